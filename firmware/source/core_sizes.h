@@ -17,7 +17,6 @@
 #define MAX_COUNTED 12
 #define MAX_ANCHORS_IN_USE 8
 #define RELAYS_KEPT 3
-#define MAX_WAITING 1
 #define MAX_PAGES 8
 #define MAX_SENDERS 8
 #define SHARES_MEMORY true

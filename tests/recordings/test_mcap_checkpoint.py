@@ -186,8 +186,6 @@ def test_states_of_other_things_are_refused(path, value):
         (["tag"], with_record(Tag, lambda one: setattr(one.pages, "issue", -1))),
         (["tag"], with_record(Tag, lambda one: setattr(one.pages.used[0], "contents", (3, 255, 255, 255, 255)))),
         (["tag"], with_record(Tag, lambda one: setattr(one.pages.collected[5], "sender_count", 17))),
-        (["tag"], with_record(Tag, lambda one: setattr(one.waiting[9], "relay_bytes", 97))),
-        (["tag"], with_record(Tag, lambda one: setattr(one, "waiting_count", 129))),
     ],
 )
 def test_states_of_other_things_are_refused_at_random_instants(path, value):

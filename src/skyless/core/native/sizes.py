@@ -26,8 +26,6 @@ MAX_ANCHORS_IN_USE: Final = 24
 """Most anchors in the estimator's state; more cost accuracy, as each then sends less, and time."""
 RELAYS_KEPT: Final = 32
 """Relays of each packet that are kept for the filter which begins."""
-MAX_WAITING: Final = 128
-"""Beacons that are kept while the site's pages are not complete."""
 MAX_PAGES: Final = 64
 """Pages of issues that are not complete."""
 MAX_SENDERS: Final = 16

@@ -359,12 +359,13 @@ INTERNAL void fill_position(LocateProblem *p, Minimum *minimum, real *position_m
 INTERNAL real site_coordinate(LocateProblem *p, Minimum *minimum, int32_t k);
 INTERNAL real site_covariance(LocateProblem *p, Minimum *minimum, int32_t a, int32_t b);
 INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum);
+INTERNAL void forget_all(Acquisition *q);
 INTERNAL void forget_packets(Acquisition *q, int32_t anchor);
 INTERNAL int32_t try_start(Acquisition *q, Packet *packet, Relays *relays);
 INTERNAL int32_t find_heard(Acquisition *q, int32_t anchor);
 INTERNAL void remove_heard(Acquisition *q, int32_t place);
 INTERNAL void forget_old_packets(Acquisition *q, int64_t now);
-INTERNAL bool keep_heard(Acquisition *q, Packet *packet, Relays *relays);
+INTERNAL bool gather_packet(Acquisition *q, Packet *packet, Relays *relays);
 INTERNAL int32_t longest_unfitting(Acquisition *q);
 INTERNAL void add_links(Acquisition *q, Packet *packet, Relays *relays);
 INTERNAL void add_link(Acquisition *q, Packet *listener, Packet *sent, Relay *relayed);
@@ -418,8 +419,8 @@ INTERNAL void handle_events(Tag *t, Acquisition *q);
 INTERNAL void forget_stamps(Tag *t, Acquisition *q);
 INTERNAL void read_pages(Tag *t);
 INTERNAL void begin_with_pages(Tag *t, Acquisition *q);
+INTERNAL void forget_unconfirmed(Tag *t, Acquisition *q);
 INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame);
-INTERNAL void wait(Tag *t);
 INTERNAL int32_t join(Tag *t, State *s, Neighbour *n);
 INTERNAL void forget_moves(Tag *t);
 INTERNAL void separate_moved(Tag *t, State *s, Acquisition *q, Neighbour *n);
@@ -5694,7 +5695,13 @@ INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum) {
  * superframe drift by tens of metres. Two messages of the same anchor give the drift; then all anchors' newest
  * pseudoranges are carried to one time and solved in closed form. */
 
-/* Forget what was received of an anchor, because its position has changed. */
+/* Forget all packets. */
+INTERNAL void forget_all(Acquisition *q) {
+    q->link_count = 0;
+    q->count = 0;
+}
+
+/* Forget what was received of an anchor. */
 INTERNAL void forget_packets(Acquisition *q, int32_t anchor) {
     int32_t place = find_heard(q, anchor);
     if (place >= 0) {
@@ -5714,11 +5721,10 @@ INTERNAL void forget_packets(Acquisition *q, int32_t anchor) {
  *
  * Returns why there is no start, ``FOUND`` if ``start`` is one. */
 INTERNAL int32_t try_start(Acquisition *q, Packet *packet, Relays *relays) {
-    add_links(q, packet, relays);
     int64_t now = packet->rx_ticks;
     int32_t anchor = packet->place.anchor;
     forget_old_packets(q, now);
-    bool came_around = keep_heard(q, packet, relays);
+    bool came_around = gather_packet(q, packet, relays);
     choose_pairs(q, now);
     put_on_one_scale(q, now);
     drop_impossible(q, now);
@@ -5767,10 +5773,11 @@ INTERNAL void forget_old_packets(Acquisition *q, int64_t now) {
     }
 }
 
-/* Keep an anchor's two newest packets; whether it had two before.
+/* Keep an anchor's two newest packets, without an attempt to start; whether it had two before.
  *
  * With too many anchors a new one takes the place of that which has not fitted the others for longest. */
-INTERNAL bool keep_heard(Acquisition *q, Packet *packet, Relays *relays) {
+INTERNAL bool gather_packet(Acquisition *q, Packet *packet, Relays *relays) {
+    add_links(q, packet, relays);
     int32_t place = find_heard(q, packet->place.anchor);
     if (place < 0) {
         if (q->count == MAX_ANCHORS) {
@@ -6354,13 +6361,12 @@ INTERNAL void widen(Course *c, int32_t axis) {
  * The filter's state and the search for a start are not used at the same time, so that a board may keep both in the same
  * memory (``SHARES_MEMORY``): a filter begins with copies of what was found. */
 
-/* Begin with the settings in ``c``: nothing has been received. */
+/* Begin with the settings in ``c``, and with the packets that a search has gathered so far. */
 SKYLESS_EXPORT void skyless_begin_course(Course *c, Acquisition *q) {
     c->in_use_s = max_real(c->tuning.short_silence_s, REAL(1.5) * c->superframe_s);
     c->start_was_contradicted = false;
     c->is_open = false;
     c->open_range_errors = false;
-    c->is_starting = true;
     c->may_begin_again = true;
     c->relays_may_contradict = true;
     c->count = 0;
@@ -6382,10 +6388,13 @@ SKYLESS_EXPORT void skyless_begin_again(Course *c, State *s, Acquisition *q) {
     begin_search(c, q);
 }
 
-/* Look for a start, without anything that was received before. */
+/* Look for a start, with nothing that a filter has received. */
 INTERNAL void begin_search(Course *c, Acquisition *q) {
     EstimatorSettings *settings = &c->settings;
     Tuning *tuning = &c->tuning;
+    if (!c->is_starting) {
+        forget_all(q);
+    }
     c->is_starting = true;
     q->tuning = *tuning;
     q->knows_height = c->dim < AXES;
@@ -6398,8 +6407,6 @@ INTERNAL void begin_search(Course *c, Acquisition *q) {
     q->speed_std_mps = settings->start_speed_std_mps;
     q->error_variance_m2 = square(settings->range_std_m) + square(settings->survey_std_m);
     q->rival_count = 0;
-    q->link_count = 0;
-    q->count = 0;
     q->is_contradicted = false;
     q->has_been_wide = false;
 }
@@ -6748,7 +6755,9 @@ INTERNAL real float_at(uint8_t *data, int32_t at) {
 
 /* Its owner */
 
-/* Begin to listen to a site or, with ``NO_SITE``, that with most anchors; the rest is of ``EstimatorSettings``. */
+/* Begin to listen to a site or, with ``NO_SITE``, that with most anchors, and with an empty search.
+ *
+ * The rest is of ``EstimatorSettings``. */
 SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest_m, real highest_m, real height_std_m,
         real max_acceleration_mps2, real integrity_risk, real alert_limit_m) {
     t->owner = (EstimatorSettings){.qa = REAL(0.5), .start_speed_std_mps = REAL(2.0), .white = REAL(3.6e-05), .walk =
@@ -6826,7 +6835,6 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
     t->has_origin = false;
     t->has_settings = false;
     t->most_relays = MAX_HEARD;
-    t->waiting_count = 0;
     forget_moves(t);
 }
 
@@ -6877,7 +6885,7 @@ INTERNAL void forget_stamps(Tag *t, Acquisition *q) {
     t->has_settings = false;
     t->pages.has_first = false;
     t->course.is_starting = true;
-    t->waiting_count = 0;
+    forget_all(q);
     forget_moves(t);
     if (t->pages.issue != NO_ISSUE) {
         skyless_begin_here(t, q);
@@ -6924,7 +6932,22 @@ INTERNAL void begin_with_pages(Tag *t, Acquisition *q) {
             t->period_ticks = max_64(t->period_ticks, period_ticks(n->period_code));
         }
     }
+    if (t->course.is_starting) {
+        forget_unconfirmed(t, q);
+    }
     skyless_begin_here(t, q);
+}
+
+/* Forget the packets of anchors that no other confirms. */
+INTERNAL void forget_unconfirmed(Tag *t, Acquisition *q) {
+    Neighbours *neighbours = &t->admission.neighbours;
+    for (int32_t place = q->count - 1; place > -1; place--) {
+        int32_t anchor = q->heard[place].newer.packet.place.anchor;
+        int32_t row = find_neighbour(neighbours, anchor);
+        if (row < 0 || !is_confirmed(&neighbours->rows[row], t->admission.rx_ticks)) {
+            forget_packets(q, anchor);
+        }
+    }
 }
 
 /* Beacons that are not just the next of an anchor in use */
@@ -6947,20 +6970,11 @@ INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame) 
     if (!n->has_place) {
         return NO_POSITION;
     }
-    if (!t->has_settings) {
-        wait(t);
+    if (!t->has_settings) {  /* others may confirm the anchor before the pages are complete */
+        take_relays(&t->packet, &t->relays, t->beacon.relays, t->beacon.relay_bytes);
+        gather_packet(q, &t->packet, &t->relays);
         return NO_PAGES;
     }
-    for (int32_t one = 0, one_end = t->waiting_count; one < one_end; one++) {
-        WaitingBeacon *waiting = &t->waiting[one];
-        int32_t row = find_neighbour(&a->neighbours, waiting->packet.place.anchor);
-        if (row >= 0 && is_confirmed(&a->neighbours.rows[row], a->rx_ticks)) {
-            t->relays.count = 0;
-            skyless_follow(c, s, q, &a->time, &waiting->packet, &t->relays, waiting->relays, waiting->relay_bytes);
-        }
-    }
-    t->relays.count = 0;
-    t->waiting_count = 0;
     int32_t outcome = join(t, s, n);
     if (outcome != JOINS) {
         return outcome;
@@ -6975,24 +6989,6 @@ INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame) 
         }
     }
     return outcome;
-}
-
-/* Keep the beacon at hand; where there are too many, the oldest is forgotten. */
-INTERNAL void wait(Tag *t) {
-    if (t->waiting_count == MAX_WAITING) {
-        for (int32_t one = 1; one < MAX_WAITING; one++) {
-            t->waiting[one - 1] = t->waiting[one];
-        }
-        t->waiting_count -= 1;
-    }
-    WaitingBeacon *waiting = &t->waiting[t->waiting_count];
-    BeaconFields *b = &t->beacon;
-    waiting->packet = t->packet;
-    waiting->relay_bytes = b->relay_bytes;
-    for (int32_t byte = 0, byte_end = b->relay_bytes; byte < byte_end; byte++) {
-        waiting->relays[byte] = b->relays[byte];
-    }
-    t->waiting_count += 1;
 }
 
 /* Whether an anchor is in use or may be: others have received it, and it is not weaker than those in use. */
@@ -7035,17 +7031,9 @@ INTERNAL void separate_moved(Tag *t, State *s, Acquisition *q, Neighbour *n) {
     n->has_moved = true;
     t->is_moving = true;
     t->moved_ticks = max_64(t->moved_ticks, t->admission.rx_ticks);
-    int32_t kept = 0;
-    for (int32_t one = 0, one_end = t->waiting_count; one < one_end; one++) {
-        if (t->waiting[one].packet.place.anchor != n->anchor) {
-            t->waiting[kept] = t->waiting[one];
-            kept += 1;
-        }
-    }
-    t->waiting_count = kept;
-    if (t->has_settings && t->course.is_starting) {
+    if (t->course.is_starting) {
         forget_packets(q, n->anchor);
-    } else if (t->has_settings) {
+    } else {
         skyless_leave(s, n->anchor);
         if (s->count < MIN_ANCHORS) {
             begin_with_pages(t, q);
@@ -7065,15 +7053,7 @@ INTERNAL bool is_kept_apart(Tag *t, Acquisition *q, Neighbour *n) {
     }
     if (!t->uses_moved && n->has_moved && calm_ticks >= MOVED_HOLD_TICKS && have_most_moved(t)) {
         t->uses_moved = true;
-        int32_t kept = 0;
-        for (int32_t one = 0, one_end = t->waiting_count; one < one_end; one++) {
-            int32_t row = find_neighbour(&t->admission.neighbours, t->waiting[one].packet.place.anchor);
-            if (row >= 0 && t->admission.neighbours.rows[row].has_moved) {
-                t->waiting[kept] = t->waiting[one];
-                kept += 1;
-            }
-        }
-        t->waiting_count = kept;
+        forget_all(q);
         if (t->has_settings) {
             begin_with_pages(t, q);
         }

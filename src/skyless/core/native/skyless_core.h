@@ -268,10 +268,6 @@ typedef double real;
 #define MAX_TRIALS 256
 /* Factor on the variance of a blocked path: metal made messages 0.2 to 0.4 m late, 4 to 8 times what noise does. */
 #define MAX_VARIANCE_FACTOR REAL(36.0)
-/* Beacons that are kept while the site's pages are not complete. */
-#ifndef MAX_WAITING
-#define MAX_WAITING 128
-#endif
 #define MERGED_SIGMAS REAL(2.0)
 /* That other one has at least as many: with fewer there is no fix. */
 #define MIN_ANCHORS 3
@@ -916,13 +912,6 @@ typedef struct Packet {
     bool relays_have_phases;  /* Whether its frame carries phases of its relays, and short stamps. */
 } Packet;
 
-/* A beacon that came before the site's pages. */
-typedef struct WaitingBeacon {
-    Packet packet;
-    int32_t relay_bytes;
-    uint8_t relays[96];
-} WaitingBeacon;
-
 /* When an anchor, that of the packet as a rule, received a packet of another. */
 typedef struct Relay {
     int32_t listener;  /* Identifier of the one that received it. */
@@ -954,8 +943,6 @@ typedef struct Tag {
     int32_t origin_mm[3];  /* To be added to all positions, where ``HAS_ORIGIN``. */
     bool has_origin;
     int32_t most_relays;  /* Of a beacon that follows its course, the newest ones: fewer where its processor is late. */
-    int32_t waiting_count;
-    WaitingBeacon waiting[MAX_WAITING];
     BeaconFields beacon;
     bool has_moved;  /* Whether its sender states another position than before. */
     Packet packet;  /* The same for the filter. */

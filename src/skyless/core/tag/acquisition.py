@@ -140,8 +140,13 @@ class Acquisition(Record):
     found: Found
 
 
+def forget_all(q: Acquisition) -> None:
+    """Forget all packets."""
+    q.count = q.link_count = 0
+
+
 def forget_packets(q: Acquisition, anchor: int) -> None:
-    """Forget what was received of an anchor, because its position has changed."""
+    """Forget what was received of an anchor."""
     place = _find_heard(q, anchor)
     if place >= 0:
         _remove_heard(q, place)
@@ -158,10 +163,9 @@ def try_start(q: Acquisition, packet: Packet, relays: Relays) -> int:
 
     Returns why there is no start, ``FOUND`` if ``start`` is one.
     """
-    _add_links(q, packet, relays)
     now, anchor = packet.rx_ticks, packet.place.anchor
     _forget_old_packets(q, now)
-    came_around = _keep_heard(q, packet, relays)
+    came_around = gather_packet(q, packet, relays)
     _choose_pairs(q, now)
     _put_on_one_scale(q, now)
     _drop_impossible(q, now)
@@ -202,11 +206,12 @@ def _forget_old_packets(q: Acquisition, now: Ticks) -> None:
             _remove_heard(q, place)
 
 
-def _keep_heard(q: Acquisition, packet: Packet, relays: Relays) -> bool:
-    """Keep an anchor's two newest packets; whether it had two before.
+def gather_packet(q: Acquisition, packet: Packet, relays: Relays) -> bool:
+    """Keep an anchor's two newest packets, without an attempt to start; whether it had two before.
 
     With too many anchors a new one takes the place of that which has not fitted the others for longest.
     """
+    _add_links(q, packet, relays)
     place = _find_heard(q, packet.place.anchor)
     if place < 0:
         if q.count == MAX_ANCHORS:

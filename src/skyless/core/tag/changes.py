@@ -20,14 +20,14 @@ from skyless.core.air.site_pages import (
     note_page,
 )
 from skyless.core.constants import TICK_RATE_HZ, TICK_S
-from skyless.core.estimator.process import leave
+from skyless.core.estimator.process import leave, take_relays
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import AXES, State, at, find_anchor
 from skyless.core.integrity import horizontal_limit, vertical_limit
 from skyless.core.native.arithmetic import floor, sqrt
 from skyless.core.native.records import Bytes, Ticks
-from skyless.core.native.sizes import MAX_ANCHORS_IN_USE, MAX_WAITING
-from skyless.core.tag.acquisition import Acquisition, forget_packets
+from skyless.core.native.sizes import MAX_ANCHORS_IN_USE
+from skyless.core.tag.acquisition import Acquisition, forget_all, forget_packets, gather_packet
 from skyless.core.tag.admission import SITE_CHANGED, Admission
 from skyless.core.tag.course import Course
 from skyless.core.tag.following import begin_course, follow
@@ -65,7 +65,10 @@ def begin_tag(
     integrity_risk: float,
     alert_limit_m: float,
 ) -> None:
-    """Begin to listen to a site or, with ``NO_SITE``, that with most anchors; the rest is of ``EstimatorSettings``."""
+    """Begin to listen to a site or, with ``NO_SITE``, that with most anchors, and with an empty search.
+
+    The rest is of ``EstimatorSettings``.
+    """
     t.owner = EstimatorSettings()
     t.admission = Admission()
     t.pages = SitePages()
@@ -78,7 +81,6 @@ def begin_tag(
     t.course.horizontal_k, t.course.vertical_k = horizontal_limit(integrity_risk), vertical_limit(integrity_risk)
     t.has_settings = t.has_origin = False
     t.most_relays = MAX_HEARD
-    t.waiting_count = 0
     _forget_moves(t)
 
 
@@ -120,7 +122,7 @@ def _forget_stamps(t: Tag, q: Acquisition) -> None:
     """The tag's counter has restarted: forget all but what the site has in common."""
     t.pages.has_first = t.has_settings = False
     t.course.is_starting = True
-    t.waiting_count = 0
+    forget_all(q)
     _forget_moves(t)
     if t.pages.issue != NO_ISSUE:
         begin_here(t, q)
@@ -160,7 +162,19 @@ def _begin_with_pages(t: Tag, q: Acquisition) -> None:
         n = neighbours.rows[row]
         if n.frames > 0 and n.rx_ticks >= oldest_ticks - PRESENT_TICKS:
             t.period_ticks = max(t.period_ticks, period_ticks(n.period_code))
+    if t.course.is_starting:
+        _forget_unconfirmed(t, q)
     begin_here(t, q)
+
+
+def _forget_unconfirmed(t: Tag, q: Acquisition) -> None:
+    """Forget the packets of anchors that no other confirms."""
+    neighbours = t.admission.neighbours
+    for place in range(q.count - 1, -1, -1):
+        anchor = q.heard[place].newer.packet.place.anchor
+        row = find_neighbour(neighbours, anchor)
+        if row < 0 or not is_confirmed(neighbours.rows[row], t.admission.rx_ticks):
+            forget_packets(q, anchor)
 
 
 # Beacons that are not just the next of an anchor in use
@@ -179,16 +193,10 @@ def process_rare(t: Tag, s: State, q: Acquisition, frame: Bytes) -> int:
         return MOVED_ANCHOR
     if not n.has_place:
         return NO_POSITION
-    if not t.has_settings:
-        _wait(t)
+    if not t.has_settings:  # others may confirm the anchor before the pages are complete
+        take_relays(t.packet, t.relays, t.beacon.relays, t.beacon.relay_bytes)
+        gather_packet(q, t.packet, t.relays)
         return NO_PAGES
-    for one in range(t.waiting_count):
-        waiting = t.waiting[one]
-        row = find_neighbour(a.neighbours, waiting.packet.place.anchor)
-        if row >= 0 and is_confirmed(a.neighbours.rows[row], a.rx_ticks):
-            t.relays.count = 0
-            follow(c, s, q, a.time, waiting.packet, t.relays, waiting.relays, waiting.relay_bytes)
-    t.waiting_count = t.relays.count = 0
     outcome = _join(t, s, n)
     if outcome != JOINS:
         return outcome
@@ -199,19 +207,6 @@ def process_rare(t: Tag, s: State, q: Acquisition, frame: Bytes) -> int:
             other.relayed_ticks = other.own_relays_ticks = NEVER
             other.is_misfit = other.anchor == c.misfit
     return outcome
-
-
-def _wait(t: Tag) -> None:
-    """Keep the beacon at hand; where there are too many, the oldest is forgotten."""
-    if t.waiting_count == MAX_WAITING:
-        for one in range(1, MAX_WAITING):
-            t.waiting[one - 1] = t.waiting[one]
-        t.waiting_count -= 1
-    waiting, b = t.waiting[t.waiting_count], t.beacon
-    waiting.packet, waiting.relay_bytes = t.packet, b.relay_bytes
-    for byte in range(b.relay_bytes):
-        waiting.relays[byte] = b.relays[byte]
-    t.waiting_count += 1
 
 
 def _join(t: Tag, s: State, n: Neighbour) -> int:
@@ -246,15 +241,9 @@ def _separate_moved(t: Tag, s: State, q: Acquisition, n: Neighbour) -> None:
         _forget_moves(t)
     n.has_moved, t.is_moving = True, True
     t.moved_ticks = max(t.moved_ticks, t.admission.rx_ticks)
-    kept = 0
-    for one in range(t.waiting_count):
-        if t.waiting[one].packet.place.anchor != n.anchor:
-            t.waiting[kept] = t.waiting[one]
-            kept += 1
-    t.waiting_count = kept
-    if t.has_settings and t.course.is_starting:
+    if t.course.is_starting:
         forget_packets(q, n.anchor)
-    elif t.has_settings:
+    else:
         leave(s, n.anchor)
         if s.count < MIN_ANCHORS:
             _begin_with_pages(t, q)
@@ -270,13 +259,7 @@ def _is_kept_apart(t: Tag, q: Acquisition, n: Neighbour) -> bool:
         return False
     if not t.uses_moved and n.has_moved and calm_ticks >= MOVED_HOLD_TICKS and _have_most_moved(t):
         t.uses_moved = True
-        kept = 0
-        for one in range(t.waiting_count):
-            row = find_neighbour(t.admission.neighbours, t.waiting[one].packet.place.anchor)
-            if row >= 0 and t.admission.neighbours.rows[row].has_moved:
-                t.waiting[kept] = t.waiting[one]
-                kept += 1
-        t.waiting_count = kept
+        forget_all(q)
         if t.has_settings:
             _begin_with_pages(t, q)
     return n.has_moved != t.uses_moved

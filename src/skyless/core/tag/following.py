@@ -21,6 +21,7 @@ from skyless.core.tag.acquisition import (
     Acquisition,
     HeardPacket,
     Start,
+    forget_all,
     try_start,
 )
 from skyless.core.tag.course import (
@@ -57,10 +58,10 @@ class Beginning(Record):
 
 
 def begin_course(c: Course, q: Acquisition) -> None:
-    """Begin with the settings in ``c``: nothing has been received."""
+    """Begin with the settings in ``c``, and with the packets that a search has gathered so far."""
     c.in_use_s = max(c.tuning.short_silence_s, 1.5 * c.superframe_s)
     c.open_range_errors = c.is_open = c.start_was_contradicted = False
-    c.relays_may_contradict = c.may_begin_again = c.is_starting = True
+    c.relays_may_contradict = c.may_begin_again = True
     c.heights_rejected = c.count = 0
     c.master_less_tag_ticks = c.started_ticks = c.newest_ticks = c.checked_ticks = 0
     c.late_share = c.extent_m = 0.0
@@ -76,8 +77,10 @@ def begin_again(c: Course, s: State, q: Acquisition) -> None:
 
 
 def _begin_search(c: Course, q: Acquisition) -> None:
-    """Look for a start, without anything that was received before."""
+    """Look for a start, with nothing that a filter has received."""
     settings, tuning = c.settings, c.tuning
+    if not c.is_starting:
+        forget_all(q)
     c.is_starting = True
     q.tuning = tuning
     q.knows_height, q.height_m = c.dim < AXES, settings.height_m if c.dim < AXES else 0.0
@@ -87,7 +90,7 @@ def _begin_search(c: Course, q: Acquisition) -> None:
     q.max_age_s = max(tuning.start_age_s, 2.5 * c.superframe_s)
     q.speed_std_mps = settings.start_speed_std_mps
     q.error_variance_m2 = square(settings.range_std_m) + square(settings.survey_std_m)
-    q.count = q.link_count = q.rival_count = 0
+    q.rival_count = 0
     q.has_been_wide = q.is_contradicted = False
 
 

@@ -7,10 +7,9 @@ import ctypes
 from math import inf, nan
 from typing import Final
 
-from skyless.core.air.beacon import MAX_HEARD, Beacon
+from skyless.core.air.beacon import Beacon
 from skyless.core.air.codec import FAULTS, fields_of
 from skyless.core.air.first_path import powers_dbm
-from skyless.core.air.frame import HEARD_BYTES
 from skyless.core.air.local_almanac import LocalAlmanac
 from skyless.core.air.page_check import is_possible_page
 from skyless.core.air.page_codec import encode_page
@@ -23,7 +22,7 @@ from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.native.library import compiled
 from skyless.core.native.records import packed, unpacked
-from skyless.core.native.sizes import MAX_PAGES, MAX_SENDERS, MAX_WAITING
+from skyless.core.native.sizes import MAX_PAGES, MAX_SENDERS
 from skyless.core.tag.admission import DROP_COUNTERS, Admission
 from skyless.core.tag.beacon_receiver import BeaconReceiver, HeardSite, MethodOptions
 from skyless.core.tag.changes import (
@@ -205,13 +204,8 @@ def _check(t: Tag) -> None:
         ValueError: one is beyond its table, or a page is damaged.
     """
     pages = [*t.pages.used, *t.pages.collected]
-    counts = [
-        (t.pages.count, MAX_PAGES),
-        (t.waiting_count, MAX_WAITING),
-        *((one.sender_count, MAX_SENDERS) for one in t.pages.collected),
-        *((one.relay_bytes / HEARD_BYTES, MAX_HEARD) for one in t.waiting),
-    ]
-    if not all(count == int(count) and 0 <= count <= most for count, most in counts):
-        raise ValueError("the receiver's state has more pages or waiting beacons than there can be")
+    senders = [one.sender_count for one in t.pages.collected]
+    if not 0 <= t.pages.count <= MAX_PAGES or min(senders) < 0 or max(senders) > MAX_SENDERS:
+        raise ValueError("the receiver's state has more pages than there can be")
     if (t.has_settings and t.pages.issue == NO_ISSUE) or not all(is_possible_page(one.contents, 0) for one in pages):
         raise ValueError("a page of the receiver's state is damaged")

@@ -2,26 +2,14 @@
 
 from typing import Annotated
 
-from skyless.core.air.beacon import MAX_HEARD
 from skyless.core.air.beacon_fields import BeaconFields
-from skyless.core.air.frame import HEARD_BYTES
 from skyless.core.air.site_pages import SitePages
 from skyless.core.estimator.process import Packet, Relays
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import AXES
-from skyless.core.native.records import Array, Byte, Integers, Record, Ticks, record
-from skyless.core.native.sizes import MAX_WAITING
+from skyless.core.native.records import Integers, Record, Ticks, record
 from skyless.core.tag.admission import Admission
 from skyless.core.tag.course import Course
-
-
-@record
-class WaitingBeacon(Record):
-    """A beacon that came before the site's pages."""
-
-    packet: Packet
-    relay_bytes: int
-    relays: Annotated[Array[Byte], MAX_HEARD * HEARD_BYTES]
 
 
 @record
@@ -48,8 +36,6 @@ class Tag(Record):
     has_origin: bool
     most_relays: int
     """Of a beacon that follows its course, the newest ones: fewer where its processor is late."""
-    waiting_count: int
-    waiting: Annotated[Array[WaitingBeacon], MAX_WAITING]
     # The beacon at hand
     beacon: BeaconFields
     has_moved: bool
