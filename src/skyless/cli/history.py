@@ -3,8 +3,9 @@
 import asyncio
 import contextlib
 import sys
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import App, Parameter
 
@@ -17,7 +18,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine
+    from collections.abc import Awaitable, Callable
 
     from skyless.run.gather.address import NatsAddress
     from skyless.run.history.hub_source import HubHistory
@@ -85,10 +86,10 @@ def run(
             raise SkylessError(f"--from is {from_!r}; give it without --mqtt and --nats, which are of a single site")
         hub = nats_address(from_, "--from", broker.mqtt_ca)
         hub.tls_context()
-        opening = _of_hub(to, hub, site_id, keep)
+        opening = partial(_of_hub, to, hub, site_id, keep)
     else:
         address = broker.required("the broker of the site whose history to keep")
-        opening = _of_broker(to, address, site_id, keep, None if nats is None else nats_address(nats))
+        opening = partial(_of_broker, to, address, site_id, keep, None if nats is None else nats_address(nats))
     make_folder("--to", to)
     with contextlib.suppress(KeyboardInterrupt):
         process.run(_keep(opening, found))
@@ -121,9 +122,9 @@ async def _of_hub(folder: Path, hub: "NatsAddress", site_id: int | None, keep: "
     return HubHistory(folder, hub, site_id, keep, log)
 
 
-async def _keep(opening: "Coroutine[Any, Any, _History]", found: "list[_History]") -> None:
+async def _keep(opening: "Callable[[], Awaitable[_History]]", found: "list[_History]") -> None:
     """Keep a history until cancelled; ``found`` gets it."""
-    node = await opening
+    node = await opening()
     found.append(node)
     screen = asyncio.ensure_future(_status(node)) if sys.stderr.isatty() else None
     try:
