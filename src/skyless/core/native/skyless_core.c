@@ -6188,10 +6188,18 @@ INTERNAL int32_t solve_without_one(Acquisition *q, int64_t now) {
  * ``host_s``: the host's time of it, NaN where that is not known. */
 SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real host_s)
         {
+    a->former = a->own;
     a->rx_ticks = unwrap(&a->own, rx_counter, host_s);
     Neighbours *t = &a->neighbours;
+    bool went_back = a->went_back;
     bool is_possible = -LAST_TICKS <= a->rx_ticks && a->rx_ticks <= LAST_TICKS;
-    if (!is_possible || (t->has_newest && a->rx_ticks < t->newest_rx_ticks - COUNTER_JUMP_TICKS)) {
+    a->went_back = t->has_newest && a->rx_ticks < t->newest_rx_ticks - COUNTER_JUMP_TICKS;
+    if (is_possible && a->went_back && !went_back) {
+        a->own = a->former;
+        return OUT_OF_ORDER;
+    }
+    if (!is_possible || a->went_back) {
+        a->went_back = false;
         forget_times(t);
         a->events = a->events | (is_possible ? COUNTER_JUMPED : HOST_JUMPED);
         restart_choice(&a->choice, is_possible ? a->rx_ticks : 0);
@@ -6219,6 +6227,8 @@ SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t
     int32_t stamp = skyless_unwrap_stamp(&a->neighbours, anchor, sequence, tx_counter, a->rx_ticks, period_ticks);
     if (stamp == STAMP_FITS) {
         a->choice.heard_ticks = a->rx_ticks;
+    } else {
+        a->own = a->former;
     }
     return stamp;
 }
@@ -6770,8 +6780,8 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .least_change_std_m = REAL(0.05), .earliest_m = (real)-__builtin_inf(), .difference_std_m = REAL(0.12),
             .stationary_s = REAL(0.0), .max_acceleration_mps2 = REAL(0.0), .max_walk_scale = REAL(10000.0),
             .integrity_risk = REAL(0.0001), .alert_limit_m = (real)__builtin_nan("")};
-    t->admission = (Admission){.own = {.bits = 40, .last_host_s = (real)__builtin_nan("")}, .choice = {.only_site = -1,
-            .site = -1}};
+    t->admission = (Admission){.own = {.bits = 40, .last_host_s = (real)__builtin_nan("")}, .former = {.bits = 40,
+            .last_host_s = (real)__builtin_nan("")}, .choice = {.only_site = -1, .site = -1}};
     t->pages = (SitePages){.issue = -1};
     t->course = (Course){.settings = {.qa = REAL(0.5), .start_speed_std_mps = REAL(2.0), .white = REAL(3.6e-05), .walk =
             REAL(0.09), .tx_variance_m2 = REAL(0.0009), .rx_variance_m2 = REAL(0.0009), .gate = REAL(4.0), .height_m =
@@ -6855,6 +6865,7 @@ SKYLESS_EXPORT void skyless_wake(Tag *t, State *s, Acquisition *q, int64_t rx_co
     }
     wake_times(&a->neighbours, a->rx_ticks, rx_counter);
     restart_choice(&a->choice, rx_counter);
+    a->went_back = false;
     a->own.has_stamp = false;
     a->time.first_ticks_master += rx_counter - a->time.last_ticks_master - floor_real(slept_s * TICK_RATE_HZ);
     a->time.last_rx_ticks_tag = rx_counter;

@@ -103,7 +103,8 @@ typedef double real;
 #define CONTRADICTED 2
 #define CONVERGED 0
 #define COUNTER_JUMPED 1
-/* Stamps that go back farther than radios and hosts reorder them mean that the tag's own counter has restarted. */
+/* Two stamps in a row that go back farther than radios and hosts reorder them mean that the tag's own counter has
+ * restarted; a single one is damaged. */
 #define COUNTER_JUMP_TICKS INT64_C(63897600000)
 #define COUNT_BITS 4
 /* Number of receptions, and which of them are weak. */
@@ -582,6 +583,8 @@ typedef struct FixTime {
 /* What a tag knows of its own counter, of sites and of anchors. */
 typedef struct Admission {
     Unwrapper own;
+    Unwrapper former;  /* The same before the frame at hand, whose stamp does not count where it is not admitted. */
+    bool went_back;  /* Whether the frame before did so. */
     SiteChoice choice;
     FixTime time;
     Neighbours neighbours;

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from skyless.core.air.anchor_stamps import STAMP_COUNTERS, STAMP_FITS, unwrap_stamp
+from skyless.core.air.anchor_stamps import OUT_OF_ORDER, STAMP_COUNTERS, STAMP_FITS, unwrap_stamp
 from skyless.core.air.instants import LONGEST_PERIOD_CODE
 from skyless.core.air.neighbours import Neighbours, forget_times
 from skyless.core.air.site_choice import (
@@ -19,7 +19,8 @@ from skyless.core.native.sizes import MAX_COUNTED, MAX_NEIGHBOURS, MAX_SITES
 from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, from_seconds, unwrap
 
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
-"""Stamps that go back farther than radios and hosts reorder them mean that the tag's own counter has restarted."""
+"""Two stamps in a row that go back farther than radios and hosts reorder them mean that the tag's own counter has
+restarted; a single one is damaged."""
 
 ADMITTED: Final = STAMP_FITS
 FOREIGN_SITE, IMPOSSIBLE_HOST_TIME = range(len(STAMP_COUNTERS), len(STAMP_COUNTERS) + 2)
@@ -36,6 +37,10 @@ class Admission(Record):
     """What a tag knows of its own counter, of sites and of anchors."""
 
     own: Unwrapper
+    former: Unwrapper
+    """The same before the frame at hand, whose stamp does not count where it is not admitted."""
+    went_back: bool
+    """Whether the frame before did so."""
     choice: SiteChoice
     time: FixTime
     neighbours: Neighbours
@@ -50,10 +55,16 @@ def admit_sender(a: Admission, site: int, anchor: int, rx_counter: Ticks, host_s
 
     ``host_s``: the host's time of it, NaN where that is not known.
     """
+    a.former = a.own
     a.rx_ticks = unwrap(a.own, rx_counter, host_s)
-    t = a.neighbours
+    t, went_back = a.neighbours, a.went_back
     is_possible = -LAST_TICKS <= a.rx_ticks <= LAST_TICKS
-    if not is_possible or (t.has_newest and a.rx_ticks < t.newest_rx_ticks - COUNTER_JUMP_TICKS):
+    a.went_back = t.has_newest and a.rx_ticks < t.newest_rx_ticks - COUNTER_JUMP_TICKS
+    if is_possible and a.went_back and not went_back:
+        a.own = a.former
+        return OUT_OF_ORDER
+    if not is_possible or a.went_back:
+        a.went_back = False
         forget_times(t)
         a.events |= COUNTER_JUMPED if is_possible else HOST_JUMPED
         restart_choice(a.choice, a.rx_ticks if is_possible else 0)
@@ -75,6 +86,8 @@ def admit_stamp(a: Admission, anchor: int, sequence: int, tx_counter: Ticks, per
     stamp = unwrap_stamp(a.neighbours, anchor, sequence, tx_counter, a.rx_ticks, period_ticks)
     if stamp == STAMP_FITS:
         a.choice.heard_ticks = a.rx_ticks
+    else:
+        a.own = a.former
     return stamp
 
 
@@ -89,7 +102,7 @@ def check(a: Admission) -> None:
         ("rows", a.neighbours.row + 1, MAX_NEIGHBOURS),
         ("sites", a.choice.count, MAX_SITES),
         ("failed sites", a.choice.failed_count, MAX_SITES),
-        ("bits other than a radio's", abs(a.own.bits - TICK_BITS), 0),
+        *(("bits other than a radio's", abs(one.bits - TICK_BITS), 0) for one in (a.own, a.former)),
         *(("anchors of a site", one.count, MAX_COUNTED) for one in first(a.choice.sites, MAX_SITES)),
         *(
             ("as a period's code", one.period_code, LONGEST_PERIOD_CODE)

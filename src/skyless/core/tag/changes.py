@@ -99,7 +99,7 @@ def wake(t: Tag, s: State, q: Acquisition, rx_counter: Ticks, slept_s: float) ->
         height_m, std_m = s.x[2], sqrt(s.P[at(2, 2)]) + slept_s * c.settings.start_speed_std_mps
     wake_times(a.neighbours, a.rx_ticks, rx_counter)
     restart_choice(a.choice, rx_counter)
-    a.own.has_stamp = False
+    a.own.has_stamp = a.went_back = False
     a.time.first_ticks_master += rx_counter - a.time.last_ticks_master - floor(slept_s * TICK_RATE_HZ)
     a.time.last_ticks_master = a.time.last_rx_ticks_tag = rx_counter
     _forget_stamps(t, q)
