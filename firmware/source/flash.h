@@ -5,10 +5,10 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-/* Read KEPT_BYTES (hardware.h); false where none were written whole. */
-bool flash_read(uint8_t *into);
+/* Read KEPT_BYTES (hardware.h): what was written last, or anything. */
+void flash_read(uint8_t *into);
 
-/* Write them in 90 ms, in which the processor stands still. Without supply in between there are none afterwards. */
+/* Write them in 90 ms, in which the processor stands still. */
 void flash_write(const uint8_t *from);
 
 #endif

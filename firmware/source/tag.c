@@ -308,9 +308,22 @@ static uint32_t reason_of(int32_t outcome)
 
 /* Serial port and Bluetooth */
 
-static void send_line(struct tag *tag)
+/* The bytes of a struct of fix.h. */
+static void send_record(struct tag *tag, uint32_t kind, const void *words, uint32_t size)
 {
-    (void)tag->hardware->write_line(tag->writer->line, tag->writer->length);
+    link_begin(tag->writer, kind);
+    link_append_bytes(tag->writer, words, size);
+    link_send(tag->writer);
+}
+
+static void send_fix(struct tag *tag)
+{
+    link_begin(tag->writer, LINK_FIX);
+    link_append_bytes(tag->writer, &tag->fix, FIX_SENT_BYTES);
+    for (uint32_t at = 0u; at < tag->fix.anchor_count; at++) {
+        link_append(tag->writer, tag->fix.anchors[at].id, 2u);
+    }
+    link_send(tag->writer);
 }
 
 /* Say where the tag is, or why it does not know. */
@@ -325,8 +338,7 @@ static void say_position(struct tag *tag, uint32_t at_us)
     } else if (tag->settings->output == OUTPUT_JSON) {
         size = json_write(&tag->fix, text);
     } else if ((tag->settings->output == OUTPUT_RECORDS) && (tag->fix.reason == 0u)) {
-        link_write_fix(tag->writer, &tag->fix);
-        send_line(tag);
+        send_fix(tag);
     } else {
         /* TAG_STATUS says why */
     }
@@ -340,12 +352,10 @@ static void send_places(struct tag *tag, uint32_t at_us)
     tag->places_us = at_us;
     tag->places_changes = tag->core.course.changes;
     for (uint32_t at = 0u; at < tag->fix.anchor_count; at++) {
-        link_write_words(tag->writer, LINK_ANCHOR_PLACE, &tag->fix.anchors[at], sizeof tag->fix.anchors[at]);
-        send_line(tag);
+        send_record(tag, LINK_ANCHOR_PLACE, &tag->fix.anchors[at], sizeof tag->fix.anchors[at]);
     }
     if (tag->fix.has_origin) {
-        link_write_words(tag->writer, LINK_GEOREFERENCE, &tag->fix.origin, sizeof tag->fix.origin);
-        send_line(tag);
+        send_record(tag, LINK_GEOREFERENCE, &tag->fix.origin, sizeof tag->fix.origin);
     }
 }
 
@@ -359,8 +369,7 @@ static void send_status(struct tag *tag, uint32_t at_us)
     count_on(tag);
     status->receiver_on_ms += tag->on_us / 1000u;
     tag->on_us %= 1000u;
-    link_write_words(tag->writer, LINK_TAG_STATUS, status, sizeof *status);
-    send_line(tag);
+    send_record(tag, LINK_TAG_STATUS, status, sizeof *status);
 }
 
 static void advertise(struct tag *tag, uint32_t at_us)
