@@ -84,7 +84,9 @@ struct fix_dops {
 };
 
 uint32_t fix_alert(const struct fix *fix);
-bool fix_has_levels(const struct fix *fix);
+/* NaN where there is none. */
+float fix_hpl_m(const struct fix *fix);
+float fix_vpl_m(const struct fix *fix);
 float fix_std_m(const struct fix *fix);
 int64_t fix_time_us(const struct fix *fix);
 

@@ -1,8 +1,7 @@
-#include "flash.h"
-
 #include "hardware.h"
 #include "link.h"
 #include "nrf52832.h"
+#include "peripherals.h"
 
 extern volatile uint32_t settings_page[]; /* from the linker script */
 

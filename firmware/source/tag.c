@@ -150,8 +150,6 @@ void tag_on_chip(struct tag *tag, uint32_t events)
         }
     } else if (tag->has_window && is_over_now) {
         schedule_miss(&tag->schedule, tag->window.row);
-    } else {
-        /* nothing to keep */
     }
     if (is_over_now && !tag->is_on_all_the_time) {
         listen_at_next(tag);
@@ -173,8 +171,6 @@ static void choose_listening(struct tag *tag, uint32_t at_us)
     } else if (!may_predict || ((tag->settings->sleep_ms == 0u) && is_over(SCAN_EVERY_US, tag->scanned_us, at_us)) ||
                (tag->has_fix && is_over(SILENT_US, tag->fixed_us, at_us))) {
         listen_all_the_time(tag);
-    } else {
-        /* as it is */
     }
 }
 
@@ -339,8 +335,6 @@ static void say_position(struct tag *tag, uint32_t at_us)
         size = json_write(&tag->fix, text);
     } else if ((tag->settings->output == OUTPUT_RECORDS) && (tag->fix.reason == 0u)) {
         send_fix(tag);
-    } else {
-        /* TAG_STATUS says why */
     }
     if ((size > 0u) && (size < OUTPUT_MAX_BYTES)) { /* a line that was cut says nothing */
         (void)tag->hardware->write_line((const uint8_t *)text, size);

@@ -638,8 +638,6 @@ static uint32_t read_frame(struct dw1000 *chip)
         chip->state = DW1000_IDLE;
     } else if (!is_early) {
         write_register(chip, 0x0Du, 0u, 2u, RXENAB);
-    } else {
-        /* it is on */
     }
     return DW1000_RECEIVED;
 }
@@ -674,11 +672,7 @@ uint32_t dw1000_poll(struct dw1000 *chip)
             events |= recover(chip);
         } else if ((seen & RXFCG) != 0u) {
             events |= read_frame(chip);
-        } else {
-            /* nothing has happened */
         }
-    } else {
-        /* IDLE: nothing can happen */
     }
     return events;
 }

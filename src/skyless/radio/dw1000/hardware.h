@@ -5,7 +5,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-/* Lights, as a sum in `show`. */
+/* Lights, as a sum in `show`: bits in the order of main.c. */
 #define LIGHT_READY 0x01u   /* on: receiving; blinking: waits for its host */
 #define LIGHT_RECEIVED 0x02u /* changes every 16 receptions */
 #define LIGHT_SENT 0x04u    /* changes every 4 frames sent */
