@@ -159,7 +159,7 @@ class CBoard:
 
     @property
     def unix_us(self) -> int:
-        """The time that its host has given."""
+        """The time of the last turn as a tag, by what its host has given."""
         return ctypes.c_int64.from_buffer(self._memory, places()["unix_us"]).value
 
     def begin(self) -> None:

@@ -255,7 +255,7 @@ static void choose_settings(struct settings *settings)
 
     *settings = SETTINGS_DEFAULT;
     settings->mode = one_in(8u) ? MODE_RADIO : MODE_TAG;
-    settings->output = any(4u);
+    settings->output = any(2u) * (any(3u) + 1u);
     settings->rate_hz = any(2u) * any(51u);
     settings->bluetooth_ms = any(2u) * 100u;
     settings->predicts = any(2u);
@@ -507,7 +507,7 @@ static void change_turns(void)
         choose_settings(&settings);
         settings_pack(&settings, flash);
     }
-    if (!one_in(4u)) {
+    if ((stage == TAG_TURN) || !one_in(4u)) {
         restart();
     }
 }

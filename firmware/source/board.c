@@ -61,7 +61,7 @@ static bool is_tag(const struct board *board)
 /* Whether the chip is configured and awake. */
 static bool has_chip(const struct board *board)
 {
-    return board->is_configured && !(is_tag(board) && board->tag.is_resting);
+    return board->is_configured && !(is_tag(board) && (board->tag.receiver == RESTING));
 }
 
 static void send_hello(struct board *board)
@@ -303,7 +303,7 @@ static void start_tag(struct board *board)
     start_chip(board, board->settings.tx_delay_ticks, board->settings.rx_delay_ticks);
     board->tried_us = board->checked_us;
     if (board->is_configured) {
-        tag_begin(&board->tag, board->hardware, &board->settings, &board->chip, &board->writer);
+        tag_begin(&board->tag);
     }
 }
 
@@ -546,6 +546,9 @@ void board_init(struct board *board, const struct hardware *hardware, const stru
     board->writer.write_line = hardware->write_line;
     board->settings = SETTINGS_DEFAULT;
     board->tag.hardware = hardware;
+    board->tag.settings = &board->settings;
+    board->tag.chip = &board->chip;
+    board->tag.writer = &board->writer;
     dw1000_init(&board->chip, hardware);
     board->busy_us = hardware->now_us();
     board->polled_us = board->busy_us;

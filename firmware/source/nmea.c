@@ -12,10 +12,11 @@
 static void begin(struct text *text, const char *name, int64_t unix_us)
 {
     int64_t hundredths = ((unix_us + 5000) % DAY_US) / 10000;
+    int64_t digits = (hundredths / 360000 * 1000000) + (hundredths / 6000 % 60 * 10000) + (hundredths % 6000);
 
     text_put(text, name);
     if (unix_us > 0) {
-        text_padded(text, "", (hundredths / 360000 * 1000000) + (hundredths / 6000 % 60 * 10000) + (hundredths % 6000), 2u, 6u);
+        text_padded(text, "", digits, 2u, 6u);
     }
 }
 
