@@ -1,5 +1,4 @@
 #include "outputs.h"
-#include "text.h"
 
 #define MANUFACTURER_SPECIFIC 0xFFu
 #define NO_COMPANY 0xFFFFu /* of those without a number of the Bluetooth SIG */

@@ -195,12 +195,20 @@ static bool poll(struct board *board, bool line_is_high)
     return events != 0u;
 }
 
+/* Poll a chip that may have something. */
+static void poll_now(struct board *board)
+{
+    bool line_is_high = board->hardware->interrupt_line();
+
+    if (line_is_high || board->is_polled) {
+        (void)poll(board, line_is_high);
+    }
+}
+
 static bool is_poll_due(const struct board *board, bool line_is_high, uint32_t now_us)
 {
-    if (line_is_high && !board->is_polled) {
-        return true;
-    }
-    return (now_us - board->polled_us) >= (board->is_polled ? FAST_POLL_US : POLL_US);
+    return (line_is_high && !board->is_polled) ||
+           ((now_us - board->polled_us) >= (board->is_polled ? FAST_POLL_US : POLL_US));
 }
 
 /* The frame to be sent */
@@ -208,13 +216,10 @@ static bool is_poll_due(const struct board *board, bool line_is_high, uint32_t n
 static void hand_over(struct board *board)
 {
     enum dw1000_queued result;
-    bool line_is_high = board->hardware->interrupt_line();
 
-    if (line_is_high || board->is_polled) {
-        (void)poll(board, line_is_high); /* or a frame that has just come would be lost */
-        if (board->stage != FRAME_HELD) {
-            return;
-        }
+    poll_now(board); /* or a frame that has just come would be lost */
+    if (board->stage != FRAME_HELD) {
+        return;
     }
     if (!dw1000_check(&board->chip)) { /* or it would be sent with other settings, at another time */
         on_lost(board);
@@ -559,14 +564,8 @@ void board_init(struct board *board, const struct hardware *hardware, const stru
 
 void board_pause(void)
 {
-    struct board *board = computing;
-
-    if (board != NULL) {
-        bool line_is_high = board->hardware->interrupt_line();
-
-        if (has_chip(board) && (line_is_high || board->is_polled)) {
-            (void)poll(board, line_is_high);
-        }
+    if ((computing != NULL) && has_chip(computing)) {
+        poll_now(computing);
     }
 }
 

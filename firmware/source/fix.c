@@ -5,12 +5,12 @@
 
 float fix_hpl_m(const struct fix *fix)
 {
-    return (fix->levels < FIX_CONTRADICTED) ? fix->hpl_m : __builtin_nanf("");
+    return (fix->levels < ALERT_NOT_EXCLUDED) ? fix->hpl_m : __builtin_nanf("");
 }
 
 float fix_vpl_m(const struct fix *fix)
 {
-    return ((fix->levels < FIX_CONTRADICTED) && (fix->is_height_known == 0u)) ? fix->vpl_m : __builtin_nanf("");
+    return ((fix->levels < ALERT_NOT_EXCLUDED) && (fix->is_height_known == 0u)) ? fix->vpl_m : __builtin_nanf("");
 }
 
 uint32_t fix_alert(const struct fix *fix)

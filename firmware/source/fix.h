@@ -12,10 +12,7 @@
 #define FIX_MAX_ANCHORS 8u
 #define FIX_NO_SITE 0xFFFFu
 
-/* State of the levels, as in core/integrity.py; none from FIX_CONTRADICTED on. */
-enum fix_levels { FIX_SOUND, FIX_OBSTRUCTED, FIX_CONTRADICTED, FIX_UNAVAILABLE };
-
-/* As in core/alert.py. */
+/* As in core/alert.py. The first four are states of the levels (core/integrity.py), which there are below NOT_EXCLUDED. */
 enum fix_alert { ALERT_NONE, ALERT_EXCLUDED, ALERT_NOT_EXCLUDED, ALERT_UNAVAILABLE, ALERT_LIMIT };
 
 struct fix_anchor {

@@ -1,5 +1,4 @@
 #include "outputs.h"
-#include "text.h"
 
 static const char *const ALERTS[] = {"none", "detected-excluded", "detected-not-excluded", "unavailable",
                                      "alert-limit-exceeded"};
@@ -63,7 +62,7 @@ static void write_fix(struct text *text, const struct fix *fix)
 
 uint32_t json_write(const struct fix *fix, char *data)
 {
-    struct text text = {data, OUTPUT_MAX_BYTES, 0u, "null"};
+    struct text text = {data, 0u, "null"};
 
     if (fix->reason == 0u) {
         write_fix(&text, fix);

@@ -1,6 +1,4 @@
-#include "earth.h"
 #include "outputs.h"
-#include "text.h"
 
 #define LEAST_VARIANCE_M2 1e-4f /* receivers of NMEA reject what claims less than a centimetre */
 #define COURSE_SIGMAS_SQUARED 4.0f
@@ -179,7 +177,7 @@ static void write_local(struct text *text, const struct fix *fix)
 
 uint32_t nmea_write(const struct fix *fix, char *data)
 {
-    struct text text = {data, OUTPUT_MAX_BYTES, 0u, ""};
+    struct text text = {data, 0u, ""};
     uint32_t alert = fix_alert(fix);
 
     if (fix->has_origin) {

@@ -128,10 +128,7 @@ uint32_t serial_port_read(uint8_t *into, uint32_t size)
     count = (fresh < size) ? fresh : size;
     for (uint32_t at = 0u; at < count; at++) {
         into[at] = in_ring[in_at];
-        in_at++;
-        if (in_at == IN_BYTES) {
-            in_at = 0u;
-        }
+        in_at = (in_at + 1u) % IN_BYTES;
     }
     in_count += count;
     return count;
@@ -164,17 +161,13 @@ void serial_port_pump(void)
 
 bool serial_port_write(const uint8_t *line, uint32_t size)
 {
-    uint32_t fill = (out_at + out_held) % OUT_BYTES;
+    uint32_t fill = out_at + out_held;
 
     if (size > (OUT_BYTES - out_held)) {
         return false;
     }
     for (uint32_t at = 0u; at < size; at++) {
-        out_ring[fill] = line[at];
-        fill++;
-        if (fill == OUT_BYTES) {
-            fill = 0u;
-        }
+        out_ring[(fill + at) % OUT_BYTES] = line[at];
     }
     out_held += size;
     serial_port_pump();

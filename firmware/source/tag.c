@@ -3,7 +3,6 @@
 #include <stddef.h>
 #include <string.h>
 
-#include "text.h"
 
 #define SECOND_US 1000000u
 /* How often places of anchors and the georeference are repeated. */
@@ -217,10 +216,7 @@ static void fill_origin(struct fix *fix, const struct tag *tag)
 
     fix->has_origin = page[0] != 0u;
     if (fix->has_origin) {
-        fix->origin.latitude_e7 = (int32_t)link_number(&page[1], 4u);
-        fix->origin.longitude_e7 = (int32_t)link_number(&page[5], 4u);
-        fix->origin.height_mm = (int32_t)link_number(&page[9], 4u);
-        fix->origin.heading_e7 = (uint32_t)link_number(&page[13], 4u);
+        (void)memcpy(&fix->origin, &page[1], sizeof fix->origin);
     }
 }
 
@@ -271,6 +267,11 @@ static const uint8_t REASONS[MALFORMED + 1] = {
 
 /* Serial port and Bluetooth */
 
+static bool sends_records(const struct tag *tag)
+{
+    return tag->settings->output == OUTPUT_RECORDS;
+}
+
 /* The bytes of a struct of fix.h. */
 static void send_record(struct tag *tag, uint32_t kind, const void *words, uint32_t size)
 {
@@ -300,7 +301,7 @@ static void say_position(struct tag *tag, uint32_t at_us)
         size = nmea_write(&tag->fix, text);
     } else if (tag->settings->output == OUTPUT_JSON) {
         size = json_write(&tag->fix, text);
-    } else if ((tag->settings->output == OUTPUT_RECORDS) && (tag->fix.reason == 0u)) {
+    } else if (sends_records(tag) && (tag->fix.reason == 0u)) {
         send_fix(tag);
     }
     if ((size > 0u) && (size < OUTPUT_MAX_BYTES)) { /* a line that was cut says nothing */
@@ -343,11 +344,6 @@ static void advertise(struct tag *tag, uint32_t at_us)
     }
 }
 
-static bool sends_records(const struct tag *tag)
-{
-    return tag->settings->output == OUTPUT_RECORDS;
-}
-
 /* What is due by the clock; whether anything was. */
 static bool say(struct tag *tag, uint32_t at_us)
 {
@@ -374,10 +370,9 @@ static bool say(struct tag *tag, uint32_t at_us)
 
 static int32_t relays_to_use(uint32_t waiting)
 {
-    if (waiting == 0u) {
-        return MAX_HEARD;
-    }
-    return (waiting <= RELAYS_IF_LATE) ? (int32_t)((RELAYS_IF_LATE + 1u) - waiting) : 0;
+    uint32_t if_late = (waiting <= RELAYS_IF_LATE) ? ((RELAYS_IF_LATE + 1u) - waiting) : 0u;
+
+    return (waiting == 0u) ? MAX_HEARD : (int32_t)if_late;
 }
 
 static void estimate(struct tag *tag)

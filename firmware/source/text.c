@@ -1,4 +1,4 @@
-#include "text.h"
+#include "outputs.h"
 
 #define MAX_DIGITS 24u
 #define HALF 4294967296.0f /* 2^32 */
@@ -6,7 +6,7 @@
 
 static void put(struct text *text, char one)
 {
-    if (text->fill < text->size) {
+    if (text->fill < OUTPUT_MAX_BYTES) {
         text->data[text->fill] = one;
         text->fill++;
     }

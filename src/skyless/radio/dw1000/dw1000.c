@@ -140,9 +140,7 @@ uint32_t dw1000_angle(int32_t x, int32_t y)
 
 int32_t dw1000_micros_until(uint64_t now_ticks, uint64_t then_ticks)
 {
-    int32_t distance = (int32_t)(uint32_t)(((then_ticks >> 16) - (now_ticks >> 16)) & 0xFFFFFFu);
-
-    return (distance >= 0x800000) ? (distance - 0x1000000) : distance;
+    return (int32_t)(((uint32_t)(then_ticks >> 16) - (uint32_t)(now_ticks >> 16)) << 8) >> 8;
 }
 
 /* Transactions */
@@ -521,13 +519,6 @@ static uint32_t recover(struct dw1000 *chip)
     return DW1000_FAILED;
 }
 
-static int32_t signed_sixteen(const uint8_t *data)
-{
-    int32_t value = (int32_t)sixteen(data);
-
-    return (value >= 0x8000) ? (value - 0x10000) : value;
-}
-
 /* The carrier's phase at the first path (UM 7.2.22, 7.2.23, 7.2.38): the angle of the accumulator's sample behind FP_INDEX,
  * less RCPHASE of 128 steps a turn; none where the sample is within three standard deviations of the noise. */
 static int32_t read_phase(struct dw1000 *chip, uint32_t first_path, uint32_t noise)
@@ -543,8 +534,8 @@ static int32_t read_phase(struct dw1000 *chip, uint32_t first_path, uint32_t noi
     write_register(chip, 0x36u, 0u, 2u, PMSC_FOR_ACC);
 
     const uint8_t *sample = read_register(chip, 0x25u, 4u * at, 5u); /* the first octet means nothing */
-    int32_t x = signed_sixteen(&sample[1]);
-    int32_t y = signed_sixteen(&sample[3]);
+    int32_t x = (int16_t)sixteen(&sample[1]);
+    int32_t y = (int16_t)sixteen(&sample[3]);
 
     write_register(chip, 0x36u, 0u, 2u, PMSC_RUNNING);
     if (((uint64_t)(x * (int64_t)x) + (uint64_t)(y * (int64_t)y)) <= (9u * (uint64_t)noise * noise)) {
@@ -572,12 +563,8 @@ static void read_measured(struct dw1000 *chip, uint32_t symbols, uint32_t first_
 static uint32_t read_carrier(struct dw1000 *chip)
 {
     const uint8_t *data = read_register(chip, 0x27u, 0x28u, 6u);
-    int32_t integrator = (int32_t)(sixteen(data) | (((uint32_t)data[2] & 0x1Fu) << 16));
 
-    if (integrator >= 0x100000) {
-        integrator -= 0x200000;
-    }
-    chip->offset_ppb = dw1000_carrier_offset_ppb(integrator);
+    chip->offset_ppb = dw1000_carrier_offset_ppb((int32_t)((uint32_t)number(data, 3u) << 11) >> 11);
     return sixteen(&data[4]);
 }
 
