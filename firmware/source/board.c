@@ -234,16 +234,12 @@ static void hand_over(struct board *board)
     }
 }
 
-static int32_t lead_us(const struct board *board)
-{
-    return LEAD_US + (board->chip.reads_phases ? PHASE_US : 0);
-}
-
 /* The frame is due by the board's clock: hand it over, or cancel it when it is overdue. That clock may be off by a few
  * per cent, so the time left is read from the chip until it is short. */
 static void serve_frame(struct board *board)
 {
     const struct hardware *hardware = board->hardware;
+    int32_t lead_us = LEAD_US + (board->chip.reads_phases ? PHASE_US : 0);
     int32_t left_us;
 
     if (board->stage == FRAME_HANDED_OVER) {
@@ -253,7 +249,7 @@ static void serve_frame(struct board *board)
         }
         return;
     }
-    left_us = dw1000_micros_until(dw1000_now(&board->chip), board->dx_ticks) - lead_us(board);
+    left_us = dw1000_micros_until(dw1000_now(&board->chip), board->dx_ticks) - lead_us;
     if (left_us > CLOSE_US) {
         board->due_us = hardware->now_us() + (uint32_t)(left_us - (left_us / 16));
     } else {
@@ -312,20 +308,14 @@ static void start_tag(struct board *board)
     }
 }
 
-static bool is_known_setting(const uint8_t *record)
-{
-    /* Channel 5, PRF 64 MHz, 6.8 Mbit/s, code 9, 128 symbols */
-    return (record[2] == 5u) && (record[3] == 64u) && (record[4] == 2u) && (record[5] == 9u) &&
-           (link_number(&record[6], 2u) == 128u);
-}
-
 static void configure(struct board *board, const uint8_t *record, uint32_t length)
 {
     if (length < LINK_CONFIG_BYTES) {
         refuse(board, LINK_CONFIG, LINK_REFUSED_MALFORMED);
         return;
     }
-    if (!is_known_setting(record)) {
+    if ((record[2] != 5u) || (record[3] != 64u) || (record[4] != 2u) || (record[5] != 9u) ||
+        (link_number(&record[6], 2u) != 128u)) { /* channel, PRF in MHz, 6.8 Mbit/s, code, symbols */
         refuse(board, LINK_CONFIG, LINK_REFUSED_SETTING);
         return;
     }
@@ -555,10 +545,7 @@ void board_init(struct board *board, const struct hardware *hardware, const stru
     board->tag.chip = &board->chip;
     board->tag.writer = &board->writer;
     dw1000_init(&board->chip, hardware);
-    board->busy_us = hardware->now_us();
-    board->polled_us = board->busy_us;
-    board->checked_us = board->busy_us;
-    board->measured_us = board->busy_us - MEASURE_US;
+    board->measured_us = hardware->now_us() - MEASURE_US;
     board->chip.millivolts = LINK_NO_VOLTAGE;
 }
 

@@ -20,11 +20,6 @@ uint32_t fix_alert(const struct fix *fix)
     return is_exceeded ? (uint32_t)ALERT_LIMIT : fix->levels;
 }
 
-float fix_root(float value)
-{
-    return __builtin_sqrtf(value);
-}
-
 float fix_std_m(const struct fix *fix)
 {
     return fix_root(fix->covariance_m2[0] + fix->covariance_m2[3] + fix->covariance_m2[5]);

@@ -95,6 +95,9 @@ bool fix_is_due(const struct fix *fix, uint32_t rate_hz, int64_t *slot);
 struct fix_dops fix_dops(const struct fix *fix);
 
 /* By the processor's instruction; NaN below 0. */
-float fix_root(float value);
+static inline float fix_root(float value)
+{
+    return __builtin_sqrtf(value);
+}
 
 #endif

@@ -155,15 +155,6 @@ static void prepare_sleep(void)
     GPIO_PIN_CNF(PIN_AWAKE) = PIN_OUTPUT;
 }
 
-/* Sleep until the time is over, the chip's interrupt line has risen, a byte has come or the transmitter is free. Events
- * that came since they were cleared have left their interrupts pending, so that the sleep ends at once. */
-static void sleep_us(uint32_t microseconds)
-{
-    GPIO_OUTCLR = 1u << PIN_AWAKE;
-    clock_sleep_us(microseconds);
-    GPIO_OUTSET = 1u << PIN_AWAKE;
-}
-
 static void clear_events(void)
 {
     GPIOTE_IN0 = 0u;
@@ -226,6 +217,8 @@ int main(void)
     serial_port_start();
     board_init(&board, &HARDWARE, &identity);
     board_begin(&board);
+    /* A sleep ends when its time is over, the chip's interrupt line has risen, a byte has come or the transmitter is free.
+     * Events that came since they were cleared have left their interrupts pending, so that it ends at once. */
     for (;;) {
         uint32_t idle_us;
 
@@ -235,7 +228,9 @@ int main(void)
         serial_port_pump();
         idle_us = board_turn(&board);
         if (idle_us >= SHORTEST_SLEEP_US) {
-            sleep_us(idle_us);
+            GPIO_OUTCLR = 1u << PIN_AWAKE;
+            clock_sleep_us(idle_us);
+            GPIO_OUTSET = 1u << PIN_AWAKE;
         }
     }
 }

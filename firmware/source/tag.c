@@ -66,7 +66,6 @@ static void set_receiver(struct tag *tag, enum tag_receiver next)
 static void listen_all_the_time(struct tag *tag)
 {
     set_receiver(tag, ALWAYS_ON);
-    dw1000_idle(tag->chip);
     dw1000_receive(tag->chip);
 }
 
@@ -85,7 +84,6 @@ static void listen_at_next(struct tag *tag)
 static void listen_in_windows(struct tag *tag)
 {
     set_receiver(tag, IN_WINDOWS);
-    dw1000_idle(tag->chip);
     listen_at_next(tag);
 }
 
@@ -210,19 +208,10 @@ static void fill_anchors(struct fix *fix, const struct tag *tag)
     }
 }
 
-static void fill_origin(struct fix *fix, const struct tag *tag)
-{
-    const uint8_t *page = tag->core.pages.used[EARTH_KIND].contents;
-
-    fix->has_origin = page[0] != 0u;
-    if (fix->has_origin) {
-        (void)memcpy(&fix->origin, &page[1], sizeof fix->origin);
-    }
-}
-
 static void fill_fix(struct tag *tag, const struct tag_reception *one, bool is_alone)
 {
     struct fix *fix = &tag->fix;
+    const uint8_t *page = tag->core.pages.used[EARTH_KIND].contents;
     real (*rows)[AXES] = is_alone ? tag->core.course.alone : tag->shared.state.fix;
     uint32_t at_us = now_us(tag);
 
@@ -245,7 +234,8 @@ static void fill_fix(struct tag *tag, const struct tag_reception *one, bool is_a
     fix->vpl_m = rows[PROTECTION][VPL];
     fix->levels = (uint32_t)rows[PROTECTION][STATE];
     fill_anchors(fix, tag);
-    fill_origin(fix, tag);
+    fix->has_origin = page[0] != 0u;
+    (void)memcpy(&fix->origin, &page[1], sizeof fix->origin);
     tag->has_fix = true;
     tag->has_started = true;
     tag->fixed_us = one->ended_us;
@@ -368,21 +358,16 @@ static bool say(struct tag *tag, uint32_t at_us)
 
 /* The estimator */
 
-static int32_t relays_to_use(uint32_t waiting)
-{
-    uint32_t if_late = (waiting <= RELAYS_IF_LATE) ? ((RELAYS_IF_LATE + 1u) - waiting) : 0u;
-
-    return (waiting == 0u) ? MAX_HEARD : (int32_t)if_late;
-}
-
 static void estimate(struct tag *tag)
 {
     struct tag_reception *one = &tag->waiting[tag->first];
+    uint32_t if_late;
     int32_t outcome;
 
     tag->first = (tag->first + 1u) % TAG_MAX_WAITING;
     tag->count--;
-    tag->core.most_relays = relays_to_use(tag->count);
+    if_late = (tag->count <= RELAYS_IF_LATE) ? ((RELAYS_IF_LATE + 1u) - tag->count) : 0u;
+    tag->core.most_relays = (tag->count == 0u) ? MAX_HEARD : (int32_t)if_late;
     outcome = skyless_hear_frame(
         &tag->core, &tag->shared.state, &tag->shared.search, one->frame, (int32_t)one->frame_bytes,
         (int64_t)one->rx_ticks, __builtin_nanf(""), dbm(one->rx_power_cdbm), dbm(one->first_path_cdbm), -1.0f);

@@ -474,16 +474,6 @@ bool dw1000_cancel(struct dw1000 *chip)
     return true;
 }
 
-/* Check whether the frame will be sent at its time, and cancel it if not (UM pp. 27, 91, 92). HPDWARN: its time has
- * passed. TXPUTE: the transmitter had no time to power up. What is out when TRXOFF comes counts as sent. */
-static enum dw1000_queued was_in_time(struct dw1000 *chip)
-{
-    read_status(chip);
-    return (((chip->status & TXFRS) != 0u) || ((chip->status & (HPDWARN | TXPUTE)) == 0u) || !dw1000_cancel(chip))
-               ? DW1000_QUEUED
-               : DW1000_LATE;
-}
-
 enum dw1000_queued dw1000_transmit_at(struct dw1000 *chip, uint64_t dx_ticks, const uint8_t *frame, uint32_t frame_bytes)
 {
     if (chip->state == DW1000_OFF) {
@@ -499,7 +489,14 @@ enum dw1000_queued dw1000_transmit_at(struct dw1000 *chip, uint64_t dx_ticks, co
     off_and_clear(chip);
     write_register(chip, 0x0Du, 0u, 1u, TXSTRT_TXDLYS);
     chip->state = DW1000_SENDING;
-    return was_in_time(chip);
+
+    /* Whether it will be sent at its time, or is cancelled (UM pp. 27, 91, 92). HPDWARN: its time has passed. TXPUTE: the
+     * transmitter had no time to power up. What is out when TRXOFF comes counts as sent. */
+    read_status(chip);
+    if (((chip->status & TXFRS) == 0u) && ((chip->status & (HPDWARN | TXPUTE)) != 0u) && dw1000_cancel(chip)) {
+        return DW1000_LATE;
+    }
+    return DW1000_QUEUED;
 }
 
 static uint32_t finish_sending(struct dw1000 *chip)
