@@ -21,6 +21,7 @@
 #include "outputs.h"
 
 #define HASHES (1u << 24)
+#define MAX_FRAMES 100000u
 #define RECEPTION (RXFCG | LDEDONE | 0x2B00u) /* with what the chip shows on the way to it */
 
 /* A frame as the file has it. */
@@ -51,12 +52,12 @@ static bool is_known[HASHES];
 /* The chip */
 static uint8_t tx_buffer[256];
 static uint8_t flash[KEPT_BYTES];
-static struct heard *frames; /* all of the file, */
+static struct heard frames[MAX_FRAMES]; /* all of the file */
 static size_t frame_count;
 static size_t next_frame;
-static uint64_t begin_ticks;  /* when the chip's counter was last 0, */
-static uint64_t now_ticks;    /* the present time, both by the file's stamps, */
-static struct heard received; /* and what the chip holds. */
+static uint64_t begin_ticks; /* when the chip's counter was last 0, */
+static uint64_t now_ticks;   /* and the present time, by the file's stamps */
+static struct heard received;
 static bool has_received;
 
 static uint32_t any(uint32_t below)
@@ -461,11 +462,9 @@ static void write_any_fix(void)
 /* Read all frames of a file. */
 static void read_frames(const char *path)
 {
-    static struct heard room[100000];
     FILE *file = fopen(path, "rb");
 
-    frames = room;
-    frame_count = (file == NULL) ? 0u : fread(room, sizeof *room, sizeof room / sizeof *room, file);
+    frame_count = (file == NULL) ? 0u : fread(frames, sizeof *frames, MAX_FRAMES, file);
     if (frame_count == 0u) {
         (void)fprintf(stderr, "fuzz: %s has no frames; tests/firmware/test_fuzz.py makes a file that has\n", path);
         exit(2);
