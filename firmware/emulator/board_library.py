@@ -76,16 +76,6 @@ def places() -> dict[str, int]:
     return dict(zip(PLACES, found, strict=True))
 
 
-class Identity(ctypes.Structure):
-    """``struct board_identity``."""
-
-    _fields_ = (
-        ("can_transmit", ctypes.c_bool),
-        ("device_id", ctypes.c_uint8 * 8),
-        ("reset_cause", ctypes.c_uint8),
-    )
-
-
 class Hardware(driver.Hardware):
     """``struct hardware``."""
 
@@ -140,8 +130,8 @@ class CBoard:
         self._memory = ctypes.create_string_buffer(places()["board_bytes"])
         self._board = ctypes.c_void_p(ctypes.addressof(self._memory))
         self._hardware = Hardware(processor)
-        identity = Identity(can_transmit, (ctypes.c_uint8 * 8)(*device_id), reset_cause)
-        self._library.board_init(self._board, ctypes.byref(self._hardware), ctypes.byref(identity))
+        identity = bytes((can_transmit, *device_id, reset_cause))
+        self._library.board_init(self._board, ctypes.byref(self._hardware), identity)
         self.chip = driver.DW1000.from_buffer(self._memory, places()["chip"])
         """Its fields; the board alone calls the driver."""
 
