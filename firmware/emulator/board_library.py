@@ -12,6 +12,8 @@ from skyless.radio.dw1000 import driver
 from skyless.radio.serial.board_settings import SETTINGS_BYTES, BoardSettings, unpack
 
 KEPT_BYTES = 80
+PLACES = ("board_bytes", "chip_bytes", "chip", "settings", "stage", "unix_us")
+"""What ``host_places`` of firmware/host/exports.c states: sizes, and where in a board its parts are."""
 STAGES = ("NO_FRAME", "FRAME_HELD", "FRAME_HANDED_OVER")
 
 
@@ -61,13 +63,17 @@ def library() -> ctypes.CDLL:
     """
     loaded = ctypes.CDLL(str(build("host")))
     driver.declare(loaded)
-    for name in ("host_board_chip", "host_board_settings", "host_writer_line", "host_reader_record"):
-        getattr(loaded, name).restype = ctypes.c_void_p
     loaded.link_number.restype = ctypes.c_uint64
-    loaded.host_board_unix_us.restype = ctypes.c_int64
     for name in ("settings_check", "settings_unpack", "fix_is_due"):
         getattr(loaded, name).restype = ctypes.c_bool
     return loaded
+
+
+@cache
+def places() -> dict[str, int]:
+    """The numbers of ``PLACES``."""
+    found = (ctypes.c_uint32 * len(PLACES)).in_dll(library(), "host_places")
+    return dict(zip(PLACES, found, strict=True))
 
 
 class Hardware(driver.Hardware):
@@ -82,7 +88,7 @@ class Hardware(driver.Hardware):
         ("set_rate", ctypes.CFUNCTYPE(None, ctypes.c_uint32)),
         ("show", ctypes.CFUNCTYPE(None, ctypes.c_uint32)),
         ("sleep_for", ctypes.CFUNCTYPE(None, ctypes.c_uint32)),
-        ("read_settings", ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_void_p)),
+        ("read_settings", ctypes.CFUNCTYPE(None, ctypes.c_void_p)),
         ("write_settings", ctypes.CFUNCTYPE(None, ctypes.c_void_p)),
         ("advertise", ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_void_p, ctypes.c_uint32)),
     )
@@ -95,11 +101,10 @@ class Hardware(driver.Hardware):
             ctypes.memmove(into, data, len(data))
             return len(data)
 
-        def read_settings(into: int) -> bool:
+        def read_settings(into: int) -> None:
             found = self.call(processor.read_settings)
             if isinstance(found, bytes):
-                ctypes.memmove(into, found, KEPT_BYTES)
-            return isinstance(found, bytes)
+                ctypes.memmove(into, found, len(found))
 
         self.connect(
             now_us=lambda: self.call(processor.now_us) & 0xFFFF_FFFF,
@@ -122,35 +127,30 @@ class CBoard:
         self, processor: Processor, *, can_transmit: bool, device_id: bytes = bytes(8), reset_cause: int = 0
     ) -> None:
         self._library = library()
-        self._memory = ctypes.create_string_buffer(self._library.host_board_bytes())
+        self._memory = ctypes.create_string_buffer(places()["board_bytes"])
         self._board = ctypes.c_void_p(ctypes.addressof(self._memory))
         self._hardware = Hardware(processor)
-        self._library.host_board_init(
-            self._board,
-            ctypes.byref(self._hardware),
-            device_id,
-            ctypes.c_bool(can_transmit),
-            ctypes.c_uint8(reset_cause),
-        )
-        self.chip = driver.DW1000.from_address(self._library.host_board_chip(self._board))
+        identity = bytes((can_transmit, *device_id, reset_cause))
+        self._library.board_init(self._board, ctypes.byref(self._hardware), identity)
+        self.chip = driver.DW1000.from_buffer(self._memory, places()["chip"])
         """Its fields; the board alone calls the driver."""
 
     @property
     def stage(self) -> str:
         """What became of the frame that the host wants to be sent."""
-        return STAGES[self._library.host_board_stage(self._board)]
+        return STAGES[ctypes.c_int.from_buffer(self._memory, places()["stage"]).value]
 
     @property
     def settings(self) -> BoardSettings | None:
         """What it works with as a tag."""
         packed = ctypes.create_string_buffer(SETTINGS_BYTES)
-        self._library.settings_pack(ctypes.c_void_p(self._library.host_board_settings(self._board)), packed)
+        self._library.settings_pack(ctypes.byref(self._memory, places()["settings"]), packed)
         return unpack(packed.raw)
 
     @property
     def unix_us(self) -> int:
-        """The time that its host has given."""
-        return int(self._library.host_board_unix_us(self._board))
+        """The time of the last turn as a tag, by what its host has given."""
+        return ctypes.c_int64.from_buffer(self._memory, places()["unix_us"]).value
 
     def begin(self) -> None:
         """``board_begin``: send HELLO."""

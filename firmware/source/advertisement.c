@@ -1,5 +1,4 @@
 #include "outputs.h"
-#include "text.h"
 
 #define MANUFACTURER_SPECIFIC 0xFFu
 #define NO_COMPANY 0xFFFFu /* of those without a number of the Bluetooth SIG */
@@ -45,5 +44,5 @@ void advertisement_write(const struct fix *fix, uint32_t age_ms, uint8_t *data)
         at = put(at, has_fix ? (fix->position_mm[axis] / 10) : 0, 3u);
     }
     at = put(at, has_fix ? centimetres(fix_std_m(fix)) : NO_LENGTH, 2u);
-    (void)put(at, (has_fix && fix_has_levels(fix)) ? centimetres(fix->hpl_m) : NO_LENGTH, 2u);
+    (void)put(at, has_fix ? centimetres(fix_hpl_m(fix)) : NO_LENGTH, 2u);
 }

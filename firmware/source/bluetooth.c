@@ -1,8 +1,10 @@
-/* Formats: Bluetooth Core Specification, vol. 6, part B, 1.4.1 (channels), 2.1 and 2.3 (packets), 3 (check, whitening).
+/* Bluetooth advertisements that nobody can connect to: ADV_NONCONN_IND on channels 37, 38 and 39, at 0 dBm. The radio sends
+ * by itself, 0.4 ms a channel; the processor only starts it.
+ *
+ * Formats: Bluetooth Core Specification, vol. 6, part B, 1.4.1 (channels), 2.1 and 2.3 (packets), 3 (check, whitening).
  * The nRF52832's anomalies 102, 106, 107 and 143 concern a radio that receives. */
-#include "bluetooth.h"
-
 #include "nrf52832.h"
+#include "peripherals.h"
 
 #define MAX_BYTES 31u
 #define ADDRESS_BYTES 6u

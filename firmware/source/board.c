@@ -5,10 +5,10 @@
 /* Version of the firmware, in HELLO */
 static const uint8_t VERSION[3] = {0u, 3u, 0u};
 
-/* How long before its time a frame is handed to the chip: a reception that is being reported then (0.29 ms), what is
+/* How long before its time a frame is handed to the chip: a reception that is being reported then (0.28 ms), what is
  * written over the SPI until it starts (0.14 ms; docs/hardware.md) and its preamble (0.14 ms). */
 #define LEAD_US 600
-/* So much longer where receptions are reported with their phases (0.32 ms). */
+/* So much longer where receptions are reported with their phases (0.30 ms). */
 #define PHASE_US 40
 /* A time closer than this is not checked again against the chip's counter. */
 #define CLOSE_US 30
@@ -61,92 +61,93 @@ static bool is_tag(const struct board *board)
 /* Whether the chip is configured and awake. */
 static bool has_chip(const struct board *board)
 {
-    return board->is_configured && !(is_tag(board) && board->tag.is_resting);
-}
-
-static void send_line(struct board *board)
-{
-    const uint8_t zero = 0u;
-
-    if (is_tag(board) && (board->settings.output != OUTPUT_RECORDS)) {
-        (void)board->hardware->write_line(&zero, 1u); /* or the text before it would belong to the record */
-    }
-    if (!board->hardware->write_line(board->writer.line, board->writer.length)) {
-        board->unsent++;
-    }
+    return board->is_configured && !(is_tag(board) && (board->tag.receiver == RESTING));
 }
 
 static void send_hello(struct board *board)
 {
-    struct link_hello hello;
+    struct link_writer *writer = &board->writer;
 
-    (void)memcpy(hello.firmware, VERSION, sizeof hello.firmware);
-    (void)memcpy(hello.identity, board->identity.device_id, sizeof hello.identity);
-    hello.capabilities =
-        LINK_HAS_PHASES | LINK_CAN_COMPUTE | (board->identity.can_transmit ? LINK_CAN_TRANSMIT : 0u);
-    hello.reset_cause = board->identity.reset_cause;
-    link_write_hello(&board->writer, &hello);
-    send_line(board);
+    link_begin(writer, LINK_HELLO);
+    link_append(writer, LINK_MAJOR, 1u);
+    link_append(writer, LINK_MINOR, 1u);
+    link_append_bytes(writer, VERSION, sizeof VERSION);
+    link_append_bytes(writer, board->identity.device_id, LINK_IDENTITY_BYTES);
+    link_append(writer, LINK_RATE_KHZ, 4u);
+    link_append(writer, LINK_COUNTER_BITS, 1u);
+    link_append(writer, LINK_HAS_PHASES | LINK_CAN_COMPUTE | (board->identity.can_transmit ? LINK_CAN_TRANSMIT : 0u), 1u);
+    link_append(writer, board->identity.reset_cause, 1u);
+    link_send(writer);
 }
 
 static void send_status(struct board *board)
 {
     const struct dw1000 *chip = &board->chip;
-    struct link_status status = {0};
+    struct link_writer *writer = &board->writer;
+    const uint32_t counts[6] = {chip->received, chip->errors, chip->sent, board->late,
+                                board->unknown + board->reader.garbled, writer->unsent};
 
-    if (board->is_configured) {
-        status.state |= LINK_IS_CONFIGURED;
-        status.now_ticks = dw1000_now(&board->chip);
+    link_begin(writer, LINK_STATUS);
+    link_append(writer, board->is_configured ? dw1000_now(&board->chip) : 0u, LINK_STAMP_BYTES);
+    link_append(writer, (board->is_configured ? LINK_IS_CONFIGURED : 0u) | (board->is_receiving ? LINK_IS_RECEIVING : 0u) |
+                            ((board->stage != NO_FRAME) ? LINK_HAS_FRAME_WAITING : 0u) |
+                            (board->is_polled ? LINK_IS_POLLED : 0u), 1u);
+    for (uint32_t at = 0u; at < 6u; at++) {
+        link_append(writer, counts[at] & LINK_COUNT_MASK, 4u);
     }
-    if (board->is_receiving) {
-        status.state |= LINK_IS_RECEIVING;
-    }
-    if (board->stage != NO_FRAME) {
-        status.state |= LINK_HAS_FRAME_WAITING;
-    }
-    if (board->is_polled) {
-        status.state |= LINK_IS_POLLED;
-    }
-    status.received = chip->received;
-    status.errors = chip->errors;
-    status.sent = chip->sent;
-    status.late = board->late;
-    status.garbled = board->unknown + board->reader.garbled + board->reader.overlong;
-    status.unsent = board->unsent;
-    status.temperature_cc = chip->temperature_cc;
-    status.millivolts = chip->millivolts;
-    link_write_status(&board->writer, &status);
-    send_line(board);
+    link_append(writer, (uint32_t)chip->temperature_cc, 2u);
+    link_append(writer, chip->millivolts, 2u);
+    link_send(writer);
 }
 
 static void refuse(struct board *board, uint32_t kind, uint32_t reason)
 {
-    link_write_refused(&board->writer, kind, reason);
-    send_line(board);
+    link_begin(&board->writer, LINK_REFUSED);
+    link_append(&board->writer, kind, 1u);
+    link_append(&board->writer, reason, 1u);
+    link_send(&board->writer);
 }
 
 static void report_late(struct board *board, uint64_t dx_ticks, uint32_t reason)
 {
     board->late++;
-    link_write_tx_late(&board->writer, dx_ticks, reason);
-    send_line(board);
+    link_begin(&board->writer, LINK_TX_LATE);
+    link_append(&board->writer, dx_ticks, LINK_STAMP_BYTES);
+    link_append(&board->writer, reason, 1u);
+    link_send(&board->writer);
+}
+
+/* RX_PHASE with a phase, RX without. */
+static void report_reception(struct board *board)
+{
+    const struct dw1000 *chip = &board->chip;
+    struct link_writer *writer = &board->writer;
+
+    link_begin(writer, (chip->phase < 0) ? LINK_RX : LINK_RX_PHASE);
+    link_append(writer, chip->rx_ticks, LINK_STAMP_BYTES);
+    link_append(writer, (uint32_t)chip->rx_power_cdbm, 2u);
+    link_append(writer, (uint32_t)chip->first_path_cdbm, 2u);
+    link_append(writer, (uint32_t)chip->offset_ppb, 2u);
+    link_append(writer, (uint32_t)chip->phase, (chip->phase < 0) ? 0u : 2u);
+    link_append_bytes(writer, chip->frame, chip->frame_bytes);
+    link_send(writer);
 }
 
 /* The chip */
 
-/* Report that the frame held will not be sent. */
-static void forget_frame(struct board *board)
+/* The frame, if there is one, will not be sent. */
+static void drop_frame(struct board *board, uint32_t reason)
 {
     if (board->stage != NO_FRAME) {
         board->stage = NO_FRAME;
-        report_late(board, board->dx_ticks, LINK_LATE_NOT_READY);
+        report_late(board, board->dx_ticks, reason);
     }
 }
 
 /* The chip has lost its settings; after a HELLO the host asks for the state, and configures it again. */
 static void on_lost(struct board *board)
 {
-    forget_frame(board);
+    drop_frame(board, LINK_LATE_NOT_READY);
     board->is_configured = false;
     board->is_receiving = false;
     if (!is_tag(board)) {
@@ -155,21 +156,17 @@ static void on_lost(struct board *board)
 }
 
 /* Compare the interrupt line before a poll with what the poll has found: one that is high without an event, or low with
- * one, several times in a row, is stuck until the opposite is seen. */
-static void judge_line(struct board *board, bool was_high, bool had_event)
+ * one, several times in a row, is stuck until it moves. */
+static void judge_line(struct board *board, bool is_high, bool had_event)
 {
-    if (was_high) {
-        board->low_with_event = 0u;
-        if (board->high_without_event < DISAGREEMENTS) {
-            board->high_without_event = had_event ? 0u : (board->high_without_event + 1u);
-        }
-    } else {
-        board->high_without_event = 0u;
-        if (had_event && (board->low_with_event < DISAGREEMENTS)) {
-            board->low_with_event++;
-        }
+    if ((is_high != board->line_was_high) || (is_high && had_event && !board->is_polled)) {
+        board->disagreements = 0u;
     }
-    board->is_polled = (board->high_without_event == DISAGREEMENTS) || (board->low_with_event == DISAGREEMENTS);
+    if ((is_high != had_event) && (board->disagreements < DISAGREEMENTS)) {
+        board->disagreements++;
+    }
+    board->line_was_high = is_high;
+    board->is_polled = board->disagreements == DISAGREEMENTS;
 }
 
 /* Report what has happened at the chip; whether anything has. */
@@ -182,18 +179,15 @@ static bool poll(struct board *board, bool line_is_high)
     if (is_tag(board)) {
         tag_on_chip(&board->tag, events);
     } else if ((events & DW1000_RECEIVED) != 0u) {
-        const struct link_measured measured = {chip->rx_power_cdbm, chip->first_path_cdbm, chip->offset_ppb, chip->phase};
-
-        link_write_rx(&board->writer, chip->rx_ticks, &measured, chip->frame, chip->frame_bytes);
-        send_line(board);
-    } else {
-        /* nothing to report */
+        report_reception(board);
     }
     if (((events & DW1000_SENT) != 0u) && (board->stage == FRAME_HANDED_OVER)) {
         board->stage = NO_FRAME;
         board->is_own_slot = true;
-        link_write_tx_done(&board->writer, board->dx_ticks, chip->tx_ticks);
-        send_line(board);
+        link_begin(&board->writer, LINK_TX_DONE);
+        link_append(&board->writer, board->dx_ticks, LINK_STAMP_BYTES);
+        link_append(&board->writer, chip->tx_ticks, LINK_STAMP_BYTES);
+        link_send(&board->writer);
     }
     if ((events & DW1000_LOST) != 0u) {
         on_lost(board);
@@ -201,12 +195,20 @@ static bool poll(struct board *board, bool line_is_high)
     return events != 0u;
 }
 
+/* Poll a chip that may have something. */
+static void poll_now(struct board *board)
+{
+    bool line_is_high = board->hardware->interrupt_line();
+
+    if (line_is_high || board->is_polled) {
+        (void)poll(board, line_is_high);
+    }
+}
+
 static bool is_poll_due(const struct board *board, bool line_is_high, uint32_t now_us)
 {
-    if (line_is_high && !board->is_polled) {
-        return true;
-    }
-    return (now_us - board->polled_us) >= (board->is_polled ? FAST_POLL_US : POLL_US);
+    return (line_is_high && !board->is_polled) ||
+           ((now_us - board->polled_us) >= (board->is_polled ? FAST_POLL_US : POLL_US));
 }
 
 /* The frame to be sent */
@@ -214,13 +216,10 @@ static bool is_poll_due(const struct board *board, bool line_is_high, uint32_t n
 static void hand_over(struct board *board)
 {
     enum dw1000_queued result;
-    bool line_is_high = board->hardware->interrupt_line();
 
-    if (line_is_high || board->is_polled) {
-        (void)poll(board, line_is_high); /* or a frame that has just come would be lost */
-        if (board->stage != FRAME_HELD) {
-            return;
-        }
+    poll_now(board); /* or a frame that has just come would be lost */
+    if (board->stage != FRAME_HELD) {
+        return;
     }
     if (!dw1000_check(&board->chip)) { /* or it would be sent with other settings, at another time */
         on_lost(board);
@@ -231,14 +230,8 @@ static void hand_over(struct board *board)
         board->stage = FRAME_HANDED_OVER;
         board->due_us = board->hardware->now_us() + LEAD_US + PHASE_US + OVERDUE_US;
     } else {
-        board->stage = NO_FRAME;
-        report_late(board, board->dx_ticks, (uint32_t)result); /* the driver's reasons have the link's numbers */
+        drop_frame(board, (uint32_t)result); /* the driver's reasons have the link's numbers */
     }
-}
-
-static int32_t lead_us(const struct board *board)
-{
-    return LEAD_US + (board->chip.reads_phases ? PHASE_US : 0);
 }
 
 /* The frame is due by the board's clock: hand it over, or cancel it when it is overdue. That clock may be off by a few
@@ -246,17 +239,17 @@ static int32_t lead_us(const struct board *board)
 static void serve_frame(struct board *board)
 {
     const struct hardware *hardware = board->hardware;
+    int32_t lead_us = LEAD_US + (board->chip.reads_phases ? PHASE_US : 0);
     int32_t left_us;
 
     if (board->stage == FRAME_HANDED_OVER) {
         board->due_us = hardware->now_us() + OVERDUE_US;
         if (dw1000_cancel(&board->chip)) {
-            board->stage = NO_FRAME;
-            report_late(board, board->dx_ticks, LINK_LATE_FOR_RADIO);
+            drop_frame(board, LINK_LATE_FOR_RADIO);
         }
         return;
     }
-    left_us = dw1000_micros_until(dw1000_now(&board->chip), board->dx_ticks) - lead_us(board);
+    left_us = dw1000_micros_until(dw1000_now(&board->chip), board->dx_ticks) - lead_us;
     if (left_us > CLOSE_US) {
         board->due_us = hardware->now_us() + (uint32_t)(left_us - (left_us / 16));
     } else {
@@ -292,28 +285,27 @@ static void accept_frame(struct board *board, const uint8_t *record, uint32_t le
     }
 }
 
+static void start_chip(struct board *board, uint32_t tx_delay_ticks, uint32_t rx_delay_ticks)
+{
+    board->writer.is_among_text = is_tag(board) && (board->settings.output != OUTPUT_RECORDS);
+    board->chip.uses_both_buffers = is_tag(board);
+    board->is_configured = dw1000_start(&board->chip, tx_delay_ticks, rx_delay_ticks);
+    board->was_refused = !board->is_configured;
+    board->is_receiving = is_tag(board) && board->is_configured;
+    board->is_polled = false;
+    board->disagreements = 0u;
+    board->checked_us = board->hardware->now_us();
+}
+
 /* Configure the chip and begin to look for a position. */
 static void start_tag(struct board *board)
 {
-    struct dw1000 *chip = &board->chip;
-
-    board->tried_us = board->hardware->now_us();
-    chip->reads_phases = false;
-    chip->uses_both_buffers = true;
-    board->is_configured = dw1000_start(chip, board->settings.tx_delay_ticks, board->settings.rx_delay_ticks);
-    board->was_refused = !board->is_configured;
-    board->is_receiving = board->is_configured;
-    board->checked_us = board->tried_us;
+    board->chip.reads_phases = false;
+    start_chip(board, board->settings.tx_delay_ticks, board->settings.rx_delay_ticks);
+    board->tried_us = board->checked_us;
     if (board->is_configured) {
-        tag_begin(&board->tag, board->hardware, &board->settings, chip, &board->writer);
+        tag_begin(&board->tag);
     }
-}
-
-static bool is_known_setting(const uint8_t *record)
-{
-    /* Channel 5, PRF 64 MHz, 6.8 Mbit/s, code 9, 128 symbols */
-    return (record[2] == 5u) && (record[3] == 64u) && (record[4] == 2u) && (record[5] == 9u) &&
-           (link_number(&record[6], 2u) == 128u);
 }
 
 static void configure(struct board *board, const uint8_t *record, uint32_t length)
@@ -322,7 +314,8 @@ static void configure(struct board *board, const uint8_t *record, uint32_t lengt
         refuse(board, LINK_CONFIG, LINK_REFUSED_MALFORMED);
         return;
     }
-    if (!is_known_setting(record)) {
+    if ((record[2] != 5u) || (record[3] != 64u) || (record[4] != 2u) || (record[5] != 9u) ||
+        (link_number(&record[6], 2u) != 128u)) { /* channel, PRF in MHz, 6.8 Mbit/s, code, symbols */
         refuse(board, LINK_CONFIG, LINK_REFUSED_SETTING);
         return;
     }
@@ -330,17 +323,9 @@ static void configure(struct board *board, const uint8_t *record, uint32_t lengt
         board->settings.mode = MODE_RADIO;
         board->is_in_flash = false;
     }
-    board->chip.uses_both_buffers = false;
-    forget_frame(board);
-    board->is_receiving = false;
+    drop_frame(board, LINK_LATE_NOT_READY);
     board->chip.reads_phases = (record[LINK_CONFIG_BYTES - 1u] & LINK_WANTS_PHASES) != 0u;
-    board->is_configured =
-        dw1000_start(&board->chip, (uint32_t)link_number(&record[8], 2u), (uint32_t)link_number(&record[10], 2u));
-    board->was_refused = !board->is_configured;
-    board->high_without_event = 0u;
-    board->low_with_event = 0u;
-    board->is_polled = false;
-    board->checked_us = board->hardware->now_us();
+    start_chip(board, (uint32_t)link_number(&record[8], 2u), (uint32_t)link_number(&record[10], 2u));
     if (board->is_configured) {
         send_status(board);
     } else {
@@ -361,25 +346,28 @@ static void receive(struct board *board)
 
 static void send_settings(struct board *board)
 {
-    link_write_tag_config(&board->writer, &board->settings, board->is_in_flash);
-    send_line(board);
+    uint8_t packed[SETTINGS_BYTES];
+
+    settings_pack(&board->settings, packed);
+    link_begin(&board->writer, LINK_TAG_CONFIG);
+    link_append(&board->writer, board->is_in_flash ? LINK_IN_FLASH : 0u, 1u);
+    link_append_bytes(&board->writer, packed, sizeof packed);
+    link_send(&board->writer);
 }
 
-/* Put the settings into flash, and see whether they are there. */
-static void keep_settings(struct board *board)
+/* What flash holds; false where it is nothing that a board can work with. */
+static bool read_settings(const struct board *board, struct settings *settings)
 {
     uint8_t kept[KEPT_BYTES] = {0u};
-    uint8_t found[KEPT_BYTES] = {0u};
 
-    settings_pack(&board->settings, kept);
-    board->hardware->write_settings(kept);
-    board->is_in_flash = board->hardware->read_settings(found) && (memcmp(kept, found, sizeof kept) == 0);
+    board->hardware->read_settings(kept);
+    return settings_unpack(kept, SETTINGS_BYTES, settings) && settings_check(settings);
 }
 
 /* Begin as a tag, or as a radio that waits for its host. */
 static void use_settings(struct board *board)
 {
-    forget_frame(board);
+    drop_frame(board, LINK_LATE_NOT_READY);
     board->is_configured = false;
     board->is_receiving = false;
     board->hardware->set_rate(is_tag(board) ? board->settings.baud : SETTINGS_DEFAULT.baud);
@@ -391,6 +379,7 @@ static void use_settings(struct board *board)
 static void change_settings(struct board *board, const uint8_t *record, uint32_t length)
 {
     struct settings settings;
+    uint8_t kept[KEPT_BYTES] = {0u};
 
     if ((length < (LINK_SETTINGS_AT + SETTINGS_BYTES)) ||
         !settings_unpack(&record[LINK_SETTINGS_AT], length - LINK_SETTINGS_AT, &settings)) {
@@ -401,24 +390,12 @@ static void change_settings(struct board *board, const uint8_t *record, uint32_t
         board->settings = settings;
         board->is_in_flash = false;
         if ((record[LINK_BODY_AT] & LINK_IN_FLASH) != 0u) {
-            keep_settings(board);
+            settings_pack(&settings, kept);
+            board->hardware->write_settings(kept);
+            board->is_in_flash = read_settings(board, &settings);
         }
         send_settings(board);
         use_settings(board);
-    }
-}
-
-/* What concerns a tag by itself. */
-static void obey_as_tag(struct board *board, const uint8_t *record, uint32_t length)
-{
-    if (record[0] == LINK_SET_TAG_CONFIG) {
-        change_settings(board, record, length);
-    } else if (record[0] == LINK_ASK_TAG_CONFIG) {
-        send_settings(board);
-    } else if (length >= (LINK_BODY_AT + 8u)) {
-        tag_set_time(&board->tag, (int64_t)link_number(&record[LINK_BODY_AT], 8u));
-    } else {
-        /* no time */
     }
 }
 
@@ -441,9 +418,15 @@ static void obey(struct board *board, const uint8_t *record, uint32_t length)
         receive(board);
         break;
     case LINK_SET_TAG_CONFIG:
+        change_settings(board, record, length);
+        break;
     case LINK_ASK_TAG_CONFIG:
+        send_settings(board);
+        break;
     case LINK_SET_TIME:
-        obey_as_tag(board, record, length);
+        if (length >= (LINK_BODY_AT + 8u)) {
+            tag_set_time(&board->tag, (int64_t)link_number(&record[LINK_BODY_AT], 8u));
+        }
         break;
     default:
         board->unknown++;
@@ -462,13 +445,13 @@ static bool serve_host(struct board *board)
     while (at < size) {
         at += link_read(reader, &data[at], size - at);
         if (reader->length > 0u) {
-            board->understood_until = reader->garbled + reader->overlong;
+            board->understood_until = reader->garbled;
             tag_on_host(&board->tag);
             obey(board, reader->record, reader->length);
         }
     }
-    if ((reader->garbled + reader->overlong - board->understood_until) >= GARBLED_IN_A_ROW) {
-        board->understood_until = reader->garbled + reader->overlong;
+    if ((reader->garbled - board->understood_until) >= GARBLED_IN_A_ROW) {
+        board->understood_until = reader->garbled;
         board->hardware->restart_line();
     }
     return size > 0u;
@@ -501,8 +484,6 @@ static bool do_chores(struct board *board, uint32_t now_us)
         } else if (measures) {
             board->measured_us = now_us;
             (void)dw1000_measure(&board->chip);
-        } else {
-            /* it is as it should be */
         }
     }
     return checks;
@@ -512,21 +493,11 @@ static bool do_chores(struct board *board, uint32_t now_us)
 
 static void show(const struct board *board, uint32_t now_us)
 {
-    uint32_t lights = 0u;
+    bool is_ready = board->is_receiving || ((now_us & BLINK_BIT) != 0u);
 
-    if (board->is_receiving || ((now_us & BLINK_BIT) != 0u)) {
-        lights |= LIGHT_READY;
-    }
-    if ((board->chip.received & 16u) != 0u) {
-        lights |= LIGHT_RECEIVED;
-    }
-    if ((board->chip.sent & 4u) != 0u) {
-        lights |= LIGHT_SENT;
-    }
-    if (board->was_refused || board->is_polled) {
-        lights |= LIGHT_FAULT;
-    }
-    board->hardware->show(lights);
+    board->hardware->show((is_ready ? LIGHT_READY : 0u) | (((board->chip.received & 16u) != 0u) ? LIGHT_RECEIVED : 0u) |
+                          (((board->chip.sent & 4u) != 0u) ? LIGHT_SENT : 0u) |
+                          ((board->was_refused || board->is_polled) ? LIGHT_FAULT : 0u));
 }
 
 static uint32_t least(uint32_t one, uint32_t other)
@@ -567,26 +538,21 @@ void board_init(struct board *board, const struct hardware *hardware, const stru
     (void)memset(board, 0, sizeof *board);
     board->hardware = hardware;
     board->identity = *identity;
+    board->writer.write_line = hardware->write_line;
     board->settings = SETTINGS_DEFAULT;
     board->tag.hardware = hardware;
+    board->tag.settings = &board->settings;
+    board->tag.chip = &board->chip;
+    board->tag.writer = &board->writer;
     dw1000_init(&board->chip, hardware);
-    board->busy_us = hardware->now_us();
-    board->polled_us = board->busy_us;
-    board->checked_us = board->busy_us;
-    board->measured_us = board->busy_us - MEASURE_US;
+    board->measured_us = hardware->now_us() - MEASURE_US;
     board->chip.millivolts = LINK_NO_VOLTAGE;
 }
 
 void board_pause(void)
 {
-    struct board *board = computing;
-
-    if (board != NULL) {
-        bool line_is_high = board->hardware->interrupt_line();
-
-        if (has_chip(board) && (line_is_high || board->is_polled)) {
-            (void)poll(board, line_is_high);
-        }
+    if ((computing != NULL) && has_chip(computing)) {
+        poll_now(computing);
     }
 }
 
@@ -601,8 +567,6 @@ static uint32_t serve_tag(struct board *board, uint32_t now_us)
         computing = NULL;
     } else if ((now_us - board->tried_us) >= RETRY_US) {
         start_tag(board);
-    } else {
-        /* the chip was tried a moment ago */
     }
     return idle_us;
 }
@@ -611,12 +575,10 @@ void board_begin(struct board *board)
 {
     const uint8_t zero = 0u;
     struct settings settings;
-    uint8_t kept[KEPT_BYTES];
 
     (void)board->hardware->write_line(&zero, 1u);
     send_hello(board);
-    if (board->hardware->read_settings(kept) && settings_unpack(kept, SETTINGS_BYTES, &settings) &&
-        settings_check(&settings)) {
+    if (read_settings(board, &settings)) {
         board->settings = settings;
         board->is_in_flash = true;
         use_settings(board);
@@ -645,8 +607,6 @@ uint32_t board_turn(struct board *board)
         is_busy = true;
     } else if (has_chip(board)) {
         is_busy = do_chores(board, now_us) || is_busy;
-    } else {
-        /* nothing to do before the host has configured the chip */
     }
     if (is_tag(board)) {
         tag_us = serve_tag(board, now_us);

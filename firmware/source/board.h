@@ -48,13 +48,12 @@ struct board {
     /* Counts since the start, as in STATUS */
     uint32_t late;
     uint32_t unknown;
-    uint32_t unsent;
-    uint32_t understood_until; /* garbled and overlong lines up to the last record */
+    uint32_t understood_until; /* garbled lines up to the last record */
 
-    /* Polls in a row that the interrupt line does not agree with */
-    uint32_t high_without_event;
-    uint32_t low_with_event;
-    bool is_polled; /* it is stuck */
+    /* The interrupt line */
+    bool line_was_high;
+    uint32_t disagreements; /* with polls, in a row */
+    bool is_polled;         /* it is stuck */
 
     /* Times of `now_us` */
     uint32_t due_us;      /* when the frame is looked at again */

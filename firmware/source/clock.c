@@ -1,8 +1,7 @@
 /* The fast crystal gives the time while the board works, through TIMER0, and the slow one while it sleeps for long,
  * through RTC1. */
-#include "clock.h"
-
 #include "nrf52832.h"
+#include "peripherals.h"
 
 #define PIECE_PERIODS 49152u /* 1.5 s: the watchdog must be fed after 2 s at the latest */
 #define LEAST_PERIODS 3u     /* the counter may miss a comparison that is closer (PS 25) */

@@ -1,6 +1,4 @@
-#include "earth.h"
-
-#include "text.h"
+#include "outputs.h"
 
 #define QUADRANT 900000000 /* 10^-7 degrees */
 #define RADIAN 1.74532925e-9f

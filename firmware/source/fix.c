@@ -3,21 +3,21 @@
 #define TICKS_PER_S 63897600000
 #define LEAST_PIVOT 1e-5f /* against its element: a smaller one is rounding */
 
-bool fix_has_levels(const struct fix *fix)
+float fix_hpl_m(const struct fix *fix)
 {
-    return fix->levels < FIX_CONTRADICTED;
+    return (fix->levels < ALERT_NOT_EXCLUDED) ? fix->hpl_m : __builtin_nanf("");
+}
+
+float fix_vpl_m(const struct fix *fix)
+{
+    return ((fix->levels < ALERT_NOT_EXCLUDED) && (fix->is_height_known == 0u)) ? fix->vpl_m : __builtin_nanf("");
 }
 
 uint32_t fix_alert(const struct fix *fix)
 {
-    bool is_exceeded = fix_has_levels(fix) && (fix->alert_limit_m > 0.0f) && (fix->hpl_m > fix->alert_limit_m);
+    bool is_exceeded = (fix->alert_limit_m > 0.0f) && (fix_hpl_m(fix) > fix->alert_limit_m);
 
     return is_exceeded ? (uint32_t)ALERT_LIMIT : fix->levels;
-}
-
-float fix_root(float value)
-{
-    return __builtin_sqrtf(value);
 }
 
 float fix_std_m(const struct fix *fix)

@@ -12,10 +12,7 @@
 #define FIX_MAX_ANCHORS 8u
 #define FIX_NO_SITE 0xFFFFu
 
-/* State of the levels, as in core/integrity.py; none from FIX_CONTRADICTED on. */
-enum fix_levels { FIX_SOUND, FIX_OBSTRUCTED, FIX_CONTRADICTED, FIX_UNAVAILABLE };
-
-/* As in core/alert.py. */
+/* As in core/alert.py. The first four are states of the levels (core/integrity.py), which there are below NOT_EXCLUDED. */
 enum fix_alert { ALERT_NONE, ALERT_EXCLUDED, ALERT_NOT_EXCLUDED, ALERT_UNAVAILABLE, ALERT_LIMIT };
 
 struct fix_anchor {
@@ -84,7 +81,9 @@ struct fix_dops {
 };
 
 uint32_t fix_alert(const struct fix *fix);
-bool fix_has_levels(const struct fix *fix);
+/* NaN where there is none. */
+float fix_hpl_m(const struct fix *fix);
+float fix_vpl_m(const struct fix *fix);
 float fix_std_m(const struct fix *fix);
 int64_t fix_time_us(const struct fix *fix);
 
@@ -96,6 +95,9 @@ bool fix_is_due(const struct fix *fix, uint32_t rate_hz, int64_t *slot);
 struct fix_dops fix_dops(const struct fix *fix);
 
 /* By the processor's instruction; NaN below 0. */
-float fix_root(float value);
+static inline float fix_root(float value)
+{
+    return __builtin_sqrtf(value);
+}
 
 #endif

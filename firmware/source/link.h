@@ -9,9 +9,6 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "fix.h"
-#include "settings.h"
-
 #define LINK_MAJOR 1u
 #define LINK_MINOR 3u
 
@@ -46,7 +43,6 @@
 #define LINK_IDENTITY_BYTES 8u
 #define LINK_STAMP_BYTES 5u
 
-#define LINK_NOT_MEASURED (-32768)
 #define LINK_NO_VOLTAGE 0xFFFFu
 
 #define LINK_CAN_TRANSMIT 0x01u
@@ -76,68 +72,34 @@
 #define LINK_COUNT_MASK 0x3FFFFFFFu
 
 #define LINK_MAX_RECORD_BYTES 250u /* with its check */
-#define LINK_MAX_LINE_BYTES 253u   /* with code and 0, and one that is never needed */
+#define LINK_MAX_LINE_BYTES 252u   /* with code and 0 */
 
-/* Writes records; each function leaves a line in `line`, `length` bytes. */
+/* Writes records: begin, append, send. */
 struct link_writer {
-    uint32_t length;
-    uint32_t fill;
+    bool (*write_line)(const uint8_t *line, uint32_t size);
+    bool is_among_text; /* each record begins with a 0, or the text before it would belong to it */
     uint8_t number;
-    uint8_t record[LINK_MAX_RECORD_BYTES];
+    uint32_t unsent; /* records that the line did not take */
+    uint32_t crc;
+    uint32_t code_at; /* of the block that is being filled */
+    uint32_t fill;
     uint8_t line[LINK_MAX_LINE_BYTES];
 };
 
-/* Measured values of a reception, as the link carries them. */
-struct link_measured {
-    int32_t rx_power_cdbm;
-    int32_t first_path_cdbm;
-    int32_t offset_ppb;
-    int32_t phase; /* negative where there is none */
-};
-
-struct link_status {
-    uint64_t now_ticks;
-    uint32_t state;
-    uint32_t received;
-    uint32_t errors;
-    uint32_t sent;
-    uint32_t late;
-    uint32_t garbled;
-    uint32_t unsent;
-    int32_t temperature_cc;
-    uint32_t millivolts;
-};
-
-struct link_hello {
-    uint8_t firmware[3];
-    uint8_t identity[LINK_IDENTITY_BYTES];
-    uint32_t capabilities;
-    uint32_t reset_cause;
-};
-
-void link_write_hello(struct link_writer *writer, const struct link_hello *hello);
-/* RX_PHASE with a phase, RX without. */
-void link_write_rx(struct link_writer *writer, uint64_t rx_ticks, const struct link_measured *measured,
-                   const uint8_t *frame, uint32_t frame_bytes);
-void link_write_tx_done(struct link_writer *writer, uint64_t dx_ticks, uint64_t tx_ticks);
-void link_write_tx_late(struct link_writer *writer, uint64_t dx_ticks, uint32_t reason);
-void link_write_status(struct link_writer *writer, const struct link_status *status);
-void link_write_refused(struct link_writer *writer, uint32_t kind, uint32_t reason);
-/* TAG_STATUS, ANCHOR_PLACE or GEOREFERENCE out of a struct of fix.h. */
-void link_write_words(struct link_writer *writer, uint32_t kind, const void *words, uint32_t size);
-void link_write_fix(struct link_writer *writer, const struct fix *fix);
-void link_write_tag_config(struct link_writer *writer, const struct settings *settings, bool is_in_flash);
+void link_begin(struct link_writer *writer, uint32_t kind);
+/* A number, little-endian; negative ones as their complement. */
+void link_append(struct link_writer *writer, uint64_t value, uint32_t size);
+void link_append_bytes(struct link_writer *writer, const void *data, uint32_t size);
+void link_send(struct link_writer *writer);
 
 /* Finds records in bytes that may hold anything. `record[0..length)` is the one that was found, without its check;
  * `length` is 0 where there is none. */
 struct link_reader {
     uint32_t length;
-    uint32_t garbled;  /* stretches between two zeros that are no record */
-    uint32_t overlong; /* those that no record can be */
-    uint32_t fill;
-    bool is_skipping;
-    uint8_t line[LINK_MAX_RECORD_BYTES + 2u];
-    uint8_t record[LINK_MAX_RECORD_BYTES + 2u];
+    uint32_t garbled; /* stretches between two zeros that are no record */
+    uint32_t left;    /* bytes until the next code of COBS */
+    uint32_t fill;    /* bytes since the last 0 */
+    uint8_t record[LINK_MAX_RECORD_BYTES + 1u];
 };
 
 /* Process `data` up to the end of the next record; how many bytes that were. */

@@ -2,15 +2,11 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-#include "bluetooth.h"
 #include "board.h"
-#include "clock.h"
-#include "flash.h"
 #include "hardware.h"
 #include "nrf52832.h"
+#include "peripherals.h"
 #include "pins.h"
-#include "serial_port.h"
-#include "startup.h"
 
 #define WATCHDOG_PERIODS (2u * 32768u) /* 2 s; no turn lasts longer than 30 ms, no sleep between turns than 0.6 s */
 #define RESET_LOW_US 100u /* the chip needs some ns (DW1000 data sheet, RSTn) */
@@ -105,37 +101,24 @@ static void start_chip_pins(bool may_sleep)
 
 /* Lights and role */
 
-static const struct {
-    uint32_t light;
-    uint32_t pin;
-} LIGHTS[4] = {
-    {LIGHT_READY, PIN_LIGHT_READY},
-    {LIGHT_RECEIVED, PIN_LIGHT_RECEIVED},
-    {LIGHT_SENT, PIN_LIGHT_SENT},
-    {LIGHT_FAULT, PIN_LIGHT_FAULT},
-};
-
-static uint32_t shown;
+static const uint8_t LIGHTS[4] = {PIN_LIGHT_READY, PIN_LIGHT_RECEIVED, PIN_LIGHT_SENT, PIN_LIGHT_FAULT};
 
 static void show(uint32_t lights)
 {
-    if (lights != shown) {
-        shown = lights;
-        for (uint32_t at = 0u; at < 4u; at++) {
-            if ((lights & LIGHTS[at].light) != 0u) {
-                GPIO_OUTCLR = 1u << LIGHTS[at].pin;
-            } else {
-                GPIO_OUTSET = 1u << LIGHTS[at].pin;
-            }
+    for (uint32_t at = 0u; at < sizeof LIGHTS; at++) {
+        if (((lights >> at) & 1u) != 0u) {
+            GPIO_OUTCLR = 1u << LIGHTS[at];
+        } else {
+            GPIO_OUTSET = 1u << LIGHTS[at];
         }
     }
 }
 
 static void start_lights(void)
 {
-    for (uint32_t at = 0u; at < 4u; at++) {
-        GPIO_OUTSET = 1u << LIGHTS[at].pin;
-        GPIO_PIN_CNF(LIGHTS[at].pin) = PIN_OUTPUT;
+    show(LIGHT_FAULT); /* until the crystal runs; if it never does the watchdog starts all again */
+    for (uint32_t at = 0u; at < sizeof LIGHTS; at++) {
+        GPIO_PIN_CNF(LIGHTS[at]) = PIN_OUTPUT;
     }
 }
 
@@ -170,15 +153,6 @@ static void prepare_sleep(void)
     }
     GPIO_OUTSET = 1u << PIN_AWAKE;
     GPIO_PIN_CNF(PIN_AWAKE) = PIN_OUTPUT;
-}
-
-/* Sleep until the time is over, the chip's interrupt line has risen, a byte has come or the transmitter is free. Events
- * that came since they were cleared have left their interrupts pending, so that the sleep ends at once. */
-static void sleep_us(uint32_t microseconds)
-{
-    GPIO_OUTCLR = 1u << PIN_AWAKE;
-    clock_sleep_us(microseconds);
-    GPIO_OUTSET = 1u << PIN_AWAKE;
 }
 
 static void clear_events(void)
@@ -232,7 +206,6 @@ int main(void)
     identity.reset_cause = (uint8_t)reset_cause();
     start_watchdog();
     start_lights();
-    show(LIGHT_FAULT); /* until the crystal runs; if it never does the watchdog starts all again */
     clock_start();
     show(0u);
     prepare_sleep();
@@ -244,6 +217,8 @@ int main(void)
     serial_port_start();
     board_init(&board, &HARDWARE, &identity);
     board_begin(&board);
+    /* A sleep ends when its time is over, the chip's interrupt line has risen, a byte has come or the transmitter is free.
+     * Events that came since they were cleared have left their interrupts pending, so that it ends at once. */
     for (;;) {
         uint32_t idle_us;
 
@@ -253,7 +228,9 @@ int main(void)
         serial_port_pump();
         idle_us = board_turn(&board);
         if (idle_us >= SHORTEST_SLEEP_US) {
-            sleep_us(idle_us);
+            GPIO_OUTCLR = 1u << PIN_AWAKE;
+            clock_sleep_us(idle_us);
+            GPIO_OUTSET = 1u << PIN_AWAKE;
         }
     }
 }

@@ -1,47 +1,34 @@
-#include "earth.h"
 #include "outputs.h"
-#include "text.h"
 
 #define LEAST_VARIANCE_M2 1e-4f /* receivers of NMEA reject what claims less than a centimetre */
 #define COURSE_SIGMAS_SQUARED 4.0f
 #define DAY_US 86400000000
-#define WHERE_BYTES 40u
 
 /* The decisions of bridges/nmea.py: quality RTK, heights as the site has them, no position that an alert forbids to use. */
 
-/* The exclusive or of all bytes after the sentence's $. */
-static void end(struct text *text, uint32_t begun_at)
+/* A sentence up to hhmmss.ss, which is empty on a board that does not know the time. */
+static void begin(struct text *text, const char *name, int64_t unix_us)
+{
+    int64_t hundredths = ((unix_us + 5000) % DAY_US) / 10000;
+    int64_t digits = (hundredths / 360000 * 1000000) + (hundredths / 6000 % 60 * 10000) + (hundredths % 6000);
+
+    text_put(text, name);
+    if (unix_us > 0) {
+        text_padded(text, "", digits, 2u, 6u);
+    }
+}
+
+/* The last part of a sentence, and the exclusive or of all bytes after its $. */
+static void end(struct text *text, const char *part)
 {
     static const char DIGITS[] = "0123456789ABCDEF";
     uint32_t sum = 0u;
 
-    for (uint32_t at = begun_at + 1u; at < text->fill; at++) {
-        sum ^= (uint8_t)text->data[at];
+    text_put(text, part);
+    for (uint32_t at = text->fill; text->data[at - 1u] != '$'; at--) {
+        sum ^= (uint8_t)text->data[at - 1u];
     }
-    const char last[] = {'*', DIGITS[(sum >> 4) & 15u], DIGITS[sum & 15u], '\r', '\n', '\0'};
-
-    text_put(text, last);
-}
-
-static void real(struct text *text, float value, uint32_t decimals)
-{
-    text_put(text, ",");
-    text_real(text, value, decimals);
-}
-
-/* A sentence up to hhmmss.ss, which is empty on a board that does not know the time; where it begins. */
-static uint32_t begin(struct text *text, const char *name, int64_t unix_us)
-{
-    int64_t hundredths = ((unix_us + 5000) % DAY_US) / 10000;
-    uint32_t begun_at = text->fill;
-
-    text_put(text, "$");
-    text_put(text, name);
-    text_put(text, ",");
-    if (unix_us > 0) {
-        text_padded(text, (hundredths / 360000 * 1000000) + (hundredths / 6000 % 60 * 10000) + (hundredths % 6000), 2u, 6u);
-    }
-    return begun_at;
+    text_put(text, (const char[]){'*', DIGITS[(sum >> 4) & 15u], DIGITS[sum & 15u], '\r', '\n', '\0'});
 }
 
 /* ddmmyy. Days to dates: E. G. Richards, Mapping Time (1998), chapter 25, with years that begin in March. */
@@ -59,7 +46,7 @@ static void date(struct text *text, int64_t unix_us)
     if (unix_us > 0) {
         year += (month >= 10) ? 1 : 0;
         month += (month >= 10) ? -9 : 3;
-        text_padded(text, (of_month * 10000) + (month * 100) + (year % 100), 0u, 6u);
+        text_padded(text, "", (of_month * 10000) + (month * 100) + (year % 100), 0u, 6u);
     }
 }
 
@@ -69,9 +56,18 @@ static void angle(struct text *text, int64_t value, const char *positive, const 
     int64_t size = (value < 0) ? -value : value;
     int64_t degrees = size / (60 * EARTH_MINUTE);
 
-    text_put(text, ",");
-    text_padded(text, (degrees * 100 * EARTH_MINUTE) + (size - (degrees * 60 * EARTH_MINUTE)), 7u, digits + 2u);
+    text_padded(text, ",", (degrees * 100 * EARTH_MINUTE) + (size - (degrees * 60 * EARTH_MINUTE)), 7u, digits + 2u);
     text_put(text, (value < 0) ? negative : positive);
+}
+
+static void place(struct text *text, const struct fix *fix)
+{
+    int64_t latitude;
+    int64_t longitude;
+
+    earth_geodetic(&fix->origin, fix->position_mm, &latitude, &longitude);
+    angle(text, latitude, ",N", ",S", 2u);
+    angle(text, longitude, ",E", ",W", 3u);
 }
 
 static float larger(float one, float other)
@@ -88,10 +84,10 @@ static void motion(struct text *text, const struct fix *fix, float s, float c)
     float variance = fix->velocity_covariance[0] + fix->velocity_covariance[3];
     float course_deg = earth_direction_deg((x * c) + (y * s), (y * c) - (x * s));
 
-    real(text, fix_root(square) * (3600.0f / 1852.0f), 3u);
+    text_real(text, ",", fix_root(square) * (3600.0f / 1852.0f), 3u);
     text_put(text, ",");
     if (square > (COURSE_SIGMAS_SQUARED * variance)) {
-        text_number(text, (text_rounded(course_deg * 100.0f) + 36000) % 36000, 2u);
+        text_number(text, "", (text_rounded(course_deg * 100.0f) + 36000) % 36000, 2u);
     }
 }
 
@@ -106,101 +102,90 @@ static void write_errors(struct text *text, const struct fix *fix, float s, floa
     float half = 0.5f * (east - north);
     float radius = fix_root((half * half) + (both * both));
     float azimuth_deg = 90.0f - (0.5f * earth_direction_deg(both, half));
-    uint32_t begun_at = begin(text, "GNGST", fix->unix_us);
 
-    real(text, fix_root(fix->mean_square_m2), 4u);
-    real(text, fix_root(middle + radius), 4u);
-    real(text, fix_root(larger(middle - radius, 0.0f)), 4u);
-    real(text, (azimuth_deg < 180.0f) ? azimuth_deg : 0.0f, 2u);
-    real(text, fix_root(north), 4u);
-    real(text, fix_root(east), 4u);
-    real(text, fix_root(larger(m2[5], LEAST_VARIANCE_M2)), 4u);
-    end(text, begun_at);
+    begin(text, "$GNGST,", fix->unix_us);
+    text_real(text, ",", fix_root(fix->mean_square_m2), 4u);
+    text_real(text, ",", fix_root(middle + radius), 4u);
+    text_real(text, ",", fix_root(larger(middle - radius, 0.0f)), 4u);
+    text_real(text, ",", (azimuth_deg < 180.0f) ? azimuth_deg : 0.0f, 2u);
+    text_real(text, ",", fix_root(north), 4u);
+    text_real(text, ",", fix_root(east), 4u);
+    text_real(text, ",", fix_root(larger(m2[5], LEAST_VARIANCE_M2)), 4u);
+    end(text, "");
 }
 
-/* The position on the Earth, as receivers of satellites say it; or that there is none. */
-static void write_global(struct text *text, const struct fix *fix, bool has_position)
+/* The position on the Earth, as receivers of satellites say it. */
+static void write_global(struct text *text, const struct fix *fix)
 {
-    struct text where = {(char[WHERE_BYTES]){0}, WHERE_BYTES - 1u, 0u, ""};
-    int64_t latitude;
-    int64_t longitude;
     float s;
     float c;
 
-    earth_geodetic(&fix->origin, fix->position_mm, &latitude, &longitude);
     earth_turn(fix->origin.heading_e7, &s, &c);
-    angle(&where, latitude, ",N", ",S", 2u);
-    angle(&where, longitude, ",E", ",W", 3u);
-
-    uint32_t begun_at = begin(text, "GNRMC", fix->unix_us);
-
-    text_put(text, has_position ? ",A" : ",V,,,,,,");
-    if (has_position) {
-        text_put(text, where.data);
-        motion(text, fix, s, c);
-    }
+    begin(text, "$GNRMC,", fix->unix_us);
+    text_put(text, ",A");
+    place(text, fix);
+    motion(text, fix, s, c);
     date(text, fix->unix_us);
-    text_put(text, has_position ? ",,,R" : ",,,N");
-    end(text, begun_at);
+    end(text, ",,,R");
+    begin(text, "$GNGGA,", fix->unix_us);
+    place(text, fix);
+    text_padded(text, ",4,", fix->anchor_count, 0u, 2u);
+    text_real(text, ",", fix_dops(fix).hdop, 2u);
+    text_number(text, ",", (int64_t)fix->origin.height_mm + fix->position_mm[2], 3u);
+    end(text, ",M,0.000,M,,");
+    write_errors(text, fix, s, c);
+}
 
-    begun_at = begin(text, "GNGGA", fix->unix_us);
-    text_put(text, has_position ? where.data : ",,,,");
-    text_put(text, has_position ? ",4," : ",0,");
-    text_padded(text, has_position ? fix->anchor_count : 0u, 0u, 2u);
-    if (has_position) {
-        real(text, fix_dops(fix).hdop, 2u);
-        text_put(text, ",");
-        text_number(text, (int64_t)fix->origin.height_mm + fix->position_mm[2], 3u);
-    }
-    text_put(text, has_position ? ",M,0.000,M,," : ",,,M,,M,,");
-    end(text, begun_at);
-    if (has_position) {
-        write_errors(text, fix, s, c);
-    }
+/* That there is none. */
+static void write_void(struct text *text, int64_t unix_us)
+{
+    begin(text, "$GNRMC,", unix_us);
+    text_put(text, ",V,,,,,,");
+    date(text, unix_us);
+    end(text, ",,,N");
+    begin(text, "$GNGGA,", unix_us);
+    end(text, ",,,,,0,00,,,M,,M,,");
 }
 
 /* The project's own sentence: time since the first fix, site, tag, position, sigma, levels, alert, V for verified. */
 static void write_local(struct text *text, const struct fix *fix)
 {
     bool has_fix = fix->reason == 0u;
-    bool has_vpl = fix_has_levels(fix) && (fix->is_height_known == 0u);
-    float none = __builtin_nanf("");
-    uint32_t begun_at = text->fill;
 
     text_put(text, "$PSKY,");
     if (has_fix) {
-        text_number(text, fix_time_us(fix) / 1000, 3u);
+        text_number(text, "", fix_time_us(fix) / 1000, 3u);
     }
     text_put(text, ",");
     if (fix->site != FIX_NO_SITE) {
-        text_number(text, fix->site, 0u);
+        text_number(text, "", fix->site, 0u);
     }
-    text_put(text, ",");
-    text_number(text, fix->tag, 0u);
+    text_number(text, ",", fix->tag, 0u);
     if (has_fix) {
         for (uint32_t axis = 0u; axis < 3u; axis++) {
-            text_put(text, ",");
-            text_number(text, fix->position_mm[axis], 3u);
+            text_number(text, ",", fix->position_mm[axis], 3u);
         }
-        real(text, fix_std_m(fix), 3u);
-        real(text, fix_has_levels(fix) ? fix->hpl_m : none, 3u);
-        real(text, has_vpl ? fix->vpl_m : none, 3u);
-        text_put(text, ",");
-        text_number(text, fix_alert(fix), 0u);
+        text_real(text, ",", fix_std_m(fix), 3u);
+        text_real(text, ",", fix_hpl_m(fix), 3u);
+        text_real(text, ",", fix_vpl_m(fix), 3u);
+        text_number(text, ",", fix_alert(fix), 0u);
     } else {
         text_put(text, ",,,,,,,");
     }
-    text_put(text, (fix->is_verified != 0u) ? ",V" : ",U");
-    end(text, begun_at);
+    end(text, (fix->is_verified != 0u) ? ",V" : ",U");
 }
 
 uint32_t nmea_write(const struct fix *fix, char *data)
 {
-    struct text text = {data, OUTPUT_MAX_BYTES, 0u, ""};
+    struct text text = {data, 0u, ""};
     uint32_t alert = fix_alert(fix);
 
     if (fix->has_origin) {
-        write_global(&text, fix, (fix->reason == 0u) && (alert != ALERT_NOT_EXCLUDED) && (alert != ALERT_LIMIT));
+        if ((fix->reason == 0u) && (alert != ALERT_NOT_EXCLUDED) && (alert != ALERT_LIMIT)) {
+            write_global(&text, fix);
+        } else {
+            write_void(&text, fix->unix_us);
+        }
     }
     write_local(&text, fix);
     return text.fill;

@@ -1,7 +1,5 @@
 #include "schedule.h"
 
-#include <string.h>
-
 #define COUNTER_MASK 0xFFFFFFFFFFu
 #define TICKS_PER_US 63898u /* 1.5 ppm too many */
 #define UNIT_STEPS 31200u   /* a quarter of a millisecond in steps of the delayed transmission */
@@ -52,11 +50,6 @@ uint64_t schedule_gap_ticks(uint32_t anchor, uint32_t sequence, uint32_t period_
     return (uint64_t)((steps / 2u) + (uint32_t)(((uint64_t)steps * drawn) >> 32)) * STEP_TICKS;
 }
 
-void schedule_forget(struct schedule *schedule)
-{
-    (void)memset(schedule, 0, sizeof *schedule);
-}
-
 /* Expect an anchor's next beacon. */
 static void advance(struct expected *one)
 {
@@ -67,28 +60,23 @@ static void advance(struct expected *one)
     one->sequence++;
 }
 
+/* The row of an anchor; of one that is new a fresh one, if need be in place of the one that was missed most. */
 static struct expected *row_of(struct schedule *schedule, uint32_t anchor)
 {
-    uint32_t row = 0u;
+    uint32_t weakest = 0u;
 
-    while ((row < schedule->count) && (schedule->anchors[row].anchor != anchor)) {
-        row++;
-    }
-    if (row == SCHEDULE_ANCHORS) { /* in place of the one that was missed most */
-        row = 0u;
-        for (uint32_t other = 1u; other < SCHEDULE_ANCHORS; other++) {
-            if (schedule->anchors[other].missed > schedule->anchors[row].missed) {
-                row = other;
-            }
+    for (uint32_t row = 0u; row < schedule->count; row++) {
+        if (schedule->anchors[row].anchor == anchor) {
+            return &schedule->anchors[row];
         }
-        schedule->anchors[row].anchor = (uint16_t)~anchor;
+        weakest = (schedule->anchors[row].missed > schedule->anchors[weakest].missed) ? row : weakest;
     }
-    if ((row == schedule->count) || (schedule->anchors[row].anchor != anchor)) {
-        schedule->count = (row == schedule->count) ? (row + 1u) : schedule->count;
-        (void)memset(&schedule->anchors[row], 0, sizeof schedule->anchors[row]);
-        schedule->anchors[row].anchor = (uint16_t)anchor;
+    if (schedule->count < SCHEDULE_ANCHORS) {
+        weakest = schedule->count;
+        schedule->count++;
     }
-    return &schedule->anchors[row];
+    schedule->anchors[weakest] = (struct expected){.anchor = (uint16_t)anchor};
+    return &schedule->anchors[weakest];
 }
 
 /* What a prediction over a sleep was wrong by shows how the board counts time asleep. */
@@ -187,14 +175,6 @@ bool schedule_next(struct schedule *schedule, uint64_t now_ticks, struct window 
     return false;
 }
 
-void schedule_begin(struct schedule *schedule)
-{
-    for (uint32_t row = 0u; row < schedule->count; row++) {
-        schedule->anchors[row].turns = 0u;
-        schedule->anchors[row].received = 0u;
-    }
-}
-
 bool schedule_is_done(const struct schedule *schedule, uint32_t beacons)
 {
     for (uint32_t row = 0u; row < schedule->count; row++) {
@@ -244,6 +224,8 @@ void schedule_wake(struct schedule *schedule, uint64_t before_ticks, uint64_t no
         struct expected *one = &schedule->anchors[row - 1u];
 
         carry_over(one, before_ticks, now_ticks, slept_us);
+        one->turns = 0u;
+        one->received = 0u;
         if (ticks_of(2 * (int64_t)guard_us(one)) > (round_ticks(one) / 512)) {
             remove_row(schedule, row - 1u);
         }

@@ -19,7 +19,7 @@ struct expected {
     uint8_t missed;      /* in a row */
     bool has_rate;
     bool has_slept;     /* the board, since the last one that was received */
-    uint32_t turns;     /* beacons that were due since `schedule_begin`, */
+    uint32_t turns;     /* beacons that were due since the last sleep, */
     uint32_t received;  /* and those of them that came */
     uint64_t due_ticks; /* RMARKER of the next one */
     uint64_t age_us;    /* from the last one that was received to that */
@@ -38,8 +38,6 @@ struct window {
     uint32_t length_us;   /* until the frame has ended for sure */
 };
 
-void schedule_forget(struct schedule *schedule);
-
 /* A beacon was received. */
 void schedule_note(struct schedule *schedule, uint32_t anchor, uint32_t sequence, uint32_t period_code, uint64_t rx_ticks);
 
@@ -50,13 +48,11 @@ bool schedule_next(struct schedule *schedule, uint64_t now_ticks, struct window 
 /* No beacon came in a window. */
 void schedule_miss(struct schedule *schedule, uint32_t row);
 
-/* Count from now on. */
-void schedule_begin(struct schedule *schedule);
-
 /* Whether so many beacons of each anchor that is expected have come, or hardly will. */
 bool schedule_is_done(const struct schedule *schedule, uint32_t beacons);
 
-/* The counter, which was at `before_ticks`, has begun again and is at `now_ticks`, `slept_us` later. */
+/* The counter, which was at `before_ticks`, has begun again and is at `now_ticks`, `slept_us` later; turns are counted
+ * from now on. */
 void schedule_wake(struct schedule *schedule, uint64_t before_ticks, uint64_t now_ticks, uint64_t slept_us);
 
 /* Time from a beacon to its anchor's next one, by the anchor's counter (`core/air/instants.py`). */

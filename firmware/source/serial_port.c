@@ -1,13 +1,21 @@
 /* The receiver fills a ring again and again (short from ENDRX to STARTRX), and TIMER1 counts its bytes through PPI. What
  * is sent waits in another ring, from which the transmitter gets one piece after the other. */
-#include "serial_port.h"
-
 #include "nrf52832.h"
+#include "peripherals.h"
 #include "pins.h"
 
 #define IN_BYTES UARTE_MAX_BYTES
 #define OUT_BYTES 1024u /* eight receptions with 100 bytes: 10 ms of the line */
 #define WAIT_TURNS 2000u /* loops of some 0.1 us: longer than the five bytes that a receiver needs to stop */
+
+static const struct {
+    uint32_t baud;
+    uint32_t code;
+} RATES[5] = {{115200u, UARTE_115200_BAUD},
+              {230400u, UARTE_230400_BAUD},
+              {460800u, UARTE_460800_BAUD},
+              {921600u, UARTE_921600_BAUD},
+              {1000000u, UARTE_1_MBAUD}};
 
 static uint32_t rate = UARTE_1_MBAUD;
 static uint8_t in_ring[IN_BYTES];
@@ -34,22 +42,10 @@ static void start_receiver(void)
 void serial_port_set_rate(uint32_t baud)
 {
     serial_port_stop();
-    switch (baud) {
-    case 115200u:
-        rate = UARTE_115200_BAUD;
-        break;
-    case 230400u:
-        rate = UARTE_230400_BAUD;
-        break;
-    case 460800u:
-        rate = UARTE_460800_BAUD;
-        break;
-    case 921600u:
-        rate = UARTE_921600_BAUD;
-        break;
-    default:
-        rate = UARTE_1_MBAUD;
-        break;
+    for (uint32_t at = 0u; at < (sizeof RATES / sizeof RATES[0]); at++) {
+        if (RATES[at].baud == baud) {
+            rate = RATES[at].code;
+        }
     }
     serial_port_start();
 }
@@ -132,10 +128,7 @@ uint32_t serial_port_read(uint8_t *into, uint32_t size)
     count = (fresh < size) ? fresh : size;
     for (uint32_t at = 0u; at < count; at++) {
         into[at] = in_ring[in_at];
-        in_at++;
-        if (in_at == IN_BYTES) {
-            in_at = 0u;
-        }
+        in_at = (in_at + 1u) % IN_BYTES;
     }
     in_count += count;
     return count;
@@ -168,17 +161,13 @@ void serial_port_pump(void)
 
 bool serial_port_write(const uint8_t *line, uint32_t size)
 {
-    uint32_t fill = (out_at + out_held) % OUT_BYTES;
+    uint32_t fill = out_at + out_held;
 
     if (size > (OUT_BYTES - out_held)) {
         return false;
     }
     for (uint32_t at = 0u; at < size; at++) {
-        out_ring[fill] = line[at];
-        fill++;
-        if (fill == OUT_BYTES) {
-            fill = 0u;
-        }
+        out_ring[(fill + at) % OUT_BYTES] = line[at];
     }
     out_held += size;
     serial_port_pump();

@@ -24,16 +24,6 @@ const struct settings SETTINGS_DEFAULT = {
     .integrity_risk = 1e-4f,
 };
 
-/* Positive floats are ordered as their bits are, which needs no unit for floats, and NaN comes last. */
-static bool is_within(float value, float least, float most)
-{
-    const float floats[3] = {least, value, most};
-    uint32_t bits[3];
-
-    (void)memcpy(bits, floats, sizeof bits);
-    return (bits[0] <= bits[1]) && (bits[1] <= bits[2]);
-}
-
 bool settings_check(const struct settings *settings)
 {
     uint32_t baud = settings->baud;
@@ -45,8 +35,8 @@ bool settings_check(const struct settings *settings)
            (settings->rx_delay_ticks <= 0xFFFFu) && (settings->has_bounds <= 1u) &&
            ((settings->has_bounds == 0u) || (settings->low_mm < settings->high_mm)) && (settings->sleep_ms <= 3600000u) &&
            (settings->superframes >= 1u) && (settings->superframes <= 100u) && (settings->predicts <= 1u) &&
-           is_within(settings->qa_m2ps3, 1e-9f, 1000.0f) && is_within(settings->integrity_risk, 1e-9f, 0.1f) &&
-           is_within(settings->alert_limit_m, 0.0f, 1000.0f);
+           (settings->qa_m2ps3 >= 1e-9f) && (settings->qa_m2ps3 <= 1000.0f) && (settings->integrity_risk >= 1e-9f) &&
+           (settings->integrity_risk <= 0.1f) && (settings->alert_limit_m >= 0.0f) && (settings->alert_limit_m <= 1000.0f);
 }
 
 void settings_pack(const struct settings *settings, uint8_t *data)

@@ -1,11 +1,10 @@
 /* From reset to main, and from any fault back to reset. */
-#include "startup.h"
-
 #include <stddef.h>
 #include <stdint.h>
 #include <string.h>
 
 #include "nrf52832.h"
+#include "peripherals.h"
 
 #define FAULT_MARK 0x0FA17ED0u
 
@@ -31,19 +30,14 @@ bool startup_take_fault(void)
     return was_fault;
 }
 
-void startup_reset(void)
-{
-    __asm volatile("dsb" ::: "memory"); /* what is to survive has been written */
-    SCB_AIRCR = AIRCR_RESET;
-    for (;;) {
-    }
-}
-
 /* There is no place for an error message: the serial line carries the link. HELLO reports the cause. */
 static void on_fault(void)
 {
     fault_mark = FAULT_MARK;
-    startup_reset();
+    __asm volatile("dsb" ::: "memory"); /* it has been written */
+    SCB_AIRCR = AIRCR_RESET;
+    for (;;) {
+    }
 }
 
 void reset_handler(void)
@@ -62,7 +56,6 @@ void reset_handler(void)
         *to = 0u;
     }
     (void)main();
-    startup_reset();
 }
 
 /* The system exceptions of the Armv7-M; interrupts are never taken. */
@@ -110,17 +103,4 @@ void *memset(void *to, int value, size_t size)
         out[at] = (uint8_t)value;
     }
     return to;
-}
-
-int memcmp(const void *one, const void *other, size_t size)
-{
-    const uint8_t *a = one;
-    const uint8_t *b = other;
-
-    for (size_t at = 0u; at < size; at++) {
-        if (a[at] != b[at]) {
-            return (a[at] < b[at]) ? -1 : 1;
-        }
-    }
-    return 0;
 }

@@ -3,7 +3,6 @@
 #include <stddef.h>
 #include <string.h>
 
-#include "text.h"
 
 #define SECOND_US 1000000u
 /* How often places of anchors and the georeference are repeated. */
@@ -28,7 +27,6 @@
 #define HOST_US 5000000u
 /* Without anything to do it looks again after this. */
 #define TURN_US 10000u
-#define UNIX_REBASE_US 0x40000000u
 #define NOT_SENT INT64_MIN
 
 /* Why there is no fix, as the places in NoFixReason (core/fix.py), from 1. */
@@ -55,24 +53,19 @@ static bool is_over(uint32_t period_us, uint32_t since_us, uint32_t at_us)
 
 /* The receiver */
 
-/* Count how long the receiver has been on all the time. */
-static void count_on(struct tag *tag)
+/* Count how long the receiver has been on all the time, and change what it does. */
+static void set_receiver(struct tag *tag, enum tag_receiver next)
 {
     uint32_t at_us = now_us(tag);
 
-    if (tag->is_on_all_the_time) {
-        tag->on_us += at_us - tag->on_since_us;
-        tag->on_since_us = at_us;
-    }
+    tag->on_us += (tag->receiver == ALWAYS_ON) ? (at_us - tag->on_since_us) : 0u;
+    tag->on_since_us = at_us;
+    tag->receiver = next;
 }
 
 static void listen_all_the_time(struct tag *tag)
 {
-    count_on(tag);
-    tag->is_on_all_the_time = true;
-    tag->has_window = false;
-    tag->on_since_us = now_us(tag);
-    dw1000_idle(tag->chip);
+    set_receiver(tag, ALWAYS_ON);
     dw1000_receive(tag->chip);
 }
 
@@ -81,7 +74,6 @@ static void listen_at_next(struct tag *tag)
 {
     while (schedule_next(&tag->schedule, dw1000_now(tag->chip), &tag->window)) {
         if (dw1000_receive_at(tag->chip, tag->window.begin_ticks, tag->window.length_us) == DW1000_QUEUED) {
-            tag->has_window = true;
             return;
         }
         schedule_miss(&tag->schedule, tag->window.row);
@@ -91,14 +83,23 @@ static void listen_at_next(struct tag *tag)
 
 static void listen_in_windows(struct tag *tag)
 {
-    count_on(tag);
-    tag->is_on_all_the_time = false;
-    dw1000_idle(tag->chip);
+    set_receiver(tag, IN_WINDOWS);
     listen_at_next(tag);
 }
 
+static void expect_next(struct tag *tag, struct tag_reception *one)
+{
+    int32_t site = tag->core.admission.choice.site;
+
+    if ((skyless_read_frame(one->frame, (int32_t)one->frame_bytes, &tag->beacon) == INTACT) &&
+        ((site == NO_SITE) || (site == tag->beacon.site))) {
+        schedule_note(&tag->schedule, (uint32_t)tag->beacon.anchor, (uint32_t)tag->beacon.sequence,
+                      (uint32_t)tag->beacon.period_code, one->rx_ticks);
+    }
+}
+
 /* Keep a reception; where too many wait, all that do are dropped, which a busy estimator gets over best. */
-static struct tag_reception *keep(struct tag *tag)
+static void keep(struct tag *tag)
 {
     const struct dw1000 *chip = tag->chip;
     struct tag_reception *one;
@@ -116,44 +117,22 @@ static struct tag_reception *keep(struct tag *tag)
     one->ended_us = now_us(tag);
     one->frame_bytes = chip->frame_bytes;
     (void)memcpy(one->frame, chip->frame, chip->frame_bytes);
-    return one;
-}
-
-static bool is_expected_site(const struct tag *tag)
-{
-    int32_t site = tag->core.admission.choice.site;
-
-    return (site == NO_SITE) || (site == tag->beacon.site);
-}
-
-static void note_beacon(struct tag *tag, struct tag_reception *one)
-{
-    if ((skyless_read_frame(one->frame, (int32_t)one->frame_bytes, &tag->beacon) == INTACT) && is_expected_site(tag)) {
-        schedule_note(&tag->schedule, (uint32_t)tag->beacon.anchor, (uint32_t)tag->beacon.sequence,
-                      (uint32_t)tag->beacon.period_code, one->rx_ticks);
-    }
+    expect_next(tag, one);
 }
 
 void tag_on_chip(struct tag *tag, uint32_t events)
 {
-    bool is_over_now = (events & (DW1000_RECEIVED | DW1000_NOTHING | DW1000_FAILED)) != 0u;
+    const uint32_t *turns = &tag->schedule.anchors[tag->window.row].turns;
+    uint32_t before = *turns;
 
-    if (is_over_now && tag->has_window) {
-        tag->on_us += tag->window.length_us;
-    }
     if ((events & DW1000_RECEIVED) != 0u) {
-        uint32_t turns = tag->has_window ? tag->schedule.anchors[tag->window.row].turns : 0u;
-
-        note_beacon(tag, keep(tag));
-        if (tag->has_window && (tag->schedule.anchors[tag->window.row].turns == turns)) {
-            schedule_miss(&tag->schedule, tag->window.row); /* another one came in its window */
-        }
-    } else if (tag->has_window && is_over_now) {
-        schedule_miss(&tag->schedule, tag->window.row);
-    } else {
-        /* nothing to keep */
+        keep(tag);
     }
-    if (is_over_now && !tag->is_on_all_the_time) {
+    if ((tag->receiver == IN_WINDOWS) && ((events & (DW1000_RECEIVED | DW1000_NOTHING | DW1000_FAILED)) != 0u)) {
+        tag->on_us += tag->window.length_us;
+        if (*turns == before) { /* nothing came in its window, or another one */
+            schedule_miss(&tag->schedule, tag->window.row);
+        }
         listen_at_next(tag);
     }
 }
@@ -165,7 +144,7 @@ static void choose_listening(struct tag *tag, uint32_t at_us)
                                     !is_over(SURE_US, tag->awake_since_us, at_us));
     bool may_predict = (tag->settings->predicts != 0u) && is_near && (tag->schedule.count >= LEAST_EXPECTED);
 
-    if (tag->is_on_all_the_time) {
+    if (tag->receiver == ALWAYS_ON) {
         if (may_predict && is_over(LEARN_US, tag->on_since_us, at_us)) {
             tag->scanned_us = at_us;
             listen_in_windows(tag);
@@ -173,8 +152,6 @@ static void choose_listening(struct tag *tag, uint32_t at_us)
     } else if (!may_predict || ((tag->settings->sleep_ms == 0u) && is_over(SCAN_EVERY_US, tag->scanned_us, at_us)) ||
                (tag->has_fix && is_over(SILENT_US, tag->fixed_us, at_us))) {
         listen_all_the_time(tag);
-    } else {
-        /* as it is */
     }
 }
 
@@ -195,16 +172,9 @@ static float dbm(int32_t power_cdbm)
     return (power_cdbm == DW1000_NOT_MEASURED) ? __builtin_nanf("") : ((float)power_cdbm / 100.0f);
 }
 
-static int64_t unix_us_at(struct tag *tag, uint32_t at_us)
+static int64_t unix_us_at(const struct tag *tag, uint32_t at_us)
 {
-    if (tag->unix_us == 0) {
-        return 0;
-    }
-    if (is_over(UNIX_REBASE_US, tag->unix_at_us, at_us)) {
-        tag->unix_us += (int64_t)(at_us - tag->unix_at_us);
-        tag->unix_at_us = at_us;
-    }
-    return tag->unix_us + (int32_t)(at_us - tag->unix_at_us);
+    return (tag->unix_us == 0) ? 0 : (tag->unix_us + (int32_t)(at_us - tag->unix_at_us));
 }
 
 void tag_set_time(struct tag *tag, int64_t unix_us)
@@ -213,15 +183,15 @@ void tag_set_time(struct tag *tag, int64_t unix_us)
     tag->unix_at_us = now_us(tag);
 }
 
-/* The lower half of rows that the estimator leaves. */
+/* The upper half of rows that the estimator leaves. */
 static void fill_covariance(float *into, real (*rows)[AXES])
 {
-    into[0] = rows[0][0];
-    into[1] = rows[0][1];
-    into[2] = rows[0][2];
-    into[3] = rows[1][1];
-    into[4] = rows[1][2];
-    into[5] = rows[2][2];
+    for (uint32_t row = 0u; row < AXES; row++) {
+        for (uint32_t axis = row; axis < AXES; axis++) {
+            *into = rows[row][axis];
+            into++;
+        }
+    }
 }
 
 static void fill_anchors(struct fix *fix, const struct tag *tag)
@@ -238,22 +208,10 @@ static void fill_anchors(struct fix *fix, const struct tag *tag)
     }
 }
 
-static void fill_origin(struct fix *fix, const struct tag *tag)
-{
-    const uint8_t *page = tag->core.pages.used[EARTH_KIND].contents;
-
-    fix->has_origin = page[0] != 0u;
-    if (fix->has_origin) {
-        fix->origin.latitude_e7 = (int32_t)link_number(&page[1], 4u);
-        fix->origin.longitude_e7 = (int32_t)link_number(&page[5], 4u);
-        fix->origin.height_mm = (int32_t)link_number(&page[9], 4u);
-        fix->origin.heading_e7 = (uint32_t)link_number(&page[13], 4u);
-    }
-}
-
 static void fill_fix(struct tag *tag, const struct tag_reception *one, bool is_alone)
 {
     struct fix *fix = &tag->fix;
+    const uint8_t *page = tag->core.pages.used[EARTH_KIND].contents;
     real (*rows)[AXES] = is_alone ? tag->core.course.alone : tag->shared.state.fix;
     uint32_t at_us = now_us(tag);
 
@@ -276,41 +234,50 @@ static void fill_fix(struct tag *tag, const struct tag_reception *one, bool is_a
     fix->vpl_m = rows[PROTECTION][VPL];
     fix->levels = (uint32_t)rows[PROTECTION][STATE];
     fill_anchors(fix, tag);
-    fill_origin(fix, tag);
+    fix->has_origin = page[0] != 0u;
+    (void)memcpy(&fix->origin, &page[1], sizeof fix->origin);
     tag->has_fix = true;
     tag->has_started = true;
     tag->fixed_us = one->ended_us;
 }
 
-static uint32_t reason_of(int32_t outcome)
-{
-    switch (outcome) {
-    case NO_PAGES:
-    case NO_POSITION:
-        return REASON_NO_ALMANAC;
-    case HAS_TOO_FEW:
-    case UNCONFIRMED_ANCHOR:
-    case WEAKER_ANCHOR:
-        return REASON_TOO_FEW_ANCHORS;
-    case BAD_GEOMETRY:
-        return REASON_BAD_GEOMETRY;
-    case IS_MIRRORED:
-        return REASON_MIRROR;
-    case IS_UNSETTLED:
-        return REASON_NOT_CONVERGED;
-    case OUTLIER:
-    case LOST:
-        return REASON_RESIDUALS;
-    default:
-        return REASON_ACQUIRING;
-    }
-}
+/* Why outcomes of the estimator are no fix; REASON_ACQUIRING of the others. */
+static const uint8_t REASONS[MALFORMED + 1] = {
+    [NO_PAGES] = REASON_NO_ALMANAC,
+    [NO_POSITION] = REASON_NO_ALMANAC,
+    [HAS_TOO_FEW] = REASON_TOO_FEW_ANCHORS,
+    [UNCONFIRMED_ANCHOR] = REASON_TOO_FEW_ANCHORS,
+    [WEAKER_ANCHOR] = REASON_TOO_FEW_ANCHORS,
+    [BAD_GEOMETRY] = REASON_BAD_GEOMETRY,
+    [IS_MIRRORED] = REASON_MIRROR,
+    [IS_UNSETTLED] = REASON_NOT_CONVERGED,
+    [OUTLIER] = REASON_RESIDUALS,
+    [LOST] = REASON_RESIDUALS,
+};
 
 /* Serial port and Bluetooth */
 
-static void send_line(struct tag *tag)
+static bool sends_records(const struct tag *tag)
 {
-    (void)tag->hardware->write_line(tag->writer->line, tag->writer->length);
+    return tag->settings->output == OUTPUT_RECORDS;
+}
+
+/* The bytes of a struct of fix.h. */
+static void send_record(struct tag *tag, uint32_t kind, const void *words, uint32_t size)
+{
+    link_begin(tag->writer, kind);
+    link_append_bytes(tag->writer, words, size);
+    link_send(tag->writer);
+}
+
+static void send_fix(struct tag *tag)
+{
+    link_begin(tag->writer, LINK_FIX);
+    link_append_bytes(tag->writer, &tag->fix, FIX_SENT_BYTES);
+    for (uint32_t at = 0u; at < tag->fix.anchor_count; at++) {
+        link_append(tag->writer, tag->fix.anchors[at].id, 2u);
+    }
+    link_send(tag->writer);
 }
 
 /* Say where the tag is, or why it does not know. */
@@ -324,11 +291,8 @@ static void say_position(struct tag *tag, uint32_t at_us)
         size = nmea_write(&tag->fix, text);
     } else if (tag->settings->output == OUTPUT_JSON) {
         size = json_write(&tag->fix, text);
-    } else if ((tag->settings->output == OUTPUT_RECORDS) && (tag->fix.reason == 0u)) {
-        link_write_fix(tag->writer, &tag->fix);
-        send_line(tag);
-    } else {
-        /* TAG_STATUS says why */
+    } else if (sends_records(tag) && (tag->fix.reason == 0u)) {
+        send_fix(tag);
     }
     if ((size > 0u) && (size < OUTPUT_MAX_BYTES)) { /* a line that was cut says nothing */
         (void)tag->hardware->write_line((const uint8_t *)text, size);
@@ -340,12 +304,10 @@ static void send_places(struct tag *tag, uint32_t at_us)
     tag->places_us = at_us;
     tag->places_changes = tag->core.course.changes;
     for (uint32_t at = 0u; at < tag->fix.anchor_count; at++) {
-        link_write_words(tag->writer, LINK_ANCHOR_PLACE, &tag->fix.anchors[at], sizeof tag->fix.anchors[at]);
-        send_line(tag);
+        send_record(tag, LINK_ANCHOR_PLACE, &tag->fix.anchors[at], sizeof tag->fix.anchors[at]);
     }
     if (tag->fix.has_origin) {
-        link_write_words(tag->writer, LINK_GEOREFERENCE, &tag->fix.origin, sizeof tag->fix.origin);
-        send_line(tag);
+        send_record(tag, LINK_GEOREFERENCE, &tag->fix.origin, sizeof tag->fix.origin);
     }
 }
 
@@ -356,11 +318,10 @@ static void send_status(struct tag *tag, uint32_t at_us)
     tag->status_us = at_us;
     status->site = tag->fix.site;
     status->reason = tag->fix.reason;
-    count_on(tag);
+    set_receiver(tag, tag->receiver);
     status->receiver_on_ms += tag->on_us / 1000u;
     tag->on_us %= 1000u;
-    link_write_words(tag->writer, LINK_TAG_STATUS, status, sizeof *status);
-    send_line(tag);
+    send_record(tag, LINK_TAG_STATUS, status, sizeof *status);
 }
 
 static void advertise(struct tag *tag, uint32_t at_us)
@@ -371,11 +332,6 @@ static void advertise(struct tag *tag, uint32_t at_us)
     if (tag->hardware->advertise(data, sizeof data)) {
         tag->advertised_us = at_us;
     }
-}
-
-static bool sends_records(const struct tag *tag)
-{
-    return tag->settings->output == OUTPUT_RECORDS;
 }
 
 /* What is due by the clock; whether anything was. */
@@ -402,22 +358,16 @@ static bool say(struct tag *tag, uint32_t at_us)
 
 /* The estimator */
 
-static int32_t relays_to_use(uint32_t waiting)
-{
-    if (waiting == 0u) {
-        return MAX_HEARD;
-    }
-    return (waiting <= RELAYS_IF_LATE) ? (int32_t)((RELAYS_IF_LATE + 1u) - waiting) : 0;
-}
-
 static void estimate(struct tag *tag)
 {
     struct tag_reception *one = &tag->waiting[tag->first];
+    uint32_t if_late;
     int32_t outcome;
 
     tag->first = (tag->first + 1u) % TAG_MAX_WAITING;
     tag->count--;
-    tag->core.most_relays = relays_to_use(tag->count);
+    if_late = (tag->count <= RELAYS_IF_LATE) ? ((RELAYS_IF_LATE + 1u) - tag->count) : 0u;
+    tag->core.most_relays = (tag->count == 0u) ? MAX_HEARD : (int32_t)if_late;
     outcome = skyless_hear_frame(
         &tag->core, &tag->shared.state, &tag->shared.search, one->frame, (int32_t)one->frame_bytes,
         (int64_t)one->rx_ticks, __builtin_nanf(""), dbm(one->rx_power_cdbm), dbm(one->first_path_cdbm), -1.0f);
@@ -433,7 +383,7 @@ static void estimate(struct tag *tag)
                 say_position(tag, now_us(tag));
             }
         } else {
-            tag->reason = reason_of(outcome);
+            tag->reason = (REASONS[outcome] == 0u) ? REASON_ACQUIRING : REASONS[outcome];
         }
     }
 }
@@ -442,7 +392,7 @@ static void estimate(struct tag *tag)
 
 static bool may_sleep(const struct tag *tag, uint32_t at_us)
 {
-    return (tag->settings->sleep_ms > 0u) && !(tag->has_host && !is_over(HOST_US, tag->host_us, at_us));
+    return (tag->settings->sleep_ms > 0u) && is_over(HOST_US, tag->host_us, at_us);
 }
 
 static bool has_heard_all(const struct tag *tag)
@@ -454,31 +404,37 @@ static bool is_done(const struct tag *tag, uint32_t at_us)
 {
     uint32_t most_us = tag->has_started ? SEARCH_US : FIRST_SEARCH_US;
 
-    return tag->is_resting || (tag->has_fix && has_heard_all(tag)) || is_over(most_us, tag->awake_since_us, at_us);
+    return (tag->receiver == RESTING) || (tag->has_fix && has_heard_all(tag)) ||
+           is_over(most_us, tag->awake_since_us, at_us);
 }
 
 /* The chip has nothing more to do, whatever the estimator makes of what was received. */
 static void rest(struct tag *tag)
 {
-    count_on(tag);
-    tag->is_on_all_the_time = false;
-    tag->has_window = false;
-    tag->is_resting = true;
+    set_receiver(tag, RESTING);
     tag->rested_ticks = dw1000_now(tag->chip);
     tag->rested_us = now_us(tag);
     dw1000_sleep(tag->chip);
+}
+
+/* Awake from now on. */
+static void begin_anew(struct tag *tag)
+{
+    tag->awake_since_us = now_us(tag);
+    tag->said_us = tag->awake_since_us;
+    tag->status_us = tag->awake_since_us;
+    tag->host_us = tag->awake_since_us - HOST_US;
 }
 
 /* Say what was found, and sleep; from then on nothing is known but the site and when its anchors send. */
 static void sleep_now(struct tag *tag, uint32_t at_us)
 {
     uint32_t sleep_ms = tag->settings->sleep_ms;
+    bool was_lost = !tag->has_fix;
     uint64_t now_ticks;
 
-    if (!tag->has_fix && !tag->is_resting && (sleep_ms < LOST_SLEEP_MS)) {
-        sleep_ms = LOST_SLEEP_MS;
-    }
-    if (!tag->is_resting) {
+    if (tag->receiver != RESTING) {
+        sleep_ms = (was_lost && (sleep_ms < LOST_SLEEP_MS)) ? LOST_SLEEP_MS : sleep_ms;
         rest(tag);
     }
     tag->fix.reason = tag->has_fix ? 0u : tag->reason;
@@ -491,44 +447,31 @@ static void sleep_now(struct tag *tag, uint32_t at_us)
     }
     tag->hardware->sleep_for(sleep_ms);
     tag->status.asleep_ms += sleep_ms;
-    tag->is_resting = false;
+    set_receiver(tag, IN_WINDOWS);
     if (!dw1000_wake(tag->chip, tag->settings->tx_delay_ticks, tag->settings->rx_delay_ticks)) {
         return; /* the board finds it lost, and starts it again */
     }
     now_ticks = dw1000_now(tag->chip);
     schedule_wake(&tag->schedule, tag->rested_ticks, now_ticks, now_us(tag) - tag->rested_us);
-    schedule_begin(&tag->schedule);
     skyless_wake(&tag->core, &tag->shared.state, &tag->shared.search, (int64_t)now_ticks,
                  (float)(now_us(tag) - tag->fixed_us) * 1e-6f);
     tag->count = 0u;
-    tag->had_fix = tag->has_fix;
     tag->has_fix = false;
-    tag->awake_since_us = now_us(tag);
-    tag->said_us = tag->awake_since_us;
-    tag->status_us = tag->awake_since_us;
-    tag->has_host = false;
-    if ((tag->settings->predicts != 0u) && tag->had_fix && (tag->schedule.count >= LEAST_EXPECTED)) {
+    begin_anew(tag);
+    if ((tag->settings->predicts != 0u) && !was_lost && (tag->schedule.count >= LEAST_EXPECTED)) {
         listen_in_windows(tag);
     } else {
         listen_all_the_time(tag);
     }
 }
 
-void tag_begin(struct tag *tag, const struct hardware *hardware, const struct settings *settings, struct dw1000 *chip,
-               struct link_writer *writer)
+void tag_begin(struct tag *tag)
 {
+    const struct settings *settings = tag->settings;
     float limit_m = (settings->alert_limit_m > 0.0f) ? settings->alert_limit_m : __builtin_nanf("");
     bool has_bounds = settings->has_bounds != 0u;
-    int64_t unix_us = tag->unix_us;
-    uint32_t unix_at_us = tag->unix_at_us;
 
-    (void)memset(tag, 0, sizeof *tag);
-    tag->unix_us = unix_us;
-    tag->unix_at_us = unix_at_us;
-    tag->hardware = hardware;
-    tag->settings = settings;
-    tag->chip = chip;
-    tag->writer = writer;
+    (void)memset((uint8_t *)tag + offsetof(struct tag, waiting), 0, sizeof *tag - offsetof(struct tag, waiting));
     tag->fix.tag = settings->tag;
     tag->fix.site = FIX_NO_SITE;
     tag->fix.risk = settings->integrity_risk;
@@ -536,11 +479,8 @@ void tag_begin(struct tag *tag, const struct hardware *hardware, const struct se
     tag->reason = REASON_NO_BEACONS;
     tag->fix.reason = tag->reason;
     tag->slot = NOT_SENT;
-    tag->awake_since_us = now_us(tag);
-    tag->said_us = tag->awake_since_us;
+    begin_anew(tag);
     tag->fixed_us = tag->awake_since_us;
-    tag->status_us = tag->awake_since_us;
-    schedule_forget(&tag->schedule);
     skyless_begin_tag(&tag->core, (settings->site == FIX_NO_SITE) ? NO_SITE : (int32_t)settings->site,
                       settings->qa_m2ps3, has_bounds ? metres(settings->low_mm) : -__builtin_inff(),
                       has_bounds ? metres(settings->high_mm) : __builtin_inff(), 0.0f, 0.0f, settings->integrity_risk,
@@ -550,7 +490,6 @@ void tag_begin(struct tag *tag, const struct hardware *hardware, const struct se
 
 void tag_on_host(struct tag *tag)
 {
-    tag->has_host = true;
     tag->host_us = now_us(tag);
 }
 
@@ -558,7 +497,9 @@ uint32_t tag_turn(struct tag *tag)
 {
     uint32_t at_us = now_us(tag);
 
-    if (tag->has_window && tag->has_started && has_heard_all(tag) && may_sleep(tag, at_us)) {
+    tag->unix_us += (tag->unix_us == 0) ? 0u : (at_us - tag->unix_at_us);
+    tag->unix_at_us = at_us;
+    if ((tag->receiver == IN_WINDOWS) && tag->has_started && has_heard_all(tag) && may_sleep(tag, at_us)) {
         rest(tag);
     }
     if (tag->count > 0u) {

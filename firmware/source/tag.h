@@ -29,11 +29,16 @@ struct tag_reception {
     uint8_t frame[DW1000_MAX_PSDU_BYTES];
 };
 
+enum tag_receiver { RESTING, ALWAYS_ON, IN_WINDOWS }; /* RESTING: the chip sleeps, or will be started */
+
 struct tag {
+    /* What stays when it begins again */
     const struct hardware *hardware;
     const struct settings *settings;
     struct dw1000 *chip;
     struct link_writer *writer;
+    int64_t unix_us; /* the host's time at unix_at_us; 0: none */
+    uint32_t unix_at_us;
 
     /* Receptions */
     struct tag_reception waiting[TAG_MAX_WAITING];
@@ -44,21 +49,17 @@ struct tag {
     /* The receiver */
     struct schedule schedule;
     struct window window;
-    bool is_on_all_the_time;
-    bool has_window;
+    enum tag_receiver receiver;
     uint32_t on_since_us; /* all the time */
     uint32_t on_us;       /* of what is not yet in the status */
     uint32_t scanned_us;
 
     /* Sleep */
-    bool is_resting;       /* the chip sleeps already, while the estimator computes */
-    uint64_t rested_ticks; /* its counter then, */
+    uint64_t rested_ticks; /* the chip's counter when it began to sleep, */
     uint32_t rested_us;    /* and the board's */
     uint32_t awake_since_us;
     uint32_t host_us; /* when the host last said something */
-    bool has_host;
-    bool has_started; /* there has been a fix, */
-    bool had_fix;     /* also before the last sleep */
+    bool has_started; /* there has been a fix */
 
     /* The estimator */
     Tag core;
@@ -79,13 +80,10 @@ struct tag {
     uint32_t places_us;     /* when anchors and georeference were sent last, */
     int64_t places_changes; /* and of which changes */
     uint32_t advertised_us;
-    int64_t unix_us;    /* the host's time at unix_at_us; 0: none */
-    uint32_t unix_at_us;
 };
 
-/* Begin with nothing known; the chip is configured and idle. The settings stay where they are. */
-void tag_begin(struct tag *tag, const struct hardware *hardware, const struct settings *settings, struct dw1000 *chip,
-               struct link_writer *writer);
+/* Begin with nothing known but the time; the chip is configured and idle. */
+void tag_begin(struct tag *tag);
 
 /* What `dw1000_poll` has returned. */
 void tag_on_chip(struct tag *tag, uint32_t events);

@@ -1,4 +1,4 @@
-#include "text.h"
+#include "outputs.h"
 
 #define MAX_DIGITS 24u
 #define HALF 4294967296.0f /* 2^32 */
@@ -6,7 +6,7 @@
 
 static void put(struct text *text, char one)
 {
-    if (text->fill < text->size) {
+    if (text->fill < OUTPUT_MAX_BYTES) {
         text->data[text->fill] = one;
         text->fill++;
     }
@@ -19,28 +19,21 @@ void text_put(struct text *text, const char *part)
     }
 }
 
-void text_padded(struct text *text, int64_t value, uint32_t decimals, uint32_t digits)
+void text_padded(struct text *text, const char *before, int64_t value, uint32_t decimals, uint32_t digits)
 {
     char found[MAX_DIGITS];
     uint32_t count = 0u;
     uint64_t rest = (value < 0) ? (0u - (uint64_t)value) : (uint64_t)value;
 
-    do {
-        uint32_t digit;
+    do { /* a division of 64 bits costs ten of 32 */
+        uint64_t tenth = (rest <= UINT32_MAX) ? ((uint32_t)rest / 10u) : (rest / 10u);
 
-        if (rest <= UINT32_MAX) { /* a division of 64 bits costs ten of 32 */
-            digit = (uint32_t)rest % 10u;
-            rest = (uint32_t)rest / 10u;
-        } else {
-            digit = (uint32_t)(rest % 10u);
-            rest /= 10u;
-        }
-        found[count] = (char)('0' + digit);
+        found[count] = (char)('0' + (uint32_t)(rest - (10u * tenth)));
+        rest = tenth;
         count++;
     } while ((rest > 0u) || (count < (decimals + digits)));
-    if (value < 0) {
-        put(text, '-');
-    }
+    text_put(text, before);
+    text_put(text, (value < 0) ? "-" : "");
     for (; count > 0u; count--) {
         if (count == decimals) {
             put(text, '.');
@@ -49,9 +42,9 @@ void text_padded(struct text *text, int64_t value, uint32_t decimals, uint32_t d
     }
 }
 
-void text_number(struct text *text, int64_t value, uint32_t decimals)
+void text_number(struct text *text, const char *before, int64_t value, uint32_t decimals)
 {
-    text_padded(text, value, decimals, 1u);
+    text_padded(text, before, value, decimals, 1u);
 }
 
 int64_t text_rounded(float value)
@@ -65,14 +58,15 @@ int64_t text_rounded(float value)
     return (value < 0.0f) ? -whole : whole;
 }
 
-void text_real(struct text *text, float value, uint32_t decimals)
+void text_real(struct text *text, const char *before, float value, uint32_t decimals)
 {
     for (uint32_t at = 0u; at < decimals; at++) {
         value *= 10.0f;
     }
     if ((value > -LARGEST) && (value < LARGEST)) {
-        text_number(text, text_rounded(value), decimals);
+        text_number(text, before, text_rounded(value), decimals);
     } else {
+        text_put(text, before);
         text_put(text, text->none);
     }
 }

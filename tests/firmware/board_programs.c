@@ -63,25 +63,31 @@ uint32_t board_turn(struct board *board)
     return 500000u;
 }
 #elif PROGRAM == SETTINGS
-/* Send whether there are settings, and they; a byte that comes is written as all of them. */
-static uint8_t kept[KEPT_BYTES];
-
+/* Send whether there are settings, and their tag; a byte that comes is the tag of those that are written. */
 void board_begin(struct board *board)
 {
-    uint8_t has = hardware->read_settings(kept) ? 1u : 0u;
+    struct settings settings = {0};
+    uint8_t kept[KEPT_BYTES];
 
     (void)board;
-    (void)hardware->write_line(&has, 1u);
-    (void)hardware->write_line(kept, sizeof kept);
+    hardware->read_settings(kept);
+    kept[0] = settings_unpack(kept, SETTINGS_BYTES, &settings) ? 1u : 0u;
+    kept[1] = (uint8_t)settings.tag;
+    (void)hardware->write_line(kept, 2u);
 }
 
 uint32_t board_turn(struct board *board)
 {
+    struct settings settings = SETTINGS_DEFAULT;
+    uint8_t kept[KEPT_BYTES] = {0};
+    uint8_t tag;
+
     (void)board;
-    if (hardware->read_line(kept, 1u) > 0u) {
-        (void)memset(kept, kept[0], sizeof kept);
+    if (hardware->read_line(&tag, 1u) > 0u) {
+        settings.tag = tag;
+        settings_pack(&settings, kept);
         hardware->write_settings(kept);
-        (void)hardware->write_line(kept, 1u);
+        (void)hardware->write_line(&tag, 1u);
     }
     return 500000u;
 }

@@ -82,7 +82,7 @@ def test_settings_survive_restarts_and_a_cut_at_any_write(folder):
     assert stage.sent[0] == 0
     write(stage, 0x11)
     assert stage.sent[-1] == 0x11
-    assert restarted(stage) == b"\1" + b"\x11" * 80
+    assert restarted(stage) == b"\1\x11"
     seen = set()
     for cut_us in [1000.0, 60_000.0, *(85_000.0 + 20.0 + 56.0 * number for number in range(19))]:
         stage = LoneBoard(elf)
@@ -93,10 +93,10 @@ def test_settings_survive_restarts_and_a_cut_at_any_write(folder):
             garbage = random.Random(cut_us)
             stage.image.settings.registers |= {at: garbage.getrandbits(32) for at in range(0, 4096, 4)}
         found = restarted(stage)
-        assert found[0] == 0 or found == b"\1" + b"\x22" * 80
+        assert found[0] == 0 or found == b"\1\x22"
         seen.add(found[0])
         write(stage, 0x33)
-        assert restarted(stage) == b"\1" + b"\x33" * 80
+        assert restarted(stage) == b"\1\x33"
     assert seen == {0, 1}
     assert is_sound(stage)
 
@@ -205,14 +205,14 @@ def test_a_window_on_the_emulated_board(folder, comes):
     stage = LoneBoard(build_board(folder, "WINDOW"))
     stage.run(1.3)
     while len(stage.sent) < 16:
-        stage.run(0.2e-3)
+        stage.run(0.01e-3)
     start_us, sleep_us, wake_us, ask_us = words(stage.sent[:16])
     assert wake_us < 6800 < start_us < 8500
     assert sleep_us < 150
     assert ask_us < 150
     assert stage.chip.asleep_s == pytest.approx(1.0, abs=5e-3)
     if comes:
-        stage.run(3.1e-3 - ask_us * 1e-6)
+        stage.run(3.2e-3 - ask_us * 1e-6)
         stamp = wrap(stage.timeline.now_ticks - from_seconds(after_rmarker_s(len(FRAME))))
         stage.chip.receive(FRAME, stamp, Diagnostics())
         stage.image.notify()

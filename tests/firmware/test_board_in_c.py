@@ -17,7 +17,7 @@ from board_stage import (
     line_of,
     needs_compiler,
 )
-from emulator.board_library import library
+from emulator.board_library import places
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -39,7 +39,7 @@ def kinds(reports):
 
 
 def test_python_knows_all_fields_of_the_chip_in_c():
-    assert library().host_chip_bytes() == ctypes.sizeof(dw1000.DW1000)
+    assert places()["chip_bytes"] == ctypes.sizeof(dw1000.DW1000)
 
 
 # What it answers

@@ -174,7 +174,6 @@ def test_over_sleeps_windows_hold_the_beacons_and_become_short(schedule_c, seed,
         schedule_c.schedule_wake(
             ctypes.byref(schedule), ctypes.c_uint64(before), ctypes.c_uint64(12_345), ctypes.c_uint64(int(counted_us))
         )
-        schedule_c.schedule_begin(ctypes.byref(schedule))
         assert schedule.count == 5
         received, sent, lengths_us = walk(schedule_c, schedule, anchors, now, now + US * 120e3, offset)
         if max(lengths_us) < 1000:  # longer windows cover others' beacons

@@ -157,8 +157,9 @@ def test_the_driver_s_names_are_the_published_bits():
     assert published.CONTROL["TRXOFF"] == here["TRXOFF"]
     assert published.CONTROL["RXENAB"] == here["RXENAB"]
     assert here["DEVICE_ID"] == published.DEVICE_ID
-    for name, address in published.OTP.items():
-        assert here[f"OTP_{name}"] == address
+    read = {name.removeprefix("OTP_"): address for name, address in here.items() if name.startswith("OTP_")}
+    assert len(read) == 4
+    assert read.items() <= published.OTP.items()
     assert here["POWER_A"] / 1e4 == published.POWER_A_DB
     assert not here["CLEARED"] & (published.STATUS["IRQS"] | published.STATUS["CPLOCK"] | published.STATUS["HPDWARN"])
 

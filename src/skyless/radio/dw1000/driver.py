@@ -200,7 +200,6 @@ class DW1000(ctypes.Structure):
     received: int
     errors: int
     sent: int
-    late: int
     rx_ticks: int
     rx_power_cdbm: int
     first_path_cdbm: int
@@ -215,7 +214,7 @@ class DW1000(ctypes.Structure):
         ("_is_listening", ctypes.c_bool),
         ("reads_phases", ctypes.c_bool),
         ("uses_both_buffers", ctypes.c_bool),
-        *((name, ctypes.c_uint32) for name in ("received", "errors", "sent", "late")),
+        *((name, ctypes.c_uint32) for name in ("received", "errors", "sent")),
         ("rx_ticks", ctypes.c_uint64),
         ("_frame", ctypes.c_void_p),
         ("_frame_bytes", ctypes.c_uint32),

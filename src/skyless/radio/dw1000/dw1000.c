@@ -140,43 +140,34 @@ uint32_t dw1000_angle(int32_t x, int32_t y)
 
 int32_t dw1000_micros_until(uint64_t now_ticks, uint64_t then_ticks)
 {
-    int32_t distance = (int32_t)(uint32_t)(((then_ticks >> 16) - (now_ticks >> 16)) & 0xFFFFFFu);
-
-    return (distance >= 0x800000) ? (distance - 0x1000000) : distance;
+    return (int32_t)(((uint32_t)(then_ticks >> 16) - (uint32_t)(now_ticks >> 16)) << 8) >> 8;
 }
 
 /* Transactions */
+
+/* Little-endian. */
+static uint64_t number(const uint8_t *data, uint32_t octets)
+{
+    uint64_t value = 0u;
+
+    for (uint32_t at = octets; at > 0u; at--) {
+        value = (value << 8) | data[at - 1u];
+    }
+    return value;
+}
 
 static uint32_t sixteen(const uint8_t *data)
 {
     return (uint32_t)data[0] | ((uint32_t)data[1] << 8);
 }
 
-static uint64_t forty(const uint8_t *data)
-{
-    uint64_t ticks = 0u;
-
-    for (uint32_t at = 5u; at > 0u; at--) {
-        ticks = (ticks << 8) | data[at - 1u];
-    }
-    return ticks;
-}
-
 /* Write the header of a transaction (UM 2.2.1.2); how many octets it has. */
 static uint32_t put_header(uint8_t *out, uint32_t first, uint32_t sub)
 {
-    if (sub == 0u) {
-        out[0] = (uint8_t)first;
-        return 1u;
-    }
-    out[0] = (uint8_t)(first | 0x40u);
-    if (sub < 0x80u) {
-        out[1] = (uint8_t)sub;
-        return 2u;
-    }
-    out[1] = (uint8_t)(0x80u | (sub & 0x7Fu));
+    out[0] = (uint8_t)(first | ((sub > 0u) ? 0x40u : 0u));
+    out[1] = (uint8_t)((sub & 0x7Fu) | ((sub >= 0x80u) ? 0x80u : 0u));
     out[2] = (uint8_t)(sub >> 7);
-    return 3u;
+    return (sub == 0u) ? 1u : ((sub < 0x80u) ? 2u : 3u);
 }
 
 /* Read a register into a buffer, behind the header; where the data begin. */
@@ -192,6 +183,12 @@ static const uint8_t *read_into(struct dw1000 *chip, uint8_t *into, uint32_t fil
 static const uint8_t *read_register(struct dw1000 *chip, uint32_t file, uint32_t sub, uint32_t octets)
 {
     return read_into(chip, chip->into, file, sub, octets);
+}
+
+/* Not inlined, which would cost the board half a kilobyte. */
+__attribute__((noinline)) static uint64_t read_number(struct dw1000 *chip, uint32_t file, uint32_t octets)
+{
+    return number(read_register(chip, file, 0u, octets), octets);
 }
 
 static void write_bytes(struct dw1000 *chip, uint32_t file, uint32_t sub, const uint8_t *data, uint32_t octets)
@@ -212,7 +209,7 @@ static void write_register(struct dw1000 *chip, uint32_t file, uint32_t sub, uin
 
 static void read_status(struct dw1000 *chip)
 {
-    chip->status = forty(read_register(chip, 0x0Fu, 0u, STATUS_OCTETS));
+    chip->status = read_number(chip, 0x0Fu, STATUS_OCTETS);
 }
 
 static void clear_status(struct dw1000 *chip, uint64_t events)
@@ -237,9 +234,7 @@ static void off_and_clear(struct dw1000 *chip)
 
 static bool is_there(struct dw1000 *chip)
 {
-    const uint8_t *found = read_register(chip, 0x00u, 0u, 4u);
-
-    return (sixteen(found) | (sixteen(&found[2]) << 16)) == DEVICE_ID;
+    return read_number(chip, 0x00u, 4u) == DEVICE_ID;
 }
 
 /* Crystal clock; nothing to be restored by the always-on block; SOFTRESET (UM 7.2.50.1, 7.2.45). */
@@ -277,8 +272,6 @@ static void calibrate(struct dw1000 *chip)
     }
     chip->voltage_33 = read_otp(chip, OTP_VOLTAGE);
     chip->temperature_23 = read_otp(chip, OTP_TEMPERATURE);
-    (void)read_otp(chip, OTP_PART_ID);
-    (void)read_otp(chip, OTP_LOT_ID);
     trim = read_otp(chip, OTP_CRYSTAL_TRIM) & 0x1Fu;
     if (trim == 0u) {
         trim = 0x10u; /* not trimmed: mid-range */
@@ -481,18 +474,6 @@ bool dw1000_cancel(struct dw1000 *chip)
     return true;
 }
 
-/* Check whether the frame will be sent at its time, and cancel it if not (UM pp. 27, 91, 92). HPDWARN: its time has
- * passed. TXPUTE: the transmitter had no time to power up. What is out when TRXOFF comes counts as sent. */
-static enum dw1000_queued was_in_time(struct dw1000 *chip)
-{
-    read_status(chip);
-    if (((chip->status & TXFRS) != 0u) || ((chip->status & (HPDWARN | TXPUTE)) == 0u) || !dw1000_cancel(chip)) {
-        return DW1000_QUEUED;
-    }
-    chip->late++;
-    return DW1000_LATE;
-}
-
 enum dw1000_queued dw1000_transmit_at(struct dw1000 *chip, uint64_t dx_ticks, const uint8_t *frame, uint32_t frame_bytes)
 {
     if (chip->state == DW1000_OFF) {
@@ -508,12 +489,19 @@ enum dw1000_queued dw1000_transmit_at(struct dw1000 *chip, uint64_t dx_ticks, co
     off_and_clear(chip);
     write_register(chip, 0x0Du, 0u, 1u, TXSTRT_TXDLYS);
     chip->state = DW1000_SENDING;
-    return was_in_time(chip);
+
+    /* Whether it will be sent at its time, or is cancelled (UM pp. 27, 91, 92). HPDWARN: its time has passed. TXPUTE: the
+     * transmitter had no time to power up. What is out when TRXOFF comes counts as sent. */
+    read_status(chip);
+    if (((chip->status & TXFRS) == 0u) && ((chip->status & (HPDWARN | TXPUTE)) != 0u) && dw1000_cancel(chip)) {
+        return DW1000_LATE;
+    }
+    return DW1000_QUEUED;
 }
 
 static uint32_t finish_sending(struct dw1000 *chip)
 {
-    chip->tx_ticks = forty(read_register(chip, 0x17u, 0u, 5u));
+    chip->tx_ticks = read_number(chip, 0x17u, 5u);
     chip->sent++;
     clear_seen(chip);
     listen_again(chip);
@@ -526,13 +514,6 @@ static uint32_t recover(struct dw1000 *chip)
     chip->errors++;
     resume(chip);
     return DW1000_FAILED;
-}
-
-static int32_t signed_sixteen(const uint8_t *data)
-{
-    int32_t value = (int32_t)sixteen(data);
-
-    return (value >= 0x8000) ? (value - 0x10000) : value;
 }
 
 /* The carrier's phase at the first path (UM 7.2.22, 7.2.23, 7.2.38): the angle of the accumulator's sample behind FP_INDEX,
@@ -550,8 +531,8 @@ static int32_t read_phase(struct dw1000 *chip, uint32_t first_path, uint32_t noi
     write_register(chip, 0x36u, 0u, 2u, PMSC_FOR_ACC);
 
     const uint8_t *sample = read_register(chip, 0x25u, 4u * at, 5u); /* the first octet means nothing */
-    int32_t x = signed_sixteen(&sample[1]);
-    int32_t y = signed_sixteen(&sample[3]);
+    int32_t x = (int16_t)sixteen(&sample[1]);
+    int32_t y = (int16_t)sixteen(&sample[3]);
 
     write_register(chip, 0x36u, 0u, 2u, PMSC_RUNNING);
     if (((uint64_t)(x * (int64_t)x) + (uint64_t)(y * (int64_t)y)) <= (9u * (uint64_t)noise * noise)) {
@@ -579,12 +560,8 @@ static void read_measured(struct dw1000 *chip, uint32_t symbols, uint32_t first_
 static uint32_t read_carrier(struct dw1000 *chip)
 {
     const uint8_t *data = read_register(chip, 0x27u, 0x28u, 6u);
-    int32_t integrator = (int32_t)(sixteen(data) | (((uint32_t)data[2] & 0x1Fu) << 16));
 
-    if (integrator >= 0x100000) {
-        integrator -= 0x200000;
-    }
-    chip->offset_ppb = dw1000_carrier_offset_ppb(integrator);
+    chip->offset_ppb = dw1000_carrier_offset_ppb((int32_t)((uint32_t)number(data, 3u) << 11) >> 11);
     return sixteen(&data[4]);
 }
 
@@ -626,7 +603,7 @@ static uint32_t read_frame(struct dw1000 *chip)
 
     const uint8_t *time = read_register(chip, 0x15u, 0u, 9u);
 
-    chip->rx_ticks = forty(time);
+    chip->rx_ticks = number(time, 5u);
     chip->frame_bytes = size;
     read_measured(chip, symbols, sixteen(&time[5]), sixteen(&time[7]));
     chip->received++;
@@ -638,8 +615,6 @@ static uint32_t read_frame(struct dw1000 *chip)
         chip->state = DW1000_IDLE;
     } else if (!is_early) {
         write_register(chip, 0x0Du, 0u, 2u, RXENAB);
-    } else {
-        /* it is on */
     }
     return DW1000_RECEIVED;
 }
@@ -663,57 +638,28 @@ uint32_t dw1000_poll(struct dw1000 *chip)
         clear_status(chip, CLKPLL_LL); /* alone: a frame may be coming in */
     }
     if (chip->state == DW1000_SENDING) {
-        if ((seen & TXFRS) != 0u) {
-            events |= finish_sending(chip);
-        }
+        events |= ((seen & TXFRS) != 0u) ? finish_sending(chip) : 0u;
+    } else if ((chip->state == DW1000_AWAITING) && ((seen & RXRFTO) != 0u)) {
+        dw1000_idle(chip);
+        events |= DW1000_NOTHING;
     } else if (chip->state != DW1000_IDLE) {
-        if ((chip->state == DW1000_AWAITING) && ((seen & RXRFTO) != 0u)) {
-            dw1000_idle(chip);
-            events |= DW1000_NOTHING;
-        } else if ((seen & RX_ERRORS) != 0u) {
-            events |= recover(chip);
-        } else if ((seen & RXFCG) != 0u) {
-            events |= read_frame(chip);
-        } else {
-            /* nothing has happened */
-        }
-    } else {
-        /* IDLE: nothing can happen */
+        events |= ((seen & RX_ERRORS) != 0u) ? recover(chip) : (((seen & RXFCG) != 0u) ? read_frame(chip) : 0u);
     }
     return events;
 }
 
 bool dw1000_check(struct dw1000 *chip)
 {
-    if (chip->state != DW1000_OFF) {
-        const uint8_t *found = read_register(chip, 0x1Fu, 0u, 4u);
-
-        if ((sixteen(found) | (sixteen(&found[2]) << 16)) != CHAN_CTRL) {
-            chip->state = DW1000_OFF;
-            chip->is_listening = false;
-        }
+    if ((chip->state != DW1000_OFF) && (read_number(chip, 0x1Fu, 4u) != CHAN_CTRL)) {
+        chip->state = DW1000_OFF;
+        chip->is_listening = false;
     }
     return chip->state != DW1000_OFF;
 }
 
 uint64_t dw1000_now(struct dw1000 *chip)
 {
-    return forty(read_register(chip, 0x06u, 0u, 5u));
-}
-
-/* From the converter's readings; with typical values where the chip brought none of its own. */
-static void convert(struct dw1000 *chip, int32_t voltage, int32_t temperature)
-{
-    if (chip->temperature_23 != 0u) {
-        chip->temperature_cc = ((temperature - (int32_t)chip->temperature_23) * 114) + 2300;
-    } else {
-        chip->temperature_cc = (temperature * 113) - 11300;
-    }
-    if (chip->voltage_33 != 0u) {
-        chip->millivolts = (uint32_t)(floor_divide((voltage - (int32_t)chip->voltage_33) * 1000, 173) + 3300);
-    } else {
-        chip->millivolts = (uint32_t)(((voltage * 57) / 10) + 2300);
-    }
+    return read_number(chip, 0x06u, 5u);
 }
 
 bool dw1000_measure(struct dw1000 *chip)
@@ -732,7 +678,12 @@ bool dw1000_measure(struct dw1000 *chip)
     int32_t voltage = read_register(chip, 0x2Au, 0x03u, 1u)[0];
     int32_t temperature = read_register(chip, 0x2Au, 0x04u, 1u)[0];
 
-    convert(chip, voltage, temperature);
+    /* with typical values where the chip brought none of its own */
+    chip->temperature_cc = (chip->temperature_23 != 0u) ? (((temperature - (int32_t)chip->temperature_23) * 114) + 2300)
+                                                        : ((temperature * 113) - 11300);
+    chip->millivolts = (uint32_t)((chip->voltage_33 != 0u)
+                                      ? (floor_divide((voltage - (int32_t)chip->voltage_33) * 1000, 173) + 3300)
+                                      : (((voltage * 57) / 10) + 2300));
     write_register(chip, 0x2Au, 0x00u, 1u, 0x00u);
     if (chip->is_listening) {
         resume(chip);

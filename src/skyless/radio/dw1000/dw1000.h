@@ -50,7 +50,6 @@ struct dw1000 {
     uint32_t received;
     uint32_t errors;
     uint32_t sent;
-    uint32_t late;
 
     /* Of the last frame that was received, until the next `dw1000_poll` */
     uint64_t rx_ticks;

@@ -55,8 +55,6 @@
 
 /* Addresses in the one-time programmable memory (UM 6.3, Table 10) */
 #define OTP_LDOTUNE 0x04u
-#define OTP_PART_ID 0x06u
-#define OTP_LOT_ID 0x07u
 #define OTP_VOLTAGE 0x08u
 #define OTP_TEMPERATURE 0x09u
 #define OTP_CRYSTAL_TRIM 0x1Eu

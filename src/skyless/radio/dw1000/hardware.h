@@ -5,7 +5,7 @@
 #include <stdbool.h>
 #include <stdint.h>
 
-/* Lights, as a sum in `show`. */
+/* Lights, as a sum in `show`: bits in the order of main.c. */
 #define LIGHT_READY 0x01u   /* on: receiving; blinking: waits for its host */
 #define LIGHT_RECEIVED 0x02u /* changes every 16 receptions */
 #define LIGHT_SENT 0x04u    /* changes every 4 frames sent */
@@ -39,8 +39,8 @@ struct hardware {
     /* Sleep with everything off but RAM; `now_us` goes on. Lines to be sent are sent before, what comes is lost, and a
      * chip that is to sleep does so already. */
     void (*sleep_for)(uint32_t milliseconds);
-    /* The KEPT_BYTES that were written last; false where there are none. */
-    bool (*read_settings)(uint8_t *into);
+    /* The KEPT_BYTES that were written last, or anything. */
+    void (*read_settings)(uint8_t *into);
     /* Keep settings when the supply fails; nothing else happens for 90 ms. */
     void (*write_settings)(const uint8_t *from);
     /* Begin to send a Bluetooth advertisement of up to 31 bytes; false while the last is on its way. */
