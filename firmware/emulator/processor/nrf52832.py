@@ -164,7 +164,7 @@ class Image:
             "timer": any(timer.draws_current for timer in self._timers),
             "uarte": self._uarte.registers[0x500] != 0,
             "spim": self._spim.registers[0x500] != 0,
-            "gpiote": any(self._gpiote.registers.values()),
+            "gpiote": any(self._gpiote.registers[at] for at in self._gpiote.CONFIG),
             "radio": self.radio.is_busy,
         }
         return frozenset(name for name, draw in draws.items() if draw)
@@ -233,8 +233,8 @@ class Image:
                 self._nvic,
                 self._uarte,
                 self._spim,
-                p.Ficr(self, self._identity),
-                p.Revision(self),
+                p.factory_information(self, self._identity),
+                p.revision(self),
             )
         }
         self._selected, self._selected_cycles = False, 0
@@ -277,7 +277,7 @@ class Image:
         """The present in cycles of the processor's clock since the first start."""
         return self.core.state.item(CYCLES) if self._executing else self._cycle_at(self._timeline.now_ticks)
 
-    def plan(self, cycles: int, happen: Callable[[], None]) -> None:
+    def plan(self, cycles: int, happen: Callable[[], object]) -> None:
         """Let something happen, unless the processor is reset before."""
         life = self._life
 
