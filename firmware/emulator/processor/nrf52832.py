@@ -15,8 +15,8 @@ from typing import Any, Final
 from msgspec import Struct
 
 from emulator.processor import peripherals as p
-from emulator.processor.cortex_m4 import Core, EmulationError, functions_of, load_elf
-from emulator.processor.cycles import CPU_HZ, CYCLES, spent_at
+from emulator.processor.cortex_m4 import Core, EmulationError
+from emulator.processor.cycles import CPU_HZ, CYCLES
 from emulator.processor.paths import PathCost, Paths
 from emulator.processor.processors import MIN_TICKS, TICKS_PER_CYCLE, Processors
 from emulator.processor.radio import OnAir, Radio
@@ -83,8 +83,7 @@ class Image:
         Without ``can_transmit`` the role's pin is connected to ground.
 
         Raises:
-            EmulationError: the file is no image for this processor, here or where the firmware uses what is not
-                modelled.
+            EmulationError: the firmware uses what is not modelled, which shows later.
             ValueError: ``identity`` has not 8 bytes.
         """
         if len(identity) != 8:
@@ -94,7 +93,7 @@ class Image:
         self.resets: Counter[str] = Counter()
         """Resets after the first start, by their cause."""
         self._timeline, self._chip, self._send = timeline, chip, send
-        self._can_transmit, self._identity, self._elf = can_transmit, identity, elf
+        self._can_transmit, self._identity = can_transmit, identity
         self._ticks_per_cycle = TICKS_PER_CYCLE * (1 + 1e-6 * clock_ppm)
         self._processors = Processors.of(timeline)
         self._epoch_ticks = timeline.now_ticks
@@ -107,7 +106,7 @@ class Image:
         self._life = 0
         self.advertised: list[OnAir] = []
         """What has left the Bluetooth antenna."""
-        self.core = Core(load_elf(elf), _WINDOWS, self._read, self._write)
+        self.core = Core(elf, _WINDOWS, self._read, self._write)
         self.settings = p.FlashPage(self, self.core.spend)
         self._start(cause=0, watchdog=None)
 
@@ -179,15 +178,9 @@ class Image:
         """Cycles of the firmware's turns by what was done in them (``paths.py``)."""
         return self._paths.costs()
 
-    def cycles_by_function(self) -> dict[str, int]:
-        """Cycles spent in each function, waits for peripherals apart; the costliest first."""
-        spent = spent_at(self.core.state)
-        rows = [(name, int(spent[at >> 1 : (at + size) >> 1].sum())) for at, size, name in functions_of(self._elf)]
-        return {name: cycles for name, cycles in sorted(rows, key=lambda row: -row[1]) if cycles}
-
     def forget_paths(self) -> None:
         """Measure paths, functions and latencies from now on."""
-        spent_at(self.core.state)[:] = 0
+        self.core.forget_spent()
         self._paths = Paths()
         self._paths.begin(self.cycles)
         self._latency = (0, 0, 0)
