@@ -12,12 +12,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from msgspec import Struct
-
 from emulator.processor import peripherals as p
 from emulator.processor.cortex_m4 import Core, EmulationError
 from emulator.processor.cycles import CPU_HZ, CYCLES
-from emulator.processor.paths import PathCost, Paths
+from emulator.processor.paths import Paths
 from emulator.processor.processors import MIN_TICKS, TICKS_PER_CYCLE, Processors
 from emulator.processor.radio import OnAir, Radio
 from emulator.processor.serial_peripherals import Spim, Uarte
@@ -56,14 +54,6 @@ _READS_STATUS: Final = bytes((SYS_STATUS.file,))
 _COMMANDS: Final = bytes((0x80 | SYS_CTRL.file,))
 
 
-class Latency(Struct, frozen=True):
-    """From a rise of the chip's interrupt line until the firmware begins to read SYS_STATUS, in s of true time."""
-
-    count: int
-    mean_s: float
-    most_s: float
-
-
 class Image:
     """A board of the emulated site (``Board`` of ``site.py``): this one executes the ELF file's machine code."""
 
@@ -97,11 +87,12 @@ class Image:
         self._ticks_per_cycle = TICKS_PER_CYCLE * (1 + 1e-6 * clock_ppm)
         self._processors = Processors.of(timeline)
         self._epoch_ticks = timeline.now_ticks
-        self._paths = Paths()
+        self.paths = Paths()
         self._irq_was_high = False
         self._rise_ticks: int | None = None
-        self._latency = (0, 0, 0)
-        self._executing = self._asleep = self._holds_chip = False
+        self.worst_latency_s = 0.0
+        """From a rise of the chip's interrupt line until the firmware began to read SYS_STATUS, in s of true time."""
+        self._executing = self.is_asleep = self._holds_chip = False
         self._asleep_since = self._slept_cycles = 0
         self._life = 0
         self.advertised: list[OnAir] = []
@@ -118,7 +109,7 @@ class Image:
 
     def receive(self, data: bytes) -> None:
         """Bytes have arrived on the UART's line."""
-        self._paths.note_bytes(data)
+        self.paths.note_bytes(data)
         self._uarte.receive(data)
 
     def power_cycle(self) -> None:
@@ -137,23 +128,9 @@ class Image:
         return self._clock.registers[0xEE4] == p.KEEP_RAM
 
     @property
-    def faults(self) -> list[str]:
-        """Faults that the firmware has run into."""
-        return self.core.faults
-
-    @property
     def leds(self) -> frozenset[str]:
         """Lights that are on (``LED_PINS``); they are so when their pin is low."""
-        return frozenset(name for name, pin in LED_PINS.items() if self._gpio.is_driven(pin, high=False))
-
-    def is_driven(self, pin: int, *, high: bool) -> bool:
-        """Whether the processor holds a pin at a level."""
-        return self._gpio.is_driven(pin, high)
-
-    @property
-    def is_asleep(self) -> bool:
-        """Whether the processor waits in WFI."""
-        return self._asleep
+        return frozenset(name for name, pin in LED_PINS.items() if self.gpio.is_driven(pin, high=False))
 
     @property
     def drawing(self) -> frozenset[str]:
@@ -172,24 +149,14 @@ class Image:
     def busy_share(self) -> float:
         """Share of the time since the first start in which the processor was awake, waits for transfers included."""
         passed = max(self._cycle_at(self._timeline.now_ticks), 1)
-        return 1.0 - (self._slept_cycles + (passed - self._asleep_since if self._asleep else 0)) / passed
-
-    def cycles_by_path(self) -> dict[str, PathCost]:
-        """Cycles of the firmware's turns by what was done in them (``paths.py``)."""
-        return self._paths.costs()
+        return 1.0 - (self._slept_cycles + (passed - self._asleep_since if self.is_asleep else 0)) / passed
 
     def forget_paths(self) -> None:
         """Measure paths, functions and latencies from now on."""
         self.core.forget_spent()
-        self._paths = Paths()
-        self._paths.begin(self.cycles)
-        self._latency = (0, 0, 0)
-
-    @property
-    def interrupt_latency(self) -> Latency:
-        """How long the firmware needs to turn to the chip."""
-        count, total, most = self._latency
-        return Latency(count, total * TICK_S / max(count, 1), most * TICK_S)
+        self.paths = Paths()
+        self.paths.begin(self.cycles)
+        self.worst_latency_s = 0.0
 
     # Start and resets
 
@@ -200,7 +167,7 @@ class Image:
         self._clock = p.Clock(self, cause)
         self._timers = [p.Timer(self, number) for number in range(3)]
         self._counters: list[p.Timer | p.Rtc] = [*self._timers, p.Rtc(self)]
-        self._gpio = p.Gpio(self, self._level, self._on_output)
+        self.gpio = p.Gpio(self, self._level, self._on_output)
         self._gpiote = p.Gpiote(self)
         self._watchdog = watchdog or p.Watchdog(self)
         self._ppi = p.Ppi(self)
@@ -218,7 +185,7 @@ class Image:
                 *self._counters,
                 self.radio,
                 self.settings,
-                self._gpio,
+                self.gpio,
                 self._gpiote,
                 self._watchdog,
                 self._ppi,
@@ -236,11 +203,11 @@ class Image:
         self._holds_chip = False
         self._stalled_until: int | None = None
         self._rise_ticks = None
-        if self._asleep:
+        if self.is_asleep:
             self._slept_cycles += max(self._cycle_at(self._timeline.now_ticks) - self._asleep_since, 0)
-        self._asleep = False
+        self.is_asleep = False
         self.core.cycles = max(self.core.cycles, self._cycle_at(self._timeline.now_ticks))
-        self._paths.begin_start(self.core.cycles)
+        self.paths.begin_start(self.core.cycles)
         self._processors.plan(self, self._ticks_at(self.core.cycles))
 
     def _ask_for_reset(self) -> None:
@@ -284,7 +251,7 @@ class Image:
 
     def advance(self, due_ticks: int, until_ticks: int) -> int | None:
         """Execute up to a true time (``processors.Processor``)."""
-        if self._asleep:
+        if self.is_asleep:
             self.core.cycles = max(self._cycle_at(due_ticks), self._asleep_since)
             self._update_timers()
             if self._watchdog.due_cycles <= self.core.cycles:
@@ -329,8 +296,8 @@ class Image:
                     f"WFI at PC 0x{self.core.pc - 2:x} with PRIMASK clear: interrupts are not modelled"
                 )
             if not self._nvic.wakes:
-                self._paths.end(self.core.cycles)
-                self._asleep, self._asleep_since = True, self.core.cycles
+                self.paths.end(self.core.cycles)
+                self.is_asleep, self._asleep_since = True, self.core.cycles
                 return True
         return False
 
@@ -341,16 +308,16 @@ class Image:
     def _wake(self) -> int:
         """End the sleep; the count of cycles at which the processor goes on."""
         self._slept_cycles += self.core.cycles - self._asleep_since
-        self._asleep = False
+        self.is_asleep = False
         self.core.spend(WAKE_UP_CYCLES)
-        self._paths.begin(self.core.cycles)
+        self.paths.begin(self.core.cycles)
         return self.core.cycles
 
     def _end_stall(self) -> None:
         """The transfer that the firmware polled for is over."""
         until = self._stalled_until or 0
         if until > self.core.cycles:
-            self._paths.note_wait(until - self.core.cycles)
+            self.paths.note_wait(until - self.core.cycles)
             self.core.cycles = until
         self._stalled_until = None
 
@@ -384,14 +351,14 @@ class Image:
 
     def has_input_buffer(self, pin: int) -> bool:
         """Whether the processor sees a pin's level."""
-        return self._gpio.has_input_buffer(pin)
+        return self.gpio.has_input_buffer(pin)
 
     def update_interrupt(self, peripheral: p.Peripheral) -> None:
         """A peripheral's line may have changed."""
         if peripheral.irq is None:
             return
         self._nvic.set_line(peripheral.irq, peripheral.line)
-        if self._asleep and self._nvic.wakes:
+        if self.is_asleep and self._nvic.wakes:
             self._processors.plan(self, self._timeline.now_ticks)
 
     def _read(self, address: int, size: int) -> int:
@@ -411,9 +378,9 @@ class Image:
         if address == _SPIM_START:
             self._note_transaction(self.core.load(self._spim.registers[0x544], self._spim.registers[0x548]))
         elif address == _COUNT_OF_BYTES:
-            self._paths.note_count_of_bytes()
+            self.paths.note_count_of_bytes()
         elif address == _WATCHDOG_FED:
-            self._paths.end_turn(self.core.cycles)
+            self.paths.end_turn(self.core.cycles)
         peripheral.write(address & 0xFFF, value)
 
     def _unknown_access(self, address: int, size: int) -> EmulationError:
@@ -436,7 +403,7 @@ class Image:
         return pin == UART_RX_PIN or pull == _PULL_UP
 
     def _on_output(self) -> None:
-        gpio = self._gpio
+        gpio = self.gpio
         selected = gpio.is_driven(SELECT_PIN, high=False)
         if selected != self._selected:
             self._selected = selected
@@ -477,9 +444,8 @@ class Image:
 
     def _note_transaction(self, out: bytes) -> None:
         """The firmware begins a transfer to the chip."""
-        self._paths.note_transaction(out)
+        self.paths.note_transaction(out)
         if self._rise_ticks is not None and out[:1] == _READS_STATUS:
-            taken = self._ticks_at(self.core.cycles) - self._rise_ticks
-            count, total, most = self._latency
-            self._latency = count + 1, total + taken, max(most, taken)
+            taken_ticks = self._ticks_at(self.core.cycles) - self._rise_ticks
+            self.worst_latency_s = max(self.worst_latency_s, taken_ticks * TICK_S)
             self._rise_ticks = None
