@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
 
-from emulator.board_library import CBoard
+from emulator.board_library import CBoard, Processor
 from emulator.site.host_programs import Process
 from skyless.core.constants import TICK_S
 from skyless.core.ticks import from_seconds
@@ -26,7 +26,7 @@ _TURN_S: Final = 5e-6
 """What a turn takes besides its transfers (assumed; the emulated processor counts it)."""
 
 
-class HostBoard:
+class HostBoard(Processor):
     """One board; its program is run again after the supply failed."""
 
     def __init__(
@@ -40,8 +40,6 @@ class HostBoard:
     ) -> None:
         self.chip = chip
         self._can_transmit, self._identity = can_transmit, identity
-        self.lights = 0
-        self.settings: bytes | None = None
         self._timeline, self._send = timeline, send
         self._start()
 
@@ -119,26 +117,10 @@ class HostBoard:
         """Whether the chip's line is high."""
         return self.chip.irq
 
-    def show(self, lights: int) -> None:
-        """Switch the lights."""
-        self.lights = lights
-
     def sleep_for(self, milliseconds: int) -> None:
         """Sleep; what comes on the UART is lost."""
         self.process.sleep(1e-3 * milliseconds)
         self._came.clear()
-
-    def read_settings(self) -> bytes | None:
-        """What was written last; it outlives power failures."""
-        return self.settings
-
-    def write_settings(self, settings: bytes) -> None:
-        """Keep settings."""
-        self.settings = settings
-
-    def advertise(self, data: bytes) -> bool:
-        """No Bluetooth here."""
-        return bool(data)
 
     def wait_s(self, seconds: float) -> None:
         """Wait, at most until the interrupt line rises or bytes come."""
@@ -165,9 +147,6 @@ class HostBoard:
         """The bytes have left the pin, unless the supply failed meanwhile."""
         if sender is self.process:
             self._send(data)
-
-    def set_rate(self, baud: int) -> None:
-        """All rates are alike here."""
 
     def restart_line(self) -> None:
         """Discard all that has come."""
