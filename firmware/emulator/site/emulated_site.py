@@ -125,6 +125,11 @@ class SiteNode:
         """Of its programs one after the other."""
         self.task: asyncio.Task[None] | None = None
 
+    def notify(self) -> None:
+        """Let the board see its chip's interrupt line, if there is one."""
+        if self.board is not None:
+            self.board.notify()
+
     @property
     def radio(self) -> WatchedRadio:
         """Of its present program, or its last one."""
@@ -145,6 +150,30 @@ class SiteNode:
         """Whether the RMARKER of its frame has left, and its end has not."""
         sending = self.chip.transceiver.sending
         return sending is not None and difference(self.air.now_ticks(), sending.marker_ticks) > 0
+
+
+class SiteResult(Struct, frozen=True):
+    """One run."""
+
+    slots: int
+    """Slots after the warm-up."""
+    sent: int
+    """Frames in them."""
+    late: int
+    """Frames that came too late for their boards, in the same time; none of them was sent."""
+    at_antennas: int
+    """Receptions at all antennas."""
+    reported: int
+    """Those that reached the programs."""
+    least_reported: float
+    """Share of those of the worst node."""
+    wrong: int
+    """Receptions at programs that no antenna got with that stamp, and frames on the air that no anchor made so."""
+    misused: dict[str, int]
+    """Uses of chips, and of an emulated processor, that their manuals forbid."""
+    fixes: int
+    rms_m: float
+    """Error of the tags' positions (2-D), root mean square over all fixes."""
 
 
 class EmulatedSite:
@@ -246,8 +275,8 @@ class EmulatedSite:
         if part != "chip":
             assert node.board is not None
             node.board.power_cycle()
-        elif node.board is not None:
-            node.board.notify()
+        else:
+            node.notify()
 
     # Programs
 
@@ -295,7 +324,7 @@ class EmulatedSite:
             tx_ticks = wrap(flight.marker_local_ticks)
             self.sent.append(SentFrame(flight.sender, flight.frame, tx_ticks, now_s, position_m))
             sender.chip.transceiver.finish()
-            _notify(sender)
+            sender.notify()
         else:
             self.cut += 1
         for rows in (delivery.by_anchors, delivery.by_tags):
@@ -308,7 +337,7 @@ class EmulatedSite:
                 fault: Fault | None = None if is_whole else "parity"
                 phase_cycles = float(row["phase_cycles"])
                 node.chip.receive(flight.frame, rx_ticks, measured, fault, carrier_phase_cycles=phase_cycles)
-                _notify(node)
+                node.notify()
 
     # What came of it
 
@@ -316,78 +345,44 @@ class EmulatedSite:
         """Node, frame and stamp of all that was sent as a whole."""
         return [(one.node, one.frame, one.tx_ticks) for one in self.sent]
 
-    def result(self, warmup_s: float = 3.0) -> "SiteResult":
-        """What was sent, reported and computed since ``warmup_s``."""
-        return judge(self, warmup_s)
-
-
-def _notify(node: SiteNode) -> None:
-    if node.board is not None:
-        node.board.notify()
-
-
-class SiteResult(Struct, frozen=True):
-    """One run."""
-
-    slots: int
-    """Slots after the warm-up."""
-    sent: int
-    """Frames in them."""
-    late: int
-    """Frames that came too late for their boards, in the same time; none of them was sent."""
-    at_antennas: int
-    """Receptions at all antennas."""
-    reported: int
-    """Those that reached the programs."""
-    least_reported: float
-    """Share of those of the worst node."""
-    wrong: int
-    """Receptions at programs that no antenna got with that stamp, and frames on the air that no anchor made so."""
-    misused: dict[str, int]
-    """Uses of chips, and of an emulated processor, that their manuals forbid."""
-    fixes: int
-    rms_m: float
-    """Error of the tags' positions (2-D), root mean square over all fixes."""
-
-
-def judge(site: EmulatedSite, warmup_s: float) -> SiteResult:
-    """Judge a run by what its antennas got and sent."""
-    count, end_s = len(site.anchors), site.medium.now_s - 5e-3  # what is on its way at the end is not judged
-    slots = set()
-    wrong = 0
-    made = [node.made for node in site.nodes]
-    for one in site.sent:
-        beacon = decode_cached(one.frame)
-        wrong += (one.frame, one.tx_ticks) not in made[one.node]
-        if isinstance(beacon, Beacon) and warmup_s <= one.time_s < end_s:
-            slots.add(beacon.superframe * count + one.node)
-    first, last = (min(slots), max(slots) + 1) if slots else (0, 0)
-    misused: Counter[str] = Counter()
-    at_antennas, reported, least = 0, 0, 1.0
-    for node in site.nodes:
-        heard = node.heard
-        judged = {key for key, ended_s in node.at_antenna.items() if warmup_s <= ended_s < end_s}
-        wrong += len(heard - node.at_antenna.keys())
-        at_antennas += len(judged)
-        reported += len(judged & heard)
-        least = min(least, len(judged & heard) / max(len(judged), 1))
-        misused += node.chip.misuse + node.air.counts + getattr(node.board, "misuse", Counter())
-    errors_m2 = [
-        float(np.sum((np.array(fix.position_m) - site.trajectories[index].position(ended_s))[:2] ** 2))
-        for index, node in enumerate(site.tags)
-        for fix, ended_s in site.fixes[node.name]
-        if warmup_s <= ended_s
-    ]
-    late = sum(time_s >= warmup_s for node in site.anchors for radio in node.radios for time_s in radio.late)
-    return SiteResult(
-        slots=last - first,
-        sent=len(slots),
-        late=late,
-        at_antennas=at_antennas,
-        reported=reported,
-        least_reported=least,
-        wrong=wrong,
-        misused=dict(misused),
-        fixes=len(errors_m2),
-        rms_m=float(np.sqrt(np.mean(errors_m2))) if errors_m2 else float("nan"),
-    )
+    def result(self, warmup_s: float) -> SiteResult:
+        """What was sent, reported and computed since ``warmup_s``, by what the antennas got and sent."""
+        count, end_s = len(self.anchors), self.medium.now_s - 5e-3  # what is on its way at the end is not judged
+        slots = set()
+        wrong = 0
+        made = [node.made for node in self.nodes]
+        for one in self.sent:
+            beacon = decode_cached(one.frame)
+            wrong += (one.frame, one.tx_ticks) not in made[one.node]
+            if isinstance(beacon, Beacon) and warmup_s <= one.time_s < end_s:
+                slots.add(beacon.superframe * count + one.node)
+        first, last = (min(slots), max(slots) + 1) if slots else (0, 0)
+        misused: Counter[str] = Counter()
+        at_antennas, reported, least = 0, 0, 1.0
+        for node in self.nodes:
+            heard = node.heard
+            judged = {key for key, ended_s in node.at_antenna.items() if warmup_s <= ended_s < end_s}
+            wrong += len(heard - node.at_antenna.keys())
+            at_antennas += len(judged)
+            reported += len(judged & heard)
+            least = min(least, len(judged & heard) / max(len(judged), 1))
+            misused += node.chip.misuse + node.air.counts + getattr(node.board, "misuse", Counter())
+        errors_m2 = [
+            float(np.sum((np.array(fix.position_m) - self.trajectories[index].position(ended_s))[:2] ** 2))
+            for index, node in enumerate(self.tags)
+            for fix, ended_s in self.fixes[node.name]
+            if warmup_s <= ended_s
+        ]
+        late = sum(time_s >= warmup_s for node in self.anchors for radio in node.radios for time_s in radio.late)
+        return SiteResult(
+            slots=last - first,
+            sent=len(slots),
+            late=late,
+            at_antennas=at_antennas,
+            reported=reported,
+            least_reported=least,
+            wrong=wrong,
+            misused=dict(misused),
+            fixes=len(errors_m2),
+            rms_m=float(np.sqrt(np.mean(errors_m2))) if errors_m2 else float("nan"),
+        )
