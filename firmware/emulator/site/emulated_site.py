@@ -194,8 +194,7 @@ class EmulatedSite:
 
         ``room``: errors of survey and ranges; None for none.
         """
-        self.site, self.seed, self.room, self._make_board, self._wire = site, seed, room, make_board, wire
-        self._lead_s = lead_s
+        self.site, self._seed, self._make_board, self._wire, self._lead_s = site, seed, make_board, wire, lead_s
         self.trajectories = list(trajectories)
         faults = replace(impairments_of(Request(site, seed=seed, room=room, carrier=True), site), diagnostics=True)
         tags = [TagSpec(trajectory) for trajectory in trajectories]
@@ -256,7 +255,7 @@ class EmulatedSite:
     def plug_in(self, node: SiteNode) -> None:
         """Give a node its board, with a port."""
         number = node.air.node
-        node.wire = SerialWire(self.medium.timeline, self._wire, random.Random(f"{self.seed} wire {number}"))
+        node.wire = SerialWire(self.medium.timeline, self._wire, random.Random(f"{self._seed} wire {number}"))
         node.board = self._make_board(
             self.medium.timeline,
             node.chip,
@@ -282,7 +281,7 @@ class EmulatedSite:
 
     def start_host(self, node: SiteNode) -> None:
         """Start the program of a node."""
-        radio = WatchedRadio(self._radio(node), node.air, self._lead_s)
+        radio = WatchedRadio(self._radio(node), self._lead_s)
         node.radios.append(radio)
         if node in self.anchors:
             anchors = Anchors(self.site, [radio], None, self.log.append, simulated=lambda: True)
@@ -309,8 +308,7 @@ class EmulatedSite:
                 await task
 
     def _on_fix(self, node: SiteNode, fix: FixMessage) -> None:
-        assert node.radio.present is not None
-        self.fixes[node.name].append((fix, node.at_antenna[node.radio.present]))
+        self.fixes[node.name].append((fix, node.at_antenna[next(reversed(node.radio.heard))]))
 
     # The air
 
