@@ -304,7 +304,7 @@ def test_the_firmware_receives_and_sends(firmware):
     dx = wrap(stage.timeline.now_ticks + from_seconds(3e-3)) & ~0x1FF
     stage.write(line_of(0x43, dx.to_bytes(5, "little") + frame, 2))
     stage.run(4e-3)
-    assert stage.air.sent == [(frame, wrap(dx + DELAYS.tx_ticks))]
+    assert stage.frames == [(frame, wrap(dx + DELAYS.tx_ticks))]
     stage.chip.transceiver.finish()
     stage.image.notify()
     stage.run(1e-3)
@@ -375,7 +375,7 @@ def test_half_of_the_stack_is_never_used(firmware):
     dx = wrap(stage.timeline.now_ticks + from_seconds(4e-3)) & ~0x1FF
     stage.write(b"garbage\0" + line_of(0x43, dx.to_bytes(5, "little") + frame, 2))
     stage.run(20e-3)
-    assert len(stage.air.sent) == 1
+    assert len(stage.frames) == 1
     assert STACK_BYTES / 2 < stage.image.core.unused_stack_bytes < STACK_BYTES
 
 

@@ -38,11 +38,11 @@ class _Bench(LoneBoard):
 
     def ask_for_frame(self, ahead_s: float) -> None:
         """A frame is to leave so long from now."""
-        self.write(self._writer.tx_at(wrap(self.air.now_ticks() + from_seconds(ahead_s)), FRAME))
+        self.write(self._writer.tx_at(wrap(self.now_ticks() + from_seconds(ahead_s)), FRAME))
 
     def arrive(self) -> None:
         """A frame has just ended."""
-        stamp = wrap(self.air.now_ticks() - from_seconds(after_rmarker_s(len(FRAME))))
+        stamp = wrap(self.now_ticks() - from_seconds(after_rmarker_s(len(FRAME))))
         self.chip.receive(FRAME, stamp, Diagnostics(-80.0, -83.0, 1.0), carrier_phase_cycles=0.7)
         self.image.notify()
 
