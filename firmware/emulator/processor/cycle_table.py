@@ -13,7 +13,7 @@ from emulator.processor.paths import BYTE, COMMAND, END_OF_TRANSMISSION, IDLE, P
 from skyless.core.air.ieee802154 import after_rmarker_s, fcs
 from skyless.core.air.reception import Diagnostics
 from skyless.core.ticks import from_seconds, wrap
-from skyless.radio.serial.link import WANTS_PHASES, Writer
+from skyless.radio.serial.link import RX_ON, WANTS_PHASES, Writer
 
 FRAME: Final = bytes(range(98)) + fcs(bytes(range(98)))
 _LEAD_S: Final = 5e-3
@@ -33,7 +33,7 @@ class _Bench(LoneBoard):
         """Configure the board, have it receive, and let it measure temperature and supply."""
         self.write(self._writer.config(DELAYS.tx_ticks, DELAYS.rx_ticks, flags))
         self.run(12e-3)
-        self.write(self._writer.rx_on())
+        self.write(self._writer.record(RX_ON))
         self.run(10e-3)
 
     def ask_for_frame(self, ahead_s: float) -> None:

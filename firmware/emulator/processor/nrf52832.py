@@ -98,6 +98,7 @@ class Image:
         self.advertised: list[OnAir] = []
         """What has left the Bluetooth antenna."""
         self.core = Core(elf, _WINDOWS, self._read, self._write)
+        self.load, self.store = self.core.load, self.core.store
         self.settings = p.FlashPage(self, self.core.spend)
         self._start(cause=0, watchdog=None)
 
@@ -105,7 +106,12 @@ class Image:
 
     def notify(self) -> None:
         """The chip's interrupt line may have changed."""
-        self._sample_interrupt()
+        high = self._chip.irq
+        if high == self._irq_was_high:
+            return
+        self._irq_was_high = high
+        self._rise_ticks = self._timeline.now_ticks if high else None
+        self._gpiote.on_edge(INTERRUPT_PIN, high)
 
     def receive(self, data: bytes) -> None:
         """Bytes have arrived on the UART's line."""
@@ -330,20 +336,9 @@ class Image:
 
     # What the peripherals see
 
-    def load(self, address: int, size: int) -> bytes:
-        """Read RAM."""
-        return self.core.load(address, size)
-
-    def store(self, address: int, data: bytes) -> None:
-        """Write RAM."""
-        self.core.store(address, data)
-
     def run_task(self, address: int) -> None:
         """Start a task by its address."""
-        peripheral = self._pages.get(address >> 12)
-        if peripheral is None:
-            raise EmulationError(f"PPI starts a task at 0x{address:08x}, where no peripheral is modelled")
-        peripheral.write(address & 0xFFF, 1)
+        self._peripheral(address, 4).write(address & 0xFFF, 1)
 
     def run_channels(self, address: int) -> None:
         """Start what PPI connects to an event."""
@@ -361,20 +356,23 @@ class Image:
         if self.is_asleep and self._nvic.wakes:
             self._processors.plan(self, self._timeline.now_ticks)
 
+    def _peripheral(self, address: int, size: int) -> p.Peripheral:
+        if address >> 12 in self._pages and size == 4 and not address & 3:
+            return self._pages[address >> 12]
+        what = "whole words only" if address >> 12 in self._pages else "no peripheral is modelled there"
+        raise EmulationError(
+            f"access of {size} bytes at 0x{address:08x} (in the block at PC 0x{self.core.pc:x}): {what}"
+        )
+
     def _read(self, address: int, size: int) -> int:
-        peripheral = self._pages.get(address >> 12)
-        if peripheral is None or size != 4 or address & 3:
-            raise self._unknown_access(address, size)
-        value = peripheral.read(address & 0xFFF)
+        value = self._peripheral(address, size).read(address & 0xFFF)
         if address == _SPIM_END and not value and self._spim.end_cycles is not None:
             self._stalled_until = self._spim.end_cycles
             self.core.stop_at(0)
         return value
 
     def _write(self, address: int, size: int, value: int) -> None:
-        peripheral = self._pages.get(address >> 12)
-        if peripheral is None or size != 4 or address & 3:
-            raise self._unknown_access(address, size)
+        peripheral = self._peripheral(address, size)
         if address == _SPIM_START:
             self._note_transaction(self.core.load(self._spim.registers[0x544], self._spim.registers[0x548]))
         elif address == _COUNT_OF_BYTES:
@@ -382,12 +380,6 @@ class Image:
         elif address == _WATCHDOG_FED:
             self.paths.end_turn(self.core.cycles)
         peripheral.write(address & 0xFFF, value)
-
-    def _unknown_access(self, address: int, size: int) -> EmulationError:
-        where = f"0x{address:08x} (in the block at PC 0x{self.core.pc:x})"
-        if address >> 12 not in self._pages:
-            return EmulationError(f"no peripheral is modelled at {where}")
-        return EmulationError(f"access of {size} bytes at {where}: whole words only")
 
     # Pins
 
@@ -421,26 +413,18 @@ class Image:
     def _pull_reset(self) -> None:
         """RSTn went low, or is released: either way the chip starts again there."""
         self._chip.pull_reset()
-        self._sample_interrupt()
+        self.notify()
 
     def exchange(self, out: bytes, hz: int) -> bytes:
         """One whole SPI transaction; a chip in reset answers nothing."""
         if self._holds_chip:
             return bytes(len(out))
         answer = self._chip.transfer(out, hz)
-        self._sample_interrupt()
+        self.notify()
         left_ticks = self._chip.transceiver.window_left_ticks
         if out[:1] == _COMMANDS and left_ticks is not None:  # the chip's crystal may be slower than true time
-            self._timeline.at(self._timeline.now_ticks + left_ticks + (left_ticks >> 13), self._sample_interrupt)
+            self._timeline.at(self._timeline.now_ticks + left_ticks + (left_ticks >> 13), self.notify)
         return answer
-
-    def _sample_interrupt(self) -> None:
-        high = self._chip.irq
-        if high == self._irq_was_high:
-            return
-        self._irq_was_high = high
-        self._rise_ticks = self._timeline.now_ticks if high else None
-        self._gpiote.on_edge(INTERRUPT_PIN, high)
 
     def _note_transaction(self, out: bytes) -> None:
         """The firmware begins a transfer to the chip."""

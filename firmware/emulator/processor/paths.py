@@ -26,6 +26,12 @@ TRANSMISSION: Final = "transmission"
 """A frame was handed to the chip."""
 END_OF_TRANSMISSION: Final = "end of transmission"
 
+_WORK: Final = {
+    (r.RX_BUFFER.file, False): RECEPTION,
+    (r.TX_BUFFER.file, True): TRANSMISSION,
+    (r.TX_STAMP.file, False): END_OF_TRANSMISSION,
+}
+"""By what is read or written of the chip; all else is POLL."""
 _ABOVE: Final = {BYTE: {COMMAND, START}, POLL: {RECEPTION, TRANSMISSION, END_OF_TRANSMISSION}}
 """Work that says more than this."""
 
@@ -88,14 +94,7 @@ class Paths:
     def note_transaction(self, sent: bytes) -> None:
         """A transaction with the chip begins, with these first bytes."""
         access = decode_header(sent)
-        work = POLL
-        if access is not None and access.file == r.RX_BUFFER.file and not access.is_write:
-            work = RECEPTION
-        elif access is not None and access.file == r.TX_BUFFER.file and access.is_write:
-            work = TRANSMISSION
-        elif access is not None and access.file == r.TX_STAMP.file and not access.is_write:
-            work = END_OF_TRANSMISSION
-        self._work[work] += 1
+        self._work[POLL if access is None else _WORK.get((access.file, access.is_write), POLL)] += 1
 
     def note_wait(self, cycles: int) -> None:
         """The processor waited for a transfer."""

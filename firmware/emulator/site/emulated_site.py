@@ -29,7 +29,7 @@ from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.codec import decode_cached
 from skyless.core.site import Site
 from skyless.core.ticks import difference, wrap
-from skyless.radio.interface import AntennaDelays, Radio
+from skyless.radio.interface import AntennaDelays
 from skyless.run.anchor import AnchorNode, Anchors
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.open_radio import open_radios
@@ -281,7 +281,10 @@ class EmulatedSite:
 
     def start_host(self, node: SiteNode) -> None:
         """Start the program of a node."""
-        radio = WatchedRadio(self._radio(node), self._lead_s)
+        assert node.wire is not None
+        kind: Literal["anchor", "tag"] = "anchor" if node in self.anchors else "tag"
+        (real,) = open_radios(f"serial:{node.wire.path}", kind, (node.name,), [node.delays])
+        radio = WatchedRadio(real, self._lead_s)
         node.radios.append(radio)
         if node in self.anchors:
             anchors = Anchors(self.site, [radio], None, self.log.append, simulated=lambda: True)
@@ -292,12 +295,6 @@ class EmulatedSite:
             self.programs[node.name] = tags.tags[0].node
             work = tags.run()
         node.task = asyncio.ensure_future(work)
-
-    def _radio(self, node: SiteNode) -> Radio:
-        """The radio of a node's program."""
-        assert node.wire is not None
-        kind: Literal["anchor", "tag"] = "anchor" if node in self.anchors else "tag"
-        return open_radios(f"serial:{node.wire.path}", kind, (node.name,), [node.delays])[0]
 
     async def stop_host(self, node: SiteNode) -> None:
         """Let the program of a node vanish."""

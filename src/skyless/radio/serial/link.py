@@ -133,6 +133,7 @@ def unstuff(line: bytes) -> bytes | None:
 class Writer:
     """Makes records, with numbers that count up; each method returns a line, ready to be sent.
 
+    Records of one or two bytes are made by ``record``.
     Ticks are numbers from 0 to 2**40 - 1. What does not fit into its field raises struct.error or OverflowError.
     """
 
@@ -185,21 +186,9 @@ class Writer:
         wrapped = (count & COUNT_MASK for count in counts)
         return self.record(STATUS, _stamp(ticks) + struct.pack("<B6IhH", state, *wrapped, temperature_cc, millivolts))
 
-    def refused(self, kind: int, reason: int) -> bytes:
-        """A command of that kind was refused."""
-        return self.record(REFUSED, bytes((kind, reason)))
-
     def ask_hello(self) -> bytes:
         """Ask the board who it is; states our version."""
         return self.record(ASK_HELLO, bytes((MAJOR, MINOR)))
-
-    def ask_status(self) -> bytes:
-        """Ask the board for its state."""
-        return self.record(ASK_STATUS)
-
-    def rx_on(self) -> bytes:
-        """Have the board receive."""
-        return self.record(RX_ON)
 
     def config(self, tx_delay_ticks: int, rx_delay_ticks: int, flags: int = 0) -> bytes:
         """Channel 5, 64 MHz PRF, 6.8 Mbit/s, preamble of 128 symbols with code 9; antenna delays."""

@@ -120,7 +120,7 @@ class LinkSession:
         if self.hello is None or self._refused:
             self._ask_hello(host_s)
         elif self.ready:
-            self._send(self._writer.ask_status())
+            self._send(self._writer.record(link.ASK_STATUS))
         else:
             self._configure()
             self._count_idle_poll()
@@ -252,7 +252,7 @@ class LinkSession:
         else:
             self._refused = ""
             if is_repeated and self._computing is None:
-                self._send(self._writer.ask_status())
+                self._send(self._writer.record(link.ASK_STATUS))
             else:
                 self._configure()
 
@@ -298,7 +298,7 @@ class LinkSession:
         asks = self._phases and self.hello is not None and self.hello.has_phases
         flags = link.WANTS_PHASES if asks else 0
         self._send(self._writer.config(self._delays.tx_ticks, self._delays.rx_ticks, flags))
-        self._send(self._writer.rx_on())
+        self._send(self._writer.record(link.RX_ON))
 
     def _on_tag_config(self, config: TagConfig, computing: Computing) -> None:
         """Ask once for what is to be changed; with the answer to that the board is ready."""
