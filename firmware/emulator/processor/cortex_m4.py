@@ -6,6 +6,7 @@ fault in that handler is a lockup. Exception returns are not modelled, since the
 """
 
 import ctypes
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -148,7 +149,7 @@ class Core:
     def unused_stack_bytes(self) -> int:
         """What lies between the data and the stack's deepest end since power-on."""
         stack_top = struct.unpack_from("<I", self._code)[0] - RAM_BASE
-        return max(map(len, _stretches(bytes(self.ram[:stack_top]))))
+        return max(map(len, re.split(rb"[^%c]" % _GARBAGE, bytes(self.ram[:stack_top]))))
 
     # Running
 
@@ -263,8 +264,3 @@ class Core:
         self._next = int.from_bytes(self._code[_HARD_FAULT_VECTOR : _HARD_FAULT_VECTOR + 4], "little") & ~1
         self.spend(12)
         return True
-
-
-def _stretches(ram: bytes) -> list[bytes]:
-    """Runs of bytes that nothing has written."""
-    return ram.translate(bytes(0 if value == _GARBAGE else 1 for value in range(256))).split(b"\x01")

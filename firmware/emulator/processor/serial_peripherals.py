@@ -30,8 +30,6 @@ class Uarte(Peripheral):
             registers=(0x200, 0x480, 0x500, *self._SET_UP, 0x534, 0x538, 0x53C, 0x544, 0x548, 0x54C),
         )
         self._send = send
-        self.received = self.sent = 0
-        """Bytes."""
         self._into = self._room = self._filled = 0
         self._is_receiving = self._is_stopping = False
         self._kept = b""
@@ -106,7 +104,6 @@ class Uarte(Peripheral):
         for byte in data:
             if self._is_stopping and len(self._kept) < 4:
                 self._kept += bytes((byte,))
-                self.received += 1
                 self.happen(self._RXDRDY)
                 continue
             if not self._is_receiving or self._filled == self._room:
@@ -114,7 +111,6 @@ class Uarte(Peripheral):
                 continue
             self.system.store(self._into + self._filled, bytes((byte,)))
             self._filled += 1
-            self.received += 1
             self.happen(self._RXDRDY)
             if self._filled == self._room:
                 self._end_rx()
@@ -147,7 +143,6 @@ class Uarte(Peripheral):
             data = self.system.load(address, len(expected))
             if data != expected:
                 self.system.misuse["uarte-buffer-changed"] += 1
-            self.sent += len(data)
             self._send(data)
 
         self.system.plan(cycles, leave)
