@@ -54,5 +54,5 @@ def test_the_commands_give_the_fixes_that_their_classes_give(kind, file, capfd, 
     fixes = [msgspec.json.decode(line, type=FixMessage) for line in printed.splitlines()]
     assert len(fixes) > 20
     assert fixes == [fix for fix, _ in of_classes.fixes["tag1"]]
-    assert of_commands.sent_frames() == of_classes.sent_frames()
+    assert of_commands.sent == of_classes.sent
     assert all(f"anchor {anchor.id}" in said for anchor in site.anchors)

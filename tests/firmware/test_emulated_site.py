@@ -50,6 +50,6 @@ def test_a_seed_gives_the_same_run_each_time(kind):
     for _ in range(2):
         site = site_of(kind, 2.1, seed=3)
         site.run(0.4)
-        runs.append((site.sent_frames(), site.fixes["tag1"], [node.radio.heard for node in site.nodes], site.log))
+        runs.append((site.sent, site.fixes["tag1"], [node.radio.heard for node in site.nodes], site.log))
     assert len(runs[0][0]) > 50
     assert runs[0] == runs[1]

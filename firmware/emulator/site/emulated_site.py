@@ -18,7 +18,6 @@ from typing import Any, Final, Literal, Protocol
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from emulator.site.serial_wire import SerialWire, WireSettings
 from emulator.site.site_air import SITE_TURNAROUND_S, SiteAir
@@ -30,10 +29,10 @@ from skyless.core.protocol1.codec import decode_cached
 from skyless.core.site import Site
 from skyless.core.ticks import difference, wrap
 from skyless.radio.interface import AntennaDelays
-from skyless.run.anchor import AnchorNode, Anchors
+from skyless.run.anchor import Anchors
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.open_radio import open_radios
-from skyless.run.tag import TagNode, Tags, TagSettings
+from skyless.run.tag import Tags, TagSettings
 from skyless.sim.dw1000.chip import Chip
 from skyless.sim.dw1000.transceiver import Fault
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
@@ -104,14 +103,22 @@ class SentFrame(Struct, frozen=True):
     """The sender's counter at the RMARKER."""
     time_s: float
     """True time of its end."""
-    position_m: NDArray[np.float64]
-    """Of the first tag."""
 
 
 class SiteNode:
     """An anchor or a tag: antenna, chip, board, wire and radio."""
 
-    def __init__(self, medium: Medium[Any], number: int, name: str, delays: AntennaDelays) -> None:
+    def __init__(
+        self,
+        medium: Medium[Any],
+        number: int,
+        name: str,
+        delays: AntennaDelays,
+        wire: SerialWire,
+        make_board: MakeBoard,
+        *,
+        can_transmit: bool,
+    ) -> None:
         self.name = name
         self.delays = delays
         self.air = SiteAir(medium, number)
@@ -119,16 +126,12 @@ class SiteNode:
         self.chip.on_wake = partial(medium.switch_on, number)
         self.at_antenna: dict[tuple[bytes, int], float] = {}
         """Frames that the antenna got while it was not sending, by their bytes and stamps: when each ended, in s."""
-        self.board: Board | None = None
-        self.wire: SerialWire | None = None
+        self.wire = wire
+        identity = number.to_bytes(8, "little")
+        self.board = make_board(medium.timeline, self.chip, wire.send, can_transmit=can_transmit, identity=identity)
         self.radios: list[WatchedRadio] = []
         """Of its programs one after the other."""
         self.task: asyncio.Task[None] | None = None
-
-    def notify(self) -> None:
-        """Let the board see its chip's interrupt line, if there is one."""
-        if self.board is not None:
-            self.board.notify()
 
     @property
     def radio(self) -> WatchedRadio:
@@ -214,12 +217,12 @@ class EmulatedSite:
         self.fixes: dict[str, list[tuple[FixMessage, float]]] = {node.name: [] for node in self.tags}
         """Fixes of each tag, with when its antenna had got the frame, in s of true time."""
         self.log: list[str] = []
-        self.programs: dict[str, AnchorNode | TagNode] = {}
-        """The programs that run, by their nodes' names."""
 
     def _node(self, number: int, name: str, delays: AntennaDelays) -> SiteNode:
         self.medium.switch_on(number)
-        return SiteNode(self.medium, number, name, delays)
+        wire = SerialWire(self.medium.timeline, self._wire, random.Random(f"{self._seed} wire {number}"))
+        is_anchor = number < len(self.site.anchors)
+        return SiteNode(self.medium, number, name, delays, wire, self._make_board, can_transmit=is_anchor)
 
     # Time
 
@@ -234,9 +237,9 @@ class EmulatedSite:
                 await asyncio.sleep(min(left_s, _REPORT_S))
 
     async def __aenter__(self) -> "EmulatedSite":
-        """Plug all boards in, and start all programs."""
+        """Connect all boards, and start all programs."""
         for node in self.nodes:
-            self.plug_in(node)
+            node.wire.start(node.board.receive)
             self.start_host(node)
         return self
 
@@ -247,23 +250,9 @@ class EmulatedSite:
             close = getattr(node.board, "close", None)
             if close is not None:
                 close()
-            if node.wire is not None:
-                node.wire.close()
+            node.wire.close()
 
     # Boards
-
-    def plug_in(self, node: SiteNode) -> None:
-        """Give a node its board, with a port."""
-        number = node.air.node
-        node.wire = SerialWire(self.medium.timeline, self._wire, random.Random(f"{self._seed} wire {number}"))
-        node.board = self._make_board(
-            self.medium.timeline,
-            node.chip,
-            node.wire.send,
-            can_transmit=number < len(self.anchors),
-            identity=number.to_bytes(8, "little"),
-        )
-        node.wire.start(node.board.receive)
 
     def brown_out(self, node: SiteNode, part: Literal["processor", "chip", "both"]) -> None:
         """Let the supply fail for a moment, for the processor, its radio, or both."""
@@ -272,28 +261,22 @@ class EmulatedSite:
             self.medium.switch_on(node.air.node)
             node.chip.power_cycle()
         if part != "chip":
-            assert node.board is not None
             node.board.power_cycle()
         else:
-            node.notify()
+            node.board.notify()
 
     # Programs
 
     def start_host(self, node: SiteNode) -> None:
         """Start the program of a node."""
-        assert node.wire is not None
         kind: Literal["anchor", "tag"] = "anchor" if node in self.anchors else "tag"
         (real,) = open_radios(f"serial:{node.wire.path}", kind, (node.name,), [node.delays])
         radio = WatchedRadio(real, self._lead_s)
         node.radios.append(radio)
         if node in self.anchors:
-            anchors = Anchors(self.site, [radio], None, self.log.append, simulated=lambda: True)
-            self.programs[node.name] = anchors.nodes[0]
-            work = anchors.run()
+            work = Anchors(self.site, [radio], None, self.log.append, simulated=lambda: True).run()
         else:
-            tags = Tags(TAG_SETTINGS, [radio], None, self.log.append, lambda fix: self._on_fix(node, fix))
-            self.programs[node.name] = tags.tags[0].node
-            work = tags.run()
+            work = Tags(TAG_SETTINGS, [radio], None, self.log.append, lambda fix: self._on_fix(node, fix)).run()
         node.task = asyncio.ensure_future(work)
 
     async def stop_host(self, node: SiteNode) -> None:
@@ -315,11 +298,10 @@ class EmulatedSite:
         sender, now_s = self.nodes[flight.sender], medium.now_s
         is_whole = flight.boot == medium.boots[flight.sender]
         if is_whole:
-            position_m = self.trajectories[0].position(now_s)
             tx_ticks = wrap(flight.marker_local_ticks)
-            self.sent.append(SentFrame(flight.sender, flight.frame, tx_ticks, now_s, position_m))
+            self.sent.append(SentFrame(flight.sender, flight.frame, tx_ticks, now_s))
             sender.chip.transceiver.finish()
-            sender.notify()
+            sender.board.notify()
         else:
             self.cut += 1
         for rows in (delivery.by_anchors, delivery.by_tags):
@@ -332,13 +314,9 @@ class EmulatedSite:
                 fault: Fault | None = None if is_whole else "parity"
                 phase_cycles = float(row["phase_cycles"])
                 node.chip.receive(flight.frame, rx_ticks, measured, fault, carrier_phase_cycles=phase_cycles)
-                node.notify()
+                node.board.notify()
 
     # What came of it
-
-    def sent_frames(self) -> list[tuple[int, bytes, int]]:
-        """Node, frame and stamp of all that was sent as a whole."""
-        return [(one.node, one.frame, one.tx_ticks) for one in self.sent]
 
     def result(self, warmup_s: float) -> SiteResult:
         """What was sent, reported and computed since ``warmup_s``, by what the antennas got and sent."""
