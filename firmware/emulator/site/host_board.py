@@ -50,8 +50,8 @@ class HostBoard(Processor):
         while True:
             wait_us = board.turn()
             self.process.sleep(_TURN_S)
-            if wait_us:
-                self.wait_s(1e-6 * wait_us)
+            if wait_us and not self._came:  # at most until the interrupt line rises or bytes come
+                self.process.wait(1e-6 * wait_us)
 
     def _start(self) -> None:
         self._came = bytearray()
@@ -121,11 +121,6 @@ class HostBoard(Processor):
         """Sleep; what comes on the UART is lost."""
         self.process.sleep(1e-3 * milliseconds)
         self._came.clear()
-
-    def wait_s(self, seconds: float) -> None:
-        """Wait, at most until the interrupt line rises or bytes come."""
-        if not self._came:
-            self.process.wait(seconds)
 
     def read_line(self, size: int) -> bytes:
         """What has come on the UART, at most ``size`` bytes."""
