@@ -182,7 +182,7 @@ class Image:
         status = lambda: (self.core.hfsr, self.core.cfsr, self.core.bfar)  # noqa: E731
         self._nvic = p.Nvic(self, status, self._ask_for_reset, self.core.use_fpu)
         self._uarte = Uarte(self, self._send)
-        self._spim = Spim(self, self)
+        self._spim = Spim(self, self._exchange)
         self.radio = Radio(self, lambda: self._clock.crystal_cycles <= self.cycles, self.advertised.append)
         self._pages: dict[int, p.Peripheral] = {
             one.base >> 12: one
@@ -415,7 +415,7 @@ class Image:
         self._chip.pull_reset()
         self.notify()
 
-    def exchange(self, out: bytes, hz: int) -> bytes:
+    def _exchange(self, out: bytes, hz: int) -> bytes:
         """One whole SPI transaction; a chip in reset answers nothing."""
         if self._holds_chip:
             return bytes(len(out))

@@ -1,7 +1,6 @@
 """UARTE0 and SPIM0: what moves data by DMA, in the time that its bits take."""
 
 from collections.abc import Callable
-from typing import Protocol
 
 from emulator.processor.peripherals import Peripheral, System
 from skyless.sim.dw1000.registers import decode_header
@@ -160,13 +159,6 @@ class Uarte(Peripheral):
         self.happen(self._TXSTOPPED)
 
 
-class SpiLine(Protocol):
-    """The other end of the SPI."""
-
-    def exchange(self, out: bytes, hz: int) -> bytes:
-        """One whole transaction."""
-
-
 class Spim(Peripheral):
     """SPIM0 with one chip behind a chip select on a pin.
 
@@ -178,7 +170,8 @@ class Spim(Peripheral):
     irq = 3
     _END = 0x118
 
-    def __init__(self, system: System, line: SpiLine) -> None:
+    def __init__(self, system: System, exchange: Callable[[bytes, int], bytes]) -> None:
+        """``exchange`` is one whole transaction: what is sent and the clock's rate; the answer."""
         super().__init__(
             system,
             tasks={0x010: self._start, 0x014: lambda: self.happen(0x104)},  # a transfer that runs goes on to its end
@@ -186,7 +179,7 @@ class Spim(Peripheral):
             # SHORTS, ENABLE, PSEL, FREQUENCY, DMA, CONFIG, ORC
             registers=(*(0x200, 0x500, 0x508, 0x50C, 0x510, 0x524), *range(0x534, 0x550, 4), 0x554, 0x5C0),
         )
-        self._line = line
+        self._exchange = exchange
         self.end_cycles: int | None = None
         """When the transfer that runs will be over."""
         self.selected = False
@@ -233,7 +226,7 @@ class Spim(Peripheral):
             self._hz = self.hz
             access = decode_header(self._sent)
             if access is not None and not access.is_write and len(self._sent) > access.octets:
-                data = self._line.exchange(self._sent, self._hz)[-len(out) :] if out else b""
+                data = self._exchange(self._sent, self._hz)[-len(out) :] if out else b""
         else:
             self.system.misuse["spim-without-chip-select"] += 1
         if receive:
@@ -248,7 +241,7 @@ class Spim(Peripheral):
         if self.end_cycles is not None:
             self.system.misuse["spim-deselected-while-busy"] += 1
         if not selected and self._sent:
-            access, sent, hz, exchange = decode_header(self._sent), self._sent, self._hz, self._line.exchange
+            access, sent, hz = decode_header(self._sent), self._sent, self._hz
             if access is None or access.is_write:
-                self.system.plan(self.system.cycles, lambda: exchange(sent, hz))
+                self.system.plan(self.system.cycles, lambda: self._exchange(sent, hz))
         self._sent, self.selected = b"", selected

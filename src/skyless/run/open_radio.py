@@ -14,7 +14,7 @@ from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio, UciRadio
 from skyless.radio.interface import AntennaDelays, Radio
 from skyless.radio.serial.serial_port import check_path
-from skyless.radio.serial.serial_radio import Computing, SerialRadio, until_next_start
+from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, SerialRadio
 from skyless.run._dw1000_model import ModelPort
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
@@ -89,7 +89,7 @@ def open_radios(
         return (Dw1000Radio(spi_port(spec, where), names[0], settings[0], phases=phases),)
     if driver == "serial":
         ports, transmits = _ports(spec, where, _SERIAL_BAUD, names), kind == "anchor"
-        computing = Computing(until_next_start, keeps=False) if computes else None
+        computing = UNTIL_NEXT_START if computes else None
         return tuple(
             SerialRadio(*ports[i], name, settings[i], transmits=transmits, phases=phases, computing=computing)
             for i, name in enumerate(names)
