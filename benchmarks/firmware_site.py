@@ -23,7 +23,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "firmware"))
 
 import numpy as np
 from emulator.build import build
-from emulator.site.emulated_site import EmulatedSite, MakeBoard, SiteResult
+from emulator.seat import MakeBoard
+from emulator.site.emulated_site import EmulatedSite, SiteResult
 from emulator.site.host_board import HostBoard
 from emulator.site.host_programs import HostLatency
 from emulator.site.serial_wire import WireSettings
@@ -93,12 +94,6 @@ def more_than(least: float, kind: type = float) -> Callable[[str], float]:
     return number
 
 
-def show(line: str) -> None:
-    """Replace the line that says how far it is, on a terminal."""
-    if sys.stderr.isatty():
-        print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
-
-
 def row(slot_ms: float, lead_ms: float | None, results: list[SiteResult], wall_s: float) -> str:
     """A line of the table."""
     sent, late, slots, got, reported, fixes = (
@@ -146,12 +141,8 @@ def main() -> None:
             for seed in range(1, asked.seeds + 1):
                 with fixed_lead(fixed=lead_ms is not None):
                     site = site_of(lab, make, seed, wire, lead_ms, Room() if asked.room else None)
-                    what = f"slots of {slot_ms:g} ms, seed {seed} of {asked.seeds}"
-                    site.run(
-                        asked.seconds, lambda now_s, what=what: show(f"{what}: {now_s:.1f} of {asked.seconds:g} s")
-                    )
+                    site.run(asked.seconds)
                     results.append(site.result(_WARMUP_S))
-            show("")
             print(row(slot_ms, lead_ms, results, time.perf_counter() - begun_s), flush=True)
 
 

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Final
 
 from emulator.processor.nrf52832 import Image
+from emulator.seat import Seat
 from skyless.core.constants import TICK_S
 from skyless.core.ticks import from_seconds, wrap
 from skyless.radio.interface import AntennaDelays
@@ -25,15 +26,11 @@ class LoneBoard:
         """What is on the air, with its stamp."""
         self.lines: list[tuple[float, bytes]] = []
         """What has come, with its time in µs."""
-        self.image = Image(
-            self.timeline,
-            self.chip,
-            lambda data: self.lines.append((1e6 * self.now_s(), data)),
-            elf=elf,
-            can_transmit=can_transmit,
-            identity=IDENTITY,
-            clock_ppm=clock_ppm,
-        )
+        seat = Seat(self.timeline, self.chip, self._note, can_transmit, IDENTITY)
+        self.image = Image(seat, elf=elf, clock_ppm=clock_ppm)
+
+    def _note(self, data: bytes) -> None:
+        self.lines.append((1e6 * self.now_s(), data))
 
     @property
     def sent(self) -> bytes:

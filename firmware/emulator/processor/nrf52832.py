@@ -1,6 +1,6 @@
 """A DWM1001 that executes the firmware's image: an nRF52832 with a DW1000 on its SPI, in true time.
 
-    image = Image(timeline, chip, send, elf=path, can_transmit=True, identity=bytes(8))
+    image = Image(Seat(timeline, chip, send, can_transmit=True), elf=path)
 
 The processor's costs and what is assumed of them: ``cycles.py``. Its peripherals: ``peripherals.py`` and
 ``serial_peripherals.py``. WFI ends 3 µs after the interrupt that ends it (assumed; the specification gives about that
@@ -10,7 +10,7 @@ for a regulator and a clock that have to start). The 64 MHz clock is exact but f
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from emulator.processor import peripherals as p
 from emulator.processor.cortex_m4 import Core, EmulationError
@@ -19,10 +19,9 @@ from emulator.processor.paths import Paths
 from emulator.processor.processors import MIN_TICKS, TICKS_PER_CYCLE, Processors
 from emulator.processor.radio import OnAir, Radio
 from emulator.processor.serial_peripherals import Spim, Uarte
+from emulator.seat import Seat
 from skyless.core.constants import TICK_S
-from skyless.sim.dw1000.chip import Chip
 from skyless.sim.dw1000.registers import SYS_CTRL, SYS_STATUS
-from skyless.sim.medium import Timeline
 
 WAKE_UP_CYCLES: Final = 3 * 64
 _LOCKUP_RESET_CYCLES: Final = 64
@@ -55,38 +54,17 @@ _COMMANDS: Final = bytes((0x80 | SYS_CTRL.file,))
 
 
 class Image:
-    """A board of the emulated site (``Board`` of ``site.py``): this one executes the ELF file's machine code."""
+    """A board that executes an ELF file's machine code; what is not modelled raises EmulationError when it is used."""
 
-    def __init__(
-        self,
-        timeline: "Timeline[Any]",
-        chip: Chip,
-        send: Callable[[bytes], None],
-        *,
-        elf: Path,
-        can_transmit: bool,
-        identity: bytes,
-        clock_ppm: float = 0.0,
-    ) -> None:
-        """``send`` gets bytes when they have left the UART's pin completely.
-
-        Without ``can_transmit`` the role's pin is connected to ground.
-
-        Raises:
-            EmulationError: the firmware uses what is not modelled, which shows later.
-            ValueError: ``identity`` has not 8 bytes.
-        """
-        if len(identity) != 8:
-            raise ValueError("a board's identity has 8 bytes")
+    def __init__(self, seat: Seat, *, elf: Path, clock_ppm: float = 0.0) -> None:
         self.misuse: Counter[str] = Counter()
         """What the firmware did to its processor that the specification forbids, and bytes that it lost."""
         self.resets: Counter[str] = Counter()
         """Resets after the first start, by their cause."""
-        self._timeline, self._chip, self._send = timeline, chip, send
-        self._can_transmit, self._identity = can_transmit, identity
+        self._seat, self._timeline, self._chip = seat, seat.timeline, seat.chip
         self._ticks_per_cycle = TICKS_PER_CYCLE * (1 + 1e-6 * clock_ppm)
-        self._processors = Processors.of(timeline)
-        self._epoch_ticks = timeline.now_ticks
+        self._processors = Processors.of(seat.timeline)
+        self._epoch_ticks = seat.timeline.now_ticks
         self.paths = Paths()
         self._irq_was_high = False
         self._rise_ticks: int | None = None
@@ -181,7 +159,7 @@ class Image:
         self._nvmc = p.Nvmc(self, self.core.use_cache, self.settings)
         status = lambda: (self.core.hfsr, self.core.cfsr, self.core.bfar)  # noqa: E731
         self._nvic = p.Nvic(self, status, self._ask_for_reset, self.core.use_fpu)
-        self._uarte = Uarte(self, self._send)
+        self._uarte = Uarte(self, self._seat.send)
         self._spim = Spim(self, self._exchange)
         self.radio = Radio(self, lambda: self._clock.crystal_cycles <= self.cycles, self.advertised.append)
         self._pages: dict[int, p.Peripheral] = {
@@ -199,7 +177,7 @@ class Image:
                 self._nvic,
                 self._uarte,
                 self._spim,
-                p.factory_information(self, self._identity),
+                p.factory_information(self, self._seat.identity),
                 p.revision(self),
             )
         }
@@ -387,9 +365,9 @@ class Image:
         if pin == INTERRUPT_PIN:
             return self._irq_was_high  # of the last notification or transaction, since nothing else changes it
         if pin == ROLE_PIN:
-            if self._can_transmit and pull != _PULL_UP:
+            if self._seat.can_transmit and pull != _PULL_UP:
                 self.misuse["role-pin-without-pull-up"] += 1
-            return self._can_transmit and pull == _PULL_UP
+            return self._seat.can_transmit and pull == _PULL_UP
         if pin == RESET_PIN:
             return not self._holds_chip
         return pin == UART_RX_PIN or pull == _PULL_UP

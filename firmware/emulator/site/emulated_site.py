@@ -11,14 +11,15 @@ import asyncio
 import contextlib
 import random
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from emulator.seat import MakeBoard, Seat
 from emulator.site.serial_wire import SerialWire, WireSettings
 from emulator.site.site_air import SITE_TURNAROUND_S, SiteAir
 from emulator.site.virtual_time import run_on
@@ -36,7 +37,7 @@ from skyless.run.tag import Tags, TagSettings
 from skyless.sim.dw1000.chip import Chip
 from skyless.sim.dw1000.transceiver import Fault
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
-from skyless.sim.medium import Delivery, Medium, Timeline
+from skyless.sim.medium import Delivery, Medium
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Trajectory
 from skyless.sim.world import diagnostics_of
@@ -44,35 +45,6 @@ from skyless.sim.world import diagnostics_of
 TAG_SETTINGS: Final = TagSettings(publish_hz=1000.0)
 """All fixes are kept."""
 DIRECT_WIRE: Final = WireSettings()
-_REPORT_S: Final = 0.1
-
-
-class Board(Protocol):
-    """What the site needs of a board, however it is made."""
-
-    def notify(self) -> None:
-        """The chip's interrupt line may have risen."""
-
-    def receive(self, data: bytes) -> None:
-        """These bytes have just come completely on the UART."""
-
-    def power_cycle(self) -> None:
-        """The supply failed and is back."""
-
-
-class MakeBoard(Protocol):
-    """Makes a board; ``send`` is called with bytes that have just left the TX pin."""
-
-    def __call__(
-        self,
-        timeline: Timeline[Any],
-        chip: Chip,
-        send: Callable[[bytes], None],
-        *,
-        can_transmit: bool,
-        identity: bytes,
-    ) -> Board:
-        """The board, which starts at this instant."""
 
 
 class SiteChip(Chip):
@@ -127,8 +99,7 @@ class SiteNode:
         self.at_antenna: dict[tuple[bytes, int], float] = {}
         """Frames that the antenna got while it was not sending, by their bytes and stamps: when each ended, in s."""
         self.wire = wire
-        identity = number.to_bytes(8, "little")
-        self.board = make_board(medium.timeline, self.chip, wire.send, can_transmit=can_transmit, identity=identity)
+        self.board = make_board(Seat(medium.timeline, self.chip, wire.send, can_transmit, number.to_bytes(8, "little")))
         self.radios: list[WatchedRadio] = []
         """Of its programs one after the other."""
         self.task: asyncio.Task[None] | None = None
@@ -226,15 +197,13 @@ class EmulatedSite:
 
     # Time
 
-    def run(self, seconds: float, report: Callable[[float], None] = lambda _: None) -> None:
-        """Let everything start, run for some seconds, and end; ``report`` is called with the time now and then."""
-        run_on(self.medium.timeline, self._play(seconds, report))
+    def run(self, seconds: float) -> None:
+        """Let everything start, run for some seconds, and end."""
+        run_on(self.medium.timeline, self._play(seconds))
 
-    async def _play(self, seconds: float, report: Callable[[float], None]) -> None:
+    async def _play(self, seconds: float) -> None:
         async with self:
-            while (left_s := seconds - self.medium.now_s) > 0.0:
-                report(self.medium.now_s)
-                await asyncio.sleep(min(left_s, _REPORT_S))
+            await asyncio.sleep(seconds)
 
     async def __aenter__(self) -> "EmulatedSite":
         """Connect all boards, and start all programs."""

@@ -3,16 +3,14 @@
 What the program computes takes no time; transfers, pauses and bytes on the line take theirs.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 from emulator.board_library import CBoard, Processor
+from emulator.seat import Seat
 from emulator.site.host_programs import Process
 from skyless.core.constants import TICK_S
 from skyless.core.ticks import from_seconds
-from skyless.sim.dw1000.chip import Chip
-from skyless.sim.medium import Timeline
 
 BYTE_S: Final = 10e-6
 """On the UART: ten bits at 1 Mbaud."""
@@ -29,23 +27,13 @@ _TURN_S: Final = 5e-6
 class HostBoard(Processor):
     """One board; its program is run again after the supply failed."""
 
-    def __init__(
-        self,
-        timeline: Timeline[Any],
-        chip: Chip,
-        send: Callable[[bytes], None],
-        *,
-        can_transmit: bool,
-        identity: bytes,
-    ) -> None:
-        self.chip = chip
-        self._can_transmit, self._identity = can_transmit, identity
-        self._timeline, self._send = timeline, send
+    def __init__(self, seat: Seat) -> None:
+        self._seat, self._timeline, self.chip = seat, seat.timeline, seat.chip
         self._start()
 
     def program(self) -> None:
         """Run the board's loop, as the image's ``main`` does."""
-        board = CBoard(self, can_transmit=self._can_transmit, device_id=self._identity)
+        board = CBoard(self, can_transmit=self._seat.can_transmit, device_id=self._seat.identity)
         board.begin()
         while True:
             wait_us = board.turn()
@@ -141,7 +129,7 @@ class HostBoard(Processor):
     def _deliver(self, data: bytes, sender: Process) -> None:
         """The bytes have left the pin, unless the supply failed meanwhile."""
         if sender is self.process:
-            self._send(data)
+            self._seat.send(data)
 
     def restart_line(self) -> None:
         """Discard all that has come."""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from emulator.site.emulated_site import MakeBoard
+from emulator.seat import MakeBoard, Seat
 from emulator.site.site_air import NodeAir
 from skyless.core.air.reception import Diagnostics
 from skyless.core.arrays import Array
@@ -50,13 +50,7 @@ class TagWorld:
             medium.clocks[node]["rate"] += 1e-6 * jumps.gauss(0.0, jump_ppm)
 
         self.chip.on_wake = wake
-        self.board = make_board(
-            medium.timeline,
-            self.chip,
-            lambda data: said(medium.now_s, data),
-            can_transmit=False,
-            identity=bytes(8),
-        )
+        self.board = make_board(Seat(medium.timeline, self.chip, lambda data: said(medium.now_s, data)))
         record = Writer().set_tag_config(settings, keep=True)
         medium.timeline.at(from_seconds(_STARTED_S), partial(self.board.receive, record))
 
