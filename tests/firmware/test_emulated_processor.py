@@ -193,7 +193,7 @@ def test_a_stack_that_is_too_long_changes_no_variable(folder):
 @pytest.mark.parametrize(
     ("forbidden", "message"),
     [
-        ("(void)REGISTER(0x40005000u)", "0x40005000, in the block at PC 0x[0-9a-f]+: no peripheral is modelled"),
+        ("(void)REGISTER(0x40005000u)", r"0x40005000 \(in the block at PC 0x[0-9a-f]+\): no peripheral is modelled"),
         ("(void)REGISTER(0x40008999u&~3u)", "Timer has no register 0x998"),
         ("*(volatile uint8_t*)0x40008544u=1u", "access of 1 bytes at 0x40008544"),
         ("UARTE_TXD_PTR=256u;UARTE_TXD_MAXCNT=9u;start_line();UARTE_STARTTX=1u", "DMA of 9 bytes at 0x00000100"),
