@@ -62,10 +62,9 @@ class Run:
         world = world_of(site, trajectories_of(request), replace(impairments_of(request, site), diagnostics=True), seed)
         make, given = partial(Image, elf=build("all"), clock_ppm=CLOCK_PPM), BoardSettings(mode=1, **settings)
         self.fixes, self.status, self._reader = [], None, Reader()
-        self.world = TagWorld(world, 1, make, self._said, given, JUMP_PPM)
-        self.tag = self.world.tags[0]
+        self.tag = TagWorld(world, make, self._said, given, JUMP_PPM)
 
-    def _said(self, _tag, now_s, data):
+    def _said(self, now_s, data):
         for record in self._reader.read(data):
             found = decode(record)
             if isinstance(found, BoardFix):
@@ -74,10 +73,6 @@ class Run:
                 self.fixes.append((now_s, error_m @ error_m, nees))
             elif isinstance(found, BoardStatus):
                 self.status = found.counters
-
-    def go(self, until_s):
-        for _ in self.world.run(until_s):
-            pass
 
     def figures(self, since_s):
         fixes = np.array([one for one in self.fixes if one[0] >= since_s]).reshape(-1, 3)
@@ -92,9 +87,9 @@ def awake(seeds, seconds):
         sums = np.zeros(3)
         for seed in seeds:
             run = Run(seed, site_of(anchors, beacons_hz), **{"output": 0, "rate_hz": 0, **settings})
-            run.go(WARMUP_S)
+            run.tag.run(WARMUP_S)
             before, busy_s = dict(run.tag.chip.arrivals), WARMUP_S * run.tag.board.busy_share
-            run.go(WARMUP_S + seconds)
+            run.tag.run(WARMUP_S + seconds)
             gone = {key: count - before.get(key, 0) for key, count in run.tag.chip.arrivals.items()}
             heard += gone.pop("heard")
             missed += sum(gone.values())
@@ -116,10 +111,10 @@ def asleep(seeds, fixes):
             settings = {"sleep_ms": 1000 * sleep_s, "superframes": superframes, "predicts": predicts}
             run = Run(seed, site_of(6, None), **settings)
             since_s = 2.5 * sleep_s
-            run.go(since_s)
+            run.tag.run(since_s)
             before = run.tag.chip.receiving_s, run.tag.chip.charge_c
             until_s = since_s + fixes * (sleep_s + 0.08)
-            run.go(until_s)
+            run.tag.run(until_s)
             sums += run.figures(since_s)
             on_s += run.tag.chip.receiving_s - before[0]
             charge_c += run.tag.chip.charge_c - before[1]

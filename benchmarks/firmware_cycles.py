@@ -13,7 +13,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1] / "firmware"))
 
 from emulator.build import build
-from emulator.processor.cycle_table import markdown, measure_cycles
+from emulator.processor.cycle_table import cycle_table
 
 PAGE = Path(__file__).parents[1] / "docs" / "hardware.md"
 PLACE = re.compile(r"(<!-- cycles: benchmarks/firmware_cycles.py --write -->\n).*?(<!-- end -->)", re.DOTALL)
@@ -24,7 +24,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Cycles of the firmware's paths, emulated.")
     parser.add_argument("--write", action="store_true", help="into docs/hardware.md")
     arguments = parser.parse_args()
-    table = markdown(measure_cycles(build("all")))
+    table = cycle_table(build("all"))
     if not arguments.write:
         print(table, end="")
         return

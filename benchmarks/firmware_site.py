@@ -1,14 +1,13 @@
 """A site on the firmware: frames in time, receptions that reach the hosts, errors. Emulated, in virtual time.
 
 python benchmarks/firmware_site.py [--boards image|host] [--slot-ms 2.1 ...] [--seconds 5] [--seeds 4]
-    [--anchors 7] [--usb] [--pauses] [--lead-ms 1.8 ...] [--repeat] [--room]
+    [--anchors 7] [--usb] [--pauses] [--lead-ms 1.8 ...] [--room]
 
 ``image`` is the ARM image on an emulated nRF52832, ``host`` the same C compiled for this computer. The lab's six
 anchors, a seventh in the middle of a short wall, and a tag that walks; the programs are those of ``skyless anchor`` and
 ``skyless tag``. The first second is not judged. ``--usb``: through a debugger's probe. ``--pauses``: hosts need time,
-as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this lead instead of adapting theirs. ``--repeat``: each
-run again with the emulated radio, whose fixes must be the same bit for bit. ``--room``: with a real room's errors of
-survey and ranges, and a tag that wanders.
+as a Raspberry Pi with CPython. ``--lead-ms``: anchors keep to this lead instead of adapting theirs. ``--room``: with a
+real room's errors of survey and ranges, and a tag that wanders.
 """
 
 import argparse
@@ -24,10 +23,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "firmware"))
 
 import numpy as np
 from emulator.build import build
-from emulator.site.emulated_site import EmulatedSite, MakeBoard, SiteResult
+from emulator.seat import MakeBoard
+from emulator.site.emulated_site import EmulatedSite, SiteResult
 from emulator.site.host_board import HostBoard
 from emulator.site.host_programs import HostLatency
-from emulator.site.repeated_site import RepeatedSite
 from emulator.site.serial_wire import WireSettings
 from msgspec.structs import replace
 
@@ -80,13 +79,6 @@ def site_of(
     return EmulatedSite(lab, paths, make, seed=seed, wire=wire, lead_s=lead_s, room=room)
 
 
-def is_repeated(site: EmulatedSite, seconds: float) -> bool:
-    """Whether the emulated radio gives the same frames and the same fixes."""
-    again = RepeatedSite(site)
-    again.run(seconds)
-    return site.sent_frames() == again.sent_frames() and len(site.fixes["tag1"]) > 0 and site.fixes == again.fixes
-
-
 def more_than(least: float, kind: type = float) -> Callable[[str], float]:
     """Reads an argument that must be a number above another."""
 
@@ -102,13 +94,7 @@ def more_than(least: float, kind: type = float) -> Callable[[str], float]:
     return number
 
 
-def show(line: str) -> None:
-    """Replace the line that says how far it is, on a terminal."""
-    if sys.stderr.isatty():
-        print(f"\r\033[K{line}", end="", file=sys.stderr, flush=True)
-
-
-def row(slot_ms: float, lead_ms: float | None, results: list[SiteResult], wall_s: float, repeated: str) -> str:
+def row(slot_ms: float, lead_ms: float | None, results: list[SiteResult], wall_s: float) -> str:
     """A line of the table."""
     sent, late, slots, got, reported, fixes = (
         sum(getattr(result, name) for result in results)
@@ -120,7 +106,7 @@ def row(slot_ms: float, lead_ms: float | None, results: list[SiteResult], wall_s
     return (
         f"| {slot_ms:g} ms | {lead} | {100 * sent / max(slots, 1):.2f} % | {late} "
         f"| {100 * reported / max(got, 1):.2f} % | {100 * min(result.least_reported for result in results):.2f} % "
-        f"| {wrong} | {fixes} | {100 * rms_m:.2f} cm | {repeated} | {wall_s:.0f} s |"
+        f"| {wrong} | {fixes} | {100 * rms_m:.2f} cm | {wall_s:.0f} s |"
     )
 
 
@@ -135,7 +121,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=more_than(0, int), default=4)
     parser.add_argument("--usb", action="store_true")
     parser.add_argument("--pauses", action="store_true")
-    parser.add_argument("--repeat", action="store_true")
     parser.add_argument("--room", action="store_true")
     asked = parser.parse_args()
     for slot_ms in asked.slot_ms:
@@ -147,24 +132,18 @@ def main() -> None:
     make = make_boards(asked.boards)
     pieces = 64 if asked.boards == "host" else 1
     wire = WireSettings(usb=asked.usb, host=HostLatency() if asked.pauses else None, piece_bytes=pieces)
-    heads = "slot | lead | slots with a frame | late | reported | worst node | wrong | fixes | error | repeated | time"
+    heads = "slot | lead | slots with a frame | late | reported | worst node | wrong | fixes | error | time"
     print(f"| {heads} |\n{'|---' * (heads.count('|') + 1)}|")
     for slot_ms in asked.slot_ms:
         lab = lab_of(slot_ms, asked.anchors, in_room=asked.room)
         for lead_ms in asked.lead_ms:
-            results, repeated, begun_s = [], 0, time.perf_counter()
+            results, begun_s = [], time.perf_counter()
             for seed in range(1, asked.seeds + 1):
                 with fixed_lead(fixed=lead_ms is not None):
                     site = site_of(lab, make, seed, wire, lead_ms, Room() if asked.room else None)
-                    what = f"slots of {slot_ms:g} ms, seed {seed} of {asked.seeds}"
-                    site.run(
-                        asked.seconds, lambda now_s, what=what: show(f"{what}: {now_s:.1f} of {asked.seconds:g} s")
-                    )
+                    site.run(asked.seconds)
                     results.append(site.result(_WARMUP_S))
-                    repeated += asked.repeat and is_repeated(site, asked.seconds)
-            same = f"{repeated} of {asked.seeds}" if asked.repeat else "-"
-            show("")
-            print(row(slot_ms, lead_ms, results, time.perf_counter() - begun_s, same), flush=True)
+            print(row(slot_ms, lead_ms, results, time.perf_counter() - begun_s), flush=True)
 
 
 if __name__ == "__main__":

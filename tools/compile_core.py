@@ -69,7 +69,7 @@ def compiled(native: Path, name: str, flags: list[str]) -> Path:
     source, library = native / "skyless_core.c", native / name
     new = library.with_name(f"{library.stem}-{os.getpid()}.so")
     try:
-        _run([*(compiler() or _zig()), *FLAGS, *flags, digest_of(source), str(source), "-o", str(new)])
+        run([*(compiler() or _zig()), *FLAGS, *flags, digest_of(source), str(source), "-o", str(new)])
         new.replace(library)
     finally:
         new.unlink(missing_ok=True)
@@ -88,15 +88,20 @@ def _zig() -> list[str]:
     return [sys.executable, "-m", "ziglang", "cc", "-s", *(["-target", known[0]] if known else ["-mcpu=baseline"])]
 
 
-def _run(command: list[str]) -> None:
+def run(command: list[str], advice: str = ADVICE) -> None:
+    """Run a compiler.
+
+    Raises:
+        SystemExit: there is none, or it failed.
+    """
     with tempfile.TemporaryDirectory() as cache:
         folders = {"ZIG_GLOBAL_CACHE_DIR": cache, "ZIG_LOCAL_CACHE_DIR": cache}
         try:
             done = subprocess.run(command, capture_output=True, text=True, check=False, env=os.environ | folders)
         except OSError as error:
-            raise SystemExit(f"skyless: {command[0]} cannot be run: {error}\n{ADVICE}") from None
+            raise SystemExit(f"skyless: {command[0]} cannot be run: {error}\n{advice}") from None
     if done.returncode:
-        raise SystemExit(f"skyless: this failed: {shlex.join(command)}\n{done.stderr.rstrip()}\n{ADVICE}")
+        raise SystemExit(f"skyless: this failed: {shlex.join(command)}\n{done.stderr.rstrip()}\n{advice}")
 
 
 if __name__ == "__main__":

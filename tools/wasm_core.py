@@ -3,11 +3,10 @@
 python tools/wasm_core.py [FILE.wasm]          # without a name that of the page, which is committed
 """
 
-import subprocess
 import sys
 from pathlib import Path
 
-from compile_core import NATIVE, digest_of
+from compile_core import NATIVE, digest_of, run
 
 FLAGS = [
     "--target=wasm32", "-nostdlib", "-ffreestanding", "-std=c99", "-Os", "-ffp-contract=off", "-fno-math-errno",
@@ -19,18 +18,9 @@ PAGE = Path(__file__).parents[1] / "src/skyless/page/browser/skyless_core.wasm"
 
 
 def build(wasm: Path, *more: str) -> None:
-    """Compile, with more options.
-
-    Raises:
-        SystemExit: there is no clang, or it failed.
-    """
+    """Compile, with more options. Raises SystemExit."""
     source = Path(__file__).parents[1] / NATIVE / "skyless_core.c"
-    try:
-        done = subprocess.run(["clang", *FLAGS, *more, digest_of(source), str(source), "-o", str(wasm)], check=False)
-    except OSError as error:
-        raise SystemExit(f"skyless: clang cannot be run: {error}; on Debian: apt install clang lld") from None
-    if done.returncode:
-        raise SystemExit("skyless: clang failed (see above)")
+    run(["clang", *FLAGS, *more, digest_of(source), str(source), "-o", str(wasm)], "Debian: apt install clang lld")
 
 
 if __name__ == "__main__":

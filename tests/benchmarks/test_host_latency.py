@@ -32,7 +32,7 @@ def test_a_host_that_is_much_too_slow_skips_slots_and_sends_no_frame_with_a_wron
 
 
 def test_a_host_without_latency_skips_nothing_and_a_run_repeats_itself():
-    results = [run_hosts(5e-3, HostLatency.none(), 5.0) for _ in range(2)]
+    results = [run_hosts(5e-3, HostLatency(0.0, 0.0, 0.0, 0.0, 0.0), 5.0) for _ in range(2)]
     assert results[0] == results[1]
     assert results[0].skipped == 0.0
     assert results[0].late == results[0].misused == 0

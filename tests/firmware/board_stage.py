@@ -6,7 +6,7 @@ from itertools import count
 import pytest
 from chip_stage import HandClock
 from cobs import cobs
-from emulator.board_library import CBoard
+from emulator.board_library import CBoard, Processor
 from emulator.build import HAS_HOST_COMPILER
 
 from skyless.core.air.ieee802154 import after_rmarker_s, fcs
@@ -38,7 +38,7 @@ def frame_of(body):
     return bytes(body) + fcs(bytes(body))
 
 
-class Bus:
+class Bus(Processor):
     """Hardware on a model of the chip: transfers and pauses take time, the line is two buffers."""
 
     def __init__(self, air, chip):
@@ -46,9 +46,9 @@ class Bus:
         self.hz = SLOW_HZ
         self.to_board, self.from_board = bytearray(), bytearray()
         self.transactions = []
-        self.restarts = self.lights = 0
+        self.restarts = 0
         self.room = 1 << 30
-        self.settings, self.advertised = None, []
+        self.advertised = []
         self.stuck = None
         """What the interrupt line shows whatever the chip does; None where it works."""
         self.present = True
@@ -91,17 +91,8 @@ class Bus:
         self.restarts += 1
         self.to_board.clear()
 
-    def show(self, lights):
-        self.lights = lights
-
     def sleep_for(self, milliseconds):
         self.air.pass_s(1e-3 * milliseconds)
-
-    def read_settings(self):
-        return self.settings
-
-    def write_settings(self, settings):
-        self.settings = settings
 
     def advertise(self, data):
         self.advertised.append(data)

@@ -3,8 +3,8 @@
 import ctypes
 
 from emulator.build import build
-from emulator.processor.cortex_m4 import RAM_BASE, Core, functions_of, load_elf, objects_of
-from emulator.processor.cycles import spent_at
+from emulator.processor.cortex_m4 import RAM_BASE, Core
+from emulator.processor.elf import code_of, symbols_of
 
 _SYSTEM_CONTROL = (0xE000E000, 0x1000)
 _FLASH_CONTROL = (0x4001E000, 0x1000)
@@ -17,10 +17,9 @@ class BoardCore:
 
     def __init__(self):
         self.elf = build("core")
-        self._at = {name: at for at, _, name in objects_of(self.elf)}
-        code = load_elf(self.elf)
-        self._stack_bytes = int.from_bytes(code[:4], "little") - RAM_BASE
-        self.processor = Core(code, [_FLASH_CONTROL, _SYSTEM_CONTROL], self._load, self._store)
+        self._at = {name: at for at, _, name in symbols_of(self.elf)}
+        self._stack_bytes = int.from_bytes(code_of(self.elf)[:4], "little") - RAM_BASE
+        self.processor = Core(self.elf, [_FLASH_CONTROL, _SYSTEM_CONTROL], self._load, self._store)
         assert self.processor.run(_FOREVER) == "sleep"
 
     def _load(self, _address, _size):
@@ -55,7 +54,6 @@ class BoardCore:
 
     def cycles_by_function(self):
         """Since they were last asked for, the most first."""
-        spent = spent_at(self.processor.state)
-        found = {name: int(spent[at // 2 : (at + size) // 2].sum()) for at, size, name in functions_of(self.elf)}
-        spent[:] = 0
-        return dict(sorted(found.items(), key=lambda one: -one[1]))
+        found = self.processor.cycles_by_function()
+        self.processor.forget_spent()
+        return found

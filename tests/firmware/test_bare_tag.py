@@ -31,7 +31,7 @@ def words(data):
 
 
 def is_sound(stage):
-    return stage.image.misuse.total() == stage.chip.misuse.total() == len(stage.image.faults) == 0
+    return stage.image.misuse.total() == stage.chip.misuse.total() == len(stage.image.core.faults) == 0
 
 
 # Sleep

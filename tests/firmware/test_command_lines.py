@@ -1,13 +1,14 @@
 """``skyless anchor`` and ``skyless tag`` by their command lines, on a whole site of boards in virtual time."""
 
+import asyncio
+
 import msgspec
 import pytest
-from emulator.site.command_site import CommandSite, program_of
 from emulator.site.emulated_site import EmulatedSite
 from site_stage import HOST, boards, wire_of
 
-from skyless.cli.main import main
-from skyless.core.errors import SkylessError
+from skyless.cli.main import main, program
+from skyless.run import process
 from skyless.run.mqtt.messages import FixMessage
 from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.trajectory import Static
@@ -30,23 +31,28 @@ def file(tmp_path_factory):
 
 @pytest.mark.parametrize("kind", [HOST])
 @pytest.mark.statistical
-def test_the_commands_give_the_fixes_that_their_classes_give(kind, file, capfd):
+def test_the_commands_give_the_fixes_that_their_classes_give(kind, file, capfd, monkeypatch):
+    """A command runs its program on a loop of its own, until Ctrl-C; here it gives it to the site's loop instead."""
     site = load_site(file)
     of_classes = EmulatedSite(site, PATHS, boards(kind), wire=wire_of(kind))
     of_classes.run(SECONDS)
     capfd.readouterr()
-    of_commands = CommandSite(file, PATHS, boards(kind), wire=wire_of(kind))
+    given = []
+    monkeypatch.setattr(process, "run", lambda main, **_: given.append(main))
+
+    class OfCommands(EmulatedSite):
+        def start_host(self, node):
+            is_anchor = node in self.anchors
+            words = ["anchor", node.name, "--site", file] if is_anchor else ["tag", node.name, "--json"]
+            words += [] if is_anchor else ["--publish-hz", "1000"]
+            program()([*map(str, words), "--radio", f"serial:{node.wire.path}", "--mqtt", "none"])
+            node.task = asyncio.ensure_future(given.pop())
+
+    of_commands = OfCommands(site, PATHS, boards(kind), wire=wire_of(kind))
     of_commands.run(SECONDS)
     printed, said = capfd.readouterr()
     fixes = [msgspec.json.decode(line, type=FixMessage) for line in printed.splitlines()]
     assert len(fixes) > 20
     assert fixes == [fix for fix, _ in of_classes.fixes["tag1"]]
-    assert of_commands.sent_frames() == of_classes.sent_frames()
+    assert of_commands.sent == of_classes.sent
     assert all(f"anchor {anchor.id}" in said for anchor in site.anchors)
-
-
-def test_a_command_line_that_is_wrong_is_refused_as_at_a_shell():
-    with pytest.raises(SkylessError, match="IDS is 99"):
-        program_of(["anchor", "99", "--radio", "serial:/dev/null"])
-    with pytest.raises(ValueError, match="runs 0 programs"):
-        program_of(["site", "--help"])

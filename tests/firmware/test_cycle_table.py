@@ -8,7 +8,7 @@ from processor_stage import needs_processor
 
 pytest.importorskip("unicorn")
 
-from emulator.processor.cycle_table import markdown, measure_cycles
+from emulator.processor.cycle_table import cycle_table
 
 pytestmark = pytest.mark.statistical
 
@@ -23,7 +23,7 @@ def figures(text):
 
 @pytest.fixture(scope="module")
 def measured():
-    return figures(markdown(measure_cycles(build("all"))))
+    return figures(cycle_table(build("all")))
 
 
 @needs_processor

@@ -4,7 +4,6 @@ The programs are those of ``skyless anchor`` and ``skyless tag``, behind pseudo-
 """
 
 import pytest
-from emulator.site.repeated_site import RepeatedSite
 from site_stage import KINDS, site_of
 
 from skyless.sim.compile_ahead import compile_kernels
@@ -25,36 +24,24 @@ def ran(request):
     """Six anchors and a tag that walks, in slots of 2.1 ms."""
     site = site_of(request.param, 2.1)
     site.run(SECONDS[request.param])
-    return site, SECONDS[request.param]
+    return site
 
 
-@pytest.mark.statistical
 def test_frames_are_sent_in_time_and_receptions_are_reported_with_the_right_stamps(ran):
-    site, _ = ran
-    result = site.result(WARMUP_S)
+    result = ran.result(WARMUP_S)
     assert result.slots > 250
     assert result.sent >= 0.995 * result.slots
     assert result.reported >= 0.99 * result.at_antennas
     assert result.wrong == 0
     assert not result.misused
-    for node in site.nodes:
+    for node in ran.nodes:
         assert not +node.radio.counters
         assert set(node.chip.arrivals) == {"heard"}
 
 
-def test_fixes_are_those_of_the_emulated_radio_bit_for_bit(ran):
-    site, seconds = ran
-    again = RepeatedSite(site)
-    again.run(seconds)
-    assert again.sent_frames() == site.sent_frames()
-    fixes = site.fixes["tag1"]
-    assert len(fixes) > 250
-    assert again.fixes["tag1"] == fixes
-
-
 def test_the_tag_is_where_the_fixes_are(ran):
-    site, _ = ran
-    assert site.result(WARMUP_S).rms_m < 0.05
+    assert len(ran.fixes["tag1"]) > 250
+    assert ran.result(WARMUP_S).rms_m < 0.05
 
 
 @pytest.mark.parametrize("kind", KINDS[:1])
@@ -63,6 +50,6 @@ def test_a_seed_gives_the_same_run_each_time(kind):
     for _ in range(2):
         site = site_of(kind, 2.1, seed=3)
         site.run(0.4)
-        runs.append((site.sent_frames(), site.fixes["tag1"], [node.radio.instants for node in site.nodes], site.log))
+        runs.append((site.sent, site.fixes["tag1"], [node.radio.heard for node in site.nodes], site.log))
     assert len(runs[0][0]) > 50
     assert runs[0] == runs[1]

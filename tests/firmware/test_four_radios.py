@@ -9,6 +9,7 @@ from collections import Counter
 import msgspec
 import pytest
 from chip_stage import TimedNode, WorldAir
+from emulator.seat import Seat
 from radio_events import fixes_of
 from site_stage import KINDS, boards
 
@@ -85,9 +86,7 @@ def over_a_board(kind, tape):
     events, counters = [], Counter()
     lines = []
     session = LinkSession("the line", DELAYS, lines.append, events.append, counters, phases=True)
-    board = boards(kind)(
-        timeline, chip, lambda data: talk(session.on_data, data), can_transmit=False, identity=bytes(8)
-    )
+    board = boards(kind)(Seat(timeline, chip, lambda data: talk(session.on_data, data)))
     first_s = tape[0].host_s
 
     def talk(call, *values):

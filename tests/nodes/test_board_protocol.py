@@ -75,7 +75,7 @@ class Host:
 
     def ready(self):
         self.say(self.writer.config(DELAY, DELAY))
-        self.say(self.writer.rx_on())
+        self.say(self.writer.record(link.RX_ON))
         return self
 
 
@@ -83,19 +83,19 @@ def test_it_greets_and_is_configured_step_by_step():
     host = Host(can_transmit=False)
     (hello,) = host.say(host.writer.ask_hello())
     assert hello == Hello(1, 3, (0, 0, 0), b"a board ", 63_897_600, 40, False, 0, True, True)
-    (status,) = host.say(host.writer.ask_status())
+    (status,) = host.say(host.writer.record(link.ASK_STATUS))
     assert (status.ticks, status.configured, status.receiving) == (77, False, False)
-    assert host.say(host.writer.rx_on()) == [NotDone(link.RX_ON, link.REFUSED_MALFORMED)]
+    assert host.say(host.writer.record(link.RX_ON)) == [NotDone(link.RX_ON, link.REFUSED_MALFORMED)]
     (status,) = host.say(host.writer.config(DELAY, DELAY))
     assert (status.configured, status.receiving) == (True, False)
     host.board.on_radio_event(Reception(b"not wanted yet", 5))
-    (status,) = host.say(host.writer.rx_on())
+    (status,) = host.say(host.writer.record(link.RX_ON))
     assert (status.configured, status.receiving, status.received) == (True, True, 0)
     host.said.clear()
     host.board.on_radio_event(Restarted())
     (hello,) = host.said
     assert isinstance(hello, Hello)
-    (status,) = host.say(host.writer.ask_status())
+    (status,) = host.say(host.writer.record(link.ASK_STATUS))
     assert not status.configured
 
 
@@ -103,7 +103,7 @@ def test_it_greets_and_is_configured_step_by_step():
 def test_phases_are_reported_where_the_host_wants_them(flags):
     host = Host()
     host.say(host.writer.config(DELAY, DELAY, flags))
-    host.say(host.writer.rx_on())
+    host.say(host.writer.record(link.RX_ON))
     host.said.clear()
     for phase_cycles in (0.75, None, 0.999_999_9):
         host.board.on_radio_event(Reception(b"frame", 5, carrier_phase_cycles=phase_cycles))
@@ -134,7 +134,7 @@ def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later()
     host.board.on_radio_event(Late(512 + DELAY))
     assert host.said == [TooLate(512, link.LATE_FOR_RADIO)]
     host.board.on_radio_event(Sent(5))  # none of its own
-    (status,) = host.say(host.writer.ask_status())
+    (status,) = host.say(host.writer.record(link.ASK_STATUS))
     assert (status.sent, status.late) == (1, 2)
     for wrong in (b"", b"\0\0", frame[:-1] + b"\1", frame_of(bytes(126))):
         assert host.say(host.writer.tx_at(512, wrong)) == [NotDone(link.TX_AT, link.REFUSED_MALFORMED)]
@@ -151,7 +151,7 @@ def test_a_board_whose_radio_is_dead_logs_nothing_and_one_that_is_not_fetched_co
     host.full = True
     host.board.on_radio_event(Reception(b"lost", 5))
     host.full = False
-    (status,) = host.say(host.writer.ask_status())
+    (status,) = host.say(host.writer.record(link.ASK_STATUS))
     assert isinstance(status, Status)
     assert (status.received, status.unsent_records) == (1, 1)
 
@@ -164,7 +164,7 @@ def test_garbage_from_the_host_is_counted_and_hurts_nothing():
         host.board.on_host_data(rng.randbytes(rng.randrange(200)) + b"\0" + bytes(record))
     host.board.on_host_data(b"\0")
     host.say(host.writer.record(0x7F))
-    (status,) = host.say(host.writer.ask_status())
+    (status,) = host.say(host.writer.record(link.ASK_STATUS))
     assert status.receiving
     assert status.garbled > 900
     assert host.radio.transmissions == []

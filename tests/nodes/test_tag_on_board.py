@@ -44,7 +44,7 @@ async def test_fixes_states_and_alerts_of_a_board_are_published_and_written_as_l
                 board.report(serial_link.FIX, fix_in_c(levels=2, is_verified=True).sent())
                 board.report(serial_link.TAG_STATUS, bytes(StatusInC(SITE, 5, 0, 200, 150, 7, 2, 9)))
                 await until(lambda: fixes and fixes[-1].alert == "detected-not-excluded")
-                await until(lambda: healths[-1].counters)
+                await until(lambda: healths[-1].fixes == 2 and healths[-1].counters)
                 lines = [json.loads(await process.stdout.readline()) for _ in range(2)]
     finally:
         await broker.stop()

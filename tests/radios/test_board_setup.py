@@ -13,7 +13,7 @@ from skyless.radio.serial import link
 from skyless.radio.serial.board_settings import BoardSettings
 from skyless.radio.serial.board_setup import set_up
 from skyless.radio.serial.link import TagConfig
-from skyless.radio.serial.serial_radio import Computing, SerialRadio, until_next_start
+from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, Computing, SerialRadio
 from skyless.radio.tag_reports import BoardFix, Reported
 from skyless.run.board_tag import BoardTag
 from support.board_tag import ANCHORS
@@ -28,25 +28,25 @@ class Worn(BoardTag):
 
 
 def serial(board):
-    return SerialRadio(board.pty.name, BAUD, "tag1", computing=Computing(until_next_start, keeps=False))
+    return SerialRadio(board.pty.name, BAUD, "tag1", computing=UNTIL_NEXT_START)
 
 
-def found(board, change=None, bauds=(BAUD,)):
-    return set_up(board.pty.name, bauds, Computing(change or (lambda held: held), keeps=change is not None))
+def found(board, changes=(), bauds=(BAUD,)):
+    return set_up(board.pty.name, bauds, Computing(dict(changes), keeps=bool(changes)))
 
 
 async def test_settings_are_read_changed_and_kept():
     async with ComputingBoard() as board:
         assert await found(board) == TagConfig(BoardSettings(), in_flash=True)
         wanted = BoardSettings(mode=1, tag=9)
-        assert await found(board, lambda _: wanted) == TagConfig(wanted, in_flash=True)
+        assert await found(board, {"mode": 1, "tag": 9}) == TagConfig(wanted, in_flash=True)
         assert board.tag.flash == wanted
 
 
 async def test_a_board_that_cannot_be_set_up_is_named_in_words():
     async with ComputingBoard() as board:
         with pytest.raises(SkylessError, match="refuses its configuration: it has not these settings"):
-            await found(board, lambda _: BoardSettings(mode=1, output=1))  # NMEA, which no emulated board writes
+            await found(board, {"mode": 1, "output": 1})  # NMEA, which no emulated board writes
     async with PlayedBoard() as board:
         with pytest.raises(SkylessError, match="computes no positions"):
             await found(board)
@@ -54,7 +54,7 @@ async def test_a_board_that_cannot_be_set_up_is_named_in_words():
         with pytest.raises(SkylessError, match="no board of Skyless answers"):
             await found(board)
     with pytest.raises(SkylessError, match="there is no /dev/nothing"):
-        await set_up("/dev/nothing", (BAUD,), Computing(until_next_start, keeps=True))
+        await set_up("/dev/nothing", (BAUD,), UNTIL_NEXT_START)
 
 
 async def test_a_rate_that_fails_is_followed_by_the_next():

@@ -61,9 +61,9 @@ def makers_of(writer):
     yield lambda: writer.tx_late(ticks, 1)
     yield lambda: writer.status(ticks, 3, [1, 2, 3, 4, 5, 6])
     yield lambda: writer.hello((0, 1, 0), bytes(8), 1)
-    yield lambda: writer.refused(link.CONFIG, 1)
+    yield lambda: writer.record(link.REFUSED, bytes((link.CONFIG, 1)))
     yield writer.ask_hello
-    yield writer.rx_on
+    yield lambda: writer.record(link.RX_ON)
     yield lambda: writer.config(16436, 16436)
     yield lambda: writer.tx_at(ticks, frame)
 
@@ -160,7 +160,7 @@ def test_lengths_are_the_documented_ones_and_numbers_run_round():
     (record,), _ = read(writer.status(0, 1, [2**30] * 6))
     assert len(record) == link.STATUS_BYTES
     assert record[8:12] == bytes(4)
-    numbers = [read(writer.rx_on())[0][0][1] for _ in range(300)]
+    numbers = [read(writer.record(link.RX_ON))[0][0][1] for _ in range(300)]
     assert numbers == [(2 + number) % 256 for number in range(300)]
 
 

@@ -162,8 +162,8 @@ def test_lost_copied_unknown_malformed_and_garbled_records_are_counted():
     talk.hear(talk.board.rx(1, 0, 0, 0, frame))
     line = talk.board.rx(2, 0, 0, 0, frame)
     talk.hear(line + line)
-    talk.board.rx_on()  # two that never arrive
-    talk.board.rx_on()
+    talk.board.record(link.RX_ON)  # two that never arrive
+    talk.board.record(link.RX_ON)
     talk.hear(talk.board.rx(3, 0, 0, 0, frame))
     talk.hear(talk.board.record(0x3F))
     talk.hear(talk.board.rx(3, 0, 0, 0, b""))
@@ -214,8 +214,8 @@ def test_a_board_of_another_major_version_is_refused_once_and_taken_when_it_has_
 def test_a_board_that_refuses_its_configuration_or_counts_otherwise_cannot_be_used():
     talk = Talk()
     talk.hello()
-    talk.hear(talk.board.refused(link.CONFIG, link.REFUSED_SETTING))
-    talk.hear(talk.board.refused(link.TX_AT, link.REFUSED_MALFORMED))
+    talk.hear(talk.board.record(link.REFUSED, bytes((link.CONFIG, link.REFUSED_SETTING))))
+    talk.hear(talk.board.record(link.REFUSED, bytes((link.TX_AT, link.REFUSED_MALFORMED))))
     assert [type(event) for event in talk.events] == [Gone]
     assert "refuses its configuration" in talk.events[0].reason
     assert talk.counters == {"refused-command": 1}
@@ -229,14 +229,14 @@ def test_a_board_whose_radio_does_not_start_is_reported_of_once_and_taken_when_i
     talk = Talk()
     for _ in range(4):
         talk.hello()
-        talk.hear(talk.board.refused(link.CONFIG, link.REFUSED_RADIO))
+        talk.hear(talk.board.record(link.REFUSED, bytes((link.CONFIG, link.REFUSED_RADIO))))
         talk.poll(STATUS_S)
     gone = Gone("the board at /dev/board refuses its configuration: its radio does not answer or start")
     assert talk.events == [gone]
     talk.hello()
     talk.status()
     assert talk.events == [gone, Restarted()]
-    talk.hear(talk.board.refused(link.CONFIG, link.REFUSED_RADIO))
+    talk.hear(talk.board.record(link.REFUSED, bytes((link.CONFIG, link.REFUSED_RADIO))))
     assert talk.events == [gone, Restarted(), gone]
 
 

@@ -6,6 +6,7 @@ fault in that handler is a lockup. Exception returns are not modelled, since the
 """
 
 import ctypes
+import re
 import struct
 from collections.abc import Callable
 from pathlib import Path
@@ -27,11 +28,12 @@ from unicorn import (
 from unicorn import arm_const as arm
 
 from emulator.processor import cycles as c
+from emulator.processor.elf import code_of, symbols_of
 from emulator.processor.unicorn_library import hook_blocks, map_window
 
 RAM_BASE: Final = 0x20000000
 RAM_BYTES: Final = 64 * 1024
-FLASH_BYTES: Final = c.FLASH_BYTES
+FLASH_BYTES: Final = 512 * 1024
 
 _WFI: Final = b"\x30\xbf"
 _NEVER: Final = 0xFFFFFFFE
@@ -59,12 +61,13 @@ class EmulationError(Exception):
 class Core:
     """Processor, flash and RAM. ``windows`` are base and size of what ``read`` and ``write`` answer for."""
 
-    def __init__(self, code: bytes, windows: list[tuple[int, int]], read: Read, write: Write) -> None:
+    def __init__(self, elf: Path, windows: list[tuple[int, int]], read: Read, write: Write) -> None:
         self.faults: list[str] = []
         """Every fault since power-on, with the address of the instruction."""
         self.hfsr = self.cfsr = self.bfar = 0
-        self._code, self._windows, self._read, self._write = code, windows, read, write
-        self.state = c.make_state(code)
+        self._elf, self._windows, self._read, self._write = elf, windows, read, write
+        self._code = code_of(elf)
+        self.state = c.make_state(elf, len(self._code))
         self.ram = (ctypes.c_uint8 * RAM_BYTES)()
         self._in_fault = False
         self.reset(keep_ram=False)
@@ -87,6 +90,16 @@ class Core:
     def spend(self, cycles: int) -> None:
         """Let the processor wait."""
         self.state[c.CYCLES] += cycles
+
+    def cycles_by_function(self) -> dict[str, int]:
+        """Cycles spent in each function since they were last forgotten, waits for peripherals apart; the most first."""
+        spent = c.spent_at(self.state)
+        found = [(int(spent[at >> 1 : (at + size) >> 1].sum()), name) for at, size, name in symbols_of(self._elf)]
+        return {name: cycles for cycles, name in sorted(found, reverse=True) if cycles}
+
+    def forget_spent(self) -> None:
+        """Count the cycles of functions from now on."""
+        c.spent_at(self.state)[:] = 0
 
     def use_cache(self, on: bool) -> None:
         """Switch the instruction cache."""
@@ -136,7 +149,7 @@ class Core:
     def unused_stack_bytes(self) -> int:
         """What lies between the data and the stack's deepest end since power-on."""
         stack_top = struct.unpack_from("<I", self._code)[0] - RAM_BASE
-        return max(map(len, _stretches(bytes(self.ram[:stack_top]))))
+        return max(map(len, re.split(rb"[^%c]" % _GARBAGE, bytes(self.ram[:stack_top]))))
 
     # Running
 
@@ -251,79 +264,3 @@ class Core:
         self._next = int.from_bytes(self._code[_HARD_FAULT_VECTOR : _HARD_FAULT_VECTOR + 4], "little") & ~1
         self.spend(12)
         return True
-
-
-def _stretches(ram: bytes) -> list[bytes]:
-    """Runs of bytes that nothing has written."""
-    return ram.translate(bytes(0 if value == _GARBAGE else 1 for value in range(256))).split(b"\x01")
-
-
-def load_elf(path: Path) -> bytes:
-    """The flash's contents from address 0: all segments of an ELF file at their load addresses.
-
-    Raises:
-        EmulationError: it is not an executable for this processor.
-    """
-    data = _read_elf(path)
-    code = bytearray()
-    table, width, count = (struct.unpack_from("<" + kind, data, at)[0] for kind, at in _PROGRAM_HEADERS)
-    for row in range(count):
-        kind, offset, _, address, size = struct.unpack_from("<5I", data, table + row * width)
-        if kind != 1 or size == 0:
-            continue
-        if address + size > FLASH_BYTES:
-            raise EmulationError(f"{path} has a segment at 0x{address:08x}, which is not in the flash")
-        code += b"\xff" * (address + size - len(code))
-        code[address : address + size] = data[offset : offset + size]
-    if len(code) < 16:
-        raise EmulationError(f"{path} has no vectors at address 0")
-    return bytes(code)
-
-
-def functions_of(path: Path) -> list[tuple[int, int, str]]:
-    """Address, size in bytes and name of every function of an ELF file, in order of their addresses.
-
-    Raises:
-        EmulationError: it is not an executable for this processor.
-    """
-    return [(address & ~1, size, name) for address, size, name in _symbols_of(path, _FUNCTION)]
-
-
-def objects_of(path: Path) -> list[tuple[int, int, str]]:
-    """The same of every variable.
-
-    Raises:
-        EmulationError: it is not an executable for this processor.
-    """
-    return _symbols_of(path, _OBJECT)
-
-
-def _symbols_of(path: Path, wanted: int) -> list[tuple[int, int, str]]:
-    data = _read_elf(path)
-    found: set[tuple[int, int, str]] = set()
-    table, width, count = (struct.unpack_from("<" + kind, data, at)[0] for kind, at in _SECTION_HEADERS)
-    sections = [struct.unpack_from("<10I", data, table + row * width) for row in range(count)]
-    for _, kind, _, _, offset, size, link, *_ in sections:
-        if kind != 2:
-            continue
-        names = sections[link][4]
-        for at in range(offset, offset + size, 16):
-            name, address, length, info = struct.unpack_from("<IIIB", data, at)
-            if info & 15 == wanted and length:
-                end = data.index(b"\0", names + name)
-                found.add((address, length, data[names + name : end].decode()))
-    return sorted(found)
-
-
-_OBJECT: Final = 1
-_FUNCTION: Final = 2
-_PROGRAM_HEADERS: Final = (("I", 28), ("H", 42), ("H", 44))
-_SECTION_HEADERS: Final = (("I", 32), ("H", 46), ("H", 48))
-"""Type and offset of the tables' address, entry size and count in an ELF file's header."""
-
-
-def _read_elf(path: Path) -> bytes:
-    data = path.read_bytes()
-    if len(data) < 52 or data[:6] != b"\x7fELF\x01\x01" or struct.unpack_from("<H", data, 18)[0] != 40:
-        raise EmulationError(f"{path} is not a 32-bit ELF file for Arm, little-endian")
-    return data

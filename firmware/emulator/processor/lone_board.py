@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Final
 
 from emulator.processor.nrf52832 import Image
-from skyless.core.constants import TICK_RATE_HZ
+from emulator.seat import Seat
+from skyless.core.constants import TICK_S
 from skyless.core.ticks import from_seconds, wrap
 from skyless.radio.interface import AntennaDelays
 from skyless.sim.dw1000.chip import Chip
@@ -15,49 +16,21 @@ DELAYS: Final = AntennaDelays(16_500, 16_300)
 IDENTITY: Final = b"identity"
 
 
-class LoneAir:
-    """An air with one antenna, whose counter is true time."""
-
-    def __init__(self) -> None:
-        self.timeline: Timeline[None] = Timeline()
-        self.sent: list[tuple[bytes, int]] = []
-
-    def now_ticks(self) -> int:
-        """The counter."""
-        return wrap(self.timeline.now_ticks)
-
-    def now_s(self) -> float:
-        """True time."""
-        return self.timeline.now_ticks / TICK_RATE_HZ
-
-    def transmit(self, frame: bytes, leaves_ticks: int) -> bool:
-        """Note a frame and its stamp."""
-        self.sent.append((frame, leaves_ticks))
-        return True
-
-    def withdraw(self) -> None:
-        """The last frame will not be sent."""
-        self.sent.pop()
-
-
 class LoneBoard:
-    """One image on a line of 1 Mbaud."""
+    """One image on a line of 1 Mbaud, and the air, whose counter is true time."""
 
     def __init__(self, elf: Path, *, can_transmit: bool = True, clock_ppm: float = 0.0) -> None:
-        self.air = LoneAir()
-        self.timeline = self.air.timeline
-        self.chip = Chip(self.air, DELAYS.tx_ticks, DELAYS.rx_ticks, self.air.now_s)
+        self.timeline: Timeline[None] = Timeline()
+        self.chip = Chip(self, DELAYS.tx_ticks, DELAYS.rx_ticks, self.now_s)
+        self.frames: list[tuple[bytes, int]] = []
+        """What is on the air, with its stamp."""
         self.lines: list[tuple[float, bytes]] = []
         """What has come, with its time in µs."""
-        self.image = Image(
-            self.timeline,
-            self.chip,
-            lambda data: self.lines.append((1e6 * self.air.now_s(), data)),
-            elf=elf,
-            can_transmit=can_transmit,
-            identity=IDENTITY,
-            clock_ppm=clock_ppm,
-        )
+        seat = Seat(self.timeline, self.chip, self._note, can_transmit, IDENTITY)
+        self.image = Image(seat, elf=elf, clock_ppm=clock_ppm)
+
+    def _note(self, data: bytes) -> None:
+        self.lines.append((1e6 * self.now_s(), data))
 
     @property
     def sent(self) -> bytes:
@@ -74,4 +47,23 @@ class LoneBoard:
         for at, byte in enumerate(data):
             ticks = self.timeline.now_ticks + from_seconds((at + 1) * gap_s)
             self.timeline.at(ticks, partial(self.image.receive, bytes((byte,))))
-        return 1e6 * (self.air.now_s() + len(data) * gap_s)
+        return 1e6 * (self.now_s() + len(data) * gap_s)
+
+    # The chip's air
+
+    def now_ticks(self) -> int:
+        """The counter."""
+        return wrap(self.timeline.now_ticks)
+
+    def now_s(self) -> float:
+        """True time."""
+        return self.timeline.now_ticks * TICK_S
+
+    def transmit(self, frame: bytes, leaves_ticks: int) -> bool:
+        """Note a frame and its stamp."""
+        self.frames.append((frame, leaves_ticks))
+        return True
+
+    def withdraw(self) -> None:
+        """The last frame will not be sent."""
+        self.frames.pop()

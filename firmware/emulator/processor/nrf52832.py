@@ -1,6 +1,6 @@
 """A DWM1001 that executes the firmware's image: an nRF52832 with a DW1000 on its SPI, in true time.
 
-    image = Image(timeline, chip, send, elf=path, can_transmit=True, identity=bytes(8))
+    image = Image(Seat(timeline, chip, send, can_transmit=True), elf=path)
 
 The processor's costs and what is assumed of them: ``cycles.py``. Its peripherals: ``peripherals.py`` and
 ``serial_peripherals.py``. WFI ends 3 µs after the interrupt that ends it (assumed; the specification gives about that
@@ -10,21 +10,18 @@ for a regulator and a clock that have to start). The 64 MHz clock is exact but f
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Final
-
-from msgspec import Struct
+from typing import Final
 
 from emulator.processor import peripherals as p
-from emulator.processor.cortex_m4 import Core, EmulationError, functions_of, load_elf
-from emulator.processor.cycles import CPU_HZ, CYCLES, spent_at
-from emulator.processor.paths import PathCost, Paths
+from emulator.processor.cortex_m4 import Core, EmulationError
+from emulator.processor.cycles import CPU_HZ, CYCLES
+from emulator.processor.paths import Paths
 from emulator.processor.processors import MIN_TICKS, TICKS_PER_CYCLE, Processors
 from emulator.processor.radio import OnAir, Radio
 from emulator.processor.serial_peripherals import Spim, Uarte
+from emulator.seat import Seat
 from skyless.core.constants import TICK_S
-from skyless.sim.dw1000.chip import Chip
 from skyless.sim.dw1000.registers import SYS_CTRL, SYS_STATUS
-from skyless.sim.medium import Timeline
 
 WAKE_UP_CYCLES: Final = 3 * 64
 _LOCKUP_RESET_CYCLES: Final = 64
@@ -56,58 +53,30 @@ _READS_STATUS: Final = bytes((SYS_STATUS.file,))
 _COMMANDS: Final = bytes((0x80 | SYS_CTRL.file,))
 
 
-class Latency(Struct, frozen=True):
-    """From a rise of the chip's interrupt line until the firmware begins to read SYS_STATUS, in s of true time."""
-
-    count: int
-    mean_s: float
-    most_s: float
-
-
 class Image:
-    """A board of the emulated site (``Board`` of ``site.py``): this one executes the ELF file's machine code."""
+    """A board that executes an ELF file's machine code; what is not modelled raises EmulationError when it is used."""
 
-    def __init__(
-        self,
-        timeline: "Timeline[Any]",
-        chip: Chip,
-        send: Callable[[bytes], None],
-        *,
-        elf: Path,
-        can_transmit: bool,
-        identity: bytes,
-        clock_ppm: float = 0.0,
-    ) -> None:
-        """``send`` gets bytes when they have left the UART's pin completely.
-
-        Without ``can_transmit`` the role's pin is connected to ground.
-
-        Raises:
-            EmulationError: the file is no image for this processor, here or where the firmware uses what is not
-                modelled.
-            ValueError: ``identity`` has not 8 bytes.
-        """
-        if len(identity) != 8:
-            raise ValueError("a board's identity has 8 bytes")
+    def __init__(self, seat: Seat, *, elf: Path, clock_ppm: float = 0.0) -> None:
         self.misuse: Counter[str] = Counter()
         """What the firmware did to its processor that the specification forbids, and bytes that it lost."""
         self.resets: Counter[str] = Counter()
         """Resets after the first start, by their cause."""
-        self._timeline, self._chip, self._send = timeline, chip, send
-        self._can_transmit, self._identity, self._elf = can_transmit, identity, elf
+        self._seat, self._timeline, self._chip = seat, seat.timeline, seat.chip
         self._ticks_per_cycle = TICKS_PER_CYCLE * (1 + 1e-6 * clock_ppm)
-        self._processors = Processors.of(timeline)
-        self._epoch_ticks = timeline.now_ticks
-        self._paths = Paths()
+        self._processors = Processors.of(seat.timeline)
+        self._epoch_ticks = seat.timeline.now_ticks
+        self.paths = Paths()
         self._irq_was_high = False
         self._rise_ticks: int | None = None
-        self._latency = (0, 0, 0)
-        self._executing = self._asleep = self._holds_chip = False
+        self.worst_latency_s = 0.0
+        """From a rise of the chip's interrupt line until the firmware began to read SYS_STATUS, in s of true time."""
+        self._executing = self.is_asleep = self._holds_chip = False
         self._asleep_since = self._slept_cycles = 0
         self._life = 0
         self.advertised: list[OnAir] = []
         """What has left the Bluetooth antenna."""
-        self.core = Core(load_elf(elf), _WINDOWS, self._read, self._write)
+        self.core = Core(elf, _WINDOWS, self._read, self._write)
+        self.load, self.store = self.core.load, self.core.store
         self.settings = p.FlashPage(self, self.core.spend)
         self._start(cause=0, watchdog=None)
 
@@ -115,11 +84,16 @@ class Image:
 
     def notify(self) -> None:
         """The chip's interrupt line may have changed."""
-        self._sample_interrupt()
+        high = self._chip.irq
+        if high == self._irq_was_high:
+            return
+        self._irq_was_high = high
+        self._rise_ticks = self._timeline.now_ticks if high else None
+        self._gpiote.on_edge(INTERRUPT_PIN, high)
 
     def receive(self, data: bytes) -> None:
         """Bytes have arrived on the UART's line."""
-        self._paths.note_bytes(data)
+        self.paths.note_bytes(data)
         self._uarte.receive(data)
 
     def power_cycle(self) -> None:
@@ -138,23 +112,9 @@ class Image:
         return self._clock.registers[0xEE4] == p.KEEP_RAM
 
     @property
-    def faults(self) -> list[str]:
-        """Faults that the firmware has run into."""
-        return self.core.faults
-
-    @property
     def leds(self) -> frozenset[str]:
         """Lights that are on (``LED_PINS``); they are so when their pin is low."""
-        return frozenset(name for name, pin in LED_PINS.items() if self._gpio.is_driven(pin, high=False))
-
-    def is_driven(self, pin: int, *, high: bool) -> bool:
-        """Whether the processor holds a pin at a level."""
-        return self._gpio.is_driven(pin, high)
-
-    @property
-    def is_asleep(self) -> bool:
-        """Whether the processor waits in WFI."""
-        return self._asleep
+        return frozenset(name for name, pin in LED_PINS.items() if self.gpio.is_driven(pin, high=False))
 
     @property
     def drawing(self) -> frozenset[str]:
@@ -164,7 +124,7 @@ class Image:
             "timer": any(timer.draws_current for timer in self._timers),
             "uarte": self._uarte.registers[0x500] != 0,
             "spim": self._spim.registers[0x500] != 0,
-            "gpiote": any(self._gpiote.registers.values()),
+            "gpiote": any(self._gpiote.registers[at] for at in self._gpiote.CONFIG),
             "radio": self.radio.is_busy,
         }
         return frozenset(name for name, draw in draws.items() if draw)
@@ -173,30 +133,14 @@ class Image:
     def busy_share(self) -> float:
         """Share of the time since the first start in which the processor was awake, waits for transfers included."""
         passed = max(self._cycle_at(self._timeline.now_ticks), 1)
-        return 1.0 - (self._slept_cycles + (passed - self._asleep_since if self._asleep else 0)) / passed
-
-    def cycles_by_path(self) -> dict[str, PathCost]:
-        """Cycles of the firmware's turns by what was done in them (``paths.py``)."""
-        return self._paths.costs()
-
-    def cycles_by_function(self) -> dict[str, int]:
-        """Cycles spent in each function, waits for peripherals apart; the costliest first."""
-        spent = spent_at(self.core.state)
-        rows = [(name, int(spent[at >> 1 : (at + size) >> 1].sum())) for at, size, name in functions_of(self._elf)]
-        return {name: cycles for name, cycles in sorted(rows, key=lambda row: -row[1]) if cycles}
+        return 1.0 - (self._slept_cycles + (passed - self._asleep_since if self.is_asleep else 0)) / passed
 
     def forget_paths(self) -> None:
         """Measure paths, functions and latencies from now on."""
-        spent_at(self.core.state)[:] = 0
-        self._paths = Paths()
-        self._paths.begin(self.cycles)
-        self._latency = (0, 0, 0)
-
-    @property
-    def interrupt_latency(self) -> Latency:
-        """How long the firmware needs to turn to the chip."""
-        count, total, most = self._latency
-        return Latency(count, total * TICK_S / max(count, 1), most * TICK_S)
+        self.core.forget_spent()
+        self.paths = Paths()
+        self.paths.begin(self.cycles)
+        self.worst_latency_s = 0.0
 
     # Start and resets
 
@@ -207,7 +151,7 @@ class Image:
         self._clock = p.Clock(self, cause)
         self._timers = [p.Timer(self, number) for number in range(3)]
         self._counters: list[p.Timer | p.Rtc] = [*self._timers, p.Rtc(self)]
-        self._gpio = p.Gpio(self, self._level, self._on_output)
+        self.gpio = p.Gpio(self, self._level, self._on_output)
         self._gpiote = p.Gpiote(self)
         self._watchdog = watchdog or p.Watchdog(self)
         self._ppi = p.Ppi(self)
@@ -215,8 +159,8 @@ class Image:
         self._nvmc = p.Nvmc(self, self.core.use_cache, self.settings)
         status = lambda: (self.core.hfsr, self.core.cfsr, self.core.bfar)  # noqa: E731
         self._nvic = p.Nvic(self, status, self._ask_for_reset, self.core.use_fpu)
-        self._uarte = Uarte(self, self._send)
-        self._spim = Spim(self, self)
+        self._uarte = Uarte(self, self._seat.send)
+        self._spim = Spim(self, self._exchange)
         self.radio = Radio(self, lambda: self._clock.crystal_cycles <= self.cycles, self.advertised.append)
         self._pages: dict[int, p.Peripheral] = {
             one.base >> 12: one
@@ -225,7 +169,7 @@ class Image:
                 *self._counters,
                 self.radio,
                 self.settings,
-                self._gpio,
+                self.gpio,
                 self._gpiote,
                 self._watchdog,
                 self._ppi,
@@ -233,8 +177,8 @@ class Image:
                 self._nvic,
                 self._uarte,
                 self._spim,
-                p.Ficr(self, self._identity),
-                p.Revision(self),
+                p.factory_information(self, self._seat.identity),
+                p.revision(self),
             )
         }
         self._selected, self._selected_cycles = False, 0
@@ -243,11 +187,11 @@ class Image:
         self._holds_chip = False
         self._stalled_until: int | None = None
         self._rise_ticks = None
-        if self._asleep:
+        if self.is_asleep:
             self._slept_cycles += max(self._cycle_at(self._timeline.now_ticks) - self._asleep_since, 0)
-        self._asleep = False
+        self.is_asleep = False
         self.core.cycles = max(self.core.cycles, self._cycle_at(self._timeline.now_ticks))
-        self._paths.begin_start(self.core.cycles)
+        self.paths.begin_start(self.core.cycles)
         self._processors.plan(self, self._ticks_at(self.core.cycles))
 
     def _ask_for_reset(self) -> None:
@@ -277,7 +221,7 @@ class Image:
         """The present in cycles of the processor's clock since the first start."""
         return self.core.state.item(CYCLES) if self._executing else self._cycle_at(self._timeline.now_ticks)
 
-    def plan(self, cycles: int, happen: Callable[[], None]) -> None:
+    def plan(self, cycles: int, happen: Callable[[], object]) -> None:
         """Let something happen, unless the processor is reset before."""
         life = self._life
 
@@ -291,7 +235,7 @@ class Image:
 
     def advance(self, due_ticks: int, until_ticks: int) -> int | None:
         """Execute up to a true time (``processors.Processor``)."""
-        if self._asleep:
+        if self.is_asleep:
             self.core.cycles = max(self._cycle_at(due_ticks), self._asleep_since)
             self._update_timers()
             if self._watchdog.due_cycles <= self.core.cycles:
@@ -336,8 +280,8 @@ class Image:
                     f"WFI at PC 0x{self.core.pc - 2:x} with PRIMASK clear: interrupts are not modelled"
                 )
             if not self._nvic.wakes:
-                self._paths.end(self.core.cycles)
-                self._asleep, self._asleep_since = True, self.core.cycles
+                self.paths.end(self.core.cycles)
+                self.is_asleep, self._asleep_since = True, self.core.cycles
                 return True
         return False
 
@@ -348,16 +292,16 @@ class Image:
     def _wake(self) -> int:
         """End the sleep; the count of cycles at which the processor goes on."""
         self._slept_cycles += self.core.cycles - self._asleep_since
-        self._asleep = False
+        self.is_asleep = False
         self.core.spend(WAKE_UP_CYCLES)
-        self._paths.begin(self.core.cycles)
+        self.paths.begin(self.core.cycles)
         return self.core.cycles
 
     def _end_stall(self) -> None:
         """The transfer that the firmware polled for is over."""
         until = self._stalled_until or 0
         if until > self.core.cycles:
-            self._paths.note_wait(until - self.core.cycles)
+            self.paths.note_wait(until - self.core.cycles)
             self.core.cycles = until
         self._stalled_until = None
 
@@ -370,20 +314,9 @@ class Image:
 
     # What the peripherals see
 
-    def load(self, address: int, size: int) -> bytes:
-        """Read RAM."""
-        return self.core.load(address, size)
-
-    def store(self, address: int, data: bytes) -> None:
-        """Write RAM."""
-        self.core.store(address, data)
-
     def run_task(self, address: int) -> None:
         """Start a task by its address."""
-        peripheral = self._pages.get(address >> 12)
-        if peripheral is None:
-            raise EmulationError(f"PPI starts a task at 0x{address:08x}, where no peripheral is modelled")
-        peripheral.write(address & 0xFFF, 1)
+        self._peripheral(address, 4).write(address & 0xFFF, 1)
 
     def run_channels(self, address: int) -> None:
         """Start what PPI connects to an event."""
@@ -391,43 +324,40 @@ class Image:
 
     def has_input_buffer(self, pin: int) -> bool:
         """Whether the processor sees a pin's level."""
-        return self._gpio.has_input_buffer(pin)
+        return self.gpio.has_input_buffer(pin)
 
     def update_interrupt(self, peripheral: p.Peripheral) -> None:
         """A peripheral's line may have changed."""
         if peripheral.irq is None:
             return
         self._nvic.set_line(peripheral.irq, peripheral.line)
-        if self._asleep and self._nvic.wakes:
+        if self.is_asleep and self._nvic.wakes:
             self._processors.plan(self, self._timeline.now_ticks)
 
+    def _peripheral(self, address: int, size: int) -> p.Peripheral:
+        if address >> 12 in self._pages and size == 4 and not address & 3:
+            return self._pages[address >> 12]
+        what = "whole words only" if address >> 12 in self._pages else "no peripheral is modelled there"
+        raise EmulationError(
+            f"access of {size} bytes at 0x{address:08x} (in the block at PC 0x{self.core.pc:x}): {what}"
+        )
+
     def _read(self, address: int, size: int) -> int:
-        peripheral = self._pages.get(address >> 12)
-        if peripheral is None or size != 4 or address & 3:
-            raise self._unknown_access(address, size)
-        value = peripheral.read(address & 0xFFF)
+        value = self._peripheral(address, size).read(address & 0xFFF)
         if address == _SPIM_END and not value and self._spim.end_cycles is not None:
             self._stalled_until = self._spim.end_cycles
             self.core.stop_at(0)
         return value
 
     def _write(self, address: int, size: int, value: int) -> None:
-        peripheral = self._pages.get(address >> 12)
-        if peripheral is None or size != 4 or address & 3:
-            raise self._unknown_access(address, size)
+        peripheral = self._peripheral(address, size)
         if address == _SPIM_START:
             self._note_transaction(self.core.load(self._spim.registers[0x544], self._spim.registers[0x548]))
         elif address == _COUNT_OF_BYTES:
-            self._paths.note_count_of_bytes()
+            self.paths.note_count_of_bytes()
         elif address == _WATCHDOG_FED:
-            self._paths.end_turn(self.core.cycles)
+            self.paths.end_turn(self.core.cycles)
         peripheral.write(address & 0xFFF, value)
-
-    def _unknown_access(self, address: int, size: int) -> EmulationError:
-        where = f"0x{address:08x} (in the block at PC 0x{self.core.pc:x})"
-        if address >> 12 not in self._pages:
-            return EmulationError(f"no peripheral is modelled at {where}")
-        return EmulationError(f"access of {size} bytes at {where}: whole words only")
 
     # Pins
 
@@ -435,15 +365,15 @@ class Image:
         if pin == INTERRUPT_PIN:
             return self._irq_was_high  # of the last notification or transaction, since nothing else changes it
         if pin == ROLE_PIN:
-            if self._can_transmit and pull != _PULL_UP:
+            if self._seat.can_transmit and pull != _PULL_UP:
                 self.misuse["role-pin-without-pull-up"] += 1
-            return self._can_transmit and pull == _PULL_UP
+            return self._seat.can_transmit and pull == _PULL_UP
         if pin == RESET_PIN:
             return not self._holds_chip
         return pin == UART_RX_PIN or pull == _PULL_UP
 
     def _on_output(self) -> None:
-        gpio = self._gpio
+        gpio = self.gpio
         selected = gpio.is_driven(SELECT_PIN, high=False)
         if selected != self._selected:
             self._selected = selected
@@ -461,32 +391,23 @@ class Image:
     def _pull_reset(self) -> None:
         """RSTn went low, or is released: either way the chip starts again there."""
         self._chip.pull_reset()
-        self._sample_interrupt()
+        self.notify()
 
-    def exchange(self, out: bytes, hz: int) -> bytes:
+    def _exchange(self, out: bytes, hz: int) -> bytes:
         """One whole SPI transaction; a chip in reset answers nothing."""
         if self._holds_chip:
             return bytes(len(out))
         answer = self._chip.transfer(out, hz)
-        self._sample_interrupt()
+        self.notify()
         left_ticks = self._chip.transceiver.window_left_ticks
         if out[:1] == _COMMANDS and left_ticks is not None:  # the chip's crystal may be slower than true time
-            self._timeline.at(self._timeline.now_ticks + left_ticks + (left_ticks >> 13), self._sample_interrupt)
+            self._timeline.at(self._timeline.now_ticks + left_ticks + (left_ticks >> 13), self.notify)
         return answer
-
-    def _sample_interrupt(self) -> None:
-        high = self._chip.irq
-        if high == self._irq_was_high:
-            return
-        self._irq_was_high = high
-        self._rise_ticks = self._timeline.now_ticks if high else None
-        self._gpiote.on_edge(INTERRUPT_PIN, high)
 
     def _note_transaction(self, out: bytes) -> None:
         """The firmware begins a transfer to the chip."""
-        self._paths.note_transaction(out)
+        self.paths.note_transaction(out)
         if self._rise_ticks is not None and out[:1] == _READS_STATUS:
-            taken = self._ticks_at(self.core.cycles) - self._rise_ticks
-            count, total, most = self._latency
-            self._latency = count + 1, total + taken, max(most, taken)
+            taken_ticks = self._ticks_at(self.core.cycles) - self._rise_ticks
+            self.worst_latency_s = max(self.worst_latency_s, taken_ticks * TICK_S)
             self._rise_ticks = None

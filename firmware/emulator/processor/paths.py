@@ -26,24 +26,33 @@ TRANSMISSION: Final = "transmission"
 """A frame was handed to the chip."""
 END_OF_TRANSMISSION: Final = "end of transmission"
 
+_WORK: Final = {
+    (r.RX_BUFFER.file, False): RECEPTION,
+    (r.TX_BUFFER.file, True): TRANSMISSION,
+    (r.TX_STAMP.file, False): END_OF_TRANSMISSION,
+}
+"""By what is read or written of the chip; all else is POLL."""
 _ABOVE: Final = {BYTE: {COMMAND, START}, POLL: {RECEPTION, TRANSMISSION, END_OF_TRANSMISSION}}
 """Work that says more than this."""
 
 
-class PathCost(Struct, frozen=True):
-    """Cycles of the 64 MHz clock that turns took."""
+class PathCost(Struct):
+    """Turns of one kind; in µs, of cycles of the 64 MHz clock."""
 
-    count: int
-    least: int
-    mean: float
-    most: int
-    mean_transfer: float
-    """Of the mean, what the processor waited for SPI transfers."""
+    count: int = 0
+    most_cycles: int = 0
+    spi_cycles: int = 0
+    """What all of them together waited for SPI transfers."""
 
     @property
     def most_us(self) -> float:
-        """Longest time."""
-        return self.most / 64
+        """Of the longest."""
+        return self.most_cycles / 64
+
+    @property
+    def spi_us(self) -> float:
+        """What one waited for SPI transfers, on average."""
+        return self.spi_cycles / 64 / self.count
 
 
 class Paths:
@@ -57,7 +66,8 @@ class Paths:
         self._begin_cycles = 0
         self._just_woken = False
         self._transfer_cycles = 0
-        self._sums: dict[str, tuple[int, int, int, int, int]] = {}
+        self.costs: dict[str, PathCost] = {}
+        """By work, several kinds joined by " + "."""
 
     def begin(self, cycles: int) -> None:
         """The processor has woken up."""
@@ -84,14 +94,7 @@ class Paths:
     def note_transaction(self, sent: bytes) -> None:
         """A transaction with the chip begins, with these first bytes."""
         access = decode_header(sent)
-        work = POLL
-        if access is not None and access.file == r.RX_BUFFER.file and not access.is_write:
-            work = RECEPTION
-        elif access is not None and access.file == r.TX_BUFFER.file and access.is_write:
-            work = TRANSMISSION
-        elif access is not None and access.file == r.TX_STAMP.file and not access.is_write:
-            work = END_OF_TRANSMISSION
-        self._work[work] += 1
+        self._work[POLL if access is None else _WORK.get((access.file, access.is_write), POLL)] += 1
 
     def note_wait(self, cycles: int) -> None:
         """The processor waited for a transfer."""
@@ -113,14 +116,8 @@ class Paths:
             if count and not _ABOVE.get(work, set()) & done
         ]
         key = " + ".join(kept) or IDLE
-        spent, waited = cycles - self._begin_cycles, self._transfer_cycles
-        count, least, total, most, transfers = self._sums.get(key, (0, spent, 0, spent, 0))
-        self._sums[key] = count + 1, min(least, spent), total + spent, max(most, spent), transfers + waited
+        cost = self.costs.setdefault(key, PathCost())
+        cost.count += 1
+        cost.most_cycles = max(cost.most_cycles, cycles - self._begin_cycles)
+        cost.spi_cycles += self._transfer_cycles
         self._work.clear()
-
-    def costs(self) -> dict[str, PathCost]:
-        """Costs by work, several kinds joined by " + "."""
-        return {
-            key: PathCost(count, least, total / count, most, transfers / count)
-            for key, (count, least, total, most, transfers) in sorted(self._sums.items())
-        }

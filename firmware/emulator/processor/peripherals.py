@@ -1,12 +1,12 @@
 """Peripherals of the nRF52832 without those that move data: registers as in its product specification (v1.4).
 
-Each has its tasks, events and plain registers by offset; whatever the firmware uses besides is an ``EmulationError``.
+Each has its tasks, events and registers by offset; whatever the firmware uses besides is an ``EmulationError``.
 Not modelled: start-up times except those of the clocks, power consumption, flash writes outside the last page, pins as
 the processor's analogue or debug functions, and timers' events in counter mode.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Final, Protocol
 
@@ -31,6 +31,8 @@ KEEP_RAM: Final = 0x45
 
 _WATCHDOG_KEY: Final = 0x6E524635
 _NEVER: Final = 1 << 62
+_INTEN: Final = 0x300
+_GPIO_CONFIG: Final = range(0x700, 0x780, 4)
 
 
 class System(Protocol):
@@ -51,44 +53,52 @@ class System(Protocol):
     def update_interrupt(self, peripheral: "Peripheral") -> None:
         """A peripheral's line may have changed."""
 
+    def load(self, address: int, size: int) -> bytes:
+        """Read RAM."""
+
+    def store(self, address: int, data: bytes) -> None:
+        """Write RAM."""
+
+    def plan(self, cycles: int, happen: Callable[[], object]) -> None:
+        """Let something happen at a count of cycles, unless the processor is reset before."""
+
+    def has_input_buffer(self, pin: int) -> bool:
+        """Whether the processor sees a pin's level."""
+
 
 class Peripheral:
-    """Tasks, events, interrupts by INTENSET, and registers."""
+    """Tasks, events, interrupts by INTEN, and registers that keep what is written."""
 
     base = 0
     irq: int | None = None
 
-    def __init__(self, system: System) -> None:
-        self.system = system
-        self.event_bits = {offset: 1 << ((offset - 0x100) >> 2) for offset in self.event_offsets()}
-        """Of each event its bit in INTEN, by offset."""
+    def __init__(
+        self,
+        system: System,
+        *,
+        tasks: Mapping[int, Callable[[], None]] | None = None,
+        events: Iterable[int] = (),
+        registers: Iterable[int] = (),
+        triples: tuple[int, ...] = (),
+    ) -> None:
+        """All by offset. ``triples``: registers with one behind them that sets bits, and another that clears them."""
+        self.system, self.tasks = system, dict(tasks or {})
+        self.event_bits = {offset: 1 << ((offset - 0x100) >> 2) for offset in events}
+        """Of each event its bit in INTEN."""
         self.events = 0
         """Bits of the events that have happened and were not cleared."""
-        self.inten = 0
-        self.registers: dict[int, int] = dict.fromkeys(self.register_offsets(), 0)
-        self.tasks = self.make_tasks()
-
-    def make_tasks(self) -> dict[int, Callable[[], None]]:
-        """Tasks by offset."""
-        return {}
-
-    def event_offsets(self) -> tuple[int, ...]:
-        """Events that are modelled."""
-        return ()
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """Registers that keep what is written."""
-        return ()
+        triples += (_INTEN,) if self.event_bits else ()
+        self.registers = dict.fromkeys((*registers, *triples), 0)
+        self._first_of = {first + behind: first for first in triples for behind in (0, 4, 8)}
 
     def read(self, offset: int) -> int:
         """A load."""
-        if offset in self.registers:
-            return self.registers[offset]
         if offset in self.event_bits:
             return int(self.events & self.event_bits[offset] != 0)
-        if offset in {0x304, 0x308} and self.event_bits:
-            return self.inten
-        raise self.unknown(offset)
+        offset = self._first_of.get(offset, offset)
+        if offset not in self.registers:
+            raise self.unknown(offset)
+        return self.registers[offset]
 
     def write(self, offset: int, value: int) -> None:
         """A store."""
@@ -99,12 +109,13 @@ class Peripheral:
             bit = self.event_bits[offset]
             self.events = self.events | bit if value else self.events & ~bit
             self.system.update_interrupt(self)
+        elif offset in self._first_of:
+            first = self._first_of[offset]
+            held = self.registers[first]
+            self.registers[first] = (value, held | value, held & ~value)[(offset - first) >> 2]
+            self.system.update_interrupt(self)
         elif offset in self.registers:
             self.registers[offset] = value
-        elif offset in {0x300, 0x304, 0x308} and self.event_bits:
-            changed = {0x300: value, 0x304: self.inten | value, 0x308: self.inten & ~value}
-            self.inten = changed[offset]
-            self.system.update_interrupt(self)
         else:
             raise self.unknown(offset)
 
@@ -121,54 +132,66 @@ class Peripheral:
     @property
     def line(self) -> bool:
         """Whether the peripheral asks for an interrupt."""
-        return bool(self.events & self.inten)
+        return bool(self.events & self.registers.get(_INTEN, 0))
+
+
+class Constants(Peripheral):
+    """Words that nothing changes."""
+
+    def __init__(self, system: System, base: int, values: dict[int, int]) -> None:
+        super().__init__(system)
+        self.base, self.registers = base, values
+
+    def write(self, offset: int, value: int) -> None:  # noqa: ARG002
+        """A store, which hardware has not."""
+        raise self.unknown(offset)
+
+
+def factory_information(system: System, identity: bytes) -> Constants:
+    """FICR: the device's identifier and Bluetooth address, low words first; what anomaly 108 needs."""
+    words = {0x060 + 4 * n: int.from_bytes(identity[4 * n : 4 * n + 4], "little") for n in range(2)}
+    return Constants(system, 0x10000000, words | {0x0A4: 0x89ABCDEF, 0x0A8: 0xFFFF0123, 0x258: 0xFFFFFF00 | KEEP_RAM})
+
+
+def revision(system: System) -> Constants:
+    """Identification of the processor: an nRF52832 of revision 1, which is 5 there."""
+    return Constants(system, 0xF0000000, {0xFE0: 0x06, 0xFE4: 0x00, 0xFE8: 0x50})
 
 
 class Clock(Peripheral):
-    """CLOCK and POWER."""
+    """CLOCK and POWER; with CONSTLAT the latency stays the one assumed."""
 
     base = 0x40000000
     irq = 0
 
     def __init__(self, system: System, cause: int) -> None:
-        super().__init__(system)
+        super().__init__(
+            system,
+            tasks={
+                0x000: self._start_hfclk,
+                0x004: self._stop_hfclk,
+                0x008: self._start_lfclk,
+                0x00C: self._stop_lfclk,
+                0x078: lambda: None,
+            },
+            events=(0x100, 0x104),
+            registers=(0x400, 0x518, 0x578, 0xEE4),  # RESETREAS, LFCLKSRC, DCDCEN, and the one of anomaly 108
+        )
         self.registers[0x400] = cause
         self._ready = {0x100: _NEVER, 0x104: _NEVER}
         self.crystal_cycles = _NEVER
         """When the fast crystal is stable."""
 
-    def make_tasks(self) -> dict[int, Callable[[], None]]:
-        """Both clocks; CONSTLAT, with which the latency stays the one assumed."""
-        return {
-            0x000: self.start_hfclk,
-            0x004: self.stop_hfclk,
-            0x008: self.start_lfclk,
-            0x00C: self.stop_lfclk,
-            0x078: lambda: None,
-        }
-
-    def event_offsets(self) -> tuple[int, ...]:
-        """Started clocks."""
-        return 0x100, 0x104
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """RESETREAS, LFCLKSRC, DCDCEN, and the one that anomaly 108 is about."""
-        return 0x400, 0x518, 0x578, 0xEE4
-
-    def start_hfclk(self) -> None:
-        """Start the crystal."""
+    def _start_hfclk(self) -> None:
         self._ready[0x100] = self.crystal_cycles = self.system.cycles + HFCLK_START_CYCLES
 
-    def start_lfclk(self) -> None:
-        """Start the slow clock."""
+    def _start_lfclk(self) -> None:
         self._ready[0x104] = self.system.cycles + LFCLK_START_CYCLES
 
-    def stop_hfclk(self) -> None:
-        """Go on with the internal oscillator."""
+    def _stop_hfclk(self) -> None:
         self._ready[0x100] = self.crystal_cycles = _NEVER
 
-    def stop_lfclk(self) -> None:
-        """Stop the slow clock."""
+    def _stop_lfclk(self) -> None:
         self._ready[0x104] = _NEVER
 
     def read(self, offset: int) -> int:
@@ -181,19 +204,25 @@ class Clock(Peripheral):
 
     def write(self, offset: int, value: int) -> None:
         """A store; ones clear RESETREAS."""
-        if offset in {0x304, 0x308, 0x300} and value:
+        if offset in self._first_of and value:
             raise self.unknown(offset)
         super().write(offset, self.registers[0x400] & ~value if offset == 0x400 else value)
 
 
 class Timer(Peripheral):
-    """TIMER0 to TIMER2; comparisons in timer mode only."""
+    """TIMER0 to TIMER2; comparisons in timer mode only, and no SHORTS."""
 
     _widths = (16, 8, 24, 32)
 
     def __init__(self, system: System, number: int) -> None:
         self.base, self.irq = 0x40008000 + 0x1000 * number, 8 + number
-        super().__init__(system)
+        tasks = {0x000: self._start, 0x004: self._stop, 0x008: self._count, 0x00C: self._clear, 0x010: self._shut_down}
+        super().__init__(
+            system,
+            tasks=tasks | {0x040 + 4 * n: partial(self._capture, n) for n in range(4)},
+            events=range(0x140, 0x150, 4),  # COMPARE
+            registers=(0x504, 0x508, 0x510, *range(0x540, 0x550, 4)),  # MODE, BITMODE, PRESCALER, CC
+        )
         self.registers[0x510] = 4
         self._step_cycles, self._mask, self._counts_events = 64, 0xFFFF, False
         self.draws_current = False
@@ -201,25 +230,6 @@ class Timer(Peripheral):
         """Count when the timer was started or stopped last, or of events."""
         self._started_cycles: int | None = None
         self._next_match = [_NEVER] * 4
-
-    def make_tasks(self) -> dict[int, Callable[[], None]]:
-        """START, STOP, COUNT, CLEAR, SHUTDOWN, CAPTURE."""
-        tasks: dict[int, Callable[[], None]] = {
-            0x000: self.start,
-            0x004: self.stop,
-            0x008: self.count,
-            0x00C: self.clear,
-            0x010: self.shut_down,
-        }
-        return tasks | {0x040 + 4 * n: partial(self.capture, n) for n in range(4)}
-
-    def event_offsets(self) -> tuple[int, ...]:
-        """COMPARE."""
-        return tuple(0x140 + 4 * n for n in range(4))
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """SHORTS is not modelled; MODE, BITMODE, PRESCALER, CC."""
-        return 0x504, 0x508, 0x510, *(0x540 + 4 * n for n in range(4))
 
     def _elapsed(self) -> int:
         """Counts since the start."""
@@ -230,40 +240,34 @@ class Timer(Peripheral):
             return self._counted & self._mask
         return (self._counted + self._elapsed()) & self._mask
 
-    def start(self) -> None:
-        """Start."""
+    def _start(self) -> None:
         self.draws_current = True
         if self._started_cycles is None:
             self._started_cycles = self.system.cycles
         self._foresee_all()
 
-    def stop(self) -> None:
-        """Stop."""
+    def _stop(self) -> None:
         self._counted, self._started_cycles = self._value(), None
         self._foresee_all()
 
-    def count(self) -> None:
-        """Count one event."""
+    def _count(self) -> None:
         if self._counts_events and self._started_cycles is not None:
             self._counted += 1
 
-    def clear(self) -> None:
-        """Count from 0."""
+    def _clear(self) -> None:
         self._counted = 0
         if self._started_cycles is not None:
             self._started_cycles = self.system.cycles
         self._foresee_all()
 
-    def shut_down(self) -> None:
+    def _shut_down(self) -> None:
         """Stop, at 0, and draw no current any more (anomaly 78)."""
         self._counted, self._started_cycles, self.draws_current = 0, None, False
         self._foresee_all()
 
-    def capture(self, n: int) -> None:
-        """Copy the count."""
+    def _capture(self, n: int) -> None:
         self.registers[0x540 + 4 * n] = self._value()
-        if self._started_cycles is not None and not self._counts_events:  # equal now, and again a whole turn later
-            self._next_match[n] = self._started_cycles + (self._elapsed() + self._mask + 1) * self._step_cycles
+        self._foresee(n)  # it is equal now, and again a whole turn later
 
     def write(self, offset: int, value: int) -> None:
         """A store."""
@@ -300,7 +304,8 @@ class Timer(Peripheral):
     @property
     def due_cycles(self) -> int:
         """When the next interrupt will be asked for."""
-        return min((at for n, at in enumerate(self._next_match) if self.inten >> (16 + n) & 1), default=_NEVER)
+        inten = self.registers[_INTEN]
+        return min((at for n, at in enumerate(self._next_match) if inten >> (16 + n) & 1), default=_NEVER)
 
     def read(self, offset: int) -> int:
         """A load."""
@@ -317,43 +322,33 @@ class Rtc(Peripheral):
     _MASK = 0xFFFFFF
 
     def __init__(self, system: System) -> None:
-        super().__init__(system)
+        tasks = {0x000: self._start, 0x004: self._stop, 0x008: lambda: None}  # CLEAR of one that is stopped
+        super().__init__(system, tasks=tasks, events=(0x140,), registers=(0x540,))  # COMPARE0, CC0
         self._zero: int | None = None
         """Period of 1/32768 s at which the count was 0."""
         self.due_cycles = _NEVER
 
-    def make_tasks(self) -> dict[int, Callable[[], None]]:
-        """START, STOP; CLEAR of one that is stopped."""
-        return {0x000: self.start, 0x004: self.stop, 0x008: lambda: None}
+    def _start(self) -> None:
+        self._zero = self._periods()
 
-    def event_offsets(self) -> tuple[int, ...]:
-        """COMPARE0."""
-        return (0x140,)
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """CC0."""
-        return (0x540,)
-
-    def start(self) -> None:
-        """Count from 0."""
-        self._zero = self.system.cycles * 32_768 // 64_000_000
-
-    def stop(self) -> None:
-        """Stop."""
+    def _stop(self) -> None:
         self._zero, self.due_cycles = None, _NEVER
+
+    def _periods(self) -> int:
+        return self.system.cycles * 32_768 // 64_000_000
 
     def read(self, offset: int) -> int:
         """A load; COUNTER."""
         if offset != 0x504:
             return super().read(offset)
-        return 0 if self._zero is None else self.system.cycles * 32_768 // 64_000_000 - self._zero & self._MASK
+        return 0 if self._zero is None else self._periods() - self._zero & self._MASK
 
     def write(self, offset: int, value: int) -> None:
         """A store; a comparison less than two periods ahead may be missed, so it is."""
         super().write(offset, value)
         if offset == 0x540 and self._zero is not None:
             ahead = (value - self.read(0x504) - 2 & self._MASK) + 2
-            self.due_cycles = -(-(self.system.cycles * 32_768 // 64_000_000 + ahead) * 64_000_000 // 32_768)
+            self.due_cycles = -(-(self._periods() + ahead) * 64_000_000 // 32_768)
 
     def update(self) -> None:
         """Raise the event of a count that has been reached."""
@@ -369,67 +364,45 @@ class Gpio(Peripheral):
     """
 
     base = 0x50000000
+    _OUT, _IN, _DIR = 0x504, 0x510, 0x514
 
     def __init__(self, system: System, level: Callable[[int, int], bool], on_output: Callable[[], None]) -> None:
-        super().__init__(system)
-        self.out = self.directions = 0
-        self.configured = [2] * 32
+        super().__init__(system, registers=_GPIO_CONFIG, triples=(self._OUT, self._DIR))
+        self.registers |= dict.fromkeys(_GPIO_CONFIG, 2)
         self._inputs: list[int] = []
         """Pins whose input buffer is on."""
         self._level, self._on_output = level, on_output
 
     def is_driven(self, pin: int, high: bool) -> bool:
         """Whether the processor holds a pin at a level."""
-        return bool(self.directions >> pin & 1) and bool(self.out >> pin & 1) == high
+        return bool(self.registers[self._DIR] >> pin & 1) and bool(self.registers[self._OUT] >> pin & 1) == high
 
     def has_input_buffer(self, pin: int) -> bool:
         """Whether the processor sees a pin's level."""
-        return not self.configured[pin] & 2
+        return not self.registers[_GPIO_CONFIG[pin]] & 2
 
     def read(self, offset: int) -> int:
         """A load."""
-        if offset == 0x510:
+        if offset == self._IN:
             return sum(self._input(pin) << pin for pin in self._inputs)
-        if 0x700 <= offset < 0x780:
-            pin = (offset - 0x700) >> 2
-            return self.configured[pin] & ~1 | (self.directions >> pin & 1)
-        values = {
-            0x504: self.out,
-            0x508: self.out,
-            0x50C: self.out,
-            **dict.fromkeys((0x514, 0x518, 0x51C), self.directions),
-        }
-        if offset not in values:
-            raise self.unknown(offset)
-        return values[offset]
+        value = super().read(offset)
+        if offset in _GPIO_CONFIG:
+            return value & ~1 | self.registers[self._DIR] >> _GPIO_CONFIG.index(offset) & 1
+        return value
 
     def _input(self, pin: int) -> int:
         """A pin that the processor drives reads as driven."""
-        if self.directions >> pin & 1:
-            return self.out >> pin & 1
-        return int(self._level(pin, self.configured[pin] >> 2 & 3))
+        if self.registers[self._DIR] >> pin & 1:
+            return self.registers[self._OUT] >> pin & 1
+        return int(self._level(pin, self.registers[_GPIO_CONFIG[pin]] >> 2 & 3))
 
     def write(self, offset: int, value: int) -> None:
         """A store."""
-        if offset == 0x504:
-            self.out = value
-        elif offset == 0x508:
-            self.out |= value
-        elif offset == 0x50C:
-            self.out &= ~value
-        elif offset == 0x514:
-            self.directions = value
-        elif offset == 0x518:
-            self.directions |= value
-        elif offset == 0x51C:
-            self.directions &= ~value
-        elif 0x700 <= offset < 0x780:
-            pin = (offset - 0x700) >> 2
-            self.configured[pin] = value
+        super().write(offset, value)
+        if offset in _GPIO_CONFIG:
+            pin = _GPIO_CONFIG.index(offset)
             self._inputs = [pin for pin in range(32) if self.has_input_buffer(pin)]
-            self.directions = self.directions & ~(1 << pin) | (value & 1) << pin
-        else:
-            raise self.unknown(offset)
+            self.registers[self._DIR] = self.registers[self._DIR] & ~(1 << pin) | (value & 1) << pin
         self._on_output()
 
 
@@ -438,19 +411,15 @@ class Gpiote(Peripheral):
 
     base = 0x40006000
     irq = 6
+    CONFIG = range(0x510, 0x530, 4)
 
-    def event_offsets(self) -> tuple[int, ...]:
-        """IN and PORT."""
-        return *(0x100 + 4 * n for n in range(8)), 0x17C
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """CONFIG."""
-        return tuple(0x510 + 4 * n for n in range(8))
+    def __init__(self, system: System) -> None:
+        super().__init__(system, events=(*range(0x100, 0x120, 4), 0x17C), registers=self.CONFIG)  # IN, PORT
 
     def on_edge(self, pin: int, high: bool) -> None:
         """A pin has changed; polarity 1 is rising, 2 falling, 3 both."""
         for n in range(8):
-            config = self.registers[0x510 + 4 * n]
+            config = self.registers[self.CONFIG[n]]
             if config & 3 == 1 and config >> 8 & 31 == pin and config >> 16 & 3 & (1 if high else 2):
                 self.happen(0x100 + 4 * n)
 
@@ -462,22 +431,11 @@ class Watchdog(Peripheral):
     irq = 16
 
     def __init__(self, system: System) -> None:
-        super().__init__(system)
-        self.registers[0x504], self.registers[0x508], self.registers[0x50C] = 0xFFFFFFFF, 1, 1
+        registers = (0x504, 0x508, 0x50C)  # CRV, RREN, CONFIG
+        super().__init__(system, tasks={0x000: self._start}, events=(0x100,), registers=registers)  # TIMEOUT
+        self.registers |= {0x504: 0xFFFFFFFF, 0x508: 1, 0x50C: 1}
         self.due_cycles = _NEVER
         self._fed = 0
-
-    def make_tasks(self) -> dict[int, Callable[[], None]]:
-        """START."""
-        return {0x000: self.start}
-
-    def event_offsets(self) -> tuple[int, ...]:
-        """TIMEOUT."""
-        return (0x100,)
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """CRV, RREN, CONFIG."""
-        return 0x504, 0x508, 0x50C
 
     @property
     def is_running(self) -> bool:
@@ -488,8 +446,8 @@ class Watchdog(Peripheral):
         self._fed = 0
         self.due_cycles = self.system.cycles + (self.registers[0x504] + 1) * 64_000_000 // 32_768
 
-    def start(self) -> None:
-        """Start; its settings are fixed from now on."""
+    def _start(self) -> None:
+        """Its settings are fixed from now on."""
         if not self.is_running:
             self._restart()
 
@@ -509,7 +467,7 @@ class Watchdog(Peripheral):
                 if self._fed & self.registers[0x508] == self.registers[0x508]:
                     self._restart()
             return
-        if offset in self.registers and self.is_running:
+        if offset in {0x504, 0x508, 0x50C} and self.is_running:
             return
         super().write(offset, value)
         if offset == 0x50C and not value & 1:
@@ -520,33 +478,14 @@ class Ppi(Peripheral):
     """Programmable channels from events to tasks."""
 
     base = 0x4001F000
+    _CHEN = 0x500
 
     def __init__(self, system: System) -> None:
-        super().__init__(system)
-        self._enabled = 0
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """EEP and TEP."""
-        return tuple(range(0x510, 0x5B0, 4))
-
-    def read(self, offset: int) -> int:
-        """A load."""
-        return self._enabled if offset in {0x500, 0x504, 0x508} else super().read(offset)
-
-    def write(self, offset: int, value: int) -> None:
-        """A store."""
-        if offset == 0x500:
-            self._enabled = value
-        elif offset == 0x504:
-            self._enabled |= value
-        elif offset == 0x508:
-            self._enabled &= ~value
-        else:
-            super().write(offset, value)
+        super().__init__(system, registers=range(0x510, 0x5B0, 4), triples=(self._CHEN,))  # EEP and TEP
 
     def on_event(self, address: int) -> None:
         """Start the tasks of an event's channels."""
-        enabled, n = self._enabled, 0
+        enabled, n = self.registers[self._CHEN], 0
         while enabled:
             if enabled & 1 and self.registers[0x510 + 8 * n] == address:
                 self.system.run_task(self.registers[0x514 + 8 * n])
@@ -560,13 +499,9 @@ class Nvmc(Peripheral):
     base = 0x4001E000
 
     def __init__(self, system: System, use_cache: Callable[[bool], None], page: "FlashPage") -> None:
-        super().__init__(system)
+        super().__init__(system, registers=(0x400, 0x504, 0x540))  # READY, CONFIG, ICACHECNF
         self.registers[0x400] = 1
         self._use_cache, self._page = use_cache, page
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """READY, CONFIG, ICACHECNF."""
-        return 0x400, 0x504, 0x540
 
     def write(self, offset: int, value: int) -> None:
         """A store; ERASEPAGE."""
@@ -607,39 +542,11 @@ class FlashPage(Peripheral):
         self.registers[offset] &= value
 
 
-class Ficr(Peripheral):
-    """Factory information: the device's identifier and Bluetooth address, low words first; what anomaly 108 needs."""
-
-    base = 0x10000000
-
-    def __init__(self, system: System, identity: bytes) -> None:
-        super().__init__(system)
-        self.registers = {0x060 + 4 * n: int.from_bytes(identity[4 * n : 4 * n + 4], "little") for n in range(2)}
-        self.registers |= {0x0A4: 0x89ABCDEF, 0x0A8: 0xFFFF0123, 0x258: 0xFFFFFF00 | KEEP_RAM}
-
-    def write(self, offset: int, value: int) -> None:  # noqa: ARG002
-        """A store, which hardware has not."""
-        raise self.unknown(offset)
-
-
-class Revision(Peripheral):
-    """Identification of the processor: an nRF52832 of revision 1, which is 5 there."""
-
-    base = 0xF0000000
-
-    def __init__(self, system: System) -> None:
-        super().__init__(system)
-        self.registers = {0xFE0: 0x06, 0xFE4: 0x00, 0xFE8: 0x50}
-
-    def write(self, offset: int, value: int) -> None:  # noqa: ARG002
-        """A store, which hardware has not."""
-        raise self.unknown(offset)
-
-
 class Nvic(Peripheral):
     """Interrupt controller and System Control Block; its ``irq`` lines are levels."""
 
     base = 0xE000E000
+    _ISER, _ICER, _ISPR, _ICPR = 0x100, 0x180, 0x200, 0x280
 
     def __init__(
         self,
@@ -648,13 +555,11 @@ class Nvic(Peripheral):
         reset: Callable[[], None],
         use_fpu: Callable[[bool], None],
     ) -> None:
-        super().__init__(system)
+        # Kept, without effect: priorities of interrupts and exceptions, VTOR, SCR, CCR, SHCSR, FPCCR; and CPACR.
+        kept = (*range(0x400, 0x428, 4), 0xD08, *range(0xD10, 0xD28, 4), 0xD88, 0xF34)
+        super().__init__(system, registers=kept)
         self.enabled = self.pending = self.asserted = 0
         self._fault_status, self._reset, self._use_fpu = fault_status, reset, use_fpu
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """Priorities of interrupts and exceptions, VTOR, SCR, CCR, SHCSR, FPCCR: kept, without effect; and CPACR."""
-        return *range(0x400, 0x428, 4), 0xD08, 0xD10, 0xD14, 0xD18, 0xD1C, 0xD20, 0xD24, 0xD88, 0xF34
 
     @property
     def wakes(self) -> bool:
@@ -673,22 +578,21 @@ class Nvic(Peripheral):
         """A load."""
         hfsr, cfsr, bfar = self._fault_status()
         values = {0xD28: cfsr, 0xD2C: hfsr, 0xD38: bfar, 0xD34: 0, 0xD0C: 0xFA050000, 0xD00: 0x410FC241, 0xD04: 0}
-        values |= dict.fromkeys((0x100, 0x180), self.enabled & 0xFFFFFFFF)
-        values |= dict.fromkeys((0x104, 0x184), self.enabled >> 32)
-        values |= dict.fromkeys((0x200, 0x280), self.pending & 0xFFFFFFFF)
-        values |= dict.fromkeys((0x204, 0x284), self.pending >> 32)
+        for first, bits in {self._ISER: self.enabled, self._ISPR: self.pending}.items():
+            values |= dict.fromkeys((first, first + 0x80), bits & 0xFFFFFFFF)
+            values |= dict.fromkeys((first + 4, first + 0x84), bits >> 32)
         return values[offset] if offset in values else super().read(offset)
 
     def write(self, offset: int, value: int) -> None:
         """A store."""
-        bits = value << (32 if offset & 4 else 0)
-        if offset in {0x100, 0x104}:
+        bits, first = value << (32 if offset & 4 else 0), offset & ~4
+        if first == self._ISER:
             self.enabled |= bits
-        elif offset in {0x180, 0x184}:
+        elif first == self._ICER:
             self.enabled &= ~bits
-        elif offset in {0x200, 0x204}:
+        elif first == self._ISPR:
             self.pending |= bits
-        elif offset in {0x280, 0x284}:
+        elif first == self._ICPR:
             self.pending = self.pending & ~bits | self.asserted
         elif offset == 0xD0C:
             if value >> 16 == 0x05FA and value & 4:

@@ -6,7 +6,7 @@ timeline's next event, at most ``SLICE_TICKS``; an event never finds one further
 instructions. The order is that of the timeline, so runs repeat themselves.
 """
 
-import heapq
+from operator import itemgetter
 from typing import Any, ClassVar, Final, Protocol
 from weakref import WeakKeyDictionary
 
@@ -45,22 +45,18 @@ class Processors:
 
     def __init__(self, timeline: "Timeline[Any]") -> None:
         self._timeline = timeline
-        self._queue: list[tuple[int, int, Processor]] = []
-        self._valid: dict[int, int] = {}
-        """Serial of the one entry of each processor that counts, by its id."""
-        self._serial = 0
+        self._due_ticks: dict[Processor, int] = {}
+        """When each that does not sleep is to be run."""
         self._asked_ticks: int | None = None
 
     def plan(self, processor: Processor, ticks: int) -> None:
         """Run a processor from then on, instead of when it was planned before."""
-        self._serial += 1
-        self._valid[id(processor)] = self._serial
-        heapq.heappush(self._queue, (ticks, self._serial, processor))
+        self._due_ticks[processor] = ticks
         self._ask()
 
     def _ask(self) -> None:
         """Have the timeline call when the first processor is due."""
-        ticks = self._queue[0][0]
+        ticks = min(self._due_ticks.values())
         if self._asked_ticks is None or ticks < self._asked_ticks:
             self._asked_ticks = ticks
             self._timeline.at(ticks, self._turn)
@@ -71,16 +67,16 @@ class Processors:
         if self._asked_ticks is not None and self._asked_ticks <= now:
             self._asked_ticks = None
         horizon = self._cut(min(now + SLICE_TICKS, timeline.until_ticks))
-        while self._queue and self._queue[0][0] < horizon:
-            ticks, serial, processor = heapq.heappop(self._queue)
-            if self._valid[id(processor)] != serial:
-                continue
+        while self._due_ticks:
+            processor, ticks = min(self._due_ticks.items(), key=itemgetter(1))
+            if ticks >= horizon:
+                self._ask()
+                return
+            del self._due_ticks[processor]
             due = processor.advance(ticks, horizon)
-            if due is not None and self._valid[id(processor)] == serial:
-                heapq.heappush(self._queue, (due, serial, processor))
+            if due is not None:
+                self._due_ticks.setdefault(processor, due)  # unless it has been planned meanwhile
             horizon = self._cut(horizon)
-        if self._queue:
-            self._ask()
 
     def _cut(self, horizon: int) -> int:
         """The timeline's next event, where it comes before a horizon."""

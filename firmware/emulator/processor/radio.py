@@ -5,8 +5,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from emulator.processor.peripherals import Peripheral
-from emulator.processor.serial_peripherals import DataSystem
+from emulator.processor.peripherals import Peripheral, System
 
 _MICROSECOND: Final = 64
 """Cycles."""
@@ -32,23 +31,12 @@ class Radio(Peripheral):
     base = 0x40001000
     irq = 1
 
-    def __init__(self, system: DataSystem, has_crystal: Callable[[], bool], send: Callable[[OnAir], None]) -> None:
-        super().__init__(system)
-        self.system: DataSystem = system
+    def __init__(self, system: System, has_crystal: Callable[[], bool], send: Callable[[OnAir], None]) -> None:
+        # SHORTS, what describes packets, their check and whitening, MODECNF0.
+        registers = (0x200, *range(0x504, 0x540, 4), 0x554, 0x650)
+        super().__init__(system, tasks={0x000: self.enable}, events=(0x110,), registers=registers)  # TXEN, DISABLED
         self._has_crystal, self._send = has_crystal, send
         self.is_busy = False
-
-    def make_tasks(self) -> dict[int, Callable[[], None]]:
-        """TXEN."""
-        return {0x000: self.enable}
-
-    def event_offsets(self) -> tuple[int, ...]:
-        """DISABLED."""
-        return (0x110,)
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """SHORTS, what describes packets, their check and whitening, MODECNF0."""
-        return 0x200, *range(0x504, 0x540, 4), 0x554, 0x650
 
     def enable(self) -> None:
         """Ramp up, send, and go off."""

@@ -1,26 +1,9 @@
 """UARTE0 and SPIM0: what moves data by DMA, in the time that its bits take."""
 
 from collections.abc import Callable
-from typing import Protocol
 
 from emulator.processor.peripherals import Peripheral, System
 from skyless.sim.dw1000.registers import decode_header
-
-
-class DataSystem(System, Protocol):
-    """What these peripherals know of their processor."""
-
-    def load(self, address: int, size: int) -> bytes:
-        """Read RAM."""
-
-    def store(self, address: int, data: bytes) -> None:
-        """Write RAM."""
-
-    def plan(self, cycles: int, happen: Callable[[], None]) -> None:
-        """Let something happen at a count of cycles, unless the processor is reset before."""
-
-    def has_input_buffer(self, pin: int) -> bool:
-        """Whether the processor sees a pin's level."""
 
 
 class Uarte(Peripheral):
@@ -34,13 +17,18 @@ class Uarte(Peripheral):
     base = 0x40002000
     irq = 2
     _ENDRX, _ENDTX, _RXDRDY, _TXDRDY, _RXTO, _TXSTOPPED = 0x110, 0x120, 0x108, 0x11C, 0x144, 0x158
+    _SET_UP = (0x508, 0x50C, 0x510, 0x514, 0x524, 0x56C)
+    """PSEL, BAUDRATE, CONFIG."""
 
-    def __init__(self, system: DataSystem, send: Callable[[bytes], None]) -> None:
-        super().__init__(system)
-        self.system: DataSystem = system
+    def __init__(self, system: System, send: Callable[[bytes], None]) -> None:
+        tasks = {0x000: self._start_rx, 0x004: self._stop_rx, 0x02C: self._flush_rx}
+        super().__init__(
+            system,
+            tasks=tasks | {0x008: self._start_tx, 0x00C: self._stop_tx},
+            events=(0x100, 0x104, 0x108, 0x110, 0x11C, 0x120, 0x124, 0x144, 0x14C, 0x150, 0x158),
+            registers=(0x200, 0x480, 0x500, *self._SET_UP, 0x534, 0x538, 0x53C, 0x544, 0x548, 0x54C),
+        )
         self._send = send
-        self.received = self.sent = 0
-        """Bytes."""
         self._into = self._room = self._filled = 0
         self._is_receiving = self._is_stopping = False
         self._kept = b""
@@ -49,24 +37,6 @@ class Uarte(Peripheral):
         """Number of the transfer that is being sent; 0 while none is."""
         self._transfers = 0
 
-    def make_tasks(self) -> dict[int, Callable[[], None]]:
-        """All of them."""
-        return {
-            0x000: self.start_rx,
-            0x004: self.stop_rx,
-            0x008: self.start_tx,
-            0x00C: self.stop_tx,
-            0x02C: self.flush_rx,
-        }
-
-    def event_offsets(self) -> tuple[int, ...]:
-        """All of them."""
-        return 0x100, 0x104, 0x108, 0x110, 0x11C, 0x120, 0x124, 0x144, 0x14C, 0x150, 0x158
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """SHORTS, ERRORSRC, ENABLE, PSEL, BAUDRATE, DMA, CONFIG."""
-        return 0x200, 0x480, 0x500, 0x508, 0x50C, 0x510, 0x514, 0x524, 0x534, 0x538, 0x53C, 0x544, 0x548, 0x54C, 0x56C
-
     def write(self, offset: int, value: int) -> None:
         """A store; ones clear ERRORSRC, and a transfer has at most 255 bytes."""
         if offset == 0x480:
@@ -74,7 +44,7 @@ class Uarte(Peripheral):
         if offset in {0x538, 0x548} and value > 255:
             self.system.misuse["uarte-transfer-too-long"] += 1
             value &= 255
-        if offset in {0x508, 0x50C, 0x510, 0x514, 0x524, 0x56C} and self.registers[0x500]:
+        if offset in self._SET_UP and self.registers[0x500]:
             self.system.misuse["uarte-set-while-enabled"] += 1
         super().write(offset, value)
 
@@ -92,15 +62,14 @@ class Uarte(Peripheral):
 
     # To the processor
 
-    def start_rx(self) -> None:
-        """Receive into the buffer that is set now."""
+    def _start_rx(self) -> None:
         if self._is_ready(0x514):
             self._into, self._room, self._filled = self.registers[0x534], self.registers[0x538], len(self._kept)
             self._write_kept()
             self._is_receiving = True
             self.happen(0x14C)
 
-    def stop_rx(self) -> None:
+    def _stop_rx(self) -> None:
         """Receive no more, unless ENDRX starts it again."""
         if self._is_receiving:
             self._end_rx()
@@ -112,8 +81,7 @@ class Uarte(Peripheral):
         self._is_stopping = False
         self.happen(self._RXTO)
 
-    def flush_rx(self) -> None:
-        """Write what came while it stopped to RAM."""
+    def _flush_rx(self) -> None:
         self.registers[0x53C] = len(self._kept)
         self._write_kept()
         self.happen(self._ENDRX)
@@ -128,14 +96,13 @@ class Uarte(Peripheral):
         self._is_receiving = False
         self.happen(self._ENDRX)
         if self.registers[0x200] & 1 << 5:
-            self.start_rx()
+            self._start_rx()
 
     def receive(self, data: bytes) -> None:
         """These bytes have arrived."""
         for byte in data:
             if self._is_stopping and len(self._kept) < 4:
                 self._kept += bytes((byte,))
-                self.received += 1
                 self.happen(self._RXDRDY)
                 continue
             if not self._is_receiving or self._filled == self._room:
@@ -143,15 +110,13 @@ class Uarte(Peripheral):
                 continue
             self.system.store(self._into + self._filled, bytes((byte,)))
             self._filled += 1
-            self.received += 1
             self.happen(self._RXDRDY)
             if self._filled == self._room:
                 self._end_rx()
 
     # From the processor
 
-    def start_tx(self) -> None:
-        """Send the buffer that is set now."""
+    def _start_tx(self) -> None:
         if not self._is_ready(0x50C):
             return
         if self._transfer:
@@ -177,7 +142,6 @@ class Uarte(Peripheral):
             data = self.system.load(address, len(expected))
             if data != expected:
                 self.system.misuse["uarte-buffer-changed"] += 1
-            self.sent += len(data)
             self._send(data)
 
         self.system.plan(cycles, leave)
@@ -189,17 +153,10 @@ class Uarte(Peripheral):
             self.happen(self._TXDRDY)
             self.happen(self._ENDTX)
 
-    def stop_tx(self) -> None:
+    def _stop_tx(self) -> None:
         """Send no more; a record that is cut off is lost as a whole."""
         self._transfer = 0
         self.happen(self._TXSTOPPED)
-
-
-class SpiLine(Protocol):
-    """The other end of the SPI."""
-
-    def exchange(self, out: bytes, hz: int) -> bytes:
-        """One whole transaction."""
 
 
 class Spim(Peripheral):
@@ -213,27 +170,21 @@ class Spim(Peripheral):
     irq = 3
     _END = 0x118
 
-    def __init__(self, system: DataSystem, line: SpiLine) -> None:
-        super().__init__(system)
-        self.system: DataSystem = system
-        self._line = line
+    def __init__(self, system: System, exchange: Callable[[bytes, int], bytes]) -> None:
+        """``exchange`` is one whole transaction: what is sent and the clock's rate; the answer."""
+        super().__init__(
+            system,
+            tasks={0x010: self._start, 0x014: lambda: self.happen(0x104)},  # a transfer that runs goes on to its end
+            events=(0x104, 0x110, 0x118, 0x120, 0x14C),  # STOPPED, ENDRX, END, ENDTX, STARTED
+            # SHORTS, ENABLE, PSEL, FREQUENCY, DMA, CONFIG, ORC
+            registers=(*(0x200, 0x500, 0x508, 0x50C, 0x510, 0x524), *range(0x534, 0x550, 4), 0x554, 0x5C0),
+        )
+        self._exchange = exchange
         self.end_cycles: int | None = None
         """When the transfer that runs will be over."""
         self.selected = False
         self._sent = b""
         self._hz = 0
-
-    def make_tasks(self) -> dict[int, Callable[[], None]]:
-        """START, STOP."""
-        return {0x010: self.start, 0x014: self.stop}
-
-    def event_offsets(self) -> tuple[int, ...]:
-        """STOPPED, ENDRX, END, ENDTX, STARTED."""
-        return 0x104, 0x110, 0x118, 0x120, 0x14C
-
-    def register_offsets(self) -> tuple[int, ...]:
-        """SHORTS, ENABLE, PSEL, FREQUENCY, DMA, CONFIG, ORC."""
-        return 0x200, 0x500, 0x508, 0x50C, 0x510, 0x524, 0x534, 0x538, 0x53C, 0x544, 0x548, 0x54C, 0x554, 0x5C0
 
     def write(self, offset: int, value: int) -> None:
         """A store; a transfer has at most 255 bytes."""
@@ -247,8 +198,7 @@ class Spim(Peripheral):
         """The clock's rate: 0x02000000 is 125 kHz, and twice the value is twice the rate."""
         return self.registers[0x524] * 125_000 // 0x02000000
 
-    def start(self) -> None:
-        """Begin a transfer."""
+    def _start(self) -> None:
         if self.registers[0x500] != 7 or not self.hz:
             self.system.misuse["spim-not-enabled"] += 1
             return
@@ -276,7 +226,7 @@ class Spim(Peripheral):
             self._hz = self.hz
             access = decode_header(self._sent)
             if access is not None and not access.is_write and len(self._sent) > access.octets:
-                data = self._line.exchange(self._sent, self._hz)[-len(out) :] if out else b""
+                data = self._exchange(self._sent, self._hz)[-len(out) :] if out else b""
         else:
             self.system.misuse["spim-without-chip-select"] += 1
         if receive:
@@ -286,10 +236,6 @@ class Spim(Peripheral):
         self.happen(0x120)
         self.happen(self._END)
 
-    def stop(self) -> None:
-        """Stop; a transfer that runs goes on to its end."""
-        self.happen(0x104)
-
     def select(self, selected: bool) -> None:
         """The chip select has changed."""
         if self.end_cycles is not None:
@@ -297,8 +243,5 @@ class Spim(Peripheral):
         if not selected and self._sent:
             access, sent, hz = decode_header(self._sent), self._sent, self._hz
             if access is None or access.is_write:
-                self.system.plan(self.system.cycles, lambda: self._finish_write(sent, hz))
+                self.system.plan(self.system.cycles, lambda: self._exchange(sent, hz))
         self._sent, self.selected = b"", selected
-
-    def _finish_write(self, sent: bytes, hz: int) -> None:
-        self._line.exchange(sent, hz)

@@ -11,15 +11,15 @@ import asyncio
 import contextlib
 import random
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, Final, Literal, Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
+from emulator.seat import MakeBoard, Seat
 from emulator.site.serial_wire import SerialWire, WireSettings
 from emulator.site.site_air import SITE_TURNAROUND_S, SiteAir
 from emulator.site.virtual_time import run_on
@@ -29,15 +29,15 @@ from skyless.core.protocol1.beacon import Beacon
 from skyless.core.protocol1.codec import decode_cached
 from skyless.core.site import Site
 from skyless.core.ticks import difference, wrap
-from skyless.radio.interface import AntennaDelays, Radio
-from skyless.run.anchor import AnchorNode, Anchors
+from skyless.radio.interface import AntennaDelays
+from skyless.run.anchor import Anchors
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.open_radio import open_radios
-from skyless.run.tag import TagNode, Tags, TagSettings
+from skyless.run.tag import Tags, TagSettings
 from skyless.sim.dw1000.chip import Chip
 from skyless.sim.dw1000.transceiver import Fault
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
-from skyless.sim.medium import Delivery, Medium, Timeline
+from skyless.sim.medium import Delivery, Medium
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Trajectory
 from skyless.sim.world import diagnostics_of
@@ -45,35 +45,6 @@ from skyless.sim.world import diagnostics_of
 TAG_SETTINGS: Final = TagSettings(publish_hz=1000.0)
 """All fixes are kept."""
 DIRECT_WIRE: Final = WireSettings()
-_REPORT_S: Final = 0.1
-
-
-class Board(Protocol):
-    """What the site needs of a board, however it is made."""
-
-    def notify(self) -> None:
-        """The chip's interrupt line may have risen."""
-
-    def receive(self, data: bytes) -> None:
-        """These bytes have just come completely on the UART."""
-
-    def power_cycle(self) -> None:
-        """The supply failed and is back."""
-
-
-class MakeBoard(Protocol):
-    """Makes a board; ``send`` is called with bytes that have just left the TX pin."""
-
-    def __call__(
-        self,
-        timeline: Timeline[Any],
-        chip: Chip,
-        send: Callable[[bytes], None],
-        *,
-        can_transmit: bool,
-        identity: bytes,
-    ) -> Board:
-        """The board, which starts at this instant."""
 
 
 class SiteChip(Chip):
@@ -104,14 +75,22 @@ class SentFrame(Struct, frozen=True):
     """The sender's counter at the RMARKER."""
     time_s: float
     """True time of its end."""
-    position_m: NDArray[np.float64]
-    """Of the first tag."""
 
 
 class SiteNode:
     """An anchor or a tag: antenna, chip, board, wire and radio."""
 
-    def __init__(self, medium: Medium[Any], number: int, name: str, delays: AntennaDelays) -> None:
+    def __init__(
+        self,
+        medium: Medium[Any],
+        number: int,
+        name: str,
+        delays: AntennaDelays,
+        wire: SerialWire,
+        make_board: MakeBoard,
+        *,
+        can_transmit: bool,
+    ) -> None:
         self.name = name
         self.delays = delays
         self.air = SiteAir(medium, number)
@@ -119,8 +98,8 @@ class SiteNode:
         self.chip.on_wake = partial(medium.switch_on, number)
         self.at_antenna: dict[tuple[bytes, int], float] = {}
         """Frames that the antenna got while it was not sending, by their bytes and stamps: when each ended, in s."""
-        self.board: Board | None = None
-        self.wire: SerialWire | None = None
+        self.wire = wire
+        self.board = make_board(Seat(medium.timeline, self.chip, wire.send, can_transmit, number.to_bytes(8, "little")))
         self.radios: list[WatchedRadio] = []
         """Of its programs one after the other."""
         self.task: asyncio.Task[None] | None = None
@@ -147,185 +126,6 @@ class SiteNode:
         return sending is not None and difference(self.air.now_ticks(), sending.marker_ticks) > 0
 
 
-class EmulatedSite:
-    """One site, deterministic by its seed. ``make_board`` makes every node's board."""
-
-    def __init__(
-        self,
-        site: Site,
-        trajectories: Sequence[Trajectory],
-        make_board: MakeBoard,
-        *,
-        seed: int = 1,
-        wire: WireSettings = DIRECT_WIRE,
-        lead_s: float | None = None,
-        room: Room | None = None,
-    ) -> None:
-        """``lead_s``: how early anchors hand their frames over at first; None for what their radios ask for.
-
-        ``room``: errors of survey and ranges; None for none.
-        """
-        self.site, self.seed, self.room, self._make_board, self._wire = site, seed, room, make_board, wire
-        self._lead_s = lead_s
-        self.trajectories = list(trajectories)
-        faults = replace(impairments_of(Request(site, seed=seed, room=room, carrier=True), site), diagnostics=True)
-        tags = [TagSpec(trajectory) for trajectory in trajectories]
-        self.medium: Medium[bool] = Medium(site, tags, faults, seed, self._deliver, SITE_TURNAROUND_S)
-        self.anchors = [
-            self._node(
-                number, str(anchor.id), AntennaDelays(anchor.tx_antenna_delay_ticks, anchor.rx_antenna_delay_ticks)
-            )
-            for number, anchor in enumerate(site.anchors)
-        ]
-        count = len(self.anchors)
-        self.tags = [self._node(count + index, f"tag{index + 1}", AntennaDelays()) for index in range(len(tags))]
-        self.nodes = self.anchors + self.tags
-        self.sent: list[SentFrame] = []
-        self.cut = 0
-        """Frames whose sender's supply failed before they ended."""
-        self.fixes: dict[str, list[tuple[FixMessage, float]]] = {node.name: [] for node in self.tags}
-        """Fixes of each tag, with when its antenna had got the frame, in s of true time."""
-        self.log: list[str] = []
-        self.programs: dict[str, AnchorNode | TagNode] = {}
-        """The programs that run, by their nodes' names."""
-
-    def _node(self, number: int, name: str, delays: AntennaDelays) -> SiteNode:
-        self.medium.switch_on(number)
-        return SiteNode(self.medium, number, name, delays)
-
-    # Time
-
-    def run(self, seconds: float, report: Callable[[float], None] = lambda _: None) -> None:
-        """Let everything start, run for some seconds, and end; ``report`` is called with the time now and then."""
-        run_on(self.medium.timeline, self._play(seconds, report))
-
-    async def _play(self, seconds: float, report: Callable[[float], None]) -> None:
-        async with self:
-            while (left_s := seconds - self.medium.now_s) > 0.0:
-                report(self.medium.now_s)
-                await asyncio.sleep(min(left_s, _REPORT_S))
-
-    async def __aenter__(self) -> "EmulatedSite":
-        """Plug all boards in, and start all programs."""
-        for node in self.nodes:
-            self.plug_in(node)
-            self.start_host(node)
-        return self
-
-    async def __aexit__(self, *_: object) -> None:
-        """End all."""
-        for node in self.nodes:
-            await self.stop_host(node)
-            close = getattr(node.board, "close", None)
-            if close is not None:
-                close()
-            if node.wire is not None:
-                node.wire.close()
-
-    # Boards
-
-    def plug_in(self, node: SiteNode) -> None:
-        """Give a node its board, with a port."""
-        number = node.air.node
-        node.wire = SerialWire(self.medium.timeline, self._wire, random.Random(f"{self.seed} wire {number}"))
-        node.board = self._make_board(
-            self.medium.timeline,
-            node.chip,
-            node.wire.send,
-            can_transmit=number < len(self.anchors),
-            identity=number.to_bytes(8, "little"),
-        )
-        node.wire.start(node.board.receive)
-
-    def brown_out(self, node: SiteNode, part: Literal["processor", "chip", "both"]) -> None:
-        """Let the supply fail for a moment, for the processor, its radio, or both."""
-        if part != "processor":
-            self.medium.switch_off(node.air.node)
-            self.medium.switch_on(node.air.node)
-            node.chip.power_cycle()
-        if part != "chip":
-            assert node.board is not None
-            node.board.power_cycle()
-        elif node.board is not None:
-            node.board.notify()
-
-    # Programs
-
-    def start_host(self, node: SiteNode) -> None:
-        """Start the program of a node."""
-        radio = WatchedRadio(self._radio(node), node.air, self._lead_s)
-        node.radios.append(radio)
-        if node in self.anchors:
-            anchors = Anchors(self.site, [radio], None, self.log.append, simulated=lambda: True)
-            self.programs[node.name] = anchors.nodes[0]
-            work = anchors.run()
-        else:
-            tags = Tags(TAG_SETTINGS, [radio], None, self.log.append, lambda fix: self._on_fix(node, fix))
-            self.programs[node.name] = tags.tags[0].node
-            work = tags.run()
-        node.task = asyncio.ensure_future(work)
-
-    def _radio(self, node: SiteNode) -> Radio:
-        """The radio of a node's program."""
-        assert node.wire is not None
-        kind: Literal["anchor", "tag"] = "anchor" if node in self.anchors else "tag"
-        return open_radios(f"serial:{node.wire.path}", kind, (node.name,), [node.delays])[0]
-
-    async def stop_host(self, node: SiteNode) -> None:
-        """Let the program of a node vanish."""
-        if node.task is not None:
-            task, node.task = node.task, None
-            task.cancel()
-            with contextlib.suppress(asyncio.CancelledError):
-                await task
-
-    def _on_fix(self, node: SiteNode, fix: FixMessage) -> None:
-        assert node.radio.present is not None
-        self.fixes[node.name].append((fix, node.at_antenna[node.radio.present]))
-
-    # The air
-
-    def _deliver(self, delivery: Delivery) -> None:
-        """A frame has ended: at its sender, and at all that can receive it."""
-        flight, medium = delivery.flight, self.medium
-        sender, now_s = self.nodes[flight.sender], medium.now_s
-        is_whole = flight.boot == medium.boots[flight.sender]
-        if is_whole:
-            position_m = self.trajectories[0].position(now_s)
-            tx_ticks = wrap(flight.marker_local_ticks)
-            self.sent.append(SentFrame(flight.sender, flight.frame, tx_ticks, now_s, position_m))
-            sender.chip.transceiver.finish()
-            _notify(sender)
-        else:
-            self.cut += 1
-        for rows in (delivery.by_anchors, delivery.by_tags):
-            for row in rows:
-                node = self.nodes[int(row["node"])]
-                rx_ticks = int(row["rx_ticks"])
-                if is_whole:
-                    node.at_antenna[flight.frame, rx_ticks] = now_s
-                measured = diagnostics_of(row) or Diagnostics()
-                fault: Fault | None = None if is_whole else "parity"
-                phase_cycles = float(row["phase_cycles"])
-                node.chip.receive(flight.frame, rx_ticks, measured, fault, carrier_phase_cycles=phase_cycles)
-                _notify(node)
-
-    # What came of it
-
-    def sent_frames(self) -> list[tuple[int, bytes, int]]:
-        """Node, frame and stamp of all that was sent as a whole."""
-        return [(one.node, one.frame, one.tx_ticks) for one in self.sent]
-
-    def result(self, warmup_s: float = 3.0) -> "SiteResult":
-        """What was sent, reported and computed since ``warmup_s``."""
-        return judge(self, warmup_s)
-
-
-def _notify(node: SiteNode) -> None:
-    if node.board is not None:
-        node.board.notify()
-
-
 class SiteResult(Struct, frozen=True):
     """One run."""
 
@@ -350,44 +150,181 @@ class SiteResult(Struct, frozen=True):
     """Error of the tags' positions (2-D), root mean square over all fixes."""
 
 
-def judge(site: EmulatedSite, warmup_s: float) -> SiteResult:
-    """Judge a run by what its antennas got and sent."""
-    count, end_s = len(site.anchors), site.medium.now_s - 5e-3  # what is on its way at the end is not judged
-    slots = set()
-    wrong = 0
-    made = [node.made for node in site.nodes]
-    for one in site.sent:
-        beacon = decode_cached(one.frame)
-        wrong += (one.frame, one.tx_ticks) not in made[one.node]
-        if isinstance(beacon, Beacon) and warmup_s <= one.time_s < end_s:
-            slots.add(beacon.superframe * count + one.node)
-    first, last = (min(slots), max(slots) + 1) if slots else (0, 0)
-    misused: Counter[str] = Counter()
-    at_antennas, reported, least = 0, 0, 1.0
-    for node in site.nodes:
-        heard = node.heard
-        judged = {key for key, ended_s in node.at_antenna.items() if warmup_s <= ended_s < end_s}
-        wrong += len(heard - node.at_antenna.keys())
-        at_antennas += len(judged)
-        reported += len(judged & heard)
-        least = min(least, len(judged & heard) / max(len(judged), 1))
-        misused += node.chip.misuse + node.air.counts + getattr(node.board, "misuse", Counter())
-    errors_m2 = [
-        float(np.sum((np.array(fix.position_m) - site.trajectories[index].position(ended_s))[:2] ** 2))
-        for index, node in enumerate(site.tags)
-        for fix, ended_s in site.fixes[node.name]
-        if warmup_s <= ended_s
-    ]
-    late = sum(time_s >= warmup_s for node in site.anchors for radio in node.radios for time_s in radio.late)
-    return SiteResult(
-        slots=last - first,
-        sent=len(slots),
-        late=late,
-        at_antennas=at_antennas,
-        reported=reported,
-        least_reported=least,
-        wrong=wrong,
-        misused=dict(misused),
-        fixes=len(errors_m2),
-        rms_m=float(np.sqrt(np.mean(errors_m2))) if errors_m2 else float("nan"),
-    )
+class EmulatedSite:
+    """One site, deterministic by its seed. ``make_board`` makes every node's board."""
+
+    def __init__(
+        self,
+        site: Site,
+        trajectories: Sequence[Trajectory],
+        make_board: MakeBoard,
+        *,
+        seed: int = 1,
+        wire: WireSettings = DIRECT_WIRE,
+        lead_s: float | None = None,
+        room: Room | None = None,
+    ) -> None:
+        """``lead_s``: how early anchors hand their frames over at first; None for what their radios ask for.
+
+        ``room``: errors of survey and ranges; None for none.
+        """
+        self.site, self._seed, self._make_board, self._wire, self._lead_s = site, seed, make_board, wire, lead_s
+        self.trajectories = list(trajectories)
+        faults = replace(impairments_of(Request(site, seed=seed, room=room, carrier=True), site), diagnostics=True)
+        tags = [TagSpec(trajectory) for trajectory in trajectories]
+        self.medium: Medium[bool] = Medium(site, tags, faults, seed, self._deliver, SITE_TURNAROUND_S)
+        self.anchors = [
+            self._node(
+                number, str(anchor.id), AntennaDelays(anchor.tx_antenna_delay_ticks, anchor.rx_antenna_delay_ticks)
+            )
+            for number, anchor in enumerate(site.anchors)
+        ]
+        count = len(self.anchors)
+        self.tags = [self._node(count + index, f"tag{index + 1}", AntennaDelays()) for index in range(len(tags))]
+        self.nodes = self.anchors + self.tags
+        self.sent: list[SentFrame] = []
+        self.cut = 0
+        """Frames whose sender's supply failed before they ended."""
+        self.fixes: dict[str, list[tuple[FixMessage, float]]] = {node.name: [] for node in self.tags}
+        """Fixes of each tag, with when its antenna had got the frame, in s of true time."""
+        self.log: list[str] = []
+
+    def _node(self, number: int, name: str, delays: AntennaDelays) -> SiteNode:
+        self.medium.switch_on(number)
+        wire = SerialWire(self.medium.timeline, self._wire, random.Random(f"{self._seed} wire {number}"))
+        is_anchor = number < len(self.site.anchors)
+        return SiteNode(self.medium, number, name, delays, wire, self._make_board, can_transmit=is_anchor)
+
+    # Time
+
+    def run(self, seconds: float) -> None:
+        """Let everything start, run for some seconds, and end."""
+        run_on(self.medium.timeline, self._play(seconds))
+
+    async def _play(self, seconds: float) -> None:
+        async with self:
+            await asyncio.sleep(seconds)
+
+    async def __aenter__(self) -> "EmulatedSite":
+        """Connect all boards, and start all programs."""
+        for node in self.nodes:
+            node.wire.start(node.board.receive)
+            self.start_host(node)
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """End all."""
+        for node in self.nodes:
+            await self.stop_host(node)
+            close = getattr(node.board, "close", None)
+            if close is not None:
+                close()
+            node.wire.close()
+
+    # Boards
+
+    def brown_out(self, node: SiteNode, part: Literal["processor", "chip", "both"]) -> None:
+        """Let the supply fail for a moment, for the processor, its radio, or both."""
+        if part != "processor":
+            self.medium.switch_off(node.air.node)
+            self.medium.switch_on(node.air.node)
+            node.chip.power_cycle()
+        if part != "chip":
+            node.board.power_cycle()
+        else:
+            node.board.notify()
+
+    # Programs
+
+    def start_host(self, node: SiteNode) -> None:
+        """Start the program of a node."""
+        kind: Literal["anchor", "tag"] = "anchor" if node in self.anchors else "tag"
+        (real,) = open_radios(f"serial:{node.wire.path}", kind, (node.name,), [node.delays])
+        radio = WatchedRadio(real, self._lead_s)
+        node.radios.append(radio)
+        if node in self.anchors:
+            work = Anchors(self.site, [radio], None, self.log.append, simulated=lambda: True).run()
+        else:
+            work = Tags(TAG_SETTINGS, [radio], None, self.log.append, lambda fix: self._on_fix(node, fix)).run()
+        node.task = asyncio.ensure_future(work)
+
+    async def stop_host(self, node: SiteNode) -> None:
+        """Let the program of a node vanish."""
+        if node.task is not None:
+            task, node.task = node.task, None
+            task.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await task
+
+    def _on_fix(self, node: SiteNode, fix: FixMessage) -> None:
+        self.fixes[node.name].append((fix, node.at_antenna[next(reversed(node.radio.heard))]))
+
+    # The air
+
+    def _deliver(self, delivery: Delivery) -> None:
+        """A frame has ended: at its sender, and at all that can receive it."""
+        flight, medium = delivery.flight, self.medium
+        sender, now_s = self.nodes[flight.sender], medium.now_s
+        is_whole = flight.boot == medium.boots[flight.sender]
+        if is_whole:
+            tx_ticks = wrap(flight.marker_local_ticks)
+            self.sent.append(SentFrame(flight.sender, flight.frame, tx_ticks, now_s))
+            sender.chip.transceiver.finish()
+            sender.board.notify()
+        else:
+            self.cut += 1
+        for rows in (delivery.by_anchors, delivery.by_tags):
+            for row in rows:
+                node = self.nodes[int(row["node"])]
+                rx_ticks = int(row["rx_ticks"])
+                if is_whole:
+                    node.at_antenna[flight.frame, rx_ticks] = now_s
+                measured = diagnostics_of(row) or Diagnostics()
+                fault: Fault | None = None if is_whole else "parity"
+                phase_cycles = float(row["phase_cycles"])
+                node.chip.receive(flight.frame, rx_ticks, measured, fault, carrier_phase_cycles=phase_cycles)
+                node.board.notify()
+
+    # What came of it
+
+    def result(self, warmup_s: float) -> SiteResult:
+        """What was sent, reported and computed since ``warmup_s``, by what the antennas got and sent."""
+        count, end_s = len(self.anchors), self.medium.now_s - 5e-3  # what is on its way at the end is not judged
+        slots = set()
+        wrong = 0
+        made = [node.made for node in self.nodes]
+        for one in self.sent:
+            beacon = decode_cached(one.frame)
+            wrong += (one.frame, one.tx_ticks) not in made[one.node]
+            if isinstance(beacon, Beacon) and warmup_s <= one.time_s < end_s:
+                slots.add(beacon.superframe * count + one.node)
+        first, last = (min(slots), max(slots) + 1) if slots else (0, 0)
+        misused: Counter[str] = Counter()
+        at_antennas, reported, least = 0, 0, 1.0
+        for node in self.nodes:
+            heard = node.heard
+            judged = {key for key, ended_s in node.at_antenna.items() if warmup_s <= ended_s < end_s}
+            wrong += len(heard - node.at_antenna.keys())
+            at_antennas += len(judged)
+            reported += len(judged & heard)
+            least = min(least, len(judged & heard) / max(len(judged), 1))
+            misused += node.chip.misuse + node.air.counts + getattr(node.board, "misuse", Counter())
+        errors_m2 = [
+            float(np.sum((np.array(fix.position_m) - self.trajectories[index].position(ended_s))[:2] ** 2))
+            for index, node in enumerate(self.tags)
+            for fix, ended_s in self.fixes[node.name]
+            if warmup_s <= ended_s
+        ]
+        late = sum(time_s >= warmup_s for node in self.anchors for radio in node.radios for time_s in radio.late)
+        return SiteResult(
+            slots=last - first,
+            sent=len(slots),
+            late=late,
+            at_antennas=at_antennas,
+            reported=reported,
+            least_reported=least,
+            wrong=wrong,
+            misused=dict(misused),
+            fixes=len(errors_m2),
+            rms_m=float(np.sqrt(np.mean(errors_m2))) if errors_m2 else float("nan"),
+        )

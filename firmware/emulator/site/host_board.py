@@ -3,16 +3,14 @@
 What the program computes takes no time; transfers, pauses and bytes on the line take theirs.
 """
 
-from collections.abc import Callable
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
-from emulator.board_library import CBoard
+from emulator.board_library import CBoard, Processor
+from emulator.seat import Seat
 from emulator.site.host_programs import Process
 from skyless.core.constants import TICK_S
 from skyless.core.ticks import from_seconds
-from skyless.sim.dw1000.chip import Chip
-from skyless.sim.medium import Timeline
 
 BYTE_S: Final = 10e-6
 """On the UART: ten bits at 1 Mbaud."""
@@ -26,34 +24,22 @@ _TURN_S: Final = 5e-6
 """What a turn takes besides its transfers (assumed; the emulated processor counts it)."""
 
 
-class HostBoard:
+class HostBoard(Processor):
     """One board; its program is run again after the supply failed."""
 
-    def __init__(
-        self,
-        timeline: Timeline[Any],
-        chip: Chip,
-        send: Callable[[bytes], None],
-        *,
-        can_transmit: bool,
-        identity: bytes,
-    ) -> None:
-        self.chip = chip
-        self._can_transmit, self._identity = can_transmit, identity
-        self.lights = 0
-        self.settings: bytes | None = None
-        self._timeline, self._send = timeline, send
+    def __init__(self, seat: Seat) -> None:
+        self._seat, self._timeline, self.chip = seat, seat.timeline, seat.chip
         self._start()
 
     def program(self) -> None:
         """Run the board's loop, as the image's ``main`` does."""
-        board = CBoard(self, can_transmit=self._can_transmit, device_id=self._identity)
+        board = CBoard(self, can_transmit=self._seat.can_transmit, device_id=self._seat.identity)
         board.begin()
         while True:
             wait_us = board.turn()
             self.process.sleep(_TURN_S)
-            if wait_us:
-                self.wait_s(1e-6 * wait_us)
+            if wait_us and not self._came:  # at most until the interrupt line rises or bytes come
+                self.process.wait(1e-6 * wait_us)
 
     def _start(self) -> None:
         self._came = bytearray()
@@ -119,31 +105,10 @@ class HostBoard:
         """Whether the chip's line is high."""
         return self.chip.irq
 
-    def show(self, lights: int) -> None:
-        """Switch the lights."""
-        self.lights = lights
-
     def sleep_for(self, milliseconds: int) -> None:
         """Sleep; what comes on the UART is lost."""
         self.process.sleep(1e-3 * milliseconds)
         self._came.clear()
-
-    def read_settings(self) -> bytes | None:
-        """What was written last; it outlives power failures."""
-        return self.settings
-
-    def write_settings(self, settings: bytes) -> None:
-        """Keep settings."""
-        self.settings = settings
-
-    def advertise(self, data: bytes) -> bool:
-        """No Bluetooth here."""
-        return bool(data)
-
-    def wait_s(self, seconds: float) -> None:
-        """Wait, at most until the interrupt line rises or bytes come."""
-        if not self._came:
-            self.process.wait(seconds)
 
     def read_line(self, size: int) -> bytes:
         """What has come on the UART, at most ``size`` bytes."""
@@ -164,10 +129,7 @@ class HostBoard:
     def _deliver(self, data: bytes, sender: Process) -> None:
         """The bytes have left the pin, unless the supply failed meanwhile."""
         if sender is self.process:
-            self._send(data)
-
-    def set_rate(self, baud: int) -> None:
-        """All rates are alike here."""
+            self._seat.send(data)
 
     def restart_line(self) -> None:
         """Discard all that has come."""

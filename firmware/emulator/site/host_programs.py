@@ -25,11 +25,6 @@ class HostLatency(Struct, frozen=True):
     work_s: float = 0.2e-3
     """What Python takes to decode a frame, or to make one (assumed)."""
 
-    @classmethod
-    def none(cls) -> "HostLatency":
-        """A host that takes no time but for the bits."""
-        return cls(0.0, 0.0, 0.0, 0.0, 0.0)
-
     def draw(self, generator: random.Random) -> float:
         """One transfer's time."""
         if generator.random() < self.spike_probability:

@@ -1,11 +1,6 @@
 """The way between a board's UART and the programs of its host: pins, an adapter, a pseudo-terminal, a busy computer."""
 
-import asyncio
-import contextlib
-import os
 import random
-import termios
-import tty
 from collections.abc import Callable
 from functools import partial
 from typing import Any, Final
@@ -15,6 +10,7 @@ from msgspec import Struct
 from emulator.site.host_programs import HostLatency
 from emulator.site.virtual_time import wake
 from skyless.core.ticks import from_seconds
+from skyless.radio.serial.pseudo_terminal import Pty
 from skyless.sim.medium import Timeline
 
 BITS_A_BYTE: Final = 10
@@ -22,7 +18,6 @@ BITS_A_BYTE: Final = 10
 _USB_BYTES: Final = 64
 _USB_S: Final = 1e-3
 """A debugger's probe passes on at most so much at most so often, as a packet of full-speed USB (assumed)."""
-_READ_BYTES: Final = 4096
 _FIFO_BYTES: Final = 32
 """A computer's UART wakes its program at most once for this number of bytes (assumed)."""
 
@@ -42,24 +37,15 @@ class WireSettings(Struct, frozen=True):
 Change = Callable[[bytes], bytes]
 
 
-def unchanged(data: bytes) -> bytes:
-    """A wire without noise."""
-    return data
-
-
 class SerialWire:
     """One board's. ``path`` is the port that its programs open."""
 
     def __init__(self, timeline: Timeline[Any], settings: WireSettings, generator: random.Random) -> None:
         self._timeline, self._settings, self._generator = timeline, settings, generator
-        self._inner, self._outer = os.openpty()
-        tty.setraw(self._outer)
-        os.set_blocking(self._inner, False)
-        self.path = os.ttyname(self._outer)
-        self.noise_to_board: Change = unchanged
-        self.noise_to_host: Change = unchanged
-        self.overruns = 0
-        """How often bytes that nobody read were dropped."""
+        self._pty = Pty(held_bytes=0)
+        self.path, self.close = self._pty.path, self._pty.close
+        self.noise_to_board: Change = bytes
+        self.noise_to_host: Change = bytes
         self._receive: Callable[[bytes], None] | None = None
         self._byte_ticks = from_seconds(BITS_A_BYTE / settings.baud)
         self._line_free = self._host_free = self._read_ticks = 0
@@ -69,13 +55,7 @@ class SerialWire:
     def start(self, receive: Callable[[bytes], None]) -> None:
         """Pass on what programs write, from the running loop on; ``receive`` gets what arrives at the board."""
         self._receive = receive
-        asyncio.get_running_loop().add_reader(self._inner, self._read)
-
-    def close(self) -> None:
-        """Remove the port."""
-        asyncio.get_running_loop().remove_reader(self._inner)
-        os.close(self._inner)
-        os.close(self._outer)
+        self._pty.start(self._on_written)
 
     # To the host
 
@@ -109,27 +89,19 @@ class SerialWire:
         return from_seconds(host.draw(self._generator))
 
     def _write(self, data: bytes) -> None:
-        try:
-            written = os.write(self._inner, data)
-        except BlockingIOError:
-            written = 0
-        if written < len(data):  # nobody reads: a UART keeps nothing either
-            self.overruns += 1
-            termios.tcflush(self._outer, termios.TCIFLUSH)
+        self._pty.send(data)
         wake(self._timeline)
 
     # To the board
 
-    def _read(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            data = os.read(self._inner, _READ_BYTES)
-            host = self._settings.host
-            if host is None:
-                self._to_adapter(data)
-                return
-            begins = max(self._timeline.now_ticks, self._host_free) + self._pause_ticks(host)
-            self._host_free = begins + from_seconds(host.work_s)
-            self._timeline.at(self._host_free, partial(self._to_adapter, data))
+    def _on_written(self, data: bytes) -> None:
+        host = self._settings.host
+        if host is None:
+            self._to_adapter(data)
+            return
+        begins = max(self._timeline.now_ticks, self._host_free) + self._pause_ticks(host)
+        self._host_free = begins + from_seconds(host.work_s)
+        self._timeline.at(self._host_free, partial(self._to_adapter, data))
 
     def _to_adapter(self, data: bytes) -> None:
         if self._settings.usb:

@@ -1,14 +1,14 @@
-"""Boards that are tags by themselves, in a simulated world: nothing is at their serial ports but what listens.
+"""A board that is a tag by itself, in a simulated world: nothing is at its serial port but what listens.
 
 The anchors are their machines as they run on hosts, without boards.
 """
 
 import random
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from emulator.site.emulated_site import Board, MakeBoard
+from emulator.seat import MakeBoard, Seat
 from emulator.site.site_air import NodeAir
 from skyless.core.air.reception import Diagnostics
 from skyless.core.arrays import Array
@@ -17,70 +17,47 @@ from skyless.radio.interface import AntennaDelays
 from skyless.radio.serial.board_settings import BoardSettings
 from skyless.radio.serial.link import Writer
 from skyless.sim.dw1000.chip import Chip
-from skyless.sim.world import Broadcast, World
+from skyless.sim.world import World
 
 DELAYS: Final = AntennaDelays()
 _STARTED_S: Final = 10e-3
 """A board listens to its serial port by then."""
 
 
-class TagBoard:
-    """A board, its chip, and where it was at the newest beacon that reached it."""
-
-    def __init__(self, chip: Chip, board: Board) -> None:
-        self.chip, self.board = chip, board
-        self.truth_m: Array | None = None
-
-
 class TagWorld:
-    """A world whose tags are boards."""
+    """A world whose only tag is a board."""
 
     def __init__(
         self,
         world: World,
-        tags: int,
         make_board: MakeBoard,
-        said: Callable[[int, float, bytes], None],
+        said: Callable[[float, bytes], None],
         settings: BoardSettings,
-        jump_ppm: float = 0.0,
+        jump_ppm: float,
     ) -> None:
-        """``said`` is called with tag, true time in s and bytes of its serial port; the boards get these settings.
+        """``said`` is called with true time in s and bytes of the board's serial port; the board gets these settings.
 
-        ``jump_ppm``: standard deviation by which a chip's crystal has changed each time that it wakes.
+        ``jump_ppm``: standard deviation by which the chip's crystal has changed each time that it wakes.
         """
-        self._world, self._said, self._jump_ppm = world, said, jump_ppm
-        first = len(world.medium.boots) - tags
-        self.tags = [self._tag(index, first + index, make_board) for index in range(tags)]
-        record, timeline = Writer().set_tag_config(settings, keep=True), world.medium.timeline
-        for tag in self.tags:
-            timeline.at(from_seconds(_STARTED_S), partial(tag.board.receive, record))
-
-    def _tag(self, index: int, node: int, make_board: MakeBoard) -> TagBoard:
-        medium = self._world.medium
-        air = NodeAir(medium, node)
-        chip = Chip(air, DELAYS.tx_ticks, DELAYS.rx_ticks, air.now_s)
-        jumps = random.Random(f"crystal {node}")
+        self._world, medium, node = world, world.medium, len(world.medium.boots) - 1
+        air, jumps = NodeAir(medium, node), random.Random(f"crystal {node}")
+        self.chip = Chip(air, DELAYS.tx_ticks, DELAYS.rx_ticks, air.now_s)
+        self.truth_m: Array | None = None
+        """Where the tag was at the newest beacon that reached it."""
 
         def wake() -> None:
             medium.switch_on(node)
-            medium.clocks[node]["rate"] += 1e-6 * jumps.gauss(0.0, self._jump_ppm)
+            medium.clocks[node]["rate"] += 1e-6 * jumps.gauss(0.0, jump_ppm)
 
-        chip.on_wake = wake
-        board = make_board(
-            medium.timeline,
-            chip,
-            lambda data: self._said(index, medium.now_s, data),
-            can_transmit=False,
-            identity=index.to_bytes(8, "little"),
-        )
-        return TagBoard(chip, board)
+        self.chip.on_wake = wake
+        self.board = make_board(Seat(medium.timeline, self.chip, lambda data: said(medium.now_s, data)))
+        record = Writer().set_tag_config(settings, keep=True)
+        medium.timeline.at(from_seconds(_STARTED_S), partial(self.board.receive, record))
 
-    def run(self, until_s: float) -> Iterator[Broadcast]:
-        """Let true time pass; each beacon, when it has reached the boards that are in reach."""
+    def run(self, until_s: float) -> None:
+        """Let true time pass."""
         for broadcast in self._world.run(until_s):
-            for index, reception, position_m in broadcast.receptions():
-                tag = self.tags[index]
-                tag.truth_m = position_m
-                tag.chip.receive(reception.frame, reception.rx_ticks, reception.diagnostics or Diagnostics())
-                tag.board.notify()
-            yield broadcast
+            for _, reception, position_m in broadcast.receptions():
+                self.truth_m = position_m
+                self.chip.receive(reception.frame, reception.rx_ticks, reception.diagnostics or Diagnostics())
+                self.board.notify()

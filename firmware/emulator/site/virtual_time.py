@@ -7,11 +7,12 @@ for a kernel thread).
 """
 
 import asyncio
-import contextlib
 import selectors
 import time
-from collections.abc import Callable, Coroutine, Iterator
+from collections.abc import Callable, Coroutine
+from contextlib import AbstractContextManager
 from typing import Any, Final, TypeVar
+from unittest import mock
 
 from skyless.core.constants import TICK_S
 from skyless.core.ticks import from_seconds
@@ -78,27 +79,19 @@ class TimelineLoop(asyncio.SelectorEventLoop):
         return done
 
 
-@contextlib.contextmanager
-def timeline_clocks(timeline: Timeline[Any]) -> Iterator[None]:
+def timeline_clocks(timeline: Timeline[Any]) -> AbstractContextManager[object]:
     """Let the clocks of the module ``time`` show the timeline's time."""
 
     def now_s() -> float:
         return timeline.now_ticks * TICK_S
 
-    clocks: dict[str, Callable[[], float]] = {
-        "monotonic": now_s,
-        "monotonic_ns": lambda: round(now_s() * 1e9),
-        "time": lambda: UNIX_S + now_s(),
-        "time_ns": lambda: round((UNIX_S + now_s()) * 1e9),
-    }
-    real = {name: getattr(time, name) for name in clocks}
-    for name, clock in clocks.items():
-        setattr(time, name, clock)
-    try:
-        yield
-    finally:
-        for name, clock in real.items():
-            setattr(time, name, clock)
+    return mock.patch.multiple(
+        time,
+        monotonic=now_s,
+        monotonic_ns=lambda: round(now_s() * 1e9),
+        time=lambda: UNIX_S + now_s(),
+        time_ns=lambda: round((UNIX_S + now_s()) * 1e9),
+    )
 
 
 def run_on(timeline: Timeline[Any], main: Coroutine[Any, Any, Value]) -> Value:

@@ -70,13 +70,12 @@ class Reported(Struct, frozen=True, gc=False):
     host_s: float
 
 
+# Values of records; one that is too short raises struct.error
+
+
 def board_fix(record: bytes) -> BoardFix | None:
     """The fix of a record; None where there is none."""
-    if len(record) < BODY_AT + _FIX.size:
-        return None
-    ticks, _, _, latency_us, _, reason, site, _, height_known, verified, *rest, count = _FIX.unpack_from(
-        record, BODY_AT
-    )
+    ticks, _, _, latency_us, _, reason, site, _, height, verified, *rest, count = _FIX.unpack_from(record, BODY_AT)
     place, velocity, covariance, velocity_covariance = rest[:3], rest[3:6], rest[6:12], rest[12:18]
     chi2, mean_square_m2, hpl_m, vpl_m, levels, risk, limit_m = rest[18:]
     is_whole = len(record) == BODY_AT + _FIX.size + 2 * count and not reason and levels <= UNAVAILABLE
@@ -99,7 +98,7 @@ def board_fix(record: bytes) -> BoardFix | None:
         struct.unpack_from(f"<{count}H", record, BODY_AT + _FIX.size),
         np.empty((0, 3)),
         DEFAULT_METHOD,
-        bool(height_known),
+        bool(height),
         requirement=IntegrityRequirement(float(f"{risk:.7g}"), limit_m or None),
         verified_until_s=time_s if verified else None,
         unverified=0.0 if verified else 1.0,
@@ -109,8 +108,6 @@ def board_fix(record: bytes) -> BoardFix | None:
 
 def board_status(record: bytes) -> BoardStatus | None:
     """The state of a record; None where there is none."""
-    if len(record) < BODY_AT + _STATUS.size:
-        return None
     site, reason, _, *counts = _STATUS.unpack_from(record, BODY_AT)
     if reason >= len(_REASONS):
         return None
@@ -118,18 +115,14 @@ def board_status(record: bytes) -> BoardStatus | None:
     return BoardStatus(None if site == _NO_SITE else site, _REASONS[reason], dict(zip(names, counts, strict=True)))
 
 
-def anchor_place(record: bytes) -> AnchorPlace | None:
-    """The anchor of a record; None where there is none."""
-    if len(record) < BODY_AT + _PLACE.size:
-        return None
+def anchor_place(record: bytes) -> AnchorPlace:
+    """The anchor of a record."""
     anchor, x_mm, y_mm, z_mm = _PLACE.unpack_from(record, BODY_AT)
     return AnchorPlace(anchor, (x_mm / 1000, y_mm / 1000, z_mm / 1000))
 
 
-def georeference(record: bytes) -> GeoreferencePage | None:
-    """The place on the Earth of a record, as on the air; None where there is none."""
-    if len(record) < BODY_AT + _EARTH.size:
-        return None
+def georeference(record: bytes) -> GeoreferencePage:
+    """The place on the Earth of a record, as on the air."""
     latitude, longitude, height_mm, heading = _EARTH.unpack_from(record, BODY_AT)
     return GeoreferencePage(latitude / 1e7, longitude / 1e7, height_mm / 1000, heading / 1e7)
 

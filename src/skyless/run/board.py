@@ -137,7 +137,7 @@ class LinkProtocol:
             dx_ticks = int.from_bytes(record[BODY_AT : link.TX_FRAME_AT], "little")
             self._transmit(dx_ticks, record[link.TX_FRAME_AT :])
         elif kind in (link.RX_ON, link.TX_AT):
-            self._write(self._writer.refused(kind, link.REFUSED_MALFORMED))
+            self.report(link.REFUSED, bytes((kind, link.REFUSED_MALFORMED)))
         elif kind in (link.SET_TAG_CONFIG, link.ASK_TAG_CONFIG, link.SET_TIME) and self.tag is not None:
             self.tag.execute(record)
         else:
@@ -159,7 +159,7 @@ class LinkProtocol:
         """Set the antenna delays; the other settings must be those of the air."""
         if len(record) < link.CONFIG_BYTES or record[2:8] != _CONFIG[2:8]:
             reason = link.REFUSED_MALFORMED if len(record) < link.CONFIG_BYTES else link.REFUSED_SETTING
-            self._write(self._writer.refused(link.CONFIG, reason))
+            self.report(link.REFUSED, bytes((link.CONFIG, reason)))
             return
         self._tx_delay_ticks = int.from_bytes(record[8:10], "little")
         self._wants_phases = bool(record[link.CONFIG_BYTES - 1] & link.WANTS_PHASES)

@@ -14,15 +14,13 @@ from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio, UciRadio
 from skyless.radio.interface import AntennaDelays, Radio
 from skyless.radio.serial.serial_port import check_path
-from skyless.radio.serial.serial_radio import Computing, SerialRadio, until_next_start
+from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, SerialRadio
 from skyless.run._dw1000_model import ModelPort
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
 _SERIAL_BAUD: Final = 1_000_000
-_SNIFFER_BAUD: Final = 115_200
-"""Any rate serves on a real sniffer's USB port."""
-_LISTENER_BAUD: Final = 115_200
-_UCI_BAUD: Final = 115_200
+_FOREIGN_BAUD: Final = 115_200
+"""Of listeners and FiRa boards; any rate serves on a real sniffer's USB port."""
 _EXPECTED: Final = (
     "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN], model:HOST[:PORT], "
     "listener:PATH[@BAUD], sniffer:PATH[@BAUD] or uci:PATH[@BAUD]"
@@ -90,9 +88,8 @@ def open_radios(
             raise SkylessError(f"--radio is {spec!r}; a chip on SPI carries one node, not {len(names)}")
         return (Dw1000Radio(spi_port(spec, where), names[0], settings[0], phases=phases),)
     if driver == "serial":
-        ports = _ports(spec, where, _SERIAL_BAUD, names)
-        transmits = kind == "anchor"
-        computing = Computing(until_next_start, keeps=False) if computes else None
+        ports, transmits = _ports(spec, where, _SERIAL_BAUD, names), kind == "anchor"
+        computing = UNTIL_NEXT_START if computes else None
         return tuple(
             SerialRadio(*ports[i], name, settings[i], transmits=transmits, phases=phases, computing=computing)
             for i, name in enumerate(names)
@@ -100,7 +97,7 @@ def open_radios(
     if driver in ("listener", "sniffer", "uci") and kind == "anchor":
         raise SkylessError(f"--radio is {spec!r}; it should be one that can transmit: a {driver} only listens")
     if driver == "listener":
-        ports = _ports(spec, where, _LISTENER_BAUD, names)
+        ports = _ports(spec, where, _FOREIGN_BAUD, names)
         return tuple(ListenerRadio(*port, name) for port, name in zip(ports, names, strict=True))
     raise SkylessError(f"--radio is {spec!r}; it should be {_EXPECTED}")
 
@@ -113,7 +110,7 @@ def open_sniffers(
     ``anchors_m``: positions of the system's anchors, as far as they are known. Raises SkylessError.
     """
     driver, _, where = spec.partition(":")
-    ports = zip(_ports(spec, where, _SNIFFER_BAUD if driver == "sniffer" else _UCI_BAUD, names), names, strict=True)
+    ports = zip(_ports(spec, where, _FOREIGN_BAUD, names), names, strict=True)
     if driver == "sniffer":
         return tuple(SnifferRadio(*port, name) for port, name in ports)
     frame = AnchorFrame()  # one for all, as their tags are of one site

@@ -4,7 +4,7 @@ import asyncio
 from typing import Annotated, Any, Final, Literal
 
 from cyclopts import App
-from msgspec.structs import asdict, fields, replace
+from msgspec.structs import asdict, fields
 
 from skyless.cli.common.options import JsonOptions, command
 from skyless.cli.common.output import print_json
@@ -95,14 +95,9 @@ def flash_config(*, asked: BoardOptions, output: JsonOptions) -> None:
             f"--radio is {asked.radio!r}; it should be a board, serial:PATH[@BAUD], as serial:/dev/ttyACM0"
         )
     check_path(asked.radio, path)
-    changes = asked.changes()
-
-    def change(settings: BoardSettings) -> BoardSettings:
-        return replace(BoardSettings() if asked.defaults else settings, **changes)
-
-    wants_change = bool(changes) or asked.defaults
+    changes = (asdict(BoardSettings()) if asked.defaults else {}) | asked.changes()
     bauds = (int(baud),) if baud else _BAUDS
-    found = asyncio.run(set_up(path, bauds, Computing(change, keeps=wants_change)))
+    found = asyncio.run(set_up(path, bauds, Computing(changes, keeps=bool(changes))))
     settings, shown = found.settings, asdict(found.settings)
     shown |= {"mode": MODES[settings.mode], "output": OUTPUTS[settings.output]}
     if output.json:
@@ -110,6 +105,6 @@ def flash_config(*, asked: BoardOptions, output: JsonOptions) -> None:
         return
     for name, value in shown.items():
         print(f"{name:<15} {value}")
-    if wants_change and not found.in_flash:
+    if changes and not found.in_flash:
         raise SkylessError(f"the board at {path} could not keep them in its flash: they hold until it is switched off")
     log("flash holds these settings" if found.in_flash else "flash holds other settings, or none")

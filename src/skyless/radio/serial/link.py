@@ -133,6 +133,7 @@ def unstuff(line: bytes) -> bytes | None:
 class Writer:
     """Makes records, with numbers that count up; each method returns a line, ready to be sent.
 
+    Records of one or two bytes are made by ``record``.
     Ticks are numbers from 0 to 2**40 - 1. What does not fit into its field raises struct.error or OverflowError.
     """
 
@@ -185,21 +186,9 @@ class Writer:
         wrapped = (count & COUNT_MASK for count in counts)
         return self.record(STATUS, _stamp(ticks) + struct.pack("<B6IhH", state, *wrapped, temperature_cc, millivolts))
 
-    def refused(self, kind: int, reason: int) -> bytes:
-        """A command of that kind was refused."""
-        return self.record(REFUSED, bytes((kind, reason)))
-
     def ask_hello(self) -> bytes:
         """Ask the board who it is; states our version."""
         return self.record(ASK_HELLO, bytes((MAJOR, MINOR)))
-
-    def ask_status(self) -> bytes:
-        """Ask the board for its state."""
-        return self.record(ASK_STATUS)
-
-    def rx_on(self) -> bytes:
-        """Have the board receive."""
-        return self.record(RX_ON)
 
     def config(self, tx_delay_ticks: int, rx_delay_ticks: int, flags: int = 0) -> bytes:
         """Channel 5, 64 MHz PRF, 6.8 Mbit/s, preamble of 128 symbols with code 9; antenna delays."""
@@ -349,11 +338,12 @@ Record = Hello | Heard | Done | TooLate | Status | NotDone | TagConfig | TagRepo
 
 def decode(record: bytes) -> Record | str:
     """Value of a record from a board (without its CRC), or why there is none."""
-    try:
-        decoder = _DECODERS[record[0]]
-    except KeyError:
+    if record[0] not in _DECODERS:
         return "unknown-record"
-    return decoder(record) or "malformed-record"
+    try:
+        return _DECODERS[record[0]](record) or "malformed-record"
+    except (struct.error, IndexError):
+        return "malformed-record"  # it is too short
 
 
 def to_steps(measured: Diagnostics) -> tuple[int, int, int]:
@@ -389,15 +379,11 @@ def _ticks(record: bytes, at: int = BODY_AT) -> int:
     return int.from_bytes(record[at : at + 5], "little")
 
 
-def _hello(record: bytes) -> Hello | None:
+def _hello(record: bytes) -> Hello:
     """Only the version is known where its major number is another."""
-    if len(record) < BODY_AT + 2:
-        return None
     major, minor = record[2], record[3]
     if major != MAJOR:
         return Hello(major, minor, (0, 0, 0), b"", 0, 0, can_transmit=False, reset_cause=None)
-    if len(record) < HELLO_BYTES:
-        return None
     *firmware, device_id, rate_khz, bits, abilities = struct.unpack_from("<3B8sIBB", record, 4)
     can_transmit = bool(abilities & CAN_TRANSMIT)
     reset_cause = record[HELLO_BYTES] if len(record) > HELLO_BYTES else None
@@ -425,13 +411,7 @@ def _done(record: bytes) -> Done | None:
     return Done(_ticks(record), _ticks(record, 7)) if len(record) >= 12 else None
 
 
-def _late(record: bytes) -> TooLate | None:
-    return TooLate(_ticks(record), record[7]) if len(record) >= 8 else None
-
-
-def _status(record: bytes) -> Status | None:
-    if len(record) < STATUS_BYTES:
-        return None
+def _status(record: bytes) -> Status:
     state, received, errors, sent, late, garbled, unsent, centidegrees, millivolts = struct.unpack_from(
         "<B6IhH", record, 7
     )
@@ -447,10 +427,6 @@ def _status(record: bytes) -> Status | None:
     )
 
 
-def _refused(record: bytes) -> NotDone | None:
-    return NotDone(record[2], record[3]) if len(record) >= 4 else None
-
-
 def _tag_config(record: bytes) -> TagConfig | None:
     settings = unpack(record[SETTINGS_AT:])
     return None if settings is None else TagConfig(settings, bool(record[BODY_AT] & IN_FLASH))
@@ -460,9 +436,9 @@ _DECODERS: Final[dict[int, Callable[[bytes], Record | None]]] = {
     HELLO: _hello,
     RX: _heard,
     TX_DONE: _done,
-    TX_LATE: _late,
+    TX_LATE: lambda record: TooLate(_ticks(record), record[7]),
     STATUS: _status,
-    REFUSED: _refused,
+    REFUSED: lambda record: NotDone(record[2], record[3]),
     RX_PHASE: _heard_with_phase,
     FIX: board_fix,
     TAG_STATUS: board_status,

@@ -3,8 +3,8 @@
 import asyncio
 import time
 from collections import Counter, deque
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -13,7 +13,7 @@ from skyless.core.air.reception import Reception, Transmission
 from skyless.core.ticks import wrap
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
 from skyless.radio.serial import link
-from skyless.radio.serial.board_settings import MODES, OUTPUTS, BoardSettings, pack
+from skyless.radio.serial.board_settings import MODES, OUTPUTS, pack
 from skyless.radio.serial.link import Done, Heard, Hello, NotDone, Record, Status, TagConfig, TooLate, decode
 from skyless.radio.serial.serial_port import BoardClock, SerialPort
 from skyless.radio.tag_reports import Reported
@@ -55,15 +55,14 @@ _RESET_CAUSES: Final = {
 class Computing(Struct, frozen=True):
     """How a host has a board work that is a tag by itself."""
 
-    change: Callable[[BoardSettings], BoardSettings]
-    """Gets its settings and returns those that it should have."""
+    changes: Mapping[str, Any]
+    """Settings that it should have, by name; the others stay."""
     keeps: bool
     """Whether flash is to hold them."""
 
 
-def until_next_start(settings: BoardSettings) -> BoardSettings:
-    """A tag that sends records to its host."""
-    return replace(settings, mode=MODES.index("tag"), output=OUTPUTS.index("records"))
+UNTIL_NEXT_START: Final = Computing({"mode": MODES.index("tag"), "output": OUTPUTS.index("records")}, keeps=False)
+"""A tag that sends records to its host."""
 
 
 class LinkSession:
@@ -120,7 +119,7 @@ class LinkSession:
         if self.hello is None or self._refused:
             self._ask_hello(host_s)
         elif self.ready:
-            self._send(self._writer.ask_status())
+            self._send(self._writer.record(link.ASK_STATUS))
         else:
             self._configure()
             self._count_idle_poll()
@@ -252,7 +251,7 @@ class LinkSession:
         else:
             self._refused = ""
             if is_repeated and self._computing is None:
-                self._send(self._writer.ask_status())
+                self._send(self._writer.record(link.ASK_STATUS))
             else:
                 self._configure()
 
@@ -298,12 +297,12 @@ class LinkSession:
         asks = self._phases and self.hello is not None and self.hello.has_phases
         flags = link.WANTS_PHASES if asks else 0
         self._send(self._writer.config(self._delays.tx_ticks, self._delays.rx_ticks, flags))
-        self._send(self._writer.rx_on())
+        self._send(self._writer.record(link.RX_ON))
 
     def _on_tag_config(self, config: TagConfig, computing: Computing) -> None:
         """Ask once for what is to be changed; with the answer to that the board is ready."""
         is_answer, self.tag_config = self.tag_config is not None, config
-        wanted = computing.change(config.settings)
+        wanted = replace(config.settings, **computing.changes)
         is_same = pack(wanted) == pack(config.settings) and config.in_flash >= computing.keeps
         if not is_same and not is_answer:
             self._send(self._writer.set_tag_config(wanted, keep=computing.keeps))

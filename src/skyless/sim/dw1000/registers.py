@@ -198,18 +198,11 @@ def decode_header(out: bytes) -> Access | None:
 
     None where the transaction ends before its header.
     """
-    if not out:
+    octets = 1 if not out[:1] or not out[0] & 0x40 else 2 if len(out) < 2 or not out[1] & 0x80 else 3
+    if len(out) < octets:
         return None
-    is_write, file = bool(out[0] & 0x80), out[0] & 0x3F
-    if not out[0] & 0x40:
-        return Access(is_write, file, 0, 1)
-    if len(out) < 2:
-        return None
-    if not out[1] & 0x80:
-        return Access(is_write, file, out[1], 2)
-    if len(out) < 3:
-        return None
-    return Access(is_write, file, (out[1] & 0x7F) | out[2] << 7, 3)
+    sub = out[1] & 0x7F if octets == 2 else (out[1] & 0x7F) | out[2] << 7 if octets == 3 else 0
+    return Access(bool(out[0] & 0x80), out[0] & 0x3F, sub, octets)
 
 
 class Memory:

@@ -123,9 +123,8 @@ class Transceiver:
 
     def reset(self) -> None:
         """Everything off."""
-        self._withdraw()
-        self.stop_listening()
-        self.sending, self.suspect = None, False
+        self.off()
+        self.suspect = False
         self._host_buffer = self._chip_buffer = self._hidden_events = 0
 
     # Status
