@@ -44,6 +44,8 @@ JUMP_PPM = 1.0
 CELLS_C = {"CR123A": 1.5 * 3600, "18650": 3.0 * 3600}
 MONTH_S = 30.4 * 86400
 WARMUP_S = 1.0
+AWAKE_S = 5.0
+"""After a start."""
 
 
 def site_of(anchors, beacons_hz):
@@ -110,7 +112,7 @@ def asleep(seeds, fixes):
         for seed in seeds:
             settings = {"sleep_ms": 1000 * sleep_s, "superframes": superframes, "predicts": predicts}
             run = Run(seed, site_of(6, None), **settings)
-            since_s = 2.5 * sleep_s
+            since_s = AWAKE_S + 2.5 * sleep_s
             run.tag.run(since_s)
             before = run.tag.chip.receiving_s, run.tag.chip.charge_c
             until_s = since_s + fixes * (sleep_s + 0.08)

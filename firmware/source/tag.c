@@ -23,7 +23,7 @@
 #define SURE_US 200000u
 /* All relays of a beacon are used where no other waits; where one does so many, and one fewer for each more. */
 #define RELAYS_IF_LATE 3u
-/* After a word of the host it stays awake. */
+/* After its start and after a word of the host it stays awake, so that a host can reach it. */
 #define HOST_US 5000000u
 /* Without anything to do it looks again after this. */
 #define TURN_US 10000u
@@ -49,6 +49,11 @@ static uint32_t now_us(const struct tag *tag)
 static bool is_over(uint32_t period_us, uint32_t since_us, uint32_t at_us)
 {
     return (at_us - since_us) >= period_us;
+}
+
+static bool may_sleep(const struct tag *tag, uint32_t at_us)
+{
+    return (tag->settings->sleep_ms > 0u) && is_over(HOST_US, tag->host_us, at_us);
 }
 
 /* The receiver */
@@ -379,7 +384,7 @@ static void estimate(struct tag *tag)
         if ((outcome == FIX) || (outcome == START_FIX)) {
             tag->status.fixes++;
             fill_fix(tag, one, outcome == START_FIX);
-            if ((tag->settings->sleep_ms == 0u) && fix_is_due(&tag->fix, tag->settings->rate_hz, &tag->slot)) {
+            if (!may_sleep(tag, now_us(tag)) && fix_is_due(&tag->fix, tag->settings->rate_hz, &tag->slot)) {
                 say_position(tag, now_us(tag));
             }
         } else {
@@ -389,11 +394,6 @@ static void estimate(struct tag *tag)
 }
 
 /* Sleep */
-
-static bool may_sleep(const struct tag *tag, uint32_t at_us)
-{
-    return (tag->settings->sleep_ms > 0u) && is_over(HOST_US, tag->host_us, at_us);
-}
 
 static bool has_heard_all(const struct tag *tag)
 {
@@ -423,7 +423,6 @@ static void begin_anew(struct tag *tag)
     tag->awake_since_us = now_us(tag);
     tag->said_us = tag->awake_since_us;
     tag->status_us = tag->awake_since_us;
-    tag->host_us = tag->awake_since_us - HOST_US;
 }
 
 /* Say what was found, and sleep; from then on nothing is known but the site and when its anchors send. */
@@ -458,6 +457,7 @@ static void sleep_now(struct tag *tag, uint32_t at_us)
     tag->count = 0u;
     tag->has_fix = false;
     begin_anew(tag);
+    tag->host_us = tag->awake_since_us - HOST_US;
     if ((tag->settings->predicts != 0u) && !was_lost && (tag->schedule.count >= LEAST_EXPECTED)) {
         listen_in_windows(tag);
     } else {
@@ -481,6 +481,7 @@ void tag_begin(struct tag *tag)
     tag->slot = NOT_SENT;
     begin_anew(tag);
     tag->fixed_us = tag->awake_since_us;
+    tag->host_us = tag->awake_since_us;
     skyless_begin_tag(&tag->core, (settings->site == FIX_NO_SITE) ? NO_SITE : (int32_t)settings->site,
                       settings->qa_m2ps3, has_bounds ? metres(settings->low_mm) : -__builtin_inff(),
                       has_bounds ? metres(settings->high_mm) : __builtin_inff(), 0.0f, 0.0f, settings->integrity_risk,
