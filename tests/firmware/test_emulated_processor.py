@@ -417,7 +417,7 @@ def test_a_line_that_starts_again_in_the_middle_of_bytes_is_not_behind(firmware)
     stage.write(b"\0" + line_of(0x45, b""))
     stage.run(3e-3)
     assert [record[0] for record in records_of(stage)] == [1, 5]
-    assert stage.image.misuse.total() <= 1  # the fifth byte while it stops
+    assert stage.image.misuse.total() <= 2  # the fifth byte while it stops, after twenty garbled lines and twenty more
 
 
 def test_a_pin_is_high_while_the_firmware_is_awake(firmware):
