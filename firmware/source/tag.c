@@ -3,7 +3,6 @@
 #include <stddef.h>
 #include <string.h>
 
-
 #define SECOND_US 1000000u
 /* How often places of anchors and the georeference are repeated. */
 #define REPEAT_US 10000000u
@@ -239,6 +238,7 @@ static void fill_fix(struct tag *tag, const struct tag_reception *one, bool is_a
     tag->has_fix = true;
     tag->has_started = true;
     tag->fixed_us = one->ended_us;
+    tag->timed_us = one->ended_us;
 }
 
 /* Why outcomes of the estimator are no fix; REASON_ACQUIRING of the others. */
@@ -358,6 +358,12 @@ static bool say(struct tag *tag, uint32_t at_us)
 
 /* The estimator */
 
+/* Not while a host speaks to it: until then it says fixes as a tag that never sleeps. */
+static bool may_sleep(const struct tag *tag, uint32_t at_us)
+{
+    return (tag->settings->sleep_ms > 0u) && is_over(HOST_US, tag->host_us, at_us);
+}
+
 static void estimate(struct tag *tag)
 {
     struct tag_reception *one = &tag->waiting[tag->first];
@@ -379,7 +385,7 @@ static void estimate(struct tag *tag)
         if ((outcome == FIX) || (outcome == START_FIX)) {
             tag->status.fixes++;
             fill_fix(tag, one, outcome == START_FIX);
-            if ((tag->settings->sleep_ms == 0u) && fix_is_due(&tag->fix, tag->settings->rate_hz, &tag->slot)) {
+            if (!may_sleep(tag, now_us(tag)) && fix_is_due(&tag->fix, tag->settings->rate_hz, &tag->slot)) {
                 say_position(tag, now_us(tag));
             }
         } else {
@@ -389,11 +395,6 @@ static void estimate(struct tag *tag)
 }
 
 /* Sleep */
-
-static bool may_sleep(const struct tag *tag, uint32_t at_us)
-{
-    return (tag->settings->sleep_ms > 0u) && is_over(HOST_US, tag->host_us, at_us);
-}
 
 static bool has_heard_all(const struct tag *tag)
 {
@@ -421,20 +422,42 @@ static void rest(struct tag *tag)
 static void begin_anew(struct tag *tag)
 {
     tag->awake_since_us = now_us(tag);
+    tag->timed_us = tag->awake_since_us;
     tag->said_us = tag->awake_since_us;
     tag->status_us = tag->awake_since_us;
-    tag->host_us = tag->awake_since_us - HOST_US;
 }
 
-/* Say what was found, and sleep; from then on nothing is known but the site and when its anchors send. */
-static void sleep_now(struct tag *tag, uint32_t at_us)
+/* Wake the chip; nothing is known from now on but the site, when its anchors send, and how high the tag was. */
+static void wake(struct tag *tag)
 {
-    uint32_t sleep_ms = tag->settings->sleep_ms;
     bool was_lost = !tag->has_fix;
     uint64_t now_ticks;
 
+    set_receiver(tag, IN_WINDOWS);
+    if (!dw1000_wake(tag->chip, tag->settings->tx_delay_ticks, tag->settings->rx_delay_ticks)) {
+        return; /* the board finds it lost, and starts it again */
+    }
+    now_ticks = dw1000_now(tag->chip);
+    schedule_wake(&tag->schedule, tag->rested_ticks, now_ticks, now_us(tag) - tag->rested_us);
+    skyless_wake(&tag->core, &tag->shared.state, &tag->shared.search, (int64_t)now_ticks,
+                 (float)(now_us(tag) - tag->timed_us) * 1e-6f);
+    tag->count = 0u;
+    tag->has_fix = false;
+    begin_anew(tag);
+    if ((tag->settings->predicts != 0u) && !was_lost && (tag->schedule.count >= LEAST_EXPECTED)) {
+        listen_in_windows(tag);
+    } else {
+        listen_all_the_time(tag);
+    }
+}
+
+/* Say what was found, and sleep. */
+static void sleep_now(struct tag *tag, uint32_t at_us)
+{
+    uint32_t sleep_ms = tag->settings->sleep_ms;
+
     if (tag->receiver != RESTING) {
-        sleep_ms = (was_lost && (sleep_ms < LOST_SLEEP_MS)) ? LOST_SLEEP_MS : sleep_ms;
+        sleep_ms = (!tag->has_fix && (sleep_ms < LOST_SLEEP_MS)) ? LOST_SLEEP_MS : sleep_ms;
         rest(tag);
     }
     tag->fix.reason = tag->has_fix ? 0u : tag->reason;
@@ -447,22 +470,8 @@ static void sleep_now(struct tag *tag, uint32_t at_us)
     }
     tag->hardware->sleep_for(sleep_ms);
     tag->status.asleep_ms += sleep_ms;
-    set_receiver(tag, IN_WINDOWS);
-    if (!dw1000_wake(tag->chip, tag->settings->tx_delay_ticks, tag->settings->rx_delay_ticks)) {
-        return; /* the board finds it lost, and starts it again */
-    }
-    now_ticks = dw1000_now(tag->chip);
-    schedule_wake(&tag->schedule, tag->rested_ticks, now_ticks, now_us(tag) - tag->rested_us);
-    skyless_wake(&tag->core, &tag->shared.state, &tag->shared.search, (int64_t)now_ticks,
-                 (float)(now_us(tag) - tag->fixed_us) * 1e-6f);
-    tag->count = 0u;
-    tag->has_fix = false;
-    begin_anew(tag);
-    if ((tag->settings->predicts != 0u) && !was_lost && (tag->schedule.count >= LEAST_EXPECTED)) {
-        listen_in_windows(tag);
-    } else {
-        listen_all_the_time(tag);
-    }
+    tag->host_us = now_us(tag) - HOST_US; /* before the clock wraps */
+    wake(tag);
 }
 
 void tag_begin(struct tag *tag)
@@ -481,6 +490,7 @@ void tag_begin(struct tag *tag)
     tag->slot = NOT_SENT;
     begin_anew(tag);
     tag->fixed_us = tag->awake_since_us;
+    tag->host_us = tag->awake_since_us - HOST_US;
     skyless_begin_tag(&tag->core, (settings->site == FIX_NO_SITE) ? NO_SITE : (int32_t)settings->site,
                       settings->qa_m2ps3, has_bounds ? metres(settings->low_mm) : -__builtin_inff(),
                       has_bounds ? metres(settings->high_mm) : __builtin_inff(), 0.0f, 0.0f, settings->integrity_risk,
@@ -508,6 +518,10 @@ uint32_t tag_turn(struct tag *tag)
     }
     if (may_sleep(tag, at_us) && is_done(tag, at_us)) {
         sleep_now(tag, at_us);
+        return 0u;
+    }
+    if (tag->receiver == RESTING) { /* the host has spoken since */
+        wake(tag);
         return 0u;
     }
     choose_listening(tag, at_us);
