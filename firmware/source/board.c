@@ -364,10 +364,11 @@ static bool read_settings(const struct board *board, struct settings *settings)
     return settings_unpack(kept, SETTINGS_BYTES, settings) && settings_check(settings);
 }
 
-/* Begin as a tag, or as a radio that waits for its host. */
+/* Begin as a tag, or as a radio that waits for its host with its receiver off. */
 static void use_settings(struct board *board)
 {
     drop_frame(board, LINK_LATE_NOT_READY);
+    dw1000_idle(&board->chip);
     board->is_configured = false;
     board->is_receiving = false;
     board->hardware->set_rate(is_tag(board) ? board->settings.baud : SETTINGS_DEFAULT.baud);

@@ -11,7 +11,7 @@ from skyless.core.air.reception import Diagnostics
 from skyless.core.ticks import from_seconds, to_seconds, wrap
 from skyless.radio.dw1000.driver import OFF
 from skyless.radio.serial.board_settings import BoardSettings, pack
-from skyless.radio.serial.link import ASK_HELLO, ASK_TAG_CONFIG
+from skyless.radio.serial.link import ASK_HELLO, ASK_TAG_CONFIG, SET_TAG_CONFIG
 from skyless.radio.tag_reports import BoardFix
 
 pytestmark = [pytest.mark.site, needs_compiler]
@@ -73,6 +73,13 @@ def test_a_host_that_goes_on_speaking_keeps_the_tag_awake_and_gets_all_its_fixes
 
     stage.hear(0.0, 3.0, ask)
     assert len([at_s for at_s, _ in stage.fixes if at_s > 1.0]) > 500
+
+
+def test_a_tag_that_was_just_set_up_stays_awake_for_its_host():
+    stage = TagStage()
+    stage.send(SET_TAG_CONFIG, b"\0" + stage.bus.settings)
+    stage.hear(0.0, 3.0)
+    assert stage.chip.asleep_s == 0.0
 
 
 def test_a_host_that_speaks_when_the_chip_sleeps_already_finds_a_tag_that_goes_on():
