@@ -347,7 +347,7 @@ static bool say(struct tag *tag, uint32_t at_us)
     } else if (sends_records(tag) && tag->has_fix &&
                (is_over(REPEAT_US, tag->places_us, at_us) || (tag->places_changes != tag->core.course.changes))) {
         send_places(tag, at_us);
-    } else if ((tag->settings->bluetooth_ms > 0u) && tag->has_started &&
+    } else if ((tag->settings->bluetooth_ms > 0u) && tag->has_started && (tag->has_fix || (tag->fix.reason != 0u)) &&
                is_over(1000u * tag->settings->bluetooth_ms, tag->advertised_us, at_us)) {
         advertise(tag, at_us);
     } else {

@@ -63,6 +63,13 @@ def test_a_tag_that_sleeps_says_a_fix_and_sleeps_again(predicts):
     assert not stage.chip.misuse
 
 
+def test_an_advertisement_after_a_sleep_has_no_position_from_before_it():
+    stage = TagStage(bluetooth_ms=100).hear(0.0, 3.0)
+    ages_ms = [10 * int.from_bytes(data[12:14], "little") for data in stage.bus.advertised]
+    assert len(ages_ms) >= len(stage.fixes)
+    assert max(ages_ms) < 1000 * SLEEP_S
+
+
 def test_a_host_that_goes_on_speaking_keeps_the_tag_awake_and_gets_all_its_fixes():
     stage, asked_s = TagStage(), [0.0]
 
