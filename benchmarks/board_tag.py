@@ -115,7 +115,7 @@ def asleep(seeds, fixes):
         for seed in seeds:
             settings = {"sleep_ms": 1000 * sleep_s, "superframes": superframes, "predicts": predicts}
             run = Run(seed, site_of(6, None), **settings)
-            since_s = 2.5 * sleep_s
+            since_s = 5.0 + 2.5 * sleep_s  # what sets a board up keeps it awake for 5 s
             run.go(since_s)
             before = run.tag.chip.receiving_s, run.tag.chip.charge_c
             until_s = since_s + fixes * (sleep_s + 0.08)
