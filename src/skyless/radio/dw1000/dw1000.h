@@ -78,7 +78,8 @@ struct dw1000 {
 
 void dw1000_init(struct dw1000 *chip, const struct hardware *hardware);
 
-/* Reset and configure the chip, which is woken if it sleeps; antenna delays in ticks. False where no DW1000 answers, or its clock does not lock. */
+/* Reset and configure the chip, which is woken if it sleeps; antenna delays in ticks. False where no DW1000 answers, or
+ * its clock does not lock. */
 bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay);
 
 /* Listen from now on; a frame that waits to be sent is sent before. */
