@@ -107,7 +107,7 @@ static uint32_t hash(const uint8_t *frame, uint32_t size)
     return (value ^ (value >> 24)) % HASHES;
 }
 
-/* Put the next frame of the file into the chip, if it is well-tempered as it is; the time is that of the frame. */
+/* Put the next frame of the file into the chip, as a rule as it is; the time is that of the frame. */
 static void let_frame_come(void)
 {
     uint64_t before_ticks = now_ticks;

@@ -88,7 +88,7 @@ static void send_status(struct board *board)
                                 board->unknown + board->reader.garbled, writer->unsent};
 
     link_begin(writer, LINK_STATUS);
-    link_append(writer, board->is_configured ? dw1000_now(&board->chip) : 0u, LINK_STAMP_BYTES);
+    link_append(writer, has_chip(board) ? dw1000_now(&board->chip) : 0u, LINK_STAMP_BYTES);
     link_append(writer, (board->is_configured ? LINK_IS_CONFIGURED : 0u) | (board->is_receiving ? LINK_IS_RECEIVING : 0u) |
                             ((board->stage != NO_FRAME) ? LINK_HAS_FRAME_WAITING : 0u) |
                             (board->is_polled ? LINK_IS_POLLED : 0u), 1u);
@@ -364,10 +364,11 @@ static bool read_settings(const struct board *board, struct settings *settings)
     return settings_unpack(kept, SETTINGS_BYTES, settings) && settings_check(settings);
 }
 
-/* Begin as a tag, or as a radio that waits for its host. */
+/* Begin as a tag, or as a radio that waits for its host with its receiver off. */
 static void use_settings(struct board *board)
 {
     drop_frame(board, LINK_LATE_NOT_READY);
+    dw1000_idle(&board->chip);
     board->is_configured = false;
     board->is_receiving = false;
     board->hardware->set_rate(is_tag(board) ? board->settings.baud : SETTINGS_DEFAULT.baud);
@@ -446,8 +447,8 @@ static bool serve_host(struct board *board)
         at += link_read(reader, &data[at], size - at);
         if (reader->length > 0u) {
             board->understood_until = reader->garbled;
-            tag_on_host(&board->tag);
             obey(board, reader->record, reader->length);
+            tag_on_host(&board->tag); /* which a tag that begins by this command remembers, too */
         }
     }
     if ((reader->garbled - board->understood_until) >= GARBLED_IN_A_ROW) {

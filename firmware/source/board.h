@@ -1,4 +1,5 @@
-/* A board that receives and sends for its host: the chip's driver on one side, the serial link on the other.
+/* A board that receives and sends for its host, or is a tag by itself: the chip's driver on one side, the serial link on
+ * the other.
  *
  * The host decides (docs/serial.md). The board holds at most one frame until shortly before its time, because the
  * receiver is off from then on.

@@ -73,7 +73,7 @@ void clock_sleep_ms(uint32_t milliseconds)
     start_slow_counter();
     begin_us = clock_now_us();
     TIMER0_STOP = 1u;
-    TIMER0_SHUTDOWN = 1u; /* one that is only stopped draws current (anomaly 78); it begins at 0 again */
+    TIMER0_SHUTDOWN = 1u; /* one that is only stopped draws current (anomaly 78) */
     TIMER0_COMPARE0 = 0u;
     CLOCK_HFCLKSTOP = 1u;
     while ((passed + LEAST_PERIODS) < periods) {
@@ -90,6 +90,7 @@ void clock_sleep_ms(uint32_t milliseconds)
     start_crystal();
     passed += (RTC1_COUNTER - (uint32_t)passed) & COUNTER_MASK;
     RTC1_STOP = 1u;
+    TIMER0_CLEAR = 1u; /* whatever its shutdown has left of its count */
     TIMER0_START = 1u;
     offset_us = begin_us + (uint32_t)((passed * 15625u) / 512u);
 }

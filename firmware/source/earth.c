@@ -48,7 +48,7 @@ void earth_geodetic(const struct fix_origin *origin, const int32_t *position_mm,
     float cosine;
     float x_m = (float)position_mm[0] * 1e-3f;
     float y_m = (float)position_mm[1] * 1e-3f;
-    float height_m = (float)(origin->height_mm + position_mm[2]) * 1e-3f;
+    float height_m = ((float)origin->height_mm + (float)position_mm[2]) * 1e-3f; /* their sum may have 33 bits */
 
     earth_turn(origin->heading_e7, &s, &c);
     float east_m = (x_m * c) + (y_m * s);

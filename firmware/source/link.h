@@ -99,7 +99,7 @@ struct link_reader {
     uint32_t garbled; /* stretches between two zeros that are no record */
     uint32_t left;    /* bytes until the next code of COBS */
     uint32_t fill;    /* bytes since the last 0 */
-    uint8_t record[LINK_MAX_RECORD_BYTES + 1u];
+    uint8_t record[LINK_MAX_RECORD_BYTES];
 };
 
 /* Process `data` up to the end of the next record; how many bytes that were. */

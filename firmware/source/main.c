@@ -8,7 +8,7 @@
 #include "peripherals.h"
 #include "pins.h"
 
-#define WATCHDOG_PERIODS (2u * 32768u) /* 2 s; no turn lasts longer than 30 ms, no sleep between turns than 0.6 s */
+#define WATCHDOG_PERIODS (2u * 32768u) /* 2 s; no turn lasts longer than 0.3 s, no sleep between turns than 0.6 s */
 #define RESET_LOW_US 100u /* the chip needs some ns (DW1000 data sheet, RSTn) */
 #define SELECTED_US 600u  /* longer than the 500 that wake it (UM 2.3) */
 #define PULL_UP_US 20u    /* 13 kOhm load a wire of 100 pF in some us */

@@ -6,7 +6,7 @@
 
 #define IN_BYTES UARTE_MAX_BYTES
 #define OUT_BYTES 1024u /* eight receptions with 100 bytes: 10 ms of the line */
-#define WAIT_TURNS 2000u /* loops of some 0.1 us: longer than the five bytes that a receiver needs to stop */
+#define WAIT_TURNS 5000u /* loops of some 0.15 us: longer than five bytes at 115200 baud, which a receiver needs to stop */
 
 static const struct {
     uint32_t baud;

@@ -3,25 +3,24 @@
 #include <stddef.h>
 #include <string.h>
 
-
 #define SECOND_US 1000000u
 /* How often places of anchors and the georeference are repeated. */
 #define REPEAT_US 10000000u
-/* Without a fix for so long the tag says why, once a second. */
+/* Without a fix for this time the tag says why, once a second. */
 #define SILENT_US 1000000u
-/* The receiver stays on for so long before it is switched off between beacons, so that all anchors are heard; and again */
+/* Before the receiver is switched off between beacons it stays on for this time, to hear all anchors, */
 #define LEARN_US 100000u
-/* now and then, for anchors that have come into reach. */
+/* and again after each of these periods, to find anchors that have come into reach. */
 #define SCAN_EVERY_US 10000000u
 /* With fewer anchors expected it stays on. */
 #define LEAST_EXPECTED 3u
-/* Awake for so long without a fix, at first and after a sleep, a tag that may sleep does so, for so long at least. */
+/* Without a fix for this time, after its start and after a sleep, a tag that may sleep does so, for LOST_SLEEP_MS at least. */
 #define FIRST_SEARCH_US 10000000u
 #define SEARCH_US 500000u
 #define LOST_SLEEP_MS 10000u
-/* After a sleep it trusts its predictions for so long. */
+/* After a sleep it trusts its predictions for this time. */
 #define SURE_US 200000u
-/* All relays of a beacon are used where no other waits; where one does so many, and one fewer for each more. */
+/* All relays of a beacon are used where no other beacon waits; where one does, this number, and one fewer for each more. */
 #define RELAYS_IF_LATE 3u
 /* After its start and after a word of the host it stays awake, so that a host can reach it. */
 #define HOST_US 5000000u
@@ -49,11 +48,6 @@ static uint32_t now_us(const struct tag *tag)
 static bool is_over(uint32_t period_us, uint32_t since_us, uint32_t at_us)
 {
     return (at_us - since_us) >= period_us;
-}
-
-static bool may_sleep(const struct tag *tag, uint32_t at_us)
-{
-    return (tag->settings->sleep_ms > 0u) && is_over(HOST_US, tag->host_us, at_us);
 }
 
 /* The receiver */
@@ -244,6 +238,7 @@ static void fill_fix(struct tag *tag, const struct tag_reception *one, bool is_a
     tag->has_fix = true;
     tag->has_started = true;
     tag->fixed_us = one->ended_us;
+    tag->timed_us = one->ended_us;
 }
 
 /* Why outcomes of the estimator are no fix; REASON_ACQUIRING of the others. */
@@ -352,7 +347,7 @@ static bool say(struct tag *tag, uint32_t at_us)
     } else if (sends_records(tag) && tag->has_fix &&
                (is_over(REPEAT_US, tag->places_us, at_us) || (tag->places_changes != tag->core.course.changes))) {
         send_places(tag, at_us);
-    } else if ((tag->settings->bluetooth_ms > 0u) && tag->has_started &&
+    } else if ((tag->settings->bluetooth_ms > 0u) && tag->has_started && (tag->has_fix || (tag->fix.reason != 0u)) &&
                is_over(1000u * tag->settings->bluetooth_ms, tag->advertised_us, at_us)) {
         advertise(tag, at_us);
     } else {
@@ -362,6 +357,12 @@ static bool say(struct tag *tag, uint32_t at_us)
 }
 
 /* The estimator */
+
+/* Not while a host speaks to it: until then it says fixes as a tag that never sleeps. */
+static bool may_sleep(const struct tag *tag, uint32_t at_us)
+{
+    return (tag->settings->sleep_ms > 0u) && is_over(HOST_US, tag->host_us, at_us);
+}
 
 static void estimate(struct tag *tag)
 {
@@ -421,19 +422,42 @@ static void rest(struct tag *tag)
 static void begin_anew(struct tag *tag)
 {
     tag->awake_since_us = now_us(tag);
+    tag->timed_us = tag->awake_since_us;
     tag->said_us = tag->awake_since_us;
     tag->status_us = tag->awake_since_us;
 }
 
-/* Say what was found, and sleep; from then on nothing is known but the site and when its anchors send. */
-static void sleep_now(struct tag *tag, uint32_t at_us)
+/* Wake the chip; nothing is known from now on but the site, when its anchors send, and how high the tag was. */
+static void wake(struct tag *tag)
 {
-    uint32_t sleep_ms = tag->settings->sleep_ms;
     bool was_lost = !tag->has_fix;
     uint64_t now_ticks;
 
+    set_receiver(tag, IN_WINDOWS);
+    if (!dw1000_wake(tag->chip, tag->settings->tx_delay_ticks, tag->settings->rx_delay_ticks)) {
+        return; /* the board finds it lost, and starts it again */
+    }
+    now_ticks = dw1000_now(tag->chip);
+    schedule_wake(&tag->schedule, tag->rested_ticks, now_ticks, now_us(tag) - tag->rested_us);
+    skyless_wake(&tag->core, &tag->shared.state, &tag->shared.search, (int64_t)now_ticks,
+                 (float)(now_us(tag) - tag->timed_us) * 1e-6f);
+    tag->count = 0u;
+    tag->has_fix = false;
+    begin_anew(tag);
+    if ((tag->settings->predicts != 0u) && !was_lost && (tag->schedule.count >= LEAST_EXPECTED)) {
+        listen_in_windows(tag);
+    } else {
+        listen_all_the_time(tag);
+    }
+}
+
+/* Say what was found, and sleep. */
+static void sleep_now(struct tag *tag, uint32_t at_us)
+{
+    uint32_t sleep_ms = tag->settings->sleep_ms;
+
     if (tag->receiver != RESTING) {
-        sleep_ms = (was_lost && (sleep_ms < LOST_SLEEP_MS)) ? LOST_SLEEP_MS : sleep_ms;
+        sleep_ms = (!tag->has_fix && (sleep_ms < LOST_SLEEP_MS)) ? LOST_SLEEP_MS : sleep_ms;
         rest(tag);
     }
     tag->fix.reason = tag->has_fix ? 0u : tag->reason;
@@ -446,23 +470,8 @@ static void sleep_now(struct tag *tag, uint32_t at_us)
     }
     tag->hardware->sleep_for(sleep_ms);
     tag->status.asleep_ms += sleep_ms;
-    set_receiver(tag, IN_WINDOWS);
-    if (!dw1000_wake(tag->chip, tag->settings->tx_delay_ticks, tag->settings->rx_delay_ticks)) {
-        return; /* the board finds it lost, and starts it again */
-    }
-    now_ticks = dw1000_now(tag->chip);
-    schedule_wake(&tag->schedule, tag->rested_ticks, now_ticks, now_us(tag) - tag->rested_us);
-    skyless_wake(&tag->core, &tag->shared.state, &tag->shared.search, (int64_t)now_ticks,
-                 (float)(now_us(tag) - tag->fixed_us) * 1e-6f);
-    tag->count = 0u;
-    tag->has_fix = false;
-    begin_anew(tag);
-    tag->host_us = tag->awake_since_us - HOST_US;
-    if ((tag->settings->predicts != 0u) && !was_lost && (tag->schedule.count >= LEAST_EXPECTED)) {
-        listen_in_windows(tag);
-    } else {
-        listen_all_the_time(tag);
-    }
+    tag->host_us = now_us(tag) - HOST_US; /* before the clock wraps */
+    wake(tag);
 }
 
 void tag_begin(struct tag *tag)
@@ -509,6 +518,10 @@ uint32_t tag_turn(struct tag *tag)
     }
     if (may_sleep(tag, at_us) && is_done(tag, at_us)) {
         sleep_now(tag, at_us);
+        return 0u;
+    }
+    if (tag->receiver == RESTING) { /* the host has spoken since */
+        wake(tag);
         return 0u;
     }
     choose_listening(tag, at_us);

@@ -73,6 +73,7 @@ struct tag {
     bool has_fix;       /* since the start or the last sleep */
     uint32_t reason;    /* why the newest beacon that counts has made none */
     uint32_t fixed_us;
+    uint32_t timed_us;  /* last fix or wake: up to then the estimator has counted time */
     uint32_t said_us;   /* when it last said where it is, or that it does not know */
     int64_t slot;       /* of the output */
     struct tag_status status;

@@ -14,6 +14,7 @@ from msgspec.structs import asdict, replace
 from skyless.cli.nodes.flash_config import BoardOptions
 from skyless.core.arguments import OptionError
 from skyless.core.fix import NoFixReason
+from skyless.radio.dw1000.driver import IDLE, LISTENING
 from skyless.radio.serial import link
 from skyless.radio.serial.board_settings import ANY_SITE, MODES, OUTPUTS, SETTINGS_BYTES, BoardSettings, pack, unpack
 from skyless.radio.serial.link import Heard, Hello, NotDone, TagConfig
@@ -201,6 +202,13 @@ def test_a_host_that_configures_the_radio_has_a_radio_until_the_next_start():
     assert kept_by(stage) == replace(TAG, output=1)
     again, _ = started(stage.bus.settings)
     assert ask(again) == [TagConfig(replace(TAG, output=1), in_flash=True)]
+
+
+def test_a_tag_that_becomes_a_radio_again_receives_nothing_before_its_host_asks():
+    stage, _ = started(flash_of(TAG))
+    assert stage.board.chip.state == LISTENING
+    assert ask(stage, link.SET_TAG_CONFIG, sent(BoardSettings())) == [TagConfig(BoardSettings(), in_flash=False)]
+    assert stage.board.chip.state == IDLE
 
 
 def test_a_tag_says_once_a_second_how_it_is():

@@ -124,7 +124,7 @@ def test_the_chip_is_started_slowly_and_configured_fast():
     bus, chip = started()
     lines = bus.log
     fast = lines.index("fast")
-    assert lines[:4] == ["slow", "reset", "pause 5000", "r 00 4"]
+    assert lines[:5] == ["slow", "r 00 4", "reset", "pause 5000", "r 00 4"]
     microcode = lines.index("w b6 0103")
     assert lines[microcode : microcode + 7] == [
         "w b6 0103", "w ed06 0080", "pause 300", "w b6 0002", "pause 100", "r 0f 5", "fast",

@@ -346,11 +346,23 @@ static bool configure(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t r
     return true;
 }
 
+/* Wake a chip that sleeps, by chip select; whether it answers then. */
+static bool is_woken(struct dw1000 *chip)
+{
+    chip->hardware->set_spi_fast(false);
+    (void)read_into(chip, chip->frame_into, 0x11u, 0u, WAKE_OCTETS);
+    chip->hardware->pause_us(RESET_US);
+    return is_there(chip);
+}
+
 bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay)
 {
     chip->state = DW1000_OFF;
     chip->is_listening = false;
     chip->hardware->set_spi_fast(false);
+    if (!is_there(chip)) {
+        (void)is_woken(chip); /* its reset pin does not wake it */
+    }
     chip->hardware->reset_chip();
     chip->hardware->pause_us(RESET_US);
     if (!is_there(chip)) {
@@ -378,10 +390,7 @@ void dw1000_sleep(struct dw1000 *chip)
 
 bool dw1000_wake(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay)
 {
-    chip->hardware->set_spi_fast(false);
-    (void)read_into(chip, chip->frame_into, 0x11u, 0u, WAKE_OCTETS);
-    chip->hardware->pause_us(RESET_US);
-    return is_there(chip) && configure(chip, tx_antenna_delay, rx_antenna_delay);
+    return is_woken(chip) && configure(chip, tx_antenna_delay, rx_antenna_delay);
 }
 
 /* Running */

@@ -3,8 +3,8 @@
  * source. It has never run on a chip.
  *
  * States:
- *   OFF        nothing is known of the chip, or it sleeps. `dw1000_start` resets and configures it, `dw1000_wake` wakes
- *              and configures it; both leave it IDLE.
+ *   OFF        nothing is known of the chip, or it sleeps. `dw1000_start` resets and configures it in either case,
+ *              `dw1000_wake` one that sleeps; both leave it IDLE.
  *   IDLE       the radio is off. `dw1000_receive` turns the receiver on, `dw1000_receive_at` for a while.
  *   LISTENING  the receiver is on, and stays on: after each frame, after each error, after each transmission.
  *   AWAITING   the receiver goes on at its time, and off with the first frame, or where none comes in its window. Ends
@@ -78,7 +78,8 @@ struct dw1000 {
 
 void dw1000_init(struct dw1000 *chip, const struct hardware *hardware);
 
-/* Reset and configure the chip; antenna delays in ticks. False where no DW1000 answers, or its clock does not lock. */
+/* Reset and configure the chip, which is woken if it sleeps; antenna delays in ticks. False where no DW1000 answers, or
+ * its clock does not lock. */
 bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay);
 
 /* Listen from now on; a frame that waits to be sent is sent before. */

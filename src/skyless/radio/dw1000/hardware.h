@@ -1,4 +1,4 @@
-/* What a board needs of its processor. The portable files (link, dw1000, board) use nothing else. */
+/* What a board needs of its processor. The driver, and the files of the firmware that know no processor, use nothing else. */
 #ifndef HARDWARE_H
 #define HARDWARE_H
 
@@ -13,7 +13,8 @@
 
 #define KEPT_BYTES 80u /* of settings, in flash */
 
-/* Only `transfer`, `pause_us`, `sleep_for` and `write_settings` wait. The driver of the DW1000 uses the first four only. */
+/* Only `transfer`, `pause_us`, `restart_line`, `set_rate`, `sleep_for` and `write_settings` wait. The driver of the DW1000
+ * uses the first four functions only. */
 struct hardware {
     /* One SPI transaction (mode 0) in both directions, 2 to 132 bytes. */
     void (*transfer)(const uint8_t *out, uint8_t *into, uint32_t size);
