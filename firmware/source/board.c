@@ -29,7 +29,7 @@ static const uint8_t VERSION[3] = {0u, 3u, 0u};
 #define CHECK_US 200000u
 /* How often temperature and supply are measured, which takes 1.1 ms without the receiver: in a free slot, */
 #define MEASURE_US 10000000u
-/* or wherever no frame is due, if there was no free slot for so long. */
+/* or wherever no frame is due, if there was no free slot for this time. */
 #define MEASURE_ANYWHERE_US 60000000u
 /* After this number of garbled lines in a row the line is restarted. */
 #define GARBLED_IN_A_ROW 20u

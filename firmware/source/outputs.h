@@ -26,11 +26,11 @@ struct text {
 
 void text_put(struct text *text, const char *part);
 
-/* A part, and behind it a number in units of 10^-decimals, of at least so many digits before the point. */
+/* A part, and behind it a number in units of 10^-decimals, of at least this number of digits before the point. */
 void text_padded(struct text *text, const char *before, int64_t value, uint32_t decimals, uint32_t digits);
 void text_number(struct text *text, const char *before, int64_t value, uint32_t decimals);
 
-/* The same with a float rounded to so many decimals; `none` for what is no number or no measurement. */
+/* The same with a float rounded to that number of decimals; `none` for what is no number or no measurement. */
 void text_real(struct text *text, const char *before, float value, uint32_t decimals);
 
 /* The nearest whole number, of at most 10^15. */

@@ -15,7 +15,7 @@ uint32_t clock_now_us(void);
 void clock_pause_us(uint32_t microseconds);
 /* Sleep until the time is over or an interrupt that is enabled is pending. */
 void clock_sleep_us(uint32_t microseconds);
-/* Sleep for so long on the slow crystal alone, up to 49 days; `clock_now_us` goes on. Every other peripheral must be off. */
+/* Sleep on the slow crystal alone, for up to 49 days; `clock_now_us` goes on. Every other peripheral must be off. */
 void clock_sleep_ms(uint32_t milliseconds);
 
 void serial_port_start(void);

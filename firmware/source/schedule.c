@@ -24,7 +24,7 @@
 #define KNOWN_DRIFT_PPM 4u
 /* From a decision until the chip has it. */
 #define SETTING_US 40
-/* Of beacons that do not come so many more are waited for: others were on the air. */
+/* For beacons that did not come, as others were on the air, this number of later ones is waited for. */
 #define SPARE_TURNS 3u
 /* An anchor that was missed more often is no longer expected. */
 #define MOST_MISSED 8u

@@ -1,6 +1,5 @@
 """A tag that sleeps between its fixes: the firmware's C in a simulated room, from its start on."""
 
-
 import numpy as np
 import pytest
 from emulator.build import HAS_HOST_COMPILER
@@ -9,7 +8,7 @@ from emulator.site.tag_world import TagWorld
 from msgspec.structs import replace
 
 from skyless.radio.serial.board_settings import BoardSettings
-from skyless.radio.serial.link import Reader, Writer, decode
+from skyless.radio.serial.link import Reader, decode
 from skyless.radio.tag_reports import BoardFix
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
@@ -22,7 +21,7 @@ pytestmark = [
 
 SLEEP_S = 0.4
 AWAKE_S = 5.0
-"""After a start, and after a record of a host."""
+"""After a start."""
 
 
 class SleepingTag:
@@ -50,10 +49,6 @@ class SleepingTag:
         self.tag.run(self.now_s)
         return self.fixes[before[0] :], self.chip.receiving_s - before[1], self.chip.asleep_s - before[2]
 
-    def ask(self):
-        """The host asks who is there."""
-        self.tag.board.receive(Writer().ask_hello())
-
 
 @pytest.mark.parametrize("predicts", [0, 1])
 def test_a_tag_that_has_started_is_awake_and_then_sleeps_between_fixes(predicts):
@@ -69,15 +64,4 @@ def test_a_tag_that_has_started_is_awake_and_then_sleeps_between_fixes(predicts)
     assert np.all(errors_m < levels_m)
     assert asleep_s > 0.6 * 12 * SLEEP_S
     assert receiving_s / len(fixes) < (0.02 if predicts else 0.2)
-    assert not +one.chip.misuse
-
-
-def test_a_record_of_a_host_keeps_it_awake():
-    one = SleepingTag(1)
-    one.run(AWAKE_S + SLEEP_S)
-    for _ in range(200):  # until it is awake
-        one.run(2.5e-3)
-        one.ask()
-    assert one.run(0.9 * AWAKE_S)[2] == 0.0
-    assert one.run(0.1 * AWAKE_S + 2 * SLEEP_S)[2] > 0.0
     assert not +one.chip.misuse

@@ -18,10 +18,12 @@ pytestmark = [pytest.mark.site, needs_compiler]
 
 SITE = replace(ROOM, schedule=replace(ROOM.schedule, mode="free", rate_hz=50.0), tags=replace(ROOM.tags, height_m=0.0))
 SLEEP_S = 0.2
+AWAKE_S = 5.0
+"""After a start."""
 
 
 class TagStage(BoardStage):
-    """A tag that sleeps; ``fixes`` are those it has said, with the seconds since its start."""
+    """A tag that may sleep; ``fixes`` are those it has said, with the seconds since then."""
 
     def __init__(self, **settings):
         super().__init__()
@@ -29,6 +31,10 @@ class TagStage(BoardStage):
         packed = pack(BoardSettings(mode=1, rate_hz=0, sleep_ms=round(1000 * SLEEP_S), **settings))
         self.bus.settings = packed.ljust(KEPT_BYTES, b"\0")
         self.board.begin()
+        while self.now_s < AWAKE_S:
+            self.air.pass_s(10e-3)
+            self.step()
+        self._begin_ticks = self.air.ticks
 
     @property
     def now_s(self):

@@ -65,7 +65,9 @@ class BoardOptions(Options, frozen=True, kw_only=True):
         """See that limits that belong together fit. Raises SkylessError."""
         if self.bluetooth_ms is not None and 0 < self.bluetooth_ms < 100:
             raise wrong("--bluetooth-ms", self.bluetooth_ms, "0, or at least 100")
-        if self.z_bounds_m is not None and not -1e5 <= self.z_bounds_m[0] < self.z_bounds_m[1] <= 1e5:
+        if self.sleep_s is not None and 0.0 < self.sleep_s < 1e-3:
+            raise wrong("--sleep-s", self.sleep_s, "0, or at least 0.001")
+        if self.z_bounds_m is not None and not -1e5 <= self.z_bounds_m[0] < self.z_bounds_m[1] - 1e-3 < 1e5:
             raise wrong("--z-bounds", self.z_bounds_m, "a lower and a higher height, within 100 km")
 
     def changes(self) -> dict[str, Any]:
