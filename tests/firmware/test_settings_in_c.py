@@ -46,7 +46,7 @@ asked = st.builds(
     tag=st.none() | st.integers(0, 0xFFFF),
     tx_delay_ticks=st.none() | st.integers(0, 0xFFFF),
     z_bounds_m=st.none() | st.tuples(st.floats(-1e5, 0.0), st.floats(0.01, 1e5)),
-    sleep_s=st.none() | st.floats(0.0, 3600.0),
+    sleep_s=st.none() | st.just(0.0) | st.floats(0.001, 3600.0),
     superframes=st.none() | st.integers(1, 100),
     receive=st.none() | st.sampled_from(["always", "expected"]),
     qa_m2ps3=st.none() | st.floats(2.0**-20, 1000.0, width=32),
@@ -96,7 +96,15 @@ def test_damaged_bytes_are_no_settings(data, bit):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"bluetooth_ms": 50}, {"z_bounds_m": (2.0, 1.0)}, {"sleep_s": 1e9}, {"tag": -1}, {"qa_m2ps3": 0.0}, {"mode": "x"}],
+    [
+        {"bluetooth_ms": 50},
+        {"z_bounds_m": (2.0, 1.0)},
+        {"sleep_s": 1e9},
+        {"sleep_s": 1e-4},
+        {"tag": -1},
+        {"qa_m2ps3": 0.0},
+        {"mode": "x"},
+    ],
 )
 def test_what_cannot_be_set_is_refused_in_words(wrong):
     with pytest.raises(OptionError, match="it should be"):
