@@ -1,4 +1,4 @@
-/* The core on the chip without a radio: whoever runs the image writes a call into RAM, and ends the processor's sleep. */
+/* The core on the chip without a radio: what runs the image writes a call into RAM, and ends the processor's sleep. */
 #include "nrf52832.h"
 #include "skyless_core.h"
 

@@ -8,7 +8,7 @@
  * (tests/firmware/test_fuzz.py makes one), now and then damaged, repeated, lost, or with a wrong stamp or power.
  *
  * Checked besides the sanitizers: every line that the board writes is a record with a right check, or text where it was
- * told to write text; numbers follow one another; a frame that the chip is made to send is one whose record came with a
+ * asked to write text; numbers follow one another; a frame that the chip is made to send is one whose record came with a
  * right FCS; a fix holds numbers, and follows beacons; and afterwards a board with a sound chip works.
  */
 #include <inttypes.h>

@@ -8,7 +8,7 @@ static const uint8_t VERSION[3] = {0u, 3u, 0u};
 /* How long before its time a frame is handed to the chip: a reception that is being reported then (0.28 ms), what is
  * written over the SPI until it starts (0.14 ms; docs/hardware.md) and its preamble (0.14 ms). */
 #define LEAD_US 600
-/* So much longer where receptions are reported with their phases (0.30 ms). */
+/* This much longer where receptions are reported with their phases (0.30 ms). */
 #define PHASE_US 40
 /* A time closer than this is not checked again against the chip's counter. */
 #define CLOSE_US 30

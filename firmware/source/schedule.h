@@ -48,7 +48,7 @@ bool schedule_next(struct schedule *schedule, uint64_t now_ticks, struct window 
 /* No beacon came in a window. */
 void schedule_miss(struct schedule *schedule, uint32_t row);
 
-/* Whether this number of beacons of each expected anchor has come, or will hardly come. */
+/* Whether this number of beacons of each expected anchor has come, or can hardly be expected any more. */
 bool schedule_is_done(const struct schedule *schedule, uint32_t beacons);
 
 /* The counter, which was at `before_ticks`, has begun again and is at `now_ticks`, `slept_us` later; turns are counted

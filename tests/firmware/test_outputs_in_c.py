@@ -89,11 +89,11 @@ def test_a_record_holds_the_fix(fix):
 @given(fixes())
 def test_a_line_of_json_says_what_the_host_s_program_says(fix):
     line = written("json", fix)
-    told, meant = msgspec.json.decode(line, type=FixMessage), message_of(fix)
+    found, meant = msgspec.json.decode(line, type=FixMessage), message_of(fix)
     assert list(json.loads(line)) == list(msgspec.structs.asdict(meant))
     assert line.endswith("}\n")
     for name, value in msgspec.structs.asdict(meant).items():
-        got = getattr(told, name)
+        got = getattr(found, name)
         if name.endswith("dop"):
             assert got == pytest.approx(value, rel=1e-2, abs=1e-3) or meant.gdop > 10.0  # far from all anchors
         elif isinstance(value, float) or (isinstance(value, tuple) and name != "anchors"):
@@ -103,9 +103,9 @@ def test_a_line_of_json_says_what_the_host_s_program_says(fix):
 
 
 def test_single_precision_dilutions_are_those_of_double():
-    meant, told = message_of(fix_in_c()), msgspec.json.decode(written("json", fix_in_c()), type=FixMessage)
+    meant, found = message_of(fix_in_c()), msgspec.json.decode(written("json", fix_in_c()), type=FixMessage)
     for name in ("gdop", "pdop", "hdop", "vdop"):
-        assert getattr(told, name) == pytest.approx(getattr(meant, name), abs=1e-3)
+        assert getattr(found, name) == pytest.approx(getattr(meant, name), abs=1e-3)
 
 
 @pytest.mark.parametrize(("place", "reason"), list(enumerate(NoFixReason, 1)))
@@ -133,15 +133,15 @@ def parsed(text):
 def test_sentences_say_what_the_bridge_s_sentences_say(fix):
     fix.has_origin, fix.origin = True, HALL
     message = message_of(fix)
-    told = parsed(written("nmea", fix))
+    found = parsed(written("nmea", fix))
     assert len(written("nmea", fix)) < 500
     if not is_usable(message):
-        assert list(told) == ["RMC", "GGA"]
-        assert (told["RMC"].status, told["GGA"].quality, told["GGA"].lat) == ("V", 0, "")
+        assert list(found) == ["RMC", "GGA"]
+        assert (found["RMC"].status, found["GGA"].quality, found["GGA"].lat) == ("V", 0, "")
         return
-    assert list(told) == ["RMC", "GGA", "GST"]
+    assert list(found) == ["RMC", "GGA", "GST"]
     meant = parsed(epoch(message, as_site(HALL), "rtk").decode())
-    rmc, gga, gst = told.values()
+    rmc, gga, gst = found.values()
     assert (rmc.date, rmc.time, rmc.status, rmc.posMode) == (*(meant["RMC"].date, meant["RMC"].time), "A", "R")
     for one, other in ((rmc, meant["RMC"]), (gga, meant["GGA"])):
         assert hypot(one.lat - other.lat, cos(radians(52.5)) * (one.lon - other.lon)) * 111_300.0 < 2e-3
@@ -156,15 +156,15 @@ def test_sentences_say_what_the_bridge_s_sentences_say(fix):
 
 
 def test_a_board_that_has_not_been_told_the_time_leaves_it_empty():
-    told = parsed(written("nmea", fix_in_c(has_origin=True, origin=HALL)))
-    assert [message.time for message in told.values()] == [""] * 3
-    assert told["RMC"].date == ""
+    found = parsed(written("nmea", fix_in_c(has_origin=True, origin=HALL)))
+    assert [message.time for message in found.values()] == [""] * 3
+    assert found["RMC"].date == ""
 
 
 @pytest.mark.parametrize("unix_s", [951_782_400, 1_709_164_800, 1_790_000_000, 2_000_000_000])
 def test_dates_are_those_of_the_calendar(unix_s):
-    told = parsed(written("nmea", fix_in_c(has_origin=True, origin=HALL, unix_us=unix_s * 1_000_000)))
-    rmc = told["RMC"]
+    found = parsed(written("nmea", fix_in_c(has_origin=True, origin=HALL, unix_us=unix_s * 1_000_000)))
+    rmc = found["RMC"]
     assert datetime.combine(rmc.date, rmc.time, UTC).timestamp() == unix_s
 
 

@@ -59,8 +59,8 @@ async def test_a_board_that_cannot_be_set_up_is_named_in_words():
 
 async def test_a_rate_that_fails_is_followed_by_the_next():
     async with ComputingBoard() as board:
-        told, deaf = board.protocol.on_host_data, iter([True])
-        board.pty.start(lambda data: None if next(deaf, False) else told(data))
+        receive, deaf = board.protocol.on_host_data, iter([True])
+        board.pty.start(lambda data: None if next(deaf, False) else receive(data))
         assert (await found(board, bauds=(115_200, BAUD))).settings == BoardSettings()
 
 

@@ -583,8 +583,9 @@ typedef struct FixTime {
 /* What a tag knows of its own counter, of sites and of anchors. */
 typedef struct Admission {
     Unwrapper own;
-    Unwrapper former;  /* The same before the frame at hand, whose stamp does not count where it is not admitted. */
-    bool went_back;  /* Whether the frame before did so. */
+    Unwrapper former;  /* ``own`` before the frame at hand, restored where that is not admitted. */
+    /* Whether the stamp of the newest frame is from before others by more than ``COUNTER_JUMP_TICKS``. */
+    bool went_back;
     SiteChoice choice;
     FixTime time;
     Neighbours neighbours;

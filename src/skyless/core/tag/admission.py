@@ -38,9 +38,9 @@ class Admission(Record):
 
     own: Unwrapper
     former: Unwrapper
-    """The same before the frame at hand, whose stamp does not count where it is not admitted."""
+    """``own`` before the frame at hand, restored where that is not admitted."""
     went_back: bool
-    """Whether the frame before did so."""
+    """Whether the stamp of the newest frame is from before others by more than ``COUNTER_JUMP_TICKS``."""
     choice: SiteChoice
     time: FixTime
     neighbours: Neighbours

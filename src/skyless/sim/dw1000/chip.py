@@ -191,7 +191,7 @@ class Chip:
         self.memory.set(r.SYS_STATUS, r.SLP2INIT)
 
     def select(self, seconds: float) -> None:
-        """Chip select was low for so long, which wakes a chip that sleeps."""
+        """Chip select was low for this time, which wakes a chip that sleeps if it is long enough."""
         if self._asleep_since_s is not None and seconds >= _SELECTED_S:
             self.on_wake()
             self.power_cycle()
