@@ -23,7 +23,8 @@ TIERS = {
     "statistical": "Monte Carlo, long fuzzing, heavy clients such as browsers: what takes more than some two seconds",
 }
 _TIER = f"({'|'.join(TIERS)})"
-_TIER_OF_FILE = re.compile(rf"^pytestmark = pytest\.mark\.{_TIER}$", re.MULTILINE)
+_TIER_OF_FILE = re.compile(rf"^pytestmark = (?:\[[^\]]*)?\bpytest\.mark\.{_TIER}\b", re.MULTILINE)
+"""A file's marker, alone or in a list of several."""
 _MARKED = re.compile(rf"\bpytest\.mark\.{_TIER}\b")
 
 

@@ -13,7 +13,8 @@ from skyless.core.extras import EXTRA_OF, what_to_install
 
 pytestmark = pytest.mark.site
 
-PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 BLOCKED = f"import sys\nsys.modules.update(dict.fromkeys({sorted(EXTRA_OF)!r}))\nfrom skyless.cli.main import main\n"
 
 
@@ -64,5 +65,5 @@ def test_a_command_needs_its_extra_only(arguments, extra):
         assert "which is not installed" not in done.stderr
     else:
         assert done.returncode == 2
-        assert done.stderr.splitlines()[-1].endswith(f"pip install 'skyless[{extra}]'")
+        assert done.stderr.splitlines()[-1].endswith(f"scripts/run --extra {extra} ... in {ROOT} adds it")
     assert "Traceback" not in done.stderr

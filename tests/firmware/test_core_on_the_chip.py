@@ -28,6 +28,8 @@ from skyless.core.estimator.process import BatchPacket, BatchRow, Place, Relay
 from skyless.core.estimator.state import State, covariances
 from skyless.core.native.views import records
 
+pytestmark = pytest.mark.site
+
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
 CASES = {"lab": (LAB_M, 0.0, {}), "room": (ROOM_M, 0.0, ERRORS), "3-D": (ROOM_M, None, ERRORS)}
 """All with packets that are lost and others that are late."""

@@ -58,9 +58,9 @@ class Host:
     """Talks with a board."""
 
     def __init__(self, can_transmit=True):
-        self.radio, self.said, self.full = Radio(), [], False
+        self.radio, self.said, self.full, self.now_s = Radio(), [], False, 0.0
         self._reader, self.writer = link.Reader(), link.Writer()
-        self.board = LinkProtocol(self.radio, self._take, can_transmit=can_transmit)
+        self.board = LinkProtocol(self.radio, self._take, can_transmit=can_transmit, clock_s=lambda: self.now_s)
 
     def _take(self, data):
         if not self.full:
@@ -218,6 +218,7 @@ def test_a_tag_on_a_board_makes_the_receiver_s_fixes_and_says_where_its_anchors_
     made = []
     for reception in heard:
         host.said.clear()
+        host.now_s += 0.01
         host.board.on_radio_event(replace(reception, host_s=None))
         expected = receiver.hear(reception)
         fixes = [fix for fix in map(board.take, host.said) if fix is not None]

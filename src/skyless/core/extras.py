@@ -1,6 +1,8 @@
 """Libraries that an extra of the package brings, and which one where a library is not installed."""
 
+import sys
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import Final
 
@@ -31,11 +33,18 @@ EXTRA_OF: Final = {
 """Extras of ``pyproject.toml`` by the name under which a library of theirs is imported."""
 
 
+def how_to_install(extra: str) -> str:
+    """Say how an extra is added to this environment: by ``scripts/run`` where that has made it, or from a checkout."""
+    if (Path(sys.prefix) / "made-from").is_file():
+        return f"scripts/run --extra {extra} ... in {Path(sys.prefix).parent} adds it"
+    return f"pip install '.[{extra}]' in a checkout of Skyless adds it"
+
+
 def what_to_install(error: ImportError, what: str = "this") -> str | None:
     """Say which extra brings the library that ``what`` needs and that could not be imported; None if none does."""
     library = (error.name or "").partition(".")[0]
     extra = EXTRA_OF.get(library)
-    return None if extra is None else f"{what} needs {library}, which is not installed: pip install 'skyless[{extra}]'"
+    return None if extra is None else f"{what} needs {library}, which is not installed: {how_to_install(extra)}"
 
 
 def extra_module(name: str, what: str) -> ModuleType:

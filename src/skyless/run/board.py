@@ -3,6 +3,7 @@
 import json
 import math
 import struct
+import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -74,10 +75,12 @@ class BoardProtocol(Protocol):
 class LinkProtocol:
     """The serial link, as the firmware of real boards speaks it (``firmware/source/board.c``)."""
 
-    def __init__(self, radio: Radio, send: Send, *, can_transmit: bool) -> None:
-        """One that only listens can be a tag by itself."""
+    def __init__(
+        self, radio: Radio, send: Send, *, can_transmit: bool, clock_s: Callable[[], float] = time.monotonic
+    ) -> None:
+        """One that only listens can be a tag by itself, whose time of the host is ``clock_s()``."""
         self._radio, self._send, self._can_transmit = radio, send, can_transmit
-        self.tag = None if can_transmit else BoardTag(self.report)
+        self.tag = None if can_transmit else BoardTag(self.report, clock_s)
         self._reader, self._writer = link.Reader(), link.Writer()
         self._configured = self._receiving = self._wants_phases = False
         self._tx_delay_ticks = 0

@@ -27,9 +27,9 @@ _REPEAT_S: Final = 10.0
 class BoardTag:
     """The tag on a board; ``settings`` are those in use, ``flash`` those that it has after a start."""
 
-    def __init__(self, report: Callable[[int, bytes], None]) -> None:
-        """``report`` sends a record of a kind."""
-        self._report = report
+    def __init__(self, report: Callable[[int, bytes], None], clock_s: Callable[[], float] = time.monotonic) -> None:
+        """``report`` sends a record of a kind; ``clock_s()`` is the host's time, on the clock of receptions."""
+        self._report, self._clock_s = report, clock_s
         self.flash = BoardSettings()
         self.begin(self.flash)
 
@@ -43,7 +43,7 @@ class BoardTag:
         )
         self.settings = settings
         self._rate, self._lateness = RateLimit(settings.rate_hz or 1e6), Lateness()
-        self._begun_s = time.monotonic()
+        self._begun_s = self._clock_s()
         self._fixed_s = self._placed_s = -_REPEAT_S
         self._placed: tuple[int, ...] = ()
         """Anchors whose places were said last."""
@@ -69,7 +69,7 @@ class BoardTag:
 
     def hear(self, reception: Reception) -> None:
         """Process a frame; say where the tag is, if that is due."""
-        now_s = time.monotonic()
+        now_s = self._clock_s()
         ended_s = now_s if reception.host_s is None else reception.host_s
         if not self._lateness.admits(ended_s, now_s) or (fix := self._receiver.hear(reception)) is None:
             return
@@ -77,7 +77,7 @@ class BoardTag:
         if self._rate.is_due(ended_s):
             if fix.anchors != self._placed or now_s - self._placed_s > _REPEAT_S:
                 self._say_places(fix, now_s)
-            latency_s, serial = time.monotonic() - ended_s, self._receiver.counters["fixes"]
+            latency_s, serial = self._clock_s() - ended_s, self._receiver.counters["fixes"]
             who = self._receiver.site or 0, self.settings.tag
             self._report(link.FIX, fix_body(fix, time.time() - latency_s, reception.rx_ticks, latency_s, serial, *who))
 
@@ -91,7 +91,7 @@ class BoardTag:
     def each_second(self) -> None:
         """Say what it has counted, and why there is no fix where there is none."""
         if self.is_on:
-            receiver, counted, now_s = self._receiver, self._receiver.counters, time.monotonic()
+            receiver, counted, now_s = self._receiver, self._receiver.counters, self._clock_s()
             reason = receiver.reason if now_s - self._fixed_s > HEALTH_S else None
             dropped = sum(count for why, count in counted.items() if why not in NOT_DROPS)
             counts = counted["heard"], counted["fixes"], self._lateness.dropped, 0, dropped

