@@ -81,8 +81,9 @@ class Hall:
                 more = {"receptions": self.receptions} | self.tags.get(name, {})
                 sent = unix_s - self.delay_s - self.clock_error_s
                 self.evidence.add_health("tag", name, tag_health(name, sent, **more), self.now_s, unix_s)
-            air = replace(EtherHealth(unix_s, 1.0, 5, 0, {}, {}, 0, 0), **self.air)
-            self.evidence.add_health("ether", "air", air, self.now_s, unix_s)
+            if self.air is not None:
+                air = replace(EtherHealth(unix_s, 1.0, 5, 0, {}, {}, 0, 0), **self.air)
+                self.evidence.add_health("ether", "air", air, self.now_s, unix_s)
 
 
 @pytest.fixture
@@ -123,15 +124,25 @@ def test_without_a_broker_nothing_else_is_judged(hall):
     assert hall.run(1.0).level == "good"
 
 
+def test_processors_in_full_use_are_a_warning_but_where_the_air_is_emulated():
+    hall = Hall()
+    hall.air = None
+    hall.start().used_share = 0.98
+    (busy,) = hall.run(10.0).reasons
+    assert (busy.kind, busy.level) == ("busy", "warning")
+    assert "this computer is fully busy: 98 % of its" in busy.text
+    hall.air = {}
+    assert hall.run(10.0).level == "good"
+
+
 @pytest.mark.parametrize(
     ("change", "back", "level", "kind", "words"),
     [
         ({"latency_s": 2.3}, {"latency_s": 1e-3}, "bad", "late", "positions are 2.3 s behind: this computer does not"),
         ({"latency_s": 0.4}, {"latency_s": 1e-3}, "warning", "late", "positions are 0.4 s behind"),
         ({"delay_s": 2.0}, {"delay_s": 0.0}, "bad", "late", "2.0 s behind: the broker or the network delivers late"),
-        ({"air": {"missed_share": 0.12}}, {"air": {}}, "warning", "slow", "the emulated air missed 12 % of the"),
+        ({"air": {"missed_share": 0.32}}, {"air": {}}, "warning", "slow", "the emulated air missed 32 % of the"),
         ({"anchors": {"missed_share": 0.7}}, {"anchors": {}}, "bad", "slow", "this computer is too slow: 6 anchors"),
-        ({"used_share": 0.98}, {"used_share": 0.9}, "warning", "busy", "this computer is fully busy: 98 % of its"),
         ({"lag_s": 0.6}, {"lag_s": 0.0}, "warning", "slow", "the page's server was delayed by 0.6 s"),
         (
             {"tags": {"t2": {"multipath_std_m": 0.08, "multipath_distance_m": 0.12}}},

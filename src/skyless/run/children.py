@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import signal
 import sys
 from collections import deque
 from collections.abc import Mapping
@@ -56,8 +57,15 @@ class Child:
         self.starts = 0
         self.pid: int | None = None  # of the running process
         self._log = log
+        self._is_asked = False
         self._last_lines: deque[str] = deque(maxlen=_LINES)
         self._line = b""
+
+    def restart(self) -> None:
+        """Start it again now, with no word about it: what it read at its start has changed."""
+        if self.pid is not None:
+            self._is_asked = True
+            os.kill(self.pid, signal.SIGTERM)
 
     async def run(self) -> None:
         """Keep it alive until cancelled, or until it has ended for good."""
@@ -67,6 +75,9 @@ class Child:
         while True:
             begun_s = asyncio.get_running_loop().time()
             code = await self._run_once()
+            if self._is_asked:
+                self._is_asked = False
+                continue
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             ended = f"{self.program.name} ended ({how}); {self._last_message()}"
             if self.program.new_file is not None and code >= 0:

@@ -17,6 +17,12 @@ from skyless.sim.evaluation.statistics import ErrorStatistics
 _WARMUP_S: Final = 1.0  # fixes of a tag count for the errors from this time after its first
 
 _ALERTS: Final = frozenset(alert.value for alert in Alert)
+_ALERT_WORDS: Final[dict[str, str]] = {
+    Alert.EXCLUDED: "left out a message that disagreed with the others",
+    Alert.NOT_EXCLUDED: "have messages that disagree, and none could be left out",
+    Alert.UNAVAILABLE: "had no bound on their error yet",
+    Alert.LIMIT: "have a bound on their error above the alert limit",
+}
 
 
 class TagFigures(Struct):
@@ -131,13 +137,13 @@ def sentence(summary: dict[str, Any]) -> str:
         )
     if summary["rmse_m"] is None or summary["updates_per_s"] is None:
         return f"{summary['tags']} tags with a fix; too short for errors and updates per second{late}"
-    alerts = ", ".join(f"{alert} {count}" for alert, count in summary["alerts"].items() if alert != Alert.NONE)
+    alerts = ", ".join(f"{n} {_ALERT_WORDS[alert]}" for alert, n in summary["alerts"].items() if alert != Alert.NONE)
     boards = f" ({summary['boards']} of them on emulated boards)" if summary["boards"] else ""
     return (
         f"{summary['tags']} tags{boards}, {summary['messages']} messages in {summary['duration_s']:.1f} s: "
         f"RMSE {100 * summary['rmse_m']:.1f} cm, largest error {100 * summary['max_m']:.1f} cm, "
         f"{summary['updates_per_s']:.0f} updates per second and tag, "
         f"99 % of fixes within {1e3 * (summary['fix_latency_p99_s'] or 0.0):.1f} ms of the frame"
-        + (f"; alerts: {alerts or 'none'}" if summary["alerts"] else "")
+        + (f"; fixes with an alert: {alerts or 'none'}" if summary["alerts"] else "")
         + late
     )

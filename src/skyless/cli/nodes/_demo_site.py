@@ -2,6 +2,9 @@
 
 import asyncio
 import contextlib
+from collections import deque
+from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Final
@@ -11,22 +14,26 @@ from msgspec.structs import replace
 
 from skyless.cli.common.options import make_folder
 from skyless.cli.nodes._demo_figures import DemoFigures
+from skyless.cli.nodes._demo_story import MOVED, furnished, kept_messages
 from skyless.cli.nodes._site_view import SiteView
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, site_named
 from skyless.core.arguments import Method, Picoseconds, Positive, Seed, whole
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
 from skyless.core.method_names import DEFAULT_METHOD
-from skyless.page.condition.evidence import ProcessorUse
+from skyless.core.protocols import beacon_period_s
+from skyless.core.whole_files import replace_files
+from skyless.page.condition.evidence import Health, ProcessorUse
 from skyless.run.broker import Broker, BrokerSettings, start_broker
 from skyless.run.children import Child, Program
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import StatusMessage, WrongMessageError, read_message
+from skyless.run.mqtt.messages import EtherHealth, StatusMessage, WrongMessageError, read_message
 from skyless.run.mqtt.topics import site_topic, status_topic, survey_topic, watch_topic
 from skyless.run.process import (
     Log,
+    data_folder,
     hold_any,
     new_recording,
     outlasting,
@@ -35,6 +42,8 @@ from skyless.run.process import (
     together,
 )
 from skyless.sim.evaluation.request import ProtectionOptions
+from skyless.sim.lab import lab_site
+from skyless.site.file.template import site_template
 
 _HOST: Final = "127.0.0.1"
 _PAGE_PORT: Final = 8080
@@ -43,6 +52,12 @@ _BROKER_RESTART_S: Final = 0.2
 _KEEPALIVE_S: Final = 10
 _RECORDING_LIMIT_MB: Final = "1000"
 _CLEAR_S: Final = 0.5  # retained messages have come by then
+
+_SLOW_SHARE: Final = 0.1
+_SLOW_FOR: Final = 8
+"""An emulated air that misses so large a share of the transmissions, on average of this many seconds, is too slow."""
+_LEAST_RATE_HZ: Final = 15.0
+"""Beacons a second of each anchor. A computer that other programs keep busy misses its share of fewer, too."""
 
 _SURVEY_DELAY_S: Final = 4.0
 """Nothing else waits for the survey. Started with the others it would delay the first fix by a second on two cores."""
@@ -66,7 +81,10 @@ class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
     carrier: bool = False
     """Let radios measure the phase of the carrier, as a DW1000 can."""
     site: Path | None = None
-    """Site file; by default the lab, six anchors on the walls of 6 m × 8 m."""
+    """Site file; by default a workshop, six anchors on the walls of 6 m × 8 m, with a plan, zones, names, a rule of
+    alarms, a history, and an anchor that is hung elsewhere after a minute."""
+    plain: bool = False
+    """Show the same six anchors and walking tags, and nothing else."""
     paper: bool = False
     """Use the paper's protocol for the lab: one anchor is the master, and another takes over when it fails."""
     method: Method = DEFAULT_METHOD
@@ -80,7 +98,8 @@ class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
     record: str | None = None
     """File for the recording, .mcap, or none; by default one in the folder that the page shows."""
     history: Path | None = None
-    """Folder of the history to keep, which the page then asks; by default none."""
+    """Folder of the history to keep, which the page then asks; by default the workshop's ends with the demo, and
+    other sites have none."""
 
 
 class WholeSite:
@@ -88,42 +107,52 @@ class WholeSite:
 
     def __init__(self, asked: DemoOptions, log: Log) -> None:
         """Raises SkylessError."""
-        if asked.mqtt == "none":
-            raise SkylessError("--mqtt is 'none'; the demo needs a broker, and brings one where --mqtt is not given")
-        if asked.mqtt is None and asked.mqtt_ca is not None:
-            raise SkylessError("--mqtt-ca is for another broker; give it together with --mqtt")
-        if asked.paper and asked.site is not None:
-            raise SkylessError(
-                "--paper is for the demo's own site; the mode of a site file stands in it (schedule.mode)"
-            )
-        lab = f"{'paper' if asked.paper else 'lab'}:{asked.noise_ps:g}"
+        _check(asked)
         self._asked, self._log = asked, log
-        self._site_name = lab if asked.site is None else str(asked.site.absolute())
+        self._ports = TemporaryDirectory(prefix="skyless-demo-")
+        self._own_file = Path(self._ports.name, "demo.toml") if asked.site is None and not asked.paper else None
+        """The demo's own site; where it is set, the rate of its beacons is lowered on a slow computer."""
+        self._has_story = self._own_file is not None and not asked.plain
+        self._missed_shares: deque[float] = deque(maxlen=_SLOW_FOR)
+        self._site_name = f"paper:{asked.noise_ps:g}" if asked.site is None else str(asked.site.absolute())
+        if self._own_file is not None:
+            lab = lab_site(asked.noise_ps)
+            self._site_name = str(self._own_file)
+            self._own_file.write_text(site_template(furnished(lab) if self._has_story else lab), encoding="utf-8")
         self.site = site_named(self._site_name)
         self._number = "--site-id", str(self.site.id)
         check_live(self.site, asked.method)
-        if asked.boards > asked.tags:
-            raise SkylessError(f"--boards is {asked.boards}; it should be at most --tags, which is {asked.tags}")
         if asked.boards and self.site.schedule.mode != "free":
             raise SkylessError(f"--boards is {asked.boards}; it should be 0 at a site with a master: boards know none")
-        asked.requirement(asked.method)
+        self.history = asked.history
         if asked.history is not None:
             extra_module("pyarrow", "--history")
-            make_folder("--history", asked.history)  # the page asks it before the history's first file
+        elif self._has_story and find_spec("pyarrow") and find_spec("duckdb"):
+            self.history = Path(self._ports.name, "history")
+        if self.history is not None:
+            make_folder("--history", self.history)  # the page asks it before the history's first file
         self.address = None if asked.mqtt is None else mqtt_address(asked.mqtt, asked.mqtt_ca)
         self._recordings = recordings_folder()
         self.recording = _recording(asked.record, self._recordings)
         self.ether_port, self._ether_held = hold_any(_HOST)
         self.page_port, self._page_held = reserve_next(_HOST, _PAGE_PORT)
-        self._ports = TemporaryDirectory(prefix="skyless-demo-")
         tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
         self._tags = tags[: asked.tags - asked.boards]
         self.boards = {tag: Path(self._ports.name, tag) for tag in tags[len(self._tags) :]}
         """The others, which are boards, and their serial ports."""
+        self.keeps = asked.mqtt is None and (asked.site is not None or asked.history is not None)
+        """Whether the embedded broker's names, zones and rules are there again the next time."""
         self.figures = DemoFigures(planar=self.site.tags.height_m is not None)
         self.view: SiteView | None = None
         self.children: list[Child] = []
         self.ready = asyncio.Event()  # the broker is there and the page is starting
+
+    @property
+    def gone(self) -> str:
+        """What ends with the demo although its page has shown it; empty where nothing does."""
+        if self._asked.mqtt is not None or self.keeps:
+            return ""
+        return "names, zones and history" if self.history is not None else "names and zones"
 
     @property
     def page(self) -> str:
@@ -138,21 +167,54 @@ class WholeSite:
         """
         with self._ether_held, self._page_held, self._ports:
             if self.address is not None:
-                whole = self._run_with(self.address, None)
-                await outlasting(_cleared_at_the_end(self.address, self.site.id, self._log), whole)
+                await self._run_with(self.address, None)
             else:
-                broker = await start_broker(BrokerSettings(temporary=True))
+                broker = await self._own_broker()
                 await self._run_with(broker.address, broker)
+
+    async def _own_broker(self) -> Broker:
+        """A broker that keeps names, zones and rules for the next demo of the site, where the user keeps anything."""
+        if self.keeps:
+            try:
+                return await start_broker(BrokerSettings(data=data_folder() / f"demo-{self.site.id}"))
+            except SkylessError as error:
+                self._log(f"names, zones and rules end with this demo: {error}")
+                self.keeps = False
+        return await start_broker(BrokerSettings(temporary=True))
 
     async def _run_with(self, address: MqttAddress, broker: Broker | None) -> None:
         self.address = address
+        story = kept_messages(self.site) if self._has_story else {}
+        if story:
+            await _place(address, story, is_new=broker is not None and not self.keeps)
         link = Link(address, "demo", site=self.site.id, kind="watch")
         self.view = SiteView(link, self.site.id, used_share=ProcessorUse().share)
         self.figures.follow(self.view)
+        self.view.on_health.append(self._on_health)
         self.children = [Child(program, self._log) for program in self._programs(address)]
         self.ready.set()
         nodes = outlasting(link.run(), together(*(child.run() for child in self.children)))  # its end is published
+        if broker is None or self.keeps:
+            own = story if broker is None else {}
+            nodes = outlasting(_cleared_at_the_end(address, self.site.id, own, self._log), nodes)
         await (nodes if broker is None else outlasting(self._keep(broker), nodes))  # they publish their end to it
+
+    def _on_health(self, health: Health) -> None:
+        """Lower the rate of the own site's beacons where the emulated air does not keep up with them."""
+        if self._own_file is None or not isinstance(health, EtherHealth) or len(self.figures.tags) < self._asked.tags:
+            return
+        self._missed_shares.append(health.missed_share)
+        rate_hz = 1.0 / beacon_period_s(self.site)
+        if sum(self._missed_shares) < _SLOW_SHARE * _SLOW_FOR or rate_hz <= _LEAST_RATE_HZ:
+            return
+        self._missed_shares.clear()
+        slower_hz = max(rate_hz / 1.5, _LEAST_RATE_HZ)
+        self.site = replace(self.site, schedule=replace(self.site.schedule, rate_hz=slower_hz))
+        replace_files({self._own_file: site_template(self.site).encode()})
+        self._log(f"a slow computer: from now on each anchor sends {slower_hz:.0f} beacons a second, not {rate_hz:.0f}")
+        for child in self.children:
+            if child.program.arguments[0] == "anchor":
+                child.restart()
 
     async def _keep(self, broker: Broker) -> None:
         """Start the embedded broker again, on the same port and with the same store, whenever it ends."""
@@ -172,6 +234,7 @@ class WholeSite:
         radio, site = ("--radio", f"ether:{_HOST}:{self.ether_port}"), ("--site", self._site_name)
         walks = _options(tags=asked.tags, speed=asked.speed, noise_ps=asked.noise_ps, seed=asked.seed)
         ether = ("ether", *site, *mqtt, "--listen", f"{_HOST}:{self.ether_port}", *walks)
+        ether += ("--move", MOVED) * self._has_story + ("--carrier",) * asked.carrier
         computing = _options(
             method=asked.method,
             integrity_risk=asked.integrity_risk,
@@ -180,7 +243,7 @@ class WholeSite:
         )
         anchors = [str(anchor.id) for anchor in self.site.anchors]
         programs = [
-            Program("ether", (*ether, "--carrier") if asked.carrier else ether),
+            Program("ether", ether),
             *(
                 Program(_named("anchor", some), ("anchor", *some, *site, *radio, *mqtt))
                 for some in _groups(anchors, 1 if asked.apart else len(anchors))
@@ -202,12 +265,27 @@ class WholeSite:
         if self.recording is not None:
             limit = ("--limit-mb", _RECORDING_LIMIT_MB)
             programs.append(Program("recorder", ("record", str(self.recording), *mqtt, *limit, *self._number), 1))
-        if asked.history is not None:
-            history = ("history", "run", "--to", str(asked.history), *self._number, *mqtt)
+        if self.history is not None:
+            history = ("history", "run", "--to", str(self.history), *self._number, *mqtt)
             programs.append(Program("history", history, start_after_s=_SURVEY_DELAY_S, logs_lines=True))
-        shown = _options(recordings=self._recordings, history=asked.history)
+        shown = _options(recordings=self._recordings, history=self.history)
         page = ("dashboard", *mqtt, "--listen", f"{_HOST}:{self.page_port}", *shown, *self._number)
         return [*programs, Program("page", page)]
+
+
+def _check(asked: DemoOptions) -> None:
+    """Whether the options fit each other. Raises SkylessError."""
+    if asked.mqtt == "none":
+        raise SkylessError("--mqtt is 'none'; the demo needs a broker, and brings one where --mqtt is not given")
+    if asked.mqtt is None and asked.mqtt_ca is not None:
+        raise SkylessError("--mqtt-ca is for another broker; give it together with --mqtt")
+    if asked.paper and asked.site is not None:
+        raise SkylessError("--paper is for the demo's own site; the mode of a site file stands in it (schedule.mode)")
+    if asked.plain and asked.site is not None:
+        raise SkylessError("--plain is for the demo's own site; a site file has what it has")
+    if asked.boards > asked.tags:
+        raise SkylessError(f"--boards is {asked.boards}; it should be at most --tags, which is {asked.tags}")
+    asked.requirement(asked.method)
 
 
 def _recording(asked: str | None, folder: Path) -> Path | None:
@@ -220,29 +298,46 @@ def _recording(asked: str | None, folder: Path) -> Path | None:
     return file
 
 
-async def _cleared_at_the_end(address: MqttAddress, site: int, log: Log) -> None:
-    """Wait until cancelled. Then clear what the site's programs, which have ended, have left retained at the broker."""
+async def _place(address: MqttAddress, messages: Mapping[str, bytes], *, is_new: bool) -> None:
+    """Publish messages for the broker to keep, unless it has others; a new broker has none."""
+    there: set[str] = set()
+    reactions = Reactions(message=lambda topic, payload: there.add(topic) if payload else None)
+    connection = await open_connection(address, address.tls_context(), Introduction("", _KEEPALIVE_S), reactions)
+    if not is_new:
+        connection.subscribe(dict.fromkeys(messages, 1))
+        await asyncio.sleep(_CLEAR_S)
+    for topic in messages.keys() - there:
+        connection.publish(topic, messages[topic], 1, retain=True)
+    await connection.leave()
+
+
+async def _cleared_at_the_end(address: MqttAddress, site: int, own: Mapping[str, bytes], log: Log) -> None:
+    """Wait until cancelled. Then clear what the site's programs, which have ended, have left retained at the broker.
+
+    ``own`` are messages of the demo, which go as well where nobody has changed them.
+    """
     try:
         await asyncio.Event().wait()
     finally:
         try:
-            await asyncio.shield(_clear_retained(address, site))
+            await asyncio.shield(_clear_retained(address, site, own))
         except (OSError, RefusedError) as error:
             log(f"{trouble_with(address, error)}: the demo's site stays there")
 
 
-async def _clear_retained(address: MqttAddress, site: int) -> None:
+async def _clear_retained(address: MqttAddress, site: int, own: Mapping[str, bytes]) -> None:
     left: set[str] = set()
 
     def note(topic: str, payload: bytes) -> None:
         with contextlib.suppress(WrongMessageError):  # of another program than the demo's
-            if payload and not (topic.endswith("/status") and read_message(payload, StatusMessage).online):
+            kept = topic in own and payload != own[topic]
+            if payload and not kept and not (topic.endswith("/status") and read_message(payload, StatusMessage).online):
                 left.add(topic)
 
     who = Introduction("", _KEEPALIVE_S)
     connection = await open_connection(address, address.tls_context(), who, Reactions(message=note))
-    own = (site_topic(site), survey_topic(site), watch_topic(site), status_topic(site, "+", "+"))
-    connection.subscribe(dict.fromkeys(own, 1))
+    topics = (site_topic(site), survey_topic(site), watch_topic(site), status_topic(site, "+", "+"), *own)
+    connection.subscribe(dict.fromkeys(topics, 1))
     await asyncio.sleep(_CLEAR_S)
     for topic in left:
         connection.publish(topic, b"", 1, retain=True)

@@ -52,6 +52,8 @@ def demo(*, asked: DemoOptions, output: JsonOptions) -> None:
     if not sys.stdout.isatty() and stage.picture is not None:
         console().print(stage.drawn(stage.picture))
     console().print(sentence(summary), soft_wrap=True)
+    if gone := stage.whole.gone:
+        console().print(f"gone with this demo: {gone}; with --history FOLDER they are there the next time")
 
 
 class _Stage:

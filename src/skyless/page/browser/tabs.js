@@ -14,7 +14,8 @@ import * as timing from "./panels/timing.js";
 import * as zones from "./panels/zones.js";
 import * as setup from "./setup/panel.js";
 
-/** Each has a title, the topics that it shows, the interval at which it shows changes, `start(panel)` and `show()`. */
+/** Each has a title, the topics that it shows, the interval at which it shows changes, `start(panel)` and `show()`; one
+    that has nothing to show at some sites says so with `isIdle()`. */
 const TABS = { tags, alarms, anchors, events, timing, zones, setup, history, recordings };
 const KEYS = Object.keys(TABS);
 const SHEET = ["low", "half", "high"];
@@ -42,6 +43,7 @@ export function start() {
   byId("sheet").addEventListener("click", () => sheet(SHEET[(SHEET.indexOf(document.body.dataset.sheet) + 1) % 3]));
   open("tags");
   on(["log", "read"], showUnread);
+  on(["site"], hideIdle);
   on(["site"], openWhereNothingIsPlaced);
   on(["picking"], () => picking && matchMedia("(max-width: 760px)").matches && sheet("half"));
   setInterval(() => TABS[current].changesWithTime && show(), 1000);
@@ -52,6 +54,12 @@ export function start() {
     else if (anchor !== null && current !== "setup") open("anchors");
     else if (zone !== null) open("zones");
   });
+}
+
+/** Offer only tabs that have something to show at this site. */
+function hideIdle() {
+  for (const [key, tab] of Object.entries(TABS)) byId(`tab-${key}`).hidden = tab.isIdle?.() ?? false;
+  if (TABS[current].isIdle?.()) open("tags");
 }
 
 /** Open the tab Set up at a site without any position, once: there is nothing else to see. */

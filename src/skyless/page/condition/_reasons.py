@@ -20,6 +20,9 @@ KEY_WAIT_S: Final = 0.6
 MISSED_SHARE: Final = 0.1
 """Share of transmissions missed in a second. A computer with little to do misses 1 to 4 % in most seconds."""
 
+EMULATED_MISSED_SHARE: Final = 0.3
+"""The same where the air is emulated: what it misses is lost as frames are on a real air, which costs little."""
+
 DROPPED_SHARE: Final = 0.02
 """Share of receptions dropped by a tag. On an idle computer it is 0."""
 
@@ -192,8 +195,8 @@ def left_out_reason(evidence: Evidence, now_s: float) -> Reason | None:
 
 
 def busy_reason(evidence: Evidence, used_share: float | None) -> Reason | None:
-    """All processors of the page's computer are in use, by any program."""
-    if used_share is None or used_share < BUSY_SHARE:
+    """All processors of the page's computer are in use, by any program. An emulated air says itself what it misses."""
+    if used_share is None or used_share < BUSY_SHARE or any(evidence.of("ether")):
         return None
     text = f"{evidence.computer(evidence.host)} is fully busy: {100.0 * used_share:.0f} % of its processors are in use"
     return Reason("busy", "warning", text, "End other programs there, or positions may come late or not at all.")
@@ -204,14 +207,16 @@ _Sign = tuple[str, float, str]  # computer, share of what was lost, and words
 
 def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
     """Transmissions of the emulated air, and of anchors."""
-    for _, air in evidence.of("ether"):
-        if air.reports(now_s) and isinstance(air.health, EtherHealth) and air.health.missed_share > MISSED_SHARE:
+    airs = list(evidence.of("ether"))
+    most = EMULATED_MISSED_SHARE if airs else MISSED_SHARE
+    for _, air in airs:
+        if air.reports(now_s) and isinstance(air.health, EtherHealth) and air.health.missed_share > most:
             share = air.health.missed_share
             yield air.host, share, f"the emulated air missed {100.0 * share:.0f} % of the transmissions"
     shares: dict[str, dict[str, float]] = {}
     for name, anchor in evidence.of("anchor"):
         share = anchor.health.missed_share if isinstance(anchor.health, AnchorHealth) else 0.0
-        if anchor.reports(now_s) and share > MISSED_SHARE:
+        if anchor.reports(now_s) and share > most:
             shares.setdefault(anchor.host, {})[name] = share
     for host, late in shares.items():
         worst = max(late.values())

@@ -5,7 +5,7 @@ import { Chart } from "../chart.js";
 import { Rows, h, text } from "../dom.js";
 import { DASH, duration, length, number } from "../format.js";
 import { anchorHistory } from "../history.js";
-import { anchorMark, condition, leads, wordsOf } from "../map/anchors.js";
+import { anchorMark, condition, leads, siteMode, wordsOf } from "../map/anchors.js";
 import { places } from "../map/places.js";
 import { startPlacing } from "../map/placing.js";
 import { findingAt, findingWords, findings, markWords } from "../survey/watch.js";
@@ -18,14 +18,16 @@ export const interval_ms = 200;
 export const changesWithTime = true;
 
 const WINDOW_S = 120;
+const HEARD_S = 3;
 /** Counters that have a fact of their own. */
 const SHOWN = new Set(["sent", "heard", "late"]);
 let parts = null;
 
 /** Build the tab. */
 export function start(panel) {
-  const table = selectionTable("anchor", ["Anchor", "Offset", "Rate", "Sync σ", "Late"], describe);
-  table.head.cells[5].title = "Transmissions that were skipped because they were late";
+  const table = selectionTable("anchor", ["Anchor", "Offset", "Rate", "Sync σ", "Hears", "Sent", "Late"], describe);
+  table.head.cells[5].title = "Anchors that it has received in the last seconds";
+  table.head.cells[7].title = "Transmissions that were skipped because they were late";
   const nodes = h("ul", { class: "nodes" });
   const programs = h("section", {}, h("h2", {}, "Programs"), nodes);
   const note = h("p", { class: "empty" }, "Anchor health is shown on the live site only.");
@@ -41,6 +43,7 @@ export function start(panel) {
 /** Bring the tab up to date. */
 export function show() {
   const live = state.mode === "live";
+  parts.box.classList.toggle("free", siteMode() === "free");
   parts.note.hidden = live;
   parts.programs.hidden = !live || state.connection.phase === "lost"; // without messages none is known to run
   parts.trying.disabled = !live || !state.site?.anchors.length || places !== null;
@@ -88,6 +91,8 @@ function describe(id) {
       leading ? "reference" : known ? number(health.offset_s, 4, "s") : DASH,
       leading || !known ? DASH : number(health.rate_ppm, 3, "ppm"),
       leading || !known ? DASH : sigma(health.offset_std_m),
+      known ? number(Object.values(health.heard_age_s ?? {}).filter((age_s) => age_s < HEARD_S).length) : DASH,
+      known ? number(health.sent) : DASH,
       kind === "bad" || kind === "unknown" ? DASH : number(health?.late),
     ],
   };

@@ -10,6 +10,8 @@ export const title = "Timing";
 export const topics = ["health", "selection", "theme", "mode"];
 export const interval_ms = 200;
 export const changesWithTime = true;
+/** Without a superframe there is nothing to draw. */
+export const isIdle = () => siteMode() === "free";
 
 /** Limit of the rows in the picture. */
 const MAX_ROWS = 24;
