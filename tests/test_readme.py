@@ -57,6 +57,7 @@ SHORTER = {
 HTTP = "tests/dashboard/test_http_doc.py::test_clients_of_a_running_server"
 EVERYDAY_PAGE = ROOT / "docs" / "tutorials" / "everyday.md"
 EVERYDAY = "tests/cli/test_everyday_tutorial.py::test_every_line_of_the_tutorial_runs"
+USERS = "tests/test_as_users_do.py::test_the_readme_s_commands_on_a_fresh_copy"
 DEMO = "tests/cli/test_demo_command.py::"
 KEYED = "tests/nodes/test_no_key_leaves.py::test_no_key_leaves_the_programs"
 SITE = "tests/nodes/test_running_site.py::test_a_site_rides_through_the_death_and_the_freezing_of_every_process"
@@ -70,9 +71,9 @@ PLAN = "tests/cli/test_plan_command.py::"
 BENCHMARK = "tests/replay/test_benchmark.py::"
 REPLAY = "tests/cli/test_replay_command.py::"
 ELSEWHERE = {
-    "scripts/run": DEMO
-    + "test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated_and_a_tag_is_a_board",
-    "scripts/test unit": "the run that this test is part of",
+    "git clone https://github.com/skyless-uwb/skyless && cd skyless": "a copy of the files stands for the clone: "
+    + USERS,
+    **dict.fromkeys(("scripts/run", "scripts/test unit"), USERS),
     "scripts/run --version": "tests/cli/test_program.py::test_version",
     'export PATH="$PWD/.venv/bin:$PATH"': "the run that this test is part of",
     "skyless demo --duration 20 --record walk.mcap": (
@@ -103,9 +104,6 @@ ELSEWHERE = {
     "skyless dashboard --assets assets.csv": HTTP,
     "curl http://127.0.0.1:8080/api/v1/assets.csv > assets.csv": HTTP,
     "curl -T assets.csv http://127.0.0.1:8080/api/v1/assets.csv": HTTP,
-    "skyless bridge foxglove://:8765 jsonl+tcp://:7010": (
-        "tests/nodes/test_bridge_nodes.py::test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did"
-    ),
     "skyless record walk.mcap": (
         "tests/nodes/test_record_command.py::test_a_recording_replays_bit_by_bit_and_ctrl_c_closes_it"
     ),

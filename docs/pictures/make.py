@@ -226,6 +226,18 @@ def beacon_to_fix() -> Figure:
     return figure
 
 
+def signed() -> Figure:
+    """How a beacon is verified: its code at once, the key that the code was made with later, and that key's signature."""
+    figure, axes = axes_of(4.4, 2.6, bare=True)
+    axes.set(xlim=(0, 10), ylim=(0, 6))
+    box(axes, 0.3, 3.4, 4.2, 2.0, "beacon\nstamp, position, code", SOFT_BLUE, 11)
+    box(axes, 5.5, 3.4, 4.2, 2.0, "key of its 100 ms\nsent half a second later", SOFT_ORANGE, 11)
+    box(axes, 2.6, 0.4, 5.0, 1.8, "the site signed the chain\na tag holds site.public", SOFT_GREEN, 11)
+    arrow(axes, (5.4, 4.4), (4.6, 4.4))
+    arrow(axes, (5.1, 2.3), (6.8, 3.3))
+    return figure
+
+
 PICTURES: dict[str, Callable[[], Figure]] = {
     "lab": lab,
     "superframe": superframe,
@@ -233,6 +245,7 @@ PICTURES: dict[str, Callable[[], Figure]] = {
     "replayed_flights": replayed_flights,
     "layers": layers,
     "beacon_to_fix": beacon_to_fix,
+    "signed": signed,
 }
 
 

@@ -25,7 +25,7 @@ HEARD = np.dtype([("length", "<i4"), ("bytes", "u1", 140), ("rx_ticks", "<i8")],
 PAUSE_TICKS = 10**9
 FIX, TAG_STATUS = 7, 8
 """Places of their counts, from that of HELLO on."""
-pytestmark = pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
+pytestmark = [pytest.mark.site, pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")]
 
 
 def write_frames(path, seconds=3.0):

@@ -95,6 +95,7 @@ def test_the_link_has_the_same_values_at_both_ends():
     assert {name: known[name] for name in shared} == {name: getattr(link, name) for name in shared}
 
 
+@pytest.mark.site
 @given(st.binary(max_size=300))
 def test_the_checks_are_those_of_the_standard_library_and_of_the_beacons(data):
     assert library().link_crc16(data, len(data)) == crc_hqx(data, 0xFFFF)

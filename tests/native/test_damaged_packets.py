@@ -24,7 +24,7 @@ from skyless.core.tag.receiver import Receiver
 from skyless.sim.carrier import CarrierModel
 
 HEARD = np.dtype([("length", "<i4"), ("bytes", "u1", 140), ("rx_ticks", "<i8")], align=True)
-pytestmark = pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
+pytestmark = [pytest.mark.site, pytest.mark.skipif(not has("gcc"), reason="there is no gcc")]
 
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
 WITHOUT_LEAKS = {**os.environ, "ASAN_OPTIONS": "detect_leaks=0"}  # the program keeps its memory to its end

@@ -16,7 +16,7 @@ from skyless.core.integrity import HPL
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.lab import paper_lab_site
 
-pytestmark = pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
+pytestmark = [pytest.mark.site, pytest.mark.skipif(not has("gcc"), reason="there is no gcc")]
 
 WITH_FLOAT = Path(__file__).with_name("with_float.py")
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}

@@ -297,6 +297,7 @@ TARGETS = {
 }
 
 
+@pytest.mark.site
 @pytest.mark.parametrize("target", TARGETS)
 def test_all_compilers_and_processors_give_the_same_bits(target, episode, tmp_path):
     compiler, *flags = TARGETS[target]
