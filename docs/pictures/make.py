@@ -227,7 +227,7 @@ def beacon_to_fix() -> Figure:
 
 
 def signed() -> Figure:
-    """How a beacon is verified: its code at once, the key that the code was made with later, and that key's signature."""
+    """How a beacon is verified: its code at once, the key of that code later, and the signature of the key's chain."""
     figure, axes = axes_of(4.4, 2.6, bare=True)
     axes.set(xlim=(0, 10), ylim=(0, 6))
     box(axes, 0.3, 3.4, 4.2, 2.0, "beacon\nstamp, position, code", SOFT_BLUE, 11)

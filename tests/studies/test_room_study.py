@@ -178,7 +178,7 @@ def test_the_wall_hides_up_to_three_anchors_for_four_seconds_and_none_before_and
     walls = pack_walls((room.WALL,))
     for path in room.past_wall(20, 5):
         hidden = [
-            sum(cross_walls(walls, *path.position(t_s)[:2], a.x_m, a.y_m)[1] > 0.0 for a in lab_site().anchors)
+            sum(cross_walls(walls, *path.position(t_s), a.x_m, a.y_m, a.z_m)[1] > 0.0 for a in lab_site().anchors)
             for t_s in np.arange(0.0, 16.5, 0.05)
         ]
         changes = np.flatnonzero(np.diff(np.array(hidden) > 0))

@@ -22,7 +22,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.geometry import RADIO_REACH_M, anchors_in_reach
 from skyless.core.protocol1.schedule import first_slots, schedule_of
 from skyless.core.protocols import beacon_period_s
-from skyless.core.site import ScheduleSite, Site
+from skyless.core.site import FloorSite, ScheduleSite, Site
 from skyless.sim.lab import lab_site
 from skyless.site.file.check import ANY_ADDRESS, check_site
 from skyless.site.file.load import load_site
@@ -216,6 +216,7 @@ def _report(site: Site) -> dict[str, Any]:
         "mode": site.schedule.mode,
         "master": site.master if site.schedule.needs_master else None,
         "tag_height_m": site.tags.height_m,
+        "floors": [_floor(floor, site) for floor in site.storeys],
         "anchors": anchors,
         "unplaced": [{"id": anchor.id} for anchor in site.unplaced],
         "beacons_per_s_of_each_anchor": 1.0 / period_s,
@@ -248,6 +249,18 @@ def _report(site: Site) -> dict[str, Any]:
     return report | {"warnings": warnings}
 
 
+def _floor(floor: FloorSite, site: Site) -> dict[str, Any]:
+    loss_db, delay_m = floor.slab
+    return {
+        "number": floor.number,
+        "name": floor.name,
+        "low_m": floor.low_m,
+        "slab_loss_db": loss_db,
+        "slab_delay_m": delay_m,
+        "anchors": sum(anchor.floor == floor.number for anchor in site.anchors),
+    }
+
+
 def _show(file: Path, report: dict[str, Any]) -> None:
     title, anchors = f"{report['name']} ({file})", [*report["anchors"], *report["unplaced"]]
     if len(anchors) <= _LONGEST_TABLE:
@@ -256,6 +269,10 @@ def _show(file: Path, report: dict[str, Any]) -> None:
         print_table(title, heads, (_row(anchor, report) for anchor in anchors), figures=True)
     else:
         print_facts(title, _summary(report))
+    if report["floors"]:
+        heads = ("floor", "name", "from / m", "slab / dB", "slab / m", "anchors")
+        rows = ([str(value) for value in floor.values()] for floor in report["floors"])
+        print_table("floors", heads, rows)
     height = report["tag_height_m"]
     tags = "estimate their height (3-D)" if height is None else f"move at a height of {height:g} m (2-D)"
     out = console()

@@ -269,6 +269,31 @@ def whole(least: int, most: int | None = None) -> Rule:
     return Rule(partial(check_whole, least=least, most=most))
 
 
+class TagCount(int):
+    """A number of tags, and the floor on which they walk where one is named."""
+
+    floor: int | None = None
+
+
+def tag_count(least: int, most: int) -> tuple[Rule, Text]:
+    """A number of tags within limits; on the command line also ``3@1``, three on floor 1."""
+
+    def check(name: str, value: object) -> TagCount:
+        count = TagCount(check_whole(name, value, least=least, most=most))
+        count.floor = value.floor if isinstance(value, TagCount) else None
+        return count
+
+    def read(name: str, text: str) -> TagCount:
+        words = re.fullmatch(r"(-?\d+)(?:@(-?\d+))?", text)
+        if words is None:
+            raise wrong(name, text, "a whole number, or one with a floor, as 3@1")
+        count = TagCount(words[1])
+        count.floor = None if words[2] is None else int(words[2])
+        return count
+
+    return Rule(check), Text(read, "NUMBER or NUMBER@FLOOR")
+
+
 def choice(*choices: str) -> Rule:
     """A text that is one of several."""
     return Rule(partial(check_choice, choices=choices))

@@ -144,6 +144,17 @@ class FloorSite(Struct, frozen=True, forbid_unknown_fields=True):
     width_m: float | None = None
     x_m: float = 0.0
     y_m: float = 0.0
+    slab_loss_db: float | UnsetType = UNSET
+    """What its ground takes from a signal that crosses it; 25 dB where it is not given (reinforced concrete, assumed).
+    The lowest floor's counts for nothing below it. Left out where it is not given, as earlier versions refuse it."""
+    slab_delay_m: float | UnsetType = UNSET
+    """By how much its ground delays such a signal; 0.4 m where it is not given (assumed)."""
+
+    @property
+    def slab(self) -> tuple[float, float]:
+        """Loss in dB and delay in metres of its ground."""
+        loss_db = 25.0 if isinstance(self.slab_loss_db, UnsetType) else self.slab_loss_db
+        return loss_db, 0.4 if isinstance(self.slab_delay_m, UnsetType) else self.slab_delay_m
 
 
 class GeoreferenceSite(Struct, frozen=True, forbid_unknown_fields=True):
@@ -194,6 +205,11 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     """The storeys, the lowest first, where the file has them. Messages carry them beside the site as well."""
     alarms: tuple[AlarmRule, ...] | UnsetType = UNSET
     """The rules of alarms, where the file has any. Beside the site in messages, as its outline is."""
+
+    @property
+    def storeys(self) -> tuple[FloorSite, ...]:
+        """The floors, none where the file has none."""
+        return () if isinstance(self.floors, UnsetType) else self.floors
 
     @property
     def all_anchors(self) -> tuple[AnchorSite | UnplacedAnchor, ...]:

@@ -84,8 +84,10 @@ def link(
             walls,
             coordinate_m(stations, sender, 0, t_s),
             coordinate_m(stations, sender, 1, t_s),
+            coordinate_m(stations, sender, 2, t_s),
             coordinate_m(stations, listener, 0, t_s),
             coordinate_m(stations, listener, 1, t_s),
+            coordinate_m(stations, listener, 2, t_s),
         )
         if stations[listener]["is_tag"] == 0 and channel[0]["walls_between_anchors"] == 0.0:
             delay_m = 0.0

@@ -213,7 +213,7 @@ class Medium(Generic[Result]):
             identifiers = [anchor.id for anchor in site.anchors]
             self._carriers = Carriers(impairments.carrier, identifiers, len(self._tags), seed)
         self._plan_changes()
-        self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls)
+        self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls, site.storeys)
         self._air = OnAir()
         self._missed_ticks = 0
         """Frames that should have left before are not sent."""

@@ -12,7 +12,7 @@ from msgspec import Struct, structs
 
 from skyless.core.arrays import Array, Records
 from skyless.core.constants import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS
-from skyless.core.site import WallSite
+from skyless.core.site import FloorSite, WallSite
 from skyless.site.kernels.compiled import kernel, part
 
 FREE_SPACE_LOSS_1_M_DB: Final = 20.0 * math.log10(4.0 * math.pi * CHANNEL_5_HZ / SPEED_OF_LIGHT_MPS)
@@ -73,18 +73,30 @@ def pack_channel(model: ChannelModel) -> Records:
     return np.array([structs.astuple(model)], dtype=CHANNEL_RECORD)
 
 
-def pack_walls(walls: tuple[WallSite, ...]) -> Array:
-    """Walls for the kernels, shape (n, 6): x1, y1, x2, y2, loss in dB, delay in metres."""
-    return np.array([structs.astuple(wall) for wall in walls], dtype=np.float64).reshape(-1, 6)
+def pack_walls(walls: tuple[WallSite, ...], floors: tuple[FloorSite, ...] = ()) -> Array:
+    """Walls and slabs for the kernels, shape (n, 6): x1, y1, x2, y2, loss in dB, delay in metres.
+
+    A slab, the ground of a floor above the lowest, has its height in place of y1, and no x1.
+    """
+    rows = [structs.astuple(wall) for wall in walls]
+    rows += [(math.nan, floor.low_m, math.nan, math.nan, *floor.slab) for floor in floors[1:]]
+    return np.array(rows, dtype=np.float64).reshape(-1, 6)
 
 
 @kernel
-def cross_walls(walls: Array, ax_m: float, ay_m: float, bx_m: float, by_m: float) -> tuple[float, float]:
-    """Loss in dB and delay in metres of all walls that the straight line from a to b crosses."""
+def cross_walls(
+    walls: Array, ax_m: float, ay_m: float, az_m: float, bx_m: float, by_m: float, bz_m: float
+) -> tuple[float, float]:
+    """Loss in dB and delay in metres of all walls and slabs that the straight line from a to b crosses."""
     loss_db = 0.0
     delay_m = 0.0
     for w in range(walls.shape[0]):
         x1, y1, x2, y2 = walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
+        if math.isnan(x1):
+            if (az_m < y1) != (bz_m < y1):
+                loss_db += walls[w, 4]
+                delay_m += walls[w, 5]
+            continue
         side_1 = (bx_m - ax_m) * (y1 - ay_m) - (by_m - ay_m) * (x1 - ax_m)
         side_2 = (bx_m - ax_m) * (y2 - ay_m) - (by_m - ay_m) * (x2 - ax_m)
         side_a = (x2 - x1) * (ay_m - y1) - (y2 - y1) * (ax_m - x1)

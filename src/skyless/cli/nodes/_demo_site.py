@@ -17,7 +17,7 @@ from skyless.cli.nodes._demo_figures import DemoFigures
 from skyless.cli.nodes._demo_story import MOVED, furnished, kept_messages
 from skyless.cli.nodes._site_view import SiteView
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, site_named
-from skyless.core.arguments import Method, Picoseconds, Positive, Seed, whole
+from skyless.core.arguments import Method, Picoseconds, Positive, Seed, TagCount, tag_count, whole
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
 from skyless.core.method_names import DEFAULT_METHOD
@@ -68,8 +68,8 @@ class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
 
     duration: Positive | None = None
     """Seconds to run, from when all tags have a fix; by default until Ctrl-C."""
-    tags: Annotated[int, whole(1, 200)] = 3
-    """How many tags walk."""
+    tags: Annotated[int, *tag_count(1, 200)] = TagCount(3)
+    """How many tags walk, 3 by default; at a site of several floors on each in turn, or on the one that is named."""
     boards: Annotated[int, whole(0, 200)] = 0
     """How many of them, the last ones, are emulated boards that compute by themselves, with settings of new ones."""
     speed: WalkingSpeed = 1.0
@@ -232,7 +232,7 @@ class WholeSite:
     def _programs(self, address: MqttAddress) -> list[Program]:
         asked, mqtt = self._asked, _mqtt(address)
         radio, site = ("--radio", f"ether:{_HOST}:{self.ether_port}"), ("--site", self._site_name)
-        walks = _options(tags=asked.tags, speed=asked.speed, noise_ps=asked.noise_ps, seed=asked.seed)
+        walks = _options(tags=_tags_text(asked.tags), speed=asked.speed, noise_ps=asked.noise_ps, seed=asked.seed)
         ether = ("ether", *site, *mqtt, "--listen", f"{_HOST}:{self.ether_port}", *walks)
         ether += ("--move", MOVED) * self._has_story + ("--carrier",) * asked.carrier
         computing = _options(
@@ -354,6 +354,11 @@ def _options(**values: float | str | Path | None) -> list[str]:
     """Options of a program, without those that are None."""
     given = ((f"--{name.replace('_', '-')}", str(value)) for name, value in values.items() if value is not None)
     return [word for option in given for word in option]
+
+
+def _tags_text(tags: int) -> str:
+    """The number of tags as ``skyless ether`` takes it."""
+    return f"{tags}@{tags.floor}" if isinstance(tags, TagCount) and tags.floor is not None else str(tags)
 
 
 def _groups(names: list[str], size: int) -> list[list[str]]:

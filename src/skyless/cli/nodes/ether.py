@@ -22,7 +22,7 @@ from skyless.cli.nodes.options import (
     run_until_stopped,
     site_named,
 )
-from skyless.core.arguments import Options, Picoseconds, Seed, Text, number, read_numbers, whole
+from skyless.core.arguments import Options, Picoseconds, Seed, TagCount, Text, number, read_numbers, tag_count
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import from_seconds
 from skyless.radio.ether_wire import DEFAULT_PORT
@@ -40,8 +40,9 @@ class EtherOptions(Options, frozen=True, kw_only=True):
 
     site: str = "lab"
     """Site file, or lab."""
-    tags: Annotated[int, whole(0, 1000)] = 3
-    """How many bodies walk about; programs connect as tag1, tag2 and so on."""
+    tags: Annotated[int, *tag_count(0, 1000)] = TagCount(3)
+    """How many bodies walk about, 3 by default; programs connect as tag1, tag2 and so on. At a site of several floors
+    they walk on each in turn, or on the one that is named."""
     speed: WalkingSpeed = 1.0
     """How fast they walk in m/s."""
     noise_ps: Picoseconds | None = None

@@ -25,6 +25,7 @@ from skyless.core.arguments import (
     read_numbers,
     read_points,
     sequence,
+    tag_count,
     whole,
     wrong,
 )
@@ -192,7 +193,7 @@ class Conditions(ProtectionOptions, frozen=True, kw_only=True):
         Rule(_check_paths),
     ] = ()
     """Paths of tags, two or more points in metres each, walked once, or for ever if it ends where it begins."""
-    tags: Annotated[int | None, whole(1, 10_000)] = None
+    tags: Annotated[int | None, *tag_count(1, 10_000)] = None
     """How many tags walk about where neither --position nor --waypoints is given; 1 by default."""
     speed_mps: Annotated[float | None, Option("speed"), number(above=0.0, most=1000.0)] = None
     """How fast tags walk, in m/s; 1 by default. In the room only for --waypoints."""

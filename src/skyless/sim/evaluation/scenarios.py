@@ -9,11 +9,12 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
+from skyless.core.arguments import TagCount
 from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import rectangle_of
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, SNAPSHOTS
-from skyless.core.site import Site
+from skyless.core.site import FloorSite, Site
 from skyless.sim.carrier import CarrierModel
 from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings, JudgedFix, TagFleet, TagReceiver
@@ -32,6 +33,9 @@ from skyless.site.channel import ChannelModel
 
 WALL_MARGIN_M: Final = 0.5
 """Walking tags keep this distance from the box around the anchors."""
+
+CARRIED_M: Final = 1.1
+"""Height above the ground at which tags walk on a floor."""
 
 MIN_WALK_M: Final = 1.0
 """Walking tags have at least this much space along x and y, even around a single anchor."""
@@ -183,6 +187,7 @@ def fleet_of_any_size(request: Request) -> TagFleet:
             ("--temperature", request.temperature),
             ("--carrier", request.carrier),
             ("walls of the site file", site.walls),
+            ("floors of the site file", site.storeys[1:]),
         )
         if given
     ]
@@ -296,7 +301,7 @@ def _path(points: list[tuple[float, float, float]], speed_mps: float) -> Waypoin
 
 def _walk(request: Request, index: int) -> Trajectory:
     """Walk between random points inside the box, round and round, turning gently at each."""
-    low, high = _walkable_box(request.site)
+    low, high = _walkable_box(request.site, walked_floor(request.site, request.tags or 1, index))
     generator = np.random.default_rng([request.seed, index])
     points = [generator.uniform(low, high)]
     while len(points) < WAYPOINTS:
@@ -315,8 +320,25 @@ def _smooth_path(points: Sequence[ArrayLike], speed_mps: float, *, loop: bool = 
     return Waypoints(points_m, speed_mps, loop=loop, corner_s=corner_s)
 
 
-def _walkable_box(site: Site) -> tuple[Array, Array]:
-    points_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+def walked_floor(site: Site, tags: int, index: int) -> FloorSite | None:
+    """The floor of a tag: the one that a ``TagCount`` names, else each in turn; None at a site without floors.
+
+    Raises SkylessError: the site has no such floor.
+    """
+    named = tags.floor if isinstance(tags, TagCount) else None
+    if named is None:
+        return site.storeys[index % len(site.storeys)] if site.storeys else None
+    for floor in site.storeys:
+        if floor.number == named:
+            return floor
+    there = ", ".join(str(floor.number) for floor in site.storeys) or "none, as the file has no [[floors]]"
+    raise SkylessError(f"--tags is '{int(tags)}@{named}'; the floor should be one of the site's: {there}")
+
+
+def _walkable_box(site: Site, floor: FloorSite | None = None) -> tuple[Array, Array]:
+    """Where tags walk: among the anchors, on a floor among its own and at the height at which tags are carried."""
+    own = [anchor for anchor in site.anchors if floor is not None and anchor.floor == floor.number] or site.anchors
+    points_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in own])
     low, high = points_m.min(axis=0), points_m.max(axis=0)
     room = rectangle_of(site)  # in a room of another shape the box around it would be partly outside
     if room is not None:
@@ -326,14 +348,16 @@ def _walkable_box(site: Site) -> tuple[Array, Array]:
     low, high = low + margin - lacking, high - margin + lacking
     if site.tags.height_m is not None:
         low[2] = high[2] = site.tags.height_m
+    elif floor is not None:
+        low[2] = high[2] = floor.low_m + CARRIED_M
     return low, high
 
 
 def patrols(site: Site, tags: int, speed_mps: float = 1.0) -> list[Trajectory]:
     """Tags walking round the site one behind the other, each on a narrower path: what the demo shows."""
-    low, high = _walkable_box(site)
     paths: list[Trajectory] = []
     for index in range(tags):
+        low, high = _walkable_box(site, walked_floor(site, tags, index))
         inset = (high - low)[:2] * 0.12 * (index % 3)
         x0, y0 = low[:2] + inset
         x1, y1 = high[:2] - inset

@@ -96,6 +96,8 @@ SITE_LIMITS: Final = {
     "walls.delay_m": Limits(0, 100, "metres"),
     "floors.number": Limits(-128, 127, whole=True),
     "floors.low_m": _COORDINATE,
+    "floors.slab_loss_db": Limits(0, 200, "decibels"),
+    "floors.slab_delay_m": Limits(0, 100, "metres"),
     "floors.width_m": Limits(0, MAX_COORDINATE_M, "metres", above=True),
     "floors.x_m": _COORDINATE,
     "floors.y_m": _COORDINATE,

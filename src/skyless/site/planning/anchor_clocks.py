@@ -229,7 +229,7 @@ class MasterReception(Struct, frozen=True):
 def reception_of(site: Site, channel: ChannelModel) -> MasterReception:
     """Predict how the anchors receive their master, with the losses of the site's walls."""
     anchors_m, master = anchor_positions(site), row_of_master(site)
-    share = anchor_links(anchors_m, master, link_budget(channel), pack_walls(site.walls)).share
+    share = anchor_links(anchors_m, master, link_budget(channel), pack_walls(site.walls, site.storeys)).share
     return MasterReception(
         np.linalg.norm(anchors_m - anchors_m[master], axis=1), share, anchor_clocks(site, share).sends
     )
@@ -286,4 +286,4 @@ def _named(site: Site, found: MasterReception, rows: Integers, do: str, does: st
 
 def _masters(site: Site, channel: ChannelModel) -> Integers:
     anchors_m: Matrix = anchor_positions(site)
-    return masters_by_links(anchors_m, link_budget(channel), pack_walls(site.walls))
+    return masters_by_links(anchors_m, link_budget(channel), pack_walls(site.walls, site.storeys))

@@ -119,7 +119,7 @@ def link(budget: Vector, walls: Matrix, a_m: Vector, b_m: Vector) -> tuple[float
     if squared_m2 > budget[4]:
         return 0.0, 0.0
     if walls.shape[0] > 0:
-        loss_db, delay_m = cross_walls(walls, a_m[0], a_m[1], b_m[0], b_m[1])
+        loss_db, delay_m = cross_walls(walls, a_m[0], a_m[1], a_m[2], b_m[0], b_m[1], b_m[2])
     if loss_db == 0.0 and squared_m2 < budget[5]:
         return 1.0 - budget[3], delay_m
     power_dbm = received_power_dbm(budget[0], math.sqrt(squared_m2), loss_db)
@@ -182,7 +182,7 @@ class Scene(NamedTuple):
             received_power_dbm(
                 self.budget[0],
                 float(np.linalg.norm(point - anchor_m)),
-                cross_walls(self.walls, anchor_m[0], anchor_m[1], point[0], point[1])[0],
+                cross_walls(self.walls, *anchor_m, *point)[0],
             )
             for anchor_m in self.anchors[rows]
         ]

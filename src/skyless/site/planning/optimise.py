@@ -229,7 +229,7 @@ class Search:
         seconds: float,
     ) -> None:
         self._site, self._settings, self._mounts, self._anchors = site, settings, mounts, anchors
-        self._budget, self._walls = link_budget(settings.channel), pack_walls(site.walls)
+        self._budget, self._walls = link_budget(settings.channel), pack_walls(site.walls, site.storeys)
         self._points = sample_points(floor, heights_m, _SEARCH_POINTS)
         self._floor, self._heights_m = floor, heights_m
         self._random = np.random.default_rng([seed, anchors])

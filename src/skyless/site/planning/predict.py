@@ -66,7 +66,7 @@ class Predictor:
         self.anchors_m = anchor_positions(site)
         self.master = row_of_master(site) if site.schedule.needs_master else None
         """Row of the master; None where there is none."""
-        self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls)
+        self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls, site.storeys)
         self.links: AnchorLinks = (
             AnchorLinks(np.ones(len(site.anchors)), np.zeros(len(site.anchors)))
             if self.master is None

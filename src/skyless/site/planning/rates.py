@@ -76,7 +76,7 @@ def tag_rates(site: Site, points_m: Matrix, channel: ChannelModel, exponent: flo
         ]
     )
     table = np.zeros((len(points_m), 3))
-    _fill_rates(np.ascontiguousarray(points_m), anchors_m[order], settings, pack_walls(site.walls), table)
+    _fill_rates(np.ascontiguousarray(points_m), anchors_m[order], settings, pack_walls(site.walls, site.storeys), table)
     return TagRates(table[:, 0] / period_s, table[:, 1].astype(np.int64), table[:, 2].astype(np.int64))
 
 
@@ -102,7 +102,7 @@ def _fill_rates(points_m: Matrix, anchors_m: Matrix, settings: Vector, walls: Ma
                 continue
             loss_db = 10.0 * (exponent - 2.0) * math.log10(max(distance_m, 1.0))
             if walls.shape[0] > 0:
-                loss_db += cross_walls(walls, anchors_m[j, 0], anchors_m[j, 1], x, y)[0]
+                loss_db += cross_walls(walls, anchors_m[j, 0], anchors_m[j, 1], anchors_m[j, 2], x, y, z)[0]
             power_dbm[count] = received_power_dbm(tx_dbm, distance_m, loss_db)
             count += 1
         for k in range(count):
