@@ -50,6 +50,11 @@ def _tier(item: pytest.Item) -> str:
     return next((mark.name for mark in item.iter_markers() if mark.name in TIERS), "unit")
 
 
+def file_tiers(text: str) -> set[str]:
+    """Tiers of the tests in a file, by its text: some more than there are, and none less."""
+    return set(_MARKED.findall(text)) | (set() if _TIER_OF_FILE.search(text) else {"unit"})
+
+
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Clients that need environments of their own run only when they are asked for: ``scripts/test clients``.
 
@@ -59,9 +64,7 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
         return True if not any("clients" in argument for argument in config.args) else None
     if not _tiers(config) or collection_path.suffix != ".py":
         return None
-    text = collection_path.read_text(encoding="utf-8")
-    tiers = set(_MARKED.findall(text)) | (set() if _TIER_OF_FILE.search(text) else {"unit"})
-    return True if tiers.isdisjoint(_tiers(config)) else None
+    return True if file_tiers(collection_path.read_text(encoding="utf-8")).isdisjoint(_tiers(config)) else None
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

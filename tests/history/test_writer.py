@@ -95,6 +95,7 @@ def one_life(folder, serials, write_after):
     writer.close()
 
 
+@pytest.mark.site
 def test_a_writer_that_dies_at_any_operation_loses_nothing_and_repeats_nothing(tmp_path_factory):
     operation, finished = 0, False
     while not finished:

@@ -12,7 +12,7 @@ from skyless.core.native.views import view
 from skyless.core.tag.position import FOUND, IMPOSSIBLE, MIRROR, RESIDUALS, SINGULAR, UNCERTAIN, Found, find_position
 from skyless.core.tag.problem import FREE, HEIGHT, PLANE, LocateProblem
 
-pytestmark = pytest.mark.skipif(not shutil.which("gcc"), reason="there is no gcc")
+pytestmark = [pytest.mark.site, pytest.mark.skipif(not shutil.which("gcc"), reason="there is no gcc")]
 
 
 def drawn_problem(draw):

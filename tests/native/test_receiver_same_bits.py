@@ -13,6 +13,8 @@ from skyless.core.air.reception import Diagnostics
 from skyless.core.tag import receiver
 from skyless.core.tag.hearing import hear_frame
 
+pytestmark = pytest.mark.site
+
 FREE = replace(ROOM, schedule=replace(ROOM.schedule, mode="free", rate_hz=60.0))
 PHASES = replace(FREE, schedule=replace(FREE.schedule, carrier_phase=True))
 

@@ -36,7 +36,7 @@ from translator.body import Translator
 from translator.files import translate
 from translator.types import INT, REAL, Elements, Number, Results, Struct, parameter_type
 
-pytestmark = pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
+pytestmark = [pytest.mark.site, pytest.mark.skipif(not has("gcc"), reason="there is no gcc")]
 
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
 SITES = [(LAB_M, 0.0, {}), (ROOM_M, 0.0, ERRORS), (ROOM_M, None, ERRORS)]
@@ -297,7 +297,6 @@ TARGETS = {
 }
 
 
-@pytest.mark.site
 @pytest.mark.parametrize("target", TARGETS)
 def test_all_compilers_and_processors_give_the_same_bits(target, episode, tmp_path):
     compiler, *flags = TARGETS[target]

@@ -31,6 +31,8 @@ from test_same_bits import ERRORS, bits
 
 from skyless.core.estimator.process import ACCEPTED, JOINED, REJECTED, STALE, process_frame
 
+pytestmark = pytest.mark.site
+
 OUTCOMES = {ACCEPTED: "accepted", JOINED: "joined", REJECTED: "rejected", STALE: "stale"}
 
 

@@ -138,6 +138,7 @@ def test_a_height_sensor_corrects_the_height(table):
     assert barometer.rmse_axes_m[2] < alone.rmse_axes_m[2]
 
 
+@pytest.mark.site
 def test_heights_serve_packets_as_well(tmp_path):
     """Of a recording whose time is that of its first packet."""
     (tmp_path / "anchors.csv").write_text(synthetic.anchors_csv())
@@ -152,6 +153,7 @@ def test_heights_serve_packets_as_well(tmp_path):
         assert spread_m[1] < 0.7 * spread_m[0]
 
 
+@pytest.mark.site
 def test_smoothing_serves_the_command_as_well(table):
     alone, later = replayed(table), replayed(table, smooth=True)
     assert (later.fixes, later.method, later.hpl_m) == (alone.fixes, "joint-smoothed", None)
