@@ -86,12 +86,13 @@ def test_the_scale_does_not_cover_the_size_of_the_room(serve, visit):
       const found = [];
       for (let y = top - 60; y < top + height; y += 2) {
         view.pan(0, y - view.toY(1, 1)); // the lower edge of the area of the anchors
-        context.fillText = (words, x, at) => found.push([x + context.measureText(words).width, at]);
-        room.drawRoom(context, [], 0);
+        context.fillText = (words, x, at) => found.push([x + context.measureText(words).width / 2, at - 6]);
+        names.still.length = 0;
+        room.nameRoom(context, []);
       }
       return [found.length, found.filter(([right, at]) => right > left && at + 11 > top && at < top + height).length];
     """
-    count, covered = seen.page.evaluate(modules(["map/floor", "map/room", "map/view"], script))
+    count, covered = seen.page.evaluate(modules(["map/floor", "map/names", "map/room", "map/view"], script))
     assert (count > 20, covered) == (True, 0)
 
 

@@ -37,6 +37,8 @@ export const DISTINCT = 56;
 /** Colours by their names in tokens.css, `tags`, a few distinct hues, and `groups`, the colours of groups. @type {any} */
 export const palette = { tags: [], groups: [] };
 
+let brush = null;
+
 /** Whether the page is dark. */
 export function isDark() {
   const chosen = document.documentElement.dataset.theme;
@@ -79,6 +81,13 @@ export function tagColour(index, count) {
 export function faint(colour, alpha) {
   const parts = colour.match(/[\d.]+/g);
   return parts ? `rgba(${parts[0]}, ${parts[1]}, ${parts[2]}, ${alpha})` : colour;
+}
+
+/** Any opaque colour of CSS as `#rrggbb`, as an input takes it. */
+export function hexOf(colour) {
+  brush ??= document.createElement("canvas").getContext("2d");
+  brush.fillStyle = colour;
+  return brush.fillStyle;
 }
 
 /** A colour `#rrggbb` as the browser writes it. */
