@@ -58,7 +58,7 @@ class Site:
         self.engine.set_zones(zones, self.now_s)
 
     def run(self, seconds):
-        """Happenings of this time, as (what, rule, subject)."""
+        """Happenings of this time, as (what, rule, subject), without updates."""
         begin = len(self.happened)
         for _ in range(round(seconds / 0.05)):
             self.now_s += 0.05
@@ -71,7 +71,7 @@ class Site:
             events = self.monitor.expire_tags(self.now_s, self.unix_s)
             self.engine.on_zone_events(events, self.now_s)
             self.happened += self.engine.tick(self.now_s, self.unix_s, blind=self.blind)
-        return [(what, one.rule, one.subject) for what, one in self.happened[begin:]]
+        return [(what, one.rule, one.subject) for what, one in self.happened[begin:] if what != "updated"]
 
     def gone(self, tag):
         del self.places[tag]
@@ -151,7 +151,7 @@ def test_silent_tags_those_named_and_those_heard():
     assert site.run(5.0) == []
     del site.places["a"]
     assert set(site.run(5.0)) == {("raised", "one", "never"), ("raised", "all", "a")}
-    assert {one.sentence for _, one in site.happened} == {
+    assert {one.sentence for what, one in site.happened if what == "raised"} == {
         "never has sent no fixes for 6 s",
         "a has sent no fixes for 4 s",
     }
@@ -248,6 +248,70 @@ def test_battery():
     assert site.happened[0][1].sentence == "the battery of t is at 8%; 20% is the least"
 
 
+def worst_of_levels(values):
+    site = Site(AlarmRule("r", "protection-level", limit=0.4))
+    site.places["t"] = IN
+    for level_m in values:
+        site.more["t"] = {"hpl_m": level_m, "alert": Alert.NONE.value}
+        site.run(0.5)
+    return site
+
+
+def worst_of_batteries(values):
+    site = Site(AlarmRule("r", "battery", limit=0.9))
+    for share in values:
+        site.engine.on_health(health("t", share), site.now_s)
+        site.run(0.5)
+    return site
+
+
+def worst_of_distances(values):
+    site = Site(AlarmRule("r", "near", limit=2.0))
+    for distance_m in values:
+        site.places |= {"t": IN, "u": (5.0, 5.0 + distance_m)}
+        site.run(0.5)
+    return site
+
+
+@pytest.mark.parametrize(
+    ("run", "worst", "words", "end"),
+    [
+        (worst_of_distances, min, "t and u were {:.1f} m apart at the least; at least 2 m is right", 9.0),
+        (worst_of_levels, max, "the protection level of t was {:.2f} m at the most; at most 0.4 m is allowed", 0.1),
+        (worst_of_batteries, min, "the battery of t was at {:.0%} at the least; 90% is the least", 1.0),
+    ],
+)
+@given(values=st.lists(st.integers(41, 89), min_size=1, max_size=12))
+@settings(max_examples=20, deadline=None)
+def test_an_alarm_says_the_worst_value_at_most_once_a_second_and_keeps_it(run, worst, words, end, values):
+    values = [value / 100.0 for value in values]
+    site = run([*values, *[end] * 6])
+    assert {kind for kind, _ in site.happened} - {"updated"} == {"raised", "ended"}
+    ended = site.last
+    assert ended.worst == pytest.approx(worst(values))
+    assert ended.sentence == words.format(ended.worst)
+    assert sum(kind == "updated" for kind, _ in site.happened) <= len(values) / 2 + 1
+
+
+def test_a_stay_says_how_long_it_has_been_and_goes_on_with_the_next_engine():
+    rule = AlarmRule("r", "inside", zone="hall", after_s=2.0)
+    site = Site(rule)
+    site.places["t"] = IN
+    site.run(130.0)
+    kept = site.last
+    assert kept.sentence == "t has been in Hall for 2 min"
+    assert sum(kind == "updated" for kind, _ in site.happened) < 50
+    other = Site(rule, kept=[kept])
+    other.places["t"] = OUT
+    other.run(8.0)
+    assert other.last.worst >= kept.worst
+    assert other.last.sentence.replace("was", "has been") == kept.sentence
+    site.places["t"] = OUT
+    site.run(3.0)
+    assert site.last.sentence == "t was in Hall for 2 min"
+    assert site.last.worst == pytest.approx(130.0, abs=1.0)
+
+
 def test_anchors():
     site = Site(AlarmRule("off", "anchor-offline", after_s=2.0), AlarmRule("moved", "anchor-moved"))
     watch = WatchMessage(
@@ -255,7 +319,7 @@ def test_anchors():
     )
     site.engine.on_anchors(["3"], watch)
     assert site.run(3.0) == [("raised", "moved", "anchor-4"), ("raised", "off", "anchor-3")]
-    assert [one.sentence for _, one in site.happened] == [
+    assert [one.sentence for what, one in site.happened if what == "raised"] == [
         "Anchor 4 has moved by 0.30 m",
         "anchor 3 has been offline for 2 s",
     ]
@@ -353,10 +417,10 @@ def test_another_engine_goes_on_from_what_is_kept():
     again = Site(*RULES, kept=kept.values())
     again.places = dict(site.places)
     assert again.run(30.0) == []
-    assert again.engine.messages == kept
+    assert [one.id for one in again.engine.messages.values()] == [one.id for one in kept.values()]
     cold = Site(*RULES, kept=kept.values())
     assert {what for what, *_ in cold.run(2 * CONFIRM_S + 5)} == {"ended"}
-    ended = {one.rule for _, one in cold.happened}
+    ended = {one.rule for what, one in cold.happened if what == "ended"}
     assert ended == {"in", "near", "many"}  # the others hold until there is a sign against them
     gone = Site(*RULES[1:], kept=kept.values())
     assert ("ended", "in", "a") in gone.run(0.1)

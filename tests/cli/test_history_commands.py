@@ -102,6 +102,7 @@ def test_answers_as_json_and_as_a_table(folder, question, capsys):
     assert run(folder, question, *QUESTIONS[question]) == 0
     out = capsys.readouterr().out
     assert SHOWN[question] in out
+    assert "seconds" not in out
     assert "[red]ann" in out or question in {"heatmap", "occupancy"}
 
 

@@ -125,7 +125,7 @@ def test_an_alarm_is_published_kept_acknowledged_and_cleared(broker):
     alarm = broker.alarm()
     assert (alarm.rule, alarm.subject, alarm.place, alarm.ended_unix_s) == ("r", "t1", "Desk", None)
     assert [one["id"] for one in sent(live, "alarms")["alarms"]] == [alarm.id]
-    assert any("alarm r: t1 is in Desk" in event.text for event in live.log.events)
+    assert any("alarm r: t1 has been in Desk" in event.text for event in live.log.events)
     with pytest.raises(NoAlarmError):
         live.acknowledge("r", "t1", "another", "Ada")
     live.acknowledge("r", "t1", alarm.id, "Ada")
@@ -209,7 +209,7 @@ def test_a_broker_that_has_lost_what_it_kept_gets_it_again(broker):
     broker.run(2.0)
     broker.connect("a")
     broker.run(6.0, IN)
-    assert broker.alarm() == alarm
+    assert broker.alarm().id == alarm.id
     assert broker.raised == [alarm.id]
 
 
@@ -317,4 +317,4 @@ def test_alarms_name_assets(broker):
     live = broker.start("a")
     live.assets.store((Asset("t1", name="Ada"),))
     broker.run(4.0, IN)
-    assert broker.alarm().sentence == "Ada (t1) is in Desk"
+    assert broker.alarm().sentence.startswith("Ada (t1) has been in Desk for ")

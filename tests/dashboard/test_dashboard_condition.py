@@ -6,6 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from skyless.core.site import UnplacedAnchor
 from skyless.page.condition._reasons import START_S, alert_reasons
 from skyless.page.condition.evidence import FRESH_S, GRACE_S, Evidence
 from skyless.page.condition.monitor import EVALUATION_S, HOLD_S, ConditionMonitor
@@ -114,6 +115,14 @@ def test_a_site_that_starts_is_not_green_before_a_position_has_come():
 def test_anchors_that_never_come_online_are_reported_after_a_while():
     hall = Hall()
     assert hall.run(START_S + 1.0).text == f"all {len(IDS)} anchors are offline"
+
+
+def test_a_site_that_is_not_set_up_has_no_fault(hall):
+    bare = tuple(UnplacedAnchor(anchor.id) for anchor in SITE.site.anchors)
+    hall.evidence.set_site(replace(SITE.site, anchors=(), unplaced=bare), hall.now_s)
+    hall.silent = {"t1", "t2", *IDS}
+    found = hall.run(10.0)
+    assert (found.level, found.text) == ("waiting", "not set up yet: tab Set up")
 
 
 def test_without_a_broker_nothing_else_is_judged(hall):

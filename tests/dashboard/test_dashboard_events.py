@@ -102,6 +102,22 @@ def test_a_takeover_names_both_masters():
     assert texts(log) == ["anchor 2 is the master now, after anchor 1"]
 
 
+def test_a_computer_that_is_busy_again_and_again_is_one_line():
+    log = EventLog()
+    busy = Reason("busy", "warning", "this computer is fully busy", "")
+    offline = Reason("anchors", "warning", "anchor 3 is offline", "")
+    for k in range(20):
+        for reasons in ((), (busy,)):
+            level, text = ("warning", reasons[0].text) if reasons else ("good", "")
+            log.on_condition(Condition(level, text, reasons, None, None), NOW + k)
+    log.on_condition(Condition("good", "", (), None, None), NOW + 30)
+    log.on_condition(Condition("warning", offline.text, (offline,), None, None), NOW + 31)
+    assert [(one.text, one.count) for one in log.events] == [
+        ("condition good, after: this computer is fully busy", 40),
+        ("warning: anchor 3 is offline", 1),
+    ]
+
+
 def test_changes_of_the_master_in_a_row_are_one_line_with_their_number():
     read = []
     log = EventLog(add=read.append)
@@ -155,16 +171,16 @@ def test_a_saved_survey_is_an_event_once():
 
 def test_the_condition_is_an_event_when_its_level_or_first_reason_changes():
     log = EventLog()
-    late = Reason("late", "warning", "positions are 0.4 s behind", "")
+    lost = Reason("no-fix", "warning", "tag t1 has no fix", "")
     for condition in (
         Condition("waiting", "no tag is online", (), None, None),
         Condition("good", "", (), None, None),
-        Condition("warning", late.text, (late,), None, None),
-        Condition("warning", "positions are 0.5 s behind", (late,), None, None),
+        Condition("warning", lost.text, (lost,), None, None),
+        Condition("warning", "tags t1 and t2 have no fix", (lost,), None, None),
         Condition("good", "", (), None, None),
     ):
         log.on_condition(condition, NOW)
-    assert texts(log) == ["condition good", "warning: positions are 0.4 s behind", "condition good"]
+    assert texts(log) == ["condition good", "warning: tag t1 has no fix", "condition good"]
 
 
 @given(st.lists(st.tuples(st.booleans(), st.sampled_from("abc"), st.floats(0.0, 9.0)), max_size=60))

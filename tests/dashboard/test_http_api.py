@@ -90,6 +90,7 @@ def test_answers_are_as_the_document_says(client, document, route):
     value = answer.json() if kind == "application/json" else answer.text
     Draft202012Validator(schema).validate(value)
     assert value
+    assert answer.content.endswith(b"\n")
 
 
 @pytest.mark.parametrize("route", ROUTES, ids=lambda route: f"{route.method} {route.path}")
@@ -100,6 +101,7 @@ def test_errors_are_as_the_document_says(client, document, route):
         assert answer.status_code == 400
         Draft202012Validator({**document["components"]["schemas"]["ErrorAnswer"]}).validate(answer.json())
         assert words in answer.json()["error"]
+        assert answer.content.endswith(b"}\n")
     assert asked(client, route, {**query, "site": "60000"}).status_code == 404
 
 

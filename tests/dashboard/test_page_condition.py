@@ -241,16 +241,16 @@ MIN_ROOM = """() => {
   return Math.min(
     line.clientHeight - line.scrollHeight, line.clientWidth - line.scrollWidth,
     words.left - whole.left, whole.right - words.right, words.top - whole.top, whole.bottom - words.bottom,
-    whole.right - more.right, whole.bottom - more.bottom,
+    whole.right - more.right, whole.bottom - more.bottom, 60 - whole.height,
     whole.top - document.querySelector("header").getBoundingClientRect().bottom,
     document.getElementById("map").getBoundingClientRect().top - whole.bottom,
   );
 }"""
-"""By how many pixels the sentence and its button are within their line, and this between header and map."""
+"""By how many pixels the sentence and its button are within their line, this between header and map and below 60."""
 
 
 @pytest.mark.parametrize("size", [(1440, 900), (390, 844)])
-def test_a_long_sentence_is_shown_whole_below_one_word(serve, visit, size):
+def test_a_long_sentence_takes_two_lines_below_one_word_and_is_whole_in_the_title(serve, visit, size):
     server = serve()
     server.site_name = "Distribution centre north, hall 7"
     words = "; ".join(f"computer host-{n} is too slow: tag{n} dropped 12 % of its receptions" for n in range(5))
@@ -259,6 +259,7 @@ def test_a_long_sentence_is_shown_whole_below_one_word(serve, visit, size):
     pill_is(page, "bad")
     assert header(page) == ("Fault", f"{words[0].upper()}{words[1:]}.")
     until(page, f"({MIN_ROOM})() >= 0")
+    assert page.get_attribute("#condition-words", "title") == header(page)[1]
     assert page.evaluate("document.getElementById('pill-words').getBoundingClientRect().height < 24")
     assert page.evaluate("document.querySelector('header').scrollWidth <= innerWidth")
 

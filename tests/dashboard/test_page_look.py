@@ -107,7 +107,7 @@ def test_tabs_move_with_arrows(server, visit):
     assert page.evaluate("document.activeElement.id") == "tab-alarms"
     assert page.locator("#panel-alarms").is_visible()
     page.keyboard.press("End")
-    assert page.locator("#panel-recordings").is_visible()
+    assert page.locator("#panel-setup").is_visible()
 
 
 def test_less_motion_means_no_interpolation_and_no_transitions(server, visit):

@@ -86,12 +86,13 @@ def test_the_scale_does_not_cover_the_size_of_the_room(serve, visit):
       const found = [];
       for (let y = top - 60; y < top + height; y += 2) {
         view.pan(0, y - view.toY(1, 1)); // the lower edge of the area of the anchors
-        context.fillText = (words, x, at) => found.push([x + context.measureText(words).width, at]);
-        room.drawRoom(context, [], 0);
+        context.fillText = (words, x, at) => found.push([x + context.measureText(words).width / 2, at - 6]);
+        names.still.length = 0;
+        room.nameRoom(context, []);
       }
       return [found.length, found.filter(([right, at]) => right > left && at + 11 > top && at < top + height).length];
     """
-    count, covered = seen.page.evaluate(modules(["map/floor", "map/room", "map/view"], script))
+    count, covered = seen.page.evaluate(modules(["map/floor", "map/names", "map/room", "map/view"], script))
     assert (count > 20, covered) == (True, 0)
 
 
@@ -140,17 +141,19 @@ def test_tags_never_share_colour_and_mark(serve, visit, scheme):
                 assert difference(one["colour"], other["colour"], eye) > 0.1, (one, other)
 
 
+def oklab(red_green_blue, eye=None):
+    """A colour of 0 to 255 in OKLab, for an eye."""
+    values = np.array(red_green_blue) / 255.0
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    cones = np.array([[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]])
+    mix = np.array([[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]])
+    return mix @ np.cbrt(cones @ (linear if eye is None else eye @ linear).clip(0.0, 1.0))
+
+
 def difference(one, other, eye):
     """Distance of two colours in OKLab for an eye; 0.02 is just seen."""
-
-    def lab(text):
-        values = np.array([int(part) for part in text[4:-1].split(",")]) / 255.0
-        linear = eye @ np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-        cones = np.array([[0.4122, 0.5363, 0.0514], [0.2119, 0.6807, 0.1074], [0.0883, 0.2817, 0.6300]])
-        mix = np.array([[0.2105, 0.7936, -0.0041], [1.9780, -2.4286, 0.4506], [0.0259, 0.7828, -0.8087]])
-        return mix @ np.cbrt(cones @ linear.clip(0.0, 1.0))
-
-    return float(np.linalg.norm(lab(one) - lab(other)))
+    one, other = (oklab([int(part) for part in text[4:-1].split(",")], eye) for text in (one, other))
+    return float(np.linalg.norm(one - other))
 
 
 def test_each_tag_has_an_entry_in_the_legend_beside_the_map(serve, visit):

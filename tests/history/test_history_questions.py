@@ -54,7 +54,7 @@ ALARMS = [
     (100.0, "alarm-raised", "r/tag1/1", "tag1", "one"),
     (200.0, "alarm-ended", "r/tag1/1", "tag1", ""),
     (300.0, "alarm-raised", "r/tag1/2", "tag1", "two"),
-    (600.0, "alarm-ended", "r/tag1/2", "tag1", ""),
+    (600.0, "alarm-ended", "r/tag1/2", "tag1", "two at the worst"),
     (700.0, "alarm-raised", "s/tag1+tag2/3", "tag1+tag2", "three"),
     (710.0, "alarm-acknowledged", "s/tag1+tag2/3", "tag1+tag2", "Ada"),
     (720.0, "alarm-acknowledged", "s/tag1+tag2/3", "tag1+tag2", "Bert"),
@@ -303,7 +303,7 @@ def test_contacts_are_pairs_of_the_same_second(history, within, distance_m):
 def test_alarms_that_overlap_the_range(history):
     found = history.alarms(SPAN)
     assert [(one.id, one.rule, one.subject, one.text) for one in found] == [
-        ("r/tag1/2", "r", "tag1", "two"),
+        ("r/tag1/2", "r", "tag1", "two at the worst"),
         ("s/tag1+tag2/3", "s", "tag1+tag2", "three"),
     ]
     assert found[0].ended_unix_s == BEGIN + 600.0

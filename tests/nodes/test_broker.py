@@ -15,11 +15,12 @@ import msgspec
 import pytest
 
 from skyless.cli.main import main
+from skyless.cli.nodes import broker as broker_command
 from skyless.cli.nodes.options import MqttOptions
 from skyless.core.errors import SkylessError
 from skyless.run import broker as broker_module
 from skyless.run.broker import BrokerSettings, StatedAddress, running_broker, start_broker
-from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
 from support.processes import SKYLESS, free_port, started
@@ -133,6 +134,20 @@ async def test_without_a_port_the_next_free_one_is_taken(taken, tmp_path, monkey
 
     async with await start_broker(BrokerSettings(data=tmp_path / "store")) as broker:
         assert taken < broker.address.port < taken + 100
+
+
+async def test_a_broker_that_listens_elsewhere_says_so(taken, tmp_path, monkeypatch, capsys):
+    for module in (broker_module, broker_command):
+        monkeypatch.setattr(module, "FIRST_PORT", taken)
+    serving = asyncio.ensure_future(
+        broker_command._serve_once(BrokerSettings(data=tmp_path / "store"), (), None, json=False)
+    )
+    while not (said := capsys.readouterr()).err:
+        await asyncio.sleep(0.05)
+    serving.cancel()
+    await asyncio.wait([serving])
+    assert f"port {taken} is taken" in said.err
+    assert f"this one listens at {mqtt_address(said.out.strip()).port};" in said.err
 
 
 async def test_a_second_broker_of_the_same_user_gets_a_folder_of_its_own(tmp_path, monkeypatch):

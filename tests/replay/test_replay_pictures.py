@@ -21,7 +21,7 @@ def rows(count, *, truth):
     times_s = np.linspace(3.0, 9.0, count)
     places = np.stack([np.cos(times_s), np.sin(times_s), 0 * times_s + 1.0], axis=1)
     fixes = places + random.normal(0.0, 0.05, places.shape)
-    return np.column_stack([times_s, fixes, places if truth else np.full(places.shape, np.nan)])
+    return np.column_stack([times_s, fixes, places if truth else np.full(places.shape, np.nan), 0 * fixes + 0.05])
 
 
 @pytest.mark.parametrize(("count", "truth"), [(500, True), (500, False), (1, True), (1, False), (2, True)])
@@ -46,7 +46,7 @@ def test_an_svg_is_xml_and_a_pdf_is_a_pdf(tmp_path):
 
 
 def test_without_a_fix_there_is_still_a_picture(tmp_path):
-    draw(tmp_path / "picture.png", np.empty((0, 7)), "no fix")
+    draw(tmp_path / "picture.png", np.empty((0, 10)), "no fix")
     assert imread(tmp_path / "picture.png").ndim == 3
 
 

@@ -25,7 +25,7 @@ _LONGEST_TABLE = 40
 _LONGEST_LIST = 10
 """Cells of a heat map that are shown."""
 
-_HEADINGS = {"subject_name": "of", "acknowledged_unix_s": "seen", "acknowledged_by": "by"}
+_HEADINGS = {"subject_name": "of", "acknowledged_unix_s": "seen", "acknowledged_by": "by", "seconds": "duration"}
 _OF_TAGS = ("tag", "other", "subject")
 _Row = dict[str, Any]
 
@@ -253,7 +253,8 @@ def _table(title: str, rows: Sequence[_Row]) -> None:
     table = Table(title=title, caption=f"{more} more rows: --json gives all" if more > 0 else None)
     names = [name for name in rows[0] if name != "id" and f"{name}_name" not in rows[0]] if rows else []
     for name in names:
-        heading = name.removesuffix("_name").removesuffix("_unix_s").replace("_", " ")
+        heading = name.removesuffix("_name").removesuffix("_unix_s")
+        heading = f"{heading.removesuffix('_m')} in m" if heading.endswith("_m") else heading.replace("_", " ")
         table.add_column(_HEADINGS.get(name, heading), overflow="fold")
     for row in rows[:_LONGEST_TABLE]:
         table.add_row(*(Text(_shown(name, row[name])) for name in names))

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.common.options import JsonOptions, check_picture, command
-from skyless.cli.common.output import WIDEST, console, print_json, to_json
+from skyless.cli.common.output import WIDEST, console, print_json, say_written, to_json
 from skyless.cli.common.progress import progress_bar, status
 from skyless.core.arguments import Rule, folder_to_write
 from skyless.core.errors import SkylessError
@@ -126,6 +126,7 @@ def _write(result: "StudyResult", output: _Output) -> None:
             write_whole(out / f"{result.name}.csv", _csv(rows).encode())
         for path, kind in files.items():
             write_whole(path, picture(figure, kind))
+            say_written(path)
     except OSError as error:
         raise SkylessError(f"{error.filename or plot or out} cannot be written: {error.strerror}") from None
 

@@ -179,7 +179,8 @@ class SiteAlarms:
                 self._lead(now_s, unix_s)
         for what, message in self.engine.tick(now_s, unix_s, blind=blind):
             self._changed = True
-            self._log(what, message, now_s)
+            if what != "updated":
+                self._log(what, message, now_s)
             self._publish(message, dropped=what == "dropped")
         if self._changed and now_s - self._sent_s >= _BROADCAST_S:
             self._changed, self._sent_s = False, now_s

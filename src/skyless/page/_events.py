@@ -45,6 +45,9 @@ _SAME_EVENT_S: Final = 2.0
 
 _SUBJECTS: Final = {"ether": "the emulated air", "dashboard": "page server", "survey": "survey program"}
 
+_BUSY: Final = frozenset({"slow", "busy", "behind", "late"})
+"""Reasons that come and go where a computer is too slow."""
+
 Kind = Literal["anchor", "master", "watch", "alert", "tag", "program", "survey", "condition", "alarm"]
 Severity = Literal["good", "note", "warning", "bad"]
 
@@ -61,7 +64,8 @@ class Event(Struct, frozen=True):
     """What it is about, such as ``tag/t1``, ``anchor/3`` or ``recorder/demo``, or empty for the site."""
     text: str
     count: int = 1
-    """Consecutive changes of the master are one line, with their number and the last of them."""
+    """Consecutive changes of the master, or of whether computers keep up, are one line, with their number and the last
+    of them."""
     first: int = 0
     """Serial of the first event of the line."""
 
@@ -94,6 +98,7 @@ class EventLog:
         self._saved: int | None = None
         self._surveyed_by: str | None = None
         self._condition: Condition | None = None
+        self._joins = ""  # what the last event was, if the next of the same is to be in its line
 
     # Nodes
 
@@ -132,7 +137,7 @@ class EventLog:
             leader = self._leader.update(health, now_s)
             if leader is not None:
                 text = f"anchor {leader} is the master now, after anchor {before}"
-                self._add(now_s, "master", "warning", f"anchor/{leader}", text)
+                self._add(now_s, "master", "warning", f"anchor/{leader}", text, joins="master")
 
     def tick(self, now_s: float) -> None:
         """Look for what has ended. Call it once or twice a second."""
@@ -244,15 +249,19 @@ class EventLog:
         if condition.level == "waiting" or (before is None and condition.level == "good"):
             return
         if condition.level == "good":
-            self._add(now_s, "condition", "good", "", "condition good")
+            was_busy = before is not None and _first(before)[1] in _BUSY
+            why = f", after: {before.text}" if before is not None and was_busy else ""
+            self._add(now_s, "condition", "good", "", f"condition good{why}", joins="busy" if was_busy else "")
         else:
             word = "fault" if condition.level == "bad" else "warning"
-            self._add(now_s, "condition", condition.level, "", f"{word}: {condition.text}")
+            joins = "busy" if _first(condition)[1] in _BUSY else ""
+            self._add(now_s, "condition", condition.level, "", f"{word}: {condition.text}", joins=joins)
 
-    def _add(self, now_s: float, kind: Kind, level: Severity, name: str, text: str) -> None:
+    def _add(self, now_s: float, kind: Kind, level: Severity, name: str, text: str, *, joins: str = "") -> None:
         self.serial += 1
         count, first = 1, self.serial
-        if kind == "master" and self.events and self.events[-1].kind == kind:
+        before, self._joins = self._joins, joins
+        if joins and joins == before:
             last = self.events.pop()
             count, first = last.count + 1, last.first
         event = Event(self.serial, now_s + self.unix_offset_s, kind, level, name, text, count, first)

@@ -17,7 +17,7 @@ from starlette.applications import Starlette
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, Response, StreamingResponse
 from starlette.routing import Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
@@ -28,6 +28,7 @@ from skyless.core.site import Site
 from skyless.page._alarms import NoAlarmError
 from skyless.page._state import PageRequest, read_request
 from skyless.page.api import geojson
+from skyless.page.api.json_answer import json_answer
 from skyless.page.api.past import Past
 from skyless.page.api.routes import api_routes, read_bytes
 from skyless.page.guard import AccessRules, Guard
@@ -108,8 +109,8 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/survey/facts", _put_facts, methods=["PUT"]),
         Route("/api/survey/save", _save_survey, methods=["POST"]),
         Route("/api/recordings", _recordings),
-        Route("/api/recordings/{name}", _recorded(Playback.summary, _json)),
-        Route("/api/recordings/{name}/events", _recorded(Playback.events, _json)),
+        Route("/api/recordings/{name}", _recorded(Playback.summary, json_answer)),
+        Route("/api/recordings/{name}/events", _recorded(Playback.events, json_answer)),
         Route("/api/recordings/{name}/file", _recorded(Playback.open_file, _download)),
         Route("/api/recordings/{name}/states", _recorded_states),
         Route("/api/recordings/{name}/floor_plan", _recorded(Playback.floor_plan, _image)),
@@ -130,12 +131,8 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
 
 async def _error(_request: Request, error: Exception) -> Response:
     if isinstance(error, HTTPException):
-        return JSONResponse({"error": error.detail}, status_code=error.status_code)
-    return JSONResponse({"error": str(error)}, status_code=_STATUSES[type(error)])
-
-
-def _json(value: object) -> Response:
-    return Response(msgspec.json.encode(value), media_type="application/json")
+        return json_answer({"error": error.detail}, error.status_code)
+    return json_answer({"error": str(error)}, _STATUSES[type(error)])
 
 
 def _services(request: Request | WebSocket) -> Services:
@@ -149,7 +146,9 @@ def _live_of(request: Request) -> LiveSite:
 
 
 async def _hub_sites(known: "HubSites", _request: Request) -> Response:
-    return _json({"hub": str(known.address), "connected": known.connected, "sites": known.sites(time.monotonic())})
+    return json_answer(
+        {"hub": str(known.address), "connected": known.connected, "sites": known.sites(time.monotonic())}
+    )
 
 
 async def _fixes(request: Request) -> Response:
@@ -228,21 +227,21 @@ async def _put_floor_plan(request: Request) -> Response:
     if _image_type(image) is None or image_size(image) is None:
         raise HTTPException(400, "this is no image that can be read; it should be a PNG or JPEG")
     _live_of(request).store_floor_plan(image)
-    return _json({"bytes": len(image)})
+    return json_answer({"bytes": len(image)})
 
 
 async def _put_facts(request: Request) -> Response:
     live = _live_of(request)
     message = live.survey.facts_message(await read_bytes(request, _MAX_BODY_BYTES, "too many facts"))
     live.publish_survey(message)
-    return _json(message)
+    return json_answer(message)
 
 
 async def _save_survey(request: Request) -> Response:
     live = _live_of(request)
     message = live.survey.save_message(await read_bytes(request, _MAX_BODY_BYTES, "the request is too long"))
     live.publish_survey(message)
-    return _json(message)
+    return json_answer(message)
 
 
 async def _put_zones(request: Request) -> Response:
@@ -250,11 +249,11 @@ async def _put_zones(request: Request) -> Response:
     live = _live_of(request)
     message = read_zones(body)
     live.store_zones(message.zones, message.site)
-    return _json({"zones": live.monitor.zones})
+    return json_answer({"zones": live.monitor.zones})
 
 
 async def _recordings(request: Request) -> Response:
-    return _json(await asyncio.to_thread(_services(request).playback.recordings))
+    return json_answer(await asyncio.to_thread(_services(request).playback.recordings))
 
 
 def _recorded(read: Callable[[Playback, str], _T], answer: Callable[[_T], Response]) -> _Endpoint:

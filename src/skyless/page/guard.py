@@ -14,8 +14,9 @@ from urllib.parse import urlsplit
 from msgspec import Struct
 from starlette.datastructures import MutableHeaders
 from starlette.requests import HTTPConnection
-from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from skyless.page.api.json_answer import json_answer
 
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; img-src 'self' data: blob:; "
@@ -73,7 +74,7 @@ class Guard:
         elif scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": fault[1]})
         else:
-            answer = JSONResponse({"error": fault[1]}, status_code=fault[0])
+            answer = json_answer({"error": fault[1]}, fault[0])
             await answer(scope, receive, self._with_headers(request, send))
 
     def _fault(self, request: HTTPConnection) -> tuple[int, str] | None:

@@ -10,6 +10,7 @@ from skyless.cli.api._result import axes_columns, data_frame
 from skyless.core.arguments import wrong
 from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.core.fix import Fix
+from skyless.sim.evaluation.figures import axes_std_m
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -74,9 +75,10 @@ class Fixes(Struct, frozen=True, eq=False):
         return mask
 
     def track(self, name: str | None) -> Matrix:
-        """Rows of time, position and true position of one tag, shape (k, 7)."""
+        """Rows of time, position, true position and σ of x, y and z of one tag, shape (k, 10)."""
         mask = self.of_tag(name)
-        return np.column_stack([self.time_s[mask], self.position_m[mask], self.truth_m[mask]])
+        std_m = axes_std_m(self.covariance_m2[mask])
+        return np.column_stack([self.time_s[mask], self.position_m[mask], self.truth_m[mask], std_m])
 
     def to_dataframe(self) -> "DataFrame":
         """One row a fix: ``t_s``, ``tag`` (its name), ``x_m`` … ``cov_zz_m2`` … as ``--fixes-csv`` calls them.

@@ -17,7 +17,7 @@ from skyless.cli.common.output import cm
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arguments import python_function, wrong
 from skyless.core.arrays import Matrix
-from skyless.core.errors import ConfigurationError
+from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.fix import Fix
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.research.foreign.formats import Recording
@@ -48,7 +48,7 @@ class ReplayResult(Result, frozen=True, eq=False):
     fixes: Fixes
     """All fixes; ``truth_m`` is NaN where it is not known."""
     tracks: dict[str, Matrix]
-    """Time, position and true position of each tag, shape (k, 7): an even sample, for drawing."""
+    """Time, position, true position and σ of x, y and z of each tag, shape (k, 10): an even sample, for drawing."""
     judged: dict[str, Judged]
     """Which fixes of each tag are judged, and against which truth."""
     measurements: Measurements
@@ -64,12 +64,23 @@ class ReplayResult(Result, frozen=True, eq=False):
         """Names of the tags; that of a recording with a single nameless one is ``tag``."""
         return self.fixes.tags
 
+    @property
+    def report(self) -> ReplayReport:
+        """Figures of a recording's only tag, named as those of a ``SimulationResult``; of several see ``reports``.
+
+        Raises:
+            SkylessError: the recording has several tags.
+        """
+        if len(self.reports) != 1:
+            raise SkylessError(f"{self.path} has {len(self.reports)} tags; reports has the figures of each")
+        return next(iter(self.reports.values()))
+
     def to_dataframe(self) -> "DataFrame":
         """See ``Fixes.to_dataframe``."""
         return self.fixes.to_dataframe()
 
     def plot(self, tag: str | None = None) -> "Figure":
-        """Track, errors over time, their histograms and distribution of one tag, by default the first.
+        """Track, height, errors and stated σ over time, histograms and distribution of one tag, by default the first.
 
         Raises:
             SkylessError: there is no such tag.
@@ -80,7 +91,7 @@ class ReplayResult(Result, frozen=True, eq=False):
         if name not in self.reports:
             raise wrong("tag", tag, f"one of {', '.join(self.tags)}")
         report = self.reports[name]
-        return track_figure(self.tracks[name], f"{report.format}, {report.fixes} fixes")
+        return track_figure(self.tracks[name], f"{self.path.name}, {name} ({report.format}): {report.fixes} fixes")
 
     def title(self) -> str:
         """What was replayed."""
@@ -247,7 +258,7 @@ def _result(
     for tag in reports:
         table = samples[tag].table()
         truth_m = truth_at(judged[tag].truth, table.time_s)
-        tracks[tag] = np.column_stack([table.time_s, table.position_m, truth_m])
+        tracks[tag] = np.column_stack([table.time_s, table.position_m, truth_m, table.std_m])
     tags = tuple(reports)
     nothing = FixRecorder(tags).fixes(), MeasurementRecorder(tags).measurements()
     return ReplayResult(path, reports, nothing[0], tracks, judged, nothing[1], warnings, height_note, summary)

@@ -75,7 +75,7 @@ class SimulationResult(Result, frozen=True, eq=False):
         return self.fixes.to_dataframe()
 
     def plot(self, tag: str | None = None) -> "Figure":
-        """Track, errors over time, their histograms and distribution of one tag, by default the first.
+        """Track, height, errors and stated σ over time, histograms and distribution of one tag, by default the first.
 
         Raises:
             SkylessError: there is no such tag.

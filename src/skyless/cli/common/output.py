@@ -144,7 +144,13 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def write_picture(path: Path, figure: "Figure") -> None:
-    """Write a figure in the format of the file's ending. Raises SkylessError when it cannot be written."""
+    """Write a figure in the format of the file's ending, and say so. Raises SkylessError when it cannot be written."""
     from skyless.site.report.figures import picture
 
     write_file(path, picture(figure, path.suffix.removeprefix(".")))
+    say_written(path)
+
+
+def say_written(path: Path) -> None:
+    """Name a file that was written, on standard error."""
+    print(f"wrote {path}", file=sys.stderr)

@@ -4,7 +4,7 @@ import math
 import statistics
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 from skyless.cli.nodes._site_view import GONE, LINK_NAME, SiteView
@@ -57,6 +57,13 @@ class SiteProbe:
         self._fixes.extend(tag.fix for tag in picture.tags if tag.fix is not None and tag.state == "fix")
         request = RequestMessage(LINK_NAME, (), _LEASE_S, stamps=True)
         self.view.link.publish(topics.request_topic(self.view.number), request)
+
+    def known(self, file_site: Site | None, *, named: bool) -> Iterable[Check]:
+        """What will not change before the end: where ``named``, the site, and what was found to be wrong."""
+        message = self.view.site
+        if named and message is not None:
+            yield self._site(message.whole_site, file_site)
+        yield from self._found.values()
 
     def checks(self, file_site: Site | None) -> tuple[Check, ...]:
         """What was found; ``file_site`` is that of a site file that the running one should be."""

@@ -140,6 +140,12 @@ async def _serve_once(
         else:
             print(running.address, *(() if nats is None else (nats,)), sep="\n")
         sys.stdout.flush()
+        port = running.address.port
+        if settings.port is None and port != FIRST_PORT:
+            log(
+                f"port {FIRST_PORT} is taken (by another broker?): this one listens at {port}; "
+                f"programs join the broker that was started last, this one, or that of --mqtt"
+            )
         parts = [_ended(running)]
         if nats is not None:
             secret = {} if nats.password is None else {PASSWORD_VARIABLE: nats.password}

@@ -5,7 +5,7 @@ import contextlib
 import platform
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Final, get_args
 
@@ -34,6 +34,8 @@ from skyless.run.process import every, run, together
 from skyless.site.file.load import load_site
 
 _FIND_S: Final = 8.0
+_NAMED_S: Final = 3.0
+"""By then the kept messages of a site, and fixes of its tags, have come."""
 
 app = App(name="doctor", help_epilogue="Example: skyless doctor --radio serial:/dev/ttyACM0 --mqtt none --duration 30")
 
@@ -109,8 +111,25 @@ async def _examine(
     seconds: float,
     progress: Callable[[float], None],
 ) -> list[Check]:
-    """All checks; ``progress`` is called with the seconds that have gone."""
+    """All checks; ``progress`` is called with the seconds that have gone. Each is logged as soon as it is known."""
     checks = [*port_checks(), clock_check()]
+    told: set[str] = set()
+
+    def tell(found: Iterable[Check]) -> None:
+        for check in found:
+            if check.name not in told:
+                told.add(check.name)
+                log(plain(f"{check.result}: {check.name}: {check.finding}"))
+
+    def look() -> None:
+        passed_s = time.monotonic() - began_s
+        progress(passed_s)
+        for probe in probes:
+            tell(one for one in probe.checks(NoiseSite())[:1] if one.result != "failed")
+        if site is not None:
+            tell(site.known(file_site, named=passed_s > _NAMED_S))
+
+    tell(checks)
     probes = [BoardProbe(radio, site_id) for radio in boards]
     site: SiteProbe | None = None
     try:
@@ -131,7 +150,7 @@ async def _examine(
     began_s = time.monotonic()
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds if work else 0.0):
-            await together(*work, every(1.0, lambda: progress(time.monotonic() - began_s)))
+            await together(*work, every(1.0, look))
     known = file_site or (None if site is None or site.view.site is None else site.view.site.site)
     for probe in probes:
         checks += probe.checks(NoiseSite() if known is None else known.noise)

@@ -29,6 +29,15 @@ class Reception(Struct, frozen=True, gc=False):
     diagnostics: Diagnostics | None = None
     carrier_phase_cycles: float | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse what is no frame or no count of ticks. Raises TypeError."""
+        if type(self.frame) is bytes and type(self.rx_ticks) is int:
+            return  # one is made for each frame: nothing else is looked at
+        if not isinstance(self.frame, bytes):
+            raise TypeError(f"frame is {self.frame!r:.80}; it should be bytes, the whole PSDU with its FCS")
+        if not hasattr(self.rx_ticks, "__index__"):
+            raise TypeError(f"rx_ticks is {self.rx_ticks!r}; it should be an integer, ticks of the receiver")
+
 
 def phase_of(reception: Reception) -> float:
     """The phase of a reception's carrier in cycles, below 0 where it is not known: as compiled functions take it."""

@@ -4,13 +4,13 @@ from collections.abc import Iterator
 from math import hypot, sqrt
 from typing import Any, Final
 
-import msgspec
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from skyless.bridges.target import bridged_site, is_usable, require_georeference
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
+from skyless.page.api.json_answer import json_answer
 from skyless.page.api.openapi import GEOJSON
 from skyless.page.live import LiveSite
 from skyless.run.geojson import coordinates, feature
@@ -30,7 +30,7 @@ def collection(live: LiveSite, kind: str) -> Response:
     except SkylessError as error:
         raise HTTPException(409, str(error)) from None
     found = {"type": "FeatureCollection", "features": list(_FEATURES[kind](live, origin))}
-    return Response(msgspec.json.encode(found), media_type=GEOJSON)
+    return json_answer(found, media_type=GEOJSON)
 
 
 def _fixes(live: LiveSite, origin: GeoreferenceSite) -> Iterator[dict[str, Any]]:

@@ -9,13 +9,13 @@ from msgspec import Struct
 
 from skyless.core.version import installed_version
 from skyless.page.api.answers import ErrorAnswer
+from skyless.page.api.json_answer import JSON
 from skyless.page.api.parameters import parameters_schema
 
 if TYPE_CHECKING:
     from skyless.page.api.routes import ApiRoute
 
 ROOT: Final = "/api/v1"
-JSON: Final = "application/json"
 GEOJSON: Final = "application/geo+json"
 CSV: Final = "text/csv"
 

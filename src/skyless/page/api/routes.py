@@ -12,7 +12,8 @@ from starlette.responses import Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 
 from skyless.page.api import geojson, past, present, stream
-from skyless.page.api.openapi import CSV, GEOJSON, JSON, ROOT, document
+from skyless.page.api.json_answer import JSON, json_answer
+from skyless.page.api.openapi import CSV, GEOJSON, ROOT, document
 from skyless.page.api.parameters import RENAMED, MapQuery, SiteQuery, read_query
 from skyless.page.api.past import Past
 from skyless.page.sites import Sites
@@ -91,10 +92,10 @@ ROUTES: Final = (
 
 def api_routes(sites: Sites, history: Past) -> list[BaseRoute]:
     """The routes of the server."""
-    whole = msgspec.json.encode(document(ROUTES))
+    whole = document(ROUTES)
 
     async def openapi(_request: Request) -> Response:
-        return Response(whole, media_type=JSON)
+        return json_answer(whole)
 
     return [
         Route(f"{ROOT}/openapi.json", openapi),
@@ -117,9 +118,9 @@ def _endpoint(route: ApiRoute, sites: Sites, history: Past) -> Callable[[Request
         else:
             answer = route.function(live, **given)
             answer = await answer if inspect.isawaitable(answer) else answer
-        if not isinstance(answer, bytes):
-            answer = msgspec.json.encode({route.key: answer} if isinstance(answer, tuple) else answer)
-        return Response(answer, media_type=route.media_types[0])
+        if isinstance(answer, bytes):
+            return Response(answer, media_type=route.media_types[0])
+        return json_answer({route.key: answer} if isinstance(answer, tuple) else answer)
 
     return respond
 

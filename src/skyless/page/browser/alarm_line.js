@@ -1,7 +1,7 @@
 /** Alarms in the header: how many are open; and below it the severest critical one that nobody has acknowledged. */
 
 import { on, state } from "./store.js";
-import { SEVERITIES, criticals, isActive, isUnseen, selectSubject } from "./alarms/model.js";
+import { SEVERITIES, counts, criticals, isActive, isUnseen, selectSubject } from "./alarms/model.js";
 import { byId, h, text } from "./dom.js";
 import { sentence } from "./format.js";
 import { open as openTab } from "./tabs.js";
@@ -16,7 +16,7 @@ export function start() {
 
 function show() {
   const unseen = state.alarms.filter(isUnseen);
-  const active = state.alarms.filter((alarm) => isActive(alarm) && !isUnseen(alarm)).length;
+  const active = counts().seen;
   const count = `${unseen.length}${state.moreAlarms ? "+" : ""}`;
   const words = `${count} ${count === "1" ? "alarm is" : "alarms are"} not acknowledged, ${active} acknowledged and active`;
   const worst = Object.keys(SEVERITIES).find((one) => unseen.some(({ severity }) => severity === one));
@@ -30,6 +30,7 @@ function show() {
   byId("tab-alarms").replaceChildren("Alarms", ...(unseen.length ? badge : []));
   const [first, ...others] = criticals();
   byId("alarm-line").hidden = !first;
+  byId("alarm-words").title = first?.sentence ?? "";
   text(byId("alarm-words"), first ? sentence(`${isActive(first) ? "critical" : "critical, ended"}: ${first.sentence}`) : "");
   text(byId("alarm-all"), others.length ? `and ${others.length} more` : "All alarms");
 }

@@ -5,7 +5,7 @@
  */
 
 import { on, select, state } from "./store.js";
-import { criticals } from "./alarms/model.js";
+import { counts, criticals } from "./alarms/model.js";
 import { Rows, byId, h, text } from "./dom.js";
 import { now_s } from "./clock.js";
 import { LEVELS, shownCondition } from "./condition.js";
@@ -18,8 +18,6 @@ import { summaryFacts } from "./summary.js";
 let kept = false;
 let over = false;
 let said = "";
-/** Level and width of the window for which the sentence's line has its height. */
-let lineOf = "";
 /** The list behind the pill: its parts stay, so that a figure that changes takes neither a click nor the focus away. */
 let list = null;
 
@@ -70,12 +68,9 @@ function show() {
   text(byId("pill-words"), word);
   pill.setAttribute("aria-label", `${word}: ${words}`);
   const line = byId("condition-line");
-  // The map below must not change its size with every figure: the line becomes lower only with another level.
-  const key = `${condition.level} ${innerWidth}`;
-  line.style.minHeight = key === lineOf ? `${line.offsetHeight}px` : "";
-  lineOf = key;
   if (line.className !== condition.level) line.className = condition.level;
   text(byId("condition-words"), words);
+  byId("condition-words").title = words; // it may be cut after two lines
   const further = condition.reasons.length - 1;
   byId("condition-more").hidden = further < 0;
   text(byId("condition-more"), further > 0 ? `and ${further} more` : "What to do");
@@ -142,10 +137,18 @@ function makeFigure(name) {
 
 /** The condition as a sentence: the worst reason, or what is so without one. */
 function statement({ level, text: words }, word) {
-  if (level === "good") return "All is well: nothing speaks against the positions shown.";
+  if (level === "good") return openAlarms() || "All is well: nothing speaks against the positions shown.";
   if (level === "replay") return "A recording is shown, not the live site.";
   if (level === "past") return "The map shows the past; nothing speaks against the live positions.";
   return sentence(words || word);
+}
+
+/** That there are alarms beside good positions; empty where there are none. */
+function openAlarms() {
+  const { unseen, seen } = counts();
+  const [count, kind] = unseen ? [unseen, ""] : [seen, "acknowledged "];
+  const more = state.moreAlarms ? "more than " : "";
+  return count ? `Positions are good; ${more}${count} ${kind}${count === 1 ? "alarm" : "alarms"}.` : "";
 }
 
 function showBanner() {

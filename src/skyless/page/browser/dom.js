@@ -26,6 +26,9 @@ export function s(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** Whether the window has the width of a phone, for which the style sheets have a layout of its own. */
+export const isPhone = () => matchMedia("(max-width: 760px)").matches;
+
 /** A button. */
 export function button(words, onclick, properties = {}) {
   return h("button", { type: "button", onclick, ...properties }, words);

@@ -1,7 +1,7 @@
 /** The legend next to the map: marks of tags and anchors, switches for layers, floors, and saving; and the scale of an overlay. */
 
 import { changed, on, saveSetting, savedSetting, select, state } from "./store.js";
-import { byId, h, offer, options, text, throttle, toast } from "./dom.js";
+import { byId, h, isPhone, offer, options, text, throttle, toast } from "./dom.js";
 import { allGroups, labelOf } from "./assets/model.js";
 import { DELAY_S, GONE_S, GREY_S, stillMotion, tracks } from "./clock.js";
 import { length } from "./format.js";
@@ -42,8 +42,8 @@ export function start() {
   setInterval(() => state.overlay.pendingSince !== null && scale(), 500);
   on(["site"], () => (byId("switch-truth").hidden = !state.simulated));
   byId("ramp-again").addEventListener("click", () => choose(state.options.overlay));
-  byId("legend").open = savedSetting(KEY) === "open";
-  byId("legend").addEventListener("toggle", () => saveSetting(KEY, byId("legend").open ? "open" : "shut"));
+  byId("legend").open = savedSetting(KEY) === "open" && !isPhone();
+  byId("legend").addEventListener("toggle", () => isPhone() || saveSetting(KEY, byId("legend").open ? "open" : "shut"));
 }
 
 /** An entry for each tag; with very many all have one mark, and the list next to the map has their names. */

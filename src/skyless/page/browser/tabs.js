@@ -1,7 +1,7 @@
 /** The side panel: tabs by the pattern of the ARIA authoring guide, and on a phone a sheet of three heights. */
 
 import { changed, isChangeable, on, state } from "./store.js";
-import { byId, h, throttle } from "./dom.js";
+import { byId, h, isPhone, throttle } from "./dom.js";
 import { places } from "./map/places.js";
 import { picking } from "./survey/picking.js";
 import * as alarms from "./alarms/panel.js";
@@ -14,9 +14,12 @@ import * as timing from "./panels/timing.js";
 import * as zones from "./panels/zones.js";
 import * as setup from "./setup/panel.js";
 
-/** Each has a title, the topics that it shows, the interval at which it shows changes, `start(panel)` and `show()`; one
-    that has nothing to show at some sites says so with `isIdle()`. */
-const TABS = { tags, alarms, anchors, events, timing, zones, setup, history, recordings };
+/**
+ * In groups: what is watched, places and the past, engineering. Each has a title, the topics that it shows, the interval at
+ * which it shows changes, `start(panel)` and `show()`; one that has nothing to show at some sites says so with `isIdle()`.
+ */
+const GROUPS = [{ tags, alarms, events }, { zones, history, recordings }, { anchors, timing, setup }];
+const TABS = Object.assign({}, ...GROUPS);
 const KEYS = Object.keys(TABS);
 const SHEET = ["low", "half", "high"];
 
@@ -26,9 +29,11 @@ let notLive = false;
 
 /** Build the panel. */
 export function start() {
+  const groups = GROUPS.map((tabs) => ({ tabs, element: h("div", { role: "presentation", class: "tab-group" }) }));
+  byId("tabs").append(...groups.map(({ element }) => element));
   for (const [key, tab] of Object.entries(TABS)) {
     const button = { type: "button", role: "tab", id: `tab-${key}`, "aria-controls": `panel-${key}` };
-    byId("tabs").append(h("button", { ...button, onclick: () => open(key) }, tab.title));
+    groups.find((one) => key in one.tabs).element.append(h("button", { ...button, onclick: () => open(key) }, tab.title));
     const attributes = { role: "tabpanel", id: `panel-${key}`, class: "tab-panel", "aria-labelledby": `tab-${key}` };
     const panel = h("div", { ...attributes, tabindex: "0" });
     byId("panels").append(panel);
@@ -45,7 +50,8 @@ export function start() {
   on(["log", "read"], showUnread);
   on(["site"], hideIdle);
   on(["site"], openWhereNothingIsPlaced);
-  on(["picking"], () => picking && matchMedia("(max-width: 760px)").matches && sheet("half"));
+  byId("legend").addEventListener("toggle", () => byId("legend").open && isPhone() && sheet("low"));
+  on(["picking"], () => picking && isPhone() && sheet("half"));
   setInterval(() => TABS[current].changesWithTime && show(), 1000);
   on(["mode", "past", "placing"], showMap);
   on(["selection"], () => {
@@ -82,7 +88,7 @@ function showUnread() {
 /** On a phone the sheet makes room where the map begins to show a recording, the past or other places of anchors. */
 function showMap() {
   const now = state.mode === "replay" || state.past !== null || places !== null;
-  if (now && !notLive && matchMedia("(max-width: 760px)").matches) sheet("low");
+  if (now && !notLive && isPhone()) sheet("low");
   notLive = now;
 }
 

@@ -20,14 +20,14 @@ const NAMES = [
   "wall",
 ];
 const TAGS = 8;
-/** Colours of groups: each differs from the others, from grey and from the background. */
+/** Colours of groups: each differs from the others, from grey and from the background, and has one hue in both themes. */
 const GROUPS = {
   light:
-    "#8778e1 #003c00 #87873c #5a0f5a #d2003c #005a87 #2d9696 #693c00 #7800d2 #000096 #0f694b #ff0fc3 " +
-    "#c3784b #874b78 #5a0f0f #5a5a00 #4b87b4 #96001e #b478a5 #965a0f #00964b #005aff #3c3c78 #b400ff",
+    "#036de2 #1d5e15 #440063 #907fc0 #e61796 #0c85a1 #045f82 #f64125 #a947fe #c66f0f #ba6a7d #84486a " +
+    "#2b3ca5 #ae2492 #7c058d #c41e0e #8a0700 #6661a6 #6f0648 #c961c4 #8c8a22 #7727e9 #248945 #7f4e17",
   dark:
-    "#9669ff #e1f0a5 #69691e #ffc3ff #4bb4a5 #ff7800 #a54b5a #87f0ff #007896 #3ce100 #78b4f0 #d287b4 " +
-    "#a5a55a #ffc396 #2d8769 #785a96 #a5692d #ff0069 #1e5af0 #ff2dff #c3a5ff #00b400 #5affb4 #e1c300",
+    "#6999dd #2e8124 #b100f9 #b295ff #fea8cf #2fc7ee #3781a6 #ca7b6c #ac64f3 #f9ba88 #fc779b #fe34b9 " +
+    "#4d69fe #be66a7 #e43fff #f82510 #a45c50 #c0beff #d3118d #fa7ef4 #c5c343 #7e68bf #4cbd6c #f59416",
 };
 /** A colour that somebody has chosen differs from the map's by at least this in its lightness, of 255. */
 const LIGHTER = 40;
@@ -36,6 +36,8 @@ export const DISTINCT = 56;
 
 /** Colours by their names in tokens.css, `tags`, a few distinct hues, and `groups`, the colours of groups. @type {any} */
 export const palette = { tags: [], groups: [] };
+
+let brush = null;
 
 /** Whether the page is dark. */
 export function isDark() {
@@ -79,6 +81,13 @@ export function tagColour(index, count) {
 export function faint(colour, alpha) {
   const parts = colour.match(/[\d.]+/g);
   return parts ? `rgba(${parts[0]}, ${parts[1]}, ${parts[2]}, ${alpha})` : colour;
+}
+
+/** Any opaque colour of CSS as `#rrggbb`, as an input takes it. */
+export function hexOf(colour) {
+  brush ??= document.createElement("canvas").getContext("2d");
+  brush.fillStyle = colour;
+  return brush.fillStyle;
 }
 
 /** A colour `#rrggbb` as the browser writes it. */

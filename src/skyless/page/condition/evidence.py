@@ -129,6 +129,11 @@ class Evidence:
         self.site = site
         self.site_anchors()
 
+    @property
+    def is_bare(self) -> bool:
+        """Whether no anchor of the site has a position yet, so that there can be no fixes."""
+        return self.site is not None and not self.site.anchors
+
     def site_anchors(self) -> list[str]:
         """The names of the site's anchors that are taken in."""
         site = self.site

@@ -108,7 +108,7 @@ class ConditionMonitor:
         ]
         if lag_s > LAG_S or behind is not None:
             self._blind_until_s = now_s + 2 * EVALUATION_S  # what has arrived meanwhile is still to be read
-        if not self.is_blind(now_s):
+        if not self.is_blind(now_s) and not evidence.is_bare:
             found += [*fix_reasons(evidence, now_s), *anchor_reasons(evidence, now_s)]
         for reason in filter(None, found):
             self._hold(reason, now_s)
@@ -139,6 +139,8 @@ class ConditionMonitor:
     def _awaited(self) -> str:
         if self.evidence.site is None:
             return "waiting for the site's anchors"
+        if self.evidence.is_bare:
+            return "not set up yet: tab Set up"
         if not self.evidence.batched_s and not any(tag.online for _, tag in self.evidence.of("tag")):
             return "no tag is online"
         return "waiting for the first position"

@@ -6,7 +6,8 @@
 4. An alarm is kept until it has ended and somebody has acknowledged it. Another occurrence replaces one that has ended.
 5. What is not known changes nothing: silence while messages cannot arrive, a tag outside of a zone that goes silent, an
    anchor that the watch no longer judges. What was not seen again since messages may have been lost raises nothing.
-6. Of several engines at a site, all are given what happens, and one that leads raises alarms. Another one, or one that
+6. An alarm says the worst value so far, at most once a second while it lasts, and keeps it when it has ended.
+7. Of several engines at a site, all are given what happens, and one that leads raises alarms. Another one, or one that
    was started again, goes on from the kept alarms (``resume``).
 
 Conditions are evaluated five times a second, and of zones with each event as well, as a tag may cross one in less.
@@ -45,8 +46,19 @@ MAX_KEPT: Final = 2_000
 
 _MAX_NAMED: Final = 20
 
-Change = tuple[Literal["raised", "ended", "acknowledged", "dropped"], AlarmMessage]
-"""What has become of an alarm. A dropped one is not kept any longer, as there are too many."""
+UPDATE_S: Final = 1.0
+"""Between updates of the sentences of active alarms."""
+
+_LONGER: Final = 1.1
+"""A duration is updated when it has grown by this factor, so that a long stay is not a message each second."""
+
+_LASTING: Final = frozenset({"inside", "outside", "silent", "anchor-offline"})
+"""Kinds of rules whose worst value is how long the condition has held."""
+
+What = Literal["raised", "updated", "ended", "acknowledged", "dropped"]
+Change = tuple[What, AlarmMessage]
+"""What has become of an alarm. An updated one says a worse value; a dropped one is not kept any longer, as there are
+too many."""
 Key = tuple[str, str]
 """Rule and subject."""
 
@@ -84,6 +96,14 @@ class _Case(Struct):
     since_s: float
     known_s: float
     """When it was last known whether the condition holds."""
+    worst: float | None = None
+    """As of ``AlarmMessage``."""
+
+    def add(self, kind: RuleKind, value: float | None) -> None:
+        """The value while the condition holds; None where it is not known."""
+        if value is not None:
+            worse = min if kind in ("near", "battery") else max
+            self.worst = value if self.worst is None else worse(self.worst, value)
 
 
 class Concerned:
@@ -139,7 +159,7 @@ class AlarmEngine:
         self._anchors: dict[RuleKind, dict[str, str]] = {}
         """What is known of anchors, by kind of rule: subjects for which the condition holds, and a sentence."""
         self._changes: list[Change] = []
-        self._blind_s = self._evaluated_s = -math.inf
+        self._blind_s = self._evaluated_s = self._updated_s = -math.inf
         self._unix_offset_s = 0.0
 
     # What the site is
@@ -223,10 +243,13 @@ class AlarmEngine:
         self.leading, self._unix_offset_s = True, unix_s - now_s
         for message in self.messages.values():
             own = self._rule_of(message)
-            if own is None or message.ended_unix_s is not None or message.subject in own.cases:
+            if own is None or message.ended_unix_s is not None:
                 continue
-            own.cases[message.subject] = _Case(True, message.since_unix_s - self._unix_offset_s, now_s)
-            if message.kind == "silent":
+            is_new, since_s = message.subject not in own.cases, message.since_unix_s - self._unix_offset_s
+            case = own.cases.setdefault(message.subject, _Case(True, since_s, now_s))
+            unstated = math.inf if message.kind == "protection-level" else None  # JSON has no infinity
+            case.add(message.kind, unstated if message.worst is None else message.worst)
+            if is_new and message.kind == "silent":
                 self._tags.setdefault(message.subject, _Tag(now_s))
         self._evaluate_all()
 
@@ -266,10 +289,14 @@ class AlarmEngine:
             own.is_on = is_on
             for subject in dict.fromkeys((*self._subjects(own, changed, now_s), *own.cases)):
                 self._check(own, subject, now_s)
+        is_due = now_s - self._updated_s >= UPDATE_S
+        self._updated_s = now_s if is_due else self._updated_s
         for message in [one for one in self.messages.values() if self.leading and one.ended_unix_s is None]:
             rule = self._rule_of(message)
             if rule is None or message.subject not in rule.cases:
                 self._end(message, now_s)
+            elif is_due:
+                self._update(message, rule, rule.cases[message.subject].worst)
         self._forget(now_s)
 
     def _subjects(self, own: _Rule, changed: Iterable[str], now_s: float) -> Iterable[str]:
@@ -369,9 +396,13 @@ class AlarmEngine:
                 case.holds, case.since_s = holds, max(self._tag(subject).seen_s, self._blind_s) if is_silent else now_s
         message = self.messages.get((rule.id, subject))
         is_active = self.leading and message is not None and message.ended_unix_s is None
+        if case.holds:
+            since_s = message.since_unix_s - self._unix_offset_s if message and is_active else case.since_s
+            case.add(rule.kind, self._value(own, subject, now_s - since_s))
         if message is not None and is_active:
             if own.is_on is False or (not case.holds and now_s - case.since_s >= rule.clear_after_s):
-                self._end(message, now_s)
+                sentence = self._sentence(own, subject, case.worst, "ended") or message.sentence
+                self._end(replace(message, sentence=sentence, worst=case.worst), now_s)
                 is_active = False
         elif case.holds and self.leading and own.is_on and case.known_s >= self._blind_s:
             lasted_s = now_s - max(case.since_s, own.on_since_s)
@@ -400,13 +431,36 @@ class AlarmEngine:
             subject=subject,
             since_unix_s=case.since_s + self._unix_offset_s,
             unix_s=unix_s,
-            sentence=self._sentence(own, subject, now_s - case.since_s),
+            sentence=self._sentence(own, subject, case.worst, "raised"),
             tags=tags[:_MAX_NAMED],
             zone=rule.zone,
             place=self._place(tags[0], fix) if is_of_tags else self._zone_name(rule.zone),
             position_m=None if fix is None else fix.position_m,
+            worst=case.worst,
         )
         self._keep(message, "raised")
+
+    def _update(self, message: AlarmMessage, own: _Rule, worst: float | None) -> None:
+        is_longer = (worst or 0.0) >= _LONGER * (message.worst or 0.0) + UPDATE_S
+        if is_longer if own.rule.kind in _LASTING else worst != message.worst or own.rule.kind == "anchor-moved":
+            sentence = self._sentence(own, message.subject, worst, "updated") or message.sentence
+            if sentence != message.sentence:
+                self._keep(replace(message, sentence=sentence, worst=worst), "updated")
+
+    def _value(self, own: _Rule, subject: str, held_s: float) -> float | None:
+        """What an alarm is about in numbers, as in ``AlarmMessage.worst``; None where that is not known."""
+        match own.rule.kind:
+            case "near":
+                return own.distances_m.get(subject)
+            case "crowded":
+                return float(len(self._crowd(own)))
+            case "battery":
+                return self._tag(subject).battery
+            case "protection-level":
+                return _level_m(self._tag(subject))
+            case "anchor-moved":
+                return None
+        return max(own.rule.after_s, held_s)
 
     def _make_room(self) -> bool:
         if len(self.messages) < MAX_KEPT:
@@ -418,7 +472,7 @@ class AlarmEngine:
             self._changes.append(("dropped", oldest))
         return bool(ended)
 
-    def _keep(self, message: AlarmMessage, what: Literal["raised", "ended", "acknowledged"]) -> None:
+    def _keep(self, message: AlarmMessage, what: What) -> None:
         """While another engine leads, that one says so as well; if it does not, this one does when it leads."""
         self.messages[message.rule, message.subject] = message
         if self.leading:
@@ -442,24 +496,29 @@ class AlarmEngine:
         names = [zone.name or zone.id for zone in self._monitor.zones_with(tag)]
         return ", ".join(names) or ("" if fix is None else "at x {:.1f}, y {:.1f} m".format(*fix.position_m))
 
-    def _sentence(self, own: _Rule, subject: str, held_s: float) -> str:
+    def _sentence(self, own: _Rule, subject: str, worst: float | None, what: What) -> str:
+        """Empty where nothing is known any more."""
         rule, limit, zone = own.rule, own.rule.limit or 0.0, self._zone_name(own.rule.zone)
         who = " and ".join(map(self._who, subject.split("~")))
-        tag, anchor = self._tag(subject), subject.replace("-", " ", 1)
-        lasting = f" for {_span(max(rule.after_s, held_s))}" if rule.after_s >= 1.0 else ""
-        share, level_m = tag.battery or 0.0, _level_m(tag)
-        level = "unknown" if level_m is None or level_m == math.inf else f"{level_m:.2f} m"
-        apart_m, moved = own.distances_m.get(subject, limit), self._anchors.get("anchor-moved", {}).get(subject)
+        anchor, was = subject.replace("-", " ", 1), what != "raised"
+        value, least, most = worst or 0.0, " at the least" if was else "", " at the most" if was else ""
+        lasting = f" for {_span(value)}" if value >= 1.0 and rule.kind in _LASTING else ""
+        be = "was" if what == "ended" else "has been" if lasting else "is"
+        was_or_is = "was" if was else "is"
+        be_not = "has not been" if be == "has been" else f"{be} not"
+        level = "unknown" if worst is None or worst == math.inf else f"{worst:.2f} m{most}"
+        moved = self._anchors.get("anchor-moved", {}).get(subject)
+        moved = moved if moved or was else f"{anchor} has moved"
         return {
-            "inside": f"{who} {'has been' if lasting else 'is'} in {zone}{lasting}",
-            "outside": f"{who} {'has not been' if lasting else 'is not'} in {zone}{lasting}",
-            "silent": f"{who} has sent no fixes{lasting}",
-            "near": f"{who} are {apart_m:.1f} m apart; at least {limit:g} m is right",
-            "crowded": f"{len(self._crowd(own))} tags are in {zone}; at most {limit:g} are allowed",
-            "anchor-offline": f"{anchor} {'has been' if lasting else 'is'} offline{lasting}",
-            "anchor-moved": (moved or f"{anchor} has moved").rstrip("."),
-            "battery": f"the battery of {who} is at {share:.0%}; {limit:.0%} is the least",
-            "protection-level": f"the protection level of {who} is {level}; at most {limit:g} m is allowed",
+            "inside": f"{who} {be} in {zone}{lasting}",
+            "outside": f"{who} {be_not} in {zone}{lasting}",
+            "silent": f"{who} {'' if what == 'ended' else 'has '}sent no fixes{lasting}",
+            "near": f"{who} {'were' if was else 'are'} {value:.1f} m apart{least}; at least {limit:g} m is right",
+            "crowded": f"{value:.0f} tags {'were' if was else 'are'} in {zone}{most}; at most {limit:g} are allowed",
+            "anchor-offline": f"{anchor} {be} offline{lasting}",
+            "anchor-moved": (moved or "").rstrip("."),
+            "battery": f"the battery of {who} {was_or_is} at {value:.0%}{least}; {limit:.0%} is the least",
+            "protection-level": f"the protection level of {who} {was_or_is} {level}; at most {limit:g} m is allowed",
         }[rule.kind]
 
 

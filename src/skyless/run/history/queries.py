@@ -110,7 +110,7 @@ _OCCUPANCY: Final = f"{_STAYS} SELECT zone, list(since), list(until) FROM stays 
 
 _ALARMS: Final = """
     SELECT alarm, split_part(alarm, '/', 1), coalesce(max(subject), ''),
-        coalesce(max(text) FILTER (kind = 'alarm-raised'), ''),
+        coalesce(nullif(max(text) FILTER (kind = 'alarm-ended'), ''), max(text) FILTER (kind = 'alarm-raised'), ''),
         epoch_ms(min(t) FILTER (kind = 'alarm-raised')) / 1000 AS raised,
         epoch_ms(max(t) FILTER (kind = 'alarm-ended')) / 1000 AS ended,
         epoch_ms(min(t) FILTER (kind = 'alarm-acknowledged')) / 1000,

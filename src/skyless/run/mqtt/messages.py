@@ -582,7 +582,7 @@ class AlarmMessage(Struct, frozen=True):
     unix_s: float
     """When the alarm was raised."""
     sentence: str
-    """For people: who, where, what."""
+    """For people: who, where, what; with the worst value so far, updated at most once a second."""
     tags: tuple[str, ...] = ()
     zone: str | None = None
     place: str = ""
@@ -591,6 +591,9 @@ class AlarmMessage(Struct, frozen=True):
     ended_unix_s: float | None = None
     acknowledged_unix_s: float | None = None
     acknowledged_by: str = ""
+    worst: float | None = None
+    """The worst value so far in the unit of the rule's limit, or for how many seconds the condition has held; None
+    where there is none, and of a protection level that cannot be given."""
 
 
 class AcknowledgeMessage(Struct, frozen=True):

@@ -32,6 +32,12 @@ export function isUnseen(alarm) {
   return (alarm.acknowledged_unix_s ?? null) === null;
 }
 
+/** How many nobody has acknowledged, and how many are acknowledged and active. */
+export function counts() {
+  const unseen = state.alarms.filter(isUnseen).length;
+  return { unseen, seen: state.alarms.filter((alarm) => isActive(alarm) && !isUnseen(alarm)).length };
+}
+
 /** The critical ones that nobody has acknowledged. */
 export function criticals() {
   return state.alarms.filter((alarm) => alarm.severity === "critical" && isUnseen(alarm));
@@ -45,6 +51,12 @@ export function subjectOf({ kind, subject }) {
   if (kind.startsWith("anchor-")) return { kind: "anchor", ids: [Number(subject.replace("anchor-", ""))] };
   if (kind === "crowded") return { kind: "zone", ids: [subject.replace("zone-", "")] };
   return { kind: "tag", ids: subject.split("~") };
+}
+
+/** The tags with an alarm that lasts. */
+export function alarmedTags() {
+  const subjects = state.mode === "live" ? state.alarms.filter(isActive).map(subjectOf) : [];
+  return new Set(subjects.flatMap(({ kind, ids }) => (kind === "tag" ? ids : [])));
 }
 
 /** Select what an alarm is about. */

@@ -5,6 +5,7 @@ import { on, state } from "../store.js";
 import { surveyShown } from "../survey/model.js";
 import { palette } from "../theme.js";
 import { groundHeight, otherFloor } from "./floors.js";
+import { boxOf, label, still } from "./names.js";
 import { placed } from "./places.js";
 import { isSeen, toX, toY, view } from "./view.js";
 
@@ -77,6 +78,7 @@ export let drawnAnchors = [];
 /** Draw all anchors, unless the survey's picture shows them; a master has a frame around it, the selected one a ring. */
 export function drawAnchors(context) {
   drawnAnchors = [];
+  still.length = 0;
   if (surveyShown()) return;
   const other = otherFloor();
   context.font = "600 11px system-ui, sans-serif";
@@ -120,8 +122,10 @@ export function drawAnchors(context) {
   for (const { words, x, y, alpha, below } of shown) {
     context.globalAlpha = alpha;
     label(context, words, x, y + MARK + below);
+    still.push(boxOf(context, words, x, y + MARK + below));
   }
   context.globalAlpha = 1;
+  still.push(...drawnAnchors.map(({ x, y }) => [x - 8, y - 8, x + 8, y + 8]));
 }
 
 /** Where an anchor is, while it is shown at a place that is tried. */
@@ -232,14 +236,4 @@ export function ring(context, x, y, radius) {
   context.beginPath();
   context.arc(x, y, radius, 0, 2 * Math.PI);
   context.stroke();
-}
-
-/** Write a label that is legible on any background. */
-export function label(context, words, x, y, colour = palette.text) {
-  context.lineWidth = 3;
-  context.lineJoin = "round";
-  context.strokeStyle = palette.bg;
-  context.strokeText(words, x, y);
-  context.fillStyle = colour;
-  context.fillText(words, x, y);
 }

@@ -2,7 +2,7 @@
 
 import { palette } from "../theme.js";
 import { findings, markWords } from "../survey/watch.js";
-import { label } from "./anchors.js";
+import { label } from "./names.js";
 import { pixelOf } from "./survey.js";
 
 const RADIUS = 16;

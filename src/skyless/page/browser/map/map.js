@@ -12,13 +12,13 @@ import { centre } from "./follow.js";
 import { listen } from "./input.js";
 import { drawHeat, drawMoment, drawWay } from "./past.js";
 import { drawMany, manyShown, start as startMany } from "./many.js";
-import { drawRoom, fillRoom } from "./room.js";
+import { drawRoom, fillRoom, nameRoom } from "./room.js";
 import { drawGround, spaceCorners } from "./space.js";
 import { drawSurvey, surveyCorners, surveyOutOfSight } from "./survey.js";
 import { RICH, drawTags, visibleTags } from "./tags.js";
 import { drawTrails, due } from "./trails.js";
 import { fit, prepare, seenBox, setSpatial, view } from "./view.js";
-import { drawDraft, drawZones, flash } from "./zones.js";
+import { drawDraft, drawZones, flash, nameZones } from "./zones.js";
 
 /** Frames drawn so far, for tests and measurements. */
 export const drawnFrames = { still: 0, moving: 0 };
@@ -88,6 +88,8 @@ function drawStill() {
   drawWalls(context, ground_m);
   drawRoom(context, floorCorners(), ground_m);
   drawAnchors(context);
+  nameZones(context);
+  nameRoom(context, floorCorners());
   drawSurvey(context);
   drawFindings(context);
   drawAlarms(context, true);

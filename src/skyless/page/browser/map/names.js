@@ -1,8 +1,10 @@
-/** Names of tags on the map: each in the first free position next to its mark. */
+/** Names on the map, none over another: those that stand still first, then tags', each in the first free position. */
 
-import { label } from "./anchors.js";
+import { palette } from "../theme.js";
 
 const HEIGHT = 13;
+/** Boxes of the marks and names that stand still, [left, top, right, bottom]; anchors' come first, then zones'. @type {number[][]} */
+export const still = [];
 /** Directions from the mark, the usual one first; then farther away, with a line to the mark. */
 const NEAR = [[1, -1], [1, 1], [-1, -1], [-1, 1], [0, -1], [0, 1]]; // prettier-ignore
 const STEPS = [
@@ -16,9 +18,41 @@ let last = new Map();
 /** Widths of names in the font used, pixels. @type {Map<string, number>} */
 const widths = new Map();
 
+/** Write a label that is legible on any background. */
+export function label(context, words, x, y, colour = palette.text) {
+  context.lineWidth = 3;
+  context.lineJoin = "round";
+  context.strokeStyle = palette.bg;
+  context.strokeText(words, x, y);
+  context.fillStyle = colour;
+  context.fillText(words, x, y);
+}
+
+/** The box of a label with its middle at x. */
+export function boxOf(context, words, x, top) {
+  const half = context.measureText(words).width / 2 + 2;
+  return [x - half, top, x + half, top + HEIGHT];
+}
+
 /**
- * Write names next to their marks.
- * @param {Array<{key: string, words: string, x: number, y: number, colour: string}>} wanted
+ * Write a label that stands still with its middle at the first of these heights where it covers nothing; where there is
+ * none, it is left out.
+ */
+export function labelIfFree(context, words, x, heights, colour = palette.text) {
+  context.textAlign = "center";
+  context.textBaseline = "middle";
+  for (const y of heights) {
+    const box = boxOf(context, words, x, y - HEIGHT / 2);
+    if (still.some((other) => overlap(other, box))) continue;
+    still.push(box);
+    label(context, words, x, y, colour);
+    return;
+  }
+}
+
+/**
+ * Write names next to their marks; where there is no room, only those that must be seen.
+ * @param {Array<{key: string, words: string, x: number, y: number, colour: string, must?: boolean}>} wanted
  * @param {Array<number[]>} taken boxes that are to stay free, [left, top, right, bottom]
  * @returns {Array<number[]>} the boxes of the names
  */
@@ -30,8 +64,9 @@ export function drawNames(context, wanted, taken) {
   const own = boxes.length - wanted.length;
   const names = [];
   const now = new Map();
-  wanted.forEach(({ key, words, x, y, colour }, index) => {
-    const chosen = choose(key, x, y, width(context, words), boxes, own + index);
+  wanted.forEach(({ key, words, x, y, colour, must }, index) => {
+    const chosen = choose(key, x, y, width(context, words), boxes, own + index, must);
+    if (!chosen) return;
     now.set(key, chosen.number);
     boxes.push(chosen.box);
     names.push(chosen.box);
@@ -58,8 +93,8 @@ function width(context, words) {
   return found;
 }
 
-/** The first position that covers nothing; the usual one where there is none. */
-function choose(key, x, y, wide, boxes, own) {
+/** The first position that covers nothing; where there is none, the usual one of a name that must be seen. */
+function choose(key, x, y, wide, boxes, own, must) {
   const candidates = STEPS.flatMap(({ dx, dy, line }) =>
     NEAR.map(([right, down]) => {
       const left = right > 0 ? x + dx : right < 0 ? x - dx - wide : x - wide / 2;
@@ -69,8 +104,8 @@ function choose(key, x, y, wide, boxes, own) {
   );
   const before = last.get(key) ?? 0;
   const order = [before, ...candidates.keys()];
-  const number = order.find((n) => !boxes.some((box, index) => index !== own && overlap(box, candidates[n].box))) ?? 0;
-  return { ...candidates[number], number };
+  const number = order.find((n) => !boxes.some((box, index) => index !== own && overlap(box, candidates[n].box)));
+  return number === undefined && !must ? null : { ...candidates[number ?? 0], number: number ?? 0 };
 }
 
 function overlap(a, b) {

@@ -2,8 +2,8 @@
 
 import { state } from "../store.js";
 import { faint, palette } from "../theme.js";
-import { label } from "./anchors.js";
 import { scaleBox } from "./floor.js";
+import { labelIfFree } from "./names.js";
 import { surveyShown } from "../survey/model.js";
 import { toX, toY, view } from "./view.js";
 
@@ -117,7 +117,7 @@ function trace(context, { corners }, ground_m) {
   context.closePath();
 }
 
-/** Draw the outline; from above, write what it is and its size below it. */
+/** Draw the outline. */
 export function drawRoom(context, plan, ground_m) {
   const outline = surveyShown() ? null : roomOutline(plan);
   if (!outline) return;
@@ -128,17 +128,21 @@ export function drawRoom(context, plan, ground_m) {
   context.setLineDash(walls ? [] : [7, 5]);
   context.stroke();
   context.setLineDash([]);
-  if (view.spatial) return;
+}
+
+/** Write below the outline what it is and its size, where there is room between other names; not in the 3-D view. */
+export function nameRoom(context, plan) {
+  const outline = surveyShown() || view.spatial ? null : roomOutline(plan);
+  if (!outline) return;
   const [xs, ys] = [outline.corners.map(([x]) => x), outline.corners.map(([, y]) => y)];
   const size = [xs, ys].map((list) => `${(Math.max(...list) - Math.min(...list)).toFixed(1)} m`);
-  const below = outline.kind === "anchors" ? 28 : 16; // clear of the names of anchors on it
   context.font = "11px system-ui, sans-serif";
-  context.textAlign = "left";
-  context.textBaseline = "top";
   const words = `${outline.name}, ${size.join(" × ")}`;
   const scale = scaleBox();
-  const top = toY(Math.min(...xs), Math.min(...ys)) + below;
-  const covered = top + 14 > scale.top && top < scale.top + scale.height;
-  const last = (covered ? scale.left : view.width) - context.measureText(words).width - 6;
-  label(context, words, Math.max(4, Math.min(toX(Math.min(...xs), Math.min(...ys)), last)), top, palette.muted);
+  const top = toY(Math.min(...xs), Math.min(...ys)) + 22;
+  const covered = top + 20 > scale.top && top - 7 < scale.top + scale.height;
+  const wide = context.measureText(words).width;
+  const last = (covered ? scale.left : view.width) - wide - 6;
+  const left = Math.max(4, Math.min(toX(Math.min(...xs), Math.min(...ys)), last));
+  labelIfFree(context, words, left + wide / 2, [top, top + 13], palette.muted);
 }

@@ -3,7 +3,7 @@
 import { state } from "../store.js";
 import { palette } from "../theme.js";
 import { metres, roundStep } from "../format.js";
-import { label } from "./anchors.js";
+import { label } from "./names.js";
 import { groundHeight } from "./floors.js";
 import { roomOutline } from "./room.js";
 import { foreshortening, isNarrow, toX, toY, view } from "./view.js";

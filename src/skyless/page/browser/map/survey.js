@@ -4,7 +4,8 @@ import { state } from "../store.js";
 import { roundStep } from "../format.js";
 import { facts, surveyShown } from "../survey/model.js";
 import { faint, palette } from "../theme.js";
-import { label, ring } from "./anchors.js";
+import { ring } from "./anchors.js";
+import { label } from "./names.js";
 import { halfAxes, isNarrow, px, py, toSite, toX, toY, view } from "./view.js";
 
 const MARK = 6;

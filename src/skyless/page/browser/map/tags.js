@@ -3,14 +3,15 @@
 import { GONE_S, freshness, now_s, shown_s, stillMotion, tracks } from "../clock.js";
 import { faint, palette } from "../theme.js";
 import { state } from "../store.js";
+import { alarmedTags } from "../alarms/model.js";
 import { labelOf } from "../assets/model.js";
 import { CXX, CXY, CYY, HEIGHT_GIVEN, HPL, TRUE_X, TRUE_Y, X, Y, Z } from "../tracks.js";
-import { DIMMED, drawnAnchors, dropLine, ring } from "./anchors.js";
+import { DIMMED, dropLine, ring } from "./anchors.js";
 import { filtering, passes } from "./filter.js";
 import { otherFloor } from "./floors.js";
 import { manyShown } from "./many.js";
 import { drawMark, tagStyle } from "./marks.js";
-import { drawNames } from "./names.js";
+import { drawNames, still } from "./names.js";
 import { drawStub } from "./trails.js";
 import { foreshortening, halfAxes, isSeen, seenCovariance, toX, toY, view } from "./view.js";
 import { inside } from "./zones.js";
@@ -161,15 +162,16 @@ function mark(context, { track, colour, shape, fresh, selected, other, x, y }) {
 
 function names(context, seen) {
   const wanted = [];
-  for (const { track, row: at, fresh, selected, x, y } of seen) {
+  for (const { track, row: at, fresh, selected, x, y } of seen.toSorted((a, b) => Number(b.selected) - Number(a.selected))) {
     if (seen.length > NAMED && !selected) continue;
     const quiet = fresh === "fresh" || state.connection.phase === "lost";
     const name = labelOf(track.name);
     const words = (quiet ? name : `${name} · no fix`) + (view.spatial ? heightWords(at, selected) : "");
-    wanted.push({ key: track.name, words, x, y, colour: fresh === "fresh" ? palette.text : palette.muted });
+    wanted.push({ key: track.name, words, x, y, colour: fresh === "fresh" ? palette.text : palette.muted, must: selected });
   }
-  const anchors = wanted.length ? drawnAnchors.map(({ x, y }) => [x - 8, y - 8, x + 8, y + 20]) : [];
-  drawNames(context, wanted, anchors);
+  const alarmed = alarmedTags();
+  const shields = seen.filter(({ track }) => alarmed.has(track.name)).map(({ x, y }) => [x - 17, y - 17, x - 1, y - 1]);
+  drawNames(context, wanted, [...still, ...shields]);
 }
 
 /** The height of a tag, and whether it was given; where all are given, only the selected one repeats it. */

@@ -2,9 +2,9 @@
 
 import { state } from "../store.js";
 import { faint, palette } from "../theme.js";
-import { label } from "./anchors.js";
 import { editor } from "./editor.js";
 import { chosenFloor, groundHeight } from "./floors.js";
+import { labelIfFree } from "./names.js";
 import { toX, toY } from "./view.js";
 
 /** Whether a zone is on the chosen floor, or on all. */
@@ -41,14 +41,20 @@ export function drawZones(context) {
     context.strokeStyle = colour;
     context.lineWidth = chosen ? 2.5 : 1.5;
     context.stroke();
-    context.font = "600 12px system-ui, sans-serif";
-    context.textAlign = "center";
-    context.textBaseline = "middle";
-    const [x, y] = middle(zone.polygon_m);
-    label(context, zone.name, toX(x, y), toY(x, y, groundHeight()));
     if (chosen && state.mode === "live") corners(context, zone.polygon_m, colour);
   }
   return flashing.size > 0;
+}
+
+/** Write the names of the zones, beside the names that are written already; the selected zone's comes first. */
+export function nameZones(context) {
+  context.font = "600 12px system-ui, sans-serif";
+  const first = (zone) => Number(state.selection.zone === zone.id);
+  for (const zone of state.zones.filter(isOnFloor).sort((a, b) => first(b) - first(a))) {
+    const [x, y] = middle(zone.polygon_m);
+    const [left, top] = [toX(x, y), toY(x, y, groundHeight())];
+    labelIfFree(context, zone.name, left, [0, -15, 15, -30, 30].map((down) => top + down));
+  }
 }
 
 /** Draw the zone that is being drawn: its corners, the line to the cursor, and the cursor. */

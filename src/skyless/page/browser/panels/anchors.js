@@ -21,6 +21,8 @@ const WINDOW_S = 120;
 const HEARD_S = 3;
 /** Counters that have a fact of their own. */
 const SHOWN = new Set(["sent", "heard", "late"]);
+const PROGRAMS = { dashboard: "page server", ether: "emulated air", survey: "survey program" };
+
 let parts = null;
 
 /** Build the tab. */
@@ -189,10 +191,16 @@ function anchorFacts(id, health) {
   };
 }
 
+/** What people call a program: its kind, and its name where that says more. */
+function programName({ kind, name }) {
+  const words = PROGRAMS[kind] ?? kind;
+  return name === kind || kind === "ether" ? words : `${words} ${name}`;
+}
+
 function makeNode(_key, node) {
   const mark = h("span", { class: "node-mark", "aria-hidden": "true" });
   const words = h("span", {});
-  const element = h("li", {}, mark, h("span", {}, `${node.kind} ${node.name}`), words);
+  const element = h("li", {}, mark, h("span", {}, programName(node)), words);
   const update = (now) => {
     element.className = now.online ? "good" : "bad";
     text(mark, now.online ? "■" : "✕");

@@ -8,9 +8,10 @@ import { add as addZones, change, editor, remove } from "../map/editor.js";
 import { floors } from "../map/floors.js";
 import { startDrawing } from "../map/tools.js";
 import { zoneColour } from "../map/zones.js";
+import { hexOf } from "../theme.js";
 
 export const title = "Zones";
-export const topics = ["zones", "events", "selection", "mode", "editor", "site"];
+export const topics = ["zones", "events", "selection", "mode", "editor", "site", "theme"];
 export const interval_ms = 60;
 
 let parts = null;
@@ -116,8 +117,7 @@ function makeZone(id, zone) {
     const chosen = state.selection.zone === id;
     element.className = chosen ? "selected" : "";
     corners.setAttribute("aria-expanded", String(chosen));
-    const colour = zoneColour(now);
-    if (document.activeElement !== swatch && colour.startsWith("#")) swatch.value = colour;
+    if (document.activeElement !== swatch) swatch.value = hexOf(zoneColour(now));
     if (document.activeElement !== name) name.value = now.name;
     const numbered = floors().filter(({ number }) => number !== undefined);
     floor.hidden = !numbered.length;
