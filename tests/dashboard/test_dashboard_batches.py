@@ -71,7 +71,8 @@ def test_zones_alarms_and_lists_are_those_of_messages():
         said.append(dashboard.said())
     events, alarms, rows = said[0]
     assert [event[:2] for event in events] == [("t1", "enter"), ("t1", "leave")]
-    assert [alarm[:3] for alarm in alarms] == [("in", "t1", True), ("quiet", "t1", True), ("in", "t1", False)]
+    states = dict.fromkeys(alarm[:3] for alarm in alarms)  # while one lasts its sentence changes
+    assert list(states) == [("in", "t1", True), ("quiet", "t1", True), ("in", "t1", False)]
     assert said[1][:2] == (events, alarms)
     for mine, other in zip(rows, said[1][2], strict=True):
         assert mine[0] == other[0]

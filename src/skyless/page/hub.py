@@ -26,6 +26,11 @@ class _Shown(Struct):
     asked_s: float
 
 
+async def _connected(link: HubLink, live: LiveSite) -> None:
+    """Keep a site connected until cancelled, which may be before it has begun."""
+    await together(link.run(), live.run())
+
+
 class ShownSites:
     """Takes the place of ``LiveSites`` at a hub."""
 
@@ -55,7 +60,7 @@ class ShownSites:
             link, live = HubLink(self.known.address, number, self._name), self._make()
             live.attach(link, number)
             link.on_state.append(live.on_connection)
-            work = self._tasks.create_task(together(link.run(), live.run()))
+            work = self._tasks.create_task(_connected(link, live))
             self._shown[number] = _Shown(live, work, 0.0)
         self._shown[number].asked_s = time.monotonic()
         return self._shown[number].live
