@@ -97,9 +97,6 @@ ELSEWHERE = {
     "chmod 600 /etc/skyless/keys/*.seed": (
         "tests/authentication/test_key_files.py::test_a_secret_that_others_can_read_is_refused_with_what_to_do"
     ),
-    "skyless tag tag1 --print": (
-        "tests/nodes/test_fix_lines.py::test_lines_for_people_have_time_tag_position_and_sigma"
-    ),
     "skyless dashboard": "tests/dashboard/test_dashboard_end_to_end.py::test_a_site_is_found_shown_and_watched",
     "skyless dashboard --assets assets.csv": HTTP,
     "curl http://127.0.0.1:8080/api/v1/assets.csv > assets.csv": HTTP,

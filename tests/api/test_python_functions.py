@@ -140,6 +140,9 @@ def test_fixes_of_replays(results):
         fixes = result.fixes
         assert len(fixes) == report.fixes
         assert result.tags == tuple(result.reports)
+        assert result.report is report
+        with pytest.raises(skyless.SkylessError, match="has 2 tags"):
+            _ = replace(result, reports={"a": report, "b": report}).report
         errors_m = np.linalg.norm(fixes.error_m[fixes.judged, :2], axis=1)
         assert np.sqrt(np.mean(errors_m**2)) == pytest.approx(report.rmse_2d_m)
     assert np.isfinite(results.recorded.fixes.hpl_m).any()

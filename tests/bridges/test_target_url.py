@@ -39,6 +39,8 @@ WRONG = {
     "jsonl+tcp://:7010?rate=5": "has 'rate'; its keys are hz, tag",
     "jsonl+udp://no.such.host.invalid:1": "a host that cannot be found",
     "gopher://:70": "one of ",
+    "mavlink://:14550": "it should be mavlink+udpout: or mavlink+serial:, if that was meant, or one of ",
+    "fox://:1": "it should be one of ",
     "jsonl+pty:/dev": "one of ",
     "nmea+tcp:10110": "it should be nmea+tcp://HOST:PORT",
     "nmea+tcp://:10110/gps": "it should be nmea+tcp://HOST:PORT",

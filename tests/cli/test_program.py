@@ -73,6 +73,7 @@ def test_every_command_has_help_with_an_example():
     [
         (["sit"], 'Did you mean "site"?'),
         (["sit"], "Available commands: demo, simulate, site, "),
+        (["compare"], 'Did you mean skyless benchmark ("Compare methods'),
         (["site", "check", "--jso"], "Did you mean --json?"),
         (["site", "check"], "requires an argument"),
         (["site", "new", "x.toml", "--width", "wide", "--depth", "3"], "--width"),

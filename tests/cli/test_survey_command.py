@@ -5,6 +5,7 @@ import json
 import os
 import re
 from errno import ENOSPC
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -76,7 +77,7 @@ def hall(tmp_path_factory):
 def run(capsys, *arguments, code=0):
     assert main(["survey", *map(str, arguments), "--json"]) == code
     out, err = capsys.readouterr()
-    assert err == ""
+    assert err == "".join(f"wrote {name}\n" for flag, name in pairwise(arguments) if flag == "--plot")
     return json.loads(out)
 
 
@@ -288,7 +289,7 @@ def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
         ((), "needs a recording"),
         (
             ("--recording", "{hall}/ranges.csv"),
-            "it should be that of a recording of skyless record, or of one of the formats",
+            'the header is "anchor_a,anchor_b,range_m"; it should be a known table',
         ),
         (("--recording", "{hall}/none.mcap"), "it should be a file, and there is none"),
         (("--recording", "{hall}/pipe"), "a pipe"),

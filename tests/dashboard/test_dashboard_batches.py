@@ -46,7 +46,7 @@ class Dashboard:
             self.live.tick()
 
     def said(self):
-        """Zone events and alarms as published, and the rows of the list."""
+        """Zone events and alarms as published, those without updates, and the rows of the list."""
         events, alarms = [], []
         for topic, payload, _, _ in self.wire.published:
             if topic == topics.zone_event_topic(SITE_ID, SQUARE.id):
@@ -56,7 +56,7 @@ class Dashboard:
                 alarm = msgspec.json.decode(payload, type=AlarmMessage)
                 alarms.append((alarm.rule, alarm.subject, alarm.ended_unix_s is None, round(alarm.unix_s, 1)))
         rows = msgspec.json.decode(self.live.state.new_state(Sent()))["tags"]
-        return events, alarms, sorted((row[0], *row[1:4], row[9], row[15]) for row in rows)
+        return events, list(dict.fromkeys(alarms)), sorted((row[0], *row[1:4], row[9], row[15]) for row in rows)
 
 
 def test_zones_alarms_and_lists_are_those_of_messages():

@@ -34,6 +34,22 @@ def lines(page):
     return page.locator(".alarms li button.name").all_inner_texts()
 
 
+def test_beside_alarms_positions_are_good_and_not_all_is_well(hall):
+    server, visit = hall
+    words = "document.getElementById('condition-words').textContent"
+    first, other = (alarm("silent", tag, "warning", f"{tag} is silent", tags=[tag]) for tag in ("robot", "forklift"))
+    seen = first | {"acknowledged_unix_s": time.time()}
+    for alarms, said in (
+        ([first], "Positions are good; 1 alarm."),
+        ([first, other], "Positions are good; 2 alarms."),
+        ([seen], "Positions are good; 1 acknowledged alarm."),
+        ([seen | {"ended_unix_s": time.time()}], "All is well: nothing speaks against the positions shown."),
+    ):
+        server.alarms = alarms
+        server.send_site_messages()
+        until(visit.page, f"said => {words} === said", said)
+
+
 def test_alarms_are_raised_shown_and_acknowledged(hall):
     server, visit = hall
     page = visit.page

@@ -186,6 +186,21 @@ def test_on_a_phone_the_legend_is_below_the_map(serve, visit):
     assert room["height"] > 150
 
 
+def test_names_that_stand_still_are_moved_or_left_out(hall):
+    drawn = hall[1].page.evaluate(
+        modules(
+            ["map/names"],
+            """const context = document.createElement("canvas").getContext("2d");
+            context.fillText = (words, x, y) => found.push([words, y]);
+            const found = [];
+            names.still.splice(0, Infinity, [90, 90, 110, 110]);
+            for (const words of ["one", "two", "none"]) names.labelIfFree(context, words, 100, [100, 120, 140]);
+            return found;""",
+        )
+    )
+    assert drawn == [["one", 120], ["two", 140]]
+
+
 def test_names_keep_clear_of_each_other_and_of_marks(hall):
     boxes = hall[1].page.evaluate(
         modules(

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.errors import ConfigurationError
 from skyless.research.foreign._tdoa_tables import read_tdoas
+from skyless.research.foreign.formats import format_of
 from skyless.site.tables import read_anchors, read_truth
 
 HEADER = b"t_s,idA,idB,tdoa_m\n"
@@ -19,6 +20,21 @@ HEADER = b"t_s,idA,idB,tdoa_m\n"
 def tdoas(table):
     drops = Counter()
     return list(read_tdoas(io.BytesIO(table), drops)), drops
+
+
+def test_the_names_of_columns_are_ours_or_those_of_the_flights_in_any_order():
+    expected = [PairTdoa(0.5, 1, 2, -0.25)]
+    for table in (b"t_s,anchor_a,anchor_b,tdoa_m\n0.5,1,2,-0.25\n", b"anchor_b,more,t_s,tdoa_m,idA\n2,x,0.5,-0.25,1\n"):
+        assert tdoas(table) == (expected, {})
+
+
+def test_a_table_without_a_column_is_refused_with_the_names_that_are_missing(tmp_path):
+    file = tmp_path / "mine.csv"
+    file.write_text("t_s,anchor_a,anchor_b,tdoa_m\n0.5,1,2,-0.25\n")
+    assert format_of(file).name == "tdoa-table"
+    file.write_text("t_s,anchor_a,to,tdoa\n0.5,1,2,-0.25\n")
+    with pytest.raises(ConfigurationError, match=r"the header is .t_s,.*\(missing: anchor_b, tdoa_m\)"):
+        format_of(file)
 
 
 def test_a_table_with_all_kinds_of_bad_lines():

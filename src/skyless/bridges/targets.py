@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from difflib import get_close_matches
 from importlib import import_module
 from typing import Final, cast
 
@@ -99,7 +100,11 @@ def open_route(text: str, context: BridgeContext) -> Route:
     url = TargetUrl(text)
     kind = TARGET_KINDS.get(url.scheme)
     if kind is None:
-        raise url.wrong(f"one of {', '.join(f'{scheme}:' for scheme in TARGET_KINDS)} as skyless bridge --help shows")
+        near = [scheme for scheme in TARGET_KINDS if scheme.startswith(f"{url.scheme}+")]
+        near = near or get_close_matches(url.scheme, TARGET_KINDS)
+        nearest = f"{' or '.join(f'{scheme}:' for scheme in near)}, if that was meant, or " if near else ""
+        names = ", ".join(f"{scheme}:" for scheme in TARGET_KINDS)
+        raise url.wrong(f"{nearest}one of {names} as skyless bridge --help shows")
     tag = url.tag()
     hz = url.number("hz", kind.hz, 0.1, kind.max_hz)
     module = import_module(f"skyless.bridges.{kind.module}")

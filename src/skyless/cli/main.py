@@ -1,6 +1,7 @@
 """The program ``skyless``: its table of commands, and what all of them share at their start and end."""
 
 import os
+import re
 import signal
 import sys
 import threading
@@ -11,7 +12,7 @@ from io import TextIOWrapper
 from types import FrameType
 from typing import TYPE_CHECKING, Final
 
-from cyclopts import App, CycloptsError, Group, Parameter
+from cyclopts import App, CycloptsError, Group, Parameter, UnknownCommandError
 from cyclopts.help import DefaultFormatter
 
 from skyless.core.errors import SkylessError
@@ -146,7 +147,17 @@ def _line_for_the_user(error: Exception) -> str | None:
         return _trouble(error)
     if isinstance(error, ModuleNotFoundError):
         return what_to_install(error)
-    return " ".join(str(error).split()) if isinstance(error, CycloptsError) else str(error)
+    return f"{' '.join(str(error).split())}{_meant(error)}" if isinstance(error, CycloptsError) else str(error)
+
+
+def _meant(error: CycloptsError) -> str:
+    """The commands that do, by their summaries, what an unknown command is called."""
+    if not isinstance(error, UnknownCommandError) or "Did you mean" in str(error) or not error.unused_tokens:
+        return ""
+    word = error.unused_tokens[0].lower()
+    known = (one for commands in _GROUPS.values() for one in commands)
+    fitting = [f'skyless {name} ("{does}")' for name, _, does in known if word in re.findall(r"[a-z]+", does.lower())]
+    return f" Did you mean {' or '.join(fitting)}?" if fitting else ""
 
 
 @contextmanager

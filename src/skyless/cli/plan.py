@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 app = App(name="plan", help_epilogue="Example: skyless plan hall.toml --method joint --plot hall.png --target 5")
 
 _NOTES: Final = (
-    "Tags are at rest. A moving tag's filter (joint) is less accurate; motion hardly affects the paper's methods "
-    "up to 1 m/s.",
+    "Tags are at rest. A moving tag's filter (joint) is more accurate where survey and ranges have errors, which it "
+    "tells from the position while it moves, else less; motion hardly affects the paper's methods up to 1 m/s.",
     "Stamps' noise and crystals are those of the site file, and the filters know them.",
     "Links are free space on channel 5 with the walls' losses of the site file; people, furniture, reflections and "
     "antennas' patterns are not known to the plan.",

@@ -3,7 +3,7 @@
 import gzip
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from io import BufferedIOBase
 from math import isfinite
 from os import PathLike
@@ -144,20 +144,25 @@ def has_columns(columns: Sequence[str], head: bytes) -> bool:
     return set(columns) <= set(header_of(head))
 
 
-def rows(stream: BufferedIOBase, drops: Drops, columns: Sequence[str]) -> Iterator[list[bytes]]:
+def rows(
+    stream: BufferedIOBase, drops: Drops, columns: Sequence[str], names_of: Mapping[str, str] | None = None
+) -> Iterator[list[bytes]]:
     """Yield the wanted columns of each row, in the wanted order; rows of another width are counted.
+
+    ``names_of``: what columns with other names are called among those that are wanted.
 
     A stream whose first line lacks one of the columns yields nothing, and that is counted too.
     """
     source = lines(stream, drops)
-    names = header_of(next(source, b""))
+    given = header_of(next(source, b""))
+    names = [(names_of or {}).get(name, name) for name in given]
     if not set(columns) <= set(names):
         drops["header-without-the-columns"] += 1
         return
     positions = [names.index(column) for column in columns]
     width = len(names)
     in_order = positions == list(range(width))
-    first = names[0].encode()
+    first = given[0].encode()
     for line in source:
         fields = line.split(b",")
         if len(fields) != width:

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -32,6 +32,12 @@ from skyless.site.planning.report import AfterMetre, Verification, described, pl
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+
+_WALKING: Final = (
+    "become more accurate in seconds to minutes: while a tag moves, joint tells errors of survey and ranges from its "
+    "position, and at rest it cannot; skyless simulate shows it"
+)
 
 
 class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
@@ -107,6 +113,8 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
             f"mean {cm(found['mean_sigma_m'])}, median {cm(found['median_sigma_m'])}, "
             f"95 % {cm(found['p95_sigma_m'])}, worst {cm(found['worst_sigma_m'])}{where}",
         )
+        if found["method"] in FILTERS and not self.site.accuracy.is_exact:
+            yield "tags that walk", _WALKING
         if found["walls_bias"]:
             rmse = f"RMSE mean {cm(found['mean_rmse_m'])}, worst {cm(found['worst_rmse_m'])}"
             yield "with the walls' delays", rmse

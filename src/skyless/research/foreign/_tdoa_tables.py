@@ -1,7 +1,7 @@
 """Tables whose rows are time differences of two anchors: ready ones, and MILUV's stamps of exchanges."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from io import BufferedIOBase
 from math import dist, isfinite
@@ -18,10 +18,11 @@ from skyless.core.ticks import difference
 from skyless.research.foreign._crazyflie import heights_of, in_order
 from skyless.site.tables import Truth
 
-# Tables of TDoAs: ``t_s,idA,idB,tdoa_m`` with tdoa_m = |p − b| − |p − a|, as the UTIL flights and Crazyflie logs.
+# Tables of TDoAs with tdoa_m = |p − b| − |p − a|: by the names of ``PairTdoa``, or those of the UTIL flights and logs.
 
-TDOA_COLUMNS: Final = ("t_s", "idA", "idB", "tdoa_m")
-
+TDOA_COLUMNS: Final = ("t_s", "anchor_a", "anchor_b", "tdoa_m")
+FLIGHT_COLUMNS: Final = ("t_s", "idA", "idB", "tdoa_m")
+_OUR_NAMES: Final = {"idA": "anchor_a", "idB": "anchor_b"}
 
 UTIL_COLUMNS: Final = ("t_tdoa", "idA", "idB", "tdoa_meas")
 """The same in UTIL's own tables, which have the columns of other sensors, of other lengths, beside them."""
@@ -29,16 +30,17 @@ UTIL_COLUMNS: Final = ("t_tdoa", "idA", "idB", "tdoa_meas")
 _POSE_COLUMNS: Final = ("t_pose", "pose_x", "pose_y", "pose_z", "pose_qx", "pose_qy", "pose_qz", "pose_qw")
 
 
-def read_tdoas(
-    stream: BufferedIOBase, drops: Drops, columns: tuple[str, str, str, str] = TDOA_COLUMNS
-) -> Iterator[PairTdoa]:
-    """Yield the TDoAs of a table, in its own time."""
-    for time, a, b, tdoa in rows(stream, drops, columns):
+def read_tdoas(stream: BufferedIOBase, drops: Drops, columns: Sequence[str] = TDOA_COLUMNS) -> Iterator[PairTdoa]:
+    """Yield the TDoAs of a table, in its own time.
+
+    Rows of UTIL's tables without any of them are those of other sensors, and not counted.
+    """
+    for time, a, b, tdoa in rows(stream, drops, [_OUR_NAMES.get(name, name) for name in columns], _OUR_NAMES):
         try:
             time_s, anchor_a, anchor_b, tdoa_m = float(time), _identifier(a), _identifier(b), float(tdoa)
         except ValueError:
             given = [bool(field.strip()) for field in (time, a, b, tdoa)]
-            if any(given) or columns is TDOA_COLUMNS:
+            if any(given) or columns is not UTIL_COLUMNS:
                 drops["malformed-number" if all(given) else "blank-field"] += 1
             continue
         if not (isfinite(time_s) and isfinite(tdoa_m)):
@@ -47,6 +49,11 @@ def read_tdoas(
             drops["anchor-against-itself"] += 1
         else:
             yield PairTdoa(time_s, anchor_a, anchor_b, tdoa_m)
+
+
+def recognise_tdoas(head: bytes) -> bool:
+    """Whether it is a table of TDoAs, by either names of its columns."""
+    return has_columns(TDOA_COLUMNS, head) or has_columns(FLIGHT_COLUMNS, head)
 
 
 def _identifier(text: bytes) -> int:

@@ -14,7 +14,7 @@ from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arrays import Array
 from skyless.core.constants import TICK_BITS
 from skyless.core.errors import ConfigurationError
-from skyless.core.input_files import Drops, has_columns, open_source, read_head
+from skyless.core.input_files import Drops, has_columns, header_of, open_source, read_head
 from skyless.radio.foreign import bitcraze, fira
 from skyless.research.foreign import _bitcraze_captures as bitcraze_captures
 from skyless.research.foreign import _crazyflie as crazyflie
@@ -107,8 +107,8 @@ FORMATS: Final = (
     ),
     Format(
         "tdoa-table",
-        "Table t_s,idA,idB,tdoa_m",
-        partial(has_columns, tdoa_tables.TDOA_COLUMNS),
+        "Table t_s,anchor_a,anchor_b,tdoa_m, or with idA and idB",
+        tdoa_tables.recognise_tdoas,
         tdoa_tables.read_tdoas,
         None,
     ),
@@ -234,6 +234,10 @@ def open_recording(
     return Recording(chosen, fspath(path), read(stream, drops), stream, drops)
 
 
+_TABLES: Final = (tdoa_tables.TDOA_COLUMNS, tdoa_tables.UTIL_COLUMNS, avalue.RECEPTION_COLUMNS, starloc.COLUMNS)
+"""Columns that people may have meant where a table has others; of equals the first."""
+_HEADER: Final = re.compile(r"[A-Za-z_][\w. ]*(,[ \w.]+)+")
+
 _MCAP: Final = b"\x89MCAP0"
 
 
@@ -265,6 +269,12 @@ def _recognised(path: str | PathLike[str]) -> Format:
     if has_columns(avalue.BLINK_COLUMNS, head):
         expected = "ccp.csv of the same system: what tags send up to anchors cannot be replayed as a tag's receptions"
         raise ConfigurationError(path, "the format", "tag blinks", expected)
+    header = head.partition(b"\n")[0].decode("ascii", "replace").strip()
+    if _HEADER.fullmatch(header):
+        meant = max(_TABLES, key=lambda columns: len({*columns} & {*header_of(head)}) / len(columns))
+        missing = ", ".join(name for name in meant if name not in header_of(head))
+        right = f"a known table's, such as {','.join(meant)} (missing: {missing}); formats: {_names()}"
+        raise ConfigurationError(path, "the header", header[:80], right)
     start = head[:24].decode("ascii", "backslashreplace")
     raise ConfigurationError(path, "the beginning", start, f"that of a recording {_readable()}")
 

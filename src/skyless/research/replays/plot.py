@@ -48,12 +48,14 @@ def _height(axes: Axes, rows: Matrix, judged: Matrix) -> None:
 
 
 def _over_time(axes: Axes, time_s: Vector, errors: Matrix, std_m: Matrix, *, known: bool) -> None:
-    """Errors of x and y, or of z, before the largest σ of them."""
+    """Errors of x and y, or of z, and the largest σ of them."""
     names = "xy" if errors.shape[1] == 2 else "z"
-    widest_m = std_m.max(axis=1)
-    axes.fill_between(time_s, -widest_m, widest_m, color="black", alpha=0.15, linewidth=0.0, label="± stated σ")
     for axis, name in enumerate(names):
         axes.plot(time_s, errors[:, axis], linewidth=0.7, label=name)
+    for sign in (1.0, -1.0):
+        axes.plot(
+            time_s, sign * std_m.max(axis=1), color="black", linewidth=0.8, label="± stated σ" if sign > 0 else None
+        )
     axes.set(xlabel="time in s", ylabel=_label(known=known), title=f"{' and '.join(names)} over time")
     axes.legend()
 

@@ -96,6 +96,8 @@ class _Case(Struct):
     since_s: float
     known_s: float
     """When it was last known whether the condition holds."""
+    begin_s: float | None = None
+    """When it first held; pauses that have not ended the alarm do not change it."""
     worst: float | None = None
     """As of ``AlarmMessage``."""
 
@@ -247,6 +249,7 @@ class AlarmEngine:
                 continue
             is_new, since_s = message.subject not in own.cases, message.since_unix_s - self._unix_offset_s
             case = own.cases.setdefault(message.subject, _Case(True, since_s, now_s))
+            case.begin_s = since_s
             unstated = math.inf if message.kind == "protection-level" else None  # JSON has no infinity
             case.add(message.kind, unstated if message.worst is None else message.worst)
             if is_new and message.kind == "silent":
@@ -397,8 +400,8 @@ class AlarmEngine:
         message = self.messages.get((rule.id, subject))
         is_active = self.leading and message is not None and message.ended_unix_s is None
         if case.holds:
-            since_s = message.since_unix_s - self._unix_offset_s if message and is_active else case.since_s
-            case.add(rule.kind, self._value(own, subject, now_s - since_s))
+            case.begin_s = case.since_s if case.begin_s is None else case.begin_s
+            case.add(rule.kind, self._value(own, subject, now_s - case.begin_s))
         if message is not None and is_active:
             if own.is_on is False or (not case.holds and now_s - case.since_s >= rule.clear_after_s):
                 sentence = self._sentence(own, subject, case.worst, "ended") or message.sentence
@@ -499,6 +502,8 @@ class AlarmEngine:
     def _sentence(self, own: _Rule, subject: str, worst: float | None, what: What) -> str:
         """Empty where nothing is known any more."""
         rule, limit, zone = own.rule, own.rule.limit or 0.0, self._zone_name(own.rule.zone)
+        if worst is None and what != "raised" and rule.kind not in ("protection-level", "anchor-moved"):
+            return ""
         who = " and ".join(map(self._who, subject.split("~")))
         anchor, was = subject.replace("-", " ", 1), what != "raised"
         value, least, most = worst or 0.0, " at the least" if was else "", " at the most" if was else ""
