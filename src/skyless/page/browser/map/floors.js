@@ -53,6 +53,16 @@ export function chosenFloor() {
   return state.options.floor === null ? undefined : floors()[state.options.floor];
 }
 
+/** Name of the floor at a height; empty at a site without floors. */
+export function floorNameAt(z_m) {
+  const list = floors();
+  return list[Math.max(indexAt(list, z_m), 0)]?.name ?? "";
+}
+
+function indexAt(list, z_m) {
+  return list.findLastIndex(({ low_m }) => (z_m || 0) >= low_m - 0.1);
+}
+
 /** Height of the chosen floor's ground; 0 while all are shown. */
 export function groundHeight() {
   return chosenFloor()?.low_m ?? 0;
@@ -65,7 +75,6 @@ export function otherFloor() {
   if (!list[chosen]) return () => false;
   return (z_m, number) => {
     if (number !== undefined && list[chosen].number !== undefined) return number !== list[chosen].number;
-    const index = list.findLastIndex(({ low_m }) => (z_m || 0) >= low_m - 0.1);
-    return Math.max(index, 0) !== chosen;
+    return Math.max(indexAt(list, z_m), 0) !== chosen;
   };
 }

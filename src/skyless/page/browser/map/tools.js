@@ -1,9 +1,10 @@
 /** The map's buttons, and the bar with help while a zone is drawn. */
 
-import { changed, on } from "../store.js";
-import { byId, text } from "../dom.js";
+import { changed, on, state } from "../store.js";
+import { byId, h, text } from "../dom.js";
 import { picking, stopPicking } from "../survey/picking.js";
 import { moving, setMoving } from "../survey/plan.js";
+import { chooseFloor, floors } from "./floors.js";
 import { begin, cancel, editor, finish, undoPoint } from "./editor.js";
 import { start as startFollow } from "./follow.js";
 import { fitAll, redraw, showSpatial } from "./map.js";
@@ -24,10 +25,22 @@ export function start() {
   click("picking-cancel", () => (picking ? stopPicking() : setMoving(false)));
   on(["editor"], show);
   on(["picking", "plan"], showPicking);
+  on(["site", "options"], showFloors);
   on(["mode"], () => {
     byId("draw").disabled = view.spatial || document.body.classList.contains("replaying");
     if (editor.drawing) cancel();
   });
+}
+
+/** A button for each floor, the highest first, and one for all. */
+function showFloors() {
+  const list = floors().map(({ name }, index) => [name, index]);
+  byId("floor-buttons").hidden = list.length < 2;
+  const buttons = [["All floors", null], ...list].reverse().map(([name, index]) => {
+    const chosen = state.options.floor === index;
+    return h("button", { type: "button", "aria-pressed": String(chosen), onclick: () => chooseFloor(index) }, name);
+  });
+  byId("floor-buttons").replaceChildren(...buttons);
 }
 
 /** Begin a zone; from the keyboard, with a cursor in the middle of the map. */

@@ -9,6 +9,7 @@ import { h, offer, options, text } from "../dom.js";
 import { DASH, bytes, duration, length, metres, number } from "../format.js";
 import { tagHistory } from "../history.js";
 import { filtering, passes } from "../map/filter.js";
+import { floorNameAt, floors } from "../map/floors.js";
 import { tagMark, tagStyle } from "../map/marks.js";
 import { inside } from "../map/zones.js";
 import {
@@ -60,6 +61,7 @@ const HEADS = {
   Age: "Time since the last fix",
   Latency: "From the end of a frame to its fix, half of them",
   Method: "How positions are computed",
+  Floor: "The floor that its height says",
 };
 /** With more tags than this, or with assets, there is a search field and a choice of groups and zones. */
 const SEARCHED = 12;
@@ -121,6 +123,7 @@ export function show() {
   if (list.length > MANY && key === shown.key && now - shown.at < MANY_MS) return;
   shown = { key, at: now };
   parts.table.element.classList.toggle("no-truth", !state.simulated);
+  parts.table.element.classList.toggle("no-floors", floors().length < 2);
   parts.table.element.classList.toggle("named", state.assets.size > 0);
   const items = list.map((track, index) => [track.name, { track, style: tagStyle(index, list.length, track.name) }]);
   const found = filtering() ? items.filter(([name, { track }]) => passes(name, stateOf(track))) : items;
@@ -175,6 +178,7 @@ function describe(name, { track, style: look }) {
       duration(age_s(track), 1),
       duration(health?.latency_p50_s),
       health ? methodWords(health) : DASH,
+      floorNameAt(row[Z]) || DASH,
     ],
   };
 }
