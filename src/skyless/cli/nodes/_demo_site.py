@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from skyless.cli.common.options import make_folder
 from skyless.cli.nodes._demo_figures import DemoFigures
-from skyless.cli.nodes._demo_story import MOVED, furnished, kept_messages
+from skyless.cli.nodes._demo_story import MOVED, furnished, kept_messages, survey_record
 from skyless.cli.nodes._site_view import SiteView
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, site_named
 from skyless.core.arguments import Method, Picoseconds, Positive, Seed, TagCount, tag_count, whole
@@ -44,6 +44,7 @@ from skyless.run.process import (
 from skyless.sim.evaluation.request import ProtectionOptions
 from skyless.sim.lab import lab_site
 from skyless.site.file.template import site_template
+from skyless.site.survey.result import encode_record, record_path
 
 _HOST: Final = "127.0.0.1"
 _PAGE_PORT: Final = 8080
@@ -120,6 +121,8 @@ class WholeSite:
             self._site_name = str(self._own_file)
             self._own_file.write_text(site_template(furnished(lab) if self._has_story else lab), encoding="utf-8")
         self.site = site_named(self._site_name)
+        if self._has_story:
+            record_path(self._site_name).write_bytes(encode_record(survey_record(self.site)))
         self._number = "--site-id", str(self.site.id)
         check_live(self.site, asked.method)
         if asked.boards and self.site.schedule.mode != "free":
@@ -242,6 +245,7 @@ class WholeSite:
             max_acceleration=asked.max_acceleration_mps2,
         )
         anchors = [str(anchor.id) for anchor in self.site.anchors]
+        known = site if self._has_story else ()
         programs = [
             Program("ether", ether),
             *(
@@ -260,7 +264,7 @@ class WholeSite:
                 Program(f"tag {tag}", ("tag", tag, "--radio", f"serial:{port}", "--from-board", *mqtt))
                 for tag, port in self.boards.items()
             ),
-            Program("survey", ("survey", "--serve", *mqtt, *self._number), start_after_s=_SURVEY_DELAY_S),
+            Program("survey", ("survey", "--serve", *mqtt, *self._number, *known), start_after_s=_SURVEY_DELAY_S),
         ]
         if self.recording is not None:
             limit = ("--limit-mb", _RECORDING_LIMIT_MB)

@@ -1,5 +1,7 @@
 """What the demo's own site has besides walking tags: a plan, zones, names, a rule, a georeference, a moved anchor."""
 
+from itertools import combinations
+from math import dist
 from pathlib import Path
 from typing import Final
 
@@ -11,6 +13,8 @@ from skyless.core.site import FloorPlanSite, GeoreferenceSite, Site
 from skyless.run.mqtt.messages import Asset, AssetsMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import assets_topic, zones_topic
 from skyless.site.file.template import rectangle
+from skyless.site.survey.facts import PairRange, PairRanges
+from skyless.site.survey.result import Survey, SurveyedAnchor, SurveyRecord
 
 _NAME: Final = "Workshop"
 _PLAN: Final = Path(__file__).with_name("demo_plan.png")
@@ -39,6 +43,18 @@ def furnished(lab: Site) -> Site:
         georeference=GeoreferenceSite(52.5163, 13.3777, height_m=35.0, heading_deg=20.0),
         alarms=(_RULE,),
     )
+
+
+def survey_record(site: Site) -> SurveyRecord:
+    """The survey that has hung its anchors, without errors: with its ranges the watch need not learn what is usual."""
+    pairs = tuple(
+        PairRange(a.id, b.id, dist((a.x_m, a.y_m, a.z_m), (b.x_m, b.y_m, b.z_m)), std_m=0.005, exchanges=1000)
+        for a, b in combinations(site.anchors, 2)
+    )
+    anchors = tuple(SurveyedAnchor(one.id, True, one.x_m, one.y_m, one.z_m) for one in site.anchors)
+    ranges = PairRanges(pairs, tuple(one.id for one in site.anchors))
+    survey = Survey(anchors, (), 0.01, len(pairs) - 2 * len(anchors) + 3, None, (), (), (), "", None, ())
+    return SurveyRecord(site.name, site.id, 0.0, ranges, survey, {})
 
 
 def kept_messages(site: Site) -> dict[str, bytes]:
