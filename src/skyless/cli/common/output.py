@@ -4,8 +4,9 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TextIO
+from typing import TYPE_CHECKING, Final, Literal, TextIO
 
 import msgspec
 
@@ -67,25 +68,70 @@ def print_facts(title: str, facts: Iterable[tuple[str, str]]) -> None:
     console().print(table)
 
 
-WIDEST: Final = 220
-"""Columns of a table that goes to a file or a program."""
+_COLUMNS: Final = 100
+"""Width of a table that goes to a file or a program."""
+
+_FRAME: Final = 3
+"""Characters between two columns."""
+
+_LONGEST_WORD: Final = 40
+"""Longer words of a table, such as paths, are broken where it would be too wide."""
 
 
-def print_table(title: str, heads: Iterable[str], rows: Iterable[Iterable[str]], *, figures: bool = False) -> None:
-    """Show a table. ``figures``: it is of numbers, which stand on the right; columns without a name hold words."""
+def print_table(
+    title: str, heads: Iterable[str], rows: Iterable[Iterable[str]], *, figures: bool = False, caption: str = ""
+) -> None:
+    """Show a table that fits the screen: heads are wrapped, and columns that are too many make further tables.
+
+    Each of these begins with the first column. ``figures``: it is of numbers, which are never wrapped and stand on the
+    right, but for the first column and columns without a name, which hold words or belong to the one before.
+    """
     from rich.markup import escape
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=escape(title))
-    for head in heads:
-        table.add_column(head, justify="right" if figures and head else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*map(Text, row))
+    named, lines = list(heads), [list(row) for row in rows]
     out = console()
     if not out.is_terminal:
-        out.width = WIDEST
-    out.print(table)
+        out.width = _COLUMNS
+    columns = [(head, *(line[number] for line in lines)) for number, head in enumerate(named)]
+    wraps = sum(max(map(len, column)) + _FRAME for column in columns) >= out.width
+    widths = [_least_width(*column, whole=figures and column[0] != "") for column in columns]
+    parts = list(_parts(named, widths, out.width)) if wraps else [range(len(named))]
+    for part in parts:
+        table = Table(title=escape(title) if part is parts[0] else None)
+        table.caption = escape(caption) if caption and part is parts[-1] else None
+        for column in part:
+            justify: Literal["left", "right"] = "right" if figures and column and named[column] else "left"
+            width = widths[column] if wraps and figures else None
+            table.add_column(named[column], justify=justify, overflow="fold", width=width)
+        for line in lines:
+            table.add_row(*(Text(line[column]) for column in part))
+        out.print(table)
+
+
+def _least_width(head: str, *cells: str, whole: bool) -> int:
+    """Characters that a column needs where words are wrapped; ``whole``: those of its head only."""
+    if whole:
+        return max(map(len, (*head.split(), *cells)))
+    return min(max((len(word) for text in (head, *cells) for word in text.split()), default=0), _LONGEST_WORD)
+
+
+def _parts(heads: list[str], widths: list[int], most: int) -> Iterator[list[int]]:
+    """The columns of each part of a table that is ``most`` wide; those without a name stay with the one before."""
+    starts = [column for column, head in enumerate(heads) if head and column] + [len(heads)]
+    part = list(range(starts[0]))
+    first, used = list(part), sum(widths[column] + _FRAME for column in part) + 1
+    begin = used
+    for start, end in pairwise(starts):
+        group = range(start, end)
+        width = sum(widths[column] + _FRAME for column in group)
+        if used + width > most and len(part) > len(first):
+            yield part
+            part, used = list(first), begin
+        part += group
+        used += width
+    yield part
 
 
 def print_warnings(warnings: Iterable[str]) -> None:
