@@ -144,8 +144,7 @@ def print_rows(result: "StudyResult") -> None:
     caption = "RMSE, 95 %, max and σ: 2-D where the tags' height is given, else 3-D" if "95 %" in heads else ""
     rows = ([line[column] for column in used] for line in cells)
     print_table(result.title(), heads, rows, figures=True, caption=caption)
-    for line in _LEGENDS.get(result.name, _OF_ERRORS):
-        console().print(line)
+    console().print(" ".join(_LEGENDS.get(result.name, _OF_ERRORS)))
 
 
 def _limit(row: "Row") -> str:

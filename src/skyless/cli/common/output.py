@@ -74,63 +74,49 @@ _COLUMNS: Final = 100
 _FRAME: Final = 3
 """Characters between two columns."""
 
-_LONGEST_WORD: Final = 40
-"""Longer words of a table, such as paths, are broken where it would be too wide."""
-
 
 def print_table(
     title: str, heads: Iterable[str], rows: Iterable[Iterable[str]], *, figures: bool = False, caption: str = ""
 ) -> None:
-    """Show a table that fits the screen: heads are wrapped, and columns that are too many make further tables.
+    """Show a table that fits the screen, with a caption below it.
 
-    Each of these begins with the first column. ``figures``: it is of numbers, which are never wrapped and stand on the
-    right, but for the first column and columns without a name, which hold words or belong to the one before.
+    ``figures``: it is of numbers, which are never wrapped and stand on the right, but for the first column and columns
+    without a name, which hold words or belong to the one before. What is too wide is continued in further tables, which
+    begin with the first column.
     """
     from rich.markup import escape
     from rich.table import Table
     from rich.text import Text
 
-    named, lines = list(heads), [list(row) for row in rows]
+    columns = list(zip(heads, *rows, strict=True))
     out = console()
     if not out.is_terminal:
         out.width = _COLUMNS
-    columns = [(head, *(line[number] for line in lines)) for number, head in enumerate(named)]
-    wraps = sum(max(map(len, column)) + _FRAME for column in columns) >= out.width
-    widths = [_least_width(*column, whole=figures and column[0] != "") for column in columns]
-    parts = list(_parts(named, widths, out.width)) if wraps else [range(len(named))]
+    wraps = figures and sum(max(map(len, column)) + _FRAME for column in columns) >= out.width
+    widths = [max(map(len, (*head.split(), *cells))) for head, *cells in columns]
+    parts = list(_parts([head for head, *_ in columns], widths, out.width)) if wraps else [[*range(len(columns))]]
     for part in parts:
         table = Table(title=escape(title) if part is parts[0] else None)
         table.caption = escape(caption) if caption and part is parts[-1] else None
         for column in part:
-            justify: Literal["left", "right"] = "right" if figures and column and named[column] else "left"
-            width = widths[column] if wraps and figures else None
-            table.add_column(named[column], justify=justify, overflow="fold", width=width)
-        for line in lines:
-            table.add_row(*(Text(line[column]) for column in part))
+            head = columns[column][0]
+            justify: Literal["left", "right"] = "right" if figures and column and head else "left"
+            table.add_column(head, justify=justify, overflow="fold", width=widths[column] if wraps else None)
+        for line in zip(*(columns[column][1:] for column in part), strict=True):
+            table.add_row(*map(Text, line))
         out.print(table)
-
-
-def _least_width(head: str, *cells: str, whole: bool) -> int:
-    """Characters that a column needs where words are wrapped; ``whole``: those of its head only."""
-    if whole:
-        return max(map(len, (*head.split(), *cells)))
-    return min(max((len(word) for text in (head, *cells) for word in text.split()), default=0), _LONGEST_WORD)
 
 
 def _parts(heads: list[str], widths: list[int], most: int) -> Iterator[list[int]]:
     """The columns of each part of a table that is ``most`` wide; those without a name stay with the one before."""
-    starts = [column for column, head in enumerate(heads) if head and column] + [len(heads)]
-    part = list(range(starts[0]))
-    first, used = list(part), sum(widths[column] + _FRAME for column in part) + 1
-    begin = used
-    for start, end in pairwise(starts):
-        group = range(start, end)
-        width = sum(widths[column] + _FRAME for column in group)
-        if used + width > most and len(part) > len(first):
+    starts = [0, *(column for column, head in enumerate(heads) if head and column), len(heads)]
+    first, *others = (list(range(*ends)) for ends in pairwise(starts))
+    part = first
+    for group in others:
+        if part != first and sum(widths[column] + _FRAME for column in part + group) >= most:
             yield part
-            part, used = list(first), begin
-        part += group
-        used += width
+            part = first
+        part = part + group
     yield part
 
 

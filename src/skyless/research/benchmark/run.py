@@ -112,13 +112,12 @@ def with_best(results: Sequence[Result]) -> Iterator[Result]:
     yield from results
     simple = [one for one in results if one.method in {PLAIN, *SIMPLE} and one.figures and one.figures.rmse_2d_m]
     for recording in dict.fromkeys(one.recording for one in simple):
-        best = min((one for one in simple if one.recording == recording), key=_error_m)
-        yield structs.replace(best, method=BEST, drawn=())
-
-
-def _error_m(result: Result) -> float:
-    assert result.figures is not None
-    return result.figures.rmse_3d_m or result.figures.rmse_2d_m or np.inf
+        errors_m = {
+            one.figures.rmse_3d_m or one.figures.rmse_2d_m or np.inf: one
+            for one in simple
+            if one.recording == recording and one.figures
+        }
+        yield structs.replace(errors_m[min(errors_m)], method=BEST, drawn=())
 
 
 def _kept(file: Path) -> tuple[Result, ...] | None:

@@ -9,13 +9,10 @@ from skyless.core.arrays import Array, Vector
 from skyless.core.fix import Fix
 
 _STEP: Final = 0.2
-"""Share of a difference's error that a step takes away; between 0.1 and 0.3 errors of a walk hardly differ."""
+"""Share of a difference's error that a step takes away."""
 
-_WINDOW: Final = 30
-"""Differences that are fitted at a time."""
-_BETWEEN: Final = 10
-"""Differences from one fit to the next."""
-_ITERATIONS: Final = 5
+_WINDOW, _BETWEEN, _ITERATIONS = 30, 10, 5
+"""Differences that are fitted at a time, those from one fit to the next, and iterations of each."""
 
 
 class Gradient:
@@ -43,10 +40,7 @@ class LeastSquares:
 
     def hear(self, observation: PairTdoa) -> Fix | None:
         """Process one time difference; see ``OwnEstimator``."""
-        a_m, b_m = observation.a_m, observation.b_m
-        assert a_m is not None
-        assert b_m is not None
-        self._rows.append((*a_m, *b_m, observation.tdoa_m))
+        self._rows.append((*(observation.a_m or ()), *(observation.b_m or ()), observation.tdoa_m))
         if len(self._rows) < _WINDOW:
             return None
         rows = np.array(self._rows)
