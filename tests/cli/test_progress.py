@@ -1,4 +1,4 @@
-"""The progress bar: on a terminal when the work is long, nowhere else."""
+"""Progress of long work: a bar on a terminal, a line now and then in a pipe."""
 
 import os
 import pty
@@ -52,8 +52,11 @@ def test_short_work_on_a_terminal():
     assert on_terminal(WORK.format(patience=60)) == ""
 
 
-def test_never_in_a_pipe():
+@pytest.mark.parametrize(("every_s", "written"), [(5.0, b""), (0.0, b"replaying: 33%\nreplaying: 67%\n")])
+def test_lines_in_a_pipe(every_s, written):
+    """One every few seconds, so none of short work, and none once all is done."""
     environment = {**os.environ, "FORCE_COLOR": "1"}
-    code = WORK.format(patience=0)
+    code = WORK.format(patience=0).replace("progress._HIDDEN_S", f"progress._LINE_S = {every_s}; progress._HIDDEN_S")
+    code = code.replace("range(4)", "(1, 2, 3)")
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, env=environment)
-    assert done.stdout + done.stderr == b""
+    assert (done.stdout, done.stderr) == (b"", written)

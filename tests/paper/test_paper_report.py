@@ -16,7 +16,15 @@ from skyless.research.paper.plan import Plan
 pytestmark = pytest.mark.statistical
 
 TINY = Plan(
-    seed=3, quick=True, fixes=600, noises_ps=(50.0, 100.0, 150.0), laps=1, fleet_sizes=(1, 3), rate_s=1.0, draws=20_000
+    seed=3,
+    quick=True,
+    fixes=600,
+    fewer_fixes=600,
+    noises_ps=(50.0, 100.0, 150.0),
+    laps=1,
+    fleet_sizes=(1, 3),
+    rate_s=1.0,
+    draws=20_000,
 )
 VOID = {"meta", "link", "br", "img", "input", "hr"}
 NO_CLOSING_NEEDED = {"path", "use", "rect", "image", "defs"}

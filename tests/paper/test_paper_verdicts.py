@@ -102,6 +102,7 @@ def test_scaling_holds_only_if_nothing_changes():
     assert scale.judge([one, replace(many, fewest_fixes_per_s=200.0)])[0] is CORRECTED
     assert scale.judge([one, replace(many, first_tag="other")])[0] is FAILS
     assert scale.judge([one, replace(many, frames_per_s=500.0)])[0] is FAILS
+    assert scale.judge([one, replace(many, fewest_heard_per_s=300.0)])[0] is FAILS
 
 
 def test_the_largest_of_many_round_errors_is_that_of_the_rayleigh_law():
@@ -156,7 +157,7 @@ def test_antenna_delays_move_the_least_squares_by_the_normal_equations():
 
 def test_the_command_beside_a_figure_makes_its_number_again():
     """Several methods and tags in one world hear what ``skyless simulate`` lets one tag hear."""
-    tracks = static.run_world("noise", 9, 60)
+    tracks = static.run_world("noise", 9, 60, 60)
     fleet = fleet_of(Request(paper_lab_site(), method="literal", seed=9, noise_ps=100.0, positions_m=(P1,), fixes=60))
     for _ in fleet.run(3.2):
         pass

@@ -61,11 +61,18 @@ def test_figures_are_those_of_the_fixes(folder, tmp_path, capsys):
     options = [ARM, "--out", str(out), "--calibrate-on", "trial1", "--estimator", f"{tmp_path / 'own.py'}:Middle"]
     assert main(["benchmark", str(folder), *options, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
-    methods = ["joint", "joint-smoothed", "gate", "bitcraze", "Middle", "joint-calibrated"]
+    simple = ["gate", "gradient", "least-squares"]
+    methods = ["joint", "joint-smoothed", *simple, "bitcraze", "Middle", "joint-calibrated", "best simple"]
     assert sorted(row["method"] for row in told["methods"]) == sorted(methods)
-    assert "Stanford" in (out / "index.html").read_text()
+    page = (out / "index.html").read_text()
+    assert "Stanford" in page
+    assert "by others" not in page
     with (out / "results.csv").open() as file:
         rows = {(row["recording"], row["method"]): row for row in csv.DictReader(file)}
+    errors_m = {key: float(row["rmse_3d_m"]) for key, row in rows.items()}
+    for trial in ("flights/const1/trial1_tdoa", "flights/const1/trial2_tdoa"):
+        assert errors_m[trial, "best simple"] == min(errors_m[trial, method] for method in simple)
+        assert max(errors_m[trial, method] for method in simple) < 0.5
     flight = folder / "flights" / "const1" / "trial1"
     fixes = tmp_path / "fixes.csv"
     given = ["--anchors", folder / "flights" / "anchors_const1.csv", "--truth", f"{flight}_pose.csv.gz", ARM]

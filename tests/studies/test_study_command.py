@@ -63,7 +63,7 @@ def test_people_get_a_table(run):
 def test_the_study_of_levels_tells_how_often_they_mislead(run):
     code, out, err = run("integrity", "--episodes", "1", "--integrity-risk", "0.01", "--processes", "1")
     assert (code, err) == (0, "")
-    for words in ("misleading", "HPL in cm", "room, ramp to 0.5 m", "all faults", "0.01 held", "in 10⁻⁴"):
+    for words in ("misleading", "HPL", "room, ramp to 0.5 m", "all faults", "0.01 held", "in 10⁻⁴"):
         assert words in out
 
 
@@ -73,19 +73,16 @@ def test_the_study_of_the_room_tells_levels_and_what_is_missed(run, tmp_path):
     code, out, err = run("room", *small, "--json", "--out", "folder")
     assert (code, err, out.count("\n")) == (0, "", 1)
     rows = json.loads(out)["rows"]
-    assert len(rows) == 52
+    assert len(rows) == 8
     first = rows[0]
     assert (first["case"], first["method"], first["runs"]) == ("the room", "joint", 2)
     assert {limit["figure"] for limit in first["limits"]} == {"rmse_m", "nees", "level", "exceeded", "hpl_m", "ratio"}
     assert first["passed"] == (not first["missed"])
     assert 0.024 < first["bound_m"] < 0.035
-    for row in [row for row in rows if row["fixes"]]:
+    for row in rows:
         assert 0.0 <= row["level"] <= 1.0
         assert (row["exceeded"] is None) == (row["level"] == 0.0)
         assert row["said_m"] > 0.0
-    without = [row for row in rows if not row["fixes"]]
-    assert {row["case"] for row in without} <= {"anchors in a line"}  # where no start is better than a wrong one
-    assert all(row["passed"] for row in without)
     with (tmp_path / "folder" / "room.csv").open(newline="") as file:
         table = list(csv.DictReader(file))
     assert table[0]["limits"].split()[:2] == ["rmse_m:..0.03", "nees:0.7..1.3"]
@@ -167,5 +164,7 @@ def test_an_interrupt_leaves_no_file_and_no_traceback(tmp_path):
         way_on = (
             f"the same command with {' '.join(resume)} goes on" if resume else "nothing was written; --resume FOLDER"
         )
-        assert err == b"" or err.startswith(f"stopped; {way_on}".encode())
+        *progress, last = err.decode().splitlines() or [""]
+        assert all(line.startswith("studying loss: ") for line in progress)
+        assert last.startswith(("studying loss: ", f"stopped; {way_on}")) or not last
         assert not (tmp_path / "out").exists()

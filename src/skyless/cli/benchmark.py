@@ -59,13 +59,13 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) 
 
     Finds what skyless replay can read, and beside NAME_tdoa.csv its truth, NAME_pose.csv, and above it the anchors,
     anchors*.csv. Runs joint, joint smoothed and calibrated, a plain filter with a gate, one with Bitcraze's rule of
-    refusing outliers, and estimators of your own. Continues where it was interrupted.
+    refusing outliers, a gradient, least squares, and estimators of your own. Continues where it was interrupted.
     """
     if not folder.is_dir():
         raise SkylessError(f"FOLDER is {str(folder)!r}; it should be a folder with recordings")
     from skyless.research.benchmark.page import SUMMARY_HEADS, summary_rows, write
     from skyless.research.benchmark.recordings import recordings_below
-    from skyless.research.benchmark.run import Asked, results_of
+    from skyless.research.benchmark.run import Asked, results_of, with_best
 
     found = [one for one in recordings_below(folder) if asked.only in one.name]
     if not found:
@@ -83,8 +83,10 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) 
     how = Asked(asked.lever_arm_m, first_s, asked.calibrate_on, estimators, programs, not asked.quick)
     try:
         with progress_bar("replaying") as reach:
-            results = list(results_of(found, how, kept, reach))
-        title = f"{len(found)} recordings" + ("" if first_s is None else f", the first {first_s:g} s of each")
+            results = list(with_best(list(results_of(found, how, kept, reach))))
+        title = f"{len(found)} recording{'s' * (len(found) != 1)}" + (
+            "" if first_s is None else f", the first {first_s:g} s of each"
+        )
         write(asked.out, results, title, shlex.join(["skyless", *sys.argv[1:]]))
     except KeyboardInterrupt:
         print("stopped; the same command continues where it was", file=sys.stderr)
@@ -96,5 +98,5 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) 
         rows = [dict(zip(SUMMARY_HEADS, row, strict=True)) for row in summary]
         print_json({"recordings": len(found), "seconds": first_s, "methods": rows})
         return
-    print_table(title, SUMMARY_HEADS, summary)
+    print_table(title, SUMMARY_HEADS, summary, figures=True)
     console().print(f"{asked.out / 'index.html'}: each recording; results.csv and results.json beside it")

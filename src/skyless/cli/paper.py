@@ -21,7 +21,7 @@ def paper(*, out: Path, seed: Seed = 1, quick: bool = False, output: JsonOptions
     """Reproduce every figure and claim of the paper, and judge which hold.
 
     Writes report.html, which needs no other file, every picture as PNG and SVG, and numbers.json. The full report takes
-    some minutes on two cores.
+    some minutes on two cores: at most 360 s of CPU time, and 600 MB of memory.
 
     Parameters
     ----------

@@ -13,19 +13,15 @@ from msgspec.structs import replace
 
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.common.options import JsonOptions, check_picture, command
-from skyless.cli.common.output import WIDEST, console, print_json, say_written, to_json
+from skyless.cli.common.output import console, print_json, print_table, say_written, to_json
 from skyless.cli.common.progress import progress_bar, status
 from skyless.core.arguments import Rule, folder_to_write
 from skyless.core.errors import SkylessError
 from skyless.core.whole_files import write_whole
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from skyless.cli.api.study import StudyResult
     from skyless.research.studies.common.plan import Row
-
-"""Columns of a table that is not shown on a terminal."""
 
 _OF_ERRORS: Final = (
     "Simulated. ± standard errors. NEES: per dimension, with the interval where 99 % of honest ones lie.",
@@ -143,29 +139,13 @@ def _csv(rows: "Sequence[Row]") -> str:
 
 def print_rows(result: "StudyResult") -> None:
     """Show the rows as a table."""
-    out = console()
-    if not out.is_terminal:
-        out.width = WIDEST
-    out.print(_table(result))
-    for line in _LEGENDS.get(result.name, _OF_ERRORS):
-        out.print(line)
-
-
-def _table(result: "StudyResult") -> "Table":
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-
-    table = Table(box=SIMPLE_HEAD, title=result.title())
     cells = [[cell(row) for _, cell in _COLUMNS] for row in result.rows]
     used = [column for column in range(len(_COLUMNS)) if any(line[column] for line in cells)]
     heads = [_COLUMNS[column][0] for column in used]
-    if "95 %" in heads:
-        table.caption = "RMSE, 95 %, max and σ: 2-D where the tags' height is given, else 3-D"
-    for column, head in enumerate(heads):
-        table.add_column(head, justify="right" if column else "left")
-    for line in cells:
-        table.add_row(*(line[column] for column in used))
-    return table
+    caption = "RMSE, 95 %, max and σ: 2-D where the tags' height is given, else 3-D" if "95 %" in heads else ""
+    rows = ([line[column] for column in used] for line in cells)
+    print_table(result.title(), heads, rows, figures=True, caption=caption)
+    console().print(" ".join(_LEGENDS.get(result.name, _OF_ERRORS)))
 
 
 def _limit(row: "Row") -> str:

@@ -4,8 +4,9 @@ import os
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TextIO
+from typing import TYPE_CHECKING, Final, Literal, TextIO
 
 import msgspec
 
@@ -67,25 +68,56 @@ def print_facts(title: str, facts: Iterable[tuple[str, str]]) -> None:
     console().print(table)
 
 
-WIDEST: Final = 220
-"""Columns of a table that goes to a file or a program."""
+_COLUMNS: Final = 100
+"""Width of a table that goes to a file or a program."""
+
+_FRAME: Final = 3
+"""Characters between two columns."""
 
 
-def print_table(title: str, heads: Iterable[str], rows: Iterable[Iterable[str]], *, figures: bool = False) -> None:
-    """Show a table. ``figures``: it is of numbers, which stand on the right; columns without a name hold words."""
+def print_table(
+    title: str, heads: Iterable[str], rows: Iterable[Iterable[str]], *, figures: bool = False, caption: str = ""
+) -> None:
+    """Show a table that fits the screen, with a caption below it.
+
+    ``figures``: it is of numbers, which are never wrapped and stand on the right, but for the first column and columns
+    without a name, which hold words or belong to the one before. What is too wide is continued in further tables, which
+    begin with the first column.
+    """
     from rich.markup import escape
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(title=escape(title))
-    for head in heads:
-        table.add_column(head, justify="right" if figures and head else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*map(Text, row))
+    columns = list(zip(heads, *rows, strict=True))
     out = console()
     if not out.is_terminal:
-        out.width = WIDEST
-    out.print(table)
+        out.width = _COLUMNS
+    wraps = figures and sum(max(map(len, column)) + _FRAME for column in columns) >= out.width
+    widths = [max(map(len, (*head.split(), *cells))) for head, *cells in columns]
+    parts = list(_parts([head for head, *_ in columns], widths, out.width)) if wraps else [[*range(len(columns))]]
+    for part in parts:
+        table = Table(title=escape(title) if part is parts[0] else None)
+        table.caption = escape(caption) if caption and part is parts[-1] else None
+        for column in part:
+            head = columns[column][0]
+            justify: Literal["left", "right"] = "right" if figures and column and head else "left"
+            table.add_column(head, justify=justify, overflow="fold", width=widths[column] if wraps else None)
+        for line in zip(*(columns[column][1:] for column in part), strict=True):
+            table.add_row(*map(Text, line))
+        out.print(table)
+
+
+def _parts(heads: list[str], widths: list[int], most: int) -> Iterator[list[int]]:
+    """The columns of each part of a table that is ``most`` wide; those without a name stay with the one before."""
+    starts = [0, *(column for column, head in enumerate(heads) if head and column), len(heads)]
+    first, *others = (list(range(*ends)) for ends in pairwise(starts))
+    part = first
+    for group in others:
+        if part != first and sum(widths[column] + _FRAME for column in part + group) >= most:
+            yield part
+            part = first
+        part = part + group
+    yield part
 
 
 def print_warnings(warnings: Iterable[str]) -> None:

@@ -1,4 +1,4 @@
-"""Progress of long work: a bar for people only, never in a pipe, never on short work."""
+"""Progress of long work, never of short work: a bar for people, a line now and then for a pipe or a file."""
 
 import sys
 import time
@@ -9,16 +9,17 @@ from typing import Any, Final
 _HIDDEN_S: Final = 1.5
 _REDRAW_S: Final = 0.1
 _STATUS_S: Final = 0.5
+_LINE_S: Final = 5.0
 
 
 @contextmanager
 def progress_bar(description: str, total: float = 1.0) -> Iterator[Callable[[float], None]]:
-    """A bar on standard error, which appears when the work in the block turns out to be long.
+    """A bar on standard error, which appears when the work in the block turns out to be long; in a pipe lines.
 
     What it gives says how much of the total is done; it is cheap enough to be called for every chunk of work.
     """
     if sys.stderr is None or not sys.stderr.isatty():
-        yield lambda _: None
+        yield _lines(description, total)
         return
     from rich.console import Console
     from rich.progress import Progress
@@ -39,6 +40,19 @@ def progress_bar(description: str, total: float = 1.0) -> Iterator[Callable[[flo
     finally:
         if progress.live.is_started:
             progress.stop()
+
+
+def _lines(description: str, total: float) -> Callable[[float], None]:
+    """Write a line on standard error every few seconds."""
+    next_s = time.monotonic() + _LINE_S
+
+    def reach(done: float) -> None:
+        nonlocal next_s
+        if time.monotonic() >= next_s and done < total and sys.stderr is not None:
+            next_s = time.monotonic() + _LINE_S
+            print(f"{description}: {done / total:.0%}", file=sys.stderr, flush=True)
+
+    return reach
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from msgspec import structs
 
 from skyless.core.arrays import Matrix
 from skyless.core.whole_files import replace_files
-from skyless.research.benchmark.run import JOINT, PLAIN, Result
+from skyless.research.benchmark.run import BEST, JOINT, PLAIN, Result
 from skyless.sim.evaluation.figures import Figures
 from skyless.site.report.figures import panel, picture, report_style
 from skyless.site.report.report_page import bullets, page, svg_figure, table
@@ -31,7 +31,7 @@ _NUMBERS: Final = tuple(
 )
 _TRIPLES: Final = ("median_m", "std_m", "rmse_axes_m", "bias_m")
 _DIVERGED_M: Final = 1.0
-"""A plain filter with a larger error has lost the tag: no ratio is made with it."""
+"""What has a larger error has lost the tag: no ratio to it is made."""
 
 
 def write(folder: Path, results: Sequence[Result], title: str, command: str) -> None:
@@ -56,12 +56,12 @@ def _csv_row(result: Result) -> list[object]:
     return [result.recording, result.method, result.reason, *(getattr(found, name) for name in _NUMBERS), *triples]
 
 
-def ratios(results: Sequence[Result], method: str) -> dict[str, float | int]:
-    """Geometric means of a method's errors over the plain filter's, of recordings that both were judged on."""
-    plain = {one.recording: one.figures for one in results if one.method == PLAIN and one.figures is not None}
+def ratios(results: Sequence[Result], method: str, other_method: str = PLAIN) -> dict[str, float | int]:
+    """Geometric means of a method's errors over another's, of recordings that both were judged on."""
+    others = {one.recording: one.figures for one in results if one.method == other_method and one.figures is not None}
     found: dict[str, list[float]] = defaultdict(list)
     for one in results:
-        other = plain.get(one.recording)
+        other = others.get(one.recording)
         if one.method == method and one.figures is not None and other is not None:
             for name in ("rmse_2d_m", "rmse_3d_m"):
                 mine_m, its_m = getattr(one.figures, name), getattr(other, name)
@@ -72,23 +72,26 @@ def ratios(results: Sequence[Result], method: str) -> dict[str, float | int]:
 
 
 def summary_rows(results: Sequence[Result]) -> Iterator[tuple[str, ...]]:
-    """One line for each method: ratios to the plain filter, NEES, and levels exceeded."""
+    """One line for each method: ratios to the plain filter and to the best simple one, NEES, and levels exceeded."""
     for method in dict.fromkeys(one.method for one in results):
-        ratio = ratios(results, method)
+        found = [ratios(results, method, other) for other in (PLAIN, BEST)]
         judged = [one.figures for one in results if one.method == method and one.figures and one.figures.judged]
         nees = [one.nees for one in judged if one.nees is not None]
         exceeded = (sum(getattr(one, f"exceeded_{way}") for one in judged) for way in ("horizontal", "vertical"))
         yield (
             method,
             f"{len(judged)}",
-            *(_number(ratio.get(name), ".3f") for name in ("rmse_2d_m", "rmse_3d_m")),
+            *(_number(ratio.get(name), ".3f") for ratio in found for name in ("rmse_2d_m", "rmse_3d_m")),
             f"{np.median(nees):.2f} ({min(nees):.2f} to {max(nees):.2f})" if nees else "–",
             f"{sum(one.levels for one in judged)}",
             ", ".join(map(str, exceeded)),
         )
 
 
-SUMMARY_HEADS: Final = ("method", "recordings", "2-D / gate", "3-D / gate", "NEES", "levels", "exceeded h, v")
+SUMMARY_HEADS: Final = (
+    *("method", "recordings", "2-D / gate", "3-D / gate", "2-D / best simple", "3-D / best simple"),
+    *("NEES", "levels", "exceeded h, v"),
+)
 
 
 def _page(results: Sequence[Result], title: str, command: str) -> str:
@@ -98,14 +101,15 @@ def _page(results: Sequence[Result], title: str, command: str) -> str:
     failed = [f"{one.recording}, {one.method}: {one.reason}" for one in results if one.figures is None]
     rows = [_row(one) for one in results if one.figures is not None]
     parts = [
-        f"<header><h1>{escape(title)}</h1>\n<p>Recordings were made by others; fixes are of methods as they stand. "
+        f"<header><h1>{escape(title)}</h1>\n<p>Fixes are of methods as they stand. "
         "Figures are defined in <code>docs/recordings.md</code>; lengths in metres. Made by "
         f"<code>{escape(command)}</code>; the same figures are in <code>results.csv</code> and "
         "<code>results.json</code>.</p></header>",
         "<section><h2>Methods</h2>",
         table(SUMMARY_HEADS, summary_rows(results)),
         "<p class='note'>Ratios are geometric means of RMSE over that of the plain filter with a gate (gate), "
-        "of recordings where that is below 1 m.</p>"
+        "and over that of the best of it, gradient and least squares on each recording (best simple), of recordings "
+        "where that is below 1 m.</p>"
         "</section><section><h2>Recordings</h2>",
         table(_HEADS, rows),
         "</section>",

@@ -17,6 +17,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.whole_files import write_whole
 from skyless.research.benchmark.plain import BITCRAZE, GATE, plain_track
 from skyless.research.benchmark.recordings import Found
+from skyless.research.benchmark.simple import Gradient, LeastSquares
 from skyless.research.calibration.biases import biases_of, tdoas_of
 from skyless.research.calibration.options import SurveyOptions
 from skyless.research.foreign.formats import open_recording
@@ -32,6 +33,9 @@ from skyless.site.survey.anchor_errors import DifferenceCalibration
 
 JOINT, SMOOTHED, CALIBRATED, PLAIN, BITCRAZE_RULE = "joint", "joint-smoothed", "joint-calibrated", "gate", "bitcraze"
 RULES: Final = {PLAIN: GATE, BITCRAZE_RULE: BITCRAZE}
+SIMPLE: Final = {"gradient": Gradient, "least-squares": LeastSquares}
+BEST: Final = "best simple"
+"""The best of ``PLAIN`` and ``SIMPLE`` on each recording, known afterwards."""
 
 DRAWN: Final = 600
 """Fixes of a recording that its pictures show."""
@@ -75,7 +79,7 @@ def methods_of(found: Found, asked: Asked, calibrated: Collection[Path | None]) 
     yield JOINT
     if found.format == SITE_FORMAT:
         return
-    yield from (*((SMOOTHED,) if asked.smooth else ()), PLAIN, BITCRAZE_RULE)
+    yield from (*((SMOOTHED,) if asked.smooth else ()), PLAIN, BITCRAZE_RULE, *SIMPLE)
     if found.anchors in calibrated and not asked.is_calibrated_on(found):
         yield CALIBRATED
     yield from asked.estimators
@@ -101,6 +105,19 @@ def results_of(
             write_whole(file, msgspec.json.encode(results))
         on_progress((number + 1) / len(cells))
         yield from results
+
+
+def with_best(results: Sequence[Result]) -> Iterator[Result]:
+    """The results, and for each recording that of ``PLAIN`` or ``SIMPLE`` with the smallest error once more."""
+    yield from results
+    simple = [one for one in results if one.method in {PLAIN, *SIMPLE} and one.figures and one.figures.rmse_2d_m]
+    for recording in dict.fromkeys(one.recording for one in simple):
+        errors_m = {
+            one.figures.rmse_3d_m or one.figures.rmse_2d_m or np.inf: one
+            for one in simple
+            if one.recording == recording and one.figures
+        }
+        yield structs.replace(errors_m[min(errors_m)], method=BEST, drawn=())
 
 
 def _kept(file: Path) -> tuple[Result, ...] | None:
@@ -139,7 +156,8 @@ def _results(
     if found.format == SITE_FORMAT:
         yield from _site_results(found)
         return
-    options = structs.replace(_options(found, asked), smooth=method == SMOOTHED, estimator=asked.estimators.get(method))
+    estimator = {**SIMPLE, **asked.estimators}.get(method)
+    options = structs.replace(_options(found, asked), smooth=method == SMOOTHED, estimator=estimator)
     calibration = None
     if method == CALIBRATED:
         assert found.anchors is not None

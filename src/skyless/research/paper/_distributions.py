@@ -6,12 +6,11 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct, structs
-from scipy.stats import norm
 
 from skyless.core.arrays import Array, Integers
 from skyless.research.paper._checks import NOISES, draw_seed, first_number, paper_chain
 from skyless.research.paper.monte_carlo import draw_lambdas
-from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, grouped
+from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, gaussian, grouped
 from skyless.research.studies.common.plan import Cell
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED
 from skyless.site.report.figures import BLUE, INK, RED, panel
@@ -72,7 +71,8 @@ def cells(plan: Plan) -> list[Cell]:
 
 def shape_distance(one: LambdaDistribution) -> float:
     """Share of the draws that lie otherwise than in a Gaussian of the corrected deviation (total variation)."""
-    expected = np.diff(norm.cdf(one.edges_m, scale=one.corrected_std_m))
+    below = [math.erf(edge / (math.sqrt(2.0) * one.corrected_std_m)) / 2.0 for edge in one.edges_m.tolist()]
+    expected = np.diff(below)
     return float(0.5 * np.abs(one.counts / one.draws - expected).sum())
 
 
@@ -147,10 +147,10 @@ def _density(one: LambdaDistribution) -> Panel:
     axes.stairs(density, edges_mm, fill=True, color=BLUE, alpha=0.4, label="draws")
     x = np.linspace(edges_mm[0], edges_mm[-1], 400)
     corrected_mm = 1e3 * one.corrected_std_m
-    axes.plot(x, norm.pdf(x, scale=corrected_mm), color=INK, label=f"corrected, σ = {corrected_mm:.2f} mm")
+    axes.plot(x, gaussian(x, corrected_mm), color=INK, label=f"corrected, σ = {corrected_mm:.2f} mm")
     if one.printed_std_m is not None:
         printed_mm = 1e3 * one.printed_std_m
-        axes.plot(x, norm.pdf(x, scale=printed_mm), "--", color=RED, label=f"as printed, σ = {printed_mm:.2f} mm")
+        axes.plot(x, gaussian(x, printed_mm), "--", color=RED, label=f"as printed, σ = {printed_mm:.2f} mm")
     axes.set(xlabel="error of one DTDoA in mm", ylabel="density in 1/mm", xlim=(-5 * corrected_mm, 5 * corrected_mm))
     axes.set_ylim(0, 1.4 * axes.get_ylim()[1])
     axes.legend(loc="upper left")

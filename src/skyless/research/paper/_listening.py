@@ -1,6 +1,7 @@
 """Tags in the lab's world that compute with several methods from the same receptions."""
 
-from collections.abc import Sequence
+from array import array
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from skyless.sim.evaluation.statistics import FirstFixes
 from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Trajectory
 
+_COLUMNS: Final = 5
 _WARMUP_S: Final = 2.0
 """Fixes before this true time are not judged: the filters settle."""
 
@@ -41,43 +43,49 @@ class _Log:
 
     def __init__(self, site: Site) -> None:
         self._first_fixes = FirstFixes(site, 1)
-        self.rows: list[tuple[float, ...]] = []
+        self._numbers = array("d")
+
+    def __len__(self) -> int:
+        return len(self._numbers) // _COLUMNS
 
     def add(self, time_s: float, fix: Fix, truth_m: Array) -> None:
         if self._first_fixes.is_first(0, time_s):
-            self.rows.append((time_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist()))
+            self._numbers.extend((time_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist()))
 
-    def track(self, most: int | None) -> Track:
-        rows = np.array(self.rows[:most]).reshape(-1, 5)
+    def track(self) -> Track:
+        rows = np.array(self._numbers).reshape(-1, _COLUMNS)
         return Track(rows[:, 0], rows[:, 1:3], rows[:, 3:5])
 
 
 def listen(
     site: Site,
-    trajectories: Sequence[Trajectory],
-    methods: Sequence[str],
+    tags: Sequence[tuple[Trajectory, Mapping[str, int]]],
     impairments: Impairments,
     seed: int,
-    *,
-    fixes: int | None = None,
     until_s: float | None = None,
 ) -> list[dict[str, Track]]:
-    """Run a world until every method of every tag has ``fixes`` fixes, or until ``until_s``.
+    """Run a world until every method of every tag has its fixes, or until ``until_s``.
+
+    ``tags``: how each moves, the methods with which it computes, and how many fixes each of them makes.
 
     Returns for each tag its track by each method. A world gives its first tag the same stamps with and without
     other tags, so ``skyless simulate`` with the same seed reproduces the first tag's figures.
     """
-    world = world_of(site, trajectories, impairments, seed)
+    world = world_of(site, [trajectory for trajectory, _ in tags], impairments, seed)
     superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
-    listeners = [[(Receiver(method), _Log(site)) for method in methods] for _ in trajectories]
-    end_s = until_s if until_s is not None else _WARMUP_S + 1.02 * (fixes or 0) * superframe_s + 1.0
+    listeners = [[(Receiver(method), _Log(site), most) for method, most in methods.items()] for _, methods in tags]
+    most_fixes = max(most for _, methods in tags for most in methods.values())
+    end_s = until_s if until_s is not None else _WARMUP_S + 1.02 * most_fixes * superframe_s + 1.0
     now_s = 0.0
-    while now_s < end_s and (fixes is None or any(len(log.rows) < fixes for pairs in listeners for _, log in pairs)):
+    while now_s < end_s and any(len(log) < most for own in listeners for _, log, most in own):
         now_s = min(now_s + 0.5, end_s)
         for broadcast in world.run(now_s):
             for tag, reception, truth_m in broadcast.receptions():
-                for receiver, log in listeners[tag]:
-                    fix = receiver.hear(reception)
+                for receiver, log, most in listeners[tag]:
+                    fix = receiver.hear(reception) if len(log) < most else None
                     if fix is not None and broadcast.end_s >= _WARMUP_S:
                         log.add(broadcast.end_s, fix, truth_m)
-    return [{method: log.track(fixes) for method, (_, log) in zip(methods, pairs, strict=True)} for pairs in listeners]
+    return [
+        {method: log.track() for method, (_, log, _) in zip(methods, own, strict=True)}
+        for (_, methods), own in zip(tags, listeners, strict=True)
+    ]

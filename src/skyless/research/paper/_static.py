@@ -7,7 +7,6 @@ import numpy as np
 from matplotlib.lines import Line2D
 from msgspec import Struct
 from msgspec.structs import replace
-from scipy.stats import kurtosis, norm, skew
 
 from skyless.core.arrays import Array
 from skyless.core.constants import TICK_M
@@ -15,6 +14,7 @@ from skyless.research.paper._listening import Track, listen
 from skyless.research.paper.plan import (
     CLAIM_M,
     P1,
+    P1_METHODS,
     P2,
     RADIO_PS,
     Panel,
@@ -23,6 +23,7 @@ from skyless.research.paper.plan import (
     Results,
     Section,
     Verdict,
+    gaussian,
     grouped,
 )
 from skyless.research.studies.common.plan import Cell
@@ -64,17 +65,22 @@ class Moments(Struct, frozen=True):
 
 def cells(plan: Plan) -> list[Cell]:
     """One world for each kind of stamp error, a tag at each position."""
-    weight_s = plan.fixes * 1e-3
+    fixes, few = {name: plan.fixes if name == "noise" else plan.fewer_fixes for name in _WORLDS}, plan.fewer_fixes
     return [
-        Cell(f"static/{name}", partial(run_world, name=name, seed=plan.seed, fixes=plan.fixes), weight_s)
-        for name in _WORLDS
+        Cell(f"static/{name}", partial(run_world, name, plan.seed, count, few), count * 2e-3)
+        for name, count in fixes.items()
     ]
 
 
-def run_world(name: str, seed: int, fixes: int) -> list[dict[str, Track]]:
-    """Two tags at rest that compute with ``_METHODS``."""
-    paths = [Static(*point) for point in _POSITIONS.values()]
-    return listen(paper_lab_site(RADIO_PS), paths, _METHODS, biased_impairments(name, seed), seed, fixes=fixes)
+def run_world(name: str, seed: int, fixes: int, fewer_fixes: int) -> list[dict[str, Track]]:
+    """Two tags at rest that compute with ``_METHODS``.
+
+    Without biases the first one also computes ``fewer_fixes`` by the other methods of figure 9.
+    """
+    usual = dict.fromkeys(_METHODS, fixes)
+    methods = dict.fromkeys(P1_METHODS, fewer_fixes) | usual if name == "noise" else usual
+    tags = [(Static(*P1), methods), (Static(*P2), usual)]
+    return listen(paper_lab_site(RADIO_PS), tags, biased_impairments(name, seed), seed)
 
 
 def biased_impairments(name: str, seed: int) -> Impairments:
@@ -122,13 +128,15 @@ def moments_of(error_m: Array) -> Moments:
     """Moments of a run of errors, shape (n,); the mean's standard error is from batches, as neighbours correlate."""
     batches = error_m[: len(error_m) // _BATCHES * _BATCHES].reshape(_BATCHES, -1).mean(axis=1)
     standard_error_m = float(batches.std(ddof=1)) / _BATCHES**0.5
+    mean_m, std_m = float(error_m.mean()), float(error_m.std())
+    scaled = (error_m - mean_m) / std_m
     return Moments(
         len(error_m),
-        float(error_m.mean()),
+        mean_m,
         standard_error_m,
-        float(error_m.std()),
-        float(skew(error_m)),
-        float(kurtosis(error_m)),
+        std_m,
+        float((scaled**3).mean()),
+        float((scaled**4).mean()) - 3.0,
     )
 
 
@@ -167,7 +175,7 @@ def section(plan: Plan, results: Results) -> Section:
     literal = {name: [m for point in _POSITIONS for m in moments[name, point, "literal"]] for name in _WORLDS}
     verdict, reason = judge(literal["noise"], literal["power"] + literal["delay"])
     panels = [
-        _histogram(point, axis, tracks)
+        _histogram(point, axis, {method: tracks[method] for method in _METHODS})
         for point, tracks in zip(_POSITIONS, worlds["noise"], strict=True)
         for axis in range(2)
     ]
@@ -218,9 +226,10 @@ def section(plan: Plan, results: Results) -> Section:
         ),
         simulated=(
             f"{grouped(plan.fixes)} fixes at P1 (3, 4) and at P2 (1.2, 1.6), one per superframe, stamp noise "
-            f"{RADIO_PS:g} ps: once with nothing but noise, once with the DW1000's range bias by received power on "
-            f"every RX stamp (APS011), once with antenna delays wrong by {100 * _DELAY_STD_M:g} cm (standard "
-            "deviation, assumed) for TX and RX of every anchor. Both methods compute from the same receptions."
+            f"{RADIO_PS:g} ps with nothing but noise; {grouped(plan.fewer_fixes)} with the DW1000's range bias by "
+            f"received power on every RX stamp (APS011), and as many with antenna delays wrong by "
+            f"{100 * _DELAY_STD_M:g} cm (standard deviation, assumed) for TX and RX of every anchor. Both methods "
+            "compute from the same receptions."
         ),
         verdict=verdict,
         reason=reason,
@@ -242,7 +251,7 @@ def _histogram(point: str, axis: int, tracks: dict[str, Track]) -> Panel:
         colour = METHOD_COLOURS[method]
         axes.hist(error_cm, edges.tolist(), density=True, histtype="stepfilled", color=colour, alpha=0.35)
         label = f"{method}: mean {error_cm.mean():+.2f}, σ {error_cm.std():.2f} cm".replace("-", "−")
-        axes.plot(edges, norm.pdf(edges, error_cm.mean(), error_cm.std()), color=colour, label=label)
+        axes.plot(edges, gaussian(edges, error_cm.std(), error_cm.mean()), color=colour, label=label)
     axes.set(xlabel=f"error along {name.upper()} in cm", ylabel="density in 1/cm")
     axes.set_ylim(0, 1.45 * axes.get_ylim()[1])
     axes.legend(loc="upper left")

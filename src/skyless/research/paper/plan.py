@@ -4,8 +4,11 @@ from collections.abc import Mapping
 from enum import StrEnum
 from typing import Any, Final
 
+import numpy as np
 from matplotlib.figure import Figure
 from msgspec import Struct
+
+from skyless.core.arrays import Array
 
 Point = tuple[float, float]
 
@@ -25,6 +28,9 @@ DW1000_PS: Final = (100.0, 150.0)
 CLAIM_M: Final = 0.20
 """The paper's bound on the position error."""
 
+P1_METHODS: Final = ("literal", "weighted", "bracketed", "joint")
+"""What the tag at P1 computes with: figure 4 shows some of them, figure 9 all."""
+
 Results = Mapping[str, Any]
 """What the tasks returned, by their names."""
 
@@ -35,9 +41,11 @@ class Plan(Struct, frozen=True):
     seed: int
     quick: bool = False
     fixes: int = 30_000
-    """Fixes, one per superframe, at each static position."""
+    """Fixes, one per superframe, at each static position with the usual stamps."""
+    fewer_fixes: int = 3_000
+    """Fixes with stamps of other noises, with biased ones, or by methods that figure 4 does not show."""
     noises_ps: tuple[float, ...] = (5.2, PAPER_PS, 50.0, RADIO_PS, 150.0, 200.0, 300.0, 500.0)
-    laps: int = 20
+    laps: int = 12
     """Rounds of the walking test."""
     fleet_sizes: tuple[int, ...] = (1, 10, 100, 1_000, 10_000)
     rate_s: float = 10.0
@@ -54,6 +62,7 @@ def plan_of(seed: int, *, quick: bool) -> Plan:
         seed,
         quick,
         fixes=1_200,
+        fewer_fixes=1_200,
         noises_ps=(PAPER_PS, 50.0, RADIO_PS, 200.0, 500.0),
         laps=2,
         fleet_sizes=(1, 10, 100),
@@ -98,6 +107,12 @@ class Section(Struct, frozen=True):
     """The same and more for programs, SI units in the names."""
     command: str
     """A command that reproduces the central number."""
+
+
+def gaussian(values: Array, std: float, mean: float = 0.0) -> Array:
+    """Density of a Gaussian at some values."""
+    density: Array = np.exp(-0.5 * ((values - mean) / std) ** 2) / (std * np.sqrt(2.0 * np.pi))
+    return density
 
 
 def grouped(count: int) -> str:

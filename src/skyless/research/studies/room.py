@@ -106,7 +106,6 @@ _LONG_WORLDS: Final = 2
 _REST_SPANS: Final = 8
 _WALK_SPANS: Final = 4
 """Tags at rest: spans of rest, of which the last is judged, and of walking before. A span is what other cases judge."""
-_QUICK_SPANS: Final = 2
 
 TURNS_MPS2: Final = (3.0, 6.0, 10.0, 30.0)
 _TURNING_MPS: Final = 3.0
@@ -128,9 +127,10 @@ Paths = Callable[[int], Sequence[Trajectory]]
 
 
 def cases(plan: Plan) -> list[Case]:
-    """The room, and what differs from it in one thing."""
+    """The room, and what differs from it in one thing; of a quick study the first case of each series."""
     changes = (*_crystals(plan), *_power_cuts(plan), *_turns(plan))
-    return [*_rooms(plan), *_rests(plan), *_errors(plan), *_fields(plan), *_obstacles(plan), *_late(plan), *changes]
+    each = [*_rooms(plan), *_rests(plan), *_errors(plan), *_fields(plan), *_obstacles(plan), *_late(plan), *changes]
+    return list({case.series: case for case in reversed(each)}.values())[::-1] if plan.quick else each
 
 
 def _case(
@@ -188,13 +188,9 @@ def _rooms(plan: Plan) -> list[Case]:
     ]
 
 
-def _spans_s(plan: Plan, spans: int) -> float:
-    return min(spans, _QUICK_SPANS if plan.quick else spans) * plan.seconds
-
-
 def _rests(plan: Plan) -> list[Case]:
     """Tags that lie still from the start on: judged at first, and a second time when they have lain for long."""
-    later_s = _WARMUP_S + _spans_s(plan, _REST_SPANS) - plan.seconds
+    later_s = _WARMUP_S + (_REST_SPANS - 1) * plan.seconds
     limits = (Limit("nees", most=2.0), _exceeded(0.0))
     found = []
     for name, site, room in (
@@ -258,7 +254,7 @@ def _fields(plan: Plan) -> list[Case]:
             *(Limit("rmse_m", most=most_m), Limit("nees", most=2.0), _exceeded(1e-3)),
             room=Room(ranges=replace(Room().ranges, changing_m=std_m, correlation_m=_FIELD_LENGTH_M)),
             long=True,
-            warmup_s=_spans_s(plan, _WALK_SPANS),
+            warmup_s=_WALK_SPANS * plan.seconds,
         )
         for std_m, most_m in _FIELDS_M
     ]
@@ -285,7 +281,7 @@ def _late(plan: Plan) -> list[Case]:
                 limits = () if count == 1 else (_exceeded(1e-3),)
                 late = partial(late_anchors, plan, count, span_m, from_s, to_s)
                 found.append(_case(plan, name, "late anchors", *limits, biases=late))
-    for creep_s in _CREEPS_S[: 1 if plan.quick else None]:
+    for creep_s in _CREEPS_S:
         name, long = f"1 of 6 creeps 5 cm/s for {creep_s:.0f} s", creep_s > plan.seconds
         late = partial(creeping_anchor, plan, creep_s)
         seconds = max(plan.seconds, creep_s)

@@ -39,6 +39,8 @@ class Plan(Struct, frozen=True):
 
 _QUICK_PLAN: Final = Plan(worlds=6, seconds=10.0, tags=2, episodes=200)
 
+_QUICK_PLANS: Final = {"room": replace(_QUICK_PLAN, worlds=3, seconds=5.0)}
+
 _USUAL: Final = {
     "room": Plan(worlds=20, seconds=15.0, tags=5),
     "large": Plan(worlds=24, seconds=30.0),
@@ -51,7 +53,7 @@ _USUAL: Final = {
 
 def plan_of(method: str, seed: int, *, study: str = "", quick: bool = False, **given: Any) -> Plan:  # noqa: ANN401 - of Plan
     """The usual amounts, or with ``quick`` few, where none are given."""
-    usual = _QUICK_PLAN if quick else _USUAL.get(study, Plan())
+    usual = _QUICK_PLANS.get(study, _QUICK_PLAN) if quick else _USUAL.get(study, Plan())
     known = {name: value for name, value in given.items() if value is not None}
     return replace(usual, method=method, seed=seed, quick=quick, **known)
 
