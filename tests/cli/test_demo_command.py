@@ -11,6 +11,7 @@ import socket
 import subprocess
 import sys
 import time
+import urllib.request
 from pathlib import Path
 
 import pytest
@@ -159,7 +160,7 @@ def test_json_also_where_ports_are_taken_and_nothing_can_be_written_at_home(tmp_
 
 
 def test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated_and_a_tag_is_a_board(tmp_path):
-    demo = Demo(tmp_path, "--tags", "2", "--boards", "1")
+    demo = Demo(tmp_path, "--plain", "--tags", "2", "--boards", "1")
     demo.wait_until_it_runs(tags=2)
     time.sleep(3.0)  # errors count from a second after the first fix, rates between two reports of health
     code, out = demo.end(signal.SIGTERM)
@@ -174,7 +175,8 @@ def test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated_a
     assert re.search(r"^board     tag2 computes by itself \(emulated\), at /", out, re.MULTILINE)
     assert "error/cm" in rows[0]
     assert not any("…" in row for row in rows)
-    assert re.search(r"2 tags \(1 of them on emulated boards\), \d+ messages in \d+\.\d s: RMSE", out.splitlines()[-1])
+    assert re.search(r"2 tags \(1 of them on emulated boards\), \d+ messages in \d+\.\d s: RMSE", out.splitlines()[-2])
+    assert out.splitlines()[-1] == "gone with this demo: names and zones; --history FOLDER keeps them"
     assert len(list((tmp_path / "skyless" / "recordings").glob("*.mcap"))) == 1
 
 
@@ -295,3 +297,37 @@ def test_a_mistake_is_told_in_one_line(capsys, arguments, said):
     assert err.startswith("skyless: ")
     assert err.count("\n") == 1
     assert said in err
+
+
+def ask(page, path, body=None):
+    """A question to the page's server, or something for it to keep."""
+    request = urllib.request.Request(page + path, body, {"Origin": page}, method="GET" if body is None else "PUT")
+    with urllib.request.urlopen(request, timeout=START_S) as answer:
+        return json.loads(answer.read() or "null")
+
+
+def test_the_demo_has_zones_names_a_rule_and_a_place_on_the_earth_for_other_tools(tmp_path):
+    demo = Demo(tmp_path, "--json", "--history", str(tmp_path / "history"))
+    demo.wait_until_it_runs()
+    page, broker = (re.search(rf"{word}://127.0.0.1:\d+", demo.said)[0] for word in ("http", "mqtt"))
+    demo.wait_for(lambda: ask(page, "/api/v1/alarms")["alarms"])
+    (alarm,) = ask(page, "/api/v1/alarms")["alarms"]
+    assert alarm["sentence"].startswith(("Ada (tag3) is in Robot cell", "Ada (tag3) was in Robot cell"))
+    assert [asset["name"] for asset in ask(page, "/api/v1/assets")["assets"]] == ["Trolley", "Forklift", "Ada"]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reader:
+        reader.settimeout(START_S)
+        reader.bind(("127.0.0.1", 0))
+        bridge = ["bridge", f"nmea+udp://127.0.0.1:{reader.getsockname()[1]}", "--mqtt", broker]
+        running = subprocess.Popen([*COMMAND[:-1], *bridge])
+        assert reader.recv(1000).startswith(b"$GN")
+        running.terminate()
+        running.wait(START_S)
+    zones = json.dumps({"zones": [{"id": "own", "name": "Own", "polygon_m": [[0, 0], [1, 0], [1, 1]]}]})
+    ask(page, "/api/zones", zones.encode())
+    _, out = demo.end(signal.SIGINT)
+    again = Demo(tmp_path, "--json", "--history", str(tmp_path / "history"))
+    again.wait_until_it_runs()
+    page = re.search(r"http://127.0.0.1:\d+", again.said)[0]
+    assert [zone["id"] for zone in ask(page, "/api/v1/zones")["zones"]] == ["own"]
+    again.end(signal.SIGINT)
+    assert "gone with this demo" not in demo.said + again.said + out

@@ -77,6 +77,7 @@ class Child:
             code = await self._run_once()
             if self._is_asked:
                 self._is_asked = False
+                self.starts -= 1
                 continue
             how = f"signal {-code}" if code < 0 else f"exit code {code}"
             ended = f"{self.program.name} ended ({how}); {self._last_message()}"

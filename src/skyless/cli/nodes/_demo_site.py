@@ -30,7 +30,7 @@ from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import EtherHealth, StatusMessage, WrongMessageError, read_message
-from skyless.run.mqtt.topics import site_topic, status_topic, survey_topic, watch_topic
+from skyless.run.mqtt.topics import alarm_topic, site_topic, status_topic, survey_topic, watch_topic
 from skyless.run.process import (
     Log,
     data_folder,
@@ -46,6 +46,7 @@ from skyless.sim.lab import lab_site
 from skyless.site.file.template import site_template
 from skyless.site.survey.result import encode_record, record_path
 
+_NAME: Final = "demo"
 _HOST: Final = "127.0.0.1"
 _PAGE_PORT: Final = 8080
 _TAGS_PER_PROCESS: Final = 25
@@ -188,19 +189,22 @@ class WholeSite:
     async def _run_with(self, address: MqttAddress, broker: Broker | None) -> None:
         self.address = address
         story = kept_messages(self.site) if self._has_story else {}
+        whole = self._run_programs(address, story, is_new=broker is not None and not self.keeps)
+        if broker is None or self.keeps:
+            own = story if broker is None else {}
+            whole = outlasting(_cleared_at_the_end(address, self.site.id, own, self._log), whole)
+        await (whole if broker is None else outlasting(self._keep(broker), whole))  # they publish their end to it
+
+    async def _run_programs(self, address: MqttAddress, story: Mapping[str, bytes], *, is_new: bool) -> None:
         if story:
-            await _place(address, story, is_new=broker is not None and not self.keeps)
-        link = Link(address, "demo", site=self.site.id, kind="watch")
+            await _place(address, story, is_new=is_new)
+        link = Link(address, _NAME, site=self.site.id, kind="watch")
         self.view = SiteView(link, self.site.id, used_share=ProcessorUse().share)
         self.figures.follow(self.view)
         self.view.on_health.append(self._on_health)
         self.children = [Child(program, self._log) for program in self._programs(address)]
         self.ready.set()
-        nodes = outlasting(link.run(), together(*(child.run() for child in self.children)))  # its end is published
-        if broker is None or self.keeps:
-            own = story if broker is None else {}
-            nodes = outlasting(_cleared_at_the_end(address, self.site.id, own, self._log), nodes)
-        await (nodes if broker is None else outlasting(self._keep(broker), nodes))  # they publish their end to it
+        await outlasting(link.run(), together(*(child.run() for child in self.children)))  # its end is published
 
     def _on_health(self, health: Health) -> None:
         """Lower the rate of the own site's beacons where the emulated air does not keep up with them."""
@@ -334,13 +338,16 @@ async def _clear_retained(address: MqttAddress, site: int, own: Mapping[str, byt
 
     def note(topic: str, payload: bytes) -> None:
         with contextlib.suppress(WrongMessageError):  # of another program than the demo's
-            kept = topic in own and payload != own[topic]
-            if payload and not kept and not (topic.endswith("/status") and read_message(payload, StatusMessage).online):
+            is_changed = topic in own and payload != own[topic]
+            is_online = topic.endswith("/status") and read_message(payload, StatusMessage).online
+            # The demo itself has ended, although a busy broker may not have heard so in time.
+            if payload and not is_changed and (not is_online or topic == status_topic(site, "watch", _NAME)):
                 left.add(topic)
 
     who = Introduction("", _KEEPALIVE_S)
     connection = await open_connection(address, address.tls_context(), who, Reactions(message=note))
     topics = (site_topic(site), survey_topic(site), watch_topic(site), status_topic(site, "+", "+"), *own)
+    topics += (alarm_topic(site, "+", "+"),) if own else ()
     connection.subscribe(dict.fromkeys(topics, 1))
     await asyncio.sleep(_CLEAR_S)
     for topic in left:

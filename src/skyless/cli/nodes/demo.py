@@ -53,7 +53,7 @@ def demo(*, asked: DemoOptions, output: JsonOptions) -> None:
         console().print(stage.drawn(stage.picture))
     console().print(sentence(summary), soft_wrap=True)
     if gone := stage.whole.gone:
-        console().print(f"gone with this demo: {gone}; with --history FOLDER they are there the next time")
+        console().print(f"gone with this demo: {gone}; --history FOLDER keeps them", soft_wrap=True)
 
 
 class _Stage:
