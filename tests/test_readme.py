@@ -11,6 +11,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from recordings import live_site
 from skyless.cli.main import main, program
@@ -335,6 +336,19 @@ def test_the_example_runs(capsys):
     assert abs(x - 3.0) < 0.15
     assert abs(y - 4.0) < 0.15
     assert z == 0.0
+
+
+def test_its_picture_has_the_tabs_of_the_page():
+    """Those that a site without a master has; ``docs/pictures/page.py`` has written what it saw into the picture."""
+    browser = ROOT / "src" / "skyless" / "page" / "browser"
+    code = (browser / "tabs.js").read_text("utf-8")
+    folders = dict(re.findall(r'import \* as (\w+) from "(\./\w+/\w+\.js)"', code))
+    names = re.findall(r"\w+", re.search(r"const GROUPS = (.*?);", code, re.DOTALL)[1])
+    texts = {name: (browser / folders[name]).read_text("utf-8") for name in names}
+    titles = [re.search(r'export const title = "(.+)"', text)[1] for text in texts.values() if "isIdle" not in text]
+    for theme in ("light", "dark"):
+        with Image.open(ROOT / "docs" / "pictures" / f"page_{theme}.webp") as picture:
+            assert picture.getexif()[0x010E] == ", ".join(titles)
 
 
 def test_its_links_lead_somewhere():

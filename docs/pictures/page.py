@@ -1,6 +1,7 @@
-"""The animation of the page at the top of the README: ``.venv/bin/python docs/pictures/make.py page``.
+"""The pictures of the page in the README: ``.venv/bin/python docs/pictures/make.py page``.
 
-Runs the demo, opens its page in Chromium once in each theme, and writes what both show at the same time.
+Runs the demo, opens its page in Chromium once in each theme, writes what both show at once as an animation, and
+then parts of the page in small pictures. The titles of the tabs are in the animation's EXIF data, for a test.
 """
 
 import io
@@ -24,7 +25,7 @@ sys.path.insert(0, str(ROOT / "tests" / "dashboard"))
 from page_browser import CHROMIUM, FLAGS, Visit, until  # noqa: E402 (the tests start the same browser)
 
 SIZE = {"width": 1200, "height": 720}
-TAGS = 4
+TAGS = 3
 FRAMES, FRAME_S = 32, 0.25
 WALKED_S = 12.0
 """How long tags walk before the first frame, so that they have trails."""
@@ -34,27 +35,35 @@ DRAW_SLOWLY = (
 """Script: the page draws once for each frame of the animation.
 
 At full speed a browser without a graphics card takes all processors, and the page would say that it is too slow."""
+SHOWN_TABS = "tabs => tabs.filter((tab) => tab.checkVisibility()).map((tab) => tab.firstChild.textContent)"
 START_S = 300.0
 """How long the demo may take to compile and to open its page."""
 LIMIT_BYTES = 600_000
+SMALL = {"width": 390, "height": 250}
+MOVED_S = 180.0
+"""How long the watch may take to name the anchor that is moved after a minute."""
+IMAGE_DESCRIPTION = 0x010E
+"""Of EXIF."""
 
 
 def record() -> None:
     """Write ``page_light.webp`` and ``page_dark.webp``."""
     with tempfile.TemporaryDirectory() as folder:
-        arguments = ["demo", "--tags", str(TAGS), "--seed", "4", "--record", "none"]
+        arguments = ["demo", "--record", "none"]
         environment = {**os.environ, "XDG_DATA_HOME": folder, "PYTHONUNBUFFERED": "1"}
         demo = subprocess.Popen(
             [sys.executable, "-m", "skyless.cli.main", *arguments],
             cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True,
         )  # fmt: skip
         try:
-            frames = _frames_of(_address_of(demo))
+            frames, small, tabs = _frames_of(_address_of(demo))
         finally:
             demo.send_signal(signal.SIGINT)
             demo.communicate(timeout=60.0)
     for theme, pictures in frames.items():
-        _write(FOLDER / f"page_{theme}.webp", pictures)
+        _write(FOLDER / f"page_{theme}.webp", pictures, tabs)
+    for name, picture in small.items():
+        picture.save(FOLDER / f"small_{name}.webp", quality=80, method=6)
 
 
 def _address_of(demo: "subprocess.Popen[str]") -> str:
@@ -67,8 +76,8 @@ def _address_of(demo: "subprocess.Popen[str]") -> str:
     raise RuntimeError("the demo named no page:\n" + "".join(lines))
 
 
-def _frames_of(address: str) -> dict[str, list[Image.Image]]:
-    """What the page shows in each theme, one frame after the other."""
+def _frames_of(address: str) -> tuple[dict[str, list[Image.Image]], dict[str, Image.Image], str]:
+    """What the page shows in each theme, one frame after the other; parts of it by name; the titles of its tabs."""
     frames: dict[str, list[Image.Image]] = {"light": [], "dark": []}
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
@@ -84,16 +93,33 @@ def _frames_of(address: str) -> dict[str, list[Image.Image]]:
             time.sleep(max(0.0, begin_s + number * FRAME_S - time.monotonic()))
             for theme, visit in visits.items():
                 frames[theme].append(_screenshot(visit.page))
+        page = visits["light"].page
+        tabs = ", ".join(page.eval_on_selector_all("#tabs [role=tab]", SHOWN_TABS))
+        small = {"level": _part(page, "#map", 0.5, 0.65)}
+        for name, tab, words in (("alarms", "alarms", "Robot cell"), ("survey", "anchors", "has moved")):
+            page.click(f"#tab-{tab}")
+            page.wait_for_selector(f"#panel-{tab} :text('{words}')", timeout=1e3 * MOVED_S)
+            small[name] = _part(page, f"#panel-{tab}", 0.0, 0.0)
         browser.close()
-    return frames
+    return frames, small, tabs
 
 
-def _screenshot(page: Any) -> Image.Image:
-    return Image.open(io.BytesIO(page.screenshot())).convert("RGB")
+def _screenshot(page: Any, **options: Any) -> Image.Image:
+    return Image.open(io.BytesIO(page.screenshot(**options))).convert("RGB")
 
 
-def _write(path: Path, frames: list[Image.Image]) -> None:
+def _part(page: Any, selector: str, across: float, down: float) -> Image.Image:
+    """A small part of an element, which begins at these shares of what is left of its sizes."""
+    box = page.locator(selector).bounding_box()
+    x = box["x"] + across * max(box["width"] - SMALL["width"], 0.0)
+    y = box["y"] + down * max(box["height"] - SMALL["height"], 0.0)
+    return _screenshot(page, clip={"x": x, "y": y, **SMALL})
+
+
+def _write(path: Path, frames: list[Image.Image], tabs: str) -> None:
     """An endless animation of no more than ``LIMIT_BYTES``, as sharp as that allows."""
+    exif = Image.Exif()
+    exif[IMAGE_DESCRIPTION] = tabs
     for quality in (80, 60, 45, 30):
         frames[0].save(
             path,
@@ -101,6 +127,7 @@ def _write(path: Path, frames: list[Image.Image]) -> None:
             append_images=frames[1:],
             duration=round(1e3 * FRAME_S),
             loop=0,
+            exif=exif,
             quality=quality,
             method=6,
         )
