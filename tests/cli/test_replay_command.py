@@ -64,9 +64,9 @@ def run(room, capsys, monkeypatch):
     return call
 
 
-def report(result):
+def report(result, said=""):
     code, out, err = result
-    assert (code, err, out.count("\n")) == (0, "", 1)
+    assert (code, err, out.count("\n")) == (0, said, 1)
     return json.loads(out)
 
 
@@ -170,8 +170,9 @@ def test_a_site_file_serves_as_anchors(run):
 @pytest.mark.statistical
 def test_pictures(run, tmp_path):
     arguments = ["tdoa-table", "--anchors", "anchors.csv", "--json"]
-    report(run(*arguments, "--truth", "truth.csv", "--plot", tmp_path / "a.png"))
-    report(run(*arguments, "--plot", tmp_path / "b.SVG"))
+    first, other = tmp_path / "a.png", tmp_path / "b.SVG"
+    report(run(*arguments, "--truth", "truth.csv", "--plot", first), f"wrote {first}\n")
+    report(run(*arguments, "--plot", other), f"wrote {other}\n")
     assert imread(tmp_path / "a.png").shape[1] > 800
     assert b"<svg" in (tmp_path / "b.SVG").read_bytes()
 

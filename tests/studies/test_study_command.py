@@ -35,7 +35,7 @@ def run(capsys, monkeypatch, tmp_path):
 
 def test_a_study_tells_its_rows_and_writes_its_files(run, tmp_path):
     code, out, err = run("loss", *SMALL, "--json", "--out", "deep/folder", "--plot", "loss.svg")
-    assert (code, err, out.count("\n")) == (0, "", 1)
+    assert (code, err, out.count("\n")) == (0, "wrote loss.svg\n", 1)
     printed = json.loads(out)
     assert (printed["study"], printed["method"], printed["seed"], printed["simulated"]) == ("loss", "joint", 1, True)
     keys = {"method", "mesh", "noise_ps", "case", "rmse_m", "bound_m", "ratio", "limit", "passed", "nees"}

@@ -122,7 +122,8 @@ def _write(result: "StudyResult", output: _Output) -> None:
             write_whole(out / f"{result.name}.csv", _csv(rows).encode())
         for path, kind in files.items():
             write_whole(path, picture(figure, kind))
-            say_written(path)
+            if path == plot:
+                say_written(path)
     except OSError as error:
         raise SkylessError(f"{error.filename or plot or out} cannot be written: {error.strerror}") from None
 
