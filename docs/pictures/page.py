@@ -38,6 +38,8 @@ At full speed a browser without a graphics card takes all processors, and the pa
 SHOWN_TABS = "tabs => tabs.filter((tab) => tab.checkVisibility()).map((tab) => tab.firstChild.textContent)"
 START_S = 300.0
 """How long the demo may take to compile and to open its page."""
+CALM_S = 3.0
+"""After the map has begun to follow a tag."""
 LIMIT_BYTES = 600_000
 SMALL = {"width": 390, "height": 250}
 MOVED_S = 180.0
@@ -95,11 +97,17 @@ def _frames_of(address: str) -> tuple[dict[str, list[Image.Image]], dict[str, Im
                 frames[theme].append(_screenshot(visit.page))
         page = visits["light"].page
         tabs = ", ".join(page.eval_on_selector_all("#tabs [role=tab]", SHOWN_TABS))
-        small = {"level": _part(page, "#map", 0.5, 0.65)}
-        for name, tab, words in (("alarms", "alarms", "Robot cell"), ("survey", "anchors", "has moved")):
+        small = {}
+        for name, tab, words in (("alarms", "alarms", "Ada (tag3)"), ("survey", "anchors", "has moved")):
             page.click(f"#tab-{tab}")
-            page.wait_for_selector(f"#panel-{tab} :text('{words}')", timeout=1e3 * MOVED_S)
+            page.wait_for_selector(f"#panel-{tab} :text('{words}'):visible", timeout=1e3 * MOVED_S)
             small[name] = _part(page, f"#panel-{tab}", 0.0, 0.0)
+        page.click("#tab-tags")
+        page.click("#panel-tags button.name:has-text('Ada')")
+        for button in ("#follow", "#zoom-in", "#zoom-in", "#zoom-in"):
+            page.click(button)
+        time.sleep(CALM_S)
+        small["level"] = _part(page, "#map", 0.5, 0.5)
         browser.close()
     return frames, small, tabs
 

@@ -22,9 +22,9 @@ _CELL: Final = Zone("cell", "Robot cell", ((3.7, 0.4), (5.7, 0.4), (5.7, 2.7), (
 _GOODS_IN: Final = Zone("goods-in", "Goods in", ((0.3, 5.3), (2.7, 5.3), (2.7, 7.7), (0.3, 7.7)), "#0f766e")
 _PEOPLE: Final = "people"
 _ASSETS: Final = (
-    Asset("tag1", "Trolley", "vehicles", "▲"),
-    Asset("tag2", "Forklift", "vehicles", "◆"),
-    Asset("tag3", "Ada", _PEOPLE, "●"),
+    Asset("tag1", "Trolley", "vehicles", "▲", "#b45309"),
+    Asset("tag2", "Forklift", "vehicles", "◆", "#7c3aed"),
+    Asset("tag3", "Ada", _PEOPLE, "●", "#0284c7"),
 )
 _RULE: Final = AlarmRule(
     "robot-cell", "inside", "Person in the robot cell", zone=_CELL.id, tags=(f"group:{_PEOPLE}",), severity="critical"
