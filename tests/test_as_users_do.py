@@ -95,8 +95,7 @@ def test_an_installed_wheel_runs_the_demo_a_modelled_radio_and_the_examples(chec
     python, skyless = environment / "bin" / "python", environment / "bin" / "skyless"
     run(shell, uv, "pip", "install", "--quiet", "--python", python, f"{wheel}[page,history,research]")
 
-    found = json.loads(run(shell, skyless, "demo", "--duration", "3", "--json", cwd=tmp_path))
-    assert found["fixes"] > 0
+    assert json.loads(run(shell, skyless, "demo", "--duration", "3", "--json", cwd=tmp_path))["fixes"] > 0
     assert list(environment.glob("lib/*/site-packages/skyless/radio/dw1000/__pycache__/*.pyc"))
 
     air, broker = f"127.0.0.1:{free_port()}", ("--mqtt", "none")
