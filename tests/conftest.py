@@ -4,7 +4,6 @@ import asyncio
 import inspect
 import math
 import os
-import re
 import signal
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,20 +12,10 @@ import pytest
 from hypothesis import settings
 
 from skyless.sim.compile_ahead import compile_kernels
+from support.tiers import TIERS, file_tiers
 
 settings.register_profile("skyless", deadline=None)  # the first call of a kernel compiles it
 settings.load_profile("skyless")
-
-TIERS = {
-    "unit": "no process, and no simulated site for longer than a second; the tier of tests without a marker",
-    "site": "simulates a site, runs a command, or starts a program",
-    "live": "a whole site of processes in real time, one test after the other",
-    "statistical": "Monte Carlo, long fuzzing, heavy clients such as browsers: what takes more than some two seconds",
-}
-_TIER = f"({'|'.join(TIERS)})"
-_TIER_OF_FILE = re.compile(rf"^pytestmark = (?:\[[^\]]*)?\bpytest\.mark\.{_TIER}\b", re.MULTILINE)
-"""A file's marker, alone or in a list of several."""
-_MARKED = re.compile(rf"\bpytest\.mark\.{_TIER}\b")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -49,11 +38,6 @@ def _tiers(config: pytest.Config) -> list[str]:
 
 def _tier(item: pytest.Item) -> str:
     return next((mark.name for mark in item.iter_markers() if mark.name in TIERS), "unit")
-
-
-def file_tiers(text: str) -> set[str]:
-    """Tiers of the tests in a file, by its text: some more than there are, and none less."""
-    return set(_MARKED.findall(text)) | (set() if _TIER_OF_FILE.search(text) else {"unit"})
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from conftest import TIERS, file_tiers
+from support.tiers import TIERS, file_tiers
 
 
 @pytest.mark.parametrize("file", sorted(Path(__file__).parent.rglob("test_*.py")), ids=lambda file: file.name)

@@ -158,6 +158,8 @@ _FLOOR = """\
 {off}number = {number}                    # that of its anchors
 {off}low_m = {low_m}                   # height of its ground
 {off}name = {name}
+{no_loss}slab_loss_db = {slab_loss_db}          # of a signal that crosses its ground, in simulations and plans
+{no_delay}slab_delay_m = {slab_delay_m}
 {off}image = {image}         # a plan of its own, as of [floor_plan]
 {off}width_m = {width_m}
 {off}x_m = {x_m}
@@ -259,8 +261,11 @@ def _floors(site: Site) -> str:
 def _floor(floor: FloorSite, off: str) -> str:
     """Its table; a floor without an image has none of the keys of one."""
     texts = {key: json.dumps(getattr(floor, key), ensure_ascii=False) for key in ("name", "image")}
-    table = _FLOOR.format(**{**structs.asdict(floor), **texts}, off=off)
-    return table if floor.image is not None else "".join(table.splitlines(keepends=True)[:4])
+    loss_db, delay_m = floor.slab
+    slab = {"slab_loss_db": loss_db, "slab_delay_m": delay_m}
+    no_loss, no_delay = (_off(getattr(floor, key) is not UNSET) for key in slab)
+    table = _FLOOR.format(**{**structs.asdict(floor), **texts, **slab}, off=off, no_loss=no_loss, no_delay=no_delay)
+    return table if floor.image is not None else "".join(table.splitlines(keepends=True)[:6])
 
 
 def _rule(rule: AlarmRule, off: str = "") -> str:
