@@ -33,6 +33,7 @@ def shell(tmp_path_factory):
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "uv"
     kept = {name: value for name, value in os.environ.items() if INDEX_SETTINGS.fullmatch(name)}
     path = os.pathsep.join(part for part in os.environ["PATH"].split(os.pathsep) if not part.startswith(str(ROOT)))
+    kept |= {"UV_SYSTEM_CERTS": "true", "UV_NATIVE_TLS": "true"}  # as scripts/environment has it
     return {"UV_CACHE_DIR": str(cache), **kept, "HOME": str(tmp_path_factory.mktemp("home")), "PATH": path}
 
 
@@ -75,14 +76,16 @@ def test_the_readme_s_commands_on_a_fresh_copy(checkout, shell):
     how = {"cwd": checkout, "env": shell, "text": True, "preexec_fn": usual_signals()}
     running = subprocess.Popen([demo], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **how)
     try:
-        said = iter(running.stdout.readline, "")
-        page = next(found[0] for line in said if (found := re.search(r"http://127\.0\.0\.1:\d+", line)))
-        assert "<title>" in page_at(page)
+        said = running.stdout.readline()
+        while not (page := re.search(r"http://127\.0\.0\.1:\d+", said)):
+            assert running.poll() is None, said
+            said += running.stdout.readline()
+        assert "<title>" in page_at(page[0])
     finally:
         running.send_signal(signal.SIGINT)
-        rest = running.communicate(timeout=WAIT_S)[0]
-    assert running.returncode in (0, 130), rest
-    assert "Traceback" not in rest
+        said += running.communicate(timeout=WAIT_S)[0]
+    assert running.returncode in (0, 130), said
+    assert "Traceback" not in said
     assert re.search(r"\d+ passed", run(shell, *test.split(), cwd=checkout))
 
 
@@ -111,8 +114,9 @@ def test_an_installed_wheel_runs_the_demo_a_modelled_radio_and_the_examples(chec
         fix = json.loads(processes[-1].stdout.readline())
         assert fix["tag"] == "tag1"
     finally:
-        for process in reversed(processes):
+        for process in processes:
             process.send_signal(signal.SIGINT)
+        for process in processes:
             process.communicate(timeout=WAIT_S)
     for example in sorted((ROOT / "examples").glob("*.py")):
         shutil.copy(example, tmp_path)

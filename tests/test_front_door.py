@@ -4,6 +4,7 @@ import subprocess
 import sys
 from importlib.metadata import version
 
+import numpy as np
 import pytest
 
 import skyless
@@ -58,3 +59,13 @@ def test_a_position_from_a_notebook():
     ranges_m = np.linalg.norm(anchors_m - tag_m, axis=1)
     solution = skyless.locate(anchors_m, ranges_m[1:] - ranges_m[0], 0.01 * (np.eye(4) + 1.0))
     np.testing.assert_allclose(solution.position_m, tag_m, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("frame", "rx_ticks", "words"),
+    [("abc", 1, "frame is 'abc'; it should be bytes"), (b"abc", 1.5, "rx_ticks is 1.5; it should be an integer")],
+)
+def test_what_is_no_frame_or_no_count_is_refused_with_what_is_wanted(frame, rx_ticks, words):
+    with pytest.raises(TypeError, match=words):
+        skyless.Reception(frame, rx_ticks)
+    assert skyless.Reception(b"abc", np.int64(7)).rx_ticks == 7  # integers of NumPy are taken

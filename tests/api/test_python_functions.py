@@ -297,7 +297,7 @@ def test_tables_of_the_others(results):
 def test_without_pandas_a_table_says_what_to_install(results, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     for result in vars(results).values():
-        with pytest.raises(skyless.SkylessError, match=r"scripts/run --extra pandas"):
+        with pytest.raises(skyless.SkylessError, match="pandas, which is not installed"):
             result.to_dataframe()
 
 

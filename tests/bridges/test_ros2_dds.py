@@ -240,5 +240,5 @@ def test_without_a_georeference_a_line_says_what_is_missing(domain):
 
 def test_without_the_package_the_message_names_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "cyclonedds.topic", None)
-    with pytest.raises(SkylessError, match=r"needs cyclonedds, which is not installed: scripts/run --extra ros2"):
+    with pytest.raises(SkylessError, match=r"needs cyclonedds, which is not installed"):
         target_of("ros2://")

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from skyless.core.extras import EXTRA_OF, what_to_install
+from skyless.core.extras import EXTRA_OF, how_to_install, what_to_install
 
 pytestmark = pytest.mark.site
 
-ROOT = Path(__file__).parents[2]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
 BLOCKED = f"import sys\nsys.modules.update(dict.fromkeys({sorted(EXTRA_OF)!r}))\nfrom skyless.cli.main import main\n"
 
 
@@ -43,6 +42,11 @@ def test_every_library_of_an_extra_is_named():
     assert set(EXTRA_OF.values()) <= set(PROJECT["optional-dependencies"])
 
 
+def test_what_to_install_depends_on_who_made_the_environment(monkeypatch, tmp_path):
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / ".venv"))
+    assert how_to_install("pandas") == "pip install '.[pandas]' in a checkout of Skyless adds it"
+
+
 def test_another_missing_module_is_a_defect():
     assert what_to_install(ImportError("text", name="skyless.nothing")) is None
     assert what_to_install(ImportError("text")) is None
@@ -66,5 +70,5 @@ def test_a_command_needs_its_extra_only(arguments, extra):
         assert "which is not installed" not in done.stderr
     else:
         assert done.returncode == 2
-        assert done.stderr.splitlines()[-1].endswith(f"scripts/run --extra {extra} ... in {ROOT} adds it")
+        assert done.stderr.splitlines()[-1].endswith(how_to_install(extra))
     assert "Traceback" not in done.stderr

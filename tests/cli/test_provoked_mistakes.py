@@ -62,7 +62,7 @@ MISTAKES = {
     "a command of a group with a slip": (["site", "chekc", "lab.toml"], 'Did you mean "check"?'),
     "an option with a slip": (["simulate", "--noise-p", "100"], "Did you mean --noise-ps?"),
     "no file": (["replay"], "FILE requires an argument"),
-    "a word instead of a number": (["simulate", "--tags", "many"], "--tags: unable to convert"),
+    "a word instead of a number": (["simulate", "--tags", "many"], "it should be a whole number"),
     "no number": (["simulate", "--noise-ps", "nan"], "--noise-ps"),
     "a method that is none": (["simulate", "--method", "best"], "it should be one of literal"),
     "a site that is not there": (["site", "check", "none.toml"], "none.toml: it should be a readable site file"),

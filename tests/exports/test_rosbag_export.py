@@ -173,5 +173,5 @@ def test_without_the_extra_the_message_names_it(export, monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     folder, code, _, err = export()
     assert (code, err.count("\n")) == (2, 1)
-    assert "rosbags, which is not installed: scripts/run --extra ros2 ..." in err
+    assert "rosbags, which is not installed" in err
     assert not folder.exists()

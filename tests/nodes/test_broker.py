@@ -143,6 +143,7 @@ async def test_a_broker_that_listens_elsewhere_says_so(taken, tmp_path, monkeypa
         broker_command._serve_once(BrokerSettings(data=tmp_path / "store"), (), None, json=False)
     )
     while not (said := capsys.readouterr()).err:
+        assert not serving.done(), serving
         await asyncio.sleep(0.05)
     serving.cancel()
     await asyncio.wait([serving])

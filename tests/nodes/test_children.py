@@ -42,6 +42,10 @@ async def test_a_program_that_is_killed_is_started_again_and_logged():
     assert said == ["air ended (signal 9); it wrote no message; started again"]
     assert not alive(first)
     assert alive(second)
+    child.restart()
+    await until(lambda: child.pid not in (None, second))
+    assert (child.starts, len(said), alive(second)) == (2, 1, False)
+    second = child.pid
     await stop(task)
     assert not alive(second)
     assert child.pid is None

@@ -6,6 +6,7 @@ CPU time is that of all processes. Memory is what they have at a time, each shar
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -41,10 +42,14 @@ def within_what_is_stated(command, page, folder, *more):
     peak_mb, ended = 0.0, 0
     with (folder / "out").open("w") as out, (folder / "err").open("w") as err:
         started = subprocess.Popen(words, cwd=folder, stdout=out, stderr=err, start_new_session=True)
-        while not ended:
-            time.sleep(0.5)
-            peak_mb = max(peak_mb, memory_mb(started.pid))
-            ended, status, used = os.wait4(started.pid, os.WNOHANG)
+        try:
+            while not ended:
+                time.sleep(0.5)
+                peak_mb = max(peak_mb, memory_mb(started.pid))
+                ended, status, used = os.wait4(started.pid, os.WNOHANG)
+        finally:
+            if not ended:
+                os.killpg(started.pid, signal.SIGKILL)
     started.returncode = os.waitstatus_to_exitcode(status)
     assert started.returncode == 0, (folder / "err").read_text()
     cpu_s = used.ru_utime + used.ru_stime

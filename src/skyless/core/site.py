@@ -146,7 +146,7 @@ class FloorSite(Struct, frozen=True, forbid_unknown_fields=True):
     y_m: float = 0.0
     slab_loss_db: float | UnsetType = UNSET
     """What its ground takes from a signal that crosses it; 25 dB where it is not given (reinforced concrete, assumed).
-    The lowest floor's counts for nothing below it. Left out where it is not given, as earlier versions refuse it."""
+    That of the lowest floor is not used. Left out where it is not given, as earlier versions refuse it."""
     slab_delay_m: float | UnsetType = UNSET
     """By how much its ground delays such a signal; 0.4 m where it is not given (assumed)."""
 

@@ -45,7 +45,7 @@ _SAME_EVENT_S: Final = 2.0
 
 _SUBJECTS: Final = {"ether": "the emulated air", "dashboard": "page server", "survey": "survey program"}
 
-_BUSY: Final = frozenset({"slow", "busy", "behind", "late"})
+_BUSY: Final = frozenset({"slow", "busy", "behind"})
 """Reasons that come and go where a computer is too slow."""
 
 Kind = Literal["anchor", "master", "watch", "alert", "tag", "program", "survey", "condition", "alarm"]

@@ -65,7 +65,8 @@ class Child:
         """Start it again now, with no word about it: what it read at its start has changed."""
         if self.pid is not None:
             self._is_asked = True
-            os.kill(self.pid, signal.SIGTERM)
+            with contextlib.suppress(ProcessLookupError):  # it has just ended by itself
+                os.kill(self.pid, signal.SIGTERM)
 
     async def run(self) -> None:
         """Keep it alive until cancelled, or until it has ended for good."""

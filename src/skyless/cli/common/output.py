@@ -90,10 +90,10 @@ def print_table(
 
     columns = list(zip(heads, *rows, strict=True))
     out = console()
-    if not out.is_terminal:
+    if not out.is_terminal and "COLUMNS" not in os.environ:
         out.width = _COLUMNS
     wraps = figures and sum(max(map(len, column)) + _FRAME for column in columns) >= out.width
-    widths = [max(map(len, (*head.split(), *cells))) for head, *cells in columns]
+    widths = [max(map(len, (*head.split(), *cells)), default=0) for head, *cells in columns]
     parts = list(_parts([head for head, *_ in columns], widths, out.width)) if wraps else [[*range(len(columns))]]
     for part in parts:
         table = Table(title=escape(title) if part is parts[0] else None)

@@ -8,13 +8,14 @@ from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Final
+from zlib import crc32
 
 from cyclopts import Parameter
 from msgspec.structs import replace
 
 from skyless.cli.common.options import make_folder
 from skyless.cli.nodes._demo_figures import DemoFigures
-from skyless.cli.nodes._demo_story import MOVED, furnished, kept_messages, survey_record
+from skyless.cli.nodes._demo_story import MOVED, furnished, messages_of, survey_record
 from skyless.cli.nodes._site_view import SiteView
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, site_named
 from skyless.core.arguments import Method, Picoseconds, Positive, Seed, TagCount, tag_count, whole
@@ -27,7 +28,7 @@ from skyless.page.condition.evidence import Health, ProcessorUse
 from skyless.run.broker import Broker, BrokerSettings, start_broker
 from skyless.run.children import Child, Program
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
-from skyless.run.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
+from skyless.run.mqtt.connection import Introduction, RefusedError, kept_messages, open_connection, trouble_with
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import EtherHealth, StatusMessage, WrongMessageError, read_message
 from skyless.run.mqtt.topics import alarm_topic, site_topic, status_topic, survey_topic, watch_topic
@@ -53,7 +54,6 @@ _TAGS_PER_PROCESS: Final = 25
 _BROKER_RESTART_S: Final = 0.2
 _KEEPALIVE_S: Final = 10
 _RECORDING_LIMIT_MB: Final = "1000"
-_CLEAR_S: Final = 0.5  # retained messages have come by then
 
 _SLOW_SHARE: Final = 0.1
 _SLOW_FOR: Final = 8
@@ -144,6 +144,9 @@ class WholeSite:
         self._tags = tags[: asked.tags - asked.boards]
         self.boards = {tag: Path(self._ports.name, tag) for tag in tags[len(self._tags) :]}
         """The others, which are boards, and their serial ports."""
+        which = self._site_name if asked.site is not None else f"{asked.plain} {asked.paper}"
+        self.kept_as = f"{self.site.id}-{crc32(which.encode()):08x}"
+        """The embedded broker's folder is of this site file, or of this kind of demo."""
         self.keeps = asked.mqtt is None and (asked.site is not None or asked.history is not None)
         """Whether the embedded broker's names, zones and rules are there again the next time."""
         self.figures = DemoFigures(planar=self.site.tags.height_m is not None)
@@ -154,9 +157,9 @@ class WholeSite:
     @property
     def gone(self) -> str:
         """What ends with the demo although its page has shown it; empty where nothing does."""
-        if self._asked.mqtt is not None or self.keeps:
-            return ""
-        return "names, zones and history" if self.history is not None else "names and zones"
+        ended = [] if self._asked.mqtt is not None or self.keeps else ["names", "zones"]
+        ended += ["history"] if self.history is not None and self._asked.history is None else []
+        return " and ".join(", ".join(ended).rsplit(", ", 1))
 
     @property
     def page(self) -> str:
@@ -180,7 +183,7 @@ class WholeSite:
         """A broker that keeps names, zones and rules for the next demo of the site, where the user keeps anything."""
         if self.keeps:
             try:
-                return await start_broker(BrokerSettings(data=data_folder() / f"demo-{self.site.id}"))
+                return await start_broker(BrokerSettings(data=data_folder() / f"demo-{self.kept_as}"))
             except SkylessError as error:
                 self._log(f"names, zones and rules end with this demo: {error}")
                 self.keeps = False
@@ -188,7 +191,7 @@ class WholeSite:
 
     async def _run_with(self, address: MqttAddress, broker: Broker | None) -> None:
         self.address = address
-        story = kept_messages(self.site) if self._has_story else {}
+        story = messages_of(self.site) if self._has_story else {}
         whole = self._run_programs(address, story, is_new=broker is not None and not self.keeps)
         if broker is None or self.keeps:
             own = story if broker is None else {}
@@ -197,7 +200,7 @@ class WholeSite:
 
     async def _run_programs(self, address: MqttAddress, story: Mapping[str, bytes], *, is_new: bool) -> None:
         if story:
-            await _place(address, story, is_new=is_new)
+            await _place(address, story, self._log, is_new=is_new)
         link = Link(address, _NAME, site=self.site.id, kind="watch")
         self.view = SiteView(link, self.site.id, used_share=ProcessorUse().share)
         self.figures.follow(self.view)
@@ -306,16 +309,20 @@ def _recording(asked: str | None, folder: Path) -> Path | None:
     return file
 
 
-async def _place(address: MqttAddress, messages: Mapping[str, bytes], *, is_new: bool) -> None:
+async def _place(address: MqttAddress, messages: Mapping[str, bytes], log: Log, *, is_new: bool) -> None:
     """Publish messages for the broker to keep, unless it has others; a new broker has none."""
-    there: set[str] = set()
-    reactions = Reactions(message=lambda topic, payload: there.add(topic) if payload else None)
-    connection = await open_connection(address, address.tls_context(), Introduction("", _KEEPALIVE_S), reactions)
-    if not is_new:
-        connection.subscribe(dict.fromkeys(messages, 1))
-        await asyncio.sleep(_CLEAR_S)
-    for topic in messages.keys() - there:
-        connection.publish(topic, messages[topic], 1, retain=True)
+    try:
+        there = {} if is_new else await kept_messages(address, messages)
+        await _publish(address, {topic: text for topic, text in messages.items() if not there.get(topic)})
+    except (OSError, RefusedError) as error:
+        log(f"{trouble_with(address, error)}: it gets no zones and names")
+
+
+async def _publish(address: MqttAddress, messages: Mapping[str, bytes]) -> None:
+    """Publish messages for the broker to keep."""
+    connection = await open_connection(address, address.tls_context(), Introduction("", _KEEPALIVE_S))
+    for topic, text in messages.items():
+        connection.publish(topic, text, 1, retain=True)
     await connection.leave()
 
 
@@ -334,25 +341,16 @@ async def _cleared_at_the_end(address: MqttAddress, site: int, own: Mapping[str,
 
 
 async def _clear_retained(address: MqttAddress, site: int, own: Mapping[str, bytes]) -> None:
-    left: set[str] = set()
-
-    def note(topic: str, payload: bytes) -> None:
-        with contextlib.suppress(WrongMessageError):  # of another program than the demo's
-            is_changed = topic in own and payload != own[topic]
-            is_online = topic.endswith("/status") and read_message(payload, StatusMessage).online
-            # The demo itself has ended, although a busy broker may not have heard so in time.
-            if payload and not is_changed and (not is_online or topic == status_topic(site, "watch", _NAME)):
-                left.add(topic)
-
-    who = Introduction("", _KEEPALIVE_S)
-    connection = await open_connection(address, address.tls_context(), who, Reactions(message=note))
     topics = (site_topic(site), survey_topic(site), watch_topic(site), status_topic(site, "+", "+"), *own)
     topics += (alarm_topic(site, "+", "+"),) if own else ()
-    connection.subscribe(dict.fromkeys(topics, 1))
-    await asyncio.sleep(_CLEAR_S)
-    for topic in left:
-        connection.publish(topic, b"", 1, retain=True)
-    await connection.leave()
+    left: dict[str, bytes] = {}
+    for topic, payload in (await kept_messages(address, topics)).items():
+        with contextlib.suppress(WrongMessageError):  # of another program than the demo's
+            is_online = topic.endswith("/status") and read_message(payload, StatusMessage).online
+            # The demo itself has ended, although a busy broker may not have heard so in time.
+            if payload and payload == own.get(topic, payload) and (not is_online or topic.endswith(f"/{_NAME}/status")):
+                left[topic] = b""
+    await _publish(address, left)
 
 
 def _mqtt(address: MqttAddress) -> tuple[str, ...]:

@@ -57,7 +57,7 @@ def survey_record(site: Site) -> SurveyRecord:
     return SurveyRecord(site.name, site.id, 0.0, ranges, survey, {})
 
 
-def kept_messages(site: Site) -> dict[str, bytes]:
+def messages_of(site: Site) -> dict[str, bytes]:
     """By topic what the page would make the broker keep: zones, and the tags' names."""
     return {
         zones_topic(site.id): msgspec.json.encode(ZonesMessage((_CELL, _GOODS_IN), site=site.name)),

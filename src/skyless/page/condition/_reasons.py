@@ -196,7 +196,7 @@ def left_out_reason(evidence: Evidence, now_s: float) -> Reason | None:
 
 def busy_reason(evidence: Evidence, used_share: float | None) -> Reason | None:
     """All processors of the page's computer are in use, by any program. An emulated air says itself what it misses."""
-    if used_share is None or used_share < BUSY_SHARE or any(evidence.of("ether")):
+    if used_share is None or used_share < BUSY_SHARE or _airs(evidence):
         return None
     text = f"{evidence.computer(evidence.host)} is fully busy: {100.0 * used_share:.0f} % of its processors are in use"
     return Reason("busy", "warning", text, "End other programs there, or positions may come late or not at all.")
@@ -205,11 +205,16 @@ def busy_reason(evidence: Evidence, used_share: float | None) -> Reason | None:
 _Sign = tuple[str, float, str]  # computer, share of what was lost, and words
 
 
+def _airs(evidence: Evidence) -> list[Node]:
+    """Emulated airs that run."""
+    return [air for _, air in evidence.of("ether") if air.online is not False]
+
+
 def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
     """Transmissions of the emulated air, and of anchors."""
-    airs = list(evidence.of("ether"))
+    airs = _airs(evidence)
     most = EMULATED_MISSED_SHARE if airs else MISSED_SHARE
-    for _, air in airs:
+    for air in airs:
         if air.reports(now_s) and isinstance(air.health, EtherHealth) and air.health.missed_share > most:
             share = air.health.missed_share
             yield air.host, share, f"the emulated air missed {100.0 * share:.0f} % of the transmissions"

@@ -110,14 +110,17 @@ def results_of(
 def with_best(results: Sequence[Result]) -> Iterator[Result]:
     """The results, and for each recording that of ``PLAIN`` or ``SIMPLE`` with the smallest error once more."""
     yield from results
-    simple = [one for one in results if one.method in {PLAIN, *SIMPLE} and one.figures and one.figures.rmse_2d_m]
-    for recording in dict.fromkeys(one.recording for one in simple):
-        errors_m = {
-            one.figures.rmse_3d_m or one.figures.rmse_2d_m or np.inf: one
-            for one in simple
-            if one.recording == recording and one.figures
-        }
-        yield structs.replace(errors_m[min(errors_m)], method=BEST, drawn=())
+    simple = [(_error_m(one), one) for one in results if one.method in {PLAIN, *SIMPLE} and one.figures]
+    for recording in dict.fromkeys(one.recording for _, one in simple):
+        errors = [(m, one) for m, one in simple if one.recording == recording and np.isfinite(m)]
+        if errors:
+            yield structs.replace(min(errors, key=lambda error: error[0])[1], method=BEST, drawn=())
+
+
+def _error_m(result: Result) -> float:
+    """The RMSE, in 3-D where the recording has heights; infinite where there is none."""
+    figures = result.figures
+    return np.inf if figures is None else figures.rmse_3d_m or figures.rmse_2d_m or np.inf
 
 
 def _kept(file: Path) -> tuple[Result, ...] | None:

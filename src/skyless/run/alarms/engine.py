@@ -250,7 +250,7 @@ class AlarmEngine:
             is_new, since_s = message.subject not in own.cases, message.since_unix_s - self._unix_offset_s
             case = own.cases.setdefault(message.subject, _Case(True, since_s, now_s))
             case.begin_s = since_s
-            unstated = math.inf if message.kind == "protection-level" else None  # JSON has no infinity
+            unstated = math.inf if "unknown" in message.sentence else None  # JSON has no infinity
             case.add(message.kind, unstated if message.worst is None else message.worst)
             if is_new and message.kind == "silent":
                 self._tags.setdefault(message.subject, _Tag(now_s))
@@ -289,6 +289,8 @@ class AlarmEngine:
             is_on = own.hours.contain(local.tm_wday, 60 * local.tm_hour + local.tm_min)
             if is_on and own.is_on is False:
                 own.on_since_s = now_s
+                for case in own.cases.values():  # what was outside the rule's hours counts for nothing
+                    case.begin_s = case.worst = None
             own.is_on = is_on
             for subject in dict.fromkeys((*self._subjects(own, changed, now_s), *own.cases)):
                 self._check(own, subject, now_s)
@@ -399,7 +401,7 @@ class AlarmEngine:
                 case.holds, case.since_s = holds, max(self._tag(subject).seen_s, self._blind_s) if is_silent else now_s
         message = self.messages.get((rule.id, subject))
         is_active = self.leading and message is not None and message.ended_unix_s is None
-        if case.holds:
+        if case.holds and own.is_on is not False:
             case.begin_s = case.since_s if case.begin_s is None else case.begin_s
             case.add(rule.kind, self._value(own, subject, now_s - case.begin_s))
         if message is not None and is_active:
@@ -502,7 +504,7 @@ class AlarmEngine:
     def _sentence(self, own: _Rule, subject: str, worst: float | None, what: What) -> str:
         """Empty where nothing is known any more."""
         rule, limit, zone = own.rule, own.rule.limit or 0.0, self._zone_name(own.rule.zone)
-        if worst is None and what != "raised" and rule.kind not in ("protection-level", "anchor-moved"):
+        if worst is None and what != "raised" and rule.kind != "anchor-moved":
             return ""
         who = " and ".join(map(self._who, subject.split("~")))
         anchor, was = subject.replace("-", " ", 1), what != "raised"

@@ -325,13 +325,16 @@ def walked_floor(site: Site, tags: int, index: int) -> FloorSite | None:
 
     Raises SkylessError: the site has no such floor.
     """
-    named = tags.floor if isinstance(tags, TagCount) else None
+    named, floors = tags.floor if isinstance(tags, TagCount) else None, site.storeys
+    if site.tags.height_m is not None:  # all tags are at one height
+        floors = ()
     if named is None:
-        return site.storeys[index % len(site.storeys)] if site.storeys else None
-    for floor in site.storeys:
+        return floors[index % len(floors)] if floors else None
+    for floor in floors:
         if floor.number == named:
             return floor
-    there = ", ".join(str(floor.number) for floor in site.storeys) or "none, as the file has no [[floors]]"
+    there = ", ".join(str(floor.number) for floor in floors)
+    there = there or "none: it has no [[floors]], or the height of all tags is given"
     raise SkylessError(f"--tags is '{int(tags)}@{named}'; the floor should be one of the site's: {there}")
 
 

@@ -32,15 +32,16 @@ export function start() {
   });
 }
 
-/** A button for each floor, the highest first, and one for all. */
+/** A button for each floor, the highest first, and one for all; they stay while the floors do, and so does the focus. */
 function showFloors() {
-  const list = floors().map(({ name }, index) => [name, index]);
-  byId("floor-buttons").hidden = list.length < 2;
-  const buttons = [["All floors", null], ...list].reverse().map(([name, index]) => {
-    const chosen = state.options.floor === index;
-    return h("button", { type: "button", "aria-pressed": String(chosen), onclick: () => chooseFloor(index) }, name);
-  });
-  byId("floor-buttons").replaceChildren(...buttons);
+  const box = byId("floor-buttons");
+  const list = [["All floors", null], ...floors().map(({ name }, index) => [name, index])].reverse();
+  if (box.dataset.names !== JSON.stringify(list)) {
+    box.dataset.names = JSON.stringify(list);
+    box.replaceChildren(...list.map(([name, index]) => h("button", { type: "button", onclick: () => chooseFloor(index) }, name)));
+  }
+  box.hidden = list.length < 3;
+  list.forEach(([, index], at) => box.children[at].setAttribute("aria-pressed", String(state.options.floor === index)));
 }
 
 /** Begin a zone; from the keyboard, with a cursor in the middle of the map. */
