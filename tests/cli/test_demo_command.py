@@ -331,5 +331,5 @@ def test_the_demo_has_zones_names_a_rule_and_a_place_on_the_earth_for_other_tool
     # Nothing else uses its ports meanwhile, so that the page is where the first one was.
     assert [zone["id"] for zone in ask(page, "/api/v1/zones")["zones"]] == ["own"]
     _, out = again.end(signal.SIGINT)
-    assert "RMSE" in out
+    assert "3 tags" in out
     assert "gone with this demo" not in out

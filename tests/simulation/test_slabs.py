@@ -14,7 +14,6 @@ from skyless.site.channel import cross_walls, pack_walls
 from skyless.site.file.template import rectangular_site
 
 FLOORS = (FloorSite(0, 0.0), FloorSite(1, 3.2, slab_loss_db=200.0), FloorSite(2, 6.4, slab_delay_m=0.7))
-HEIGHTS_M = st.floats(-1.0, 10.0)
 
 
 def house():
@@ -24,7 +23,7 @@ def house():
     return replace(room, anchors=(*room.anchors, *upper), floors=FLOORS[:2])
 
 
-@given(HEIGHTS_M, HEIGHTS_M)
+@given(st.floats(-1.0, 10.0), st.floats(-1.0, 10.0))
 def test_a_signal_crosses_the_slabs_between_its_ends(a_m, b_m):
     slabs = [floor for floor in FLOORS[1:] if min(a_m, b_m) < floor.low_m <= max(a_m, b_m)]
     loss_db, delay_m = cross_walls(pack_walls((), FLOORS), 1.0, 2.0, a_m, 5.0, 1.0, b_m)
