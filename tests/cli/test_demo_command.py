@@ -329,7 +329,7 @@ def test_the_demo_has_zones_names_a_rule_and_a_place_on_the_earth_for_other_tool
     again = Demo(tmp_path, "--history", str(tmp_path / "history"))
     again.wait_until_it_runs()
     # Nothing else uses its ports meanwhile, so that the page is where the first one was.
-    assert [zone["id"] for zone in ask(page, "/api/v1/zones")["zones"]] == ["own"]
+    again.wait_for(lambda: [zone["id"] for zone in ask(page, "/api/v1/zones")["zones"]] == ["own"])
     _, out = again.end(signal.SIGINT)
     assert "3 tags" in out
     assert "gone with this demo" not in out
