@@ -182,7 +182,7 @@ def test_a_dead_anchor_has_no_figures(hall):
     page.click("#tab-anchors")
     dead = page.locator("#panel-anchors tr.bad:has-text('8')")
     dead.wait_for()
-    assert dead.locator("td").all_inner_texts()[2:] == ["–"] * 4
+    assert dead.locator("td").all_inner_texts()[2:] == ["–"] * 6
     page.click("#panel-anchors button:text-is('8')")
     page.wait_for_selector("#panel-anchors .detail dd:has-text('its figures are not known')")
     assert set(page.locator("#panel-anchors .detail output").all_inner_texts()) <= {"–"}

@@ -257,8 +257,10 @@ def _result(
     tracks = {}
     for tag in reports:
         table = samples[tag].table()
-        truth_m = truth_at(judged[tag].truth, table.time_s)
-        tracks[tag] = np.column_stack([table.time_s, table.position_m, truth_m, table.std_m])
+        tracks[tag] = track = np.empty((len(table.time_s), 10))
+        track[:, 0], track[:, 1:4] = table.time_s, table.position_m
+        track[:, 4:7] = truth_at(judged[tag].truth, table.time_s)
+        np.sqrt(np.diagonal(table.covariance_m2, axis1=1, axis2=2), out=track[:, 7:])
     tags = tuple(reports)
     nothing = FixRecorder(tags).fixes(), MeasurementRecorder(tags).measurements()
     return ReplayResult(path, reports, nothing[0], tracks, judged, nothing[1], warnings, height_note, summary)

@@ -49,11 +49,6 @@ class FixTable(Struct, frozen=True):
     alert: Vector
     """Shape (n,): number of the alert in ``Alert``; −1 without levels."""
 
-    @property
-    def std_m(self) -> Matrix:
-        """Shape (n, 3): standard deviations of x, y and z."""
-        return axes_std_m(self.covariance_m2)
-
 
 def axes_std_m(covariance_m2: Array) -> Matrix:
     """Standard deviations of x, y and z of covariances of shape (n, 3, 3), shape (n, 3)."""

@@ -49,11 +49,7 @@ export function show() {
   parts.picture.replaceChildren(...(shown.length ? [draw(shown)] : []));
   text(
     parts.empty,
-    siteMode() === "free"
-      ? "No superframe: the anchors send at random instants."
-      : state.mode === "live"
-        ? "No positioning phases reported yet."
-        : "Phases are shown on the live site only.",
+    state.mode === "live" ? "No positioning phases reported yet." : "Phases are shown on the live site only.",
   );
   const { slot_s = 0 } = state.site?.schedule ?? {};
   const slots = slotCount();
