@@ -267,7 +267,7 @@ async def test_what_the_broker_had_kept_before_is_in_the_stream_of_the_state_and
             await until(lambda node=node: node.summary.online.get("anchor"))
             stream = client.jetstream()
             found, subjects_of_site = {}, ("zones", "floor_plan.2")
-            # Who is online may be told before what was kept.
+            # Programs may be known as online before the messages that were kept have arrived.
             while found != dict.fromkeys(subjects_of_site, f"{n}".encode()):
                 for subject in subjects_of_site:
                     with contextlib.suppress(NotFoundError):

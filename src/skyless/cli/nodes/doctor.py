@@ -113,12 +113,12 @@ async def _examine(
 ) -> list[Check]:
     """All checks; ``progress`` is called with the seconds that have gone. Each is logged as soon as it is known."""
     checks = [*port_checks(), clock_check()]
-    told: set[str] = set()
+    shown: set[str] = set()
 
     def tell(found: Iterable[Check]) -> None:
         for check in found:
-            if check.name not in told:
-                told.add(check.name)
+            if check.name not in shown:
+                shown.add(check.name)
                 log(plain(f"{check.result}: {check.name}: {check.finding}"))
 
     def look() -> None:
