@@ -26,7 +26,7 @@ from skyless.research.replays.captures import CaptureReplay, ReplayReport, dista
 from skyless.research.replays.options import ReplayOptions
 from skyless.research.replays.site import SiteReplay, TagReport, summary_of
 from skyless.run.recordings.recording import McapRecording, is_mcap
-from skyless.sim.evaluation.figures import FixSamples, Judged
+from skyless.sim.evaluation.figures import FixSamples, Judged, axes_std_m
 from skyless.sim.evaluation.truth import truth_at
 from skyless.site.file.load import site_of
 
@@ -47,8 +47,8 @@ class ReplayResult(Result, frozen=True, eq=False):
     """Figures of each tag, by its name."""
     fixes: Fixes
     """All fixes; ``truth_m`` is NaN where it is not known."""
-    tracks: dict[str, Matrix]
-    """Time, position, true position and σ of x, y and z of each tag, shape (k, 10): an even sample, for drawing."""
+    samples: Mapping[str, FixSamples]
+    """An even sample of the fixes of each tag."""
     judged: dict[str, Judged]
     """Which fixes of each tag are judged, and against which truth."""
     measurements: Measurements
@@ -63,6 +63,12 @@ class ReplayResult(Result, frozen=True, eq=False):
     def tags(self) -> tuple[str, ...]:
         """Names of the tags; that of a recording with a single nameless one is ``tag``."""
         return self.fixes.tags
+
+    def track(self, tag: str) -> Matrix:
+        """Time, position, true position and σ of x, y and z of an even sample of a tag's fixes, shape (k, 10)."""
+        table = self.samples[tag].table()
+        truth_m = truth_at(self.judged[tag].truth, table.time_s)
+        return np.column_stack([table.time_s, table.position_m, truth_m, axes_std_m(table.covariance_m2)])
 
     @property
     def report(self) -> ReplayReport:
@@ -91,7 +97,7 @@ class ReplayResult(Result, frozen=True, eq=False):
         if name not in self.reports:
             raise wrong("tag", tag, f"one of {', '.join(self.tags)}")
         report = self.reports[name]
-        return track_figure(self.tracks[name], f"{self.path.name}, {name} ({report.format}): {report.fixes} fixes")
+        return track_figure(self.track(name), f"{self.path.name}, {name} ({report.format}): {report.fixes} fixes")
 
     def title(self) -> str:
         """What was replayed."""
@@ -254,16 +260,9 @@ def _result(
     summary: dict[str, Any],
     warnings: tuple[str, ...] = (),
 ) -> ReplayResult:
-    tracks = {}
-    for tag in reports:
-        table = samples[tag].table()
-        tracks[tag] = track = np.empty((len(table.time_s), 10))
-        track[:, 0], track[:, 1:4] = table.time_s, table.position_m
-        track[:, 4:7] = truth_at(judged[tag].truth, table.time_s)
-        np.sqrt(np.diagonal(table.covariance_m2, axis1=1, axis2=2), out=track[:, 7:])
     tags = tuple(reports)
     nothing = FixRecorder(tags).fixes(), MeasurementRecorder(tags).measurements()
-    return ReplayResult(path, reports, nothing[0], tracks, judged, nothing[1], warnings, height_note, summary)
+    return ReplayResult(path, reports, nothing[0], samples, judged, nothing[1], warnings, height_note, summary)
 
 
 def run_replay(asked: ReplayOptions) -> ReplayResult:
