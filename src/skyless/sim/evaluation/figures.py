@@ -228,8 +228,7 @@ def _claims(error_m: Matrix, covariance_m2: Array) -> dict[str, Any]:
     dim = error_m.shape[1]
     claimed: Mask = np.asarray(np.isfinite(covariance_m2).all(axis=(1, 2)))
     claimed[claimed] = np.linalg.det(covariance_m2[claimed]) > 0.0
-    if not claimed.all():
-        error_m, covariance_m2 = error_m[claimed], covariance_m2[claimed]
+    error_m, covariance_m2 = error_m[claimed], covariance_m2[claimed]
     if len(error_m) == 0:
         return {}
     nees = (error_m * np.linalg.solve(covariance_m2, error_m[..., None])[..., 0]).sum(axis=1)
