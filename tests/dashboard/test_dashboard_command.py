@@ -1,6 +1,5 @@
-"""``skyless dashboard``: its options, its port, and connections that never finish their first request."""
+"""``skyless dashboard``: its options, and its port."""
 
-import asyncio
 import json
 import signal
 import socket
@@ -9,15 +8,11 @@ import sys
 from urllib.parse import urlsplit
 
 import pytest
-import uvicorn
-from starlette.applications import Starlette
-from starlette.responses import PlainTextResponse
-from starlette.routing import Route
 
 from skyless.cli.dashboard import _address, _listening, _rules
 from skyless.cli.main import main
 from skyless.core.errors import SkylessError
-from skyless.page.serve import PORT, ListenAddress, _Server, bind
+from skyless.page.serve import PORT, ListenAddress, bind
 from skyless.run.process import reserve
 from support.processes import free_port
 
@@ -143,36 +138,6 @@ def test_the_server_loads_nothing_heavy():
     loaded = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout.split()
     assert "skyless.page.app" in loaded
     assert not {"numpy", "numba", "scipy", "matplotlib"} & set(loaded)
-
-
-@pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\nHost: localhost\r\n"])
-async def test_a_request_that_is_never_finished_is_ended(sent):
-    async def slow(_request):
-        await asyncio.sleep(1.0)
-        return PlainTextResponse("done")
-
-    port = free_port()
-    config = uvicorn.Config(Starlette(routes=[Route("/", slow)]), port=port, log_config=None, lifespan="off")
-    server = _Server(config)
-    serving = asyncio.create_task(server.serve())
-    while not server.started:
-        await asyncio.sleep(0.01)
-    ending = asyncio.create_task(server.end_unfinished(0.2))
-    idle_reader, idle_writer = await asyncio.open_connection("127.0.0.1", port, family=socket.AF_INET)
-    idle_writer.write(sent)
-    reader, writer = await asyncio.open_connection("127.0.0.1", port, family=socket.AF_INET)
-    writer.write(b"GET / HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
-    async with asyncio.timeout(20.0):
-        try:
-            ended = await idle_reader.read()
-        except ConnectionResetError:
-            ended = b""
-        answer = await reader.read()
-    ending.cancel()
-    server.should_exit = True
-    await serving
-    assert ended == b""
-    assert answer.endswith(b"done")
 
 
 BUSY = """

@@ -133,6 +133,12 @@ def test_without_a_broker_nothing_else_is_judged(hall):
     assert hall.run(1.0).level == "good"
 
 
+def test_subscriptions_that_the_broker_refuses_are_a_fault(hall):
+    condition = hall.monitor.evaluate(hall.now_s, refused={"skyless/v1/7/zones"})
+    assert (condition.level, condition.reasons[0].kind) == ("bad", "refused")
+    assert "skyless/v1/7/zones" in condition.text and "no room" in condition.reasons[0].advice
+
+
 def test_processors_in_full_use_are_a_warning_but_where_the_air_is_emulated():
     hall = Hall()
     hall.air = None

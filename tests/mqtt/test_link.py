@@ -9,13 +9,16 @@ import threading
 
 import msgspec
 import pytest
-from mqtt_brokers import running, stopped, subscribed
+from mqtt_brokers import Embedded, running, stopped, subscribed
+from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
+from skyless.run import broker as broker_module
 from skyless.run.mqtt import connection
 from skyless.run.mqtt import link as link_module
+from skyless.run.mqtt.access import USERS, Role
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.connection import check_broker
+from skyless.run.mqtt.connection import Introduction, Reactions, check_broker, open_connection
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import StatusMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import fix_topic, receptions_topic, status_topic, zones_topic
@@ -99,6 +102,7 @@ async def test_what_the_broker_has_kept_comes_before_what_replaces_it(make_broke
 
 NODE = """
 import asyncio, sys
+from skyless.run.mqtt.access import USERS, Role
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 link = Link(MqttAddress("127.0.0.1", int(sys.argv[1])), "t1", site=7, kind="tag", keepalive_s=1)
@@ -504,3 +508,46 @@ async def test_a_status_is_published_again_and_again(make_broker, monkeypatch):
         assert len(set(inbox.messages)) == 1
         await stopped(task)
         await until(lambda: inbox.online("tag", "t1") is False)
+
+
+async def subscribers(address, count, filters=60):
+    """Connections with subscriptions of QoS 1, and whether each was granted. A session of nats-server may have 63."""
+    granted, opened = [], []
+    for number in range(count):
+        react = Reactions(subscribed=lambda _filter, yes: granted.append(yes))
+        opened.append(await open_connection(address, None, Introduction("", 10), react))
+        opened[-1].subscribe({f"t/{number}/{one}": 1 for one in range(filters)})
+    await until(lambda: len(granted) == count * filters)
+    return opened, granted
+
+
+async def test_the_embedded_broker_has_room_for_more_subscriptions_than_its_server_by_default(tmp_path):
+    async with running(broker := Embedded(tmp_path)):
+        opened, granted = await subscribers(broker.address, 20)
+        assert granted.count(True) == 1200
+        await asyncio.gather(*(one.leave() for one in opened))
+
+
+@pytest.mark.parametrize("role", [None, Role.PAGE])
+async def test_a_full_broker_is_named_as_the_reason_and_asked_again(tmp_path, role, monkeypatch, caplog):
+    monkeypatch.setattr(broker_module, "_MAX_SUBSCRIPTIONS", 60)
+    monkeypatch.setattr(link_module, "RESEND_S", 0.2)
+    roles = None if role is None else dict.fromkeys(USERS, "a-password-of-all")
+    broker = Embedded(tmp_path, roles=roles)
+    address = broker.address if role is None else replace(broker.address, user=str(role), password="a-password-of-all")
+    everything = replace(broker.address, user=role and str(Role.OPERATOR), password=role and "a-password-of-all")
+    inbox = Inbox(address, "skyless/v1/7/zones", qos=1)
+    inbox.link.subscribe("elsewhere", lambda _topic, _payload: None, qos=1)
+    async with running(broker):
+        opened, _ = await subscribers(everything, 1)
+        task = asyncio.ensure_future(inbox.link.run())
+        refused = {"skyless/v1/7/zones", "elsewhere"}
+        await until(lambda: inbox.link.refused == refused)
+        sure = "this user may read it, so the broker has no room for more subscriptions (its log says why)"
+        assert (sure in caplog.text) == (role is not None)
+        assert ("the role page may not read it" in caplog.text) == (role is not None)
+        assert ("or there is no room for more subscriptions" in caplog.text) == (role is None)
+        await opened[0].leave()
+        await until(lambda: inbox.link.refused == ({"elsewhere"} if role else set()))
+        assert caplog.text.count("has refused a subscription") == 2, "each is said once"
+        await stopped(task)

@@ -526,11 +526,13 @@ class LiveSite:
 
     def _evaluate(self, now_s: float) -> None:
         watch, age_s = self.survey.watch.message, self.survey.watch.age_s()
-        unread_s = 0.0 if self._link is None else self._link.unread_s
+        unread_s, refused = (0.0, ()) if self._link is None else (self._link.unread_s, self._link.refused)
         used_share = None if self._used_share is None else self._used_share(now_s)
         if self._at_hub and self._link is not None:
             self.evidence.hub_trouble = self._link.trouble
-        self.condition = self._condition_monitor.evaluate(now_s, self._lag_s, watch, age_s, used_share, unread_s)
+        self.condition = self._condition_monitor.evaluate(
+            now_s, self._lag_s, watch, age_s, used_share, unread_s, refused
+        )
         self._lag_s = 0.0
         blind = self._condition_monitor.is_blind(now_s)
         self.state.judge(now_s, blind=blind)

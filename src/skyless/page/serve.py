@@ -14,6 +14,7 @@ from msgspec import Struct
 from skyless.core.errors import SkylessError
 from skyless.page._state import MAX_REQUEST_BYTES
 from skyless.page.app import Services, make_app
+from skyless.page.connections import Connection, FailedAccepts, end_unfinished
 from skyless.page.guard import AccessRules
 from skyless.page.sockets import SEND_TIMEOUT_S
 from skyless.run.process import ending_signals, reserve
@@ -22,8 +23,6 @@ PORT: Final = 8080
 _MORE_PORTS: Final = 50
 _PING_S: Final = 5.0
 _GRACE_S: Final = 0.4
-REQUEST_TIMEOUT_S: Final = 10.0
-"""A connection that has not sent the head of its first request by then is ended. Uvicorn knows no such limit."""
 _SEND_BUFFER_BYTES: Final = 262_144  # data for a slow page that waits in the kernel and is sent before anything newer
 
 
@@ -86,6 +85,7 @@ async def serve(services: Services, rules: AccessRules, sock: socket.socket, sit
     """Serve pages until Ctrl-C, SIGTERM or SIGHUP. ``sites`` keeps the sites connected."""
     config = uvicorn.Config(
         make_app(services, rules),
+        http=Connection,
         lifespan="off",
         log_config=None,
         log_level="error",
@@ -100,11 +100,12 @@ async def serve(services: Services, rules: AccessRules, sock: socket.socket, sit
         timeout_graceful_shutdown=1,
     )
     server = _Server(config)
-    jobs = [sites, server.end_unfinished()]
+    jobs = [sites, end_unfinished(server.server_state.connections)]
     if services.gathered is not None:
         jobs.append(services.gathered.run(services.sites))
     work = [asyncio.create_task(job) for job in jobs]
     loop = asyncio.get_running_loop()
+    FailedAccepts(loop)
     for number in (signal.SIGINT, *ending_signals()):
         loop.add_signal_handler(number, _stop, server, services)
     serving = asyncio.create_task(server.serve(sockets=[sock]))
@@ -140,21 +141,6 @@ class _Server(uvicorn.Server):
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
-
-    async def end_unfinished(self, timeout_s: float = REQUEST_TIMEOUT_S) -> None:
-        """End connections without a request, until cancelled."""
-        seen_s: dict[object, float] = {}
-        while True:
-            await asyncio.sleep(timeout_s / 4)
-            now_s = asyncio.get_running_loop().time()
-            connections = list(self.server_state.connections)
-            seen_s = {one: seen_s.get(one, now_s) for one in connections}
-            for connection in connections:
-                transport = getattr(connection, "transport", None)
-                # A connection of HTTP has no cycle before its first request; one of a WebSocket is of another class.
-                unfinished = getattr(connection, "cycle", self) is None
-                if unfinished and transport is not None and now_s - seen_s[connection] >= timeout_s:
-                    transport.abort()
 
     def drop_connections(self) -> None:
         """Close connections that have not ended."""

@@ -349,11 +349,13 @@ class Anchors:
         """An anchor's connection to the broker."""
         link = link_of(address, node.id, site=self._site.id, kind="anchor")
         if link is not None:
-            for topic, kind, act, fault in (
-                (request_topic(self._site.id), RequestMessage, node.on_request, "bad-request"),
-                (placement_topic(self._site.id), PlacementMessage, partial(self._place, node), "bad-placement"),
-            ):
-                link.subscribe(topic, reader(kind, act, partial(node.refuse, fault)), qos=1)
+            site, placed = self._site.id, partial(self._place, node)
+            link.subscribe(
+                request_topic(site), reader(RequestMessage, node.on_request, partial(node.refuse, "bad-request"))
+            )
+            link.subscribe(
+                placement_topic(site), reader(PlacementMessage, placed, partial(node.refuse, "bad-placement")), qos=1
+            )
         return link
 
     def _place(self, node: AnchorNode, message: PlacementMessage) -> None:

@@ -276,7 +276,7 @@ class Tag:
         self._fix_topic = fix_topic(site, self.node.name)
         self._health_topic = health_topic(site, "tag", self.node.name)
         self._receptions_topic = receptions_topic(site, self.node.name)
-        self.link.subscribe(request_topic(site), reader(RequestMessage, self._on_request, self._on_bad_request), qos=1)
+        self.link.subscribe(request_topic(site), reader(RequestMessage, self._on_request, self._on_bad_request))
         self._link_tasks.append(asyncio.ensure_future(keep(self.link, self._log)))
 
     def _on_request(self, request: RequestMessage) -> None:

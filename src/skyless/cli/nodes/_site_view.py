@@ -203,8 +203,8 @@ class SiteView:
         """Find the condition again, as the page does. ``lag_s`` is the delay of this call."""
         now_s = self._clock()
         watch, made_s = self._watch or (None, now_s)
-        used, unread_s = self._used_share(now_s), self.link.unread_s
-        self.condition = self._monitor.evaluate(now_s, lag_s, watch, now_s - made_s, used, unread_s)
+        used, unread_s, refused = self._used_share(now_s), self.link.unread_s, self.link.refused
+        self.condition = self._monitor.evaluate(now_s, lag_s, watch, now_s - made_s, used, unread_s, refused)
 
     def picture(self) -> Picture:
         """The site now."""

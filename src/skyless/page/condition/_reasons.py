@@ -1,7 +1,7 @@
 """What can be wrong with a live site: each function looks for one cause and gives its reason. No I/O."""
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence, Sized
+from collections.abc import Collection, Iterable, Mapping, Sequence, Sized
 from typing import Final, Literal
 
 from msgspec import Struct
@@ -125,6 +125,16 @@ def broker_reason(hub_trouble: str | None) -> Reason:
         return Reason("broker", "bad", f"{hub_trouble}; nothing is updated", "The page connects by itself.")
     advice = "Start the broker again, or see whether its computer is reachable; the page connects by itself."
     return Reason("broker", "bad", "the broker is not connected: nothing is updated", advice)
+
+
+def refused_reason(topic_filters: Collection[str]) -> Reason | None:
+    """The broker refuses subscriptions, so that a part of what the site says is missing."""
+    if not topic_filters:
+        return None
+    named = ", ".join(sorted(topic_filters)[:_MAX_NAMED])
+    text = f"the broker has refused {len(topic_filters)} subscriptions, so what they bring is missing: {named}"
+    advice = "It has no room for more (its log says why), or the user has too few permissions (docs/mqtt.md, Roles)."
+    return Reason("refused", "bad", text, advice)
 
 
 def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> Reason | None:
@@ -623,7 +633,7 @@ def _finders(nodes: Iterable[tuple[str, str]]) -> str:
 # Words, and the order of reasons
 
 _ORDER: Final = (
-    *("broker", "behind", "slow", "busy", "late", "not-shown", "forged", "clock", "chain-ended", "codes"),
+    *("broker", "refused", "behind", "slow", "busy", "late", "not-shown", "forged", "clock", "chain-ended", "codes"),
     *("not-verified", "no-fixes", "limit"),
     *("moved", "anchors", "master", "no-fix", "alert", "keys", "not-synchronised", "silent-anchors", "silent", "watch"),
     *("multipath", "chain"),

@@ -5,6 +5,7 @@ its level, too, falls only after that time. The condition is good only on fresh 
 tag has a fix that has just arrived, and nothing speaks against it. Where nothing is known it is "waiting".
 """
 
+from collections.abc import Collection
 from typing import Final, Literal
 
 from msgspec import Struct
@@ -26,6 +27,7 @@ from skyless.page.condition._reasons import (
     multipath_reason,
     offline_anchors,
     rank,
+    refused_reason,
     slow_reason,
     watch_reasons,
 )
@@ -76,12 +78,13 @@ class ConditionMonitor:
         watch_age_s: float | None = None,
         used_share: float | None = None,
         unread_s: float = 0.0,
+        refused: Collection[str] = (),
     ) -> Condition:
         """The condition now.
 
         ``lag_s`` is by how much the server's own work was delayed since the last evaluation, ``used_share`` the share
         of its computer's processors that is in use, None where it is not known; ``unread_s`` is for how long messages
-        have waited in its own queue.
+        have waited in its own queue, and ``refused`` which subscriptions the broker has refused.
         """
         evidence = self.evidence
         ages = evidence.ages.least_ages_s()
@@ -95,6 +98,7 @@ class ConditionMonitor:
             return Condition(reason.level, reason.text, (reason,), None, None)
         behind = behind_reason(ages, unread_s)
         found = [
+            refused_reason(refused),
             behind,
             slow_reason(evidence, now_s, lag_s),
             busy_reason(evidence, used_share) if evidence.nodes else None,

@@ -43,7 +43,7 @@ class HubLink:
         self.trouble: str | None = "not connected yet"
         self.on_state: list[Callable[[bool], None]] = []
         """Called with ``connected`` whenever it changes."""
-        self.unacknowledged, self.unread_s = 0, 0.0
+        self.unacknowledged, self.unread_s, self.refused = 0, 0.0, frozenset[str]()
         self.drops: Counter[str] = Counter()
         self._name = name
         self._subscriptions = Subscriptions()

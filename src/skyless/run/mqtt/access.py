@@ -14,6 +14,7 @@ from typing import Final
 
 from msgspec import Struct
 from msgspec.structs import replace
+from paho.mqtt.client import topic_matches_sub
 
 from skyless.core.errors import SkylessError, writing
 from skyless.core.whole_files import replace_files
@@ -120,6 +121,14 @@ ACCESS: Final = {
         subscribe=(topics.site_topic(EVERY_SITE), topics.fix_topic(EVERY_SITE, EVERY_NODE)),
     ),
 }
+
+
+def may_subscribe(user: str | None, topic_filter: str) -> bool | None:
+    """Whether the roles let a user subscribe to a filter; None where it is not known, as without roles."""
+    if user is not None and user not in ACCESS:
+        return None
+    granted = any(topic_matches_sub(one, topic_filter) for one in ACCESS[Role(user or Role.STRANGER)].subscribe)
+    return granted or (None if user is None else False)
 
 
 USERS: Final = tuple(role for role in Role if role is not Role.STRANGER)

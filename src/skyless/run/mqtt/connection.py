@@ -70,6 +70,8 @@ class Reactions(Struct, frozen=True):
     """The broker has the message of QoS 1 that ``publish`` gave this number."""
     writable: Callable[[], None] = lambda: None
     """The connection accepts more again."""
+    subscribed: Callable[[str, bool], None] = lambda _filter, _granted: None
+    """The broker has granted a subscription, or has refused it."""
 
 
 class RefusedError(Exception):
@@ -293,8 +295,7 @@ class Connection:
         self, _client: object, _data: object, number: int, codes: list[ReasonCode], _more: object
     ) -> None:
         for name, code in zip(self._asked.pop(number, ()), codes, strict=False):
-            if code.is_failure:
-                _log.warning("the broker %s does not let this user subscribe to %s", self._address, name)
+            self._react.subscribed(name, not code.is_failure)
 
 
 def _decrypted(sock: socket.socket) -> int:

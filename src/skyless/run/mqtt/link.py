@@ -16,6 +16,7 @@ from msgspec import Struct
 from paho.mqtt.matcher import MQTTMatcher
 
 from skyless.core.version import installed_version
+from skyless.run.mqtt.access import may_subscribe
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import (
     Connection,
@@ -83,6 +84,8 @@ class Link:
         self.connected = False
         self.trouble: str | None = "not connected yet"
         """Why there is no connection; None while there is one."""
+        self.refused: set[str] = set()
+        """Topic filters that the broker does not let it subscribe to, because of the user or for want of room."""
         self.on_state: list[Callable[[bool], None]] = []
         """Called with ``connected`` whenever it changes."""
         self._tls = address.tls_context()
@@ -94,7 +97,7 @@ class Link:
         self._offline = StatusMessage(online=False, kind=kind, name=str(name))
         self._outbox = Outbox(limits or Limits())
         self._subscriptions = Subscriptions()
-        self._reactions = Reactions(self._subscriptions.receive, self._acknowledged, self._pump)
+        self._reactions = Reactions(self._subscriptions.receive, self._acknowledged, self._pump, self._subscribed)
         self._connection: Connection | None = None
         self._brokers = address.brokers
         """Those of the address in turn, the present one first."""
@@ -247,6 +250,9 @@ class Link:
     def _repeat_status(self, connection: Connection) -> None:
         if self._connection is connection and not self._stopping:
             self.publish(self._status_topic, self._online, qos=1, retain=True)
+            if self.refused:  # a broker that was full may have room again
+                filters = self._subscriptions.filters
+                connection.subscribe({name: filters[name] for name in self.refused})
             self._repeat_later(connection)
 
     def _correct_status(self, _topic: str, payload: bytes) -> None:
@@ -287,6 +293,19 @@ class Link:
                 return
             number = connection.publish(message.topic, message.payload, message.qos, retain=message.retain)
             self._outbox.mark_sent(message, number)
+
+    def _subscribed(self, topic_filter: str, granted: bool) -> None:
+        if granted:
+            self.refused.discard(topic_filter)
+        elif topic_filter not in self.refused:
+            self.refused.add(topic_filter)
+            user = self.address.user
+            why = {
+                True: "this user may read it, so the broker has no room for more subscriptions (its log says why)",
+                False: f"the role {user} may not read it",
+                None: "this user may not read it, or there is no room for more subscriptions (its log says why)",
+            }[may_subscribe(user, topic_filter)]
+            _log.warning("the broker %s has refused a subscription to %s: %s", self.address, topic_filter, why)
 
     def _acknowledged(self, number: int) -> None:
         self._outbox.acknowledge(number)

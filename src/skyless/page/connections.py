@@ -1,0 +1,103 @@
+"""The connections of the page's server: how many there may be, and which end because nothing is asked on them."""
+
+import asyncio
+import logging
+from typing import Any, Final
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+MAX_CONNECTIONS: Final = 600
+"""In all: well below the 1,024 open files that a program usually may have."""
+
+MAX_CONNECTIONS_PER_ADDRESS: Final = 200
+
+REQUEST_TIMEOUT_S: Final = 10.0
+BODY_TIMEOUT_S: Final = 60.0
+"""A connection that has waited longer for a request, or for its body, is ended. Uvicorn ends those only that have been
+answered and are silent since."""
+
+_REFUSAL: Final = b"this server has %d connections%s, the most that it takes; try again, or close other pages\n"
+_RESPONSE: Final = (
+    b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: text/plain; charset=utf-8\r\nContent-Length: %d\r\n"
+    b"Retry-After: 10\r\nConnection: close\r\n\r\n%b"
+)
+_LOG_INTERVAL_S: Final = 60.0
+
+_log = logging.getLogger("skyless.page")
+
+
+class Connection(H11Protocol):
+    """A connection of HTTP, which becomes one of a WebSocket where that is asked.
+
+    Where there are too many, the one that has waited longest for the rest of a request makes room. Only where none
+    does, the new one is refused.
+    """
+
+    since_s = 0.0
+    """When the connection began."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Take the connection, if there is room."""
+        super().connection_made(transport)
+        self.since_s = self.loop.time()
+        others = [one for one in self.connections if one is not self and not one.transport.is_closing()]
+        of_address = [one for one in others if _address(one) == _address(self)]
+        if len(of_address) >= MAX_CONNECTIONS_PER_ADDRESS:
+            self._make_room(of_address, b" of this address")
+        elif len(others) >= MAX_CONNECTIONS:
+            self._make_room(others, b"")
+
+    def _make_room(self, crowd: list[Any], which: bytes) -> None:
+        unfinished = [one for one in crowd if is_unfinished(one)]
+        if unfinished:
+            min(unfinished, key=lambda one: one.since_s).transport.abort()
+            return
+        text = _REFUSAL % (len(crowd), which)
+        self.transport.write(_RESPONSE % (len(text), text))
+        self.transport.close()
+
+
+def _address(connection: H11Protocol) -> object:
+    return connection.client and connection.client[0]
+
+
+def is_unfinished(connection: object) -> bool:
+    """Whether a connection waits for a request, or the rest of one. A WebSocket never does."""
+    if not isinstance(connection, Connection):
+        return False
+    cycle = connection.cycle
+    return cycle is None or cycle.more_body or cycle.response_complete
+
+
+async def end_unfinished(
+    connections: set[Any], timeout_s: float = REQUEST_TIMEOUT_S, body_timeout_s: float = BODY_TIMEOUT_S
+) -> None:
+    """End connections that have been without a whole request for too long, until cancelled."""
+    since_s: dict[object, float] = {}
+    while True:
+        await asyncio.sleep(timeout_s / 4)
+        now_s = asyncio.get_running_loop().time()
+        waiting = {(one, one.cycle): one for one in list(connections) if is_unfinished(one)}
+        since_s = {key: since_s.get(key, now_s) for key in waiting}
+        for key, connection in waiting.items():
+            reads_body = connection.cycle is not None and not connection.cycle.response_complete
+            if now_s - since_s[key] >= (body_timeout_s if reads_body else timeout_s):
+                connection.transport.abort()
+
+
+class FailedAccepts:
+    """Logs connections that the system could not accept, as for want of open files, in one line a minute."""
+
+    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
+        self._count, self._said_s = 0, float("-inf")
+        loop.set_exception_handler(self._handle)
+
+    def _handle(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        error = context.get("exception")
+        if not isinstance(error, OSError) or "accept" not in context.get("message", ""):
+            loop.default_exception_handler(context)
+            return
+        self._count += 1
+        if loop.time() - self._said_s >= _LOG_INTERVAL_S:
+            _log.error("connections could not be accepted (%d times): %s", self._count, error.strerror)
+            self._count, self._said_s = 0, loop.time()
