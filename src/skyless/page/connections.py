@@ -57,8 +57,8 @@ class Connection(H11Protocol):
         self.transport.close()
 
 
-def _address(connection: H11Protocol) -> object:
-    return connection.client and connection.client[0]
+def _address(connection: object) -> object:
+    return (getattr(connection, "client", None) or ("",))[0]
 
 
 def is_unfinished(connection: object) -> bool:
