@@ -307,14 +307,27 @@ def test_a_mail_when_an_alarm_is_raised_and_when_it_has_ended():
     assert "This site is simulated." in text
 
 
-def test_a_name_with_line_breaks_cannot_add_headers():
+@pytest.mark.parametrize(
+    "name", ["x\r\nBcc: eve@example.org\r\n\r\nbody", "=?utf-8?q?=0D=0ABcc:_eve@example.org?=", "\x1b]0;x\x07\x85"]
+)
+def test_a_name_cannot_add_headers(name):
     box = Mailbox()
     with mail_server(box) as port:
         target = open_target(f"smtp://127.0.0.1:{port}?to=ada@example.org")
-        deliver(target, [replace(ALARM, name="x\r\nBcc: eve@example.org\r\n\r\nbody")], lambda: target.delivered == 1)
+        deliver(target, [replace(ALARM, name=name)], lambda: target.delivered == 1)
     ((people, mail),) = box.mails
     assert people == ["ada@example.org"]
     assert mail["Bcc"] is None
+    assert mail["Subject"].isprintable()
+
+
+@pytest.mark.parametrize("unix_s", [1e17, -1e17, 1e300])
+def test_a_time_that_is_none_does_not_stop_a_mail(unix_s):
+    box = Mailbox()
+    with mail_server(box) as port:
+        target = open_target(f"smtp://127.0.0.1:{port}?to=ada@example.org")
+        deliver(target, [replace(ALARM, since_unix_s=unix_s)], lambda: target.delivered == 1)
+    assert "which is no time" in box.mails[0][1].get_content()
 
 
 def test_a_mail_that_is_refused_for_good_is_counted():

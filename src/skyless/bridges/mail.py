@@ -74,18 +74,30 @@ class Mail(AlarmTarget):
         where = "" if site is None else site.name
         mail = EmailMessage()
         ended = "" if delivery.what == "raised" else "ended: "
-        mail["Subject"] = " ".join(f"{ended}{alarm.name} [{alarm.severity}] {where}".split())[:200]
+        mail["Subject"] = _header(f"{ended}{alarm.name} [{alarm.severity}] {where}")[:200]
         mail["From"], mail["To"] = self._from, ", ".join(self._to)
         mail["Date"] = formatdate(localtime=True)
         mail["Message-ID"] = f"<{sha256(delivery.key.encode()).hexdigest()[:32]}@skyless>"
         mail["Auto-Submitted"] = "auto-generated"
         times = {"Since": alarm.since_unix_s, "Raised": alarm.unix_s, "Ended": alarm.ended_unix_s}
         facts = {"Site": where, "Place": alarm.place, "Severity": alarm.severity}
-        facts |= {name: time.strftime("%Y-%m-%d %H:%M:%S %Z", time.localtime(at)) for name, at in times.items() if at}
+        facts |= {name: _time(at) for name, at in times.items() if at}
         lines = (f"{name}: {value}" for name, value in facts.items() if value)
         simulated = "\nThis site is simulated.\n" if site is not None and site.simulated else ""
         mail.set_content(f"{alarm.sentence}.\n\n" + "\n".join(lines) + f"\n{simulated}\n{alarm.id}\n")
         return mail
+
+
+def _header(text: str) -> str:
+    """A text as the value of a header. A name ``=?utf-8?q?=0D=0ABcc:…?=`` adds a header in Python before 3.11.10."""
+    return " ".join("".join(one if one.isprintable() else " " for one in text).replace("=?", "= ?").split())
+
+
+def _time(unix_s: float) -> str:
+    try:
+        return time.strftime("%Y-%m-%d %H:%M:%S %Z", time.localtime(unix_s))
+    except (OverflowError, ValueError, OSError):
+        return f"{unix_s:g} s, which is no time"
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Mail:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Final
 from cyclopts import App, CycloptsError, Group, Parameter, UnknownCommandError
 from cyclopts.help import DefaultFormatter
 
+from skyless.cli.common.output import plain
 from skyless.core.errors import SkylessError
 from skyless.core.extras import what_to_install
 from skyless.core.version import installed_version
@@ -136,7 +137,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (SkylessError, CycloptsError, ModuleNotFoundError, OSError) as error:
         if (line := _line_for_the_user(error)) is None:
             raise
-        print(f"skyless: {line}", file=sys.stderr)
+        print(f"skyless: {plain(line, chr(10))}", file=sys.stderr)
         return _USER_ERROR
     return result if isinstance(result, int) else 0
 

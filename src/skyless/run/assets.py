@@ -18,6 +18,8 @@ COLUMNS: Final = Asset.__struct_fields__
 """Head of a table in CSV, as it is written."""
 
 _TAG: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
+_FORMULA: Final = ("=", "+", "-", "@", "'")
+"""How a cell begins that a spreadsheet may compute; and one of text there, which must stay distinct from it."""
 _COLOUR: Final = re.compile(r"(#[0-9A-Fa-f]{6})?")
 _MAX_LENGTHS: Final = {"name": 100, "group": 64, "icon": 8, "owner": 100, "notes": 1000}
 
@@ -60,11 +62,12 @@ def _fault(asset: Asset) -> str:
 
 
 def write_csv(assets: Iterable[Asset]) -> bytes:
-    """A table in CSV (RFC 4180), UTF-8."""
+    """A table in CSV (RFC 4180), UTF-8. What a spreadsheet would take for a formula has an apostrophe before it."""
     out = io.StringIO()
     writer = csv.writer(out)
     writer.writerow(COLUMNS)
-    writer.writerows(msgspec.structs.astuple(asset) for asset in assets)
+    for asset in assets:
+        writer.writerow(f"'{cell}" if cell.startswith(_FORMULA) else cell for cell in msgspec.structs.astuple(asset))
     return out.getvalue().encode()
 
 
@@ -93,7 +96,7 @@ def read_csv(data: bytes) -> tuple[Asset, ...]:
                 continue
             fault = f"it has {len(row)} cells; it should have {len(columns)}, as the head"
             if len(row) == len(columns):
-                asset = Asset(**{name: cell.strip() for name, cell in zip(columns, row, strict=True)})
+                asset = Asset(**{name: _text(cell.strip()) for name, cell in zip(columns, row, strict=True)})
                 fault = _fault(asset)
                 if asset.tag in found:
                     fault = f"tag {asset.tag!r} stands in line {found[asset.tag][0]} already"
@@ -105,6 +108,11 @@ def read_csv(data: bytes) -> tuple[Asset, ...]:
     assets = tuple(asset for _, asset in found.values())
     check_assets(assets)
     return assets
+
+
+def _text(cell: str) -> str:
+    """A cell without the apostrophe that ``write_csv`` puts before it."""
+    return cell[1:] if cell[:1] == "'" and cell[1:].startswith(_FORMULA) else cell
 
 
 def _columns(head: list[str]) -> list[str]:

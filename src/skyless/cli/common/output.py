@@ -144,9 +144,9 @@ def cm(value_m: float | None) -> str:
     return number(value_m, "{:.2f} cm", 100.0)
 
 
-def plain(text: str) -> str:
-    """A text from the network without characters that would control the terminal."""
-    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)
+def plain(text: str, keep: str = "") -> str:
+    """A text from the network without characters that would control the terminal, but for those to be kept."""
+    return "".join(one if one.isprintable() or one in keep else "\N{REPLACEMENT CHARACTER}" for one in text)
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Final
 
 from cyclopts import Parameter
 
+from skyless.cli.common.output import plain
 from skyless.core.arguments import Options, number, read_numbers, whole
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
@@ -126,8 +127,8 @@ def run_until_stopped(program: Coroutine[Any, Any, None], *, punctual: bool = Fa
 
 
 def log(line: str) -> None:
-    """Show a line to a person, on standard error."""
-    print(line, file=sys.stderr, flush=True)
+    """Show a line to a person, on standard error. What came from the network may be in it."""
+    print(plain(line, "\n"), file=sys.stderr, flush=True)
 
 
 def name_unplaced(site: Site) -> None:

@@ -7,7 +7,7 @@ from typing import Any, Final, Literal, get_origin
 import msgspec
 from msgspec import Struct
 from starlette.exceptions import HTTPException
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 
@@ -128,10 +128,13 @@ def _endpoint(route: ApiRoute, sites: Sites, history: Past) -> Callable[[Request
 async def read_bytes(request: Request, most_bytes: int, fault: str = "") -> bytes:
     """The request's body. One that is too long is answered with status 413 and the given words."""
     body = bytearray()
-    async for chunk in request.stream():
-        body += chunk
-        if len(body) > most_bytes:
-            raise HTTPException(413, fault or f"the body should have {most_bytes} bytes at most")
+    try:
+        async for chunk in request.stream():
+            body += chunk
+            if len(body) > most_bytes:
+                raise HTTPException(413, fault or f"the body should have {most_bytes} bytes at most")
+    except ClientDisconnect:
+        raise HTTPException(400, "the client has left in the middle of the body") from None
     return bytes(body)
 
 

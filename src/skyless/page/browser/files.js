@@ -2,10 +2,13 @@
 
 import { h } from "./dom.js";
 
-/** A table as CSV: commas, CRLF, quotes where they are needed; null is an empty field. @param {Iterable<any[]>} rows */
+/**
+ * A table as CSV: commas, CRLF, quotes where they are needed; null is an empty field. Words that a spreadsheet would
+ * take for a formula have an apostrophe before them. @param {Iterable<any[]>} rows
+ */
 export function csvOf(heads, rows) {
   const field = (value) => {
-    const words = String(value ?? "");
+    const words = typeof value === "string" && /^[=+\-@']/.test(value) ? `'${value}` : String(value ?? "");
     return /[",\r\n]/.test(words) ? `"${words.replaceAll('"', '""')}"` : words;
   };
   const line = (row) => `${row.map(field).join(",")}\r\n`;

@@ -24,12 +24,17 @@ export function readCsv(file) {
   const seen = new Set();
   return lines.map(({ cells, line }) => {
     if (cells.length > names.length) throw new Error(`Line ${line} has ${cells.length} values for ${names.length} columns.`);
-    const asset = Object.fromEntries(names.map((name, index) => [name, (cells[index] ?? "").trim()]));
+    const asset = Object.fromEntries(names.map((name, index) => [name, wordsOf(cells[index] ?? "")]));
     if (!asset.tag) throw new Error(`Line ${line} names no tag.`);
     if (seen.has(asset.tag)) throw new Error(`Line ${line}: the tag "${asset.tag}" is listed twice.`);
     seen.add(asset.tag);
     return asset;
   });
+}
+
+/** A cell, without the apostrophe that stands before what a spreadsheet would take for a formula. */
+function wordsOf(cell) {
+  return cell.trim().replace(/^'(?=[=+\-@'])/, "");
 }
 
 /** The rows that are not empty, each with the number of its first line; a value in quotes may have separators and line ends. */
