@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_nmea import FIX, HALL
 from websockets.asyncio.client import connect
-from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
 from skyless.bridges import foxglove
 from skyless.bridges.foxglove import (
@@ -38,9 +38,9 @@ ANSWER_S = 20.0
 
 
 @asynccontextmanager
-async def served(site=SITE):
+async def served(site=SITE, origins=()):
     """A target that serves on a free port."""
-    server = FoxgloveTarget("foxglove://:0", "127.0.0.1", 0, unix_time=lambda: FIX.unix_s)
+    server = FoxgloveTarget("foxglove://:0", "127.0.0.1", 0, origins, unix_time=lambda: FIX.unix_s)
     if site is not None:
         server.on_site(site)
     running = asyncio.create_task(server.run())
@@ -90,6 +90,33 @@ class Client:
 async def client_of(server, subprotocols=SUBPROTOCOLS):
     async with connect(f"ws://127.0.0.1:{server.port}", subprotocols=list(subprotocols)) as connection:
         yield Client(connection)
+
+
+@pytest.mark.parametrize(
+    ("host", "origin", "status"),
+    [
+        (None, None, 101),
+        (None, "https://app.foxglove.dev", 101),
+        (None, "http://localhost:8080", 101),
+        (None, "https://lichtblick.example", 101),
+        (None, "http://evil.example", 403),
+        (None, "null", 403),
+        ("evil.example", None, 421),
+        ("evil.example", "http://evil.example", 421),
+    ],
+)
+def test_pages_of_other_sites_are_refused(host, origin, status):
+    async def run():
+        async with served(origins=["https://lichtblick.example"]) as server:
+            address = f"ws://127.0.0.1:{server.port}" if host is None else f"ws://{host}:{server.port}"
+            try:
+                where = {"host": "127.0.0.1", "port": server.port}
+                async with connect(address, origin=origin, subprotocols=list(SUBPROTOCOLS), **where):
+                    return 101
+            except InvalidStatus as error:
+                return error.response.status_code
+
+    assert asyncio.run(run()) == status
 
 
 def advertised(topic):

@@ -266,7 +266,7 @@ def exchange(*requests):
 
 def test_it_answers_scrapes_and_nothing_else():
     _, (whole, head, other, no_page, posted) = exchange(
-        b"GET /metrics?x=1 HTTP/1.1\r\nHost: a\r\n\r\n",
+        b"GET /metrics?x=1 HTTP/1.1\r\nHost: localhost:9464\r\n\r\n",
         b"HEAD /metrics HTTP/1.1\r\n\r\n",
         b"GET / HTTP/1.1\r\n\r\n",
         b"HEAD / HTTP/1.1\r\n\r\n",
@@ -282,6 +282,22 @@ def test_it_answers_scrapes_and_nothing_else():
     assert no_page.endswith(b"\r\n\r\n")
     assert other.startswith(b"HTTP/1.1 404")
     assert posted.startswith(b"HTTP/1.1 405")
+
+
+@pytest.mark.parametrize(
+    ("header", "status", "count"),
+    [
+        ("Host: evil.example", "421", "host"),
+        ("Host: 192.0.2.1", "421", "host"),
+        ("Host: localhost\r\nOrigin: http://evil.example", "403", "origin"),
+        ("Host: localhost\r\nSec-Fetch-Site: cross-site", "403", "origin"),
+    ],
+)
+def test_pages_of_other_sites_are_refused(header, status, count):
+    target, (answer,) = exchange(f"GET /metrics HTTP/1.1\r\n{header}\r\n\r\n".encode())
+    assert answer.startswith(f"HTTP/1.1 {status} ".encode())
+    assert b"skyless_" not in answer
+    assert target.dropped == {count: 1}
 
 
 def test_what_is_no_request_is_counted_and_harms_nobody():

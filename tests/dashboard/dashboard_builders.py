@@ -70,7 +70,7 @@ class Times:
 class Wire:
     """In the place of a link: keeps what is published, and echoes it as a broker does."""
 
-    unread_s = 0.0
+    unread_s, refused = 0.0, ()
     unacknowledged = 0
     trouble = None
 

@@ -6,11 +6,13 @@ Source: https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md
 import asyncio
 import contextlib
 import logging
+import re
 import secrets
 import socket
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
+from http import HTTPStatus
 from struct import Struct as Format
 from typing import Annotated, Any, Final
 
@@ -18,6 +20,8 @@ import msgspec
 from msgspec import Meta, Struct
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request as HttpRequest
+from websockets.http11 import Response
 from websockets.typing import Subprotocol
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl, cannot_listen, floored
@@ -31,10 +35,17 @@ from skyless.run.foxglove.messages import (
     scene,
     schema_of,
 )
+from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, TagHealth
+from skyless.run.web import is_local_origin, is_own_host, own_names, same_origin
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """Names of the protocol, the newer first; what they share is all that is used here."""
+
+_APPLICATIONS: Final = ("https://app.foxglove.dev", "file://")
+"""Origins of Foxglove's own application, in a browser and on the desktop."""
+
+_ORIGIN: Final = re.compile(r"[a-z+-]+://[^/\s,]*")
 
 WARNING: Final = 1
 """Level of a status."""
@@ -232,8 +243,17 @@ _quiet.propagate = False
 class FoxgloveTarget(Target):
     """Serves one site to any number of clients. A channel costs nothing while nobody has subscribed it."""
 
-    def __init__(self, text: str, host: str, port: int, unix_time: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self,
+        text: str,
+        host: str,
+        port: int,
+        origins: Collection[str] = (),
+        unix_time: Callable[[], float] = time.time,
+    ) -> None:
+        """``origins`` are those of web applications that may connect, besides Foxglove's and those of this computer."""
         super().__init__(text)
+        self._origins = {*_APPLICATIONS, *origins}
         self.port = port
         """The one that is used, where 0 was asked for and the server runs."""
         self._host, self._unix_time = host, unix_time
@@ -279,6 +299,7 @@ class FoxgloveTarget(Target):
                 self._serve,
                 self._host,
                 self.port,
+                process_request=self._refusal,
                 subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
                 compression=None,
                 max_size=_MAX_REQUEST_BYTES,
@@ -291,6 +312,18 @@ class FoxgloveTarget(Target):
         async with server:
             self.port = next(iter(server.sockets)).getsockname()[1]
             await server.serve_forever()
+
+    def _refusal(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
+        """The answer to a page of another site; None where the client may connect."""
+        host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
+        if not is_own_host(host, own_names(self._host), remote=not is_loopback(self._host)):
+            self.dropped["host"] += 1
+            return connection.respond(HTTPStatus.MISDIRECTED_REQUEST, "unknown host name: use the address\n")
+        if origin is None or origin in self._origins or is_local_origin(origin) or same_origin(origin, host):
+            return None
+        self.dropped["origin"] += 1
+        text = f"pages of {origin} may not connect; ?origins={origin} lets them\n"
+        return connection.respond(HTTPStatus.FORBIDDEN, text)
 
     async def _serve(self, connection: ServerConnection) -> None:
         """Serve one client until it goes."""
@@ -367,5 +400,9 @@ class FoxgloveTarget(Target):
 
 
 def make_target(url: TargetUrl, _context: BridgeContext) -> FoxgloveTarget:
-    """The target of ``foxglove://HOST:PORT``."""
-    return FoxgloveTarget(url.text, url.host(), url.port(_PORT))
+    """The target of ``foxglove://HOST:PORT``; ``origins=`` has web applications that may connect, with commas."""
+    origins = tuple(filter(None, url.text_option("origins").split(",")))
+    for origin in origins:
+        if not _ORIGIN.fullmatch(origin):
+            raise url.wrong(f"with origins= as https://HOST, several with commas; {origin!r} is none")
+    return FoxgloveTarget(url.text, url.host(), url.port(_PORT), origins)

@@ -9,13 +9,15 @@ import asyncio
 import time
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from math import inf, isinf, isnan
 from typing import Final, Literal
 
 from skyless.bridges.target import TAG_NAME, BridgeContext, BridgedSite, Target, TargetUrl, cannot_listen
 from skyless.core.version import installed_version
+from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
+from skyless.run.web import is_own_host, own_names
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
@@ -379,8 +381,10 @@ class Prometheus(Target):
     of time and of bytes, and where there are too many the oldest is ended, so that none keeps a scrape out.
     """
 
-    def __init__(self, text: str, host: str, port: int, *, positions: bool) -> None:
+    def __init__(self, text: str, host: str, port: int, names: Collection[str] = (), *, positions: bool) -> None:
+        """``names`` are those by which others reach it, besides the computer's own and its addresses."""
         super().__init__(text)
+        self._names = {*own_names(host), *names}
         self.metrics = SiteMetrics(positions=positions)
         self.dropped = self.metrics.dropped
         self.port = port
@@ -439,6 +443,13 @@ class Prometheus(Target):
             writer.transport.abort()
 
     def _answer(self, request: bytes) -> bytes:
+        headers = _headers(request)
+        if "host" in headers and not is_own_host(headers["host"], self._names, remote=not is_loopback(self._host)):
+            self.dropped["host"] += 1
+            return _response("421 Misdirected Request", "unknown host name; ?hosts=NAME in the target admits it\n")
+        if "origin" in headers or headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
+            self.dropped["origin"] += 1
+            return _response("403 Forbidden", "pages of other sites are refused\n")
         method, _, rest = request.partition(b" ")
         path = rest.partition(b" ")[0].partition(b"?")[0]
         if method not in (b"GET", b"HEAD"):
@@ -450,6 +461,12 @@ class Prometheus(Target):
         return whole if method == b"GET" else whole.partition(b"\r\n\r\n")[0] + b"\r\n\r\n"
 
 
+def _headers(request: bytes) -> dict[str, str]:
+    """The headers of a request by their names in lower case."""
+    lines = (line.partition(b":") for line in request.split(b"\r\n")[1:])
+    return {name.decode("latin-1").lower(): value.decode("latin-1").strip() for name, _, value in lines if name}
+
+
 def _response(status: str, text: str, content_type: str = "text/plain; charset=utf-8") -> bytes:
     body = text.encode()
     head = (
@@ -459,6 +476,10 @@ def _response(status: str, text: str, content_type: str = "text/plain; charset=u
 
 
 def make_target(url: TargetUrl, _context: BridgeContext) -> Prometheus:
-    """``prometheus://[HOST][:PORT]``; with ``position=yes`` it gives where tags are. Raises SkylessError."""
+    """``prometheus://[HOST][:PORT]``; with ``position=yes`` it gives where tags are. Raises SkylessError.
+
+    ``hosts=`` has names by which others reach it, with commas.
+    """
+    names = [name.lower() for name in url.text_option("hosts").split(",") if name]
     positions = url.choice("position", ("no", "yes"), "no") == "yes"
-    return Prometheus(url.text, url.host(), url.port(_PORT), positions=positions)
+    return Prometheus(url.text, url.host(), url.port(_PORT), names, positions=positions)

@@ -5,11 +5,8 @@ operator's.
 """
 
 import hmac
-import ipaddress
-import re
 from hashlib import sha256
 from typing import Final
-from urllib.parse import urlsplit
 
 from msgspec import Struct
 from starlette.datastructures import MutableHeaders
@@ -17,6 +14,7 @@ from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from skyless.page.api.json_answer import json_answer
+from skyless.run.web import is_own_host, same_origin
 
 _HEADERS: Final = {
     "Content-Security-Policy": "default-src 'self'; script-src 'self' 'wasm-unsafe-eval'; img-src 'self' data: blob:; "
@@ -28,7 +26,6 @@ _HEADERS: Final = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 
-_HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::\d{1,5})?")
 _AT_HUB: Final = "this page is at a hub, which only reads; the site's own page changes it"
 _POLICY_VIOLATION: Final = 1008
 
@@ -53,7 +50,7 @@ class AccessRules(Struct, frozen=True):
 class Guard:
     """ASGI middleware: checks Host, Origin and token of every request and WebSocket, and adds security headers.
 
-    DNS rebinding: a page of another site that points its own name to this address sends that name as Host: refused.
+    ``skyless.run.web`` says what Host and Origin are refused for.
     """
 
     def __init__(self, app: ASGIApp, rules: AccessRules) -> None:
@@ -80,10 +77,10 @@ class Guard:
     def _fault(self, request: HTTPConnection) -> tuple[int, str] | None:
         hosts = request.headers.getlist("host")
         host = hosts[0].lower() if len(hosts) == 1 else ""
-        if not self._is_own_host(host):
+        if not is_own_host(host, self._rules.names, remote=self._rules.remote):
             return 421, "unknown host name: open the address that the dashboard has printed"
         origin = request.headers.get("origin")
-        if origin is not None and not _same_origin(origin, host):
+        if origin is not None and not same_origin(origin, host):
             return 403, "requests of other sites are refused"
         reads = request.scope.get("method", "GET") in {"GET", "HEAD"}
         if self._secret is None or self._carries(request, self._secret):
@@ -93,19 +90,6 @@ class Guard:
         if not reads:
             return 403, "the reader's token does not allow changes: they need the operator's, --token of the dashboard"
         return None
-
-    def _is_own_host(self, host: str) -> bool:
-        match = _HOST.fullmatch(host)
-        if match is None:
-            return False
-        name = match["name"].strip("[]").removesuffix(".")
-        if name == "localhost" or name in self._rules.names:
-            return True
-        try:
-            address = ipaddress.ip_address(name)
-        except ValueError:
-            return False
-        return self._rules.remote or address.is_loopback
 
     def _carries(self, request: HTTPConnection, secret: str) -> bool:
         """Whether a request carries the token with this digest, or the digest as a cookie."""
@@ -131,14 +115,6 @@ class Guard:
 
 def _digest(token: str) -> str:
     return sha256(token.encode()).hexdigest()
-
-
-def _same_origin(origin: str, host: str) -> bool:
-    try:
-        parts = urlsplit(origin.lower())
-    except ValueError:
-        return False
-    return parts.scheme in {"http", "https"} and parts.netloc == host
 
 
 def _tokens(request: HTTPConnection) -> list[str]:
