@@ -253,7 +253,7 @@ def test_a_program_of_the_wrong_role_is_warned(role, make_access, caplog, monkey
         await asyncio.wait([task])
 
     asyncio.run(check())
-    assert ("subscribe to skyless/v1/7/tag/n1/status" in caplog.text) == (role is Role.ANCHORS)
+    assert ("a subscription to skyless/v1/7/tag/n1/status" in caplog.text) == (role is Role.ANCHORS)
     assert access.passwords[role] not in caplog.text
 
 
