@@ -38,6 +38,7 @@ from skyless.run.hub.files import LEAF_PORT
 from skyless.run.process import end_with_parent
 
 SITE = 7
+FIX_STREAM = subjects.at(subjects.FIX_STREAM, SITE)
 TAGS = 5
 RECORDS = 20
 PERIOD_S = 0.05
@@ -242,7 +243,7 @@ class Stage:
         try:
             while time.monotonic() < begin_s + LIMIT_S:
                 with contextlib.suppress(Error):
-                    if (await client.jetstream().stream_info(subjects.HUB_FIXES)).state.messages >= aim:
+                    if (await client.jetstream().stream_info(FIX_STREAM)).state.messages >= aim:
                         return time.monotonic() - begin_s
                 await asyncio.sleep(0.2)
             return float("inf")
@@ -254,7 +255,7 @@ class Stage:
         client = await connect(self.address, "reader", quiet, Counter())
         try:
             found = []
-            async for message in follow(client.jetstream(), subjects.HUB_FIXES, ">", quiet):
+            async for message in follow(client.jetstream(), FIX_STREAM, ">", quiet):
                 found.append(decode_batch(message.data).sequence)
                 if len(found) >= self.acknowledged:
                     return found

@@ -92,14 +92,14 @@ async def test_a_page_that_is_started_after_a_cut_shows_the_site_and_changes_not
     with servers.running("hub"):
         with servers.running("site"):
             async with _client(servers.hub) as hub_client, _client(servers.site) as site, asyncio.timeout(60):
-                await make_hub_streams(hub_client.jetstream(), servers.plan, TENANT)
+                await make_hub_streams(hub_client, servers.plan, TENANT)
                 gather = asyncio.ensure_future(Gather(servers.site, NUMBER, 10**8, print).run())
                 walking = asyncio.ensure_future(_walk(site))
                 async with httpx.AsyncClient() as http, _dashboard(servers, http):
                     await _until(http, "sites", lambda found: found and found[0]["name"] == HALL.site.name)
                     await _until(http, "sites", lambda found: found[0]["condition"] not in {"unknown", "cut"})
                     await _until(http, f"v1/tags?site={NUMBER}", lambda found: found and found[0]["fix"])
-                while (await hub_client.jetstream().stream_info("STATE")).state.messages < 3:
+                while (await hub_client.jetstream().stream_info("STATE_7")).state.messages < 3:
                     await asyncio.sleep(0.1)
                 walking.cancel()
                 gather.cancel()

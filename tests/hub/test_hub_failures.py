@@ -34,6 +34,7 @@ from skyless.run.mqtt.connection import check_broker
 from support.processes import SKYLESS, free_node_port, free_port, started
 
 SITE, ROWS, RUN = 7, 20, 5
+FIX_STREAM = subjects.at(subjects.FIX_STREAM, SITE)
 FULL_BYTES = 300_000
 """A stream that is full after some 250 batches."""
 FEW, MANY = 20, 600
@@ -143,10 +144,10 @@ def test_a_full_hub_drops_the_oldest_and_a_history_that_was_away_counts_them(tmp
         stage.to_history.cut()
         await stage.send(MANY)
         client = await client_of(hub.address("plant"))
-        state = (await client.jetstream().stream_info(subjects.HUB_FIXES)).state
+        state = (await client.jetstream().stream_info(FIX_STREAM)).state
         while state.last_seq < stage.sent:
             await asyncio.sleep(0.1)
-            state = (await client.jetstream().stream_info(subjects.HUB_FIXES)).state
+            state = (await client.jetstream().stream_info(FIX_STREAM)).state
         await client.close()
         stage.first = state.first_seq
         stage.to_history.cut(is_cut=False)

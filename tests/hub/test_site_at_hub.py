@@ -53,7 +53,7 @@ def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
             assert "skyless.v1.7.request" not in commands
             stored = plant.jetstream()
             async with asyncio.timeout(60):
-                while (await stored.stream_info("STATE")).state.messages == 0:
+                while (await stored.stream_info("STATE_7")).state.messages == 0:
                     await asyncio.sleep(0.2)
             with pytest.raises(NoRespondersError):
                 await plant.request("$JS.site7.API.STREAM.PURGE.STATE_7")

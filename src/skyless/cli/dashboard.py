@@ -155,10 +155,9 @@ def _at_hub(make: "partial[LiveSite]", serves: "partial[Services]", hub: str, ca
     address = hub_address(hub, ca)
     from skyless.page.gathered import Gathered
     from skyless.page.hub import ShownSites
-    from skyless.run.gather.subjects import HUB_NAMES
 
     sites = ShownSites(address, "skyless dashboard", partial(make, broker=str(address), at_hub=True))
-    return str(address), serves(sites=sites, gathered=Gathered(address, HUB_NAMES), hub=sites), sites.run()
+    return str(address), serves(sites=sites, gathered=Gathered(address), hub=sites), sites.run()
 
 
 def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":

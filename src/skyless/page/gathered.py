@@ -38,12 +38,11 @@ _EMPTY: Final = Columns()
 class Gathered:
     """The columns of the sites that are shown, and the pages that see them."""
 
-    def __init__(self, address: NatsAddress, names: str = subjects.NAMES_STREAM) -> None:
-        """``names`` is the stream of the names of tags."""
+    def __init__(self, address: NatsAddress) -> None:
         self.drops: Counter[str] = Counter()
         """Batches that were dropped, by reason."""
         self.pages = 0
-        self._address, self._names = address, names
+        self._address = address
         self._sites: dict[int | None, Columns] = {}
         self._say = rarely(logging.getLogger("skyless.page").warning)
 
@@ -84,7 +83,7 @@ class Gathered:
         """Give a site fixes of its batches for ever, for all that its messages are for: zones, alarms, lists."""
         columns, heard_s = self._sites[site], 0.0
         stream, names, numbers = client.jetstream(), columns.names, dict[str, int]()
-        stream_of_names, missing_s = subjects.at(self._names, site), dict[int, float]()
+        missing_s = dict[int, float]()
         while True:
             now_s = time.monotonic()
             if now_s - heard_s >= _HEARD_S:
@@ -95,7 +94,7 @@ class Gathered:
             unknown = (number for number in records["tag"].tolist() if number not in names)
             asked = [number for number in unknown if missing_s.get(number, 0.0) <= now_s][:_MAX_ASKED]
             try:
-                answers = await asyncio.gather(*(name_of(stream, stream_of_names, site, number) for number in asked))
+                answers = await asyncio.gather(*(name_of(stream, site, number) for number in asked))
                 for number, name in zip(asked, answers, strict=True):
                     if name:
                         names[number], numbers[name] = name, number

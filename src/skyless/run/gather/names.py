@@ -28,10 +28,11 @@ class TagName(Struct, frozen=True):
     since_unix_s: float
 
 
-async def name_of(stream: "JetStreamContext", names: str, site: int, number: int) -> str:
-    """The name of a tag's number in the stream ``names``, empty where it has none. Raises nats.errors.Error."""
+async def name_of(stream: "JetStreamContext", site: int, number: int) -> str:
+    """The name of a tag's number, empty where it has none. Raises nats.errors.Error."""
+    names, subject = subjects.at(subjects.NAMES_STREAM, site), subjects.at(subjects.NAMES, site, number)
     try:
-        message = await stream.get_last_msg(names, subjects.at(subjects.NAMES, site, number), direct=True)
+        message = await stream.get_last_msg(names, subject, direct=True)
         return msgspec.json.decode(message.data or b"", type=TagName).name
     except (NotFoundError, msgspec.MsgspecError, ValueError):
         return ""
@@ -40,19 +41,17 @@ async def name_of(stream: "JetStreamContext", names: str, site: int, number: int
 class Names:
     """Numbers and names of a site's tags. Every program that packs fixes gives numbers in this way."""
 
-    def __init__(self, stream: "JetStreamContext", site: int, table: str = "") -> None:
-        """``table`` is the stream of names where it is not the site's own but that of a hub."""
+    def __init__(self, stream: "JetStreamContext", site: int) -> None:
         self.tags: dict[int, TagName] = {}
         self.numbers: dict[str, int] = {}
         self.issue = 0
         """The largest number that was given. Readers that know fewer read the names again."""
         self._stream, self._site, self._read = stream, site, 0
-        self._table = table or subjects.at(subjects.NAMES_STREAM, site)
 
     async def read(self) -> None:
         """Read what the stream has that is not known here yet. Raises nats.errors.Error."""
-        of_site = subjects.at(subjects.NAMES, self._site)
-        async for message in messages(self._stream, self._table, self._read, of_site):
+        name, of_site = subjects.at(subjects.NAMES_STREAM, self._site), subjects.at(subjects.NAMES, self._site)
+        async for message in messages(self._stream, name, self._read, of_site):
             self._read = message.metadata.sequence.stream
             with contextlib.suppress(msgspec.MsgspecError, ValueError):
                 number = int(message.subject.rpartition(".")[2])

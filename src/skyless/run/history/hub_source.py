@@ -4,58 +4,65 @@ import asyncio
 import time
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
+
+from nats.errors import Error
 
 from skyless.core.errors import SkylessError
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
-from skyless.run.gather.names import Names
 from skyless.run.gather.streams import follow
 from skyless.run.history.program import HistoryState, SiteHistory
 from skyless.run.history.retention import Keep
-from skyless.run.history.stream_source import BatchTaker, first_place
-from skyless.run.history.writer import Intake, Writer
+from skyless.run.history.stream_source import first_place, take_batches
+from skyless.run.history.writer import Writer
+from skyless.run.hub.sites import LIST_S
+from skyless.run.hub.streams import sites_at
 from skyless.run.mqtt.link import Subscriptions
 from skyless.run.process import Log
 
 if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+
     from nats.aio.client import Client
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
 
-_QUEUE: Final = 200
-"""Batches of a site that wait for its names or the disk; then all sites wait."""
-
 
 class _Site:
-    """One site that is kept."""
+    """One site that is kept, from its own streams: what they have under another site's subjects is not read."""
 
     def __init__(self, stream: "JetStreamContext", writer: Writer, keep: Keep, log: Log) -> None:
         self.writer, self.history = writer, SiteHistory(writer, keep, log)
-        self._batches: asyncio.Queue[Msg] = asyncio.Queue(_QUEUE)
+        self._stream, self._say = stream, rarely(log)
         self._subscriptions = Subscriptions()
         self.history.attach(self._subscriptions.add, fixes=False)
-        self._taker = BatchTaker(Names(stream, writer.site, subjects.HUB_NAMES), writer, log)
-
-    async def receive(self, name: str, message: "Msg") -> None:
-        """Take a message of a stream, unless it is known."""
-        if name == subjects.HUB_FIXES:
-            await self._batches.put(message)
-            return
-        if name == subjects.HUB_EVENTS:
-            place = message.metadata.sequence.stream
-            if place <= self.writer.events.position:
-                return
-            self.history.event_place = place
-        self._subscriptions.receive(subjects.topic_of(message.subject), message.data)
+        writer.come_from_hub()
 
     async def run(self) -> None:
         """Keep it until cancelled."""
-        await self.history.run(self._take())
+        await self.history.run(self._take_state(), self._take_events(), self._take_fixes())
 
-    async def _take(self) -> None:
-        while True:
-            await self._taker.take(await self._batches.get())
+    async def _take_fixes(self) -> None:
+        await take_batches(self._stream, self.writer, self._say)
+
+    async def _take_state(self) -> None:
+        async for message in self._follow(subjects.STATE_STREAM, is_state=True):
+            self._receive(message)
+
+    async def _take_events(self) -> None:
+        name, intake = subjects.at(subjects.EVENT_STREAM, self.writer.site), self.writer.events
+        after = await first_place(self._stream, name, intake, self._say)
+        async for message in self._follow(subjects.EVENT_STREAM, after):
+            self.history.event_place = message.metadata.sequence.stream
+            self._receive(message)
+
+    def _follow(self, pattern: str, after: int = 0, *, is_state: bool = False) -> "AsyncGenerator[Msg, None]":
+        name, own = subjects.at(pattern, self.writer.site), f"skyless.v1.{self.writer.site}.>"
+        return follow(self._stream, name, own, self._say, after, newest_of_each=is_state)
+
+    def _receive(self, message: "Msg") -> None:
+        self._subscriptions.receive(subjects.topic_of(message.subject), message.data)
 
 
 class HubHistory:
@@ -63,7 +70,7 @@ class HubHistory:
 
     def __init__(self, folder: Path, address: NatsAddress, site: int | None, keep: Keep, log: Log) -> None:
         self._folder, self._address, self._keep, self._log = folder, address, keep, log
-        self._only = subjects.EVERY if site is None else str(site)
+        self._only = site
         self._say = rarely(log)
         self._sites: dict[int, _Site] = {}
         self._drops: Counter[str] = Counter()
@@ -95,32 +102,26 @@ class HubHistory:
         self._stream = client.jetstream()
         try:
             async with asyncio.TaskGroup() as self._tasks:
-                for folder in self._folder.glob(f"site={self._only}"):
+                for folder in self._folder.glob("site=*"):
                     if (number := folder.name.removeprefix("site=")).isdecimal():
-                        self._site(int(number))
-                for name in (subjects.HUB_STATE, subjects.HUB_EVENTS, subjects.HUB_FIXES):
-                    self._tasks.create_task(self._take(name))
+                        self._keep_site(int(number))
+                self._tasks.create_task(self._find_sites(client))
         except* SkylessError as errors:
             raise errors.exceptions[0] from None
         finally:
             await client.close()
 
-    def _site(self, number: int) -> _Site:
-        if number not in self._sites:
+    def _keep_site(self, number: int) -> None:
+        if number not in self._sites and self._only in {None, number}:
             site = self._sites[number] = _Site(self._stream, Writer(self._folder, number), self._keep, self._log)
             self._tasks.create_task(site.run())
-        return self._sites[number]
 
-    async def _take(self, name: str) -> None:
-        """Give the messages of a stream to their sites."""
-
-        def intakes() -> list[Intake]:
-            writers = [site.writer for site in self._sites.values()]
-            return [writer.fixes if name == subjects.HUB_FIXES else writer.events for writer in writers]
-
-        is_state = name == subjects.HUB_STATE
-        after = 0 if is_state else await first_place(self._stream, name, intakes, self._say)
-        pattern = f"skyless.*.{self._only}.>"
-        async for message in follow(self._stream, name, pattern, self._say, after, newest_of_each=is_state):
-            if (number := subjects.site_in(message.subject)) is not None:
-                await self._site(number).receive(name, message)
+    async def _find_sites(self, client: "Client") -> None:
+        """Keep all sites that the hub has."""
+        while True:
+            try:
+                for number in sorted(await sites_at(client)):
+                    self._keep_site(number)
+            except Error as error:
+                self._say(f"the sites at the hub cannot be listed: {error or type(error).__name__}")
+            await asyncio.sleep(LIST_S)

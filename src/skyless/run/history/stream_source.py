@@ -2,7 +2,6 @@
 
 import asyncio
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -96,8 +95,8 @@ class BatchTaker:
         return kept
 
 
-async def first_place(stream: "JetStreamContext", name: str, intakes_of: Callable[[], list[Intake]], say: Log) -> int:
-    """The place in a stream of which all intakes have what is before. Waits for the stream."""
+async def first_place(stream: "JetStreamContext", name: str, intake: Intake, say: Log) -> int:
+    """The place in a stream up to which an intake has all. Waits for the stream."""
     while True:
         try:
             last = (await stream.stream_info(name)).state.last_seq
@@ -105,26 +104,28 @@ async def first_place(stream: "JetStreamContext", name: str, intakes_of: Callabl
         except Error as error:
             say(f"waits for the stream {name}, which a gather or skyless hub apply makes: {error or 'no answer'}")
             await asyncio.sleep(_RETRY_S)
-    intakes = intakes_of()
-    for intake in intakes:
-        if intake.position > last:
-            say(f"the stream {name} was deleted and made again; it is taken from its beginning")
-            intake.position = 0
-    return min((intake.position for intake in intakes), default=0)
+    if intake.position > last:
+        say(f"the stream {name} was deleted and made again; it is taken from its beginning")
+        intake.position = 0
+    return intake.position
 
 
-async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:
+async def take_batches(stream: "JetStreamContext", writer: Writer, say: Log) -> None:
     """Give the batches of a site's stream to a history until cancelled, from where it stopped the last time.
 
     The place in the stream is kept together with the rows, so that each batch is taken once.
     """
-    say, name = rarely(log), subjects.at(subjects.FIX_STREAM, writer.site)
+    name, own = subjects.at(subjects.FIX_STREAM, writer.site), subjects.at(subjects.FIXES, writer.site)
+    taker = BatchTaker(Names(stream, writer.site), writer, say)
+    async for message in follow(stream, name, own, say, await first_place(stream, name, writer.fixes, say)):
+        await taker.take(message)
+
+
+async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:
+    """The same with a connection of its own."""
+    say = rarely(log)
     client = await connect(address, "skyless history", say, writer.drops)
     try:
-        stream = client.jetstream()
-        taker = BatchTaker(Names(stream, writer.site), writer, log)
-        after = await first_place(stream, name, lambda: [writer.fixes], say)
-        async for message in follow(stream, name, ">", say, after):
-            await taker.take(message)
+        await take_batches(client.jetstream(), writer, say)
     finally:
         await client.close()

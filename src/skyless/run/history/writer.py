@@ -72,10 +72,19 @@ class Intake:
             sql.execute(f"CREATE TABLE IF NOT EXISTS {kind} (first INTEGER PRIMARY KEY, rows, unix_s, data)")
             (end,) = sql.execute(f"SELECT max(first + rows) FROM {kind}").fetchone()
             sql.execute("CREATE TABLE IF NOT EXISTS positions (kind PRIMARY KEY, position)")
-            for (position,) in sql.execute("SELECT position FROM positions WHERE kind = ?", (kind,)):
-                self.position = position
+        self._read_position(kind)
         self.next = max(self.last + 1, end or 1)
         """Number of the next row that comes to the journal."""
+
+    def come_from_hub(self) -> None:
+        """Take places for those of the site's stream at a hub."""
+        self._read_position(f"hub {self._kind}")
+
+    def _read_position(self, key: str) -> None:
+        self._position_key, self.position = key, 0
+        with self._journal.transaction() as sql:
+            for (position,) in sql.execute("SELECT position FROM positions WHERE kind = ?", (key,)):
+                self.position = position
 
     def add(self, rows: Records | Sequence[Event], arrived_unix_s: float, position: int = 0) -> None:
         """Take rows, which are in the journal after ``store``, and with them their place in the source."""
@@ -100,7 +109,7 @@ class Intake:
         try:
             with self._journal.transaction() as sql:
                 sql.executemany(f"INSERT INTO {self._kind} VALUES (?, ?, ?, ?)", values)
-                sql.execute("INSERT OR REPLACE INTO positions VALUES (?, ?)", (self._kind, self.position))
+                sql.execute("INSERT OR REPLACE INTO positions VALUES (?, ?)", (self._position_key, self.position))
         except OSError:
             while self.waiting > MAX_WAITING:
                 self.lost += len(self._batches.pop(0)[0])
@@ -221,6 +230,15 @@ class Writer:
         if self.fixes.next > 1 and not self.names.rows:
             self.journal.close()
             raise SkylessError(f"{names} is missing; it should be the table that tells whose the fixes are")
+
+    def come_from_hub(self) -> None:
+        """Take rows from the site's streams at a hub. Raises SkylessError: those that are there came from elsewhere."""
+        for intake in (self.fixes, self.events):
+            intake.come_from_hub()
+        if self.fixes.next > 1 and not self.fixes.position:
+            raise SkylessError(
+                f"{self.folder} has fixes that are not from this site's stream at a hub; give another"
+            )
 
     @property
     def unwritten(self) -> int:

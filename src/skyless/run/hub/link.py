@@ -71,7 +71,9 @@ class HubLink:
                 if self._is_live(topic_filter):
                     await client.subscribe(subjects.subject_of(topic_filter), cb=self._on_message)
             await together(
-                self._follow(client, subjects.HUB_STATE), self._follow(client, subjects.HUB_EVENTS), self._watch(client)
+                self._follow(client, subjects.STATE_STREAM),
+                self._follow(client, subjects.EVENT_STREAM),
+                self._watch(client),
             )
         finally:
             await client.close()
@@ -86,8 +88,9 @@ class HubLink:
                 return False
         return True
 
-    async def _follow(self, client: "Client", name: str) -> None:
-        found = follow(client.jetstream(), name, f"skyless.v1.{self.site}.>", self._say, newest_of_each=True)
+    async def _follow(self, client: "Client", pattern: str) -> None:
+        name, own = subjects.at(pattern, self.site), f"skyless.v1.{self.site}.>"
+        found = follow(client.jetstream(), name, own, self._say, newest_of_each=True)
         async for message in found:
             await self._on_message(message)
 

@@ -1,5 +1,6 @@
 """The sites at a hub: names from what they retain, conditions from what their gathers say every second."""
 
+import asyncio
 import contextlib
 import logging
 import time
@@ -8,13 +9,15 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import msgspec
 from msgspec import Struct
+from nats.errors import Error
+from nats.js.errors import NotFoundError
 
 from skyless.run.find_site import KnownSites
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
 from skyless.run.gather.node import Summary
-from skyless.run.gather.streams import follow
 from skyless.run.hub.link import SILENT_S
+from skyless.run.hub.streams import sites_at
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
@@ -22,6 +25,8 @@ if TYPE_CHECKING:
 
 LISTEN_S: Final = 2.5
 """After this time every site whose line is up has been heard."""
+LIST_S: Final = 5.0
+"""Interval at which the hub is asked which sites it has."""
 _ORDER: Final = ("bad", "cut", "degraded", "unknown", "good")
 
 
@@ -75,7 +80,8 @@ class HubSites:
     def names(self) -> dict[int, str]:
         """The names of the sites by their numbers."""
         heard = {number: summary.site for number, (_, _, summary) in self._heard.items()}
-        return heard | {site.number: site.name for site in self._known.sites()}
+        known = {site.number: site.name for site in self._known.sites()}
+        return heard | known | {number: name for number, name in heard.items() if name}
 
     def sites(self, now_s: float) -> list[HubSite]:
         """The sites, those in trouble first."""
@@ -110,11 +116,23 @@ class HubSites:
 
         try:
             await client.subscribe(subjects.at(subjects.SUMMARY, subjects.EVERY), cb=on_summary)
-            every = subjects.at(subjects.SITES, subjects.EVERY)
-            async for message in follow(client.jetstream(), subjects.HUB_STATE, every, say, newest_of_each=True):
-                self.add_site(subjects.topic_of(message.subject), message.data)
+            while True:
+                try:
+                    for number in await sites_at(client) - {site for site, name in self.names().items() if name}:
+                        await self._read_name(client, number)
+                except Error as error:
+                    say(f"the sites at the hub cannot be listed: {error or type(error).__name__}")
+                await asyncio.sleep(LIST_S)
         finally:
             await client.close()
+
+    async def _read_name(self, client: "Client", number: int) -> None:
+        """Read what a site retains of itself, which may not have come to the hub yet."""
+        subject = subjects.at(subjects.SITES, number)
+        with contextlib.suppress(NotFoundError):
+            name = subjects.at(subjects.STATE_STREAM, number)
+            found = await client.jetstream().get_last_msg(name, subject, direct=True)
+            self.add_site(subjects.topic_of(subject), found.data or b"")
 
 
 def _lasting(seconds: float) -> str:

@@ -1,13 +1,20 @@
-"""The streams of a hub, which take what the sites' own streams have whenever their lines are up."""
+"""The streams of a hub, which take what the sites' own streams have whenever their lines are up.
+
+Each site has its own, so that none can push out what another has sent. A source asks for the subjects of its site,
+which the site's server may ignore: so readers ask the hub for those subjects again, and take the site from the stream.
+"""
 
 import asyncio
 import contextlib
+import json
+import re
 from collections import Counter
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import msgspec
 from nats.errors import Error
 from nats.js.api import ExternalStream, StreamConfig, StreamSource
+from nats.js.errors import NotFoundError
 
 from skyless.core.errors import SkylessError
 from skyless.run.gather import subjects
@@ -18,30 +25,53 @@ from skyless.run.hub.files import Hub
 from skyless.run.process import Log
 
 if TYPE_CHECKING:
-    from nats.js import JetStreamContext
+    from nats.aio.client import Client
 
 _READY_S: Final = 60.0
 _RETRY_S: Final = 1.0
 _LISTEN_S: Final = 2.5
+_NAMES_BYTES: Final = 30_000_000
+_STATE_BYTES: Final = 100_000_000
+"""What a site can store at most: names of 200,000 tags; floor plans, and statuses of as many programs."""
+_OF_ALL_SITES: Final = ("FIXES", "NAMES", "STATE", "EVENTS")
+"""Streams of hubs before version 0.3, in which each site could write as another."""
 
 
-async def make_hub_streams(stream: "JetStreamContext", hub: Hub, tenant: str) -> None:
-    """Make the streams of a tenant, or add sites to those that are there. Raises nats.errors.Error."""
-    fixes = {"max_age": KEEP_S, "max_bytes": round(1e9 * hub.fixes_gb)}
-    for name, of_site, limits in (
-        (subjects.HUB_STATE, subjects.STATE_STREAM, NEWEST_OF_EACH),
-        (subjects.HUB_NAMES, subjects.NAMES_STREAM, NEWEST_OF_EACH),
-        (subjects.HUB_EVENTS, subjects.EVENT_STREAM, {"max_age": KEEP_EVENTS_S, "max_bytes": 4 * EVENT_BYTES}),
-        (subjects.HUB_FIXES, subjects.FIX_STREAM, fixes),
-    ):
-        sources = [_source(of_site, site) for site in hub.sites[tenant]]
-        await make_stream(stream, StreamConfig(name=name, num_replicas=len(hub.nodes), sources=sources, **limits))
+async def make_hub_streams(client: "Client", hub: Hub, tenant: str) -> None:
+    """Make the streams of a tenant, or change those that are there. Raises nats.errors.Error."""
+    stream, sites = client.jetstream(), hub.sites[tenant]
+    for name in _OF_ALL_SITES:
+        with contextlib.suppress(NotFoundError):
+            await stream.delete_stream(name)
+    share = 1.0 / max(1, len(sites))
+    of_each: tuple[tuple[int, str, dict[str, Any]], ...] = (
+        (1, subjects.STATE_STREAM, NEWEST_OF_EACH | {"max_bytes": _STATE_BYTES}),
+        (2, subjects.NAMES_STREAM, NEWEST_OF_EACH | {"max_bytes": _NAMES_BYTES}),
+        (1, subjects.EVENT_STREAM, {"max_age": KEEP_EVENTS_S, "max_bytes": round(4 * EVENT_BYTES * share)}),
+        (2, subjects.FIX_STREAM, {"max_age": KEEP_S, "max_bytes": round(1e9 * hub.fixes_gb * share)}),
+    )
+    there = await sites_at(client)
+    for site in sorted(sites, key=lambda site: site not in there):  # those that are there make room first
+        api, deliver = f"$JS.{subjects.at(subjects.DOMAIN, site)}.API", subjects.at(subjects.SOURCED, site)
+        for version, pattern, limits in of_each:
+            name, own = subjects.at(pattern, site), f"skyless.v{version}.{site}.>"
+            source = StreamSource(name=name, filter_subject=own, external=ExternalStream(api=api, deliver=deliver))
+            config = StreamConfig(name=name, num_replicas=len(hub.nodes), sources=[source], **limits)
+            await make_stream(stream, config)
 
 
-def _source(pattern: str, site: int) -> StreamSource:
-    api = f"$JS.{subjects.at(subjects.DOMAIN, site)}.API"
-    external = ExternalStream(api=api, deliver=subjects.at(subjects.SOURCED, site))
-    return StreamSource(name=subjects.at(pattern, site), external=external)
+async def sites_at(client: "Client") -> set[int]:
+    """The sites of a tenant that have streams at its hub. Raises nats.errors.Error."""
+    found, total = set[str](), 1
+    while len(found) < total:
+        answer = await client.request("$JS.API.STREAM.NAMES", json.dumps({"offset": len(found)}).encode())
+        page = json.loads(answer.data)
+        names, total = page.get("streams") or (), page.get("total", 0)
+        if not names:
+            break
+        found.update(names)
+    prefix = subjects.at(subjects.STATE_STREAM, "")
+    return {int(name.removeprefix(prefix)) for name in found if re.fullmatch(rf"{prefix}\d{{1,5}}", name)}
 
 
 async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary | None]:
@@ -55,7 +85,7 @@ async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary 
             client = await connect(address, "skyless hub", say, Counter())
             while True:
                 try:
-                    await make_hub_streams(client.jetstream(), hub, tenant)
+                    await make_hub_streams(client, hub, tenant)
                     break
                 except (Error, TimeoutError) as error:
                     say(str(error) or type(error).__name__)
