@@ -1,17 +1,22 @@
 """A site with all that the HTTP interface gives, and a history that needs no files."""
 
+import asyncio
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import ClassVar
 from unittest.mock import MagicMock
 
+import msgspec
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status
 from msgspec.structs import replace
+from starlette.exceptions import HTTPException
 
 from skyless.core.alarm_rule import AlarmRule
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
+from skyless.page.api import past
 from skyless.run.history.answers import (
     AlarmRow,
     Contact,
@@ -49,17 +54,13 @@ class FakeHistory:
     """Answers of the right kinds; for the tag ``slow`` it takes long."""
 
     asked: ClassVar = []
-    threads: ClassVar = set()
     release = threading.Event()
 
     def __init__(self, folder, site):
-        if folder.name == "empty":
-            raise SkylessError(f"{folder} holds no history")
         self.where = folder, site
 
     def _note(self, *question):
         FakeHistory.asked.append((*self.where, *question))
-        FakeHistory.threads.add(threading.current_thread().name)
 
     def tags(self):
         return ("t1", "t2")
@@ -111,10 +112,24 @@ def span_of(from_text, to_text, now_unix_s):
 def fake_history(patch):
     """Put it in the place of the real one, whose libraries need not be there."""
     FakeHistory.asked.clear()
-    FakeHistory.threads.clear()
     FakeHistory.release.clear()
     patch.setitem(sys.modules, "skyless.run.history.queries", SimpleNamespace(History=FakeHistory))
     patch.setitem(sys.modules, "skyless.run.history.times", SimpleNamespace(span_of=span_of))
+    patch.setattr(past, "TaskProcess", FakeProcess)
+
+
+class FakeProcess:
+    """Takes the place of the history's process: a thread answers."""
+
+    def __init__(self, module, fault):
+        self._fault, self._pool = fault, ThreadPoolExecutor(1, "history")
+
+    async def run(self, question):
+        loop = asyncio.get_running_loop()
+        try:
+            return msgspec.json.encode(await loop.run_in_executor(self._pool, past._answer, question))
+        except SkylessError as error:
+            raise HTTPException(self._fault, str(error)) from None
 
 
 def fill(live, wire):

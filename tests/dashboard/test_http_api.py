@@ -6,6 +6,7 @@ import time
 from itertools import pairwise
 
 import msgspec
+import numpy as np
 import pytest
 from dashboard_builders import HERE, SITE_ID, browser_of
 from http_values import ALARM, ASSETS, NAMES, RULE, FakeHistory, fake_history, fill, show
@@ -21,6 +22,9 @@ from skyless.page.api import past
 from skyless.page.api.routes import ROUTES
 from skyless.page.guard import AccessRules
 from skyless.run.assets import write_csv
+from skyless.run.fix_batch import RECORD
+from skyless.run.history.layout import site_folder
+from skyless.run.history.writer import Writer
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import ZoneEvent
 
@@ -42,7 +46,8 @@ BODIES = {
 
 
 @pytest.fixture
-def site(live, wire, monkeypatch):
+def site(live, wire, monkeypatch, tmp_path):
+    site_folder(tmp_path, SITE_ID).mkdir()
     fake_history(monkeypatch)
     fill(live, wire)
     return live
@@ -263,8 +268,6 @@ def test_the_history_gets_what_was_asked(client, tmp_path):
     assert (track[4].from_unix_s, track[5]) == (1.0, 9)
     assert heatmap[4:] == (0.5, ("t1", "t2"))
     assert dwell[4:] == ((), "desk")
-    assert len(FakeHistory.threads) == 1
-    assert "MainThread" not in FakeHistory.threads
 
 
 @pytest.mark.parametrize(
@@ -305,6 +308,24 @@ def test_a_slow_question_ends_and_holds_up_nothing_else(client, monkeypatch):
             break
         time.sleep(0.02)
     assert client.get("history/tags").json() == {"tags": ["t1", "t2"]}
+
+
+def test_a_real_history_answers_and_a_question_that_takes_too_long_is_ended(live, wire, tmp_path, monkeypatch):
+    writer = Writer(tmp_path, SITE_ID)
+    records = np.zeros(3, RECORD)
+    records["tag"], records["unix_us"] = writer.tag_number("t1", 1.7e9), (1.7e9 + np.arange(3)) * 1e6
+    writer.fixes.add(records, 1.7e9)
+    writer.close()
+    fill(live, wire)
+    with browser_of(live, history=tmp_path, base_url=f"{API}/") as client:
+        monkeypatch.setattr(past, "QUERY_TIMEOUT_S", 0.01)
+        assert client.get("history/tags").status_code == 503
+        monkeypatch.setattr(past, "QUERY_TIMEOUT_S", 60.0)
+        assert client.get("history/tags").json() == {"tags": ["t1"]}
+        asked = {"from": "1699999999", "to": "1700000001"}
+        assert client.get("history/track", params={"tag": "t1", **asked}).json()["fixes"] == 1
+        assert "no tag 't9'" in client.get("history/track", params={"tag": "t9", **asked}).json()["error"]
+        client.app.state.services.past.stop()
 
 
 def test_without_a_history(site):

@@ -13,7 +13,7 @@ from skyless.run.history import stream_source
 from skyless.run.history.stream_source import BatchTaker
 from skyless.run.history.writer import Writer
 
-SITE = 7
+SITE, BEGIN_S = 7, 1_800_000_000
 
 
 class LateNames:
@@ -32,7 +32,7 @@ class LateNames:
 
 def message(place, run, sequence, *tags, issue=0):
     records = np.zeros(len(tags), RECORD)
-    records["tag"], records["unix_us"] = tags, 1_000_000 * place
+    records["tag"], records["unix_us"] = tags, 1_000_000 * (BEGIN_S + place)
     data = encode_batch(Batch(run, sequence, 1, issue or max(tags), records))
     return SimpleNamespace(data=data, metadata=SimpleNamespace(sequence=SimpleNamespace(stream=place)))
 

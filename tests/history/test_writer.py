@@ -277,7 +277,7 @@ def test_a_damaged_table_of_names_or_a_missing_one_is_named(tmp_path):
     Writer(tmp_path, 1).close()
 
 
-@pytest.mark.parametrize("unix_s", [-1.0, 1e300, 9e9])
+@pytest.mark.parametrize("unix_s", [-1.0, 0.0, 5_000.0, 1e300, 9e9])
 def test_a_time_that_is_none_is_counted(tmp_path, unix_s):
     writer = Writer(tmp_path, 1)
     assert writer.number(fix(unix_s=unix_s), NOON_S) is None

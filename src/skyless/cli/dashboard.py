@@ -1,7 +1,6 @@
 """``skyless dashboard``: the live page."""
 
 import contextlib
-import os
 import sys
 from functools import partial
 from pathlib import Path
@@ -120,9 +119,6 @@ def dashboard(
         print(f"page    {page}\n{'broker' if hub is None else 'hub   '}  {address}", flush=True)
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(serve(services, rules, sock, work))
-    if services.past.is_busy:  # Python would wait for the thread that answers
-        sys.stdout.flush()
-        os._exit(0)
 
 
 def _at_broker(

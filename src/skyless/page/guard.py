@@ -80,7 +80,9 @@ class Guard:
         if not is_own_host(host, self._rules.names, remote=self._rules.remote):
             return 421, "unknown host name: open the address that the dashboard has printed"
         origin = request.headers.get("origin")
-        if origin is not None and not same_origin(origin, host):
+        # An image or a link of another site has no Origin; a link may lead to the page.
+        is_own = request.headers.get("sec-fetch-site", "none") in {"none", "same-origin"} or request.url.path == "/"
+        if not is_own or (origin is not None and not same_origin(origin, host)):
             return 403, "requests of other sites are refused"
         reads = request.scope.get("method", "GET") in {"GET", "HEAD"}
         if self._secret is None or self._carries(request, self._secret):

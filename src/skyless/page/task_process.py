@@ -17,6 +17,7 @@ from starlette.exceptions import HTTPException
 from skyless.core.errors import SkylessError
 
 _TIMEOUT_S: Final = 120.0
+MAX_ANSWER_BYTES: Final = 16_000_000
 _IDLE_S: Final = 60.0
 """A process without a task for this long is ended: it has loaded a hundred megabytes."""
 
@@ -33,9 +34,9 @@ class _Answer(Struct):
 class TaskProcess:
     """Runs a module that does tasks, one after the other."""
 
-    def __init__(self, module: str) -> None:
-        """``module`` calls ``serve_tasks`` when it is run."""
-        self._module = module
+    def __init__(self, module: str, fault: int = 422) -> None:
+        """``module`` calls ``serve_tasks`` when it is run; ``fault`` is the status of what it answers with an error."""
+        self._module, self._fault = module, fault
         self._lock = asyncio.Lock()
         self._process: subprocess.Popen[bytes] | None = None
         self._idle: asyncio.TimerHandle | None = None
@@ -67,7 +68,7 @@ class TaskProcess:
             raise HTTPException(422, "it could not be computed; the dashboard's terminal shows why")
         answer = msgspec.json.decode(line, type=_Answer)
         if answer.error is not None:
-            raise HTTPException(422, answer.error)
+            raise HTTPException(self._fault, answer.error)
         return bytes(answer.value)
 
     def _exchange(self, task: bytes) -> bytes:
@@ -101,7 +102,11 @@ def serve_tasks(kind: type[_Task], answer: Callable[[_Task], object]) -> None:
     os.nice(_NICE)
     for line in sys.stdin.buffer:
         try:
-            found = _Answer(Raw(msgspec.json.encode(answer(msgspec.json.decode(line, type=kind)))))
+            value = msgspec.json.encode(answer(msgspec.json.decode(line, type=kind)))
+            found = _Answer(Raw(value))
+            if len(value) > MAX_ANSWER_BYTES:
+                size, most = (f"{1e-6 * count:.0f} MB" for count in (len(value), MAX_ANSWER_BYTES))
+                found = _Answer(error=f"the answer has {size}, and may have {most}; ask for less")
         except SkylessError as error:
             found = _Answer(error=str(error))
         sys.stdout.buffer.write(msgspec.json.encode(found) + b"\n")

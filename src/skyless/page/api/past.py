@@ -1,26 +1,34 @@
-"""Questions to the history: one thread answers them one after the other, so that pages never wait for a long one."""
+"""Questions to the history: a process of its own answers them one after the other.
+
+So a long one takes neither memory nor time from the server, which raises alarms as well, and can be ended.
+"""
 
 import asyncio
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
+from msgspec import Struct
 from starlette.exceptions import HTTPException
 
-from skyless.core.errors import SkylessError
 from skyless.page.api.parameters import Begin, CellSize, Distance, End, Points, Step, TagName, TagNames, ZoneId, names
+from skyless.page.task_process import TaskProcess, serve_tasks
 from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track
+from skyless.run.history.layout import site_folder
 
 if TYPE_CHECKING:
     from skyless.run.history.queries import History
 
-_T = TypeVar("_T")
-
 QUERY_TIMEOUT_S: Final = 60.0
 MAX_WAITING: Final = 20
 """Questions that may wait for their turn."""
+
+
+class _Question(Struct, frozen=True):
+    folder: str
+    site: int
+    name: str
+    given: dict[str, Any]
 
 
 class Past:
@@ -29,24 +37,23 @@ class Past:
     def __init__(self, folder: Path | None) -> None:
         """Without a folder there is none."""
         self._folder = folder
-        self._pool = ThreadPoolExecutor(1, "history")  # its thread begins with the first question
+        self._process = TaskProcess("skyless.page.api.past", fault=400)
         self._waiting = 0
-        self.is_busy = False
-        """Whether a question is being answered. Nothing can end that, but the end of the process."""
 
-    async def ask(self, site: int | None, question: "Callable[[History], _T]") -> _T:
-        """The answer of a site's history. Raises HTTPException, also where it takes too long."""
+    async def ask(self, site: int | None, name: str, given: dict[str, Any]) -> bytes:
+        """The answer of a site's history to a function of this file, as JSON. Raises HTTPException."""
         if self._folder is None:
             raise HTTPException(404, "this server has no history: start the page's server with --history FOLDER")
         if site is None:
             raise HTTPException(404, "no site is known yet")
+        if not site_folder(self._folder, site).is_dir():
+            raise HTTPException(404, f"{self._folder} holds no history of site {site}; skyless history run writes one")
         if self._waiting >= MAX_WAITING:
             raise HTTPException(503, f"{MAX_WAITING} questions to the history are waiting; ask again later")
         self._waiting += 1
         try:
-            async with asyncio.timeout(QUERY_TIMEOUT_S):  # one that has begun goes on, and the next waits for its end
-                loop = asyncio.get_running_loop()
-                return await loop.run_in_executor(self._pool, self._answer, self._folder, site, question)
+            async with asyncio.timeout(QUERY_TIMEOUT_S):
+                return await self._process.run(_Question(str(self._folder), site, name, given))
         except TimeoutError:
             fault = f"the history has not answered within {QUERY_TIMEOUT_S:g} s; ask for a shorter time"
             raise HTTPException(503, fault) from None
@@ -54,22 +61,8 @@ class Past:
             self._waiting -= 1
 
     def stop(self) -> None:
-        """Begin no further question."""
-        self._pool.shutdown(wait=False, cancel_futures=True)
-
-    def _answer(self, folder: Path, site: int, question: "Callable[[History], _T]") -> _T:
-        from skyless.run.history.queries import History  # noqa: PLC0415 - of the extra history
-
-        self.is_busy = True
-        status = 404  # there is no such history
-        try:
-            history = History(folder, site)
-            status = 400
-            return question(history)
-        except SkylessError as error:
-            raise HTTPException(status, str(error)) from None
-        finally:
-            self.is_busy = False
+        """End the question at hand, and begin no further one."""
+        self._process.stop()
 
 
 def _span(begin: str, end: str) -> Span:
@@ -117,3 +110,16 @@ def contacts(
 def alarms(history: "History", *, begin: Begin, end: End = "") -> tuple[AlarmRow, ...]:
     """Alarms of the past."""
     return history.alarms(_span(begin, end))
+
+
+def _answer(question: _Question) -> object:
+    """What the process answers; a tuple as an object with one key. Raises SkylessError."""
+    from skyless.run.history.queries import History  # noqa: PLC0415 - of the extra history
+
+    functions = {one.__name__: one for one in (tags, track, heatmap, dwell, occupancy, contacts, alarms)}
+    found = functions[question.name](History(Path(question.folder), question.site), **question.given)
+    return {question.name: found} if isinstance(found, tuple) else found
+
+
+if __name__ == "__main__":
+    serve_tasks(_Question, _answer)

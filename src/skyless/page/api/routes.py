@@ -114,10 +114,9 @@ def _endpoint(route: ApiRoute, sites: Sites, history: Past) -> Callable[[Request
         if route.body is not None:
             given["body"] = _read_body(await read_bytes(request, MAX_BODY_BYTES), route.body)
         if route.is_past:
-            answer = await history.ask(live.number, lambda asked: route.function(asked, **given))
-        else:
-            answer = route.function(live, **given)
-            answer = await answer if inspect.isawaitable(answer) else answer
+            return json_answer(await history.ask(live.number, route.key, given))
+        answer = route.function(live, **given)
+        answer = await answer if inspect.isawaitable(answer) else answer
         if isinstance(answer, bytes):
             return Response(answer, media_type=route.media_types[0])
         return json_answer({route.key: answer} if isinstance(answer, tuple) else answer)

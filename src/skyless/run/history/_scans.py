@@ -18,9 +18,9 @@ _SIDE: Final = 2000
 """Cells along each side of the grid, which lies around the first fixes; with a power of two, rows of the grid would
 share few lines of the processor's cache."""
 _OUTSIDE: Final = _SIDE * _SIDE
+MAX_CELLS: Final = 2_000_000
 _WILD_SHARE: Final = 1e-3
 """Of the time, this share may be outside the grid, which then are wild fixes."""
-_NOWHERE: Final = 2**30
 
 _Ints = NDArray[Any]
 
@@ -59,29 +59,56 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
     if not len(rows):
         return Heatmap(0.0, 0.0, cell_m, 0, 0, (), number)
     grid = grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    if grid.size > MAX_CELLS:
+        right = f"choose ones of {1.1 * cell_m * math.sqrt(grid.size / MAX_CELLS):.2g} m"
+        raise SkylessError(f"{grid.size} cells of {cell_m:g} m are too many; {right}")
     x0_m, y0_m = (cell_m * (first + int(used[0])) for first, used in zip(corner, (columns, rows), strict=True))
     return Heatmap(x0_m, y0_m, cell_m, grid.shape[1], grid.shape[0], tuple((1e-3 * grid.ravel()).tolist()), number)
 
 
 def near(
-    files: Sequence[Path], span: Span, own: Sequence[_Ints], bucket_ms: int, distance_mm: int
+    files: Sequence[Path], span: Span, own: Collection[int], bucket_ms: int, distance_mm: int, gap: int
 ) -> NDArray[np.int64]:
-    """Tag, number of the bucket of time, and squared distance of fixes near those of ``own`` in the same bucket.
+    """When tags were near one with the numbers ``own``: tag, first and last bucket of time, least squared distance.
 
-    ``own`` are times and coordinates, of which the first in each bucket counts. Raises OSError.
+    The first fix of ``own`` in a bucket counts. ``gap`` is how many buckets may lie between those of one contact.
+    Raises OSError.
     """
-    buckets, nth = np.unique(own[0] // bucket_ms, return_index=True)
-    first, count = int(buckets[0]), int(buckets[-1] - buckets[0]) + 1
-    places = np.full((2, count + 1), _NOWHERE, np.int32)  # the last one is for all other times
-    places[:, buckets - first] = own[1][nth], own[2][nth]
-    found = [np.empty((3, 0), np.int64)]
+    firsts: list[tuple[_Ints, ...]] = []
+    for (_, t, x, y), _ in read_rows(files, span, own):
+        nth = np.unique(t // bucket_ms, return_index=True)[1]
+        firsts.append((t[nth], x[nth], y[nth]))
+    if not firsts:
+        return np.empty((4, 0), np.int64)
+    times, *places = (np.concatenate(columns) for columns in zip(*firsts, strict=True))
+    del firsts
+    order = np.argsort(times)
+    buckets, nth = np.unique(times[order] // bucket_ms, return_index=True)
+    x0, y0 = (column[order[nth]].astype(np.int64) for column in places)
+    runs = [np.empty((4, 0), np.int64)]
     for (tag, t, x, y), _ in read_rows(files, span, None):
-        index = np.minimum((t // bucket_ms - first).view(np.uint64), np.uint64(count)).view(np.int64)
-        rows = np.flatnonzero(np.abs(x - places[0][index]) <= distance_mm)
-        place = places[:, index[rows]].astype(np.int64)
-        square = (x[rows] - place[0]) ** 2 + (y[rows] - place[1]) ** 2
-        found.append(np.array([tag[rows], index[rows] + first, square])[:, square <= distance_mm**2])
-    return np.concatenate(found, axis=1)
+        bucket = t // bucket_ms
+        at = np.minimum(np.searchsorted(buckets, bucket), len(buckets) - 1)
+        is_near = (buckets[at] == bucket) & (np.abs(x - x0[at]) <= distance_mm) & (np.abs(y - y0[at]) <= distance_mm)
+        rows = np.flatnonzero(is_near & ~np.isin(tag, list(own)))
+        square = (x[rows] - x0[at[rows]]) ** 2 + (y[rows] - y0[at[rows]]) ** 2
+        found = np.array([tag[rows], bucket[rows], bucket[rows], square], np.int64)
+        runs.append(_joined(found[:, square <= distance_mm**2], gap))
+    return _joined(np.concatenate(runs, axis=1), gap)
+
+
+def _joined(runs: NDArray[np.int64], gap: int) -> NDArray[np.int64]:
+    """Runs of buckets of tags, with the runs of a tag joined that have ``gap`` buckets or less between them."""
+    if not runs.size:
+        return runs
+    tag, first, last, square = runs[:, np.lexsort((runs[1], runs[0]))]
+    is_other = np.append(True, tag[1:] != tag[:-1])
+    later = np.cumsum(is_other) * (last.max() - first.min() + gap + 2)  # each tag after the one before
+    until = np.maximum.accumulate(last + later)
+    begins = np.flatnonzero(np.append(True, (first + later)[1:] > until[:-1] + gap + 1))
+    return np.array(
+        [tag[begins], first[begins], np.maximum.reduceat(last, begins), np.minimum.reduceat(square, begins)]
+    )
 
 
 def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -> Iterator[tuple[list[_Ints], int]]:

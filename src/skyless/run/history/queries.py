@@ -8,11 +8,13 @@ import contextlib
 import math
 import secrets
 import tempfile
+from array import array
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import wraps
-from itertools import chain
+from itertools import chain, groupby, islice
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
@@ -29,7 +31,7 @@ from skyless.core.site import GeoreferenceSite
 from skyless.core.whole_files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
 from skyless.run.geojson import coordinates, feature
-from skyless.run.history._scans import limits, near, read_rows, time_in_cells
+from skyless.run.history._scans import limits, near, time_in_cells
 from skyless.run.history.answers import (
     GAP_S,
     THINNED_GAP_S,
@@ -54,8 +56,16 @@ from skyless.run.history.layout import (
 )
 from skyless.run.history.tables import read_table
 
-MEMORY: Final = "800MB"
-"""What DuckDB may use, which is most of what a question uses."""
+MEMORY: Final = "120MB"
+"""What DuckDB may use before it writes to temporary files; Python and the libraries take 130 MB besides."""
+
+MAX_POINTS: Final = 20_000
+MAX_STEPS: Final = 20_000
+"""Steps of time of all zones together."""
+MAX_ROWS: Final = 200_000
+"""Rows of an answer that is a table."""
+MAX_EXPORTED: Final = 100_000_000
+"""Rows of a file."""
 
 EXPORT_SUFFIXES: Final = (".csv", ".parquet", ".geojsonl")
 
@@ -71,7 +81,7 @@ _CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
 """By whether days are thinned: the length in milliseconds of the intervals within which fixes are compared, and the
 longest interruption of a contact in such intervals."""
 _MAX_DISTANCE_M: Final = 50.0
-_MAX_STEPS: Final = 100_000
+_FETCHED: Final = 10_000
 _NAMED: Final = 5
 """How many known names an error lists."""
 
@@ -106,7 +116,7 @@ _DWELL: Final = f"""
     FROM stays WHERE enters GROUP BY tag, zone ORDER BY tag, zone
 """
 
-_OCCUPANCY: Final = f"{_STAYS} SELECT zone, list(since), list(until) FROM stays WHERE enters GROUP BY zone"
+_OCCUPANCY: Final = f"{_STAYS} SELECT zone, since, until FROM stays WHERE enters ORDER BY zone"
 
 _ALARMS: Final = """
     SELECT alarm, split_part(alarm, '/', 1), coalesce(max(subject), ''),
@@ -153,7 +163,8 @@ def _damaged(history: object) -> Path | None:
     if isinstance(history, History):
         for file in (*current_files(history.folder, history.site), *current_events(history.folder, history.site)):
             try:
-                parquet.read_table(file)
+                for _ in parquet.ParquetFile(file).iter_batches():
+                    pass
             except (OSError, pyarrow.ArrowException):
                 return file
     return None
@@ -207,14 +218,21 @@ class History:
         Raises SkylessError: there is no such tag.
         """
         ((tag, numbers),) = self._tags((tag,)).items()
-        files, columns = self._files(span), "ms / 1000, x_m, y_m, z_m, std_m, hpl_m, alert"
-        sql = f"SELECT {columns} FROM ({_FIXES} AND tag IN ({_listed(numbers)})) ORDER BY ms"
-        rows = _rows(sql, files, span)
-        if not rows:
+        check_number("the number of points", most_points, least=2, most=MAX_POINTS)
+        files, own = self._files(span), f"{_FIXES} AND tag IN ({_listed(numbers)})"
+        gap_ms = round(1000 * (THINNED_GAP_S if _are_thinned(files) else GAP_S))
+        times, length = array("q"), _Length(gap_ms)
+        for row in _stream(f"SELECT ms, x_m, y_m, std_m FROM ({own}) ORDER BY ms", files, span):
+            times.append(row[0])
+            length.add(*row)
+        if not times:
             return Track(tag, (), 0, 0.0)
-        gap_s = THINNED_GAP_S if _are_thinned(files) else GAP_S
-        kept = _thinned(np.array([row[0] for row in rows]), max(most_points, 2), gap_s)
-        return Track(tag, tuple(TrackPoint(*rows[k]) for k in kept), len(rows), _length_m(rows, gap_s))
+        ms = np.frombuffer(times, np.int64)
+        kept = np.unique(ms[_thinned(ms, most_points, gap_ms)]).tolist()
+        columns = "ms / 1000, x_m, y_m, z_m, std_m, hpl_m, alert"
+        sql = f"SELECT DISTINCT ON (ms) {columns} FROM ({own} AND list_contains($kept, epoch_ms(t))) ORDER BY ms"
+        points = _stream(sql, files, span, kept=kept)
+        return Track(tag, tuple(TrackPoint(*row) for row in points), len(ms), length.total_m)
 
     @_asked
     def heatmap(self, span: Span, cell_m: float = 0.25, tags: Sequence[str] = ()) -> Heatmap:
@@ -233,7 +251,7 @@ class History:
         names = self._zone_names(zone)
         return tuple(
             Dwell(tag, one, names.get(one, one), visits, *map(float, figures))
-            for tag, one, visits, *figures in self._of_stays(_DWELL, span, tags, zone)
+            for tag, one, visits, *figures in _table(self._of_stays(_DWELL, span, tags, zone))
         )
 
     @_asked
@@ -243,16 +261,19 @@ class History:
         Raises SkylessError.
         """
         check_number("the step", step_s, least=1.0)
-        length_s = span.to_unix_s - span.from_unix_s
-        if length_s / step_s > _MAX_STEPS:
-            raise SkylessError(f"steps of {step_s:g} s in a range of {length_s:.0f} s are too many; choose longer ones")
-        names = self._zone_names(zone)
-        stays = {one: times for one, *times in self._of_stays(_OCCUPANCY, span, (), zone)}
-        edges = np.append(np.arange(0.0, length_s, step_s), length_s)
-        found = []
-        for one in [zone] if zone is not None else sorted({*names, *stays}):
-            begins, ends = (np.array(times) - span.from_unix_s for times in stays.get(one, ((), ())))
-            for begin, mean, most in zip(edges[:-1].tolist(), *counts(begins, ends, edges), strict=True):
+        names, length_s = self._zone_names(zone), span.to_unix_s - span.from_unix_s
+        zones = [zone] if zone is not None else sorted(names)
+        if len(zones) * length_s / step_s > MAX_STEPS:
+            many = f"steps of {step_s:g} s for {len(zones)} zones in a range of {length_s:.0f} s are too many"
+            right = math.ceil(len(zones) * length_s / MAX_STEPS)
+            raise SkylessError(f"{many}; choose longer ones, of {right} s or more, a shorter range or one zone")
+        edges, found = np.append(np.arange(0.0, length_s, step_s), length_s), []
+        counted = dict.fromkeys(zones, counts(np.empty(0), np.empty(0), edges))
+        for one, rows in groupby(self._of_stays(_OCCUPANCY, span, (), zone), itemgetter(0)):
+            times = np.fromiter(chain.from_iterable(row[1:] for row in rows), np.float64) - span.from_unix_s
+            counted[one] = counts(times[::2], times[1::2], edges)
+        for one in sorted(counted):
+            for begin, mean, most in zip(edges[:-1].tolist(), *counted[one], strict=True):
                 found.append(Occupancy(one, names.get(one, one), span.from_unix_s + begin, mean, most))
         return tuple(found)
 
@@ -266,35 +287,25 @@ class History:
         ((tag, own),) = self._tags((tag,)).items()
         names, files = self._names(), self._files(span)
         length_ms, gap = _CONTACT_MS[_are_thinned(files)]
-        batches = [columns for columns, _ in read_rows(files, span, own)]
-        if not batches:
-            return ()
-        _, *fixes = (np.concatenate(columns) for columns in zip(*batches, strict=True))
-        order = np.argsort(fixes[0], kind="stable")
-        found = near(files, span, [column[order] for column in fixes], length_ms, round(1000.0 * distance_m))
-        found = found[:, ~np.isin(found[0], own)]
-        if not found.size:
-            return ()
-        number, bucket, square = found[:, np.lexsort((found[1], found[0]))]
-        begins = np.flatnonzero((np.diff(number, prepend=-1) != 0) | (np.diff(bucket, prepend=0) > gap + 1))
-        ends = np.append(begins[1:], len(number)) - 1
-        least_m = 1e-3 * np.sqrt(np.minimum.reduceat(square, begins))
+        found = near(files, span, own, length_ms, round(1000.0 * distance_m), gap)
+        if found.shape[1] > MAX_ROWS:
+            raise SkylessError(f"there are {found.shape[1]} contacts, more than {MAX_ROWS}; choose a shorter range")
         contacts = [
             Contact(
                 tag,
-                names.get(int(number[begin]), f"#{number[begin]}"),
-                max(1e-3 * length_ms * int(bucket[begin]), span.from_unix_s),
-                min(1e-3 * length_ms * int(bucket[end] + 1), span.to_unix_s),
-                float(least),
+                names.get(number, f"#{number}"),
+                max(1e-3 * length_ms * begin, span.from_unix_s),
+                min(1e-3 * length_ms * (end + 1), span.to_unix_s),
+                1e-3 * math.sqrt(square),
             )
-            for begin, end, least in zip(begins, ends, least_m, strict=True)
+            for number, begin, end, square in found.T.tolist()
         ]
         return tuple(sorted(contacts, key=lambda one: (one.begin_unix_s, one.other)))
 
     @_asked
     def alarms(self, span: Span) -> tuple[AlarmRow, ...]:
         """Alarms that were raised before the range's end and had not ended at its beginning. Raises SkylessError."""
-        return tuple(AlarmRow(*row) for row in _rows(_ALARMS, current_events(self.folder, self.site), span))
+        return tuple(AlarmRow(*row) for row in _table(_stream(_ALARMS, current_events(self.folder, self.site), span)))
 
     @_asked
     def export(self, file: Path, span: Span, tags: Sequence[str] = (), origin: GeoreferenceSite | None = None) -> int:
@@ -308,8 +319,11 @@ class History:
             raise SkylessError("GeoJSON has degrees: it needs a site with [georeference] (latitude_deg, longitude_deg)")
         of_tags = f"AND tag IN ({_listed(chain(*self._tags(tags).values()))})" if tags else ""
         names, files = self._names(), self._files(span)
-        if not files:
+        ((count,),) = _stream(f"SELECT count(*) FROM ({_FIXES} {of_tags})", files, span) if files else ((0,),)
+        if not count:
             raise SkylessError("there are no fixes in this range: nothing is written")
+        if count > MAX_EXPORTED:
+            raise SkylessError(f"{count} fixes are more than {MAX_EXPORTED}; choose a shorter range, or tags")
         parameters = _parameters(files, span) | {"numbers": list(names), "names": list(names.values())}
         sql = f"""
             SELECT coalesce(name, '#' || tag) AS tag, make_timestamp(ms * 1000) AS time_utc, x_m, y_m, z_m, std_m,
@@ -368,12 +382,12 @@ class History:
             raise SkylessError(f"the history of site {self.site} has no zone {zone!r}; {_some(names, 'zones')}")
         return names
 
-    def _of_stays(self, sql: str, span: Span, asked: Sequence[str], zone: str | None) -> list[tuple[Any, ...]]:
+    def _of_stays(self, sql: str, span: Span, asked: Sequence[str], zone: str | None) -> Iterator[tuple[Any, ...]]:
         tags, until = [*self._tags(asked)], self.known_until_unix_s()
         if until is None or until <= span.from_unix_s:
-            return []
+            return iter(())
         known = Span(span.from_unix_s, min(until, span.to_unix_s))
-        return _rows(sql, current_events(self.folder, self.site), known, tags=tags, zone=zone)
+        return _stream(sql, current_events(self.folder, self.site), known, tags=tags, zone=zone)
 
 
 # Plain computations
@@ -398,31 +412,33 @@ def _ramp(times: _Floats, at: _Floats) -> _Floats:
     return ramp
 
 
-def _thinned(times_s: _Floats, most: int, gap_s: float) -> list[int]:
+def _thinned(times: _Ints, most: int, gap: int) -> list[int]:
     """Indices of rows, evenly among them, ``most`` at most; rows at gaps are kept if they are half of it or less."""
-    if len(times_s) <= most:
-        return list(range(len(times_s)))
-    gaps = np.flatnonzero(np.diff(times_s) > gap_s)
+    if len(times) <= most:
+        return list(range(len(times)))
+    gaps = np.flatnonzero(np.diff(times) > gap)
     fixed = np.union1d(gaps, gaps + 1)
     if len(fixed) > most // 2:
         fixed = fixed[:0]
-    evenly = np.linspace(0, len(times_s) - 1, most - len(fixed)).round()
+    evenly = np.linspace(0, len(times) - 1, most - len(fixed)).round()
     return list(map(int, np.union1d(evenly, fixed)))
 
 
-def _length_m(rows: Sequence[tuple[Any, ...]], gap_s: float) -> float:
+class _Length:
     """Length of a way of moves that are not within the noise, each from the end of the last."""
-    total_m = x0 = y0 = 0.0
-    before_s = -math.inf
-    for now_s, x, y, _, std_m, *_ in rows:
-        moved_m = math.hypot(x - x0, y - y0)
-        if now_s - before_s > gap_s:
-            x0, y0 = x, y
-        elif moved_m >= max(_MOVE_M, _MOVE_SIGMAS * std_m):
-            total_m += moved_m
-            x0, y0 = x, y
-        before_s = now_s
-    return total_m
+
+    def __init__(self, gap_ms: int) -> None:
+        self.total_m = 0.0
+        self._gap_ms, self._before_ms, self._x, self._y = gap_ms, -math.inf, 0.0, 0.0
+
+    def add(self, now_ms: int, x: float, y: float, std_m: float) -> None:
+        """Go on to the next fix."""
+        moved_m = math.hypot(x - self._x, y - self._y)
+        is_new = now_ms - self._before_ms > self._gap_ms
+        if is_new or moved_m >= max(_MOVE_M, _MOVE_SIGMAS * std_m):
+            self.total_m += 0.0 if is_new else moved_m
+            self._x, self._y = x, y
+        self._before_ms = now_ms
 
 
 # Files and DuckDB
@@ -438,12 +454,22 @@ def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
         yield duck
 
 
-def _rows(sql: str, files: Iterable[Path], span: Span, **more: object) -> list[tuple[Any, ...]]:
+def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iterator[tuple[Any, ...]]:
+    """The rows of an answer, of which few are in memory at once."""
     parameters = _parameters(files, span) | more
-    if not parameters["files"]:
-        return []
-    with _connection() as duck:
-        return duck.execute(sql, parameters).fetchall()
+    if parameters["files"]:
+        with _connection() as duck:
+            found = duck.execute(sql, parameters)
+            while rows := found.fetchmany(_FETCHED):
+                yield from rows
+
+
+def _table(found: Iterator[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+    """The rows of an answer that is a table. Raises SkylessError."""
+    rows = list(islice(found, MAX_ROWS + 1))
+    if len(rows) > MAX_ROWS:
+        raise SkylessError(f"the answer has more than {MAX_ROWS} rows; choose a shorter range, a tag or a zone")
+    return rows
 
 
 def _parameters(files: Iterable[Path], span: Span) -> dict[str, Any]:

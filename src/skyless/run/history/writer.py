@@ -41,8 +41,9 @@ MAX_WAITING: Final = 500_000
 """How many rows of a kind wait in memory while the disk does not take them."""
 
 MAX_TAGS: Final = 200_000
+MIN_UNIX_S: Final = 1e9
 MAX_UNIX_S: Final = 8e9
-"""Times beyond, in more than 200 years, are no times."""
+"""Times before 2001 are those of a computer without a clock; times in more than 200 years are no times."""
 
 
 class Intake:
@@ -236,9 +237,7 @@ class Writer:
         for intake in (self.fixes, self.events):
             intake.come_from_hub()
         if self.fixes.next > 1 and not self.fixes.position:
-            raise SkylessError(
-                f"{self.folder} has fixes that are not from this site's stream at a hub; give another"
-            )
+            raise SkylessError(f"{self.folder} has fixes that are not from this site's stream at a hub; give another")
 
     @property
     def unwritten(self) -> int:
@@ -247,7 +246,7 @@ class Writer:
 
     def number(self, fix: FixMessage, unix_s: float) -> int | None:
         """The number of a fix's tag, which no other ever gets; None for a fix that is not kept, which is counted."""
-        if not 0.0 <= fix.unix_s <= MAX_UNIX_S:
+        if not MIN_UNIX_S <= fix.unix_s <= MAX_UNIX_S:
             self.drops["wrong-time"] += 1
             return None
         return self.tag_number(fix.tag, unix_s)
