@@ -9,11 +9,10 @@ from msgspec import Struct
 from starlette.exceptions import HTTPException
 
 from skyless.page.live import LiveSite
-from skyless.page.sites import number_of
+from skyless.page.sites import connected, number_of
 from skyless.run.gather.address import NatsAddress
 from skyless.run.hub.link import HubLink
 from skyless.run.hub.sites import HubSites
-from skyless.run.process import together
 
 LET_GO_S: Final = 60.0
 """Healths of all tags cross a site's line while it is connected, so not for longer after the last look."""
@@ -24,11 +23,6 @@ class _Shown(Struct):
     live: LiveSite
     work: asyncio.Task[None]
     asked_s: float
-
-
-async def _connected(link: HubLink, live: LiveSite) -> None:
-    """Keep a site connected until cancelled, which may be before it has begun."""
-    await together(link.run(), live.run())
 
 
 class ShownSites:
@@ -60,7 +54,7 @@ class ShownSites:
             link, live = HubLink(self.known.address, number, self._name), self._make()
             live.attach(link, number)
             link.on_state.append(live.on_connection)
-            work = self._tasks.create_task(_connected(link, live))
+            work = self._tasks.create_task(connected(link, live))
             self._shown[number] = _Shown(live, work, 0.0)
         self._shown[number].asked_s = time.monotonic()
         return self._shown[number].live

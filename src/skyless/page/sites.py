@@ -1,25 +1,38 @@
 """The sites of one broker that pages show: each has its own live state, zones, survey and link to the broker.
 
-A page is connected to one of them for as long as it is open, so that it cannot mix two sites.
+A page is connected to one of them for as long as it is open, so that it cannot mix two sites. A site that nobody looks
+at is let go some time later, unless it has zones or alarm rules, which are watched here.
 """
 
 import asyncio
+import time
 from collections.abc import Callable
-from typing import Protocol
+from typing import Final, Protocol
 
 from starlette.exceptions import HTTPException
 
+from skyless.page._kept import SiteLink
 from skyless.page.live import LiveSite
 from skyless.run.alarms.engine import MAX_KEPT
 from skyless.run.find_site import SiteOnBroker, watch_sites
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.outbox import Limits
+from skyless.run.process import every, together
+
+MAX_SITES: Final = 20
+LET_GO_S: Final = 600.0
+_CHECK_S: Final = 1.0
 
 
 def number_of(asked: str | None) -> int:
     """The number of a site in a request, or -1 where it is none."""
     return int(asked) if asked and asked.isascii() and asked.isdecimal() and len(asked) < 6 else -1
+
+
+async def connected(link: SiteLink, live: LiveSite) -> None:
+    """Keep a site connected until cancelled, which may be before it has begun."""
+    await together(link.run(), live.run())
 
 
 class Sites(Protocol):
@@ -40,9 +53,12 @@ class LiveSites:
         """``first`` is connected to the first site, and ``make`` returns the state of another."""
         self._first, self._make = first, make
         self._by_number: dict[int, LiveSite] = {}
+        self._asked_s: dict[int, float] = {}
+        self._work: dict[int, asyncio.Task[None] | None] = {}
+        """What keeps the sites connected but the first."""
         self._on_broker: dict[int, SiteOnBroker] = {}
         self._default: int | None = None
-        self._connect: Callable[[LiveSite, int], None] = lambda _live, _number: None
+        self._connect: Callable[[LiveSite, int], asyncio.Task[None] | None] = lambda _live, _number: None
 
     @property
     def all(self) -> list[LiveSite]:
@@ -56,6 +72,10 @@ class LiveSites:
         number = number_of(asked)
         if number not in self._by_number and (number not in self._on_broker or self._make is None):
             raise HTTPException(404, f"site is {asked[:20]!r}; this broker has no such site, or it is not shown here")
+        if number not in self._by_number and len(self._by_number) >= MAX_SITES:
+            raise HTTPException(
+                503, f"{MAX_SITES} sites are shown here; those that nobody looks at are let go later"
+            )
         return self._shown(number)
 
     def _usual(self) -> LiveSite:
@@ -76,9 +96,21 @@ class LiveSites:
             is_first = number == self._default and self._first not in self._by_number.values()
             live = self._first if is_first or self._make is None else self._make()
             self._by_number[number] = live
-            self._connect(live, number)
+            self._work[number] = self._connect(live, number)
             self._report(live)
+        self._asked_s[number] = time.monotonic()
         return live
+
+    def let_go(self) -> None:
+        """Disconnect sites that nobody has asked for in a while. The first stays."""
+        now_s = time.monotonic()
+        for number, live in list(self._by_number.items()):
+            if live.pages or live.streams or live.monitor.zones or live.alarms.rules or live is self._first:
+                self._asked_s[number] = now_s
+            elif now_s - self._asked_s[number] > LET_GO_S:
+                del self._by_number[number]
+                if (work := self._work.pop(number)) is not None:
+                    work.cancel()
 
     def on_sites(self, sites: list[SiteOnBroker]) -> None:
         """The sites of the broker have changed. The first site that is alive is shown from now on."""
@@ -96,16 +128,15 @@ class LiveSites:
         """Stay connected to the named site, or to the sites that pages ask for, until cancelled."""
         async with asyncio.TaskGroup() as tasks:
 
-            def connect(live: LiveSite, number: int) -> None:
+            def connect(live: LiveSite, number: int) -> asyncio.Task[None]:
                 link = Link(address, live.name, site=number, kind="dashboard", limits=Limits(topics=2 * MAX_KEPT))
                 link.on_state.append(live.on_connection)
                 live.attach(link, number)
-                tasks.create_task(link.run())
-                if live is not self._first:
-                    tasks.create_task(live.run())
+                return tasks.create_task(link.run() if live is self._first else connected(link, live))
 
             self._connect = connect
             tasks.create_task(self._first.run())
+            tasks.create_task(every(_CHECK_S, self.let_go))
             if site_id is None:
                 await watch_sites(address, self.on_sites, self._on_broker_state)
             else:

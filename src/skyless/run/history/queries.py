@@ -56,7 +56,7 @@ from skyless.run.history.layout import (
 )
 from skyless.run.history.tables import read_table
 
-MEMORY: Final = "120MB"
+MEMORY: Final = "96MB"
 """What DuckDB may use before it writes to temporary files; Python and the libraries take 130 MB besides."""
 
 MAX_POINTS: Final = 20_000
