@@ -31,7 +31,7 @@ def commands():
             r"^ExecStart=/opt/skyless/bin/skyless (.*)$", unit.read_text(encoding="utf-8"), re.MULTILINE
         )
         line = re.sub(r"\$\{\w*LIMIT\w*}", "1000", re.sub(r"%i", "1", line))
-        yield pytest.param(shlex.split(line), id=unit.name)
+        yield pytest.param(shlex.split(line.replace("$SITE", "--site-id=7")), id=unit.name)
 
 
 @pytest.mark.parametrize("words", list(commands()))

@@ -270,10 +270,11 @@ async def test_stamps_of_beacons_that_are_not_accepted_are_not_kept(tmp_path, cl
             assert (2 in stage.node.heard_s) is is_kept
 
 
-def moved(site, x_m=0.0, ticks=0):
-    """The site with one anchor elsewhere, or with another delay."""
+def moved(site, x_m=0.0, ticks=0, rx_ticks=0):
+    """The site with one anchor elsewhere, or with other delays."""
     first = site.anchors[0]
-    first = replace(first, x_m=first.x_m + x_m, tx_antenna_delay_ticks=first.tx_antenna_delay_ticks + ticks)
+    delays = {"tx_antenna_delay_ticks": ticks, "rx_antenna_delay_ticks": rx_ticks}
+    first = replace(first, x_m=first.x_m + x_m, **{name: getattr(first, name) + more for name, more in delays.items()})
     return replace(site, anchors=(first, *site.anchors[1:]))
 
 
@@ -286,19 +287,24 @@ def keyed_node(folder, said, site=FREE, **options):
     return AnchorNode(site, 1, FakeRadio("1"), said.append, AnchorKeys(folder, site.id, said.append, {}), **options)
 
 
-@pytest.mark.parametrize(("x_m", "ticks", "far"), [(3.0, 0, "3.00"), (-0.51, 0, "0.51"), (0.0, 200, "0.94")])
-def test_a_placement_far_from_the_site_file_moves_no_anchor_with_keys(tmp_path, x_m, ticks, far):
+@pytest.mark.parametrize(
+    ("change", "far"),
+    [((3.0,), "3.00"), ((-0.51,), "0.51"), ((0.0, 200), "0.94"), ((0.0, 60, 60), "0.56"), ((0.3, -60, -60), "0.86"),
+     ((0.3, 0, 60), "0.58")],
+)  # fmt: skip
+def test_a_placement_far_from_the_site_file_moves_no_anchor_with_keys(tmp_path, change, far):
     """Its codes would vouch for what anybody with the password of a survey sends."""
     said = []
-    node, message = keyed_node(tmp_path, said), placement(FREE, moved(FREE, x_m, ticks))
+    node, message = keyed_node(tmp_path, said), placement(FREE, moved(FREE, *change))
     assert not node.place(message)
     assert not node.place(message)
     assert node.site is FREE
     assert node.refused == {"placement-refused": 2}
     assert len(said) == 1
-    assert re.search(f"ignored: they differ from the site file by {far} m.*0.5 m.*--allow-placement", said[0])
+    assert re.search(f"ignored: they change a range by {far} m from.*0.5 m.*--allow-placement", said[0])
     assert keyed_node(tmp_path, said, allow_placement=True).place(message)
     assert AnchorNode(FREE, 1, FakeRadio("1"), said.append).place(message)
+    assert keyed_node(tmp_path, said).place(placement(FREE, moved(FREE, 0.2, 60, -60)))
 
 
 def test_many_small_placements_do_not_add_up(tmp_path):

@@ -247,25 +247,25 @@ def is_same_but_placed(one: Site, other: Site) -> bool:
 
 
 def largest_change_m(one: Site, other: Site) -> float:
-    """The largest displacement of an anchor between two sites, or change of one of its delays as a distance.
+    """The largest error that one site instead of the other can make in a range to an anchor.
 
-    Both have the same anchors. One that has a position in the second site alone has an infinite change.
+    It is the anchor's displacement and the change of its delays together: both delays are in the time between a beacon
+    that it receives and its own. Both sites have the same anchors. One that has a position in the second site alone has
+    an infinite change.
     """
     others = {anchor.id: anchor for anchor in other.all_anchors}
-    return max(max(_changes_m(anchor, others[anchor.id])) for anchor in one.all_anchors)
+    return max(_change_m(anchor, others[anchor.id]) for anchor in one.all_anchors)
 
 
-def _changes_m(one: AnchorSite | UnplacedAnchor, other: AnchorSite | UnplacedAnchor) -> tuple[float, float, float]:
+def _change_m(one: AnchorSite | UnplacedAnchor, other: AnchorSite | UnplacedAnchor) -> float:
     moved_m = 0.0
     if isinstance(other, AnchorSite):
         moved_m = math.inf
         if isinstance(one, AnchorSite):
             moved_m = math.dist((one.x_m, one.y_m, one.z_m), (other.x_m, other.y_m, other.z_m))
-    return (
-        moved_m,
-        abs(other.tx_antenna_delay_ticks - one.tx_antenna_delay_ticks) * TICK_M,
-        abs(other.rx_antenna_delay_ticks - one.rx_antenna_delay_ticks) * TICK_M,
-    )
+    tx_ticks = other.tx_antenna_delay_ticks - one.tx_antenna_delay_ticks
+    rx_ticks = other.rx_antenna_delay_ticks - one.rx_antenna_delay_ticks
+    return moved_m + TICK_M * max(abs(tx_ticks), abs(rx_ticks), abs(tx_ticks + rx_ticks))
 
 
 def _frame_of(site: Site) -> object:

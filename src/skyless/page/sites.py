@@ -73,9 +73,7 @@ class LiveSites:
         if number not in self._by_number and (number not in self._on_broker or self._make is None):
             raise HTTPException(404, f"site is {asked[:20]!r}; this broker has no such site, or it is not shown here")
         if number not in self._by_number and len(self._by_number) >= MAX_SITES:
-            raise HTTPException(
-                503, f"{MAX_SITES} sites are shown here; those that nobody looks at are let go later"
-            )
+            raise HTTPException(503, f"{MAX_SITES} sites are shown here; those that nobody looks at are let go later")
         return self._shown(number)
 
     def _usual(self) -> LiveSite:

@@ -127,7 +127,7 @@ class AnchorNode:
             fault = "its anchors, slots or schedule are not those of the site file"
         elif not self._may_move and (change_m := largest_change_m(self._radio_site, message.site)) > MAX_MOVE_M:
             fault = (
-                f"they differ from the site file by {change_m:.2f} m, and anchors with keys adopt up to "
+                f"they change a range by {change_m:.2f} m from the site file's, and anchors with keys adopt up to "
                 f"{MAX_MOVE_M:g} m; put the new site file here, or start with --allow-placement"
             )
         else:

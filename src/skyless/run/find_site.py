@@ -25,6 +25,8 @@ _GATHER_S: Final = 0.25  # retained messages come one after the other: after thi
 
 _LONGEST_GATHER_S: Final = 3.0  # sites whose programs come and go all the time are reported after this time
 
+_NAMED: Final = 5
+"""How many sites an error lists."""
 _KINDS: Final = ("anchor", "tag", "ether")
 _log = logging.getLogger("skyless.run")
 
@@ -118,8 +120,9 @@ async def find_site(address: MqttAddress) -> int:
     if len(alive) > 1:
         named = "; ".join(
             f"number {site.number}, {site.name!r}, {site.online} program{'s' if site.online > 1 else ''} online"
-            for site in alive
+            for site in alive[:_NAMED]
         )
+        named += f"; and {len(alive) - _NAMED} more" if len(alive) > _NAMED else ""
         raise SkylessError(
             f"the broker {address} carries {len(alive)} sites ({named}); --site-id should name one of them"
         )
