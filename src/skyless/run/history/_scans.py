@@ -19,6 +19,8 @@ _SIDE: Final = 2000
 share few lines of the processor's cache."""
 _OUTSIDE: Final = _SIDE * _SIDE
 MAX_CELLS: Final = 2_000_000
+MAX_RUNS: Final = 200_000
+"""Times for which two tags were near each other, before those in different files are joined."""
 _WILD_SHARE: Final = 1e-3
 """Of the time, this share may be outside the grid, which then are wild fixes."""
 
@@ -85,20 +87,38 @@ def near(
     order = np.argsort(times)
     buckets, nth = np.unique(times[order] // bucket_ms, return_index=True)
     x0, y0 = (column[order[nth]].astype(np.int64) for column in places)
-    runs = [np.empty((4, 0), np.int64)]
+    runs: list[NDArray[np.int64]] = []
     for (tag, t, x, y), _ in read_rows(files, span, None):
         bucket = t // bucket_ms
-        at = np.minimum(np.searchsorted(buckets, bucket), len(buckets) - 1)
-        is_near = (buckets[at] == bucket) & (np.abs(x - x0[at]) <= distance_mm) & (np.abs(y - y0[at]) <= distance_mm)
-        rows = np.flatnonzero(is_near & ~np.isin(tag, list(own)))
+        at = _indices(buckets, bucket)
+        rows = np.flatnonzero((np.abs(x - x0[at]) <= distance_mm) & (buckets[at] == bucket))
+        rows = rows[(np.abs(y[rows] - y0[at[rows]]) <= distance_mm) & ~np.isin(tag[rows], list(own))]
         square = (x[rows] - x0[at[rows]]) ** 2 + (y[rows] - y0[at[rows]]) ** 2
         found = np.array([tag[rows], bucket[rows], bucket[rows], square], np.int64)
-        runs.append(_joined(found[:, square <= distance_mm**2], gap))
-    return _joined(np.concatenate(runs, axis=1), gap)
+        runs.append(joined([found[:, square <= distance_mm**2]], gap))
+        if sum(one.shape[1] for one in runs) > MAX_RUNS:
+            runs = [joined(runs, gap)]
+    return joined(runs, gap)
 
 
-def _joined(runs: NDArray[np.int64], gap: int) -> NDArray[np.int64]:
-    """Runs of buckets of tags, with the runs of a tag joined that have ``gap`` buckets or less between them."""
+def _indices(known: _Ints, wanted: _Ints) -> _Ints:
+    """Where numbers are in a sorted array, or any place where they are not."""
+    first, last = int(wanted.min()), int(wanted.max())
+    if last - first > ROW_GROUP:
+        return np.searchsorted(known, wanted).clip(max=len(known) - 1)
+    begin, end = np.searchsorted(known, [first, last + 1])
+    places = np.zeros(last - first + 1, np.intp)  # three times as fast, and files are of some hours
+    places[known[begin:end] - first] = np.arange(begin, end)
+    found: _Ints = places[wanted - first]
+    return found
+
+
+def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:
+    """Runs of buckets of tags, with the runs of a tag joined that have ``gap`` buckets or less between them.
+
+    Raises SkylessError: they are too many.
+    """
+    runs = np.concatenate([np.empty((4, 0), np.int64), *parts], axis=1)
     if not runs.size:
         return runs
     tag, first, last, square = runs[:, np.lexsort((runs[1], runs[0]))]
@@ -106,6 +126,8 @@ def _joined(runs: NDArray[np.int64], gap: int) -> NDArray[np.int64]:
     later = np.cumsum(is_other) * (last.max() - first.min() + gap + 2)  # each tag after the one before
     until = np.maximum.accumulate(last + later)
     begins = np.flatnonzero(np.append(True, (first + later)[1:] > until[:-1] + gap + 1))
+    if len(begins) > MAX_RUNS // 2:
+        raise SkylessError("the contacts are too many; choose a shorter range or a smaller distance")
     return np.array(
         [tag[begins], first[begins], np.maximum.reduceat(last, begins), np.minimum.reduceat(square, begins)]
     )

@@ -31,7 +31,7 @@ from skyless.core.site import GeoreferenceSite
 from skyless.core.whole_files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
 from skyless.run.geojson import coordinates, feature
-from skyless.run.history._scans import limits, near, time_in_cells
+from skyless.run.history._scans import joined, limits, near, time_in_cells
 from skyless.run.history.answers import (
     GAP_S,
     THINNED_GAP_S,
@@ -56,13 +56,13 @@ from skyless.run.history.layout import (
 )
 from skyless.run.history.tables import read_table
 
-MEMORY: Final = "96MB"
+MEMORY: Final = "64MB"
 """What DuckDB may use before it writes to temporary files; Python and the libraries take 130 MB besides."""
 
 MAX_POINTS: Final = 20_000
 MAX_STEPS: Final = 20_000
 """Steps of time of all zones together."""
-MAX_ROWS: Final = 200_000
+MAX_ROWS: Final = 100_000
 """Rows of an answer that is a table."""
 MAX_EXPORTED: Final = 100_000_000
 """Rows of a file."""
@@ -82,6 +82,7 @@ _CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
 longest interruption of a contact in such intervals."""
 _MAX_DISTANCE_M: Final = 50.0
 _FETCHED: Final = 10_000
+_PART_S: Final = 28.0 * 86_400.0
 _NAMED: Final = 5
 """How many known names an error lists."""
 
@@ -221,18 +222,17 @@ class History:
         check_number("the number of points", most_points, least=2, most=MAX_POINTS)
         files, own = self._files(span), f"{_FIXES} AND tag IN ({_listed(numbers)})"
         gap_ms = round(1000 * (THINNED_GAP_S if _are_thinned(files) else GAP_S))
-        times, length = array("q"), _Length(gap_ms)
-        for row in _stream(f"SELECT ms, x_m, y_m, std_m FROM ({own}) ORDER BY ms", files, span):
-            times.append(row[0])
-            length.add(*row)
-        if not times:
+        ((count,),) = _stream(f"SELECT count(*) FROM ({own})", files, span) if files else ((0,),)
+        if not count:
             return Track(tag, (), 0, 0.0)
-        ms = np.frombuffer(times, np.int64)
-        kept = np.unique(ms[_thinned(ms, most_points, gap_ms)]).tolist()
+        way = _Way(count, most_points, gap_ms)
+        for row in _stream(f"SELECT ms, x_m, y_m, std_m FROM ({own}) ORDER BY ms", files, span):
+            way.add(*row)
+        kept = way.kept()
         columns = "ms / 1000, x_m, y_m, z_m, std_m, hpl_m, alert"
         sql = f"SELECT DISTINCT ON (ms) {columns} FROM ({own} AND list_contains($kept, epoch_ms(t))) ORDER BY ms"
-        points = _stream(sql, files, span, kept=kept)
-        return Track(tag, tuple(TrackPoint(*row) for row in points), len(ms), length.total_m)
+        points = tuple(TrackPoint(*row) for row in _stream(sql, files, span, kept=kept))
+        return Track(tag, points, count, way.length_m)
 
     @_asked
     def heatmap(self, span: Span, cell_m: float = 0.25, tags: Sequence[str] = ()) -> Heatmap:
@@ -287,9 +287,9 @@ class History:
         ((tag, own),) = self._tags((tag,)).items()
         names, files = self._names(), self._files(span)
         length_ms, gap = _CONTACT_MS[_are_thinned(files)]
-        found = near(files, span, own, length_ms, round(1000.0 * distance_m), gap)
-        if found.shape[1] > MAX_ROWS:
-            raise SkylessError(f"there are {found.shape[1]} contacts, more than {MAX_ROWS}; choose a shorter range")
+        found = joined(
+            [near(*part, own, length_ms, round(1000.0 * distance_m), gap) for part in _parts(files, span)], gap
+        )
         contacts = [
             Contact(
                 tag,
@@ -346,9 +346,7 @@ class History:
     # What they share
 
     def _files(self, span: Span) -> list[Path]:
-        """Files in which fixes of the range may be: they lie by the day of arrival."""
-        begin, end = _day(span.from_unix_s, -_EARLY), _day(span.to_unix_s, _LATE)
-        return [file for file in current_files(self.folder, self.site) if begin <= day_of(file) <= end]
+        return _of_days(current_files(self.folder, self.site), span)
 
     def _table(self, name: str, columns: dict[str, str]) -> list[dict[str, Any]]:
         file = self._site_folder / name
@@ -412,33 +410,42 @@ def _ramp(times: _Floats, at: _Floats) -> _Floats:
     return ramp
 
 
-def _thinned(times: _Ints, most: int, gap: int) -> list[int]:
-    """Indices of rows, evenly among them, ``most`` at most; rows at gaps are kept if they are half of it or less."""
-    if len(times) <= most:
-        return list(range(len(times)))
-    gaps = np.flatnonzero(np.diff(times) > gap)
-    fixed = np.union1d(gaps, gaps + 1)
-    if len(fixed) > most // 2:
-        fixed = fixed[:0]
-    evenly = np.linspace(0, len(times) - 1, most - len(fixed)).round()
-    return list(map(int, np.union1d(evenly, fixed)))
+class _Way:
+    """Fixes of a tag in the order of their times: their length, and which are kept of them."""
 
-
-class _Length:
-    """Length of a way of moves that are not within the noise, each from the end of the last."""
-
-    def __init__(self, gap_ms: int) -> None:
-        self.total_m = 0.0
-        self._gap_ms, self._before_ms, self._x, self._y = gap_ms, -math.inf, 0.0, 0.0
+    def __init__(self, count: int, most: int, gap_ms: int) -> None:
+        """``most`` are kept of ``count`` fixes."""
+        self.length_m = 0.0
+        """Of moves that are not within the noise, each from the end of the last."""
+        self._most, self._gap_ms = most, gap_ms
+        self._step, self._index = max(1.0, (count - 1) / (most - 1)), -1
+        self._evenly, self._at_gaps = array("q"), list[float]()
+        self._before_ms, self._x, self._y = -math.inf, 0.0, 0.0
 
     def add(self, now_ms: int, x: float, y: float, std_m: float) -> None:
         """Go on to the next fix."""
         moved_m = math.hypot(x - self._x, y - self._y)
         is_new = now_ms - self._before_ms > self._gap_ms
         if is_new or moved_m >= max(_MOVE_M, _MOVE_SIGMAS * std_m):
-            self.total_m += 0.0 if is_new else moved_m
+            self.length_m += 0.0 if is_new else moved_m
             self._x, self._y = x, y
+        if is_new and self._index >= 0 and len(self._at_gaps) <= self._most // 2:
+            self._at_gaps += [self._before_ms, now_ms]
+        self._index += 1
+        if self._index >= round(len(self._evenly) * self._step):
+            self._evenly.append(now_ms)
         self._before_ms = now_ms
+
+    def kept(self) -> list[int]:
+        """Times of fixes, evenly among them; those at gaps are kept if they are half of ``most`` or less."""
+        at_gaps = np.unique(np.array(self._at_gaps, np.int64))
+        if len(at_gaps) > self._most // 2:
+            at_gaps = at_gaps[:0]
+        evenly = np.array(self._evenly)
+        if len(evenly) + len(at_gaps) > self._most:
+            evenly = evenly[np.linspace(0, len(evenly) - 1, self._most - len(at_gaps)).round().astype(int)]
+        found: list[int] = np.union1d(evenly, at_gaps).tolist()
+        return found
 
 
 # Files and DuckDB
@@ -478,6 +485,22 @@ def _parameters(files: Iterable[Path], span: Span) -> dict[str, Any]:
 
 def _day(unix_s: float, later: timedelta) -> str:
     return (datetime.fromtimestamp(unix_s, UTC) + later).date().isoformat()
+
+
+def _parts(files: Sequence[Path], span: Span) -> Iterator[tuple[list[Path], Span]]:
+    """A range in parts of four weeks, of which some have files."""
+    begin_s = span.from_unix_s // _PART_S * _PART_S
+    while begin_s < span.to_unix_s:
+        part = Span(max(begin_s, span.from_unix_s), min(begin_s + _PART_S, span.to_unix_s))
+        if of_part := _of_days(files, part):
+            yield of_part, part
+        begin_s += _PART_S
+
+
+def _of_days(files: Iterable[Path], span: Span) -> list[Path]:
+    """Files in which fixes of the range may be: they lie by the day of arrival."""
+    begin, end = _day(span.from_unix_s, -_EARLY), _day(span.to_unix_s, _LATE)
+    return [file for file in files if begin <= day_of(file) <= end]
 
 
 def _are_thinned(files: Iterable[Path]) -> bool:
