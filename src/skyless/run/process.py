@@ -162,7 +162,7 @@ async def outlasting(lasting: Coroutine[Any, Any, None], others: Coroutine[Any, 
 
 def link_of(address: MqttAddress | None, name: int | str, *, site: int, kind: str) -> Link | None:
     """The node's connection to the broker, or None without one."""
-    return None if address is None else Link(address, name, site=site, kind=kind)
+    return None if address is None else Link(address, name, site=site, kind=kind, keepalive_s=NODE_KEEPALIVE_S)
 
 
 async def keep(link: Link, log: Log) -> None:

@@ -23,7 +23,7 @@ from skyless.run.board_receiver import BoardReceiver
 from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog, PhaseLog
 from skyless.run.keys.node_keys import Remembered, TagMemory, TagReport, trust_reason
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.link import NODE_KEEPALIVE_S, Link
 from skyless.run.mqtt.messages import Counters, FixMessage, RequestMessage, TagHealth
 from skyless.run.mqtt.topics import fix_topic, health_topic, receptions_topic, request_topic
 from skyless.run.process import HEALTH_S, Log, Usage, data_folder, every, keep, reader, together
@@ -272,7 +272,7 @@ class Tag:
         self._link_tasks = [task for task in self._link_tasks if not task.done()]
         self._site = site
         self._late_before += 0 if self.link is None else self.link.late
-        self.link = Link(self._address, self.node.name, site=site, kind="tag")
+        self.link = Link(self._address, self.node.name, site=site, kind="tag", keepalive_s=NODE_KEEPALIVE_S)
         self._fix_topic = fix_topic(site, self.node.name)
         self._health_topic = health_topic(site, "tag", self.node.name)
         self._receptions_topic = receptions_topic(site, self.node.name)

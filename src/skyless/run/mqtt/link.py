@@ -37,6 +37,11 @@ _encode: Final = msgspec.json.Encoder().encode
 Handler = Callable[[str, bytes], None]
 """Called from the event loop with topic and payload; must return quickly."""
 
+READER_KEEPALIVE_S: Final = 20
+NODE_KEEPALIVE_S: Final = 10
+"""For how long a broker may be silent. It is pinged after half of that, and gives a client up after three quarters: one
+whose event loop stands for a quarter of it then loses the broker, as bridges did in bursts with 10 s."""
+
 _MAX_TOPICS: Final = 10_000
 _FIRST_WAIT_S: Final = 0.1
 _LONGEST_WAIT_S: Final = 5.0
@@ -69,7 +74,7 @@ class Link:
         kind: str,
         persistent: bool = False,
         client_key: str = "",
-        keepalive_s: int = 10,
+        keepalive_s: int = READER_KEEPALIVE_S,
         limits: Limits | None = None,
     ) -> None:
         """``persistent`` lets the broker keep messages of QoS 1 for this name while it is away, until it is stopped.
