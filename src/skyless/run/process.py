@@ -25,7 +25,7 @@ from msgspec import Struct
 
 from skyless.core.site import Site
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.link import RESEND_S, Handler, Link
+from skyless.run.mqtt.link import NODE_KEEPALIVE_S, RESEND_S, Handler, Link
 from skyless.run.mqtt.messages import SiteMessage, WrongMessageError, read_message, site_message
 from skyless.run.mqtt.topics import floor_plan_topic, plan_of_floor_topic, site_topic
 
