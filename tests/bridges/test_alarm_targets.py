@@ -18,6 +18,7 @@ from msgspec.structs import replace
 
 from skyless.bridges import _deliveries
 from skyless.bridges.hub import Hub
+from skyless.bridges.limits import BridgeLimits
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
 from skyless.core.errors import SkylessError
@@ -180,7 +181,7 @@ def _drip(connection, ended):
 
 
 def test_the_oldest_of_too_many_is_dropped_and_counted(monkeypatch):
-    monkeypatch.setattr(_deliveries, "MAX_WAITING", 5)
+    monkeypatch.setattr(_deliveries, "LIMITS", BridgeLimits(deliveries=5))
     with Receiver() as receiver:
         target = open_target(f"webhook+http://127.0.0.1:{receiver.port}/")
         deliver(target, [replace(ALARM, id=f"cold/t/{k}") for k in range(8)], lambda: target.delivered == 5)

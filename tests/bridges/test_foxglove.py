@@ -23,6 +23,7 @@ from skyless.bridges.foxglove import (
     Unsubscribe,
     decode_request,
 )
+from skyless.bridges.limits import BridgeLimits
 from skyless.bridges.target import BridgedSite
 from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
@@ -274,7 +275,7 @@ async def stuck_socket(port, channels):
 
 
 async def test_more_clients_than_it_serves_are_closed(monkeypatch):
-    monkeypatch.setattr(foxglove, "MAX_CLIENTS", 1)
+    monkeypatch.setattr(foxglove, "LIMITS", BridgeLimits(clients=1))
     async with served() as server, client_of(server) as first:
         await first.text(lambda text: text["op"] == "serverInfo")
         async with client_of(server) as second:

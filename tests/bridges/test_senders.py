@@ -8,8 +8,9 @@ import stat
 
 import pytest
 
-from skyless.bridges._senders import MAX_READERS, PtySender, SerialSender, TcpServer, UdpSender
+from skyless.bridges._senders import PtySender, SerialSender, TcpServer, UdpSender
 from skyless.bridges.jsonl import JsonLines
+from skyless.bridges.limits import LIMITS
 from skyless.core.errors import SkylessError
 from skyless.radio.serial.pseudo_terminal import Pty
 
@@ -78,11 +79,11 @@ async def test_a_tcp_reader_that_never_reads_costs_no_other_a_byte_and_is_discon
 async def test_more_connections_than_allowed_are_closed_at_once():
     async with running(TcpServer("t:", "127.0.0.1", 0, list)) as server:
         port = await listening(server)
-        held = [await asyncio.open_connection("127.0.0.1", port) for _ in range(MAX_READERS)]
+        held = [await asyncio.open_connection("127.0.0.1", port) for _ in range(LIMITS.readers)]
         reader, _ = await asyncio.open_connection("127.0.0.1", port)
         with contextlib.suppress(ConnectionResetError):
             assert await reader.read() == b""
-        assert len(server._readers) == MAX_READERS
+        assert len(server._readers) == LIMITS.readers
         assert server.dropped == {"too-many-readers": 1}
         del held
 

@@ -12,6 +12,7 @@ from starlette.routing import Route
 
 from skyless.page import connections
 from skyless.page.connections import Connection, FailedAccepts, end_unfinished
+from skyless.page.limits import PageLimits
 from support.processes import free_port
 
 pytestmark = pytest.mark.site
@@ -84,7 +85,7 @@ async def test_a_request_that_is_never_finished_is_ended(data):
 
 
 async def test_requests_that_are_not_finished_make_room_for_a_reader(monkeypatch):
-    monkeypatch.setattr(connections, "MAX_CONNECTIONS_PER_ADDRESS", 8)
+    monkeypatch.setattr(connections, "LIMITS", PageLimits(connections_per_address=8))
     async with serving() as server:
         halves = [await sent(server, data) for data in 10 * tuple(UNFINISHED.values())]
         reader, writer = await sent(server, LAST)
@@ -94,9 +95,9 @@ async def test_requests_that_are_not_finished_make_room_for_a_reader(monkeypatch
             end.close()
 
 
-@pytest.mark.parametrize(("limit", "said"), [("MAX_CONNECTIONS", b""), ("MAX_CONNECTIONS_PER_ADDRESS", b" of this ")])
+@pytest.mark.parametrize(("limit", "said"), [("connections", b""), ("connections_per_address", b" of this ")])
 async def test_beyond_the_limit_of_requests_in_work_a_client_is_told(monkeypatch, limit, said):
-    monkeypatch.setattr(connections, limit, 3)
+    monkeypatch.setattr(connections, "LIMITS", PageLimits(**{limit: 3}))
     release = asyncio.Event()
     async with serving(release) as server:
         busy = [await sent(server, SLOW) for _ in range(3)]

@@ -13,11 +13,10 @@ from starlette.websockets import WebSocketDisconnect
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite
 from skyless.page.guard import AccessRules, Guard
+from skyless.page.limits import LIMITS
 from skyless.page.live import (
     GONE_S,
     IDLE_S,
-    MAX_PAGES,
-    MAX_PAGES_PER_ADDRESS,
     TooManyPagesError,
 )
 from skyless.run.mqtt import topics
@@ -253,7 +252,7 @@ def test_a_page_that_went_away_is_forgotten(browser, live):
 
 
 def test_one_page_too_many_is_closed_with_the_reason(browser, live, times):
-    pages = [live.open_page("testclient") for _ in range(MAX_PAGES_PER_ADDRESS)]
+    pages = [live.open_page("testclient") for _ in range(LIMITS.pages_per_address)]
     with browser.websocket_connect(SOCKET) as socket, pytest.raises(WebSocketDisconnect) as closed:
         socket.receive_json()
     assert (closed.value.code, closed.value.reason[:28]) == (1013, "too many pages are open: 100")
@@ -262,7 +261,7 @@ def test_one_page_too_many_is_closed_with_the_reason(browser, live, times):
 
 
 def test_an_idle_page_makes_room(browser, live, times):
-    pages = [live.open_page("testclient") for _ in range(MAX_PAGES_PER_ADDRESS)]
+    pages = [live.open_page("testclient") for _ in range(LIMITS.pages_per_address)]
     times.move(IDLE_S - 1.0)
     for page in pages[1:]:
         live.keep_page(page)
@@ -275,13 +274,13 @@ def test_an_idle_page_makes_room(browser, live, times):
 
 
 def test_all_computers_together_open_a_limited_number_of_pages(live, times):
-    for k in range(MAX_PAGES):
+    for k in range(LIMITS.pages):
         live.open_page(f"10.0.0.{k}")
-    with pytest.raises(TooManyPagesError, match=f"0 of this computer, {MAX_PAGES} in all"):
+    with pytest.raises(TooManyPagesError, match=f"0 of this computer, {LIMITS.pages} in all"):
         live.open_page("10.0.1.1")
     times.move(IDLE_S)
     live.open_page("10.0.1.1")
-    assert len(live.pages) == MAX_PAGES
+    assert len(live.pages) == LIMITS.pages
 
 
 def test_a_page_that_sends_nothing_for_minutes_is_closed(live, times):

@@ -17,7 +17,8 @@ from websockets.protocol import State
 
 from skyless.page.app import Services, make_app
 from skyless.page.guard import AccessRules
-from skyless.page.live import IDLE_S, MAX_PAGES_PER_ADDRESS
+from skyless.page.limits import LIMITS
+from skyless.page.live import IDLE_S
 from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites
 from skyless.run.broker import BrokerSettings, start_broker
@@ -195,8 +196,8 @@ def test_idle_connections_shut_nobody_out_and_a_page_too_many_gets_the_reason(li
             address = f"ws://127.0.0.1:{sock.getsockname()[1]}/live"
             async with contextlib.AsyncExitStack() as stack:
                 await settled(lambda: server.started)
-                idle = [await stack.enter_async_context(connect(address)) for _ in range(MAX_PAGES_PER_ADDRESS)]
-                await settled(lambda: len(live.pages) == MAX_PAGES_PER_ADDRESS)
+                idle = [await stack.enter_async_context(connect(address)) for _ in range(LIMITS.pages_per_address)]
+                await settled(lambda: len(live.pages) == LIMITS.pages_per_address)
                 with pytest.raises(websockets.ConnectionClosed) as closed:
                     async with connect(address) as refused:
                         await refused.recv()
@@ -205,7 +206,7 @@ def test_idle_connections_shut_nobody_out_and_a_page_too_many_gets_the_reason(li
                 newest = await stack.enter_async_context(connect(address))
                 assert (await next_of(newest, "hello"))["mqtt"] is False
                 await settled(lambda: any(page.state is State.CLOSED for page in idle))
-                assert len(live.pages) == MAX_PAGES_PER_ADDRESS
+                assert len(live.pages) == LIMITS.pages_per_address
                 server.should_exit = True
             await serving
 

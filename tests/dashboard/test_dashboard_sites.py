@@ -9,8 +9,9 @@ from dashboard_builders import SITE, SQUARE, Times, Wire, browser_of
 from starlette.exceptions import HTTPException
 
 from skyless.page import sites as sites_module
+from skyless.page.limits import LIMITS, PageLimits
 from skyless.page.live import LiveSite
-from skyless.page.sites import MAX_SITES, LiveSites
+from skyless.page.sites import LiveSites
 from skyless.run.find_site import SiteOnBroker
 from skyless.run.mqtt import topics
 
@@ -128,14 +129,14 @@ def test_a_server_of_one_site_shows_that_and_offers_none(stage):
 
 def test_twenty_sites_are_shown_and_those_that_nobody_looks_at_are_let_go(stage, monkeypatch):
     stage.on_broker(s0=1, **{f"s{number}": 0 for number in range(1, 300)})
-    waits = [stage.sites.of(str(number)) for number in range(1, MAX_SITES)]
-    for number in range(MAX_SITES, 300):
-        with pytest.raises(HTTPException, match="20 sites are shown here") as refused:
+    waits = [stage.sites.of(str(number)) for number in range(1, LIMITS.sites)]
+    for number in range(LIMITS.sites, 300):
+        with pytest.raises(HTTPException, match="20 sites are shown") as refused:
             stage.sites.of(str(number))
         assert refused.value.status_code == 503
     page, first = waits[0].open_page(), stage.sites.of(None)
     waits[1].monitor.zones = (SQUARE,)
-    monkeypatch.setattr(sites_module, "LET_GO_S", -1.0)
+    monkeypatch.setattr(sites_module, "LIMITS", PageLimits(site_idle_s=-1.0))
     stage.sites.let_go()
     assert set(stage.sites.all) == {first, waits[0], waits[1]}
     waits[0].pages.discard(page)

@@ -14,7 +14,7 @@ from msgspec.structs import replace
 from skyless.core.errors import SkylessError
 from skyless.core.site import FloorPlanSite, UnplacedAnchor
 from skyless.page._site_survey import SiteSurvey
-from skyless.page.app import MAX_FLOOR_PLAN_BYTES
+from skyless.page.limits import LIMITS
 from skyless.page.overlay_process import overlay
 from skyless.page.tasks import OverlayTask
 from skyless.run.mqtt import topics
@@ -188,7 +188,7 @@ def test_a_floor_plan_is_retained_and_shown(browser, wire, live):
 
 
 @pytest.mark.parametrize(
-    ("body", "status"), [(b"GIF89a", 400), (b"", 400), (IMAGE[:12], 400), (bytes(MAX_FLOOR_PLAN_BYTES + 1), 413)]
+    ("body", "status"), [(b"GIF89a", 400), (b"", 400), (IMAGE[:12], 400), (bytes(LIMITS.floor_plan_bytes + 1), 413)]
 )
 def test_other_images_are_refused(browser, wire, body, status):
     answer = browser.put("/api/floor_plan", content=body)

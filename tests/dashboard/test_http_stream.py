@@ -14,6 +14,7 @@ from skyless.page.api import stream
 from skyless.page.api.stream import SiteStream
 from skyless.page.event_list import MAX_KEPT
 from skyless.page.guard import AccessRules
+from skyless.page.limits import PageLimits
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import ZoneEvent
 
@@ -135,7 +136,7 @@ def test_wrong_questions_are_closed_with_a_reason(site, query):
 
 
 def test_there_are_only_so_many(site, monkeypatch):
-    monkeypatch.setattr(stream, "MAX_STREAMS", 1)
+    monkeypatch.setattr(stream, "LIMITS", PageLimits(streams=1))
     with browser_of(site) as client, client.websocket_connect(STREAM) as first:
         first.receive_json()
         with client.websocket_connect(STREAM) as second, pytest.raises(WebSocketDisconnect) as closed:

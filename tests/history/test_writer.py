@@ -16,6 +16,7 @@ from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import records_of
 from skyless.run.history import writer as writer_module
 from skyless.run.history.layout import FIX_COLUMNS, current_events, current_files, rows_of, site_folder
+from skyless.run.history.limits import HistoryLimits
 from skyless.run.history.tables import Event, fix_table
 from skyless.run.history.writer import Journal, Writer
 
@@ -180,7 +181,7 @@ def full_disk(writer):
 
 
 def test_a_full_disk_costs_the_oldest_rows_that_wait_and_is_counted(tmp_path, monkeypatch):
-    monkeypatch.setattr(writer_module, "MAX_WAITING", 1000)
+    monkeypatch.setattr(writer_module, "LIMITS", HistoryLimits(waiting_rows=1000))
     writer = Writer(tmp_path, 1)
     writer.number(fix(), NOON_S)
     writer.fixes.add(records([1, 2]), NOON_S)
@@ -286,7 +287,7 @@ def test_a_time_that_is_none_is_counted(tmp_path, unix_s):
 
 
 def test_too_many_tags_are_counted(tmp_path, monkeypatch):
-    monkeypatch.setattr(writer_module, "MAX_TAGS", 2)
+    monkeypatch.setattr(writer_module, "LIMITS", HistoryLimits(tags=2))
     writer = Writer(tmp_path, 1)
     assert [writer.number(fix(name), NOON_S) for name in ("a", "b", "c", "a")] == [1, 2, None, 1]
     assert writer.drops == {"too-many-tags": 1}

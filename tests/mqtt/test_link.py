@@ -14,6 +14,7 @@ from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
 from skyless.run import broker as broker_module
+from skyless.run.broker import BrokerLimits
 from skyless.run.mqtt import connection
 from skyless.run.mqtt import link as link_module
 from skyless.run.mqtt.access import USERS, Role
@@ -530,7 +531,7 @@ async def test_the_embedded_broker_has_room_for_more_subscriptions_than_its_serv
 
 @pytest.mark.parametrize("role", [None, Role.PAGE])
 async def test_a_full_broker_is_named_as_the_reason_and_asked_again(tmp_path, role, monkeypatch, caplog):
-    monkeypatch.setattr(broker_module, "_MAX_SUBSCRIPTIONS", 60)
+    monkeypatch.setattr(broker_module, "LIMITS", BrokerLimits(subscriptions=60))
     monkeypatch.setattr(link_module, "RESEND_S", 0.2)
     roles = None if role is None else dict.fromkeys(USERS, "a-password-of-all")
     broker = Embedded(tmp_path, roles=roles)

@@ -18,12 +18,10 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
+from skyless.bridges.limits import LIMITS
 from skyless.bridges.target import BridgedSite, Target
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.messages import AlarmMessage
-
-MAX_WAITING: Final = 1000
-"""Messages that wait. Beyond it the oldest is dropped."""
 
 TIMEOUT_S: Final = 10.0
 """For each attempt, all of it."""
@@ -103,7 +101,7 @@ class AlarmTarget(Target):
         for what in states:
             if what in self._kinds and what not in (known or ()):
                 self._waiting.append(Delivery(what, alarm, now_s, now_s, FIRST_PAUSE_S))
-        while len(self._waiting) > MAX_WAITING:
+        while len(self._waiting) > LIMITS.deliveries:
             del self._waiting[0]
             self.dropped["too-many"] += 1
         self._wake.set()

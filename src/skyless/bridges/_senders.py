@@ -13,13 +13,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from skyless.bridges.limits import LIMITS
 from skyless.bridges.target import cannot_listen
 from skyless.core.errors import SkylessError
 from skyless.radio.serial.pseudo_terminal import Pty
 from skyless.radio.serial.serial_port import SerialPort
-
-MAX_READERS: Final = 64
-"""Connections to one TCP server."""
 
 _WAITING_BYTES: Final = 1 << 15
 """Bytes that may wait for one reader in this process, or a single longer message; and as many in the system."""
@@ -79,7 +77,7 @@ class _TcpReader(asyncio.Protocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Greet it, if there are not too many."""
         assert isinstance(transport, asyncio.Transport)
-        if len(self._readers) >= MAX_READERS:
+        if len(self._readers) >= LIMITS.readers:
             self._dropped["too-many-readers"] += 1
             transport.abort()
             return

@@ -24,6 +24,7 @@ from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 from websockets.typing import Subprotocol
 
+from skyless.bridges.limits import LIMITS
 from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl, cannot_listen, floored
 from skyless.run.foxglove.messages import (
     SCENE_TOPIC,
@@ -142,9 +143,6 @@ def _text(value: dict[str, Any]) -> str:
     return msgspec.json.encode(value).decode()
 
 
-_MAX_WAITING: Final = 500
-"""Messages for one client; beyond it the oldest is dropped."""
-
 STUCK_S: Final = 10.0
 """A client that has accepted nothing for so long, while its messages were being dropped, is disconnected."""
 
@@ -160,7 +158,7 @@ class Session:
         self._numbers: dict[int, int] = {}
         """The client's numbers of its subscriptions, by channel."""
         self._texts: deque[str] = deque()
-        self._data: deque[bytes] = deque(maxlen=_MAX_WAITING)
+        self._data: deque[bytes] = deque(maxlen=LIMITS.waiting_messages)
         self._ready = asyncio.Event()
         self._sent_s = asyncio.get_running_loop().time()
 
@@ -224,10 +222,6 @@ class Session:
 
 
 _PORT: Final = 8765
-MAX_CLIENTS: Final = 32
-MAX_CHANNELS: Final = 2000
-
-_MAX_REQUEST_BYTES: Final = 1 << 16
 _SEND_BUFFER_BYTES: Final = 1 << 16
 """In the system, for each client: what is there is sent before anything newer."""
 
@@ -302,7 +296,7 @@ class FoxgloveTarget(Target):
                 process_request=self._refusal,
                 subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
                 compression=None,
-                max_size=_MAX_REQUEST_BYTES,
+                max_size=LIMITS.request_bytes,
                 write_limit=_SEND_BUFFER_BYTES,
                 close_timeout=_GOODBYE_S,
                 logger=_quiet,
@@ -327,7 +321,7 @@ class FoxgloveTarget(Target):
 
     async def _serve(self, connection: ServerConnection) -> None:
         """Serve one client until it goes."""
-        if len(self._sessions) >= MAX_CLIENTS:
+        if len(self._sessions) >= LIMITS.clients:
             self.dropped["too-many-clients"] += 1
             return
         connection.transport.get_extra_info("socket").setsockopt(
@@ -388,7 +382,7 @@ class FoxgloveTarget(Target):
             self.dropped["out-of-range"] += 1
 
     def _advertise(self, topic: str, schema: tuple[str, bytes]) -> None:
-        if len(self._channels) >= MAX_CHANNELS:
+        if len(self._channels) >= LIMITS.channels:
             self.dropped["too-many-channels"] += 1
             return
         number = len(self._channels) + 1

@@ -13,6 +13,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from math import inf, isinf, isnan
 from typing import Final, Literal
 
+from skyless.bridges.limits import LIMITS
 from skyless.bridges.target import TAG_NAME, BridgeContext, BridgedSite, Target, TargetUrl, cannot_listen
 from skyless.core.version import installed_version
 from skyless.run.mqtt.address import is_loopback
@@ -36,10 +37,6 @@ _MAX_REASONS: Final = 50
 
 _FIXES: Final = "skyless_tag_fixes_total"
 _PORT: Final = 9464
-_MAX_CONNECTIONS: Final = 32
-_MAX_REQUEST_BYTES: Final = 8192
-_ANSWER_S: Final = 5.0
-"""A connection is ended after this time, even in the middle of an answer."""
 
 # What is given as it stands in a message: the metric's name, the message's field, and a line of help.
 
@@ -412,7 +409,7 @@ class Prometheus(Target):
     async def run(self) -> None:
         """Serve until cancelled. Raises SkylessError: it cannot listen there."""
         try:
-            server = await asyncio.start_server(self._serve, self._host, self.port, limit=_MAX_REQUEST_BYTES)
+            server = await asyncio.start_server(self._serve, self._host, self.port, limit=LIMITS.head_bytes)
         except OSError as error:
             raise cannot_listen(self.text, self._host, self.port, error) from None
         self.port = server.sockets[0].getsockname()[1]
@@ -424,13 +421,13 @@ class Prometheus(Target):
                 writer.transport.abort()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if len(self._open) >= _MAX_CONNECTIONS:
+        if len(self._open) >= LIMITS.clients:
             oldest = next(iter(self._open))
             del self._open[oldest]
             oldest.transport.abort()
         self._open[writer] = None
         try:
-            async with asyncio.timeout(_ANSWER_S):
+            async with asyncio.timeout(LIMITS.answer_s):
                 request = await reader.readuntil(b"\r\n\r\n")
                 writer.write(self._answer(request))
                 await writer.drain()

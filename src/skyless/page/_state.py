@@ -32,7 +32,6 @@ MAX_ROWS: Final = 2_000
 MAX_HEALTHS: Final = 200
 """Beyond this number of tags, or anchors, a page is sent only the health of those that it names."""
 
-MAX_REQUEST_BYTES: Final = 16_384
 _MAX_NAMED: Final = 200
 
 _MAX_ENCODED: Final = 16

@@ -32,6 +32,7 @@ from skyless.page.api.json_answer import json_answer
 from skyless.page.api.past import Past
 from skyless.page.api.routes import api_routes, read_bytes
 from skyless.page.guard import AccessRules, Guard
+from skyless.page.limits import LIMITS
 from skyless.page.live import LiveSite, TooManyPagesError
 from skyless.page.playback import Playback, RecordingFile
 from skyless.page.sites import Sites
@@ -52,9 +53,6 @@ if TYPE_CHECKING:
 _PAGE: Final = Path(__file__).parent / "browser"
 _MAX_STATES_S: Final = 60.01
 _MAX_WHAT_IF_S: Final = 60.0
-_MAX_BODY_BYTES: Final = 1_000_000
-MAX_FLOOR_PLAN_BYTES: Final = 8_000_000
-"""As on MQTT (``docs/mqtt.md``). The page's ``survey/plan.js`` has the same limit."""
 
 _T = TypeVar("_T")
 _Endpoint = Callable[[Request], Coroutine[Any, Any, Response]]
@@ -193,7 +191,7 @@ async def _overlay(request: Request) -> Response:
 async def _planned(request: Request, live: LiveSite) -> Site:
     """The site as it would be with the anchors where the request's body has them; as it is where there is none."""
     site = live.require_site().whole_site
-    body = await read_bytes(request, _MAX_BODY_BYTES, "too many anchors")
+    body = await read_bytes(request, LIMITS.body_bytes, "too many anchors")
     if not body:
         return site
     try:
@@ -222,7 +220,7 @@ def _number(request: Request, name: str, default: float, least: float, most: flo
 
 async def _put_floor_plan(request: Request) -> Response:
     image = await read_bytes(
-        request, MAX_FLOOR_PLAN_BYTES, f"the image is larger than {MAX_FLOOR_PLAN_BYTES // 10**6} MB"
+        request, LIMITS.floor_plan_bytes, f"the image is larger than {LIMITS.floor_plan_bytes // 10**6} MB"
     )
     if _image_type(image) is None or image_size(image) is None:
         raise HTTPException(400, "this is no image that can be read; it should be a PNG or JPEG")
@@ -232,20 +230,20 @@ async def _put_floor_plan(request: Request) -> Response:
 
 async def _put_facts(request: Request) -> Response:
     live = _live_of(request)
-    message = live.survey.facts_message(await read_bytes(request, _MAX_BODY_BYTES, "too many facts"))
+    message = live.survey.facts_message(await read_bytes(request, LIMITS.body_bytes, "too many facts"))
     live.publish_survey(message)
     return json_answer(message)
 
 
 async def _save_survey(request: Request) -> Response:
     live = _live_of(request)
-    message = live.survey.save_message(await read_bytes(request, _MAX_BODY_BYTES, "the request is too long"))
+    message = live.survey.save_message(await read_bytes(request, LIMITS.body_bytes, "the request is too long"))
     live.publish_survey(message)
     return json_answer(message)
 
 
 async def _put_zones(request: Request) -> Response:
-    body = await read_bytes(request, _MAX_BODY_BYTES, "too many zones")
+    body = await read_bytes(request, LIMITS.body_bytes, "too many zones")
     live = _live_of(request)
     message = read_zones(body)
     live.store_zones(message.zones, message.site)

@@ -6,22 +6,13 @@ from typing import Any, Final
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-MAX_CONNECTIONS: Final = 600
-"""In all: well below the 1,024 open files that a program usually may have."""
-
-MAX_CONNECTIONS_PER_ADDRESS: Final = 200
-
-REQUEST_TIMEOUT_S: Final = 10.0
-BODY_TIMEOUT_S: Final = 60.0
-"""A connection that has waited longer for a request, or for its body, is ended. Uvicorn ends those only that have been
-answered and are silent since."""
+from skyless.page.limits import LIMITS
 
 _REFUSAL: Final = b"this server has %d connections%s, the most that it takes; try again, or close other pages\n"
 _RESPONSE: Final = (
     b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: text/plain; charset=utf-8\r\nContent-Length: %d\r\n"
     b"Retry-After: 10\r\nConnection: close\r\n\r\n%b"
 )
-_LOG_INTERVAL_S: Final = 60.0
 
 _log = logging.getLogger("skyless.page")
 
@@ -42,9 +33,9 @@ class Connection(H11Protocol):
         self.since_s = self.loop.time()
         others = [one for one in self.connections if one is not self and not one.transport.is_closing()]
         of_address = [one for one in others if _address(one) == _address(self)]
-        if len(of_address) >= MAX_CONNECTIONS_PER_ADDRESS:
+        if len(of_address) >= LIMITS.connections_per_address:
             self._make_room(of_address, b" of this address")
-        elif len(others) >= MAX_CONNECTIONS:
+        elif len(others) >= LIMITS.connections:
             self._make_room(others, b"")
 
     def _make_room(self, crowd: list[Any], which: bytes) -> None:
@@ -70,9 +61,12 @@ def is_unfinished(connection: object) -> bool:
 
 
 async def end_unfinished(
-    connections: set[Any], timeout_s: float = REQUEST_TIMEOUT_S, body_timeout_s: float = BODY_TIMEOUT_S
+    connections: set[Any], timeout_s: float = LIMITS.request_s, body_timeout_s: float = LIMITS.body_s
 ) -> None:
-    """End connections that have been without a whole request for too long, until cancelled."""
+    """End connections that have been without a whole request for too long, until cancelled.
+
+    Uvicorn ends those only that have been answered and are silent since.
+    """
     since_s: dict[object, float] = {}
     while True:
         await asyncio.sleep(timeout_s / 4)
@@ -98,6 +92,6 @@ class FailedAccepts:
             loop.default_exception_handler(context)
             return
         self._count += 1
-        if loop.time() - self._said_s >= _LOG_INTERVAL_S:
+        if loop.time() - self._said_s >= LIMITS.accepts_log_s:
             _log.error("connections could not be accepted (%d times): %s", self._count, error.strerror)
             self._count, self._said_s = 0, loop.time()

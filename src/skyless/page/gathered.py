@@ -15,7 +15,8 @@ from starlette.websockets import WebSocket
 from skyless.core.site import AnchorSite
 from skyless.page._state import read_request
 from skyless.page.columns import MAX_DUE, Columns
-from skyless.page.live import MAX_PAGES, LiveSite
+from skyless.page.limits import LIMITS
+from skyless.page.live import LiveSite
 from skyless.page.live2 import View, anchors_message, conditions_message, names_message, tags_message
 from skyless.page.sites import Sites
 from skyless.page.sockets import TRY_LATER, send, serve_socket
@@ -119,7 +120,7 @@ class Gathered:
 
     async def serve(self, socket: WebSocket, live: LiveSite) -> None:
         """Serve one accepted page until it closes."""
-        if self.pages >= MAX_PAGES:
+        if self.pages >= LIMITS.pages:
             await socket.close(TRY_LATER, f"too many pages are open: {self.pages}")
             return
         page = _Page()

@@ -27,6 +27,7 @@ from skyless.page._state import PageRequest, Sent, SiteState, encode
 from skyless.page.condition.evidence import Evidence
 from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor, offline_anchors
 from skyless.page.event_list import EventList
+from skyless.page.limits import LIMITS
 from skyless.page.site_assets import AssetsFile, SiteAssets
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
@@ -63,8 +64,6 @@ _log = logging.getLogger("skyless.page")
 OLDEST_S: Final = 5.0
 """A fix that is older is not given to programs."""
 
-MAX_PAGES: Final = 400
-MAX_PAGES_PER_ADDRESS: Final = 100
 IDLE_S: Final = 12.0
 """A page that has sent nothing for this long makes room for another one. A visible page sends a ping every 2 s."""
 
@@ -479,9 +478,9 @@ class LiveSite:
     def _make_room(self, address: str) -> None:
         """Close the page that is idle for longest where there are too many. Raises TooManyPagesError."""
         mine = [page for page in self.pages if page.address == address]
-        if len(mine) < MAX_PAGES_PER_ADDRESS and len(self.pages) < MAX_PAGES:
+        if len(mine) < LIMITS.pages_per_address and len(self.pages) < LIMITS.pages:
             return
-        oldest = min(mine if len(mine) >= MAX_PAGES_PER_ADDRESS else self.pages, key=lambda page: page.active_s)
+        oldest = min(mine if len(mine) >= LIMITS.pages_per_address else self.pages, key=lambda page: page.active_s)
         if self._clock() - oldest.active_s < IDLE_S:
             raise TooManyPagesError(f"too many pages are open: {len(mine)} of this computer, {len(self.pages)} in all")
         self._close_idle(oldest)

@@ -12,10 +12,10 @@ import uvicorn
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
-from skyless.page._state import MAX_REQUEST_BYTES
 from skyless.page.app import Services, make_app
 from skyless.page.connections import Connection, FailedAccepts, end_unfinished
 from skyless.page.guard import AccessRules
+from skyless.page.limits import LIMITS
 from skyless.page.sockets import SEND_TIMEOUT_S
 from skyless.run.process import ending_signals, reserve
 
@@ -96,7 +96,7 @@ async def serve(services: Services, rules: AccessRules, sock: socket.socket, sit
         ws_per_message_deflate=False,  # on the same machine it would only cost time
         ws_ping_interval=_PING_S,
         ws_ping_timeout=SEND_TIMEOUT_S,
-        ws_max_size=MAX_REQUEST_BYTES,
+        ws_max_size=LIMITS.message_bytes,
         timeout_graceful_shutdown=1,
     )
     server = _Server(config)

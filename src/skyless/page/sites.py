@@ -12,6 +12,7 @@ from typing import Final, Protocol
 from starlette.exceptions import HTTPException
 
 from skyless.page._kept import SiteLink
+from skyless.page.limits import LIMITS
 from skyless.page.live import LiveSite
 from skyless.run.alarms.engine import MAX_KEPT
 from skyless.run.find_site import SiteOnBroker, watch_sites
@@ -20,8 +21,6 @@ from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.outbox import Limits
 from skyless.run.process import every, together
 
-MAX_SITES: Final = 20
-LET_GO_S: Final = 600.0
 _CHECK_S: Final = 1.0
 
 
@@ -72,8 +71,8 @@ class LiveSites:
         number = number_of(asked)
         if number not in self._by_number and (number not in self._on_broker or self._make is None):
             raise HTTPException(404, f"site is {asked[:20]!r}; this broker has no such site, or it is not shown here")
-        if number not in self._by_number and len(self._by_number) >= MAX_SITES:
-            raise HTTPException(503, f"{MAX_SITES} sites are shown here; those that nobody looks at are let go later")
+        if number not in self._by_number and len(self._by_number) >= LIMITS.sites:
+            raise HTTPException(503, f"{LIMITS.sites} sites are shown; those that nobody looks at are let go later")
         return self._shown(number)
 
     def _usual(self) -> LiveSite:
@@ -105,7 +104,7 @@ class LiveSites:
         for number, live in list(self._by_number.items()):
             if live.pages or live.streams or live.monitor.zones or live.alarms.rules or live is self._first:
                 self._asked_s[number] = now_s
-            elif now_s - self._asked_s[number] > LET_GO_S:
+            elif now_s - self._asked_s[number] > LIMITS.site_idle_s:
                 del self._by_number[number]
                 if (work := self._work.pop(number)) is not None:
                     work.cancel()

@@ -15,9 +15,9 @@ from msgspec import Raw, Struct
 from starlette.exceptions import HTTPException
 
 from skyless.core.errors import SkylessError
+from skyless.page.limits import LIMITS
 
 _TIMEOUT_S: Final = 120.0
-MAX_ANSWER_BYTES: Final = 16_000_000
 _IDLE_S: Final = 60.0
 """A process without a task for this long is ended: it has loaded a hundred megabytes."""
 
@@ -104,8 +104,8 @@ def serve_tasks(kind: type[_Task], answer: Callable[[_Task], object]) -> None:
         try:
             value = msgspec.json.encode(answer(msgspec.json.decode(line, type=kind)))
             found = _Answer(Raw(value))
-            if len(value) > MAX_ANSWER_BYTES:
-                size, most = (f"{1e-6 * count:.0f} MB" for count in (len(value), MAX_ANSWER_BYTES))
+            if len(value) > LIMITS.answer_bytes:
+                size, most = (f"{1e-6 * count:.0f} MB" for count in (len(value), LIMITS.answer_bytes))
                 found = _Answer(error=f"the answer has {size}, and may have {most}; ask for less")
         except SkylessError as error:
             found = _Answer(error=str(error))

@@ -43,11 +43,7 @@ _PORTS_TO_TRY: Final = 100
 
 _TEMPORARY: Final = "skyless-broker-"  # how the name of a temporary folder begins
 
-_MAX_STORED: Final = 4 * 1024**3
 _NATS_HOST: Final = "127.0.0.1"
-_MAX_SUBSCRIPTIONS: Final = 100_000
-"""Of QoS 1, of all clients; each is a consumer of one stream, of which nats-server has 1,000 by default. 1,040 clients
-took 112 MB of memory instead of 106."""
 _SEND_AGAIN: Final = "3s"  # when a message that a dying subscriber has not acknowledged is sent again; 30 s by default
 
 _ABANDONED_S: Final = 10.0  # a temporary folder of this age that no broker has locked was left by one that was killed
@@ -56,6 +52,22 @@ _START_S: Final = 20.0
 _POLL_S: Final = 0.02
 _ATTEMPTS: Final = 20
 _WAIT_S: Final = 0.01
+
+
+class BrokerLimits(Struct, frozen=True):
+    """Beyond them nats-server ends a connection, or refuses what is asked, and says so in its log."""
+
+    message_bytes: int = MAX_PAYLOAD
+    """A message, such as a floor plan."""
+    stored_bytes: int = 4 * 1024**3
+    """What is retained, and what waits for clients with sessions; a gather's streams come in addition."""
+    subscriptions: int = 100_000
+    """Subscriptions of QoS 1 of all clients: each is a consumer of a stream, and nats-server's default is 1,000."""
+    log_bytes: int = 1_000_000
+    """A file of the log, of which there are two."""
+
+
+LIMITS: Final = BrokerLimits()
 
 
 class BrokerSettings(Struct, frozen=True):
@@ -129,14 +141,14 @@ def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAd
     whole: dict[str, Any] = {
         "server_name": "skyless",
         "listen": "127.0.0.1:-1" if nats is None else nats.url.partition("://")[2],  # NATS itself
-        "max_payload": MAX_PAYLOAD,
+        "max_payload": LIMITS.message_bytes,
         "jetstream": {
             "store_dir": str(data),
-            "max_file_store": _MAX_STORED + (settings.gathered_bytes or 0),
-            "limits": {"default_max_consumers": _MAX_SUBSCRIPTIONS},
+            "max_file_store": LIMITS.stored_bytes + (settings.gathered_bytes or 0),
+            "limits": {"default_max_consumers": LIMITS.subscriptions},
         },
         "log_file": str(data / "nats-server.log"),
-        "logfile_size_limit": 1_000_000,
+        "logfile_size_limit": LIMITS.log_bytes,
         "logfile_max_num": 2,
         "mqtt": mqtt,
     }

@@ -6,22 +6,19 @@ So a long one takes neither memory nor time from the server, which raises alarms
 import asyncio
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
 from starlette.exceptions import HTTPException
 
 from skyless.page.api.parameters import Begin, CellSize, Distance, End, Points, Step, TagName, TagNames, ZoneId, names
+from skyless.page.limits import LIMITS
 from skyless.page.task_process import TaskProcess, serve_tasks
 from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track
 from skyless.run.history.layout import site_folder
 
 if TYPE_CHECKING:
     from skyless.run.history.queries import History
-
-QUERY_TIMEOUT_S: Final = 60.0
-MAX_WAITING: Final = 20
-"""Questions that may wait for their turn."""
 
 
 class _Question(Struct, frozen=True):
@@ -48,14 +45,14 @@ class Past:
             raise HTTPException(404, "no site is known yet")
         if not site_folder(self._folder, site).is_dir():
             raise HTTPException(404, f"{self._folder} holds no history of site {site}; skyless history run writes one")
-        if self._waiting >= MAX_WAITING:
-            raise HTTPException(503, f"{MAX_WAITING} questions to the history are waiting; ask again later")
+        if self._waiting >= LIMITS.questions:
+            raise HTTPException(503, f"{LIMITS.questions} questions to the history are waiting; ask again later")
         self._waiting += 1
         try:
-            async with asyncio.timeout(QUERY_TIMEOUT_S):
+            async with asyncio.timeout(LIMITS.question_s):
                 return await self._process.run(_Question(str(self._folder), site, name, given))
         except TimeoutError:
-            fault = f"the history has not answered within {QUERY_TIMEOUT_S:g} s; ask for a shorter time"
+            fault = f"the history has not answered within {LIMITS.question_s:g} s; ask for a shorter time"
             raise HTTPException(503, fault) from None
         finally:
             self._waiting -= 1

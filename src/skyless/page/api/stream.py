@@ -16,6 +16,7 @@ from starlette.websockets import WebSocket
 from skyless.core.version import installed_version
 from skyless.page.api.parameters import SiteQuery, TagNames, names, read_query
 from skyless.page.api.present import usable
+from skyless.page.limits import LIMITS
 from skyless.page.live import LiveSite
 from skyless.page.sites import Sites
 from skyless.page.sockets import POLICY_VIOLATION, TRY_LATER, send, serve_socket
@@ -23,7 +24,6 @@ from skyless.run.mqtt.messages import AlarmMessage
 
 PERIOD_S: Final = 0.1
 _PAUSES: Final = 9.0  # of very many tags a stream is sent less often, so that it takes a tenth of a processor at most
-MAX_STREAMS: Final = 200
 _MAX_REASON_BYTES: Final = 120  # of the 123 that the protocol allows
 
 
@@ -97,8 +97,8 @@ def endpoint(sites: Sites) -> Callable[[WebSocket], Awaitable[None]]:
         except HTTPException as error:
             await socket.close(POLICY_VIOLATION, error.detail.encode()[:_MAX_REASON_BYTES].decode(errors="ignore"))
             return
-        if len(open_streams) >= MAX_STREAMS:
-            await socket.close(TRY_LATER, f"{MAX_STREAMS} streams are open")
+        if len(open_streams) >= LIMITS.streams:
+            await socket.close(TRY_LATER, f"{LIMITS.streams} streams are open")
             return
         open_streams.add(socket)
         live.streams += 1

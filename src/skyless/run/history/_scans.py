@@ -12,15 +12,13 @@ from pyarrow import parquet
 from skyless.core.errors import SkylessError
 from skyless.run.history.answers import GAP_S, THINNED_GAP_S, Heatmap, Span
 from skyless.run.history.layout import THINNED
+from skyless.run.history.limits import LIMITS
 from skyless.run.history.tables import ROW_GROUP
 
 _SIDE: Final = 2000
 """Cells along each side of the grid, which lies around the first fixes; with a power of two, rows of the grid would
 share few lines of the processor's cache."""
 _OUTSIDE: Final = _SIDE * _SIDE
-MAX_CELLS: Final = 2_000_000
-MAX_RUNS: Final = 200_000
-"""Times for which two tags were near each other, before those in different files are joined."""
 _WILD_SHARE: Final = 1e-3
 """Of the time, this share may be outside the grid, which then are wild fixes."""
 
@@ -61,8 +59,8 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
     if not len(rows):
         return Heatmap(0.0, 0.0, cell_m, 0, 0, (), number)
     grid = grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    if grid.size > MAX_CELLS:
-        right = f"choose ones of {1.1 * cell_m * math.sqrt(grid.size / MAX_CELLS):.2g} m"
+    if grid.size > LIMITS.cells:
+        right = f"choose ones of {1.1 * cell_m * math.sqrt(grid.size / LIMITS.cells):.2g} m"
         raise SkylessError(f"{grid.size} cells of {cell_m:g} m are too many; {right}")
     x0_m, y0_m = (cell_m * (first + int(used[0])) for first, used in zip(corner, (columns, rows), strict=True))
     return Heatmap(x0_m, y0_m, cell_m, grid.shape[1], grid.shape[0], tuple((1e-3 * grid.ravel()).tolist()), number)
@@ -96,7 +94,7 @@ def near(
         square = (x[rows] - x0[at[rows]]) ** 2 + (y[rows] - y0[at[rows]]) ** 2
         found = np.array([tag[rows], bucket[rows], bucket[rows], square], np.int64)
         runs.append(joined([found[:, square <= distance_mm**2]], gap))
-        if sum(one.shape[1] for one in runs) > MAX_RUNS:
+        if sum(one.shape[1] for one in runs) > 2 * LIMITS.contacts:
             runs = [joined(runs, gap)]
     return joined(runs, gap)
 
@@ -126,7 +124,7 @@ def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:
     later = np.cumsum(is_other) * (last.max() - first.min() + gap + 2)  # each tag after the one before
     until = np.maximum.accumulate(last + later)
     begins = np.flatnonzero(np.append(True, (first + later)[1:] > until[:-1] + gap + 1))
-    if len(begins) > MAX_RUNS // 2:
+    if len(begins) > LIMITS.contacts:
         raise SkylessError("the contacts are too many; choose a shorter range or a smaller distance")
     return np.array(
         [tag[begins], first[begins], np.maximum.reduceat(last, begins), np.minimum.reduceat(square, begins)]

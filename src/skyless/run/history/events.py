@@ -5,8 +5,8 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from skyless.run.history.layout import EventKind
+from skyless.run.history.limits import LIMITS
 from skyless.run.history.tables import Event
-from skyless.run.history.writer import MAX_UNIX_S
 from skyless.run.mqtt.messages import AlarmMessage, StatusMessage, ZoneEvent
 
 REMEMBERED_KINDS: Final = ("alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online")
@@ -43,7 +43,7 @@ class EventLog:
         return self._new(unix_s, kind, text=f"{message.kind} {message.name} is {kind}", **who)
 
     def _new(self, unix_s: float | None, kind: EventKind, **about: Any) -> list[Event]:  # noqa: ANN401 - Event's fields
-        if unix_s is None or not 0.0 <= unix_s <= MAX_UNIX_S:
+        if unix_s is None or not 0.0 <= unix_s <= LIMITS.last_unix_s:
             return []
         event = Event(datetime.fromtimestamp(round(1000 * unix_s) / 1000, UTC), kind, **about)
         return [event] if self._is_new(event) else []

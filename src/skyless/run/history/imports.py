@@ -102,5 +102,5 @@ def _known(recording: McapRecording, writer: Writer) -> tuple[NDArray[np.int64],
 
 
 def _keys(tag: NDArray[Any], ms: NDArray[np.int64]) -> NDArray[np.int64]:
-    """A number for each tag and millisecond; times have 43 bits (``MAX_UNIX_S``), tags fewer than 20."""
+    """A number for each tag and millisecond; times have 43 bits (``LIMITS.last_unix_s``), tags fewer than 20."""
     return (tag.astype(np.int64) << 43) | ms

@@ -54,18 +54,8 @@ from skyless.run.history.layout import (
     day_of,
     site_folder,
 )
+from skyless.run.history.limits import LIMITS
 from skyless.run.history.tables import read_table
-
-MEMORY: Final = "64MB"
-"""What DuckDB may use before it writes to temporary files; Python and the libraries take 130 MB besides."""
-
-MAX_POINTS: Final = 20_000
-MAX_STEPS: Final = 20_000
-"""Steps of time of all zones together."""
-MAX_ROWS: Final = 100_000
-"""Rows of an answer that is a table."""
-MAX_EXPORTED: Final = 100_000_000
-"""Rows of a file."""
 
 EXPORT_SUFFIXES: Final = (".csv", ".parquet", ".geojsonl")
 
@@ -80,7 +70,6 @@ _MOVE_SIGMAS: Final = 3.0
 _CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
 """By whether days are thinned: the length in milliseconds of the intervals within which fixes are compared, and the
 longest interruption of a contact in such intervals."""
-_MAX_DISTANCE_M: Final = 50.0
 _FETCHED: Final = 10_000
 _PART_S: Final = 28.0 * 86_400.0
 _NAMED: Final = 5
@@ -219,7 +208,7 @@ class History:
         Raises SkylessError: there is no such tag.
         """
         ((tag, numbers),) = self._tags((tag,)).items()
-        check_number("the number of points", most_points, least=2, most=MAX_POINTS)
+        check_number("the number of points", most_points, least=2, most=LIMITS.points)
         files, own = self._files(span), f"{_FIXES} AND tag IN ({_listed(numbers)})"
         gap_ms = round(1000 * (THINNED_GAP_S if _are_thinned(files) else GAP_S))
         ((count,),) = _stream(f"SELECT count(*) FROM ({own})", files, span) if files else ((0,),)
@@ -263,9 +252,9 @@ class History:
         check_number("the step", step_s, least=1.0)
         names, length_s = self._zone_names(zone), span.to_unix_s - span.from_unix_s
         zones = [zone] if zone is not None else sorted(names)
-        if len(zones) * length_s / step_s > MAX_STEPS:
+        if len(zones) * length_s / step_s > LIMITS.steps:
             many = f"steps of {step_s:g} s for {len(zones)} zones in a range of {length_s:.0f} s are too many"
-            right = math.ceil(len(zones) * length_s / MAX_STEPS)
+            right = math.ceil(len(zones) * length_s / LIMITS.steps)
             raise SkylessError(f"{many}; choose longer ones, of {right} s or more, a shorter range or one zone")
         edges, found = np.append(np.arange(0.0, length_s, step_s), length_s), []
         counted = dict.fromkeys(zones, counts(np.empty(0), np.empty(0), edges))
@@ -283,7 +272,7 @@ class History:
 
         In a range with thinned days it is the first fix of ten seconds. Raises SkylessError.
         """
-        check_number("the distance", distance_m, least=0.01, most=_MAX_DISTANCE_M)
+        check_number("the distance", distance_m, least=0.01, most=LIMITS.contact_m)
         ((tag, own),) = self._tags((tag,)).items()
         names, files = self._names(), self._files(span)
         length_ms, gap = _CONTACT_MS[_are_thinned(files)]
@@ -322,8 +311,8 @@ class History:
         ((count,),) = _stream(f"SELECT count(*) FROM ({_FIXES} {of_tags})", files, span) if files else ((0,),)
         if not count:
             raise SkylessError("there are no fixes in this range: nothing is written")
-        if count > MAX_EXPORTED:
-            raise SkylessError(f"{count} fixes are more than {MAX_EXPORTED}; choose a shorter range, or tags")
+        if count > LIMITS.exported_rows:
+            raise SkylessError(f"{count} fixes are more than {LIMITS.exported_rows}; choose a shorter range, or tags")
         parameters = _parameters(files, span) | {"numbers": list(names), "names": list(names.values())}
         sql = f"""
             SELECT coalesce(name, '#' || tag) AS tag, make_timestamp(ms * 1000) AS time_utc, x_m, y_m, z_m, std_m,
@@ -455,8 +444,11 @@ class _Way:
 def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
     """DuckDB without files of its own but temporary ones, and without the network."""
     spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # made where it is needed
-    options: dict[str, Any] = {"memory_limit": MEMORY, "temp_directory": spill, "autoinstall_known_extensions": "false"}
-    options["threads"] = 1  # less processor time in all, and the other cores are left to the site
+    options: dict[str, Any] = {"memory_limit": f"{LIMITS.memory_mb}MB", "temp_directory": spill}
+    options |= {
+        "autoinstall_known_extensions": "false",
+        "threads": 1,
+    }  # less processor time in all, and the other cores are left to the site
     with duckdb.connect(config=options) as duck:
         yield duck
 
@@ -473,9 +465,9 @@ def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iter
 
 def _table(found: Iterator[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
     """The rows of an answer that is a table. Raises SkylessError."""
-    rows = list(islice(found, MAX_ROWS + 1))
-    if len(rows) > MAX_ROWS:
-        raise SkylessError(f"the answer has more than {MAX_ROWS} rows; choose a shorter range, a tag or a zone")
+    rows = list(islice(found, LIMITS.rows + 1))
+    if len(rows) > LIMITS.rows:
+        raise SkylessError(f"the answer has more than {LIMITS.rows} rows; choose a shorter range, a tag or a zone")
     return rows
 
 

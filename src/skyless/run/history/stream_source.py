@@ -12,7 +12,8 @@ from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
 from skyless.run.gather.names import Names
 from skyless.run.gather.streams import follow
-from skyless.run.history.writer import MAX_UNIX_S, MIN_UNIX_S, Intake, Writer
+from skyless.run.history.limits import LIMITS
+from skyless.run.history.writer import Intake, Writer
 from skyless.run.process import Log
 
 if TYPE_CHECKING:
@@ -87,7 +88,7 @@ class BatchTaker:
         given, rows = np.unique(records["tag"], return_inverse=True)
         tags = (self._names.tags.get(int(number)) for number in given)
         own = np.array([(tag and writer.tag_number(tag.name, now_s)) or 0 for tag in tags], np.uint32)[rows]
-        in_time = (records["unix_us"] >= 1e6 * MIN_UNIX_S) & (records["unix_us"] <= 1e6 * MAX_UNIX_S)
+        in_time = (records["unix_us"] >= 1e6 * LIMITS.first_unix_s) & (records["unix_us"] <= 1e6 * LIMITS.last_unix_s)
         writer.drops["no-name"] += int(np.count_nonzero(own == 0))
         writer.drops["wrong-time"] += int(np.count_nonzero((own != 0) & ~in_time))
         kept: Records = records[(own != 0) & in_time].copy()

@@ -30,20 +30,13 @@ from skyless.run.history.layout import (
     rows_of,
     site_folder,
 )
+from skyless.run.history.limits import LIMITS
 from skyless.run.history.tables import Event, event_table, fix_table, read_table, schema_of, write_table
 from skyless.run.mqtt.messages import Asset, FixMessage, Zone
 from skyless.run.process import locked
 
 FILE_ROWS: Final = 1_000_000
 """Rows of a file, nearly: one more batch would be too many."""
-
-MAX_WAITING: Final = 500_000
-"""How many rows of a kind wait in memory while the disk does not take them."""
-
-MAX_TAGS: Final = 200_000
-MIN_UNIX_S: Final = 1e9
-MAX_UNIX_S: Final = 8e9
-"""Times before 2001 are those of a computer without a clock; times in more than 200 years are no times."""
 
 
 class Intake:
@@ -112,7 +105,7 @@ class Intake:
                 sql.executemany(f"INSERT INTO {self._kind} VALUES (?, ?, ?, ?)", values)
                 sql.execute("INSERT OR REPLACE INTO positions VALUES (?, ?)", (self._position_key, self.position))
         except OSError:
-            while self.waiting > MAX_WAITING:
+            while self.waiting > LIMITS.waiting_rows:
                 self.lost += len(self._batches.pop(0)[0])
             raise
         self._batches.clear()
@@ -246,7 +239,7 @@ class Writer:
 
     def number(self, fix: FixMessage, unix_s: float) -> int | None:
         """The number of a fix's tag, which no other ever gets; None for a fix that is not kept, which is counted."""
-        if not MIN_UNIX_S <= fix.unix_s <= MAX_UNIX_S:
+        if not LIMITS.first_unix_s <= fix.unix_s <= LIMITS.last_unix_s:
             self.drops["wrong-time"] += 1
             return None
         return self.tag_number(fix.tag, unix_s)
@@ -254,7 +247,7 @@ class Writer:
     def tag_number(self, name: str, unix_s: float) -> int | None:
         """The number of a tag; None where too many have one, which is counted."""
         if name not in self.names.rows:
-            if len(self.names.rows) >= MAX_TAGS:
+            if len(self.names.rows) >= LIMITS.tags:
                 self.drops["too-many-tags"] += 1
                 return None
             newest = next(reversed(self.names.rows.values()), {"tag": 0})
