@@ -87,6 +87,7 @@ NAVIGATION = {
         "docs/batches",
         "docs/hub",
         "docs/hub_operation",
+        "docs/limits",
         "docs/http",
         "docs/history",
         "docs/phases",

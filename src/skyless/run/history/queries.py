@@ -445,10 +445,8 @@ def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
     """DuckDB without files of its own but temporary ones, and without the network."""
     spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # made where it is needed
     options: dict[str, Any] = {"memory_limit": f"{LIMITS.memory_mb}MB", "temp_directory": spill}
-    options |= {
-        "autoinstall_known_extensions": "false",
-        "threads": 1,
-    }  # less processor time in all, and the other cores are left to the site
+    # One thread takes less processor time in all, and leaves the other cores to the site.
+    options |= {"autoinstall_known_extensions": "false", "threads": 1}
     with duckdb.connect(config=options) as duck:
         yield duck
 
