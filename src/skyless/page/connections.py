@@ -41,7 +41,8 @@ class Connection(H11Protocol):
     def _make_room(self, crowd: list[Any], which: bytes) -> None:
         unfinished = [one for one in crowd if is_unfinished(one)]
         if unfinished:
-            min(unfinished, key=lambda one: one.since_s).transport.abort()
+            # One that has been answered and is silent, as a browser keeps it, is the last that makes room.
+            min(unfinished, key=lambda one: (one.timeout_keep_alive_task is not None, one.since_s)).transport.abort()
             return
         text = _REFUSAL % (len(crowd), which)
         self.transport.write(_RESPONSE % (len(text), text))
