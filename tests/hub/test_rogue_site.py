@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from pyarrow import parquet
-from small_hub import client_of, running_hub, site
+from small_hub import client_of, has_stream, running_hub, site
 
 from skyless.run.broker import _program
 from skyless.run.fix_batch import RECORD, Batch, encode_batch
@@ -110,6 +110,7 @@ async def _run(folder, hub, rogue_address, *, is_filtered):
         async with asyncio.timeout(90):
             await streams.make_hub_streams(tenant, hub, "plant")
             assert await streams.sites_at(tenant) == {HONEST, ROGUE}
+            assert not any([await has_stream(tenant, old) for old in streams._OF_ALL_SITES])
             # A source that was made before the line was up asks again after half a minute at most.
             while history.state().fixes < 8 or not all(known.names().get(one) and seen[one] for one in seen):
                 await asyncio.sleep(0.1)

@@ -127,7 +127,7 @@ _ROWS: Mapping[str, Callable[[Any], list[_Row]]] = {
 
 @questions.command(help_epilogue="Example: skyless history track tag7 --from 8:00 --to 16:00 --plot way.png")
 @command
-def track(tag: str, /, *, asked: _Drawn, points: Annotated[int, whole(2, 1_000_000)] = 2000) -> int:
+def track(tag: str, /, *, asked: _Drawn, points: Annotated[int, whole(2, 20_000)] = 2000) -> int:
     """Where a tag was: its way, thinned to a number of points, with its length.
 
     Parameters

@@ -63,6 +63,8 @@ class BrokerLimits(Struct, frozen=True):
     """What is retained, and what waits for clients with sessions; a gather's streams come in addition."""
     subscriptions: int = 100_000
     """Subscriptions of QoS 1 of all clients: each is a consumer of a stream, and nats-server's default is 1,000."""
+    session_idle_h: int = 24
+    """Hours after which subscriptions of a session that is away end, where strangers may read and could leave many."""
     log_bytes: int = 1_000_000
     """A file of the log, of which there are two."""
 
@@ -138,6 +140,8 @@ def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAd
     mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": _SEND_AGAIN}
     if settings.certificate is not None:
         mqtt["tls"] = {"cert_file": str(settings.certificate), "key_file": str(settings.key)}
+    if settings.strangers_read:
+        mqtt["consumer_inactive_threshold"] = f"{LIMITS.session_idle_h}h"
     whole: dict[str, Any] = {
         "server_name": "skyless",
         "listen": "127.0.0.1:-1" if nats is None else nats.url.partition("://")[2],  # NATS itself

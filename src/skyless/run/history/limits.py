@@ -20,7 +20,7 @@ class HistoryLimits(Struct, frozen=True):
     """Contacts of a tag."""
     contact_m: float = 50.0
     """Distance within which tags count as in contact."""
-    cells: int = 2_000_000
+    cells: int = 1_000_000
     """Cells of a heat map."""
     exported_rows: int = 100_000_000
     """Rows of an exported file."""

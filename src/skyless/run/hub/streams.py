@@ -34,7 +34,7 @@ _NAMES_BYTES: Final = 30_000_000
 _STATE_BYTES: Final = 100_000_000
 """What a site can store at most: names of 200,000 tags; floor plans, and statuses of as many programs."""
 _OF_ALL_SITES: Final = ("FIXES", "NAMES", "STATE", "EVENTS")
-"""Streams of hubs before version 0.3, in which each site could write as another."""
+"""Streams of earlier hubs, in which each site could write as another."""
 
 
 async def make_hub_streams(client: "Client", hub: Hub, tenant: str) -> None:
