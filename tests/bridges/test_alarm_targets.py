@@ -18,10 +18,10 @@ from msgspec.structs import replace
 
 from skyless.bridges import _deliveries
 from skyless.bridges.hub import Hub
-from skyless.bridges.limits import BridgeLimits
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
 from skyless.core.errors import SkylessError
+from skyless.run.limits import BridgeLimits
 from skyless.run.mqtt.messages import AlarmMessage
 from support.waiting import until
 

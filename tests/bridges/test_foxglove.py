@@ -23,11 +23,11 @@ from skyless.bridges.foxglove import (
     Unsubscribe,
     decode_request,
 )
-from skyless.bridges.limits import BridgeLimits
 from skyless.bridges.target import BridgedSite
 from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
 from skyless.core.site import WallSite
+from skyless.run.limits import BridgeLimits
 from skyless.run.mqtt.messages import Zone
 from support.waiting import until
 

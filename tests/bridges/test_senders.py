@@ -10,9 +10,9 @@ import pytest
 
 from skyless.bridges._senders import PtySender, SerialSender, TcpServer, UdpSender
 from skyless.bridges.jsonl import JsonLines
-from skyless.bridges.limits import LIMITS
 from skyless.core.errors import SkylessError
 from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.run.limits import BRIDGES as LIMITS
 
 
 @contextlib.asynccontextmanager

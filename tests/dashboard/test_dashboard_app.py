@@ -13,12 +13,12 @@ from starlette.websockets import WebSocketDisconnect
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite
 from skyless.page.guard import AccessRules, Guard
-from skyless.page.limits import LIMITS
 from skyless.page.live import (
     GONE_S,
     IDLE_S,
     TooManyPagesError,
 )
+from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import site_message
 from skyless.sim.lab import lab_site

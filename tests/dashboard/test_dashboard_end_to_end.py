@@ -17,11 +17,11 @@ from websockets.protocol import State
 
 from skyless.page.app import Services, make_app
 from skyless.page.guard import AccessRules
-from skyless.page.limits import LIMITS
 from skyless.page.live import IDLE_S
 from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites
 from skyless.run.broker import BrokerSettings, start_broker
+from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import ZonesMessage

@@ -9,10 +9,11 @@ from dashboard_builders import SITE, SQUARE, Times, Wire, browser_of
 from starlette.exceptions import HTTPException
 
 from skyless.page import sites as sites_module
-from skyless.page.limits import LIMITS, PageLimits
 from skyless.page.live import LiveSite
 from skyless.page.sites import LiveSites
 from skyless.run.find_site import SiteOnBroker
+from skyless.run.limits import PAGE as LIMITS
+from skyless.run.limits import PageLimits
 from skyless.run.mqtt import topics
 
 

@@ -14,9 +14,9 @@ from msgspec.structs import replace
 from skyless.core.errors import SkylessError
 from skyless.core.site import FloorPlanSite, UnplacedAnchor
 from skyless.page._site_survey import SiteSurvey
-from skyless.page.limits import LIMITS
 from skyless.page.overlay_process import overlay
 from skyless.page.tasks import OverlayTask
+from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
 from skyless.run.mqtt.address import MqttAddress

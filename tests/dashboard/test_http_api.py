@@ -21,11 +21,11 @@ from skyless.core.earth import geodetic
 from skyless.page.api import past
 from skyless.page.api.routes import ROUTES
 from skyless.page.guard import AccessRules
-from skyless.page.limits import PageLimits
 from skyless.run.assets import write_csv
 from skyless.run.fix_batch import RECORD
 from skyless.run.history.layout import site_folder
 from skyless.run.history.writer import Writer
+from skyless.run.limits import PageLimits
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import ZoneEvent
 

@@ -14,7 +14,7 @@ from skyless.page.api import stream
 from skyless.page.api.stream import SiteStream
 from skyless.page.event_list import MAX_KEPT
 from skyless.page.guard import AccessRules
-from skyless.page.limits import PageLimits
+from skyless.run.limits import PageLimits
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import ZoneEvent
 

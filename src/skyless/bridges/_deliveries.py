@@ -18,9 +18,9 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-from skyless.bridges.limits import LIMITS
 from skyless.bridges.target import BridgedSite, Target
 from skyless.core.errors import SkylessError
+from skyless.run.limits import BRIDGES as LIMITS
 from skyless.run.mqtt.messages import AlarmMessage
 
 TIMEOUT_S: Final = 10.0

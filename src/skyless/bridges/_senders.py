@@ -13,11 +13,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from skyless.bridges.limits import LIMITS
 from skyless.bridges.target import cannot_listen
 from skyless.core.errors import SkylessError
 from skyless.radio.serial.pseudo_terminal import Pty
 from skyless.radio.serial.serial_port import SerialPort
+from skyless.run.limits import BRIDGES as LIMITS
 
 _WAITING_BYTES: Final = 1 << 15
 """Bytes that may wait for one reader in this process, or a single longer message; and as many in the system."""

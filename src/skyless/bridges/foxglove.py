@@ -24,7 +24,6 @@ from websockets.http11 import Request as HttpRequest
 from websockets.http11 import Response
 from websockets.typing import Subprotocol
 
-from skyless.bridges.limits import LIMITS
 from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl, cannot_listen, floored
 from skyless.run.foxglove.messages import (
     SCENE_TOPIC,
@@ -36,6 +35,7 @@ from skyless.run.foxglove.messages import (
     scene,
     schema_of,
 )
+from skyless.run.limits import BRIDGES as LIMITS
 from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, TagHealth
 from skyless.run.web import is_local_origin, is_own_host, own_names, same_origin

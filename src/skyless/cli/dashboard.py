@@ -208,6 +208,7 @@ def _rules(
     import socket
 
     from skyless.page.guard import AccessRules
+    from skyless.run.web import own_names
 
     for option, value in (("--token", token), ("--reader-token", reader_token)):
         if value is not None and len(value) < _SHORTEST_TOKEN:
@@ -219,8 +220,7 @@ def _rules(
         if reader_token is not None:
             token = token or secrets.token_urlsafe(18)
         return AccessRules(token, reader_token, read_only=read_only, cookie=cookie)
-    own = socket.gethostname().lower()
-    names = {host.lower(), own, own.partition(".")[0], f"{own.partition('.')[0]}.local", socket.getfqdn().lower()}
+    names = {*own_names(host), socket.gethostname().lower().partition(".")[0], socket.getfqdn().lower()}
     token = token or secrets.token_urlsafe(18)
     return AccessRules(token, reader_token, frozenset(names), read_only=read_only, remote=True, cookie=cookie)
 

@@ -32,13 +32,13 @@ from skyless.page.api.json_answer import json_answer
 from skyless.page.api.past import Past
 from skyless.page.api.routes import api_routes, read_bytes
 from skyless.page.guard import AccessRules, Guard
-from skyless.page.limits import LIMITS
 from skyless.page.live import LiveSite, TooManyPagesError
 from skyless.page.playback import Playback, RecordingFile
 from skyless.page.sites import Sites
 from skyless.page.sockets import GOING_AWAY, TRY_LATER, send, serve_socket
 from skyless.page.task_process import TaskProcess
 from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, WhatIfTask
+from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt.messages import WrongMessageError
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.zones.zone_list import read_zones

@@ -2,19 +2,19 @@
 
 import asyncio
 import logging
+import math
+import time
 from typing import Any, Final
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from skyless.page.limits import LIMITS
+from skyless.run.limits import PAGE as LIMITS
 
 _REFUSAL: Final = b"this server has %d connections%s, the most that it takes; try again, or close other pages\n"
 _RESPONSE: Final = (
     b"HTTP/1.1 503 Service Unavailable\r\nContent-Type: text/plain; charset=utf-8\r\nContent-Length: %d\r\n"
     b"Retry-After: 10\r\nConnection: close\r\n\r\n%b"
 )
-
-_log = logging.getLogger("skyless.page")
 
 
 class Connection(H11Protocol):
@@ -80,19 +80,16 @@ async def end_unfinished(
                 connection.transport.abort()
 
 
-class FailedAccepts:
-    """Logs connections that the system could not accept, as for want of open files, in one line a minute."""
+class FailedAccepts(logging.Filter):
+    """Lets the event loop log failed accepts, as for want of open files, once a minute, and without a traceback."""
 
-    def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._count, self._said_s = 0, float("-inf")
-        loop.set_exception_handler(self._handle)
+    said_s = -math.inf
 
-    def _handle(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        error = context.get("exception")
-        if not isinstance(error, OSError) or "accept" not in context.get("message", ""):
-            loop.default_exception_handler(context)
-            return
-        self._count += 1
-        if loop.time() - self._said_s >= LIMITS.accepts_log_s:
-            _log.error("connections could not be accepted (%d times): %s", self._count, error.strerror)
-            self._count, self._said_s = 0, loop.time()
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Whether a line is logged."""
+        if "accept()" not in record.getMessage():
+            return True
+        now_s, record.exc_info = time.monotonic(), None
+        is_due = now_s - self.said_s >= LIMITS.accepts_log_s
+        self.said_s = now_s if is_due else self.said_s
+        return is_due

@@ -15,7 +15,6 @@ from starlette.websockets import WebSocket
 from skyless.core.site import AnchorSite
 from skyless.page._state import read_request
 from skyless.page.columns import MAX_DUE, Columns
-from skyless.page.limits import LIMITS
 from skyless.page.live import LiveSite
 from skyless.page.live2 import View, anchors_message, conditions_message, names_message, tags_message
 from skyless.page.sites import Sites
@@ -24,6 +23,7 @@ from skyless.run.fix_batch import FIELDS, BadBatchError, decode_batch, fix_of
 from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
 from skyless.run.gather.names import name_of
+from skyless.run.limits import PAGE as LIMITS
 
 PERIOD_S: Final = 0.1
 _HAND_OVER_S: Final = 0.05

@@ -27,8 +27,8 @@ from skyless.page._state import PageRequest, Sent, SiteState, encode
 from skyless.page.condition.evidence import Evidence
 from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor, offline_anchors
 from skyless.page.event_list import EventList
-from skyless.page.limits import LIMITS
 from skyless.page.site_assets import AssetsFile, SiteAssets
+from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.access import Role
 from skyless.run.mqtt.messages import (

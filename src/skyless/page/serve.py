@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import errno
+import logging
 import signal
 import socket
 from collections.abc import Coroutine, Iterator
@@ -15,8 +16,8 @@ from skyless.core.errors import SkylessError
 from skyless.page.app import Services, make_app
 from skyless.page.connections import Connection, FailedAccepts, end_unfinished
 from skyless.page.guard import AccessRules
-from skyless.page.limits import LIMITS
 from skyless.page.sockets import SEND_TIMEOUT_S
+from skyless.run.limits import PAGE as LIMITS
 from skyless.run.process import ending_signals, reserve
 
 PORT: Final = 8080
@@ -105,7 +106,7 @@ async def serve(services: Services, rules: AccessRules, sock: socket.socket, sit
         jobs.append(services.gathered.run(services.sites))
     work = [asyncio.create_task(job) for job in jobs]
     loop = asyncio.get_running_loop()
-    FailedAccepts(loop)
+    logging.getLogger("asyncio").addFilter(FailedAccepts())
     for number in (signal.SIGINT, *ending_signals()):
         loop.add_signal_handler(number, _stop, server, services)
     serving = asyncio.create_task(server.serve(sockets=[sock]))

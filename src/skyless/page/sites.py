@@ -12,10 +12,10 @@ from typing import Final, Protocol
 from starlette.exceptions import HTTPException
 
 from skyless.page._kept import SiteLink
-from skyless.page.limits import LIMITS
 from skyless.page.live import LiveSite
 from skyless.run.alarms.engine import MAX_KEPT
 from skyless.run.find_site import SiteOnBroker, watch_sites
+from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.outbox import Limits

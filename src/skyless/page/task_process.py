@@ -15,7 +15,7 @@ from msgspec import Raw, Struct
 from starlette.exceptions import HTTPException
 
 from skyless.core.errors import SkylessError
-from skyless.page.limits import LIMITS
+from skyless.run.limits import PAGE as LIMITS
 
 _TIMEOUT_S: Final = 120.0
 _IDLE_S: Final = 60.0

@@ -12,10 +12,10 @@ from msgspec import Struct
 from starlette.exceptions import HTTPException
 
 from skyless.page.api.parameters import Begin, CellSize, Distance, End, Points, Step, TagName, TagNames, ZoneId, names
-from skyless.page.limits import LIMITS
 from skyless.page.task_process import TaskProcess, serve_tasks
 from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track
 from skyless.run.history.layout import site_folder
+from skyless.run.limits import PAGE as LIMITS
 
 if TYPE_CHECKING:
     from skyless.run.history.queries import History

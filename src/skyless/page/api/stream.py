@@ -16,10 +16,10 @@ from starlette.websockets import WebSocket
 from skyless.core.version import installed_version
 from skyless.page.api.parameters import SiteQuery, TagNames, names, read_query
 from skyless.page.api.present import usable
-from skyless.page.limits import LIMITS
 from skyless.page.live import LiveSite
 from skyless.page.sites import Sites
 from skyless.page.sockets import POLICY_VIOLATION, TRY_LATER, send, serve_socket
+from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt.messages import AlarmMessage
 
 PERIOD_S: Final = 0.1

@@ -12,8 +12,8 @@ from pyarrow import parquet
 from skyless.core.errors import SkylessError
 from skyless.run.history.answers import GAP_S, THINNED_GAP_S, Heatmap, Span
 from skyless.run.history.layout import THINNED
-from skyless.run.history.limits import LIMITS
 from skyless.run.history.tables import ROW_GROUP
+from skyless.run.limits import HISTORY as LIMITS
 
 _SIDE: Final = 2000
 """Cells along each side of the grid, which lies around the first fixes; with a power of two, rows of the grid would
@@ -88,7 +88,7 @@ def near(
     runs: list[NDArray[np.int64]] = []
     for (tag, t, x, y), _ in read_rows(files, span, None):
         bucket = t // bucket_ms
-        at = _indices(buckets, bucket)
+        at = np.searchsorted(buckets, bucket).clip(max=len(buckets) - 1)
         rows = np.flatnonzero((np.abs(x - x0[at]) <= distance_mm) & (buckets[at] == bucket))
         rows = rows[(np.abs(y[rows] - y0[at[rows]]) <= distance_mm) & ~np.isin(tag[rows], list(own))]
         square = (x[rows] - x0[at[rows]]) ** 2 + (y[rows] - y0[at[rows]]) ** 2
@@ -97,18 +97,6 @@ def near(
         if sum(one.shape[1] for one in runs) > 2 * LIMITS.contacts:
             runs = [joined(runs, gap)]
     return joined(runs, gap)
-
-
-def _indices(known: _Ints, wanted: _Ints) -> _Ints:
-    """Where numbers are in a sorted array, or any place where they are not."""
-    first, last = int(wanted.min()), int(wanted.max())
-    if last - first > ROW_GROUP:
-        return np.searchsorted(known, wanted).clip(max=len(known) - 1)
-    begin, end = np.searchsorted(known, [first, last + 1])
-    places = np.zeros(last - first + 1, np.intp)  # three times as fast, and files are of some hours
-    places[known[begin:end] - first] = np.arange(begin, end)
-    found: _Ints = places[wanted - first]
-    return found
 
 
 def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:

@@ -5,8 +5,8 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from skyless.run.history.layout import EventKind
-from skyless.run.history.limits import LIMITS
 from skyless.run.history.tables import Event
+from skyless.run.limits import HISTORY as LIMITS
 from skyless.run.mqtt.messages import AlarmMessage, StatusMessage, ZoneEvent
 
 REMEMBERED_KINDS: Final = ("alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online")

@@ -37,7 +37,6 @@ class _Site:
         self._stream, self._say = stream, rarely(log)
         self._subscriptions = Subscriptions()
         self.history.attach(self._subscriptions.add, fixes=False)
-        writer.come_from_hub()
 
     async def run(self) -> None:
         """Keep it until cancelled."""
@@ -113,7 +112,8 @@ class HubHistory:
 
     def _keep_site(self, number: int) -> None:
         if number not in self._sites and self._only in {None, number}:
-            site = self._sites[number] = _Site(self._stream, Writer(self._folder, number), self._keep, self._log)
+            writer = Writer(self._folder, number, "hub ")
+            site = self._sites[number] = _Site(self._stream, writer, self._keep, self._log)
             self._tasks.create_task(site.run())
 
     async def _find_sites(self, client: "Client") -> None:

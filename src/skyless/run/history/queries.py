@@ -54,8 +54,8 @@ from skyless.run.history.layout import (
     day_of,
     site_folder,
 )
-from skyless.run.history.limits import LIMITS
 from skyless.run.history.tables import read_table
+from skyless.run.limits import HISTORY as LIMITS
 
 EXPORT_SUFFIXES: Final = (".csv", ".parquet", ".geojsonl")
 

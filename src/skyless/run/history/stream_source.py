@@ -12,8 +12,8 @@ from skyless.run.gather import subjects
 from skyless.run.gather.address import NatsAddress, connect, rarely
 from skyless.run.gather.names import Names
 from skyless.run.gather.streams import follow
-from skyless.run.history.limits import LIMITS
 from skyless.run.history.writer import Intake, Writer
+from skyless.run.limits import HISTORY as LIMITS
 from skyless.run.process import Log
 
 if TYPE_CHECKING:

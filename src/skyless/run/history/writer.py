@@ -30,8 +30,8 @@ from skyless.run.history.layout import (
     rows_of,
     site_folder,
 )
-from skyless.run.history.limits import LIMITS
 from skyless.run.history.tables import Event, event_table, fix_table, read_table, schema_of, write_table
+from skyless.run.limits import HISTORY as LIMITS
 from skyless.run.mqtt.messages import Asset, FixMessage, Zone
 from skyless.run.process import locked
 
@@ -49,12 +49,13 @@ class Intake:
         folder: Path,
         encode: Callable[[Any], bytes],
         table: Callable[[Sequence[bytes]], pa.Table],
+        source: str,
     ) -> None:
         self.lost = 0
         """Rows that were dropped, as the disk did not take them in time."""
         self.taken = 0
         """Rows since the start."""
-        self._journal, self._kind, self._folder = journal, kind, folder
+        self._journal, self._kind, self._folder, self._place = journal, kind, folder, source + kind
         self._encode, self._table = encode, table
         self._batches: list[tuple[Records | Sequence[Event], float]] = []
         self.position = 0
@@ -66,19 +67,11 @@ class Intake:
             sql.execute(f"CREATE TABLE IF NOT EXISTS {kind} (first INTEGER PRIMARY KEY, rows, unix_s, data)")
             (end,) = sql.execute(f"SELECT max(first + rows) FROM {kind}").fetchone()
             sql.execute("CREATE TABLE IF NOT EXISTS positions (kind PRIMARY KEY, position)")
-        self._read_position(kind)
+        with journal.transaction() as sql:
+            for (position,) in sql.execute("SELECT position FROM positions WHERE kind = ?", (self._place,)):
+                self.position = position
         self.next = max(self.last + 1, end or 1)
         """Number of the next row that comes to the journal."""
-
-    def come_from_hub(self) -> None:
-        """Take places for those of the site's stream at a hub."""
-        self._read_position(f"hub {self._kind}")
-
-    def _read_position(self, key: str) -> None:
-        self._position_key, self.position = key, 0
-        with self._journal.transaction() as sql:
-            for (position,) in sql.execute("SELECT position FROM positions WHERE kind = ?", (key,)):
-                self.position = position
 
     def add(self, rows: Records | Sequence[Event], arrived_unix_s: float, position: int = 0) -> None:
         """Take rows, which are in the journal after ``store``, and with them their place in the source."""
@@ -103,7 +96,7 @@ class Intake:
         try:
             with self._journal.transaction() as sql:
                 sql.executemany(f"INSERT INTO {self._kind} VALUES (?, ?, ?, ?)", values)
-                sql.execute("INSERT OR REPLACE INTO positions VALUES (?, ?)", (self._position_key, self.position))
+                sql.execute("INSERT OR REPLACE INTO positions VALUES (?, ?)", (self._place, self.position))
         except OSError:
             while self.waiting > LIMITS.waiting_rows:
                 self.lost += len(self._batches.pop(0)[0])
@@ -199,8 +192,11 @@ class Table:
 class Writer:
     """Writes the history of one site."""
 
-    def __init__(self, folder: Path, site: int) -> None:
-        """Raises SkylessError: it cannot be written, another program does so, or it is damaged."""
+    def __init__(self, folder: Path, site: int, source: str = "") -> None:
+        """``source`` names streams whose places are kept, which no other's may continue.
+
+        Raises SkylessError: it cannot be written, another program does so, it is damaged, or has rows from elsewhere.
+        """
         self.root, self.site, self.folder = folder, site, site_folder(folder, site)
         self.drops: Counter[str] = Counter()
         """Messages that are not kept, by reason."""
@@ -215,22 +211,21 @@ class Writer:
             self.assets = Table(self.folder / "assets.parquet", ASSET_COLUMNS, "tag")
             self.zones = Table(self.folder / "zones.parquet", ZONE_COLUMNS, "zone")
             self.journal = Journal(self.folder / "journal.sqlite")
-            self.fixes = Intake(self.journal, "fixes", self.folder, np.ndarray.tobytes, _fixes_in)
-            self.events = Intake(self.journal, "events", self.folder / "events", msgspec.json.encode, _events_in)
+            self.fixes = Intake(self.journal, "fixes", self.folder, np.ndarray.tobytes, _fixes_in, source)
+            events = self.folder / "events"
+            self.events = Intake(self.journal, "events", events, msgspec.json.encode, _events_in, source)
         except BlockingIOError:
             raise SkylessError(f"{self.folder} is written by another program; each needs a folder of its own") from None
         except OSError as error:
             raise SkylessError(f"{error.filename or folder} cannot be written: {error.strerror}") from None
-        if self.fixes.next > 1 and not self.names.rows:
+        fault = ""
+        if not self.names.rows:
+            fault = f"{names} is missing; it should be the table that tells whose the fixes are"
+        elif source and not self.fixes.position:
+            fault = f"{self.folder} has fixes that are not from the site's stream at a hub; it should be another folder"
+        if fault and self.fixes.next > 1:
             self.journal.close()
-            raise SkylessError(f"{names} is missing; it should be the table that tells whose the fixes are")
-
-    def come_from_hub(self) -> None:
-        """Take rows from the site's streams at a hub. Raises SkylessError: those that are there came from elsewhere."""
-        for intake in (self.fixes, self.events):
-            intake.come_from_hub()
-        if self.fixes.next > 1 and not self.fixes.position:
-            raise SkylessError(f"{self.folder} has fixes that are not from this site's stream at a hub; give another")
+            raise SkylessError(fault)
 
     @property
     def unwritten(self) -> int:
