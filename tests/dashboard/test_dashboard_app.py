@@ -68,6 +68,14 @@ def test_files_outside_the_page_stay_there(browser, path):
     assert browser.get(path).status_code == 404
 
 
+@pytest.mark.parametrize("site", ["cross-site", "same-site"])
+def test_another_sites_image_or_link_gets_the_page_at_most(browser, site):
+    headers = {"sec-fetch-site": site}
+    assert browser.get("/", headers=headers).status_code == 200
+    assert browser.get("/api/v1/site", headers=headers).status_code == 403
+    assert browser.get("/api/v1/site", headers={"sec-fetch-site": "same-origin"}).status_code == 404  # none is here
+
+
 @pytest.mark.parametrize("path", ["/", "/page/main.js", "/api/recordings", "/nowhere"])
 def test_every_answer_carries_the_security_headers(browser, path):
     headers = browser.get(path).headers

@@ -18,6 +18,7 @@ from pyarrow import parquet
 from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
+from skyless.run.history import _scans, queries
 from skyless.run.history.answers import GAP_S, AlarmRow, Contact, Dwell, Span
 from skyless.run.history.layout import (
     ASSET_COLUMNS,
@@ -29,6 +30,7 @@ from skyless.run.history.layout import (
     site_folder,
 )
 from skyless.run.history.queries import History, counts, sites_in
+from skyless.run.limits import HistoryLimits
 
 SITE, TAGS, FIXES = 7, 20, 5000
 MIDNIGHT = datetime(2026, 11, 20, tzinfo=UTC).timestamp()
@@ -393,6 +395,35 @@ def test_an_empty_range(history, tmp_path):
 def test_what_cannot_be_answered_is_said(history, ask, error):
     with pytest.raises(SkylessError, match=error):
         ask(history)
+
+
+@pytest.mark.parametrize(
+    ("limits", "ask", "error"),
+    [
+        ({"cells": 10}, lambda h: h.heatmap(SPAN), "cells of 0.25 m are too many; choose ones of"),
+        ({"contacts": 1}, lambda h: h.contacts("tag1", SPAN), "choose a shorter range or a smaller distance"),
+        ({"rows": 3}, lambda h: h.dwell(SPAN), "more than 3 rows; choose a shorter range, a tag or a zone"),
+        ({"rows": 1}, lambda h: h.alarms(SPAN), "more than 1 rows"),
+        (
+            {"steps": 100},
+            lambda h: h.occupancy(SPAN, step_s=99.0),
+            r"99 s for 3 zones .* of 106 s or more, a shorter range or",
+        ),
+        ({"points": 9}, lambda h: h.track("tag1", SPAN, 10), "the number of points is 10"),
+        ({"exported_rows": 9}, lambda h: h.export(h.folder / "x.csv", SPAN), "fixes are more than 9; choose a shorter"),
+    ],
+)
+def test_what_is_too_much_is_refused_with_what_would_do(history, monkeypatch, limits, ask, error):
+    for module in (queries, _scans):
+        monkeypatch.setattr(module, "LIMITS", HistoryLimits(**limits))
+    with pytest.raises(SkylessError, match=error):
+        ask(history)
+
+
+def test_contacts_are_the_same_in_parts(history, monkeypatch):
+    whole = history.contacts("tag1", SPAN)
+    monkeypatch.setattr(queries, "_PART_S", 100.0)
+    assert history.contacts("tag1", SPAN) == whole != ()
 
 
 def test_a_file_that_is_replaced_while_it_is_read(history, monkeypatch):

@@ -286,6 +286,17 @@ def test_a_time_that_is_none_is_counted(tmp_path, unix_s):
     writer.close()
 
 
+def test_a_hubs_history_goes_on_in_its_own_folder_only(tmp_path):
+    for source, position in (("", 7), ("hub ", 5)):
+        writer = Writer(tmp_path / source.strip(), 1, source)
+        number = writer.number(fix(), NOON_S)
+        writer.fixes.add(records_of([(number, fix())], simulated=True), NOON_S, position)
+        writer.close()
+    assert Writer(tmp_path / "hub", 1, "hub ").fixes.position == 5
+    with pytest.raises(SkylessError, match="not from the site's stream at a hub; it should be another folder"):
+        Writer(tmp_path, 1, "hub ")
+
+
 def test_too_many_tags_are_counted(tmp_path, monkeypatch):
     monkeypatch.setattr(writer_module, "LIMITS", HistoryLimits(tags=2))
     writer = Writer(tmp_path, 1)
