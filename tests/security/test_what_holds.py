@@ -1,0 +1,67 @@
+"""What an adversary has tried and what held, in one place: the tests that say so still, by file."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parents[1]
+HOLDS = {
+    "authentication/test_key_files.py": ("test_any_bytes_as_a_public_key_give_one_line",),
+    "benchmarks/test_hub_cuts.py": ("test_every_fix_is_in_the_history_once_after_kills_and_cuts",),
+    "bridges/test_alarm_targets.py": ("test_a_name_cannot_add_headers",),
+    "bridges/test_foxglove.py": ("test_pages_of_other_sites_are_refused",),
+    "dashboard/test_connections.py": (
+        "test_requests_that_are_not_finished_make_room_for_a_reader",
+        "test_beyond_the_limit_of_requests_in_work_a_client_is_told",
+    ),
+    "dashboard/test_dashboard_app.py": (
+        "test_without_the_token_every_request_of_a_stranger_is_refused",
+        "test_a_rebound_name_is_refused",
+        "test_other_sites_pages_are_refused",
+        "test_another_sites_image_or_link_gets_the_page_at_most",
+        "test_files_outside_the_page_stay_there",
+        "test_all_computers_together_open_a_limited_number_of_pages",
+    ),
+    "dashboard/test_dashboard_sites.py": ("test_twenty_sites_are_shown_and_those_that_nobody_looks_at_are_let_go",),
+    "dashboard/test_http_api.py": (
+        "test_the_readers_token_reads_and_the_operators_does_all",
+        "test_a_real_history_answers_and_a_question_that_takes_too_long_is_ended",
+    ),
+    "dashboard/test_http_stream.py": ("test_there_are_only_so_many",),
+    "firmware/test_fuzz.py": ("test_random_bytes_any_chip_and_damaged_beacons_stop_nothing",),
+    "gather/test_fix_batch.py": ("test_damaged_bytes_are_refused_or_a_batch_and_raise_nothing_else",),
+    "gather/test_gather.py": ("test_a_history_of_the_stream_has_each_fix_once_wherever_it_is_killed",),
+    "history/test_history_program.py": ("test_nothing_that_reached_the_journal_is_lost_or_doubled_by_kills",),
+    "history/test_history_questions.py": (
+        "test_what_is_too_much_is_refused_with_what_would_do",
+        "test_a_damaged_file_is_named_and_no_traceback",
+    ),
+    "history/test_writer.py": ("test_a_full_disk_costs_the_oldest_rows_that_wait_and_is_counted",),
+    "hub/test_hub_failures.py": ("test_a_wrong_certificate_is_said_and_a_right_one_is_taken",),
+    "hub/test_rogue_site.py": ("test_no_site_writes_as_another",),
+    "machines/test_forged_beacons.py": ("test_no_forged_frame_moves_a_verified_fix_or_an_anchor",),
+    "machines/test_fuzz_machines.py": (
+        "test_a_tag_on_a_hostile_channel",
+        "test_an_anchor_on_a_hostile_channel",
+    ),
+    "native/test_damaged_packets.py": ("test_sanitizers_find_nothing_and_every_fix_is_a_number",),
+    "nodes/test_anchor_with_keys.py": ("test_a_placement_far_from_the_site_file_moves_no_anchor_with_keys",),
+    "nodes/test_bridge_nodes.py": ("test_all_that_targets_need_comes_from_the_broker_and_nonsense_is_counted",),
+    "nodes/test_broker_access.py": (
+        "test_each_role_publishes_exactly_what_the_table_says",
+        "test_each_role_receives_exactly_what_the_table_says",
+        "test_the_files_are_private_complete_and_never_replaced",
+    ),
+    "recordings/test_capture_fuzz.py": ("test_made_up_captures",),
+    "recordings/test_mcap_files.py": (
+        "test_a_full_disk_ends_the_recording_once_and_leaves_a_whole_file",
+        "test_damaged_files_do_not_raise",
+    ),
+}
+
+
+@pytest.mark.parametrize("file", HOLDS)
+def test_the_tests_are_there(file):
+    tree = ast.parse((TESTS / file).read_text(encoding="utf-8"))
+    assert {*HOLDS[file]} <= {getattr(node, "name", "") for node in tree.body}
