@@ -7,6 +7,7 @@ import pytest
 
 TESTS = Path(__file__).parents[1]
 HOLDS = {
+    "site/test_site_load.py": ("test_no_file_ends_in_anything_but_a_configuration_error",),
     "authentication/test_key_files.py": ("test_any_bytes_as_a_public_key_give_one_line",),
     "benchmarks/test_hub_cuts.py": ("test_every_fix_is_in_the_history_once_after_kills_and_cuts",),
     "bridges/test_alarm_targets.py": ("test_a_name_cannot_add_headers",),

@@ -1,0 +1,70 @@
+"""Folders that cannot be written, and files of a history that no program of ours wrote."""
+
+import numpy as np
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+from skyless.cli.main import main
+from skyless.core.errors import SkylessError
+from skyless.run.history.answers import Span
+from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, file_name, site_folder
+from skyless.run.history.queries import History
+from skyless.run.history.tables import schema_of
+
+QUESTIONS = {
+    "track": lambda history, span: history.track("a", span),
+    "heatmap": lambda history, span: history.heatmap(span),
+    "contacts": lambda history, span: history.contacts("a", span),
+    "dwell": lambda history, span: history.dwell(span),
+    "occupancy": lambda history, span: history.occupancy(span, step_s=1e6),
+    "alarms": lambda history, span: history.alarms(span),
+    "export": lambda history, span: history.export(history.folder / "all.csv", span),
+    "newest": lambda history, _span: history.known_until_unix_s(),
+}
+INTEGERS = {pa.int32(): np.int32, pa.uint32(): np.uint32, pa.uint16(): np.uint16}
+DAY_MS = 86_400_000
+
+
+def column(kind, draw):
+    """Values that no program writes: the least and the largest ones, others, and none."""
+    if pa.types.is_timestamp(kind):
+        return pa.array([draw.choice([-(2**62), -1, 0, 20_000 * DAY_MS, 2**62]) for _ in range(50)], pa.int64()).cast(
+            kind
+        )
+    if pa.types.is_string(kind):
+        return pa.array([draw.choice(["", "a", "enter", "leave", "\0", "ä" * 9_000, None]) for _ in range(50)], kind)
+    limits = np.iinfo(INTEGERS[kind])
+    return pa.array([int(draw.choice([limits.min, 1, limits.max])) for _ in range(50)], kind)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_history_of_extreme_values_answers_or_says_why_not(tmp_path, seed):
+    draw, site = np.random.default_rng(seed), site_folder(tmp_path, 1)
+    for folder, columns in ((site, FIX_COLUMNS), (site / "events", EVENT_COLUMNS)):
+        schema = schema_of(columns)
+        (folder / "day=2024-10-04").mkdir(parents=True)
+        table = pa.Table.from_arrays([column(field.type, draw) for field in schema], schema=schema)
+        table = table.drop_columns(["flags"]) if seed == 5 and "flags" in columns else table
+        parquet.write_table(table, folder / "day=2024-10-04" / file_name(1, 50))
+    names = pa.Table.from_arrays([pa.array([1]), pa.array(["a"]), pa.array([0])], names=list(NAME_COLUMNS))
+    parquet.write_table(names.cast(schema_of(NAME_COLUMNS | {"since": "int64"})), site / "names.parquet")
+    for span in (Span(0.0, 2e9), Span(1.728e9 - 10.0, 1.728e9 + 1e6)):
+        for ask in QUESTIONS.values():
+            try:
+                ask(History(tmp_path, 1), span)
+            except SkylessError as error:
+                assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("history", "run", "--to"), ("site", "new"), ("broker", "--port", "1", "--data"),
+     ("hub", "init", "--node", "127.0.0.1:4222", "--sites", "7"), ("broker", "access")],
+)  # fmt: skip
+def test_a_folder_that_cannot_be_written_is_one_line(words, tmp_path, capsys):
+    (tmp_path / "file").touch()
+    rest = ("--mqtt", "mqtt://127.0.0.1:9") if words[0] == "history" else ()
+    assert main([*words, str(tmp_path / "file" / "x"), *rest]) == 2
+    said = capsys.readouterr().err.strip()
+    assert str(tmp_path / "file") in said.replace("\n", "") and "Traceback" not in said
