@@ -64,10 +64,7 @@ def is_unfinished(connection: object) -> bool:
 async def end_unfinished(
     connections: set[Any], timeout_s: float = LIMITS.request_s, body_timeout_s: float = LIMITS.body_s
 ) -> None:
-    """End connections that have been without a whole request for too long, until cancelled.
-
-    Uvicorn ends those only that have been answered and are silent since.
-    """
+    """End connections that have been without a whole request for too long, until cancelled; uvicorn ends idle ones."""
     since_s: dict[object, float] = {}
     while True:
         await asyncio.sleep(timeout_s / 4)

@@ -276,9 +276,7 @@ class History:
         ((tag, own),) = self._tags((tag,)).items()
         names, files = self._names(), self._files(span)
         length_ms, gap = _CONTACT_MS[_are_thinned(files)]
-        found = joined(
-            [near(*part, own, length_ms, round(1000.0 * distance_m), gap) for part in _parts(files, span)], gap
-        )
+        found = [near(*part, own, length_ms, round(1000.0 * distance_m), gap) for part in _parts(files, span)]
         contacts = [
             Contact(
                 tag,
@@ -287,7 +285,7 @@ class History:
                 min(1e-3 * length_ms * (end + 1), span.to_unix_s),
                 1e-3 * math.sqrt(square),
             )
-            for number, begin, end, square in found.T.tolist()
+            for number, begin, end, square in joined(found, gap).T.tolist()
         ]
         return tuple(sorted(contacts, key=lambda one: (one.begin_unix_s, one.other)))
 

@@ -119,20 +119,16 @@ class HubSites:
             while True:
                 try:
                     for number in await sites_at(client) - {site for site, name in self.names().items() if name}:
-                        await self._read_name(client, number)
+                        subject = subjects.at(subjects.SITES, number)
+                        with contextlib.suppress(NotFoundError):  # it has not come to the hub yet
+                            name = subjects.at(subjects.STATE_STREAM, number)
+                            found = await client.jetstream().get_last_msg(name, subject, direct=True)
+                            self.add_site(subjects.topic_of(subject), found.data or b"")
                 except Error as error:
                     say(f"the sites at the hub cannot be listed: {error or type(error).__name__}")
                 await asyncio.sleep(LIST_S)
         finally:
             await client.close()
-
-    async def _read_name(self, client: "Client", number: int) -> None:
-        """Read what a site retains of itself, which may not have come to the hub yet."""
-        subject = subjects.at(subjects.SITES, number)
-        with contextlib.suppress(NotFoundError):
-            name = subjects.at(subjects.STATE_STREAM, number)
-            found = await client.jetstream().get_last_msg(name, subject, direct=True)
-            self.add_site(subjects.topic_of(subject), found.data or b"")
 
 
 def _lasting(seconds: float) -> str:
