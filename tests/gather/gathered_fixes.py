@@ -7,7 +7,7 @@ from skyless.run.mqtt.messages import FixMessage
 
 VARIANCE = (1e-4,) * 9
 FIX = FixMessage(
-    *("a", 1, 1000.0, 1.0, (1.0, 2.0, 3.0), VARIANCE, None, None, 0.02, 1.0, 1.0, 1.0, None),
+    *("a", 1, 1_700_000_000.0, 1.0, (1.0, 2.0, 3.0), VARIANCE, None, None, 0.02, 1.0, 1.0, 1.0, None),
     *((1, 2, 3), 2.5, 3, 0.01, "joint", True, 0.001),
 )
 
