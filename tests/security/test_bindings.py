@@ -34,7 +34,7 @@ def test_without_options_nothing_listens_but_for_this_computer(program, tmp_path
     for name in ("HOME", "XDG_DATA_HOME", "XDG_CACHE_HOME"):
         monkeypatch.setenv(name, str(tmp_path))
     words = ("--mqtt", "mqtt://127.0.0.1:9") if program == "dashboard" else ()
-    with started(*SKYLESS, program, *words) as process:
+    with started(*SKYLESS, program, *words, limit_s=180.0) as process:
         assert process.stdout.readline()
         seen, begun_s = set(), time.monotonic()
         while time.monotonic() < begun_s + 2.0:
