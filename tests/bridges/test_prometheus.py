@@ -29,6 +29,7 @@ from skyless.bridges.prometheus import (
 )
 from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.core.errors import SkylessError
+from skyless.run.limits import BridgeLimits
 from skyless.run.mqtt.messages import AnchorHealth, Counters, StatusMessage, TagHealth
 
 pytestmark = pytest.mark.site
@@ -309,7 +310,7 @@ def test_what_is_no_request_is_counted_and_harms_nobody():
 
 
 def test_connections_that_send_nothing_keep_no_scrape_out_and_end_with_the_server(monkeypatch):
-    monkeypatch.setattr(prometheus_target, "_ANSWER_S", 3600.0)
+    monkeypatch.setattr(prometheus_target, "LIMITS", BridgeLimits(answer_s=3600.0))
 
     async def talk():
         target = make_target(TargetUrl("prometheus://"), CONTEXT)

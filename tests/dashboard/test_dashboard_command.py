@@ -1,6 +1,7 @@
 """``skyless dashboard``: its options, and its port."""
 
 import json
+import os
 import signal
 import socket
 import subprocess
@@ -14,6 +15,7 @@ from skyless.cli.main import main
 from skyless.core.errors import SkylessError
 from skyless.page.serve import PORT, ListenAddress, bind
 from skyless.run.process import reserve
+from skyless.sim.lab import lab_site
 from support.processes import free_port
 
 pytestmark = pytest.mark.site
@@ -141,28 +143,27 @@ def test_the_server_loads_nothing_heavy():
 
 
 BUSY = """
-import sys, threading
+import sys
 from skyless.cli.main import main
-from skyless.run.history import queries
+from skyless.page.api import past
+from skyless.page.task_process import TaskProcess
 
-class History:
-    def __init__(self, folder, site): ...
-    def tags(self):
-        print("asked", flush=True)
-        threading.Event().wait()
-
-queries.History = History
+past.TaskProcess = lambda module, fault: TaskProcess("never_answers", fault)
 sys.exit(main(sys.argv[1:]))
 """
+NEVER_ANSWERS = "import sys\nsys.stdin.readline()\nprint('asked', file=sys.stderr, flush=True)\nsys.stdin.readline()"
 
 
 def test_a_question_to_the_history_that_never_ends_does_not_keep_the_dashboard(tmp_path):
     options = ["--mqtt", f"mqtt://127.0.0.1:{free_port()}", "--site", "lab", "--history", str(tmp_path), "--json"]
     command = [sys.executable, "-c", BUSY, "dashboard", *options]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    (tmp_path / "never_answers.py").write_text(NEVER_ANSWERS)
+    (tmp_path / f"site={lab_site().id}").mkdir()
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, env=os.environ | {"PYTHONPATH": str(tmp_path)}, **pipes) as process:
         page = json.loads(process.stdout.readline())["page"]
         with socket.create_connection(("127.0.0.1", urlsplit(page).port)) as asking:
             asking.sendall(b"GET /api/v1/history/tags HTTP/1.1\r\nHost: localhost\r\n\r\n")
-            assert process.stdout.readline() == "asked\n"
+            assert "asked\n" in iter(process.stderr.readline, "")
             process.send_signal(signal.SIGINT)
             assert process.wait() == 0

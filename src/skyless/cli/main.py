@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Final
 from cyclopts import App, CycloptsError, Group, Parameter, UnknownCommandError
 from cyclopts.help import DefaultFormatter
 
-from skyless.cli.common.output import plain
 from skyless.core.errors import SkylessError
 from skyless.core.extras import what_to_install
 from skyless.core.version import installed_version
@@ -137,6 +136,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (SkylessError, CycloptsError, ModuleNotFoundError, OSError) as error:
         if (line := _line_for_the_user(error)) is None:
             raise
+        from skyless.cli.common.output import plain  # loads more than --help needs
+
         print(f"skyless: {plain(line, chr(10))}", file=sys.stderr)
         return _USER_ERROR
     return result if isinstance(result, int) else 0

@@ -431,8 +431,7 @@ class _Way:
         evenly = np.array(self._evenly)
         if len(evenly) + len(at_gaps) > self._most:
             evenly = evenly[np.linspace(0, len(evenly) - 1, self._most - len(at_gaps)).round().astype(int)]
-        found: list[int] = np.union1d(evenly, at_gaps).tolist()
-        return found
+        return [int(ms) for ms in np.union1d(evenly, at_gaps)]
 
 
 # Files and DuckDB
