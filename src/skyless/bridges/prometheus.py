@@ -10,6 +10,7 @@ import time
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from email.parser import BytesHeaderParser
 from math import inf, isinf, isnan
 from typing import Final, Literal
 
@@ -440,8 +441,8 @@ class Prometheus(Target):
             writer.transport.abort()
 
     def _answer(self, request: bytes) -> bytes:
-        headers = _headers(request)
-        if "host" in headers and not is_own_host(headers["host"], self._names, remote=not is_loopback(self._host)):
+        headers = BytesHeaderParser().parsebytes(request.partition(b"\r\n")[2])
+        if "host" in headers and not is_own_host(str(headers["host"]), self._names, remote=not is_loopback(self._host)):
             self.dropped["host"] += 1
             return _response("421 Misdirected Request", "unknown host name; ?hosts=NAME in the target admits it\n")
         if "origin" in headers or headers.get("sec-fetch-site", "none") not in ("none", "same-origin"):
@@ -456,12 +457,6 @@ class Prometheus(Target):
         else:
             whole = _response("404 Not Found", "the figures are at /metrics\n")
         return whole if method == b"GET" else whole.partition(b"\r\n\r\n")[0] + b"\r\n\r\n"
-
-
-def _headers(request: bytes) -> dict[str, str]:
-    """The headers of a request by their names in lower case."""
-    lines = (line.partition(b":") for line in request.split(b"\r\n")[1:])
-    return {name.decode("latin-1").lower(): value.decode("latin-1").strip() for name, _, value in lines if name}
 
 
 def _response(status: str, text: str, content_type: str = "text/plain; charset=utf-8") -> bytes:

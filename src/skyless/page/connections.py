@@ -31,8 +31,8 @@ class Connection(H11Protocol):
         """Take the connection, if there is room."""
         super().connection_made(transport)
         self.since_s = self.loop.time()
-        others = [one for one in self.connections if one is not self and not one.transport.is_closing()]
-        of_address = [one for one in others if _address(one) == _address(self)]
+        others: list[Any] = [one for one in self.connections if one is not self and not one.transport.is_closing()]
+        of_address = [one for one in others if (one.client or "")[:1] == (self.client or "")[:1]]
         if len(of_address) >= LIMITS.connections_per_address:
             self._make_room(of_address, b" of this address")
         elif len(others) >= LIMITS.connections:
@@ -47,10 +47,6 @@ class Connection(H11Protocol):
         text = _REFUSAL % (len(crowd), which)
         self.transport.write(_RESPONSE % (len(text), text))
         self.transport.close()
-
-
-def _address(connection: object) -> object:
-    return (getattr(connection, "client", None) or ("",))[0]
 
 
 def is_unfinished(connection: object) -> bool:

@@ -7,7 +7,7 @@ at is let go some time later, unless it has zones or alarm rules, which are watc
 import asyncio
 import time
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Protocol
 
 from starlette.exceptions import HTTPException
 
@@ -20,8 +20,6 @@ from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.outbox import Limits
 from skyless.run.process import every, together
-
-_CHECK_S: Final = 1.0
 
 
 def number_of(asked: str | None) -> int:
@@ -133,7 +131,7 @@ class LiveSites:
 
             self._connect = connect
             tasks.create_task(self._first.run())
-            tasks.create_task(every(_CHECK_S, self.let_go))
+            tasks.create_task(every(1.0, self.let_go))
             if site_id is None:
                 await watch_sites(address, self.on_sites, self._on_broker_state)
             else:

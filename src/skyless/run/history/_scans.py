@@ -11,8 +11,8 @@ from pyarrow import parquet
 
 from skyless.core.errors import SkylessError
 from skyless.run.history.answers import GAP_S, THINNED_GAP_S, Heatmap, Span
-from skyless.run.history.layout import THINNED
-from skyless.run.history.tables import ROW_GROUP
+from skyless.run.history.layout import FIX_COLUMNS, THINNED
+from skyless.run.history.tables import ROW_GROUP, schema_of
 from skyless.run.limits import HISTORY as LIMITS
 
 _SIDE: Final = 2000
@@ -122,9 +122,12 @@ def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:
 def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -> Iterator[tuple[list[_Ints], int]]:
     """Tags, times in ms and coordinates of batches of rows, and for how many ms a fix counts there at most."""
     begin_ms, end_ms = (math.ceil(round(1000.0 * unix_s, 2)) for unix_s in (span.from_unix_s, span.to_unix_s))
+    wanted = schema_of({name: FIX_COLUMNS[name] for name in ("tag", "t", "x_mm", "y_mm")})
     for file in files:
         try:
             whole = parquet.ParquetFile(file, memory_map=True, pre_buffer=False)
+            if not {*wanted} <= {*whole.schema_arrow}:
+                raise ValueError(f"its columns are {', '.join(whole.schema_arrow.names)}")
         except ValueError as error:  # ArrowInvalid is one
             raise SkylessError(f"{file} cannot be read; it should be a Parquet file of fixes: {error}") from None
         gap_ms = round(1000.0 * (THINNED_GAP_S if THINNED in (whole.schema_arrow.metadata or {}) else GAP_S))
@@ -132,8 +135,8 @@ def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -
             (tag0, tag1), (first_ms, last_ms) = (limits(whole.metadata, group, name) for name in ("tag", "t"))
             if last_ms < begin_ms or first_ms >= end_ms or not (tags is None or any(tag0 <= n <= tag1 for n in tags)):
                 continue
-            for batch in whole.iter_batches(ROW_GROUP, [group], ["tag", "t", "x_mm", "y_mm"], use_threads=False):
-                tag, t, x, y = batch.columns
+            for batch in whole.iter_batches(ROW_GROUP, [group], wanted.names, use_threads=False):
+                tag, t, x, y = (batch[name] for name in wanted.names)
                 rows = [np.from_dlpack(column) for column in (tag, t.view("int64"), x, y)]
                 if tags is not None:
                     rows = [column[np.isin(rows[0], list(tags))] for column in rows]
@@ -144,6 +147,8 @@ def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -
 
 
 def limits(metadata: parquet.FileMetaData, group: int, column: str) -> tuple[int, int]:
-    """The least and the largest value of a column in a row group; times are in ms."""
+    """The least and the largest value of a column in a row group; times are in ms. Raises ValueError."""
     known = metadata.row_group(group).column(metadata.schema.names.index(column)).statistics
+    if known is None or not isinstance(known.max_raw, int):
+        raise ValueError(f"its column {column} has no whole numbers, or no statistics of them")
     return known.min_raw, known.max_raw  # others make dates, for which Pandas would be imported

@@ -63,6 +63,7 @@ _EARLY: Final = timedelta(hours=1)
 _LATE: Final = timedelta(days=1)
 """How much earlier and later than its time a fix may arrive: clocks differ, and sites keep what a cut line delays."""
 
+_UNREADABLE: Final = (OSError, ValueError, RecursionError, duckdb.Error, pyarrow.ArrowException, msgspec.MsgspecError)
 _TRIES: Final = 3
 _MOVE_M: Final = 0.25
 _MOVE_SIGMAS: Final = 3.0
@@ -81,19 +82,20 @@ _FIXES: Final = f"""
         list_extract({[alert.value for alert in ALERTS]}, flags & {ALERT_BITS}) AS alert,
         flags & {SIMULATED} != 0 AS simulated
     FROM read_parquet($files) WHERE t >= to_timestamp($begin) AND t < to_timestamp($end)
+        AND x_mm NOT NULL AND y_mm NOT NULL AND z_mm NOT NULL AND std_mm NOT NULL
 """
 
 _STAYS: Final = """
     WITH crossings AS (
         SELECT tag, zone, kind = 'enter' AS enters, epoch_ms(t) / 1000 AS s FROM read_parquet($files)
-        WHERE kind IN ('enter', 'leave') AND t >= to_timestamp($begin) AND t < to_timestamp($end)
+        WHERE kind IN ('enter', 'leave') AND t >= to_timestamp($begin) AND t < to_timestamp($end) AND tag NOT NULL
         UNION ALL
         SELECT tag, zone, arg_max(kind, t) = 'enter', $begin FROM read_parquet($files)
-        WHERE kind IN ('enter', 'leave') AND t < to_timestamp($begin) GROUP BY tag, zone
+        WHERE kind IN ('enter', 'leave') AND t < to_timestamp($begin) AND tag NOT NULL GROUP BY tag, zone
     ), stays AS (
         SELECT tag, zone, enters, s AS since, lead(s, 1, $end) OVER of_tag AS until,
             lag(enters, 1, false) OVER of_tag AS was_inside
-        FROM crossings WHERE (len($tags) = 0 OR list_contains($tags, tag)) AND ($zone IS NULL OR zone = $zone)
+        FROM crossings WHERE (len($tags) = 0 OR list_contains($tags, tag)) AND zone = coalesce($zone, zone)
         WINDOW of_tag AS (PARTITION BY hash(tag, zone) ORDER BY s, enters)
     )
 """
@@ -141,7 +143,7 @@ def _asked(question: Callable[_P, _R]) -> Callable[_P, _R]:
                 with contextlib.suppress(FileNotFoundError, duckdb.IOException):
                     return question(*args, **kwargs)
             return question(*args, **kwargs)
-        except (OSError, duckdb.Error, pyarrow.ArrowException) as error:
+        except _UNREADABLE as error:
             reason = str(error).partition("\n")[0]
             raise SkylessError(f"{_damaged(args[0]) or 'the history'} cannot be read: {reason}") from None
 
@@ -153,9 +155,10 @@ def _damaged(history: object) -> Path | None:
     if isinstance(history, History):
         for file in (*current_files(history.folder, history.site), *current_events(history.folder, history.site)):
             try:
-                for _ in parquet.ParquetFile(file).iter_batches():
-                    pass
-            except (OSError, pyarrow.ArrowException):
+                whole = parquet.ParquetFile(file)
+                for group in range(whole.num_row_groups):
+                    _ = limits(whole.metadata, group, "t"), whole.read_row_group(group)
+            except _UNREADABLE:
                 return file
     return None
 
@@ -182,6 +185,7 @@ class History:
         """Names of assets by the names of their tags, from the newest list that the history has received."""
         return {row["tag"]: row["name"] for row in self._table("assets.parquet", ASSET_COLUMNS) if row["name"]}
 
+    @_asked
     def zones(self) -> dict[str, tuple[str, tuple[tuple[float, float], ...]]]:
         """Names and corners of all zones by their identifiers."""
         kind = tuple[tuple[float, float], ...]
@@ -337,12 +341,13 @@ class History:
 
     def _table(self, name: str, columns: dict[str, str]) -> list[dict[str, Any]]:
         file = self._site_folder / name
-        return read_table(file, columns).to_pylist() if file.exists() else []
+        rows = read_table(file, columns).to_pylist() if file.exists() else []
+        return [row for row in rows if row[next(iter(columns))] is not None]
 
     def _names(self) -> dict[int, str]:
         """The newest name of each number."""
         rows = self._table("names.parquet", NAME_COLUMNS | {"since": "int64"})
-        return {row["tag"]: row["name"] for row in sorted(rows, key=lambda row: row["since"])}
+        return {row["tag"]: row["name"] for row in sorted(rows, key=lambda row: row["since"] or 0) if row["name"]}
 
     def _tags(self, asked: Iterable[str]) -> dict[str, list[int]]:
         """Tags by their names or those of their assets, and their numbers. Raises SkylessError."""
@@ -502,7 +507,7 @@ def _listed(numbers: Iterable[int]) -> str:
 def _some(known: Iterable[str], kind: str) -> str:
     names = sorted(known)
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    return f"it has {', '.join(names[:_NAMED])}{more}" if names else f"it has no {kind} yet"
+    return f"it has {', '.join(name[:40] for name in names[:_NAMED])}{more}" if names else f"it has no {kind} yet"
 
 
 def _write_features(file: Path, found: duckdb.DuckDBPyConnection, origin: GeoreferenceSite) -> int:

@@ -74,6 +74,7 @@ def read_table(file: Path, columns: dict[str, str], wanted: pc.Expression | None
     """Columns of the wanted rows of a file. Raises SkylessError: it cannot be read, or lacks one."""
     try:
         table = parquet.ParquetFile(file).read(columns=list(columns)).cast(schema_of(columns))
+        table.validate(full=True)  # texts are UTF-8
     except (OSError, ValueError, pa.ArrowException) as error:
         should = f"it should be a Parquet file with {', '.join(columns)}"
         raise SkylessError(f"{file} cannot be read; {should}: {error}") from None
