@@ -126,7 +126,7 @@ def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -
     for file in files:
         try:
             whole = parquet.ParquetFile(file, memory_map=True, pre_buffer=False)
-            if not {*wanted} <= {*whole.schema_arrow}:
+            if not {*wanted} <= {*whole.schema_arrow} or len({*whole.schema_arrow.names}) < len(whole.schema_arrow):
                 raise ValueError(f"its columns are {', '.join(whole.schema_arrow.names)}")
         except ValueError as error:  # ArrowInvalid is one
             raise SkylessError(f"{file} cannot be read; it should be a Parquet file of fixes: {error}") from None
