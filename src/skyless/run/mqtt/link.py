@@ -39,8 +39,8 @@ Handler = Callable[[str, bytes], None]
 
 READER_KEEPALIVE_S: Final = 20
 NODE_KEEPALIVE_S: Final = 10
-"""For how long a broker may be silent. It is pinged after half of that, and gives a client up after three quarters: one
-whose event loop stands for a quarter of it then loses the broker, as bridges did in bursts with 10 s."""
+"""For how long a broker may be silent. A link sends a ping after half of that time, and the broker disconnects a client
+that has been silent for three quarters: a busy event loop may delay a ping by a quarter. With 10 s bridges lost it."""
 
 _MAX_TOPICS: Final = 10_000
 _FIRST_WAIT_S: Final = 0.1
