@@ -39,7 +39,7 @@ _LONGEST_JUMP_TICKS: Final = TICK_RATE_HZ  # where clocks may have drifted farth
 def circular_mean(cycles: Array) -> tuple[float, float]:
     """Mean of phases, shape (n,), n > 0, without outliers, in [0, 1), and the scatter of one of them, in cycles."""
     kept, mean = cycles, 0.0
-    for sigmas in (1e9, 5.0, 3.0):
+    for sigmas in (1e9, 5.0, 3.0, 3.0, 3.0, 3.0):  # many wild phases move the first means
         off = (cycles - mean + 0.5) % 1.0 - 0.5
         kept = off[np.abs(off) <= sigmas * STD_OVER_MAD * float(np.median(np.abs(off))) + 1e-9]
         mean += float(np.angle(np.exp(2j * np.pi * kept).sum()) / (2.0 * np.pi))
