@@ -19,11 +19,13 @@ from typing import Any
 
 import numpy as np
 from msgspec import structs
+from recorded_phases import MARGINS_S, stops_of, tracked
 
 from skyless.core.errors import SkylessError
 from skyless.core.estimator import settings as parameters
-from skyless.core.site import EXACT, Site
+from skyless.core.site import EXACT, AccuracySite, Site
 from skyless.research.benchmark.recordings import Found, recordings_below
+from skyless.research.foreign import _muloc as muloc
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions
 from skyless.research.studies import loss, motion, nlos, room
@@ -31,7 +33,8 @@ from skyless.research.studies.common.plan import Plan, plan_of
 from skyless.research.studies.common.summary import Case
 from skyless.research.studies.common.worlds import Run, beacons_of, judged, worlds
 from skyless.sim.evaluation.scenarios import Room, wanderers
-from skyless.sim.lab import lab_site
+from skyless.sim.impairments import AnchorBias, Body
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.trajectory import Trajectory, Waypoints
 from skyless.site.file.template import rectangular_site
 
@@ -41,16 +44,12 @@ DIFFERENCES = "skyless.research.masterless.difference_tracking:"
 MECHANISMS: dict[str, dict[str, float]] = {
     "": {},
     "Jumps of range errors": {"in_row": OFF, "in_row_where_late": OFF},
-    "… are easier after others": {"obstructed_suspect": 3.0, "obstructed_together": 7.0},
-    "… only while the anchor's clock is steady": {"steady_walk_scale": OFF},
-    "… not where multipath is as large": {"multipath_std_m": OFF},
     "… widen all range errors": {"jump_rise": 0.0},
     "… may still be changing": {"first_change_scale": 1.0, "change_growth": 1.0},
     "… grow while innovations stay on one side": {"change_growth": 1.0},
     "… of more than 20 cm return slowly": {"obstruction_return_m": OFF},
     "… end where the error is small": {"ended_std_m": 0.0},
-    "Single late packets": {"late_often_share": OFF, "late_probability_density": 0.0},
-    "… narrow the gate": {"late_probability_density": 0.0},
+    "Single late packets": {"late_often_share": OFF},
     "… need more in a row for a jump": {"in_row_where_late": 2},
     "… less weight of large innovations": {"reception_huber": OFF},
     "… weak first paths": {"skyless.core.air.first_path:CLEAR_DB": OFF},
@@ -63,6 +62,7 @@ MECHANISMS: dict[str, dict[str, float]] = {
     "Noise of the tag's clock adapts": {"walk_scale_gain": 1.0, "common": OFF},
     "… a step of it is seen at once": {"common": OFF},
     "Jumps of anchors' clocks and of pairs": {"relays_in_row": OFF},
+    "Reports only of steady clocks": {"steady_walk_scale": OFF},
     "Covariance is scaled by NIS": {"inconsistent_nis": OFF},
     "Multipath is learnt": {"place_samples": OFF},
     "Ranges are linearised at held points": {"held_step_m": 0.0, "held_max_m": 0.0},
@@ -98,15 +98,12 @@ ROOM = {
     "one anchor 20 cm off": "off",
     "multipath of 5 cm over 10 cm": "multipath",
     "multipath of 10 cm over 10 cm": "10 cm",
-    "past a wall": "wall",
-    "a body": "body",
     "1 of 6 late, 0.1–0.4 m": "1 late",
     "2 of 6 late, 0.1–0.4 m, 6 s": "2 late, 6 s",
     "2 of 6 late, 0.5–2 m": "2 late, far",
     "3 of 6 late, 0.5–2 m": "3 late, far",
     "1 of 6 creeps 5 cm/s for 5 s": "creep",
     "tags' crystals +2 ppm": "crystal",
-    "all anchors' crystals ±0.03–0.1 ppm/s": "draughts",
     "turns of 30 m/s² at 3 m/s": "turns",
 }
 LAB = {
@@ -143,8 +140,41 @@ def cases(seed: int, count: int) -> list[Case]:
     plan = structs.replace(plan, worlds=count)
     in_lab = [case for case in (*loss.cases(plan), *nlos.cases(plan), *motion.cases(plan)) if case.name in LAB]
     named = {ROOM.get(case.name) or LAB[case.name]: case for case in (*in_room, *in_lab)}
+    named |= {case.name: case for case in in_both_protocols(structs.replace(plan, tags=2, seconds=12.0))}
     named |= {case.name: case for case in starts(structs.replace(plan, tags=16, seconds=START_S))}
     return [structs.replace(case, name=name, runs=case.runs[:count]) for name, case in named.items()]
+
+
+def in_both_protocols(plan: Plan) -> list[Case]:
+    """What goes wrong for all anchors or messages at once, with a master (1) and without (2), in the room's errors."""
+    crystals = {"crystals": (100.0, 300.0, 1e4), "fast crystals": (300.0, 1000.0, 1e4), "power cut": (0.5, 3.0, 60.0)}
+    faults: dict[str, dict[str, Any]] = {
+        "room": {},
+        **{name: {"warm_ups": partial(room.warming_anchors, plan, *of)} for name, of in crystals.items()},
+        "10 % late": {"nlos": 0.1},
+        "30 % late": {"nlos": 0.3},
+        "wall": {"walls_between_anchors": False},
+        "body": {"body": Body()},
+        "carried": {"body": Body(delay_m=0.4, sector_rad=2.4)},
+        "drifts off": {"biases": drifting_anchor},
+    }
+    found = []
+    for protocol, site in ((1, paper_lab_site(plan.noise_ps, AccuracySite())), (2, lab_site(plan.noise_ps))):
+        walled = structs.replace(site, walls=(room.WALL,))
+        for name, more in faults.items():
+            paths = partial(room.past_wall, plan.tags) if name == "wall" else partial(wanderers, site, plan.tags)
+            runs = worlds(plan, walled if name == "wall" else site, paths, room=Room(), warmup_s=1.5, **more)
+            found.append(Case(f"{name} ({protocol})", "both protocols", None, runs))
+    return found
+
+
+def drifting_anchor(number: int) -> tuple[AnchorBias, ...]:
+    """An anchor whose range error grows by 1 to 5 m/s for a second, and then stays."""
+    creep_mps = (1.0, 2.0, 5.0)[number % 3]
+    return (
+        AnchorBias(number % 6 + 1, 0.0, from_s=5.0, to_s=6.0, creep_mps=creep_mps),
+        AnchorBias(number % 6 + 1, creep_mps, from_s=6.0, to_s=np.inf),
+    )
 
 
 def starts(plan: Plan) -> list[Case]:
@@ -233,6 +263,22 @@ def recorded(found: Found, first_s: float, mechanisms: dict[str, dict[str, float
     return sums
 
 
+def packets(path: Path, channel: int, has_phases: bool, mechanisms: dict[str, dict[str, float]]) -> Sums:
+    """The same of MULoc's packets of one channel, at its stops."""
+    sums = {}
+    for name, changes in mechanisms.items():
+        with switched(changes):
+            rows, total = tracked(path, channel, has_phases=has_phases), np.zeros(5)
+        for begin_s, end_s, place_m in stops_of(path):
+            own = rows[(rows[:, 0] >= begin_s + MARGINS_S[0]) & (rows[:, 0] <= end_s - MARGINS_S[1])]
+            error_m, covariances, levels_m = own[:, 1:3] - place_m, own[:, 3:7].reshape(-1, 2, 2), own[:, 7]
+            nees = np.einsum("ni,nij,nj->", error_m, np.linalg.inv(covariances), error_m) / 2.0
+            exceeded = (np.hypot(*error_m.T) > levels_m).sum()
+            total += (len(own), (error_m**2).sum(), nees, np.isfinite(levels_m).sum(), exceeded)
+        sums[name] = total.tolist()
+    return sums
+
+
 def call(cell: tuple[str, Callable[[], Sums]]) -> tuple[str, Sums]:
     """The work of one process."""
     name, function = cell
@@ -295,6 +341,11 @@ def main() -> None:
         else []
     )
     cells += [(name, partial(recorded, found, asked.first, chosen)) for name, found in below]
+    for path in sorted(asked.data.glob("muloc/*.npz")) if asked.data else []:
+        for channel in muloc.CHANNELS:
+            for has_phases in (False, True):
+                name = f"MULoc {channel}, {'phases' if has_phases else 'stamps'}"
+                cells.append((name, partial(packets, path, channel, has_phases, chosen)))
     cells = [cell for cell in cells if any(word in cell[0] for word in asked.rows)]
     amounts = [asked.seed, asked.worlds, asked.first, *chosen]
     kept: list[tuple[str, Sums]] = []

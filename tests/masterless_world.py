@@ -24,21 +24,21 @@ TOLD_TICKS = 6.0
 """Scatter of told flights."""
 
 
-def path_m(t_s, speed_mps):
-    """A circle of 2 m about the middle, 1.2 m high; at rest on it with no speed."""
-    angle = 0.7 + speed_mps * t_s / 2.0
+def path_m(t_s, speed_mps, rest_s=0.0):
+    """A circle of 2 m about the middle, 1.2 m high, after a rest on it; at rest with no speed."""
+    angle = 0.7 + speed_mps * max(t_s - rest_s, 0.0) / 2.0
     return 4.5 + 2.0 * cos(angle), 3.5 + 2.0 * sin(angle), 1.2
 
 
 class MasterlessWorld:
     """Oscillators, antenna delays and the air between the nodes; node ``TAG`` listens."""
 
-    def __init__(self, seed, speed_mps=0.0, random_walk_fm=1e-9, delay_scatter_ticks=20.0):
+    def __init__(self, seed, speed_mps=0.0, random_walk_fm=1e-9, delay_scatter_ticks=20.0, rest_s=0.0):
         self.random = np.random.default_rng(seed)
         generators = [np.random.default_rng([seed, node]) for node in range(2 * TAG + 2)]
         self.clocks = make_clocks(OscillatorModel(random_walk_fm=random_walk_fm), generators[: TAG + 1])
         self.streams = Streams(generators[TAG + 1 :])
-        self.speed_mps = speed_mps
+        self.speed_mps, self.rest_s = speed_mps, rest_s
         scatter = self.random.normal(0.0, delay_scatter_ticks / 2.0, (TAG + 1, 2))
         self.delays = DELAY_TICKS + scatter  # of TX and RX
         self.late_m = {}
@@ -62,7 +62,7 @@ class MasterlessWorld:
         """A packet: its TX stamp, and the RX stamp of every node that heard it."""
         tx_ticks = self.read(sender, t_s)
         late = self.delays[sender, 0] + self.noise()
-        places = dict(ANCHORS_M) | {TAG: path_m(t_s, self.speed_mps)}
+        places = dict(ANCHORS_M) | {TAG: path_m(t_s, self.speed_mps, self.rest_s)}
         rx_ticks = {}
         for node, place_m in places.items():
             if node != sender:

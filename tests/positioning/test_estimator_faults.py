@@ -185,7 +185,7 @@ def test_lasting_faults_are_known_as_their_information_has_it():
     """While anchors join, fall silent, come again, and have faults that are opened."""
     episode = episode_of(MESH, 300, 4, ROOM_M)
     frames = np.arange(len(episode.packets.anchors))
-    packets = late_from(episode.packets, 1, 0.6)
+    packets = late_from(episode.packets, 1, -0.6)
     packets = late_from(packets, 5, 0.3, begin=1600)
     silent = (packets.anchors == 3) & (frames > 400) & (frames < 1200)
     packets = kept(packets, ~silent & ((packets.anchors != 6) | (frames > 100)))

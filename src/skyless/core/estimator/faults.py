@@ -28,6 +28,7 @@ from skyless.core.estimator.state import (
     forget_lasting,
     learn_lasting,
     make_uncertain,
+    remove_anchor,
 )
 from skyless.core.native.arithmetic import exp, sqrt, square
 
@@ -172,12 +173,14 @@ def _open_new_faults(s: State, kind: int) -> None:
     """Open the range errors of the anchors whose faults explain the innovations about as well as any other's.
 
     A single one opens by itself; where it is open which of several it is, the position uses none of them,
-    as long as enough anchors are left.
+    as long as enough anchors are left. None opens where so few anchors are there that nothing could contradict it.
     """
     spare, explained = s.count - s.dim - 1, s.work[0]
     for anchor in range(s.count):
         spare -= int(s.anchors[anchor].is_obstructed)
         explained[anchor] = _explained_alone(s, kind, anchor)
+    if s.count < s.dim + 3:
+        return
     limit, first = _largest(s, kind) - s.tuning.rival_chi2, 0
     while spare > 0 and first >= 0:
         first = -1
@@ -227,7 +230,14 @@ def _open_lasting_faults(s: State, chi2: float) -> None:
 
 
 def _open_lasting_fault(s: State, anchor: int) -> None:
-    """Add a lasting fault to the state, and note that the anchor has one."""
+    """Add a lasting fault to the state, and note that the anchor has one.
+
+    Where single packets are late often, one that makes ranges much shorter is no fault of the anchor: its clock has
+    been wrong since a first packet that was late. It leaves, to join again.
+    """
+    if s.status.late_share > s.tuning.late_often_share and s.lasting_m[anchor] < -s.tuning.lasting_std_m:
+        remove_anchor(s, anchor)
+        return
     _open_fault(s, LASTING, anchor)
     s.anchors[anchor].has_fault = True
 

@@ -126,9 +126,8 @@ def _add_noise(s: State, value: int, other: int, of_values: float, of_both: floa
 
 
 def jump_share(s: State) -> float:
-    """1 where range errors have jumped recently, 0 where none has or learnt multipath is as large as a jump."""
-    status = s.status
-    return min(status.obstruction, 1.0) if status.place_variance_m2 < square(s.tuning.multipath_std_m) else 0.0
+    """1 where range errors have jumped recently, 0 where none has."""
+    return min(s.status.obstruction, 1.0)
 
 
 def range_error_decay(s: State, anchor: int, dt: float, walked_m: float) -> tuple[float, float, float]:

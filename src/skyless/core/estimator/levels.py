@@ -16,7 +16,6 @@ from skyless.core.constants import TICK_S
 from skyless.core.estimator.faults import fault_chi2, whiten
 from skyless.core.estimator.monitor import covariance_scale, is_warm
 from skyless.core.estimator.state import AXES, FAULT_KINDS, LASTING, State, at
-from skyless.core.estimator.verdicts import uses_phases
 from skyless.core.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
 from skyless.core.native.arithmetic import hypot, sqrt, square
 
@@ -59,9 +58,6 @@ def protect(s: State) -> None:
             up += square(s.V[2][row])
     levels[HPL] += settings.max_acceleration_mps2 * sqrt(squared)
     levels[VPL] += settings.max_acceleration_mps2 * sqrt(up)
-    if uses_phases(s):
-        levels[HPL] *= s.tuning.phase_levels
-        levels[VPL] *= s.tuning.phase_levels
 
 
 def largest_test(s: State) -> float:

@@ -33,6 +33,7 @@ from skyless.core.estimator.monitor import (
     end_small_obstruction,
     has_jumped,
     is_common,
+    is_of_clock,
     is_warm,
     learn_place,
     open_range_error,
@@ -48,6 +49,7 @@ from skyless.core.estimator.state import (
     make_uncertain,
     set_covariance,
 )
+from skyless.core.estimator.verdicts import is_late_often
 from skyless.core.native.arithmetic import floor, sqrt, square
 from skyless.core.native.records import Reals, Ticks
 from skyless.core.ticks import TICK_MASK
@@ -201,16 +203,20 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
         _carry_ticks(s, anchor)
         return USED
     a.innovation = innovation / sqrt(innovation_variance)
-    if status.late_share <= tuning.late_often_share:  # late packets are no multipath
+    if not is_late_often(s):  # late packets are no multipath
         learn_place(s, anchor, innovation + s.x[where.change + anchor])
     if is_warm(s) and abs(a.innovation) > tuning.common and is_common(s, a.innovation):
         status.walk_scale = settings.max_walk_scale
         a.outliers_in_row = 0
     elif is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
-        if a.relay_outliers_in_row >= tuning.relays_in_row:
+        if is_of_clock(s, anchor, innovation):
             return CLOCK_JUMPED
+        # what came after them shows that none of these was late
+        status.late_share = max(status.late_share - tuning.late_forgetting * (a.outliers_in_row - 1), 0.0)
         innovation = _jump(s, anchor, innovation, rx_variance)
         innovation_variance = compute_ph(s) + rx_variance
+        if innovation < -settings.gate * sqrt(innovation_variance):
+            return CLOCK_JUMPED
     scale = variance_scale(s, innovation, innovation_variance, False)
     if scale > 0.0:
         end_small_obstruction(s, anchor)
@@ -241,7 +247,8 @@ def _jump(s: State, anchor: int, innovation: float, rx_variance: float) -> float
     Obstacles make packets late: an early jump of an anchor that is not known to be obstructed ends an obstruction that
     has been there since it joined, and all its earlier receptions are considered again.
 
-    Returns the innovation that is left.
+    Returns the innovation that is left. If that is early by more than antennas explain and packets are late often, the
+    range error stays as it is: the anchor's clock has been wrong since a first packet that was late.
     """
     a, tuning = s.anchors[anchor], s.tuning
     if innovation < 0.0:
@@ -257,14 +264,16 @@ def _jump(s: State, anchor: int, innovation: float, rx_variance: float) -> float
         s.status.ends_of_obstructions += 1
         if innovation * innovation <= square(s.settings.gate) * (compute_ph(s) + rx_variance):
             return innovation
-    open_range_error(s, anchor, innovation)
+    if innovation > -tuning.lasting_std_m or not is_late_often(s):
+        open_range_error(s, anchor, innovation)
     return innovation
 
 
-def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> None:
+def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, variance_factor: float) -> None:
     """Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
 
-    All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``).
+    All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``). Where packets
+    are late often, this one may be.
     """
     settings, where, a = s.settings, s.layout, s.anchors[anchor]
     offset, noise = where.offset + anchor, where.tx_noise + anchor
@@ -278,7 +287,9 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> 
     _add_range_errors(s, anchor, 1.0)
     variance = settings.rx_variance_m2
     curvature_m = _find_curvature_m(s, range_m, variance)
-    variance += 2.0 * curvature_m * curvature_m + compute_ph(s)
+    variance = variance * variance_factor + 2.0 * curvature_m * curvature_m + compute_ph(s)
+    if is_late_often(s):
+        variance += square(s.tuning.late_std_m)
     open_state(s, offset, anchor, variance)
     a.offset_ticks = rx_ticks - tx_ticks - floor(range_m / TICK_M)
     rest_m = (rx_ticks - tx_ticks - a.offset_ticks) * TICK_M
@@ -496,8 +507,9 @@ def report(s: State, anchor: int, master: int, subticks: Ticks, variance_m2: flo
             find_rate(s, master, innovation, innovation_variance, elapsed_s)
             status.reports_used += 1
         return
-    if own_variance <= variance_m2:
-        return
+    wandering = max(a.walk_scale, s.anchors[master].walk_scale)
+    if own_variance <= variance_m2 or wandering > s.tuning.steady_walk_scale:
+        return  # the anchor's own filter has a fixed process noise: it lags behind clocks that wander more
     if innovation * innovation > square(s.settings.gate) * (own_variance + variance_m2):
         status.reports_rejected += 1
         return

@@ -2,7 +2,7 @@
 
 It must handle
 
-1. single late receptions, as paths are blocked for a moment: the gate, which narrows where they are frequent;
+1. single late receptions, as paths are blocked for a moment: the gate;
 2. an anchor behind an obstacle from now on, and its return: its range error jumps, and is estimated again;
 3. a person or a wall that obstructs several anchors in turn: a jump raises the process noise of all range errors;
 4. reflections that change as the tag walks: learnt from what range errors differ by from step to step;
@@ -16,21 +16,11 @@ Anchors that are late from the start, or ever more, without a jump are found by 
 says what each of these buys.
 """
 
-from typing import Final
-
 from skyless.core.estimator.faults import begin_obstruction
-from skyless.core.estimator.kalman import finish_updates, jump_share
+from skyless.core.estimator.kalman import finish_updates
 from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, at, make_uncertain
+from skyless.core.estimator.verdicts import is_late_often
 from skyless.core.native.arithmetic import log, sqrt, square
-
-_ROOT_2_PI: Final = 2.5066282746310002
-
-
-def gate_of(s: State) -> float:
-    """Beyond how many standard deviations a reception is more likely late than not."""
-    late, gate = min(s.status.late_share, 0.9), s.settings.gate
-    odds = late * s.tuning.late_probability_density * _ROOT_2_PI / (1.0 - late)
-    return min(gate, sqrt(-2.0 * log(odds))) if odds > 1e-6 else gate
 
 
 def is_warm(s: State) -> bool:
@@ -40,25 +30,17 @@ def is_warm(s: State) -> bool:
 
 def has_jumped(s: State, anchor: int, innovation: float, innovation_variance: float) -> bool:
     """Whether this reception and those before it show that an anchor's range error has jumped."""
-    a, status, tuning, settings = s.anchors[anchor], s.status, s.tuning, s.settings
-    clear = 0
-    for other in range(s.count):
-        clear += int(not s.anchors[other].is_obstructed)
-    is_easy = clear > s.dim + 1 and a.walk_scale <= tuning.steady_walk_scale
-    share = jump_share(s) if is_easy else 0.0  # else clocks, which all anchors share or which wander, would open all
-    suspect = tuning.suspect + share * (tuning.obstructed_suspect - tuning.suspect)
-    together = tuning.together + share * (tuning.obstructed_together - tuning.together)
-    if innovation * innovation <= suspect * suspect * innovation_variance:
+    a, tuning, settings = s.anchors[anchor], s.tuning, s.settings
+    if innovation * innovation <= square(tuning.suspect) * innovation_variance:
         a.outliers_in_row = 0
     else:
         stamps = 2.0 * (settings.tx_variance_m2 + settings.rx_variance_m2)
         apart, both = innovation - a.outlier_m, innovation + a.outlier_m
         agrees = a.outliers_in_row > 0 and apart * apart <= square(tuning.suspect) * stamps
-        agrees = agrees and both * both > together * together * innovation_variance
+        agrees = agrees and both * both > square(tuning.together) * innovation_variance
         a.outliers_in_row = a.outliers_in_row + 1 if agrees else 1
         a.outlier_m = innovation
-    often = status.late_share > tuning.late_often_share
-    return a.outliers_in_row >= (tuning.in_row_where_late if often else tuning.in_row)
+    return a.outliers_in_row >= (tuning.in_row_where_late if is_late_often(s) else tuning.in_row)
 
 
 def is_common(s: State, normalised: float) -> bool:
@@ -74,6 +56,16 @@ def is_common(s: State, normalised: float) -> bool:
         elif newest * normalised <= 0.0:
             others += 2
     return s.count > s.dim and others <= 1
+
+
+def is_of_clock(s: State, anchor: int, innovation: float) -> bool:
+    """Whether relays show that an anchor's clock has left its estimate to the side on which its reception is.
+
+    Where its range error has jumped instead, its receptions draw the estimate away, and relays lie on the other side.
+    """
+    a = s.anchors[anchor]
+    has_moved = a.relay_outliers_in_row >= s.tuning.relays_in_row or _is_off_zero(s, a.relay_mean)
+    return has_moved and a.relay_mean * innovation > 0.0
 
 
 def open_range_error(s: State, anchor: int, innovation: float) -> None:
@@ -125,9 +117,9 @@ def variance_scale(s: State, innovation: float, innovation_variance: float, is_d
     if not is_difference:
         status.late_share += tuning.late_forgetting * (beyond - status.late_share)
     status.rejected_share += forgetting * (beyond - status.rejected_share)
-    if is_beyond or (not is_difference and normalised > gate_of(s)):
+    if is_beyond:
         status.rejected += 1
-        status.rejected_in_row += int(is_beyond)
+        status.rejected_in_row += 1
         return 0.0
     status.accepted += 1
     status.rejected_in_row = 0
@@ -135,7 +127,7 @@ def variance_scale(s: State, innovation: float, innovation_variance: float, is_d
     status.mean_square_m2 += forgetting * (innovation * innovation - status.mean_square_m2)
     if is_difference:
         return max(1.0, abs(normalised) / tuning.difference_huber)
-    if status.late_share > tuning.late_often_share:
+    if is_late_often(s):
         return max(1.0, abs(normalised) / tuning.reception_huber)
     return 1.0
 

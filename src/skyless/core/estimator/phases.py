@@ -64,7 +64,6 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     if outcome == PHASE_REFUSED:
         status.wild_share += tuning.phase_forgetting * (1.0 - status.wild_share)
     elif outcome == PHASE_USED:
-        status.phase_ticks = status.epoch_ticks
         status.wild_share -= tuning.phase_forgetting * status.wild_share
         _learn_noise(s, square(innovation) - predicted)
         if a.has_former:

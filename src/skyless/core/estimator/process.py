@@ -222,7 +222,7 @@ def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
     predict(s, rx_ticks)
     fade_faults(s)
     if outcome == JOINED:
-        first_reception(s, anchor, rx_ticks, tx_ticks)
+        first_reception(s, anchor, rx_ticks, tx_ticks, packet.variance_factor)
     else:
         result = own_reception(s, anchor, rx_ticks, tx_ticks, packet.variance_factor)
         if result == CLOCK_JUMPED:
@@ -305,13 +305,19 @@ def _process_relay(s: State, relayed: Relay) -> None:
 
 
 def _check_motion_and_faults(s: State, elapsed_s: float) -> None:
-    """Check whether the tag stands still and, once in a round of packets, for faults."""
+    """Check whether the tag stands still and, once in a round of packets, for faults.
+
+    An anchor whose clock turns out to be wrong leaves, to join again.
+    """
     if s.settings.stationary_s > 0.0:
         update_stationary(s, elapsed_s)
         if is_stationary(s):
             zero_velocity(s)
-    if s.status.packets % s.count == 0:
+    count = s.count
+    if s.status.packets % count == 0:
         open_faults(s)
+        if s.count < count:
+            fit_plane(s)
 
 
 # What a fix carries

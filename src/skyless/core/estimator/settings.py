@@ -36,8 +36,11 @@ class Tuning(Record):
     """Factor on adapted process noise with each innovation that does not call for more."""
     common: float = 1.5
     """Normalised innovations of all anchors beyond this on one side: the tag's clock has left its rate."""
-    relays_in_row: float = 4
-    """Number of relays in a row beyond the gate that show a jump: of an anchor's clock, or of the path of a pair."""
+    relays_in_row: float = 8
+    """Number of relays in a row beyond the gate that show a jump, of an anchor's clock or of the path of a pair, and
+    not that relays are late often."""
+    steady_walk_scale: float = 4.0
+    """Factor on the random walk of a clock up to which it is steady, and anchors know their own as they report."""
 
     # Motion
     q_scale_gain: float = 1.05
@@ -74,8 +77,6 @@ class Tuning(Record):
     """Weight in the share of late receptions: the last 200."""
     late_often_share: float = 0.02
     """Share of late receptions beyond which single ones are late often."""
-    late_probability_density: float = 0.05
-    """Density of the normalised innovations of late receptions: a metre late at 5 cm."""
     reception_huber: float = 1.5
     """Normalised innovation beyond which receptions have less weight where they are late often (Huber 1964)."""
     difference_huber: float = 1.0
@@ -99,9 +100,9 @@ class Tuning(Record):
     jump_std_m: float = 0.2
     """Least standard deviation of a range error that has jumped [m]."""
     first_change_scale: float = 25.0
-    """Factor on the process noise of a range error that has just jumped: it may still be changing."""
+    """Factor on the process noise of a range error that has just jumped: it may still be changing …"""
     change_growth: float = 1.2
-    """Growth of that process noise while the mean of the anchor's innovations is off zero …"""
+    """… its growth while the mean of the anchor's innovations is off zero …"""
     change_loss: float = 0.97
     """… and its factor otherwise."""
     ended_std_m: float = 0.05
@@ -114,14 +115,6 @@ class Tuning(Record):
     """Time in which it returns to zero, and in which a jump is forgotten [s]."""
     obstruction_return_m: float = 0.2
     """Largest return in that time [m]: long delays are no less likely to stay."""
-    obstructed_suspect: float = 2.2
-    """Where others have jumped recently, a normalised innovation of this much may be a jump …"""
-    obstructed_together: float = 5.0
-    """… if two are together beyond this, and the anchor's clock is steady: by chance once in some thousand packets."""
-    steady_walk_scale: float = 4.0
-    """Factor on the random walk of a clock up to which it is steady."""
-    multipath_std_m: float = 0.06
-    """Learnt multipath of this standard deviation makes errors that would be taken for jumps [m]."""
     jump_rise: float = 0.5
     """Part of its full size by which a jump raises the process noise of all range errors."""
     obstructed_std_m: float = 0.08
@@ -182,7 +175,7 @@ class Tuning(Record):
     # Starts, and what is lost
     start_age_s: float = 0.5
     """Older packets are not used for a start; where superframes are longer, for the rate of the clock only [s]."""
-    curved_std: float = 0.05
+    curved_std: float = 0.1
     """Part of the mean range beyond which ranges are curved within a standard deviation: updates would make the filter
     sure of a wrong position. It has no level, and is not predicted further."""
     start_patience_s: float = 0.5
@@ -267,10 +260,6 @@ class Tuning(Record):
     """Number of phases of an anchor in a row beyond the gate at which its ambiguity begins again."""
     phase_nis: float = 2.0
     """Mean NIS of stamps beyond which a phase has a wrong cycle."""
-    phase_levels: float = 2.0
-    """Factor on levels where phases are in use: stamps that err alike for long show in no test …"""
-    phase_memory_s: float = 5.0
-    """… and the time for which they count as such after the last one [s]."""
     phase_after_s: float = 1.0
     """Time after the start from which phases are used [s]: places that still move by the stamps' noise would turn the
     directions to the anchors, which phases would take for motion."""

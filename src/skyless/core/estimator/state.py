@@ -254,8 +254,6 @@ class Status(Record):
     """Of a phase, as innovations show it."""
     wild_share: float
     """Running share of phases beyond the gate."""
-    phase_ticks: Ticks
-    """The tag's reading when a phase of its own was used last."""
     phases_used: Count
     phases_refused: Count
     phases_opened: Count
@@ -439,7 +437,7 @@ def prepare(s: State) -> None:
     status, settings, tuning = s.status, s.settings, s.tuning
     stamps_m2 = settings.tx_variance_m2 + settings.rx_variance_m2
     status.q_scale = status.mean_nis = 1.0
-    status.height_ticks = status.phase_ticks = NEVER
+    status.height_ticks = NEVER
     status.walk_scale = min(tuning.start_walk_scale, settings.max_walk_scale)
     status.fault_std_m[LASTING] = tuning.lasting_std_m
     status.fault_std_m[RECENT] = tuning.recent_std_m

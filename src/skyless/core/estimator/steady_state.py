@@ -213,7 +213,7 @@ def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
     """The tag's reception of a message."""
     a, where = s.anchors[message.anchor], s.layout
     if a.packets == 0:
-        first_reception(s, message.anchor, rx_ticks, rx_ticks)
+        first_reception(s, message.anchor, rx_ticks, rx_ticks, 1.0)
         s.V[where.offset + message.anchor][_walls(s)] += message.late_m
     else:
         elapsed_s = (rx_ticks - a.rx_ticks) * TICK_S

@@ -2,7 +2,6 @@
 
 from typing import Final
 
-from skyless.core.constants import TICK_S
 from skyless.core.estimator.faults import whiten
 from skyless.core.estimator.state import State, at
 from skyless.core.native.arithmetic import square
@@ -44,11 +43,6 @@ def has_phase(s: State, anchor: int) -> bool:
     """Whether phases of an anchor are in use: one has confirmed its ambiguity, and they are not refused."""
     own = s.anchors[anchor].own
     return own.is_known and own.refused_in_row < int(s.tuning.phases_in_row) - 1
-
-
-def uses_phases(s: State) -> bool:
-    """Whether phases of the tag's own have been used so recently that places still rest on them."""
-    return (s.status.epoch_ticks - s.status.phase_ticks) * TICK_S < s.tuning.phase_memory_s
 
 
 def horizontal_variance_m2(s: State, ahead_s: float) -> float:

@@ -209,10 +209,17 @@ INTERNAL void open_lasting_faults(State *s, real chi2);
 INTERNAL void open_lasting_fault(State *s, int32_t anchor);
 INTERNAL void end_lasting_fault(State *s, int32_t anchor);
 INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor);
-INTERNAL real gate_of(State *s);
+INTERNAL bool is_late_often(State *s);
+INTERNAL bool rejects_most(State *s);
+INTERNAL bool is_lost(State *s);
+INTERNAL bool relays_contradict(State *s);
+INTERNAL bool relays_fit(State *s);
+INTERNAL real horizontal_variance_m2(State *s, real ahead_s);
+INTERNAL bool fits_settings(State *s);
 INTERNAL bool is_warm(State *s);
 INTERNAL bool has_jumped(State *s, int32_t anchor, real innovation, real innovation_variance);
 INTERNAL bool is_common(State *s, real normalised);
+INTERNAL bool is_of_clock(State *s, int32_t anchor, real innovation);
 INTERNAL void open_range_error(State *s, int32_t anchor, real innovation);
 INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised);
 INTERNAL bool is_off_zero(State *s, real mean);
@@ -225,14 +232,6 @@ INTERNAL void adapt_process_noise(State *s, real normalised);
 INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised);
 INTERNAL real walk_scale(State *s, real scale, real mean);
 INTERNAL real covariance_scale(State *s);
-INTERNAL bool is_late_often(State *s);
-INTERNAL bool rejects_most(State *s);
-INTERNAL bool is_lost(State *s);
-INTERNAL bool relays_contradict(State *s);
-INTERNAL bool relays_fit(State *s);
-INTERNAL bool uses_phases(State *s);
-INTERNAL real horizontal_variance_m2(State *s, real ahead_s);
-INTERNAL bool fits_settings(State *s);
 INTERNAL void protect(State *s);
 INTERNAL real largest_test(State *s);
 INTERNAL void find_least_axis(State *s, int32_t dim);
@@ -252,7 +251,7 @@ INTERNAL real reception_terms(State *s, int32_t anchor, bool has_tx_noise);
 INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks, real variance_factor);
 INTERNAL void carry_ticks(State *s, int32_t anchor);
 INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance);
-INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
+INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks, real variance_factor);
 INTERNAL void open_state(State *s, int32_t state, int32_t own, real variance);
 INTERNAL void find_rate(State *s, int32_t anchor, real innovation, real innovation_variance, real elapsed_s);
 INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s, bool has_tx_noise);
@@ -403,7 +402,7 @@ INTERNAL void use_only(Course *c, Acquisition *q);
 INTERNAL void fill_alone(Course *c, Acquisition *q);
 INTERNAL bool begin_filter(Course *c, State *s, Acquisition *q, Relays *relays);
 INTERNAL void choose_packets(Course *c, Acquisition *q, Beginning *b);
-INTERNAL void insert_packet(Beginning *b, HeardPacket *one);
+INTERNAL void insert_packet(Beginning *b, HeardPacket *one, real factor);
 INTERNAL bool is_chosen(Course *c, Acquisition *q, int32_t place);
 INTERNAL void add_power(Neighbour *n, real power_dbm);
 INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks);
@@ -1487,7 +1486,6 @@ INTERNAL void prepare(State *s) {
     real stamps_m2 = settings->tx_variance_m2 + settings->rx_variance_m2;
     status->mean_nis = REAL(1.0);
     status->q_scale = REAL(1.0);
-    status->phase_ticks = NEVER;
     status->height_ticks = NEVER;
     status->walk_scale = min_real(tuning->start_walk_scale, settings->max_walk_scale);
     status->fault_std_m[LASTING] = tuning->lasting_std_m;
@@ -2004,11 +2002,9 @@ INTERNAL void add_noise(State *s, int32_t value, int32_t other, real of_values, 
 
 /* Range errors that change */
 
-/* 1 where range errors have jumped recently, 0 where none has or learnt multipath is as large as a jump. */
+/* 1 where range errors have jumped recently, 0 where none has. */
 INTERNAL real jump_share(State *s) {
-    Status *status = &s->status;
-    return status->place_variance_m2 < square(s->tuning.multipath_std_m) ? min_real(status->obstruction, REAL(1.0)) :
-            REAL(0.0);
+    return min_real(s->status.obstruction, REAL(1.0));
 }
 
 /* What an anchor's range errors keep over what has passed and was walked since its newest packet.
@@ -2490,13 +2486,16 @@ INTERNAL void open_faults(State *s) {
 /* Open the range errors of the anchors whose faults explain the innovations about as well as any other's.
  *
  * A single one opens by itself; where it is open which of several it is, the position uses none of them,
- * as long as enough anchors are left. */
+ * as long as enough anchors are left. None opens where so few anchors are there that nothing could contradict it. */
 INTERNAL void open_new_faults(State *s, int32_t kind) {
     int32_t spare = s->count - s->dim - 1;
     real *explained = s->work[0];
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         spare -= (int32_t)s->anchors[anchor].is_obstructed;
         explained[anchor] = explained_alone(s, kind, anchor);
+    }
+    if (s->count < s->dim + 3) {
+        return;
     }
     real limit = largest(s, kind) - s->tuning.rival_chi2;
     int32_t first = 0;
@@ -2569,8 +2568,15 @@ INTERNAL void open_lasting_faults(State *s, real chi2) {
     }
 }
 
-/* Add a lasting fault to the state, and note that the anchor has one. */
+/* Add a lasting fault to the state, and note that the anchor has one.
+ *
+ * Where single packets are late often, one that makes ranges much shorter is no fault of the anchor: its clock has
+ * been wrong since a first packet that was late. It leaves, to join again. */
 INTERNAL void open_lasting_fault(State *s, int32_t anchor) {
+    if (s->status.late_share > s->tuning.late_often_share && s->lasting_m[anchor] < -s->tuning.lasting_std_m) {
+        remove_anchor(s, anchor);
+        return;
+    }
     open_fault(s, LASTING, anchor);
     s->anchors[anchor].has_fault = true;
 }
@@ -2624,11 +2630,73 @@ INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
     s->status.faults_opened += 1;
 }
 
+/* What the estimator's counters say of its state: whether a new start is needed, and what that has to expect. */
+
+/* Whether single packets are late often. */
+INTERNAL bool is_late_often(State *s) {
+    return s->status.late_share > s->tuning.late_often_share;
+}
+
+/* Whether most measurements lie beyond the gate. */
+INTERNAL bool rejects_most(State *s) {
+    return s->status.rejected_share > s->tuning.lost_share;
+}
+
+/* Whether more packets are rejected than a right state would reject. */
+INTERNAL bool is_lost(State *s) {
+    int32_t in_row = s->status.rejected_in_row + s->status.stale_in_row;
+    real late = min_real(s->status.late_share, MOST_LATE);
+    return rejects_most(s) || (real)in_row * (REAL(1.0) - REAL(2.0) * late) >= s->tuning.lost_in_row;
+}
+
+/* Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks. */
+INTERNAL bool relays_contradict(State *s) {
+    Status *status = &s->status;
+    return status->relays_lately_rejected > max_real(s->tuning.max_relays_rejected, status->relays_lately_accepted);
+}
+
+/* Whether most of what anchors received of each other fits, and that is more than a few receptions. */
+INTERNAL bool relays_fit(State *s) {
+    Status *status = &s->status;
+    return status->relays_lately_accepted > max_real(s->tuning.max_relays_rejected, REAL(4.0) *
+            status->relays_lately_rejected);
+}
+
+/* Sum of the variances of x and y ``ahead_s`` later, if nothing is received until then. */
+INTERNAL real horizontal_variance_m2(State *s, real ahead_s) {
+    real total = REAL(2.0) * s->settings.qa * s->status.q_scale * ahead_s * ahead_s * ahead_s / REAL(3.0);
+    for (int32_t axis = 0; axis < 2; axis++) {
+        int32_t speed = s->layout.velocity + axis;
+        total += s->P[at(axis, axis)] + ahead_s * (REAL(2.0) * s->P[at(axis, speed)] + ahead_s * s->P[at(speed,
+                speed)]);
+    }
+    return total;
+}
+
+/* Whether the constants of the ranges are as small as the settings state, as far as they are known. */
+INTERNAL bool fits_settings(State *s) {
+    int32_t first = s->layout.constant;
+    int32_t count = s->count;
+    for (int32_t one = 0; one < count; one++) {
+        for (int32_t other = 0; other < one + 1; other++) {
+            s->work[one][other] = s->P[at(first + one, first + other)];
+        }
+        s->work[one][one] += square(s->settings.range_std_m);
+        s->work[count][one] = s->x[first + one];
+    }
+    whiten(s, count, 1);
+    real chi2 = REAL(0.0);
+    for (int32_t one = 0; one < count; one++) {
+        chi2 += square(s->work[count][one]);
+    }
+    return chi2 < s->tuning.fitting_chi2 * (real)count;
+}
+
 /* Which measurements are used, and how process noise is adapted to innovations.
  *
  * It must handle
  *
- * 1. single late receptions, as paths are blocked for a moment: the gate, which narrows where they are frequent;
+ * 1. single late receptions, as paths are blocked for a moment: the gate;
  * 2. an anchor behind an obstacle from now on, and its return: its range error jumps, and is estimated again;
  * 3. a person or a wall that obstructs several anchors in turn: a jump raises the process noise of all range errors;
  * 4. reflections that change as the tag walks: learnt from what range errors differ by from step to step;
@@ -2641,14 +2709,6 @@ INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
  * Anchors that are late from the start, or ever more, without a jump are found by ``faults``. ``docs/estimator_table.md``
  * says what each of these buys. */
 
-/* Beyond how many standard deviations a reception is more likely late than not. */
-INTERNAL real gate_of(State *s) {
-    real late = min_real(s->status.late_share, REAL(0.9));
-    real gate = s->settings.gate;
-    real odds = late * s->tuning.late_probability_density * ROOT_2_PI / (REAL(1.0) - late);
-    return odds > REAL(1e-06) ? min_real(gate, SQRT(-REAL(2.0) * log_(odds))) : gate;
-}
-
 /* Whether two packets of each anchor have been processed since the start. */
 INTERNAL bool is_warm(State *s) {
     return s->status.packets > 2 * s->count;
@@ -2657,30 +2717,20 @@ INTERNAL bool is_warm(State *s) {
 /* Whether this reception and those before it show that an anchor's range error has jumped. */
 INTERNAL bool has_jumped(State *s, int32_t anchor, real innovation, real innovation_variance) {
     Anchor *a = &s->anchors[anchor];
-    Status *status = &s->status;
     Tuning *tuning = &s->tuning;
     EstimatorSettings *settings = &s->settings;
-    int32_t clear = 0;
-    for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
-        clear += (int32_t)!s->anchors[other].is_obstructed;
-    }
-    bool is_easy = clear > s->dim + 1 && a->walk_scale <= tuning->steady_walk_scale;
-    real share = is_easy ? jump_share(s) : REAL(0.0);  /* else clocks, which all anchors share or which wander, would open all */
-    real suspect = tuning->suspect + share * (tuning->obstructed_suspect - tuning->suspect);
-    real together = tuning->together + share * (tuning->obstructed_together - tuning->together);
-    if (innovation * innovation <= suspect * suspect * innovation_variance) {
+    if (innovation * innovation <= square(tuning->suspect) * innovation_variance) {
         a->outliers_in_row = 0;
     } else {
         real stamps = REAL(2.0) * (settings->tx_variance_m2 + settings->rx_variance_m2);
         real apart = innovation - a->outlier_m;
         real both = innovation + a->outlier_m;
         bool agrees = a->outliers_in_row > 0 && apart * apart <= square(tuning->suspect) * stamps;
-        agrees = agrees && both * both > together * together * innovation_variance;
+        agrees = agrees && both * both > square(tuning->together) * innovation_variance;
         a->outliers_in_row = agrees ? a->outliers_in_row + 1 : 1;
         a->outlier_m = innovation;
     }
-    bool often = status->late_share > tuning->late_often_share;
-    return (real)a->outliers_in_row >= (often ? tuning->in_row_where_late : tuning->in_row);
+    return (real)a->outliers_in_row >= (is_late_often(s) ? tuning->in_row_where_late : tuning->in_row);
 }
 
 /* Whether the newest innovations of all anchors but one, which may show nothing, lie on the side of this one.
@@ -2697,6 +2747,15 @@ INTERNAL bool is_common(State *s, real normalised) {
         }
     }
     return s->count > s->dim && others <= 1;
+}
+
+/* Whether relays show that an anchor's clock has left its estimate to the side on which its reception is.
+ *
+ * Where its range error has jumped instead, its receptions draw the estimate away, and relays lie on the other side. */
+INTERNAL bool is_of_clock(State *s, int32_t anchor, real innovation) {
+    Anchor *a = &s->anchors[anchor];
+    bool has_moved = (real)a->relay_outliers_in_row >= s->tuning.relays_in_row || is_off_zero(s, a->relay_mean);
+    return has_moved && a->relay_mean * innovation > REAL(0.0);
 }
 
 /* Let an anchor's range error be estimated again from a jump on. */
@@ -2757,9 +2816,9 @@ INTERNAL real variance_scale(State *s, real innovation, real innovation_variance
         status->late_share += tuning->late_forgetting * (beyond - status->late_share);
     }
     status->rejected_share += forgetting * (beyond - status->rejected_share);
-    if (is_beyond || (!is_difference && normalised > gate_of(s))) {
+    if (is_beyond) {
         status->rejected += 1;
-        status->rejected_in_row += (int32_t)is_beyond;
+        status->rejected_in_row += 1;
         return REAL(0.0);
     }
     status->accepted += 1;
@@ -2769,7 +2828,7 @@ INTERNAL real variance_scale(State *s, real innovation, real innovation_variance
     if (is_difference) {
         return max_real(REAL(1.0), abs_real(normalised) / tuning->difference_huber);
     }
-    if (status->late_share > tuning->late_often_share) {
+    if (is_late_often(s)) {
         return max_real(REAL(1.0), abs_real(normalised) / tuning->reception_huber);
     }
     return REAL(1.0);
@@ -2901,73 +2960,6 @@ INTERNAL real covariance_scale(State *s) {
     return nis > s->tuning.inconsistent_nis ? nis * nis : REAL(1.0);
 }
 
-/* What the estimator's counters say of its state: whether a new start is needed, and what that has to expect. */
-
-/* Whether single packets are late often. */
-INTERNAL bool is_late_often(State *s) {
-    return s->status.late_share > s->tuning.late_often_share;
-}
-
-/* Whether most measurements lie beyond the gate. */
-INTERNAL bool rejects_most(State *s) {
-    return s->status.rejected_share > s->tuning.lost_share;
-}
-
-/* Whether more packets are rejected than a right state would reject. */
-INTERNAL bool is_lost(State *s) {
-    int32_t in_row = s->status.rejected_in_row + s->status.stale_in_row;
-    real late = min_real(s->status.late_share, MOST_LATE);
-    return rejects_most(s) || (real)in_row * (REAL(1.0) - REAL(2.0) * late) >= s->tuning.lost_in_row;
-}
-
-/* Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks. */
-INTERNAL bool relays_contradict(State *s) {
-    Status *status = &s->status;
-    return status->relays_lately_rejected > max_real(s->tuning.max_relays_rejected, status->relays_lately_accepted);
-}
-
-/* Whether most of what anchors received of each other fits, and that is more than a few receptions. */
-INTERNAL bool relays_fit(State *s) {
-    Status *status = &s->status;
-    return status->relays_lately_accepted > max_real(s->tuning.max_relays_rejected, REAL(4.0) *
-            status->relays_lately_rejected);
-}
-
-/* Whether phases of the tag's own have been used so recently that places still rest on them. */
-INTERNAL bool uses_phases(State *s) {
-    return (real)(s->status.epoch_ticks - s->status.phase_ticks) * TICK_S < s->tuning.phase_memory_s;
-}
-
-/* Sum of the variances of x and y ``ahead_s`` later, if nothing is received until then. */
-INTERNAL real horizontal_variance_m2(State *s, real ahead_s) {
-    real total = REAL(2.0) * s->settings.qa * s->status.q_scale * ahead_s * ahead_s * ahead_s / REAL(3.0);
-    for (int32_t axis = 0; axis < 2; axis++) {
-        int32_t speed = s->layout.velocity + axis;
-        total += s->P[at(axis, axis)] + ahead_s * (REAL(2.0) * s->P[at(axis, speed)] + ahead_s * s->P[at(speed,
-                speed)]);
-    }
-    return total;
-}
-
-/* Whether the constants of the ranges are as small as the settings state, as far as they are known. */
-INTERNAL bool fits_settings(State *s) {
-    int32_t first = s->layout.constant;
-    int32_t count = s->count;
-    for (int32_t one = 0; one < count; one++) {
-        for (int32_t other = 0; other < one + 1; other++) {
-            s->work[one][other] = s->P[at(first + one, first + other)];
-        }
-        s->work[one][one] += square(s->settings.range_std_m);
-        s->work[count][one] = s->x[first + one];
-    }
-    whiten(s, count, 1);
-    real chi2 = REAL(0.0);
-    for (int32_t one = 0; one < count; one++) {
-        chi2 += square(s->work[count][one]);
-    }
-    return chi2 < s->tuning.fitting_chi2 * (real)count;
-}
-
 /* Protection levels: how wrong a position may be, even if receptions are late (``docs/maths.md`` section 8).
  *
  * Hypothesis: the tag's receptions of every anchor are late (or early) by a constant of its own, all at once. With the
@@ -3030,10 +3022,6 @@ INTERNAL void protect(State *s) {
     }
     levels[HPL] += settings->max_acceleration_mps2 * SQRT(squared);
     levels[VPL] += settings->max_acceleration_mps2 * SQRT(up);
-    if (uses_phases(s)) {
-        levels[HPL] *= s->tuning.phase_levels;
-        levels[VPL] *= s->tuning.phase_levels;
-    }
 }
 
 /* The largest test of faults, χ² with as many degrees of freedom as there are anchors if there are none. */
@@ -3418,18 +3406,24 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
         return USED;
     }
     a->innovation = innovation / SQRT(innovation_variance);
-    if (status->late_share <= tuning->late_often_share) {  /* late packets are no multipath */
+    if (!is_late_often(s)) {  /* late packets are no multipath */
         learn_place(s, anchor, innovation + s->x[where->change + anchor]);
     }
     if (is_warm(s) && abs_real(a->innovation) > tuning->common && is_common(s, a->innovation)) {
         status->walk_scale = settings->max_walk_scale;
         a->outliers_in_row = 0;
     } else if (is_warm(s) && has_jumped(s, anchor, innovation, innovation_variance)) {
-        if ((real)a->relay_outliers_in_row >= tuning->relays_in_row) {
+        if (is_of_clock(s, anchor, innovation)) {
             return CLOCK_JUMPED;
         }
+        /* what came after them shows that none of these was late */
+        status->late_share = max_real(status->late_share - tuning->late_forgetting * (real)(a->outliers_in_row - 1),
+                REAL(0.0));
         innovation = jump(s, anchor, innovation, rx_variance);
         innovation_variance = compute_ph(s) + rx_variance;
+        if (innovation < -settings->gate * SQRT(innovation_variance)) {
+            return CLOCK_JUMPED;
+        }
     }
     real scale = variance_scale(s, innovation, innovation_variance, false);
     if (scale > REAL(0.0)) {
@@ -3463,7 +3457,8 @@ INTERNAL void carry_ticks(State *s, int32_t anchor) {
  * Obstacles make packets late: an early jump of an anchor that is not known to be obstructed ends an obstruction that
  * has been there since it joined, and all its earlier receptions are considered again.
  *
- * Returns the innovation that is left. */
+ * Returns the innovation that is left. If that is early by more than antennas explain and packets are late often, the
+ * range error stays as it is: the anchor's clock has been wrong since a first packet that was late. */
 INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance) {
     Anchor *a = &s->anchors[anchor];
     Tuning *tuning = &s->tuning;
@@ -3483,14 +3478,17 @@ INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance) 
             return innovation;
         }
     }
-    open_range_error(s, anchor, innovation);
+    if (innovation > -tuning->lasting_std_m || !is_late_often(s)) {
+        open_range_error(s, anchor, innovation);
+    }
     return innovation;
 }
 
 /* Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
  *
- * All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``). */
-INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks) {
+ * All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``). Where packets
+ * are late often, this one may be. */
+INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks, real variance_factor) {
     EstimatorSettings *settings = &s->settings;
     Layout *where = &s->layout;
     Anchor *a = &s->anchors[anchor];
@@ -3508,7 +3506,10 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     add_range_errors(s, anchor, REAL(1.0));
     real variance = settings->rx_variance_m2;
     real curvature_m = find_curvature_m(s, range_m, variance);
-    variance += REAL(2.0) * curvature_m * curvature_m + compute_ph(s);
+    variance = variance * variance_factor + REAL(2.0) * curvature_m * curvature_m + compute_ph(s);
+    if (is_late_often(s)) {
+        variance += square(s->tuning.late_std_m);
+    }
     open_state(s, offset, anchor, variance);
     a->offset_ticks = rx_ticks - tx_ticks - floor_real(range_m / TICK_M);
     real rest_m = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M;
@@ -3760,8 +3761,9 @@ INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks,
         }
         return;
     }
-    if (own_variance <= variance_m2) {
-        return;
+    real wandering = max_real(a->walk_scale, s->anchors[master].walk_scale);
+    if (own_variance <= variance_m2 || wandering > s->tuning.steady_walk_scale) {
+        return;  /* the anchor's own filter has a fixed process noise: it lags behind clocks that wander more */
     }
     if (innovation * innovation > square(s->settings.gate) * (own_variance + variance_m2)) {
         status->reports_rejected += 1;
@@ -3939,7 +3941,6 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     if (outcome == PHASE_REFUSED) {
         status->wild_share += tuning->phase_forgetting * (REAL(1.0) - status->wild_share);
     } else if (outcome == PHASE_USED) {
-        status->phase_ticks = status->epoch_ticks;
         status->wild_share -= tuning->phase_forgetting * status->wild_share;
         learn_noise(s, square(innovation) - predicted);
         if (a->has_former) {
@@ -4371,7 +4372,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
     predict(s, rx_ticks);
     fade_faults(s);
     if (outcome == JOINED) {
-        first_reception(s, anchor, rx_ticks, tx_ticks);
+        first_reception(s, anchor, rx_ticks, tx_ticks, packet->variance_factor);
     } else {
         int32_t result = own_reception(s, anchor, rx_ticks, tx_ticks, packet->variance_factor);
         if (result == CLOCK_JUMPED) {
@@ -4472,7 +4473,9 @@ INTERNAL void process_relay(State *s, Relay *relayed) {
     }
 }
 
-/* Check whether the tag stands still and, once in a round of packets, for faults. */
+/* Check whether the tag stands still and, once in a round of packets, for faults.
+ *
+ * An anchor whose clock turns out to be wrong leaves, to join again. */
 INTERNAL void check_motion_and_faults(State *s, real elapsed_s) {
     if (s->settings.stationary_s > REAL(0.0)) {
         update_stationary(s, elapsed_s);
@@ -4480,8 +4483,12 @@ INTERNAL void check_motion_and_faults(State *s, real elapsed_s) {
             zero_velocity(s);
         }
     }
-    if (floor_mod_64(s->status.packets, s->count) == 0) {
+    int32_t count = s->count;
+    if (floor_mod_64(s->status.packets, count) == 0) {
         open_faults(s);
+        if (s->count < count) {
+            skyless_fit_plane(s);
+        }
     }
 }
 
@@ -4745,7 +4752,7 @@ INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
     Anchor *a = &s->anchors[message->anchor];
     Layout *where = &s->layout;
     if (a->packets == 0) {
-        first_reception(s, message->anchor, rx_ticks, rx_ticks);
+        first_reception(s, message->anchor, rx_ticks, rx_ticks, REAL(1.0));
         s->V[where->offset + message->anchor][walls(s)] += message->late_m;
     } else {
         real elapsed_s = (real)(rx_ticks - a->rx_ticks) * TICK_S;
@@ -5910,12 +5917,13 @@ INTERNAL void put_on_one_scale(Acquisition *q, int64_t now) {
         }
     }
     int32_t kept = 0;
+    q->is_linked = q->best.count >= stated;
     for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
         HeardAnchor *one = &q->heard[q->pairs[pair]];
         bool is_kept = one->older.packet.is_stated && one->newer.packet.is_stated;
         one->older.scaled = one->older.packet.stated;
         one->newer.scaled = one->newer.packet.stated;
-        if (q->best.count >= stated) {
+        if (q->is_linked) {
             is_kept = q->best.is_reached[pair] == 1;
             if (is_kept) {
                 convert(q, pair, &one->older);
@@ -6595,28 +6603,36 @@ INTERNAL bool begin_filter(Course *c, State *s, Acquisition *q, Relays *relays) 
     return true;
 }
 
-/* Copy the last packets of each anchor with which to begin. */
+/* Copy the last packets of each anchor with which to begin.
+ *
+ * The residuals of the start are those of the newer ones. Where packets contradicted each other before and these do
+ * not, an older one may be late, and must not decide what its anchor's clock reads if relays show that as well. */
 INTERNAL void choose_packets(Course *c, Acquisition *q, Beginning *b) {
+    real factor = REAL(1.0);
+    if (q->is_linked && q->is_contradicted && !q->start.is_contradicted) {
+        factor += square(c->tuning.lasting_std_m) / c->settings.rx_variance_m2;
+    }
     for (int32_t place = 0, place_end = q->count; place < place_end; place++) {
         if (is_chosen(c, q, place)) {
-            insert_packet(b, &q->heard[place].newer);
+            insert_packet(b, &q->heard[place].newer, REAL(1.0));
         }
     }
     for (int32_t place = 0, place_end = q->count; place < place_end; place++) {
         if (q->heard[place].count > 1 && is_chosen(c, q, place)) {
-            insert_packet(b, &q->heard[place].older);
+            insert_packet(b, &q->heard[place].older, factor);
         }
     }
 }
 
-/* Add a packet behind those that were received before it. */
-INTERNAL void insert_packet(Beginning *b, HeardPacket *one) {
+/* Add a packet behind those that were received before it, with so much more variance. */
+INTERNAL void insert_packet(Beginning *b, HeardPacket *one, real factor) {
     int32_t place = b->count;
     while (place > 0 && b->packets[place - 1].packet.rx_ticks > one->packet.rx_ticks) {
         b->packets[place] = b->packets[place - 1];
         place -= 1;
     }
     b->packets[place] = *one;
+    b->packets[place].packet.variance_factor *= factor;
     b->count += 1;
 }
 
@@ -6794,41 +6810,39 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .stationary_s = REAL(0.0), .max_acceleration_mps2 = REAL(0.0), .max_walk_scale = REAL(10000.0),
             .integrity_risk = REAL(0.0001), .alert_limit_m = (real)__builtin_nan("")}, .tuning = {.restart_m =
             REAL(300.0), .start_walk_scale = REAL(100.0), .mean_gain = REAL(0.05), .mean_limit = REAL(9.0),
-            .walk_scale_gain = REAL(1.2), .scale_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row = REAL(4.0),
-            .q_scale_gain = REAL(1.05), .max_scale = REAL(100.0), .lag_limit = REAL(2.6), .lag_forgetting = REAL(0.01),
-            .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07), .stationary_std_mps = REAL(0.01),
-            .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share = REAL(0.01), .slope_from_m =
-            REAL(4.0), .forgetting = REAL(0.02), .inconsistent_nis = REAL(1.6), .late_forgetting = REAL(0.005),
-            .late_often_share = REAL(0.02), .late_probability_density = REAL(0.05), .reception_huber = REAL(1.5),
+            .walk_scale_gain = REAL(1.2), .scale_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row = REAL(8.0),
+            .steady_walk_scale = REAL(4.0), .q_scale_gain = REAL(1.05), .max_scale = REAL(100.0), .lag_limit =
+            REAL(2.6), .lag_forgetting = REAL(0.01), .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07),
+            .stationary_std_mps = REAL(0.01), .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share =
+            REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02), .inconsistent_nis = REAL(1.6),
+            .late_forgetting = REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5),
             .difference_huber = REAL(1.0), .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share =
             REAL(0.5), .suspect = REAL(3.0), .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0),
             .jump_std_m = REAL(0.2), .first_change_scale = REAL(25.0), .change_growth = REAL(1.2), .change_loss =
             REAL(0.97), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk = REAL(0.004),
-            .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .obstructed_suspect = REAL(2.2),
-            .obstructed_together = REAL(5.0), .steady_walk_scale = REAL(4.0), .multipath_std_m = REAL(0.06), .jump_rise
-            = REAL(0.5), .obstructed_std_m = REAL(0.08), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1),
-            .place_limit = REAL(2.0), .place_limited_mean = REAL(0.7421917096296904), .place_first = REAL(20.0),
-            .place_samples = REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 = REAL(0.0012), .place_kept =
-            REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3), .recent_std_m = REAL(0.08),
-            .creeping_std_m = REAL(0.2), .recent_packets = REAL(16.0), .creeping_s = REAL(3.0), .late_std_m = REAL(1.0),
-            .sure_chi2 = REAL(50.0), .rival_chi2 = REAL(20.0), .early_weight = REAL(0.8), .open_pair_std_m = REAL(0.1),
-            .pair_jump_m2 = REAL(0.25), .pair_relays = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s =
-            REAL(0.5), .curved_std = REAL(0.05), .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s
-            = REAL(1.0), .early_nis = REAL(2.0), .start_margin = REAL(4.0), .short_silence_s = REAL(0.1),
-            .longest_silence_s = REAL(5.0), .slow_superframe_s = REAL(0.2), .slow_curved_std = REAL(0.2),
-            .longest_superframe_s = REAL(2.0), .height_sigmas = REAL(5.0), .heights_in_row = REAL(20.0),
-            .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late = REAL(2.0), .late_penalty =
-            REAL(2.0), .staying_share = REAL(0.2), .staying_std = REAL(0.5), .window = REAL(60.0), .window_s =
-            REAL(1.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .chance = REAL(0.01),
-            .rival_m = REAL(0.5), .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m =
-            REAL(3.0), .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m =
-            REAL(0.006), .phase_forgetting = REAL(0.005), .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0),
-            .phase_gate = REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02), .phase_line_m = REAL(0.03),
-            .phase_former_s = REAL(0.5), .phases_in_row = REAL(4.0), .phase_nis = REAL(2.0), .phase_levels = REAL(2.0),
-            .phase_memory_s = REAL(5.0), .phase_after_s = REAL(1.0), .uncovered_chi2 = REAL(240.0), .max_open_level_std
-            = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2
-            = REAL(25.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true, .misfit = -1, .relays_may_contradict =
-            true, .may_begin_again = true};
+            .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5),
+            .obstructed_std_m = REAL(0.08), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1), .place_limit =
+            REAL(2.0), .place_limited_mean = REAL(0.7421917096296904), .place_first = REAL(20.0), .place_samples =
+            REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 = REAL(0.0012), .place_kept = REAL(0.1),
+            .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3), .recent_std_m = REAL(0.08), .creeping_std_m =
+            REAL(0.2), .recent_packets = REAL(16.0), .creeping_s = REAL(3.0), .late_std_m = REAL(1.0), .sure_chi2 =
+            REAL(50.0), .rival_chi2 = REAL(20.0), .early_weight = REAL(0.8), .open_pair_std_m = REAL(0.1), .pair_jump_m2
+            = REAL(0.25), .pair_relays = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s = REAL(0.5), .curved_std
+            = REAL(0.1), .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s = REAL(1.0), .early_nis
+            = REAL(2.0), .start_margin = REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0),
+            .slow_superframe_s = REAL(0.2), .slow_curved_std = REAL(0.2), .longest_superframe_s = REAL(2.0),
+            .height_sigmas = REAL(5.0), .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15), .fitting_chi2 =
+            REAL(2.0), .most_late = REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2), .staying_std =
+            REAL(0.5), .window = REAL(60.0), .window_s = REAL(1.0), .median_difference_std_m = REAL(0.08),
+            .late_start_std_m = REAL(0.14), .chance = REAL(0.01), .rival_m = REAL(0.5), .height_margin_m = REAL(1.0),
+            .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0), .zero_variance_m2 = REAL(10000.0),
+            .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006), .phase_forgetting = REAL(0.005),
+            .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =
+            REAL(0.1), .phase_step_m = REAL(0.02), .phase_line_m = REAL(0.03), .phase_former_s = REAL(0.5),
+            .phases_in_row = REAL(4.0), .phase_nis = REAL(2.0), .phase_after_s = REAL(1.0), .uncovered_chi2 =
+            REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0),
+            .shift_part = REAL(0.25), .apart_chi2 = REAL(25.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true,
+            .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
     t->owner.qa = qa;
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;

@@ -373,7 +373,6 @@ typedef double real;
 #define RESTART_SILENCE_PERIODS 4
 #define RESTART_SILENCE_TICKS INT64_C(12779520000)
 #define RIVAL_MINIMUM_CHI2 REAL(9.0)
-#define ROOT_2_PI REAL(2.5066282746310002)
 /* What rounding in single precision may make of a variance of lasting faults that is smaller. */
 #define ROUNDING_M2 REAL(1e-07)
 /* Variance of rounding to whole ticks. */
@@ -680,8 +679,11 @@ typedef struct Tuning {
     real scale_loss;  /* Factor on adapted process noise with each innovation that does not call for more. */
     /* Normalised innovations of all anchors beyond this on one side: the tag's clock has left its rate. */
     real common;
-    /* Number of relays in a row beyond the gate that show a jump: of an anchor's clock, or of the path of a pair. */
+    /* Number of relays in a row beyond the gate that show a jump, of an anchor's clock or of the path of a pair, and
+     * not that relays are late often. */
     real relays_in_row;
+    /* Factor on the random walk of a clock up to which it is steady, and anchors know their own as they report. */
+    real steady_walk_scale;
     real q_scale_gain;  /* Growth of the process noise of motion with each innovation. */
     real max_scale;  /* Largest factor on the process noise of motion, and of a range error that has jumped. */
     /* Mean square of the innovations along the axes, 1 where the filter is right, beyond which that noise grows. */
@@ -700,8 +702,6 @@ typedef struct Tuning {
     real inconsistent_nis;  /* Mean NIS beyond which covariances are scaled by its square. */
     real late_forgetting;  /* Weight in the share of late receptions: the last 200. */
     real late_often_share;  /* Share of late receptions beyond which single ones are late often. */
-    /* Density of the normalised innovations of late receptions: a metre late at 5 cm. */
-    real late_probability_density;
     /* Normalised innovation beyond which receptions have less weight where they are late often (Huber 1964). */
     real reception_huber;
     real difference_huber;  /* The same of time differences, always. */
@@ -715,22 +715,15 @@ typedef struct Tuning {
     real in_row_where_late;  /* … and where single receptions are late often. */
     real together;  /* Sum of two such normalised innovations: by chance once in some million packets. */
     real jump_std_m;  /* Least standard deviation of a range error that has jumped [m]. */
-    /* Factor on the process noise of a range error that has just jumped: it may still be changing. */
+    /* Factor on the process noise of a range error that has just jumped: it may still be changing … */
     real first_change_scale;
-    real change_growth;  /* Growth of that process noise while the mean of the anchor's innovations is off zero … */
+    real change_growth;  /* … its growth while the mean of the anchor's innovations is off zero … */
     real change_loss;  /* … and its factor otherwise. */
     real ended_std_m;  /* An obstruction has ended where the range error is known to this [m] … */
     real ended;  /* … and within this number of standard deviations of zero. */
     real obstructed_walk;  /* Density with which a range error that has jumped wanders [m²/s]. */
     real obstruction_memory_s;  /* Time in which it returns to zero, and in which a jump is forgotten [s]. */
     real obstruction_return_m;  /* Largest return in that time [m]: long delays are no less likely to stay. */
-    /* Where others have jumped recently, a normalised innovation of this much may be a jump … */
-    real obstructed_suspect;
-    /* … if two are together beyond this, and the anchor's clock is steady: by chance once in some thousand packets. */
-    real obstructed_together;
-    real steady_walk_scale;  /* Factor on the random walk of a clock up to which it is steady. */
-    /* Learnt multipath of this standard deviation makes errors that would be taken for jumps [m]. */
-    real multipath_std_m;
     real jump_rise;  /* Part of its full size by which a jump raises the process noise of all range errors. */
     real obstructed_std_m;  /* Standard deviation by which all range errors change where some have jumped [m] … */
     real obstructed_s;  /* … and the time in which they do [s]. */
@@ -826,8 +819,6 @@ typedef struct Tuning {
     /* Number of phases of an anchor in a row beyond the gate at which its ambiguity begins again. */
     real phases_in_row;
     real phase_nis;  /* Mean NIS of stamps beyond which a phase has a wrong cycle. */
-    real phase_levels;  /* Factor on levels where phases are in use: stamps that err alike for long show in no test … */
-    real phase_memory_s;  /* … and the time for which they count as such after the last one [s]. */
     /* Time after the start from which phases are used [s]: places that still move by the stamps' noise would turn the
      * directions to the anchors, which phases would take for motion. */
     real phase_after_s;
@@ -1073,6 +1064,7 @@ typedef struct Acquisition {
     ClockLink links[MAX_LINKS];
     bool has_been_wide;
     int64_t wide_ticks;  /* When a start was first possible, but wide. */
+    bool is_linked;  /* Whether TX times are on a common scale by relays, and not as anchors state them. */
     bool is_contradicted;
     int64_t contradicted_ticks;  /* When packets first contradicted each other. */
     /* Anchors with which two positions fitted alike; as many of them are tried again once a superframe only. */
@@ -1161,7 +1153,6 @@ typedef struct Status {
     real way_m;  /* … and the sum of all steps: unlike ``walked_m`` it does not grow at rest. */
     real phase_variance_m2;  /* Of a phase, as innovations show it. */
     real wild_share;  /* Running share of phases beyond the gate. */
-    int64_t phase_ticks;  /* The tag's reading when a phase of its own was used last. */
     int64_t phases_used;
     int64_t phases_refused;
     int64_t phases_opened;  /* Ambiguities that began, or began again … */

@@ -113,6 +113,8 @@ class Acquisition(Record):
     has_been_wide: bool
     wide_ticks: Ticks
     """When a start was first possible, but wide."""
+    is_linked: bool
+    """Whether TX times are on a common scale by relays, and not as anchors state them."""
     is_contradicted: bool
     contradicted_ticks: Ticks
     """When packets first contradicted each other."""
@@ -318,11 +320,12 @@ def _put_on_one_scale(q: Acquisition, now: Ticks) -> None:
             if q.reach.count > q.best.count:
                 q.best = q.reach
     kept = 0
+    q.is_linked = q.best.count >= stated
     for pair in range(q.pair_count):
         one = q.heard[q.pairs[pair]]
         is_kept = one.older.packet.is_stated and one.newer.packet.is_stated
         one.older.scaled, one.newer.scaled = one.older.packet.stated, one.newer.packet.stated
-        if q.best.count >= stated:
+        if q.is_linked:
             is_kept = q.best.is_reached[pair] == 1
             if is_kept:
                 _convert(q, pair, one.older)

@@ -246,22 +246,30 @@ def _begin_filter(c: Course, s: State, q: Acquisition, relays: Relays) -> bool:
 
 
 def _choose_packets(c: Course, q: Acquisition, b: Beginning) -> None:
-    """Copy the last packets of each anchor with which to begin."""
+    """Copy the last packets of each anchor with which to begin.
+
+    The residuals of the start are those of the newer ones. Where packets contradicted each other before and these do
+    not, an older one may be late, and must not decide what its anchor's clock reads if relays show that as well.
+    """
+    factor = 1.0
+    if q.is_linked and q.is_contradicted and not q.start.is_contradicted:
+        factor += square(c.tuning.lasting_std_m) / c.settings.rx_variance_m2
     for place in range(q.count):
         if _is_chosen(c, q, place):
-            _insert_packet(b, q.heard[place].newer)
+            _insert_packet(b, q.heard[place].newer, 1.0)
     for place in range(q.count):
         if q.heard[place].count > 1 and _is_chosen(c, q, place):
-            _insert_packet(b, q.heard[place].older)
+            _insert_packet(b, q.heard[place].older, factor)
 
 
-def _insert_packet(b: Beginning, one: HeardPacket) -> None:
-    """Add a packet behind those that were received before it."""
+def _insert_packet(b: Beginning, one: HeardPacket, factor: float) -> None:
+    """Add a packet behind those that were received before it, with so much more variance."""
     place = b.count
     while place > 0 and b.packets[place - 1].packet.rx_ticks > one.packet.rx_ticks:
         b.packets[place] = b.packets[place - 1]
         place -= 1
     b.packets[place] = one
+    b.packets[place].packet.variance_factor *= factor
     b.count += 1
 
 

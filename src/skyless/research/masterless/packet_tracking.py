@@ -35,6 +35,7 @@ MASTERLESS: Final = DIFFERENCES.changed(
     slope_std_m=0.05,
     phase_std_m=0.006,
     phase_wander=9e-4,
+    stationary_s=0.0,
 )
 """Ranges err as in ``DIFFERENCES``. In captures of TDoA3 anchors a reception is 4 cm off by itself.
 Phases count less than they could, as neither heights of recorded anchors are known nor their places to a centimetre."""
