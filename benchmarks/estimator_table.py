@@ -61,7 +61,7 @@ MECHANISMS: dict[str, dict[str, float]] = {
     "Noise of motion adapts": {"q_scale_gain": 1.0},
     "Noise of the tag's clock adapts": {"walk_scale_gain": 1.0, "common": OFF},
     "… a step of it is seen at once": {"common": OFF},
-    "Jumps of anchors' clocks and of pairs": {"relays_in_row": OFF},
+    "Jumps of pairs' paths": {"relays_in_row": OFF},
     "Reports only of steady clocks": {"steady_walk_scale": OFF},
     "Covariance is scaled by NIS": {"inconsistent_nis": OFF},
     "Multipath is learnt": {"place_samples": OFF},

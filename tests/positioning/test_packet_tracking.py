@@ -77,15 +77,17 @@ def test_a_walk_is_followed_and_the_errors_are_as_said(walked):
     assert sum(tracking.drops.values()) < 0.01 * len(timed)
 
 
+@pytest.mark.parametrize("looks_for_rest", [False, True])
 @pytest.mark.parametrize("seed", range(4))
-def test_a_fault_needs_an_anchor_that_could_contradict_it(seed):
+def test_a_fault_needs_an_anchor_that_could_contradict_it(seed, looks_for_rest):
     """Four anchors in two dimensions: a tag that stands and then drives off moves, instead of an anchor's range error.
 
     On recorded packets one got a fault of 38 cm that it did not have, and nothing was left to contradict that.
     """
     _, timed = capture("tdoa3", seed=seed, seconds=12.0, speed_mps=0.25, rest_s=3.5)
     four = [(t_s, packet) for t_s, packet in timed if packet.anchor in {0, 2, 4, 6}]
-    tracking, rows, _ = follow(four, 0.25, height_m=1.2, rest_s=3.5)
+    settings = MASTERLESS.changed(stationary_s=3.0 if looks_for_rest else 0.0)
+    tracking, rows, _ = follow(four, 0.25, height_m=1.2, rest_s=3.5, settings=settings)
     assert tracking.tracking.excluded == ()
     assert len(rows) > 0.98 * sum(t_s >= 1.0 for t_s, _ in four)
     assert rmse_m(rows, 2) < 0.08

@@ -173,7 +173,7 @@ def _open_new_faults(s: State, kind: int) -> None:
     """Open the range errors of the anchors whose faults explain the innovations about as well as any other's.
 
     A single one opens by itself; where it is open which of several it is, the position uses none of them,
-    as long as enough anchors are left. None opens where so few anchors are there that nothing could contradict it.
+    as long as enough anchors are left. None opens where there are too few anchors to contradict it afterwards.
     """
     spare, explained = s.count - s.dim - 1, s.work[0]
     for anchor in range(s.count):
@@ -232,8 +232,8 @@ def _open_lasting_faults(s: State, chi2: float) -> None:
 def _open_lasting_fault(s: State, anchor: int) -> None:
     """Add a lasting fault to the state, and note that the anchor has one.
 
-    Where single packets are late often, one that makes ranges much shorter is no fault of the anchor: its clock has
-    been wrong since a first packet that was late. It leaves, to join again.
+    Nothing makes ranges much shorter. Where single packets are often late, the first packet was, from which the
+    anchor's clock was taken: it leaves the state instead, to join again with its next packet.
     """
     if s.status.late_share > s.tuning.late_often_share and s.lasting_m[anchor] < -s.tuning.lasting_std_m:
         remove_anchor(s, anchor)

@@ -211,7 +211,7 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
     elif is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
         if is_of_clock(s, anchor, innovation):
             return CLOCK_JUMPED
-        # what came after them shows that none of these was late
+        # the outliers counted as late; a jump shows that none of them was
         status.late_share = max(status.late_share - tuning.late_forgetting * (a.outliers_in_row - 1), 0.0)
         innovation = _jump(s, anchor, innovation, rx_variance)
         innovation_variance = compute_ph(s) + rx_variance
@@ -248,7 +248,7 @@ def _jump(s: State, anchor: int, innovation: float, rx_variance: float) -> float
     has been there since it joined, and all its earlier receptions are considered again.
 
     Returns the innovation that is left. If that is early by more than antennas explain and packets are late often, the
-    range error stays as it is: the anchor's clock has been wrong since a first packet that was late.
+    range error stays as it is: the first packet, from which the anchor's clock was taken, was late.
     """
     a, tuning = s.anchors[anchor], s.tuning
     if innovation < 0.0:
@@ -273,7 +273,7 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, var
     """Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
 
     All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``). Where packets
-    are late often, this one may be.
+    are often late, this one may be, which its variance then counts.
     """
     settings, where, a = s.settings, s.layout, s.anchors[anchor]
     offset, noise = where.offset + anchor, where.tx_noise + anchor
@@ -391,8 +391,6 @@ def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks
     if not -settings.gate <= normalised <= settings.gate:
         status.relays_rejected += 1
         status.relays_lately_rejected += 1.0
-        i.relay_outliers_in_row += 1
-        j.relay_outliers_in_row += 1
         link.outliers_in_row += 1
         if link.outliers_in_row >= tuning.relays_in_row:
             link.outliers_in_row = 0
@@ -401,7 +399,7 @@ def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks
         return False
     status.relays_used += 1
     status.relays_lately_accepted += 1.0
-    i.relay_outliers_in_row = j.relay_outliers_in_row = link.outliers_in_row = 0
+    link.outliers_in_row = 0
     share = link.variance_m2 / innovation_variance
     link.constant_m += share * innovation
     link.variance_m2 -= share * link.variance_m2

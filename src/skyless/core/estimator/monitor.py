@@ -59,13 +59,13 @@ def is_common(s: State, normalised: float) -> bool:
 
 
 def is_of_clock(s: State, anchor: int, innovation: float) -> bool:
-    """Whether relays show that an anchor's clock has left its estimate to the side on which its reception is.
+    """Whether it is an anchor's clock that has jumped, and not its range error.
 
-    Where its range error has jumped instead, its receptions draw the estimate away, and relays lie on the other side.
+    Then the mean of its relays' innovations is off zero with the sign of its reception's. After a jump of the range
+    error it has the opposite sign: the receptions have pulled the clock's estimate away from what relays show.
     """
-    a = s.anchors[anchor]
-    has_moved = a.relay_outliers_in_row >= s.tuning.relays_in_row or _is_off_zero(s, a.relay_mean)
-    return has_moved and a.relay_mean * innovation > 0.0
+    relay_mean = s.anchors[anchor].relay_mean
+    return _is_off_zero(s, relay_mean) and relay_mean * innovation > 0.0
 
 
 def open_range_error(s: State, anchor: int, innovation: float) -> None:

@@ -307,7 +307,7 @@ def _process_relay(s: State, relayed: Relay) -> None:
 def _check_motion_and_faults(s: State, elapsed_s: float) -> None:
     """Check whether the tag stands still and, once in a round of packets, for faults.
 
-    An anchor whose clock turns out to be wrong leaves, to join again.
+    An anchor whose clock is wrong leaves the state, to join again with its next packet.
     """
     if s.settings.stationary_s > 0.0:
         update_stationary(s, elapsed_s)

@@ -37,10 +37,9 @@ class Tuning(Record):
     common: float = 1.5
     """Normalised innovations of all anchors beyond this on one side: the tag's clock has left its rate."""
     relays_in_row: float = 8
-    """Number of relays in a row beyond the gate that show a jump, of an anchor's clock or of the path of a pair, and
-    not that relays are late often."""
+    """Number of relays of a pair in a row beyond the gate that show that its path has jumped; fewer may be late."""
     steady_walk_scale: float = 4.0
-    """Factor on the random walk of a clock up to which it is steady, and anchors know their own as they report."""
+    """Factor on the random walk of a clock up to which an anchor's report of it is used: its filter assumes 1."""
 
     # Motion
     q_scale_gain: float = 1.05

@@ -123,7 +123,6 @@ class Anchor(Record):
     """Factor on the process noise of a range error that has jumped."""
     has_fault: bool
     """Whether a lasting fault of it was added to the state."""
-    relay_outliers_in_row: int
     relay_mean: float
     """Running mean of what relays show of its clock, normalised."""
     walk_scale: float

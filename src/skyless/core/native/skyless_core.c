@@ -2486,7 +2486,7 @@ INTERNAL void open_faults(State *s) {
 /* Open the range errors of the anchors whose faults explain the innovations about as well as any other's.
  *
  * A single one opens by itself; where it is open which of several it is, the position uses none of them,
- * as long as enough anchors are left. None opens where so few anchors are there that nothing could contradict it. */
+ * as long as enough anchors are left. None opens where there are too few anchors to contradict it afterwards. */
 INTERNAL void open_new_faults(State *s, int32_t kind) {
     int32_t spare = s->count - s->dim - 1;
     real *explained = s->work[0];
@@ -2570,8 +2570,8 @@ INTERNAL void open_lasting_faults(State *s, real chi2) {
 
 /* Add a lasting fault to the state, and note that the anchor has one.
  *
- * Where single packets are late often, one that makes ranges much shorter is no fault of the anchor: its clock has
- * been wrong since a first packet that was late. It leaves, to join again. */
+ * Nothing makes ranges much shorter. Where single packets are often late, the first packet was, from which the
+ * anchor's clock was taken: it leaves the state instead, to join again with its next packet. */
 INTERNAL void open_lasting_fault(State *s, int32_t anchor) {
     if (s->status.late_share > s->tuning.late_often_share && s->lasting_m[anchor] < -s->tuning.lasting_std_m) {
         remove_anchor(s, anchor);
@@ -2749,13 +2749,13 @@ INTERNAL bool is_common(State *s, real normalised) {
     return s->count > s->dim && others <= 1;
 }
 
-/* Whether relays show that an anchor's clock has left its estimate to the side on which its reception is.
+/* Whether it is an anchor's clock that has jumped, and not its range error.
  *
- * Where its range error has jumped instead, its receptions draw the estimate away, and relays lie on the other side. */
+ * Then the mean of its relays' innovations is off zero with the sign of its reception's. After a jump of the range
+ * error it has the opposite sign: the receptions have pulled the clock's estimate away from what relays show. */
 INTERNAL bool is_of_clock(State *s, int32_t anchor, real innovation) {
-    Anchor *a = &s->anchors[anchor];
-    bool has_moved = (real)a->relay_outliers_in_row >= s->tuning.relays_in_row || is_off_zero(s, a->relay_mean);
-    return has_moved && a->relay_mean * innovation > REAL(0.0);
+    real relay_mean = s->anchors[anchor].relay_mean;
+    return is_off_zero(s, relay_mean) && relay_mean * innovation > REAL(0.0);
 }
 
 /* Let an anchor's range error be estimated again from a jump on. */
@@ -3416,7 +3416,7 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
         if (is_of_clock(s, anchor, innovation)) {
             return CLOCK_JUMPED;
         }
-        /* what came after them shows that none of these was late */
+        /* the outliers counted as late; a jump shows that none of them was */
         status->late_share = max_real(status->late_share - tuning->late_forgetting * (real)(a->outliers_in_row - 1),
                 REAL(0.0));
         innovation = jump(s, anchor, innovation, rx_variance);
@@ -3458,7 +3458,7 @@ INTERNAL void carry_ticks(State *s, int32_t anchor) {
  * has been there since it joined, and all its earlier receptions are considered again.
  *
  * Returns the innovation that is left. If that is early by more than antennas explain and packets are late often, the
- * range error stays as it is: the anchor's clock has been wrong since a first packet that was late. */
+ * range error stays as it is: the first packet, from which the anchor's clock was taken, was late. */
 INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance) {
     Anchor *a = &s->anchors[anchor];
     Tuning *tuning = &s->tuning;
@@ -3487,7 +3487,7 @@ INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance) 
 /* Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
  *
  * All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``). Where packets
- * are late often, this one may be. */
+ * are often late, this one may be, which its variance then counts. */
 INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks, real variance_factor) {
     EstimatorSettings *settings = &s->settings;
     Layout *where = &s->layout;
@@ -3622,8 +3622,6 @@ INTERNAL bool relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks
     if (!(-settings->gate <= normalised && normalised <= settings->gate)) {
         status->relays_rejected += 1;
         status->relays_lately_rejected += REAL(1.0);
-        i->relay_outliers_in_row += 1;
-        j->relay_outliers_in_row += 1;
         link->outliers_in_row += 1;
         if ((real)link->outliers_in_row >= tuning->relays_in_row) {
             link->outliers_in_row = 0;
@@ -3636,8 +3634,6 @@ INTERNAL bool relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks
     status->relays_used += 1;
     status->relays_lately_accepted += REAL(1.0);
     link->outliers_in_row = 0;
-    j->relay_outliers_in_row = 0;
-    i->relay_outliers_in_row = 0;
     real share = link->variance_m2 / innovation_variance;
     link->constant_m += share * innovation;
     link->variance_m2 -= share * link->variance_m2;
@@ -4475,7 +4471,7 @@ INTERNAL void process_relay(State *s, Relay *relayed) {
 
 /* Check whether the tag stands still and, once in a round of packets, for faults.
  *
- * An anchor whose clock turns out to be wrong leaves, to join again. */
+ * An anchor whose clock is wrong leaves the state, to join again with its next packet. */
 INTERNAL void check_motion_and_faults(State *s, real elapsed_s) {
     if (s->settings.stationary_s > REAL(0.0)) {
         update_stationary(s, elapsed_s);
@@ -6605,8 +6601,8 @@ INTERNAL bool begin_filter(Course *c, State *s, Acquisition *q, Relays *relays) 
 
 /* Copy the last packets of each anchor with which to begin.
  *
- * The residuals of the start are those of the newer ones. Where packets contradicted each other before and these do
- * not, an older one may be late, and must not decide what its anchor's clock reads if relays show that as well. */
+ * The start's residuals are those of each anchor's newer packet. If earlier packets contradicted each other and these
+ * do not, an older one may be late. Its variance is then larger, where relays show the anchor's clock as well. */
 INTERNAL void choose_packets(Course *c, Acquisition *q, Beginning *b) {
     real factor = REAL(1.0);
     if (q->is_linked && q->is_contradicted && !q->start.is_contradicted) {
@@ -6624,7 +6620,7 @@ INTERNAL void choose_packets(Course *c, Acquisition *q, Beginning *b) {
     }
 }
 
-/* Add a packet behind those that were received before it, with so much more variance. */
+/* Add a packet behind those received earlier; ``factor`` is on its variance. */
 INTERNAL void insert_packet(Beginning *b, HeardPacket *one, real factor) {
     int32_t place = b->count;
     while (place > 0 && b->packets[place - 1].packet.rx_ticks > one->packet.rx_ticks) {

@@ -679,10 +679,9 @@ typedef struct Tuning {
     real scale_loss;  /* Factor on adapted process noise with each innovation that does not call for more. */
     /* Normalised innovations of all anchors beyond this on one side: the tag's clock has left its rate. */
     real common;
-    /* Number of relays in a row beyond the gate that show a jump, of an anchor's clock or of the path of a pair, and
-     * not that relays are late often. */
+    /* Number of relays of a pair in a row beyond the gate that show that its path has jumped; fewer may be late. */
     real relays_in_row;
-    /* Factor on the random walk of a clock up to which it is steady, and anchors know their own as they report. */
+    /* Factor on the random walk of a clock up to which an anchor's report of it is used: its filter assumes 1. */
     real steady_walk_scale;
     real q_scale_gain;  /* Growth of the process noise of motion with each innovation. */
     real max_scale;  /* Largest factor on the process noise of motion, and of a range error that has jumped. */
@@ -1192,7 +1191,6 @@ typedef struct Anchor {
     real change_mean;  /* Running mean of its innovations since then, normalised. */
     real change_scale;  /* Factor on the process noise of a range error that has jumped. */
     bool has_fault;  /* Whether a lasting fault of it was added to the state. */
-    int32_t relay_outliers_in_row;
     real relay_mean;  /* Running mean of what relays show of its clock, normalised. */
     real walk_scale;  /* Factor on its oscillator's random walk. */
     real change_variance_m2;  /* Of the part of its range error that changes as the tag moves. */

@@ -248,8 +248,8 @@ def _begin_filter(c: Course, s: State, q: Acquisition, relays: Relays) -> bool:
 def _choose_packets(c: Course, q: Acquisition, b: Beginning) -> None:
     """Copy the last packets of each anchor with which to begin.
 
-    The residuals of the start are those of the newer ones. Where packets contradicted each other before and these do
-    not, an older one may be late, and must not decide what its anchor's clock reads if relays show that as well.
+    The start's residuals are those of each anchor's newer packet. If earlier packets contradicted each other and these
+    do not, an older one may be late. Its variance is then larger, where relays show the anchor's clock as well.
     """
     factor = 1.0
     if q.is_linked and q.is_contradicted and not q.start.is_contradicted:
@@ -263,7 +263,7 @@ def _choose_packets(c: Course, q: Acquisition, b: Beginning) -> None:
 
 
 def _insert_packet(b: Beginning, one: HeardPacket, factor: float) -> None:
-    """Add a packet behind those that were received before it, with so much more variance."""
+    """Add a packet behind those received earlier; ``factor`` is on its variance."""
     place = b.count
     while place > 0 and b.packets[place - 1].packet.rx_ticks > one.packet.rx_ticks:
         b.packets[place] = b.packets[place - 1]
