@@ -3,7 +3,8 @@
 One mechanism at a time is switched off, by values of constants with which it does nothing, and the same receptions are
 processed again: simulated rooms, the paper's lab, and recordings below ``--data``. The table has the RMSE over that
 with all mechanisms on. ``--kept FILE`` keeps the sums as JSON: a run that was interrupted continues there.
-``--only WORD`` takes the mechanisms that hold a word, ``--rows WORD`` the rows.
+``--only WORD`` takes the mechanisms that hold a word, ``--rows WORD`` the situations. ``--constants`` doubles and
+halves one constant at a time instead.
 """
 
 import argparse
@@ -129,8 +130,29 @@ RECORDED = (
 START_S = 1.4
 """For which starts are judged, from power-on."""
 
-SUMS = ("fixes", "squared_m2", "nees", "levels", "exceeded")
-Sums = dict[str, list[float]]
+Sums = list[list[float]]
+"""A row for each tag or recording: fixes, sum of squared errors [m²], of NEES, levels, fixes beyond their level."""
+
+BEYOND_SCATTER = 3.0
+"""Standard errors, over worlds, of the mean logarithm of a ratio."""
+LEAST_CHANGE = 0.02
+"""Smaller changes of an RMSE are not shown."""
+FEW_WORLDS_CHANGE = 0.1
+"""A change that rests on few worlds is shown from here on, in brackets."""
+
+
+FACTORS = ("× 2", "÷ 2")
+
+
+def constants() -> dict[str, dict[str, float]]:
+    """Each constant of ``Tuning`` doubled and halved; of factors near 1 their distance from that."""
+    found = {}
+    for name in parameters.Tuning.__annotations__:
+        value = getattr(parameters.TUNING, name)
+        for sign, factor in zip(FACTORS, (2.0, 0.5), strict=True):
+            is_near_one = 0.9 < value < 1.3 and value != 1.0
+            found[f"`{name}` {sign}"] = {name: 1.0 + factor * (value - 1.0) if is_near_one else factor * value}
+    return found
 
 
 def cases(seed: int, count: int) -> list[Case]:
@@ -232,18 +254,31 @@ def switched(changes: dict[str, float]) -> Iterator[None]:
             setattr(module, name, value)
 
 
-def simulated(run: Run, mechanisms: dict[str, dict[str, float]]) -> Sums:
-    """Sums over the fixes of a world, with each mechanism off; none where there is no fix."""
-    tape, sums = list(beacons_of(run)), {}
+def simulated(run: Run, mechanisms: dict[str, dict[str, float]]) -> dict[str, Sums]:
+    """Sums over the fixes of each tag of a world, with each mechanism off."""
+    tape, found = list(beacons_of(run)), {}
+    alone = [
+        [structs.replace(one, receptions=[heard for heard in one.receptions if heard[0] == tag]) for one in tape]
+        for tag in range(len(run.trajectories))
+    ]
     for name, changes in mechanisms.items():
         with switched(changes):
-            found = judged(run, tape)
-        levels = (0.0, 0.0) if found.levels is None else (found.levels.levels.sum(), found.levels.exceeded.sum())
-        sums[name] = [float(one) for one in (found.fixes, found.squared_m2, found.nees, *levels)]
-    return sums
+            results = [judged(run, of_tag) for of_tag in alone]
+        found[name] = []
+        for one in results:
+            levels = (0.0, 0.0) if one.levels is None else (one.levels.levels.sum(), one.levels.exceeded.sum())
+            found[name].append([float(value) for value in (one.fixes, one.squared_m2, one.nees, *levels)])
+    return found
 
 
-def recorded(found: Found, first_s: float, mechanisms: dict[str, dict[str, float]]) -> Sums:
+def sums_of(error_m: np.ndarray, covariances_m2: np.ndarray, levels_m: np.ndarray) -> list[float]:
+    """The same of fixes: errors, shape (n, dim), their covariances, and horizontal levels."""
+    nees = np.einsum("ni,nij,nj->", error_m, np.linalg.inv(covariances_m2), error_m) / error_m.shape[1]
+    exceeded = (np.hypot(error_m[:, 0], error_m[:, 1]) > levels_m).sum()
+    return [float(one) for one in (len(error_m), (error_m**2).sum(), nees, np.isfinite(levels_m).sum(), exceeded)]
+
+
+def recorded(found: Found, first_s: float, mechanisms: dict[str, dict[str, float]]) -> dict[str, Sums]:
     """The same of a recording."""
     sums = {}
     options = ReplayOptions(
@@ -255,83 +290,103 @@ def recorded(found: Found, first_s: float, mechanisms: dict[str, dict[str, float
             run = CaptureReplay(options)
             run.run(None, lambda _: None)
             table, (truth_m, is_judged) = run.samples.table(), run.judged.of(run.samples.table().time_s)
-        error_m, levels_m = (table.position_m - truth_m)[is_judged], table.levels_m[is_judged]
-        nees = np.einsum("ni,nij,nj->", error_m, np.linalg.inv(table.covariance_m2[is_judged]), error_m) / 3.0
-        exceeded = np.hypot(error_m[:, 0], error_m[:, 1]) > levels_m[:, 0]
-        levels = np.isfinite(levels_m[:, 0])
-        sums[name] = [float(one) for one in (len(error_m), (error_m**2).sum(), nees, levels.sum(), exceeded.sum())]
+        error_m = (table.position_m - truth_m)[is_judged]
+        sums[name] = [sums_of(error_m, table.covariance_m2[is_judged], table.levels_m[is_judged, 0])]
     return sums
 
 
-def packets(path: Path, channel: int, has_phases: bool, mechanisms: dict[str, dict[str, float]]) -> Sums:
-    """The same of MULoc's packets of one channel, at its stops."""
+def packets(path: Path, channel: int, has_phases: bool, mechanisms: dict[str, dict[str, float]]) -> dict[str, Sums]:
+    """The same of MULoc's packets of one channel, at each of its stops."""
     sums = {}
     for name, changes in mechanisms.items():
         with switched(changes):
-            rows, total = tracked(path, channel, has_phases=has_phases), np.zeros(5)
+            rows, sums[name] = tracked(path, channel, has_phases=has_phases), []
         for begin_s, end_s, place_m in stops_of(path):
             own = rows[(rows[:, 0] >= begin_s + MARGINS_S[0]) & (rows[:, 0] <= end_s - MARGINS_S[1])]
-            error_m, covariances, levels_m = own[:, 1:3] - place_m, own[:, 3:7].reshape(-1, 2, 2), own[:, 7]
-            nees = np.einsum("ni,nij,nj->", error_m, np.linalg.inv(covariances), error_m) / 2.0
-            exceeded = (np.hypot(*error_m.T) > levels_m).sum()
-            total += (len(own), (error_m**2).sum(), nees, np.isfinite(levels_m).sum(), exceeded)
-        sums[name] = total.tolist()
+            sums[name].append(sums_of(own[:, 1:3] - place_m, own[:, 3:7].reshape(-1, 2, 2), own[:, 7]))
     return sums
 
 
-def call(cell: tuple[str, Callable[[], Sums]]) -> tuple[str, Sums]:
+def call(cell: tuple[str, Callable[[], dict[str, Sums]]]) -> tuple[str, dict[str, Sums]]:
     """The work of one process."""
     name, function = cell
     return name, function()
 
 
-def markdown(rows: dict[str, dict[str, np.ndarray]]) -> str:
-    """Two tables: everything on, and the RMSE with each mechanism off over that."""
-    lines = ["| | fixes | RMSE | NEES | levels | exceeded |", "|---|---|---|---|---|---|"]
-    for row, by_name in rows.items():
-        fixes, squared_m2, nees, levels, exceeded = by_name[""]
-        rmse_cm, share = 100.0 * (squared_m2 / fixes) ** 0.5, 100.0 * levels / fixes
+Column = dict[str, list[np.ndarray]]
+"""Of each mechanism the sums of each world, shape (tags, 5)."""
+
+
+def markdown(columns: dict[str, Column]) -> str:
+    """Two tables: everything on, and what changes beyond the scatter of worlds with each mechanism off."""
+    lines = ["| | RMSE | worst tag | NEES | levels | exceeded |", "|---|---|---|---|---|---|"]
+    for name, column in columns.items():
+        tags = np.concatenate(column[""])
+        fixes, squared_m2, nees, levels, exceeded = tags.sum(axis=0)
+        worst_cm = 100.0 * np.max(np.sqrt(tags[:, 1] / np.maximum(tags[:, 0], 1.0)))
         lines.append(
-            f"| {row} | {fixes:.0f} | {rmse_cm:.2f} cm | {nees / fixes:.2f} | {share:.0f} % | {exceeded:.0f} |"
+            f"| {name} | {100.0 * (squared_m2 / fixes) ** 0.5:.2f} cm | {worst_cm:.1f} cm | {nees / fixes:.2f} "
+            f"| {100.0 * levels / fixes:.0f} % | {exceeded:.0f} |"
         )
-    lines += ["", f"| off | {' | '.join(rows)} |", "|---" * (len(rows) + 1) + "|"]
-    names = next(iter(rows.values()))
-    for name in (one for one in names if one):
-        lines.append(f"| {name} | {' | '.join(_cell(by_name[''], by_name[name]) for by_name in rows.values())} |")
+    names = [name for name in next(iter(columns.values())) if name]
+    if all(name.endswith(FACTORS) for name in names):
+        lines += ["", f"| constant | {' | '.join(FACTORS)} |", "|---|---|---|"]
+        for name in sorted({name.rpartition("`")[0] for name in names}):
+            both = (changes(columns, f"{name}` {factor}") for factor in FACTORS)
+            lines.append(f"| {name}` | {' | '.join(both)} |")
+    else:
+        lines += ["", "| off | what changes |", "|---|---|"]
+        lines += [f"| {name} | {changes(columns, name)} |" for name in names]
     return "\n".join(lines) + "\n"
 
 
-def _cell(on: np.ndarray, off: np.ndarray) -> str:
-    """RMSE over that with everything on, other numbers of fixes, a NEES worse by half, more levels exceeded."""
-    if not off[0]:
-        return "no fix"
-    if not on[0]:
-        return "fixes"
-    ratio = ((off[1] / off[0]) / (on[1] / on[0])) ** 0.5
-    parts = [f"{ratio:.2f}" if abs(ratio - 1.0) >= 0.005 else ""]
-    if abs(off[0] / on[0] - 1.0) >= 0.02:
-        parts.append(f"{100.0 * (off[0] / on[0] - 1.0):+.0f} % fixes")
-    if off[2] / off[0] > max(1.5 * on[2] / on[0], 1.3):
-        parts.append(f"(NEES {off[2] / off[0]:.1f})")
-    if off[3] / off[0] < on[3] / on[0] - 0.05:
-        parts.append(f"levels {100.0 * off[3] / off[0]:.0f} %")
-    if off[4] > on[4]:
-        parts.append(f"**{off[4] - on[4]:.0f} exceeded**")
-    return " ".join(part for part in parts if part) or "·"
+def changes(columns: dict[str, Column], name: str) -> str:
+    """What a mechanism changes in all columns."""
+    found = ((column, changed(by_name[""], by_name[name])) for column, by_name in columns.items())
+    return "; ".join(f"{column} {text}" for column, text in found if text) or "nothing"
+
+
+def changed(on: list[np.ndarray], off: list[np.ndarray]) -> str:
+    """What a mechanism changes in a column, empty where that is nothing beyond the scatter of worlds."""
+    worlds_on, worlds_off = (np.array([world.sum(axis=0) for world in side]) for side in (on, off))
+    fixes_on, squared_on, nees_on, levels_on, exceeded_on = worlds_on.sum(axis=0)
+    fixes_off, squared_off, nees_off, levels_off, exceeded_off = worlds_off.sum(axis=0)
+    if not fixes_on or not fixes_off:
+        return "" if fixes_on == fixes_off else "no fix" if fixes_on else "fixes"
+    ratio, parts = ((squared_off / fixes_off) / (squared_on / fixes_on)) ** 0.5, []
+    both = (worlds_on[:, 0] > 0.0) & (worlds_off[:, 0] > 0.0)
+    one, other = worlds_on[both], worlds_off[both]
+    logs = 0.5 * np.log((other[:, 1] / other[:, 0]) / (one[:, 1] / one[:, 0]))
+    error = np.std(logs, ddof=1) / len(logs) ** 0.5 if len(logs) > 1 else 0.0
+    if abs(ratio - 1.0) >= LEAST_CHANGE and abs(np.mean(logs)) > BEYOND_SCATTER * error:
+        parts.append(f"{ratio:.2f}")
+    elif abs(ratio - 1.0) >= FEW_WORLDS_CHANGE:
+        parts.append(f"({ratio:.2f})")
+    if abs(fixes_off / fixes_on - 1.0) >= LEAST_CHANGE:
+        parts.append(f"{100.0 * (fixes_off / fixes_on - 1.0):+.0f} % fixes")
+    if nees_off / fixes_off > max(1.5 * nees_on / fixes_on, 1.3):
+        parts.append(f"NEES {nees_off / fixes_off:.1f}")
+    if abs(levels_off / fixes_off - levels_on / fixes_on) > 0.05:
+        parts.append(f"levels {100.0 * levels_off / fixes_off:.0f} %")
+    if exceeded_off != exceeded_on:
+        parts.append(f"**{exceeded_off - exceeded_on:+.0f} exceeded**")
+    return ", ".join(parts)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=7)
-    parser.add_argument("--worlds", type=int, default=2, help="of each simulated row")
+    parser.add_argument("--worlds", type=int, default=2, help="of each simulated situation")
     parser.add_argument("--data", type=Path, help="folder of recordings")
     parser.add_argument("--first", type=float, default=60.0, help="seconds of each recording")
     parser.add_argument("--rows", nargs="*", default=[""])
     parser.add_argument("--only", nargs="*", default=[""])
     parser.add_argument("--kept", type=Path, help="file in which the sums are kept")
     parser.add_argument("--docs", type=Path, help="page whose part behind <!-- table --> is replaced")
+    parser.add_argument("--constants", action="store_true", help="each constant doubled and halved, instead")
     asked = parser.parse_args()
-    chosen = {name: off for name, off in MECHANISMS.items() if not name or any(word in name for word in asked.only)}
+    known = {"": {}, **constants()} if asked.constants else MECHANISMS
+    chosen = {name: off for name, off in known.items() if not name or any(word in name for word in asked.only)}
     cells = [
         (case.name, partial(simulated, run, chosen)) for case in cases(asked.seed, asked.worlds) for run in case.runs
     ]
@@ -348,7 +403,7 @@ def main() -> None:
                 cells.append((name, partial(packets, path, channel, has_phases, chosen)))
     cells = [cell for cell in cells if any(word in cell[0] for word in asked.rows)]
     amounts = [asked.seed, asked.worlds, asked.first, *chosen]
-    kept: list[tuple[str, Sums]] = []
+    kept: list[tuple[str, dict[str, Sums]]] = []
     if asked.kept and asked.kept.exists():
         of, kept = json.loads(asked.kept.read_text())
         if of != amounts:
@@ -361,15 +416,17 @@ def main() -> None:
             if asked.kept:
                 asked.kept.write_text(json.dumps([amounts, kept]))
             print(f"{len(kept)} of {len(cells)}: {name}", file=sys.stderr, flush=True)
-    rows: dict[str, dict[str, np.ndarray]] = {name: {} for name, _ in cells}
+    columns: dict[str, Column] = {name: {} for name, _ in cells}
     for name, sums in kept:
         for mechanism, values in sums.items():
-            rows[name][mechanism] = rows[name].get(mechanism, 0.0) + np.array(values)
-    text = markdown(rows)
+            columns[name].setdefault(mechanism, []).append(np.array(values))
+    text = markdown(columns)
     print(text)
     if asked.docs:
-        head = asked.docs.read_text().partition("<!-- table -->")[0]
-        asked.docs.write_text(f"{head}<!-- table -->\n\n{text}")
+        mark = "<!-- constants -->" if asked.constants else "<!-- table -->"
+        before, _, behind = asked.docs.read_text().partition(mark)
+        _, end, rest = behind.partition("<!-- end -->")
+        asked.docs.write_text(f"{before}{mark}\n\n{text}\n{end}{rest}")
 
 
 if __name__ == "__main__":

@@ -53,6 +53,20 @@ def walking(case=AGILE, superframes=200, seed=1, **others):
     return episode_of(case, superframes, seed, path_m=path_m, **others)
 
 
+@pytest.mark.parametrize(("late_share", "added_m2"), [(0.0, 0.0), (0.1, TUNING.late_std_m**2)])
+def test_what_is_known_of_a_clock_at_first_has_the_variance_of_the_packet(late_share, added_m2):
+    """A path that looks blocked multiplies that of the reception; where packets are often late, so may this one be."""
+    episode, variances_m2 = walking(superframes=2), []
+    for share, factor in ((0.0, 1.0), (late_share, 5.0)):
+        estimator = begun(episode, settings_of(AGILE), std_m=0.1)
+        estimator.state.status.late_share = share
+        estimator.process(*next(iter(one_by_one(episode.packets))), variance_factor=factor)
+        offset = estimator.state.layout.offset
+        variances_m2.append(seen(estimator.state).P[offset, offset])
+    wider_m2 = 4.0 * estimator.settings.rx_variance_m2 + added_m2
+    assert variances_m2[1] - variances_m2[0] == pytest.approx(wider_m2, rel=1e-6)
+
+
 @CASES
 @pytest.mark.parametrize("late_m", [0.5, 2.0, 30.0, -2.0])
 def test_a_single_late_packet_is_left_out(case, late_m):

@@ -75,6 +75,13 @@ def test_the_published_recording_is_replayed_without_options(recordings):
         pytest.skip(f"no recording at {path}")
     report = skyless.replay(path).reports["tag"]
     assert report.height_m == 0.0
-    assert report.judged > 30_000
-    assert report.rmse_2d_m < 0.1
+    assert report.measurements == "packets and phases"
+    assert report.judged > 15_000
+    assert report.rmse_2d_m < 0.05
     assert report.exceeded_horizontal == 0
+    stamps = skyless.replay(path, stamps_only=True).reports["tag"]
+    assert (stamps.measurements, stamps.judged) == ("packets", report.judged)
+    assert stamps.rmse_2d_m < 0.06
+    assert stamps.exceeded_horizontal == 0
+    differences = skyless.replay(path, measurements="differences").reports["tag"]
+    assert differences.judged > 30_000  # of both channels

@@ -50,8 +50,7 @@ READING_SHARE: Final = 0.1
 """Part of the time of a smoothed replay in which the recording is read."""
 
 FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
-"""Formats of which packets are used by default, as real captures showed that to be better; of Avalue's and MULoc's it
-was not."""
+"""Formats of which packets are used by default, as real captures showed that to be better; of Avalue's it was not."""
 
 
 _MAX_WITHOUT_ANCHORS: Final = 20_000
@@ -136,7 +135,10 @@ class CaptureReplay:
         self.measurements = self._measurements(kind)
         self._heights = known_heights(asked)
         path, anchors_m = asked.file, self._anchors_m
-        self.recording: Recording = open_recording(path, asked.format, asked.listener, anchors_m, asked.channel)
+        self._channel = asked.channel
+        if self._channel is None and self.measurements == PACKETS and kind.channels:
+            self._channel = kind.channels[0]  # stamps of two channels have other constants
+        self.recording: Recording = open_recording(path, asked.format, asked.listener, anchors_m, self._channel)
         self._qa = process_noise(asked.qa, asked.dynamics)
         self._calibration = calibration
         table = asked.anchors if isinstance(asked.anchors, str | Path) and not asked.uncalibrated else None
@@ -157,7 +159,7 @@ class CaptureReplay:
                 raise SkylessError(f"--measurements is 'packets'; {asked.needs_differences} needs differences")
             return DIFFERENCES_MADE
         if asked.measurements is None:
-            suits = self._has_phases or kind.is_dl_tdoa or (kind.name in FORMATS_BY_PACKETS and self._anchors_m)
+            suits = kind.channels or kind.is_dl_tdoa or (kind.name in FORMATS_BY_PACKETS and self._anchors_m)
             return PACKETS if suits and asked.tdoa_std_m is None else DIFFERENCES_MADE
         if asked.measurements == PACKETS and kind.tx_bits is None:
             wanted = f"it should be 'differences': {kind.name} holds no anchors' packets"
@@ -169,8 +171,7 @@ class CaptureReplay:
     @property
     def _has_phases(self) -> bool:
         """Whether phases of a channel's carrier are used."""
-        asked = self._asked
-        return asked.channel is not None and not asked.stamps_only and asked.measurements != DIFFERENCES_MADE
+        return self._channel is not None and not self._asked.stamps_only and self.measurements == PACKETS
 
     def _new_pipeline(self) -> Pipeline:
         if self.measurements == PACKETS:
@@ -191,7 +192,7 @@ class CaptureReplay:
         assert bits is not None
         qa = MASTERLESS.qa if self._qa is None else self._qa
         known = {"qa": qa, "height_m": self.height_m, "height_std_m": self._height_std_m}
-        known["carrier_cycles"] = CARRIER_CYCLES[self._asked.channel or 5] if self._has_phases else 0
+        known["carrier_cycles"] = CARRIER_CYCLES[self._channel or 5] if self._has_phases else 0
         is_dl_tdoa = self.recording.format.is_dl_tdoa
         tracking = PacketTracking(
             (DL_TDOA if is_dl_tdoa else MASTERLESS).changed(**known),

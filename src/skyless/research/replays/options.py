@@ -98,7 +98,7 @@ class RecordingOptions(ComputedOptions, frozen=True, kw_only=True):
     listener: str | None = None
     """Which receiver, in recordings with several."""
     channel: int | None = None
-    """Which radio channel, in recordings of several; phases of the carrier are used of one channel only."""
+    """Which radio channel, in recordings of several; by default the first for packets, and all for differences."""
     above_m: Annotated[float | None, Option("above")] = None
     """Judge only while the true height exceeds this, in metres; by default 0.3 for a table of differences that starts
     below it and later flies, as tags on the floor hear reflections only."""
@@ -178,7 +178,7 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
     """How positions are computed, in recordings of skyless record; by default as the tag did."""
     measurements: Annotated[str | None, choice(*MEASUREMENTS)] = None
     """What the filter is given of other recordings: packets, as anchors sent them, which is the default for
-    Bitcraze's and FiRa's; or differences, which are made of them."""
+    Bitcraze's, FiRa's and MULoc's; or differences, which are made of them."""
     stamps_only: bool = False
     """Leave out the phases of carriers that were recorded."""
     integrity_risk: IntegrityRisk | None = None
