@@ -30,7 +30,7 @@ def test_each_constant_is_doubled_and_halved_where_that_makes_sense():
     found = constants()
     assert len(found) == 2 * len(settings.Tuning.__annotations__)
     assert found["`suspect` ÷ 2"] == {"suspect": 1.5}
-    assert found["`scale_loss` × 2"]["scale_loss"] == pytest.approx(0.98)
+    assert found["`noise_loss` × 2"]["noise_loss"] == pytest.approx(0.98)
 
 
 def world(rmse_m, exceeded=0.0, fixes=100.0):

@@ -45,7 +45,7 @@ def test_fixes_know_what_hard_turns_cost_them():
     for seed in (1, 2):
         fleet = Fleet(site, [path], impairments_of(Request(site), site), seed, FleetSettings())
         for one in fleet.run(15.0):
-            if one.time_s > 2.0 and one.fix.chi2 > TUNING.inconsistent_nis:
+            if one.time_s > 2.0 and one.fix.chi2 > TUNING.wrong_nis:
                 error = one.error_m[:2]
                 normalised.append(error @ np.linalg.solve(one.fix.covariance_m2[:2, :2], error) / 2.0)
     assert len(normalised) > 200

@@ -177,7 +177,7 @@ class Estimator:
         staying_m = late_m if may_stay else 0.0
         s.x[change], s.x[constant] = late_m - TUNING.staying_share * staying_m, TUNING.staying_share * staying_m
         s.P[at(change, change)] += variance_m2
-        s.P[at(constant, constant)] += (TUNING.staying_std * staying_m) ** 2
+        s.P[at(constant, constant)] += (TUNING.staying_share * staying_m) ** 2
         make_uncertain(s, ALL_RANGE_ERRORS)
 
     def withhold_levels(self, are_withheld: bool = True) -> None:

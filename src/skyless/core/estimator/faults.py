@@ -181,7 +181,7 @@ def _open_new_faults(s: State, kind: int) -> None:
         explained[anchor] = _explained_alone(s, kind, anchor)
     if s.count < s.dim + 3:
         return
-    limit, first = _largest(s, kind) - s.tuning.rival_chi2, 0
+    limit, first = _largest(s, kind) - s.tuning.apart_chi2, 0
     while spare > 0 and first >= 0:
         first = -1
         for anchor in range(s.count):
@@ -211,7 +211,7 @@ def _note_jump(s: State) -> None:
 
 def _open_lasting_faults(s: State, chi2: float) -> None:
     """Add the lasting faults of one or two anchors to the state, where no others explain the test as well."""
-    rival_chi2 = s.tuning.rival_chi2
+    apart_chi2 = s.tuning.apart_chi2
     for faults in range(1, min(MAX_FAULTS, s.count - s.dim - 2) + 1):
         first, second, most, rival = -1, -1, 0.0, 0.0
         for one in range(s.count):
@@ -222,7 +222,7 @@ def _open_lasting_faults(s: State, chi2: float) -> None:
                         first, second, most, rival = one, other, explained, most
                     elif explained > rival:
                         rival = explained
-        if chi2 - most < rival_chi2 and most - rival > rival_chi2:
+        if chi2 - most < apart_chi2 and most - rival > apart_chi2:
             _open_lasting_fault(s, first)
             if faults == 2:
                 _open_lasting_fault(s, second)

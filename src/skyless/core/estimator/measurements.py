@@ -206,13 +206,13 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
     if not is_late_often(s):  # late packets are no multipath
         learn_place(s, anchor, innovation + s.x[where.change + anchor])
     if is_warm(s) and abs(a.innovation) > tuning.common and is_common(s, a.innovation):
-        status.walk_scale = settings.max_walk_scale
+        status.walk_scale = tuning.max_walk_scale
         a.outliers_in_row = 0
     elif is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
         if is_of_clock(s, anchor, innovation):
             return CLOCK_JUMPED
         # the outliers counted as late; a jump shows that none of them was
-        status.late_share = max(status.late_share - tuning.late_forgetting * (a.outliers_in_row - 1), 0.0)
+        status.late_share = max(status.late_share - tuning.slow_forgetting * (a.outliers_in_row - 1), 0.0)
         innovation = _jump(s, anchor, innovation, rx_variance)
         innovation_variance = compute_ph(s) + rx_variance
         if innovation < -settings.gate * sqrt(innovation_variance):
@@ -394,7 +394,7 @@ def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks
         link.outliers_in_row += 1
         if link.outliers_in_row >= tuning.relays_in_row:
             link.outliers_in_row = 0
-            link.variance_m2 += tuning.pair_jump_m2
+            link.variance_m2 += square(tuning.max_change_std_m)
             forth.relays = back.relays = 0
         return False
     status.relays_used += 1

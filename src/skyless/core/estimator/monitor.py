@@ -16,11 +16,17 @@ Anchors that are late from the start, or ever more, without a jump are found by 
 says what each of these buys.
 """
 
+from typing import Final
+
 from skyless.core.estimator.faults import begin_obstruction
 from skyless.core.estimator.kalman import finish_updates
 from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, at, make_uncertain
 from skyless.core.estimator.verdicts import is_late_often
 from skyless.core.native.arithmetic import log, sqrt, square
+
+_LIMIT: Final = 2.0
+"""A comparison of range errors counts as this many times their mean at most, as jumps are not multipath."""
+_LIMITED_MEAN: Final = 0.7421917  # of χ² with one degree of freedom where no value counts as more than that
 
 
 def is_warm(s: State) -> bool:
@@ -35,9 +41,8 @@ def has_jumped(s: State, anchor: int, innovation: float, innovation_variance: fl
         a.outliers_in_row = 0
     else:
         stamps = 2.0 * (settings.tx_variance_m2 + settings.rx_variance_m2)
-        apart, both = innovation - a.outlier_m, innovation + a.outlier_m
+        apart = innovation - a.outlier_m
         agrees = a.outliers_in_row > 0 and apart * apart <= square(tuning.suspect) * stamps
-        agrees = agrees and both * both > square(tuning.together) * innovation_variance
         a.outliers_in_row = a.outliers_in_row + 1 if agrees else 1
         a.outlier_m = innovation
     return a.outliers_in_row >= (tuning.in_row_where_late if is_late_often(s) else tuning.in_row)
@@ -73,24 +78,27 @@ def open_range_error(s: State, anchor: int, innovation: float) -> None:
     change = s.layout.change + anchor
     s.status.obstructions += 1
     begin_obstruction(s, anchor)
-    s.P[at(change, change)] += max(square(s.tuning.jump_std_m), innovation * innovation)
+    s.P[at(change, change)] += innovation * innovation
     make_uncertain(s, CHANGING_RANGE_ERRORS)
 
 
 def adapt_change_noise(s: State, anchor: int, normalised: float) -> None:
     """Adapt the process noise of an obstructed anchor's range error to an innovation."""
-    tuning, a = s.tuning, s.anchors[anchor]
-    a.change_mean += tuning.mean_gain * (normalised - a.change_mean)
-    if _is_off_zero(s, a.change_mean):
-        a.change_scale = min(a.change_scale * tuning.change_growth, tuning.max_scale)
-    else:
-        a.change_scale = max(a.change_scale * tuning.change_loss, 1.0)
+    a = s.anchors[anchor]
+    a.change_mean += s.tuning.mean_gain * (normalised - a.change_mean)
+    a.change_scale = _adapted(s, a.change_scale, _is_off_zero(s, a.change_mean), s.tuning.max_scale)
+
+
+def _adapted(s: State, scale: float, is_too_small: bool, largest: float) -> float:
+    """Factor on process noise after an innovation, which says whether that is too small."""
+    scale *= s.tuning.noise_growth if is_too_small else s.tuning.noise_loss
+    return min(max(scale, 1.0), largest)
 
 
 def _is_off_zero(s: State, mean: float) -> bool:
     """Whether a running mean of normalised innovations is further off zero than chance makes it."""
     gain = s.tuning.mean_gain
-    return mean * mean * (2.0 - gain) / gain > s.tuning.mean_limit
+    return mean * mean * (2.0 - gain) / gain > square(s.tuning.suspect)
 
 
 def end_small_obstruction(s: State, anchor: int) -> None:
@@ -115,7 +123,7 @@ def variance_scale(s: State, innovation: float, innovation_variance: float, is_d
     is_beyond = not -settings.gate <= normalised <= settings.gate
     beyond = 1.0 if is_beyond else 0.0
     if not is_difference:
-        status.late_share += tuning.late_forgetting * (beyond - status.late_share)
+        status.late_share += tuning.slow_forgetting * (beyond - status.late_share)
     status.rejected_share += forgetting * (beyond - status.rejected_share)
     if is_beyond:
         status.rejected += 1
@@ -127,9 +135,7 @@ def variance_scale(s: State, innovation: float, innovation_variance: float, is_d
     status.mean_square_m2 += forgetting * (innovation * innovation - status.mean_square_m2)
     if is_difference:
         return max(1.0, abs(normalised) / tuning.difference_huber)
-    if is_late_often(s):
-        return max(1.0, abs(normalised) / tuning.reception_huber)
-    return 1.0
+    return max(1.0, abs(normalised) / tuning.reception_huber) if is_late_often(s) else 1.0
 
 
 def adapt_change_variance(s: State, anchor: int, elapsed_s: float) -> None:
@@ -163,7 +169,7 @@ def learn_place(s: State, anchor: int, residual_m: float) -> None:
         status.place_samples = min(status.place_samples + 1, int(tuning.place_memory))
         for lag in range(2):
             half, mean = 0.5 * square(residual_m - a.place_residual_m[lag]), status.place_square_m2[lag]
-            limited = min(half, tuning.place_limit * mean) / tuning.place_limited_mean
+            limited = min(half, _LIMIT * mean) / _LIMITED_MEAN
             status.place_square_m2[lag] += (limited - mean) / (tuning.place_first + status.place_samples)
     a.place_residual_m[1] = a.place_residual_m[0]
     a.place_residual_m[0] = residual_m
@@ -206,27 +212,18 @@ def adapt_process_noise(s: State, normalised: float) -> None:
         status.lag[axis] += gain * (s.h[axis] * normalised - status.lag[axis])
         lag_square += square(status.lag[axis])
     lag_square *= (2.0 - gain) / gain
-    status.lag_square += tuning.lag_forgetting * (lag_square - status.lag_square)
-    if status.lag_square > tuning.lag_limit:
-        status.q_scale = min(status.q_scale * tuning.q_scale_gain, tuning.max_scale)
-    else:
-        status.q_scale = max(status.q_scale * tuning.scale_loss, 1.0)
+    status.lag_square += tuning.forgetting * (lag_square - status.lag_square)
+    status.q_scale = _adapted(s, status.q_scale, status.lag_square > tuning.lag_limit, tuning.max_scale)
     status.common_mean += gain * (normalised - status.common_mean)
-    status.walk_scale = _walk_scale(s, status.walk_scale, status.common_mean)
+    is_common = _is_off_zero(s, status.common_mean)
+    status.walk_scale = _adapted(s, status.walk_scale, is_common, tuning.max_walk_scale)
 
 
 def adapt_clock_noise(s: State, anchor: int, normalised: float) -> None:
     """Adapt the process noise of an anchor's clock to what a relay shows of it."""
     a = s.anchors[anchor]
     a.relay_mean += s.tuning.mean_gain * (normalised - a.relay_mean)
-    a.walk_scale = _walk_scale(s, a.walk_scale, a.relay_mean)
-
-
-def _walk_scale(s: State, scale: float, mean: float) -> float:
-    """Factor on the random walk of a clock: it grows while the running mean of its innovations is off zero."""
-    tuning = s.tuning
-    scale *= tuning.walk_scale_gain if _is_off_zero(s, mean) else tuning.scale_loss
-    return min(max(scale, 1.0), s.settings.max_walk_scale)
+    a.walk_scale = _adapted(s, a.walk_scale, _is_off_zero(s, a.relay_mean), s.tuning.max_walk_scale)
 
 
 def covariance_scale(s: State) -> float:
@@ -235,4 +232,4 @@ def covariance_scale(s: State) -> float:
     Most of an innovation is the stamps' noise, so the state errs by more than the innovations show.
     """
     nis = s.status.mean_nis
-    return nis * nis if nis > s.tuning.inconsistent_nis else 1.0
+    return nis * nis if nis > s.tuning.wrong_nis else 1.0

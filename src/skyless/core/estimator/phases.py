@@ -62,9 +62,9 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
         _keep_former(s, anchor)
     outcome = _use_phase(s, ambiguity, a.own, innovation, variance)
     if outcome == PHASE_REFUSED:
-        status.wild_share += tuning.phase_forgetting * (1.0 - status.wild_share)
+        status.wild_share += tuning.slow_forgetting * (1.0 - status.wild_share)
     elif outcome == PHASE_USED:
-        status.wild_share -= tuning.phase_forgetting * status.wild_share
+        status.wild_share -= tuning.slow_forgetting * status.wild_share
         _learn_noise(s, square(innovation) - predicted)
         if a.has_former:
             _rejoin(s, anchor)
@@ -146,7 +146,7 @@ def _limit_m2(s: State, variance: float) -> float:
 def _learn_noise(s: State, shown_m2: float) -> None:
     """Let the variance of phases follow what innovations show beyond their prediction: reflections differ in size."""
     tuning, status = s.tuning, s.status
-    status.phase_variance_m2 += tuning.phase_forgetting * (shown_m2 - status.phase_variance_m2)
+    status.phase_variance_m2 += tuning.slow_forgetting * (shown_m2 - status.phase_variance_m2)
     status.phase_variance_m2 = min(
         max(status.phase_variance_m2, square(s.settings.phase_std_m)),
         square(max(tuning.phase_max_std_m, s.settings.phase_std_m)),
@@ -156,10 +156,10 @@ def _learn_noise(s: State, shown_m2: float) -> None:
 def _may_count(s: State) -> bool:
     """Whether the tag's phases may count: neither just after the start nor where stamps contradict the state."""
     status, tuning = s.status, s.tuning
-    if status.mean_nis > tuning.phase_nis:
+    if status.mean_nis > tuning.wrong_nis:
         close_phases(s)
-    is_settled = (status.epoch_ticks - status.start_ticks) * TICK_S >= tuning.phase_after_s
-    return is_settled and status.mean_nis <= tuning.phase_nis
+    is_settled = (status.epoch_ticks - status.start_ticks) * TICK_S >= tuning.new_start_s
+    return is_settled and status.mean_nis <= tuning.wrong_nis
 
 
 def close_phases(s: State) -> None:
@@ -190,7 +190,7 @@ def _follow_line(s: State) -> None:
         away_m2 += square(s.x[axis] - s.status.line_m[axis])
     for anchor in range(s.count):
         is_in_use = is_in_use or s.anchors[anchor].own.is_known
-    if is_in_use and away_m2 <= square(s.tuning.phase_line_m):
+    if is_in_use and away_m2 <= square(s.tuning.held_step_m):
         return
     if away_m2 > square(s.tuning.held_max_m):
         close_phases(s)

@@ -20,7 +20,7 @@ from skyless.core.estimator.state import (
 from skyless.core.native.sizes import MAX_ANCHORS
 from skyless.core.native.views import view
 
-VERSION: Final = 3
+VERSION: Final = 4
 """Changes with the fields of ``State`` and of the records in it."""
 _HEAD: Final = Format("<HBBB")
 """Version, dimensions, anchors, and whether there are ambiguities."""

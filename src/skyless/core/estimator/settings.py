@@ -1,16 +1,10 @@
 """What the estimator assumes: constants that are the same everywhere, and settings of a site and its tags."""
 
-from math import erf, erfc, exp, inf, isnan, nan, pi, sqrt
+from math import inf, isnan, nan
 from typing import Final
 
 from skyless.core.integrity import RISK
 from skyless.core.native.records import Record, record
-
-
-def _mean_up_to(limit: float) -> float:
-    """Mean of the lower of χ² with one degree of freedom and a limit."""
-    root = sqrt(0.5 * limit)
-    return erf(root) - 2.0 * root * exp(-root * root) / sqrt(pi) + limit * erfc(root)
 
 
 @record
@@ -28,12 +22,12 @@ class Tuning(Record):
     mean_gain: float = 0.05
     """Weight in running means of normalised innovations (along each axis, of all anchors, of an anchor's relays), and
     loss of the counts of recent relays with each packet."""
-    mean_limit: float = 9.0
-    """Square of such a mean over its expectation beyond which process noise grows."""
-    walk_scale_gain: float = 1.2
-    """Growth of a clock's process noise with each innovation."""
-    scale_loss: float = 0.99
-    """Factor on adapted process noise with each innovation that does not call for more."""
+    noise_growth: float = 1.2
+    """Growth of adapted process noise with each innovation that calls for more …"""
+    max_walk_scale: float = 1e4
+    """Largest factor on the random walk of a clock, and that of the tag's once all innovations are on one side."""
+    noise_loss: float = 0.99
+    """… and its factor with each other one."""
     common: float = 1.5
     """Normalised innovations of all anchors beyond this on one side: the tag's clock has left its rate."""
     relays_in_row: float = 8
@@ -42,14 +36,10 @@ class Tuning(Record):
     """Factor on the random walk of a clock up to which an anchor's report of it is used: its filter assumes 1."""
 
     # Motion
-    q_scale_gain: float = 1.05
-    """Growth of the process noise of motion with each innovation."""
     max_scale: float = 100.0
     """Largest factor on the process noise of motion, and of a range error that has jumped."""
     lag_limit: float = 2.6
     """Mean square of the innovations along the axes, 1 where the filter is right, beyond which that noise grows."""
-    lag_forgetting: float = 0.01
-    """Weight in that mean."""
     better_known: float = 0.8
     """The place of a tag at rest moves when its variance has shrunk to this part."""
     stationary_noise_share: float = 2e-7
@@ -59,7 +49,7 @@ class Tuning(Record):
 
     # Linearisation (docs/maths.md, section 6)
     held_step_m: float = 0.15
-    """Distance of the estimate from the point of linearisation at which that moves [m]."""
+    """Distance of the estimate from the point of linearisation, of ranges or of phases, at which that moves [m]."""
     held_max_m: float = 0.4
     """It stays within ``suspect`` standard deviations of the estimate, up to this distance [m]."""
     curvature_share: float = 0.01
@@ -69,11 +59,12 @@ class Tuning(Record):
 
     # Which innovations are used
     forgetting: float = 0.02
-    """Weight in the mean NIS and in the share of rejected innovations: the last 50."""
-    inconsistent_nis: float = 1.6
-    """Mean NIS beyond which covariances are scaled by its square."""
-    late_forgetting: float = 0.005
-    """Weight in the share of late receptions: the last 200."""
+    """Weight in the mean NIS, in the share of rejected innovations and in the mean square along axes: the last 50."""
+    wrong_nis: float = 2.0
+    """Mean NIS beyond which covariances are scaled by its square, phases are not used, and a new start is given up, once:
+    it was wrong, for example by packets that were late."""
+    slow_forgetting: float = 0.005
+    """Weight in the shares of late receptions and of phases beyond the gate, and in the phases' noise: the last 200."""
     late_often_share: float = 0.02
     """Share of late receptions beyond which single ones are late often."""
     reception_huber: float = 1.5
@@ -89,21 +80,14 @@ class Tuning(Record):
 
     # Range errors that jump
     suspect: float = 3.0
-    """Normalised innovation beyond which a reception may be a jump, and two of them differ by chance."""
+    """Normalised innovation beyond which a reception may be a jump, two of them differ by chance, and a running mean
+    over its expectation calls for more process noise."""
     in_row: float = 2
     """Number of such receptions in a row that make a jump, and of impossible ones if a counter has restarted …"""
     in_row_where_late: float = 5
     """… and where single receptions are late often."""
-    together: float = 7.0
-    """Sum of two such normalised innovations: by chance once in some million packets."""
-    jump_std_m: float = 0.2
-    """Least standard deviation of a range error that has jumped [m]."""
-    first_change_scale: float = 25.0
-    """Factor on the process noise of a range error that has just jumped: it may still be changing …"""
-    change_growth: float = 1.2
-    """… its growth while the mean of the anchor's innovations is off zero …"""
-    change_loss: float = 0.97
-    """… and its factor otherwise."""
+    first_change_scale: float = 10.0
+    """Factor on the process noise of a range error that has just jumped: it may still be changing."""
     ended_std_m: float = 0.05
     """An obstruction has ended where the range error is known to this [m] …"""
     ended: float = 2.0
@@ -116,7 +100,7 @@ class Tuning(Record):
     """Largest return in that time [m]: long delays are no less likely to stay."""
     jump_rise: float = 0.5
     """Part of its full size by which a jump raises the process noise of all range errors."""
-    obstructed_std_m: float = 0.08
+    obstructed_std_m: float = 0.05
     """Standard deviation by which all range errors change where some have jumped [m] …"""
     obstructed_s: float = 5.0
     """… and the time in which they do [s]."""
@@ -124,10 +108,6 @@ class Tuning(Record):
     # Multipath, from range errors compared after each step of the tag and after two (a semivariogram, Matheron 1963)
     place_step_m: float = 0.1
     """Length of a step [m]."""
-    place_limit: float = 2.0
-    """A comparison counts as this many times their mean at most, as jumps are not multipath."""
-    place_limited_mean: float = _mean_up_to(2.0)
-    """Mean of χ² with one degree of freedom where no value counts as more than that."""
     place_first: float = 20
     """Number of comparisons for which the stamps' noise stands beforehand."""
     place_samples: float = 100
@@ -139,7 +119,8 @@ class Tuning(Record):
     place_kept: float = 0.1
     """Least correlation over a step, and least loss of it."""
     max_change_std_m: float = 0.5
-    """Largest standard deviation of the part of a range error that changes as the tag moves [m]."""
+    """Largest standard deviation of the part of a range error that changes as the tag moves, and that of a pair's range
+    that has jumped [m]."""
 
     # Faults that the state does not hold (docs/maths.md, section 8)
     lasting_std_m: float = 0.3
@@ -156,16 +137,12 @@ class Tuning(Record):
     """Standard deviation beforehand of a fault that is added to the state, and of all faults at the start [m]."""
     sure_chi2: float = 50.0
     """Test beyond which there is a fault: χ² of eight degrees of freedom with a probability of 4·10⁻⁸."""
-    rival_chi2: float = 20.0
-    """Least difference to what other anchors' faults explain, and most of the test that chosen ones leave."""
     early_weight: float = 0.8
     """Weight of what an early fault explains: obstacles make packets late."""
 
     # Anchors that stand elsewhere
     open_pair_std_m: float = 0.1
     """Standard deviation of the range between two anchors against the survey, before it is measured [m]."""
-    pair_jump_m2: float = 0.25
-    """Variance of a pair's range that has jumped [m²]."""
     pair_relays: float = 12
     """Number of relays in either direction after which their mean is a range."""
     misplaced_pairs: float = 2
@@ -180,25 +157,19 @@ class Tuning(Record):
     start_patience_s: float = 0.5
     """Time for which a start waits that is wide or contradicted: more anchors may come [s]."""
     start_tail: float = 1e-4
-    """Probability with which residuals of a start are larger by chance than those that contradict it."""
+    """Probability with which residuals of a start are larger by chance than those that contradict it, and weight below
+    which other positions are no rivals."""
     new_start_s: float = 1.0
-    """Time for which a start is new [s]: one with open range errors is not repeated within it …"""
-    early_nis: float = 2.0
-    """… and one whose mean NIS exceeds this is given up, once: it was wrong, for example by packets that were late."""
+    """Time for which a start is new [s]: one with open range errors is not repeated within it, and phases are not used,
+    as places that still move by the stamps' noise would turn the directions to the anchors."""
     start_margin: float = 4.0
     """Factor on the start's covariance, as the filter is then given the packets that it rests on."""
     short_silence_s: float = 0.1
     """No state grows much wider over shorter silences; packets that are late by less are late from the radio [s]."""
     longest_silence_s: float = 5.0
     """After a longer one the state is worse than a new start [s]."""
-    slow_superframe_s: float = 0.2
-    """In longer superframes, where a new start takes seconds, a silence may widen the state more [s] …"""
-    slow_curved_std: float = 0.2
-    """… up to this part of the mean range."""
     longest_superframe_s: float = 2.0
     """In longer ones a tag may be metres away: nothing is predicted, and each round of packets is a start [s]."""
-    height_sigmas: float = 5.0
-    """Number of standard deviations by which a sensor's height is wrong at most."""
     heights_in_row: float = 20
     """Number of heights in a row that do not fit, after which the position is wrong."""
     open_survey_std_m: float = 0.15
@@ -210,9 +181,7 @@ class Tuning(Record):
     late_penalty: float = 2.0
     """What each of them adds to χ²: odds of 1 to 3."""
     staying_share: float = 0.2
-    """Part of an anchor's lateness at the start that stays: its mean …"""
-    staying_std: float = 0.5
-    """… and its standard deviation."""
+    """Part of an anchor's lateness at the start that stays: its mean, and its standard deviation."""
     window: float = 60
     """Number of ready-made time differences from which a start is looked for …"""
     window_s: float = 1.0
@@ -221,8 +190,6 @@ class Tuning(Record):
     """Standard deviation of the median of a pair's differences [m]."""
     late_start_std_m: float = 0.14
     """Standard deviation of each anchor's error at the start, before any are estimated [m]."""
-    chance: float = 0.01
-    """Probability below which residuals are not noise, and rivals no rivals, in a start from differences."""
     rival_m: float = 0.5
     """Distance from which two positions are rivals; anchors lie elsewhere for a tag that has moved as far [m]."""
     height_margin_m: float = 1.0
@@ -238,9 +205,7 @@ class Tuning(Record):
     phase_start_std_m: float = 0.002
     """Standard deviation of a phase before innovations show another [m] …"""
     phase_max_std_m: float = 0.006
-    """… its upper bound, or that of the settings [m] …"""
-    phase_forgetting: float = 0.005
-    """… and the weight of the newest in it, and in the share of phases beyond the gate."""
+    """… and its upper bound, or that of the settings [m]."""
     phase_mesh_std_m: float = 0.0012
     """Standard deviation of a phase that an anchor measured of another [m]."""
     phase_wander: float = 25.0
@@ -251,17 +216,10 @@ class Tuning(Record):
     """Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle."""
     phase_step_m: float = 0.02
     """Length of the steps by which reflections change phases [m]."""
-    phase_line_m: float = 0.03
-    """Distance of the estimate from the point at which phases are linearised, at which that moves [m]."""
     phase_former_s: float = 0.5
     """Time for which an ambiguity from before a gap is kept to find by how many cycles it has changed [s]."""
     phases_in_row: float = 4
     """Number of phases of an anchor in a row beyond the gate at which its ambiguity begins again."""
-    phase_nis: float = 2.0
-    """Mean NIS of stamps beyond which a phase has a wrong cycle."""
-    phase_after_s: float = 1.0
-    """Time after the start from which phases are used [s]: places that still move by the stamps' noise would turn the
-    directions to the anchors, which phases would take for motion."""
 
     # Levels that are withheld
     uncovered_chi2: float = 240.0
@@ -274,8 +232,9 @@ class Tuning(Record):
     """Least distance from the anchors' plane at which its two sides are compared [m]."""
     shift_part: float = 0.25
     """Standard deviation of the best place on the other side about the mirror image, over that distance."""
-    apart_chi2: float = 25.0
-    """Squared difference over its variance from which two things differ: ranges of both sides, or two starts."""
+    apart_chi2: float = 20.0
+    """Squared difference over its variance from which two things differ: ranges of both sides, two starts, or what faults
+    of other anchors explain."""
     sensor_valid_s: float = 1.0
     """Time for which a sensor's height decides between them [s]."""
 
@@ -353,8 +312,6 @@ class EstimatorSettings(Record):
     """A tag that has not shown any motion for this time counts as stationary; 0: never."""
     max_acceleration_mps2: float = 0.0
     """The tag's largest acceleration, as far as levels are to cover it beyond ``qa``."""
-    max_walk_scale: float = 1e4
-    """Largest factor on ``walk`` where innovations show that oscillators wander more."""
     integrity_risk: float = RISK
     alert_limit_m: float = nan
     """Fixes with a higher horizontal protection level have an alert; NaN for none."""

@@ -437,7 +437,7 @@ def prepare(s: State) -> None:
     stamps_m2 = settings.tx_variance_m2 + settings.rx_variance_m2
     status.q_scale = status.mean_nis = 1.0
     status.height_ticks = NEVER
-    status.walk_scale = min(tuning.start_walk_scale, settings.max_walk_scale)
+    status.walk_scale = tuning.start_walk_scale
     status.fault_std_m[LASTING] = tuning.lasting_std_m
     status.fault_std_m[RECENT] = tuning.recent_std_m
     status.fault_std_m[CREEPING] = tuning.creeping_std_m

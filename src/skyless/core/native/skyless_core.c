@@ -222,6 +222,7 @@ INTERNAL bool is_common(State *s, real normalised);
 INTERNAL bool is_of_clock(State *s, int32_t anchor, real innovation);
 INTERNAL void open_range_error(State *s, int32_t anchor, real innovation);
 INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised);
+INTERNAL real adapted(State *s, real scale, bool is_too_small, real largest);
 INTERNAL bool is_off_zero(State *s, real mean);
 INTERNAL void end_small_obstruction(State *s, int32_t anchor);
 INTERNAL real variance_scale(State *s, real innovation, real innovation_variance, bool is_difference);
@@ -230,7 +231,6 @@ INTERNAL void learn_place(State *s, int32_t anchor, real residual_m);
 INTERNAL void update_stationary(State *s, real dt);
 INTERNAL void adapt_process_noise(State *s, real normalised);
 INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised);
-INTERNAL real walk_scale(State *s, real scale, real mean);
 INTERNAL real covariance_scale(State *s);
 INTERNAL void protect(State *s);
 INTERNAL real largest_test(State *s);
@@ -1487,7 +1487,7 @@ INTERNAL void prepare(State *s) {
     status->mean_nis = REAL(1.0);
     status->q_scale = REAL(1.0);
     status->height_ticks = NEVER;
-    status->walk_scale = min_real(tuning->start_walk_scale, settings->max_walk_scale);
+    status->walk_scale = tuning->start_walk_scale;
     status->fault_std_m[LASTING] = tuning->lasting_std_m;
     status->fault_std_m[RECENT] = tuning->recent_std_m;
     status->fault_std_m[CREEPING] = tuning->creeping_std_m;
@@ -1886,7 +1886,7 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     }
     status->walked_m += SQRT(speed_squared) * dt;
     if (status->obstruction > REAL(0.0)) {
-        status->obstruction *= exp_(-dt / s->tuning.obstruction_memory_s);
+        status->obstruction *= exp_(-dt / s->tuning.obstructed_s);
     }
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         status->line_m[axis] += s->x[where->velocity + axis] * dt;
@@ -2023,8 +2023,7 @@ INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, r
     real obstructed = share * dt / tuning->obstructed_s;
     if (a->is_obstructed) {
         real change_m = s->x[s->layout.change + anchor];
-        real memory_s = tuning->obstruction_memory_s * max_real(REAL(1.0), abs_real(change_m) /
-                tuning->obstruction_return_m);
+        real memory_s = tuning->obstructed_s * max_real(REAL(1.0), abs_real(change_m) / tuning->obstruction_return_m);
         variance = REAL(0.5) * memory_s * tuning->obstructed_walk * a->change_scale;
         kept = exp_(-dt / memory_s);
     } else {
@@ -2497,7 +2496,7 @@ INTERNAL void open_new_faults(State *s, int32_t kind) {
     if (s->count < s->dim + 3) {
         return;
     }
-    real limit = largest(s, kind) - s->tuning.rival_chi2;
+    real limit = largest(s, kind) - s->tuning.apart_chi2;
     int32_t first = 0;
     while (spare > 0 && first >= 0) {
         first = -1;
@@ -2532,7 +2531,7 @@ INTERNAL void note_jump(State *s) {
 
 /* Add the lasting faults of one or two anchors to the state, where no others explain the test as well. */
 INTERNAL void open_lasting_faults(State *s, real chi2) {
-    real rival_chi2 = s->tuning.rival_chi2;
+    real apart_chi2 = s->tuning.apart_chi2;
     for (int32_t faults = 1, faults_end = min_32(MAX_FAULTS, s->count - s->dim - 2) + 1; faults < faults_end; faults++)
             {
         int32_t first = -1;
@@ -2558,7 +2557,7 @@ INTERNAL void open_lasting_faults(State *s, real chi2) {
                 }
             }
         }
-        if (chi2 - most < rival_chi2 && most - rival > rival_chi2) {
+        if (chi2 - most < apart_chi2 && most - rival > apart_chi2) {
             open_lasting_fault(s, first);
             if (faults == 2) {
                 open_lasting_fault(s, second);
@@ -2724,9 +2723,7 @@ INTERNAL bool has_jumped(State *s, int32_t anchor, real innovation, real innovat
     } else {
         real stamps = REAL(2.0) * (settings->tx_variance_m2 + settings->rx_variance_m2);
         real apart = innovation - a->outlier_m;
-        real both = innovation + a->outlier_m;
         bool agrees = a->outliers_in_row > 0 && apart * apart <= square(tuning->suspect) * stamps;
-        agrees = agrees && both * both > square(tuning->together) * innovation_variance;
         a->outliers_in_row = agrees ? a->outliers_in_row + 1 : 1;
         a->outlier_m = innovation;
     }
@@ -2763,26 +2760,27 @@ INTERNAL void open_range_error(State *s, int32_t anchor, real innovation) {
     int32_t change = s->layout.change + anchor;
     s->status.obstructions += 1;
     begin_obstruction(s, anchor);
-    s->P[at(change, change)] += max_real(square(s->tuning.jump_std_m), innovation * innovation);
+    s->P[at(change, change)] += innovation * innovation;
     make_uncertain(s, CHANGING_RANGE_ERRORS);
 }
 
 /* Adapt the process noise of an obstructed anchor's range error to an innovation. */
 INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised) {
-    Tuning *tuning = &s->tuning;
     Anchor *a = &s->anchors[anchor];
-    a->change_mean += tuning->mean_gain * (normalised - a->change_mean);
-    if (is_off_zero(s, a->change_mean)) {
-        a->change_scale = min_real(a->change_scale * tuning->change_growth, tuning->max_scale);
-    } else {
-        a->change_scale = max_real(a->change_scale * tuning->change_loss, REAL(1.0));
-    }
+    a->change_mean += s->tuning.mean_gain * (normalised - a->change_mean);
+    a->change_scale = adapted(s, a->change_scale, is_off_zero(s, a->change_mean), s->tuning.max_scale);
+}
+
+/* Factor on process noise after an innovation, which says whether that is too small. */
+INTERNAL real adapted(State *s, real scale, bool is_too_small, real largest) {
+    scale *= is_too_small ? s->tuning.noise_growth : s->tuning.noise_loss;
+    return min_real(max_real(scale, REAL(1.0)), largest);
 }
 
 /* Whether a running mean of normalised innovations is further off zero than chance makes it. */
 INTERNAL bool is_off_zero(State *s, real mean) {
     real gain = s->tuning.mean_gain;
-    return mean * mean * (REAL(2.0) - gain) / gain > s->tuning.mean_limit;
+    return mean * mean * (REAL(2.0) - gain) / gain > square(s->tuning.suspect);
 }
 
 /* End an obstruction that has gone without a jump back: the range error is known, and is hardly there. */
@@ -2813,7 +2811,7 @@ INTERNAL real variance_scale(State *s, real innovation, real innovation_variance
     bool is_beyond = !(-settings->gate <= normalised && normalised <= settings->gate);
     real beyond = is_beyond ? REAL(1.0) : REAL(0.0);
     if (!is_difference) {
-        status->late_share += tuning->late_forgetting * (beyond - status->late_share);
+        status->late_share += tuning->slow_forgetting * (beyond - status->late_share);
     }
     status->rejected_share += forgetting * (beyond - status->rejected_share);
     if (is_beyond) {
@@ -2825,13 +2823,7 @@ INTERNAL real variance_scale(State *s, real innovation, real innovation_variance
     status->rejected_in_row = 0;
     status->mean_nis += forgetting * (normalised * normalised - status->mean_nis);
     status->mean_square_m2 += forgetting * (innovation * innovation - status->mean_square_m2);
-    if (is_difference) {
-        return max_real(REAL(1.0), abs_real(normalised) / tuning->difference_huber);
-    }
-    if (is_late_often(s)) {
-        return max_real(REAL(1.0), abs_real(normalised) / tuning->reception_huber);
-    }
-    return REAL(1.0);
+    return is_difference || is_late_often(s) ? max_real(REAL(1.0), abs_real(normalised) / tuning->huber) : REAL(1.0);
 }
 
 /* Let the variance of an anchor's changing range error track its estimate: the mean of its square.
@@ -2872,7 +2864,7 @@ INTERNAL void learn_place(State *s, int32_t anchor, real residual_m) {
         for (int32_t lag = 0; lag < 2; lag++) {
             real half = REAL(0.5) * square(residual_m - a->place_residual_m[lag]);
             real mean = status->place_square_m2[lag];
-            real limited = min_real(half, tuning->place_limit * mean) / tuning->place_limited_mean;
+            real limited = min_real(half, LIMIT * mean) / LIMITED_MEAN;
             status->place_square_m2[lag] += (limited - mean) / (tuning->place_first + (real)status->place_samples);
         }
     }
@@ -2928,28 +2920,18 @@ INTERNAL void adapt_process_noise(State *s, real normalised) {
         lag_square += square(status->lag[axis]);
     }
     lag_square *= (REAL(2.0) - gain) / gain;
-    status->lag_square += tuning->lag_forgetting * (lag_square - status->lag_square);
-    if (status->lag_square > tuning->lag_limit) {
-        status->q_scale = min_real(status->q_scale * tuning->q_scale_gain, tuning->max_scale);
-    } else {
-        status->q_scale = max_real(status->q_scale * tuning->scale_loss, REAL(1.0));
-    }
+    status->lag_square += tuning->forgetting * (lag_square - status->lag_square);
+    status->q_scale = adapted(s, status->q_scale, status->lag_square > tuning->lag_limit, tuning->max_scale);
     status->common_mean += gain * (normalised - status->common_mean);
-    status->walk_scale = walk_scale(s, status->walk_scale, status->common_mean);
+    bool is_common = is_off_zero(s, status->common_mean);
+    status->walk_scale = adapted(s, status->walk_scale, is_common, tuning->max_walk_scale);
 }
 
 /* Adapt the process noise of an anchor's clock to what a relay shows of it. */
 INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised) {
     Anchor *a = &s->anchors[anchor];
     a->relay_mean += s->tuning.mean_gain * (normalised - a->relay_mean);
-    a->walk_scale = walk_scale(s, a->walk_scale, a->relay_mean);
-}
-
-/* Factor on the random walk of a clock: it grows while the running mean of its innovations is off zero. */
-INTERNAL real walk_scale(State *s, real scale, real mean) {
-    Tuning *tuning = &s->tuning;
-    scale *= is_off_zero(s, mean) ? tuning->walk_scale_gain : tuning->scale_loss;
-    return min_real(max_real(scale, REAL(1.0)), s->settings.max_walk_scale);
+    a->walk_scale = adapted(s, a->walk_scale, is_off_zero(s, a->relay_mean), s->tuning.max_walk_scale);
 }
 
 /* Factor on the position's covariance while innovations are larger than the filter expects.
@@ -2957,7 +2939,7 @@ INTERNAL real walk_scale(State *s, real scale, real mean) {
  * Most of an innovation is the stamps' noise, so the state errs by more than the innovations show. */
 INTERNAL real covariance_scale(State *s) {
     real nis = s->status.mean_nis;
-    return nis > s->tuning.inconsistent_nis ? nis * nis : REAL(1.0);
+    return nis > s->tuning.wrong_nis ? nis * nis : REAL(1.0);
 }
 
 /* Protection levels: how wrong a position may be, even if receptions are late (``docs/maths.md`` section 8).
@@ -3410,14 +3392,14 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
         learn_place(s, anchor, innovation + s->x[where->change + anchor]);
     }
     if (is_warm(s) && abs_real(a->innovation) > tuning->common && is_common(s, a->innovation)) {
-        status->walk_scale = settings->max_walk_scale;
+        status->walk_scale = tuning->max_walk_scale;
         a->outliers_in_row = 0;
     } else if (is_warm(s) && has_jumped(s, anchor, innovation, innovation_variance)) {
         if (is_of_clock(s, anchor, innovation)) {
             return CLOCK_JUMPED;
         }
         /* the outliers counted as late; a jump shows that none of them was */
-        status->late_share = max_real(status->late_share - tuning->late_forgetting * (real)(a->outliers_in_row - 1),
+        status->late_share = max_real(status->late_share - tuning->slow_forgetting * (real)(a->outliers_in_row - 1),
                 REAL(0.0));
         innovation = jump(s, anchor, innovation, rx_variance);
         innovation_variance = compute_ph(s) + rx_variance;
@@ -3625,7 +3607,7 @@ INTERNAL bool relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks
         link->outliers_in_row += 1;
         if ((real)link->outliers_in_row >= tuning->relays_in_row) {
             link->outliers_in_row = 0;
-            link->variance_m2 += tuning->pair_jump_m2;
+            link->variance_m2 += square(tuning->max_change_std_m);
             back->relays = 0;
             forth->relays = 0;
         }
@@ -3935,9 +3917,9 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     }
     int32_t outcome = use_phase(s, ambiguity, &a->own, innovation, variance);
     if (outcome == PHASE_REFUSED) {
-        status->wild_share += tuning->phase_forgetting * (REAL(1.0) - status->wild_share);
+        status->wild_share += tuning->slow_forgetting * (REAL(1.0) - status->wild_share);
     } else if (outcome == PHASE_USED) {
-        status->wild_share -= tuning->phase_forgetting * status->wild_share;
+        status->wild_share -= tuning->slow_forgetting * status->wild_share;
         learn_noise(s, square(innovation) - predicted);
         if (a->has_former) {
             rejoin(s, anchor);
@@ -4032,7 +4014,7 @@ INTERNAL real limit_m2(State *s, real variance) {
 INTERNAL void learn_noise(State *s, real shown_m2) {
     Tuning *tuning = &s->tuning;
     Status *status = &s->status;
-    status->phase_variance_m2 += tuning->phase_forgetting * (shown_m2 - status->phase_variance_m2);
+    status->phase_variance_m2 += tuning->slow_forgetting * (shown_m2 - status->phase_variance_m2);
     status->phase_variance_m2 = min_real(max_real(status->phase_variance_m2, square(s->settings.phase_std_m)),
             square(max_real(tuning->phase_max_std_m, s->settings.phase_std_m)));
 }
@@ -4041,11 +4023,11 @@ INTERNAL void learn_noise(State *s, real shown_m2) {
 INTERNAL bool may_count(State *s) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
-    if (status->mean_nis > tuning->phase_nis) {
+    if (status->mean_nis > tuning->wrong_nis) {
         close_phases(s);
     }
-    bool is_settled = (real)(status->epoch_ticks - status->start_ticks) * TICK_S >= tuning->phase_after_s;
-    return is_settled && status->mean_nis <= tuning->phase_nis;
+    bool is_settled = (real)(status->epoch_ticks - status->start_ticks) * TICK_S >= tuning->new_start_s;
+    return is_settled && status->mean_nis <= tuning->wrong_nis;
 }
 
 /* Let all ambiguities of the tag's phases begin again: what they were taken for may be wrong by cycles. */
@@ -4083,7 +4065,7 @@ INTERNAL void follow_line(State *s) {
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         is_in_use = is_in_use || s->anchors[anchor].own.is_known;
     }
-    if (is_in_use && away_m2 <= square(s->tuning.phase_line_m)) {
+    if (is_in_use && away_m2 <= square(s->tuning.held_step_m)) {
         return;
     }
     if (away_m2 > square(s->tuning.held_max_m)) {
@@ -6279,7 +6261,7 @@ INTERNAL bool is_contradicted(Course *c, State *s, int64_t rx_ticks) {
     real age_s = (real)(rx_ticks - c->started_ticks) * TICK_S;
     if (age_s >= tuning->new_start_s) {
         c->may_begin_again = true;
-    } else if (c->may_begin_again && s->fix[QUALITY][0] > tuning->early_nis) {
+    } else if (c->may_begin_again && s->fix[QUALITY][0] > tuning->wrong_nis) {
         c->may_begin_again = false;  /* if it does not help, all is noisier than stated */
         return true;
     }
@@ -6487,8 +6469,7 @@ INTERNAL bool is_out_of_reach(Course *c, State *s, int64_t rx_ticks) {
     if (silent_s < tuning->short_silence_s) {
         return false;
     }
-    real part = c->superframe_s < tuning->slow_superframe_s ? tuning->curved_std : tuning->slow_curved_std;
-    return SQRT(horizontal_variance_m2(s, silent_s)) > part * mean_range_m(c, s->x);
+    return SQRT(horizontal_variance_m2(s, silent_s)) > tuning->curved_std * mean_range_m(c, s->x);
 }
 
 /* From a position to the anchors in use. */
@@ -6790,8 +6771,8 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .pair_std_m = REAL(0.02), .slope_std_m = REAL(0.05), .place_std_m = REAL(0.005), .place_distance_m =
             REAL(1.0), .place_time_s = REAL(100.0), .change_memory_s = REAL(0.0), .barometer_walk = REAL(0.00025),
             .least_change_std_m = REAL(0.05), .earliest_m = (real)-__builtin_inf(), .difference_std_m = REAL(0.12),
-            .stationary_s = REAL(0.0), .max_acceleration_mps2 = REAL(0.0), .max_walk_scale = REAL(10000.0),
-            .integrity_risk = REAL(0.0001), .alert_limit_m = (real)__builtin_nan("")};
+            .stationary_s = REAL(0.0), .max_acceleration_mps2 = REAL(0.0), .integrity_risk = REAL(0.0001),
+            .alert_limit_m = (real)__builtin_nan("")};
     t->admission = (Admission){.own = {.bits = 40, .last_host_s = (real)__builtin_nan("")}, .former = {.bits = 40,
             .last_host_s = (real)__builtin_nan("")}, .choice = {.only_site = -1, .site = -1}};
     t->pages = (SitePages){.issue = -1};
@@ -6803,42 +6784,35 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .pair_std_m = REAL(0.02), .slope_std_m = REAL(0.05), .place_std_m = REAL(0.005), .place_distance_m =
             REAL(1.0), .place_time_s = REAL(100.0), .change_memory_s = REAL(0.0), .barometer_walk = REAL(0.00025),
             .least_change_std_m = REAL(0.05), .earliest_m = (real)-__builtin_inf(), .difference_std_m = REAL(0.12),
-            .stationary_s = REAL(0.0), .max_acceleration_mps2 = REAL(0.0), .max_walk_scale = REAL(10000.0),
-            .integrity_risk = REAL(0.0001), .alert_limit_m = (real)__builtin_nan("")}, .tuning = {.restart_m =
-            REAL(300.0), .start_walk_scale = REAL(100.0), .mean_gain = REAL(0.05), .mean_limit = REAL(9.0),
-            .walk_scale_gain = REAL(1.2), .scale_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row = REAL(8.0),
-            .steady_walk_scale = REAL(4.0), .q_scale_gain = REAL(1.05), .max_scale = REAL(100.0), .lag_limit =
-            REAL(2.6), .lag_forgetting = REAL(0.01), .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07),
-            .stationary_std_mps = REAL(0.01), .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share =
-            REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02), .inconsistent_nis = REAL(1.6),
-            .late_forgetting = REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5),
-            .difference_huber = REAL(1.0), .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share =
-            REAL(0.5), .suspect = REAL(3.0), .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0),
-            .jump_std_m = REAL(0.2), .first_change_scale = REAL(25.0), .change_growth = REAL(1.2), .change_loss =
-            REAL(0.97), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk = REAL(0.004),
-            .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5),
-            .obstructed_std_m = REAL(0.08), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1), .place_limit =
-            REAL(2.0), .place_limited_mean = REAL(0.7421917096296904), .place_first = REAL(20.0), .place_samples =
-            REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 = REAL(0.0012), .place_kept = REAL(0.1),
-            .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3), .recent_std_m = REAL(0.08), .creeping_std_m =
-            REAL(0.2), .recent_packets = REAL(16.0), .creeping_s = REAL(3.0), .late_std_m = REAL(1.0), .sure_chi2 =
-            REAL(50.0), .rival_chi2 = REAL(20.0), .early_weight = REAL(0.8), .open_pair_std_m = REAL(0.1), .pair_jump_m2
-            = REAL(0.25), .pair_relays = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s = REAL(0.5), .curved_std
-            = REAL(0.1), .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s = REAL(1.0), .early_nis
-            = REAL(2.0), .start_margin = REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0),
-            .slow_superframe_s = REAL(0.2), .slow_curved_std = REAL(0.2), .longest_superframe_s = REAL(2.0),
-            .height_sigmas = REAL(5.0), .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15), .fitting_chi2 =
-            REAL(2.0), .most_late = REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2), .staying_std =
-            REAL(0.5), .window = REAL(60.0), .window_s = REAL(1.0), .median_difference_std_m = REAL(0.08),
-            .late_start_std_m = REAL(0.14), .chance = REAL(0.01), .rival_m = REAL(0.5), .height_margin_m = REAL(1.0),
-            .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0), .zero_variance_m2 = REAL(10000.0),
-            .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006), .phase_forgetting = REAL(0.005),
+            .stationary_s = REAL(0.0), .max_acceleration_mps2 = REAL(0.0), .integrity_risk = REAL(0.0001),
+            .alert_limit_m = (real)__builtin_nan("")}, .tuning = {.restart_m = REAL(300.0), .start_walk_scale =
+            REAL(100.0), .mean_gain = REAL(0.05), .noise_growth = REAL(1.2), .max_walk_scale = REAL(10000.0),
+            .noise_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row = REAL(8.0), .steady_walk_scale = REAL(4.0),
+            .max_scale = REAL(100.0), .lag_limit = REAL(2.6), .better_known = REAL(0.8), .stationary_noise_share =
+            REAL(2e-07), .stationary_std_mps = REAL(0.01), .held_step_m = REAL(0.15), .held_max_m = REAL(0.4),
+            .curvature_share = REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02), .wrong_nis = REAL(2.0),
+            .slow_forgetting = REAL(0.005), .late_often_share = REAL(0.02), .huber = REAL(1.0), .max_relays_rejected =
+            REAL(4.0), .lost_in_row = REAL(8.0), .lost_share = REAL(0.5), .suspect = REAL(3.0), .in_row = REAL(2.0),
+            .in_row_where_late = REAL(5.0), .first_change_scale = REAL(10.0), .ended_std_m = REAL(0.05), .ended =
+            REAL(2.0), .obstructed_walk = REAL(0.004), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5),
+            .obstructed_std_m = REAL(0.05), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1), .place_first =
+            REAL(20.0), .place_samples = REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 = REAL(0.0012),
+            .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3), .recent_std_m =
+            REAL(0.08), .creeping_std_m = REAL(0.2), .recent_packets = REAL(16.0), .creeping_s = REAL(3.0), .late_std_m
+            = REAL(1.0), .sure_chi2 = REAL(50.0), .early_weight = REAL(0.8), .open_pair_std_m = REAL(0.1), .pair_relays
+            = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s = REAL(0.5), .curved_std = REAL(0.1),
+            .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s = REAL(1.0), .start_margin =
+            REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0), .longest_superframe_s = REAL(2.0),
+            .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late =
+            REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s =
+            REAL(1.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),
+            .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
+            .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
             .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =
-            REAL(0.1), .phase_step_m = REAL(0.02), .phase_line_m = REAL(0.03), .phase_former_s = REAL(0.5),
-            .phases_in_row = REAL(4.0), .phase_nis = REAL(2.0), .phase_after_s = REAL(1.0), .uncovered_chi2 =
-            REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0),
-            .shift_part = REAL(0.25), .apart_chi2 = REAL(25.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true,
-            .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
+            REAL(0.1), .phase_step_m = REAL(0.02), .phase_former_s = REAL(0.5), .phases_in_row = REAL(4.0),
+            .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m
+            = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting
+            = true, .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
     t->owner.qa = qa;
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;
@@ -6883,8 +6857,8 @@ SKYLESS_EXPORT void skyless_wake(Tag *t, State *s, Acquisition *q, int64_t rx_co
     forget_stamps(t, q);
     if (had_height) {
         q->has_bounds = true;
-        q->low_m = height_m - c->tuning.height_sigmas * std_m;
-        q->high_m = height_m + c->tuning.height_sigmas * std_m;
+        q->low_m = height_m - c->settings.gate * std_m;
+        q->high_m = height_m + c->settings.gate * std_m;
     }
 }
 

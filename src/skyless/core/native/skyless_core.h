@@ -191,6 +191,9 @@ typedef double real;
 /* Numbers that ``levels.protect`` writes: ``HPL``, ``VPL``, and the tests of all kinds of faults. */
 #define LEVELS 5
 #define LIGHT_2 REAL(8.987551787368176e+16)
+/* A comparison of range errors counts as this many times their mean at most, as jumps are not multipath. */
+#define LIMIT REAL(2.0)
+#define LIMITED_MEAN REAL(0.7421917)
 /* The leading bits of ln 2: products with small whole numbers are exact. */
 #define LN_2_HIGH REAL(0.6931471803691238)
 #define LN_2_LOW REAL(1.9082149292705877e-10)
@@ -632,7 +635,6 @@ typedef struct EstimatorSettings {
     real difference_std_m;  /* Standard deviation of each ready-made time difference. */
     real stationary_s;  /* A tag that has not shown any motion for this time counts as stationary; 0: never. */
     real max_acceleration_mps2;  /* The tag's largest acceleration, as far as levels are to cover it beyond ``qa``. */
-    real max_walk_scale;  /* Largest factor on ``walk`` where innovations show that oscillators wander more. */
     real integrity_risk;
     real alert_limit_m;  /* Fixes with a higher horizontal protection level have an alert; NaN for none. */
 } EstimatorSettings;
@@ -674,67 +676,68 @@ typedef struct Tuning {
     /* Weight in running means of normalised innovations (along each axis, of all anchors, of an anchor's relays), and
      * loss of the counts of recent relays with each packet. */
     real mean_gain;
-    real mean_limit;  /* Square of such a mean over its expectation beyond which process noise grows. */
-    real walk_scale_gain;  /* Growth of a clock's process noise with each innovation. */
-    real scale_loss;  /* Factor on adapted process noise with each innovation that does not call for more. */
+    real noise_growth;  /* Growth of adapted process noise with each innovation that calls for more … */
+    /* Largest factor on the random walk of a clock, and that of the tag's once all innovations are on one side. */
+    real max_walk_scale;
+    real noise_loss;  /* … and its factor with each other one. */
     /* Normalised innovations of all anchors beyond this on one side: the tag's clock has left its rate. */
     real common;
     /* Number of relays of a pair in a row beyond the gate that show that its path has jumped; fewer may be late. */
     real relays_in_row;
     /* Factor on the random walk of a clock up to which an anchor's report of it is used: its filter assumes 1. */
     real steady_walk_scale;
-    real q_scale_gain;  /* Growth of the process noise of motion with each innovation. */
     real max_scale;  /* Largest factor on the process noise of motion, and of a range error that has jumped. */
     /* Mean square of the innovations along the axes, 1 where the filter is right, beyond which that noise grows. */
     real lag_limit;
-    real lag_forgetting;  /* Weight in that mean. */
     real better_known;  /* The place of a tag at rest moves when its variance has shrunk to this part. */
     /* Part of the process noise of motion that a tag at rest keeps: 5 cm within half a minute. */
     real stationary_noise_share;
     real stationary_std_mps;  /* Standard deviation of the velocity of a tag at rest [m/s]. */
-    real held_step_m;  /* Distance of the estimate from the point of linearisation at which that moves [m]. */
+    /* Distance of the estimate from the point of linearisation, of ranges or of phases, at which that moves [m]. */
+    real held_step_m;
     real held_max_m;  /* It stays within ``suspect`` standard deviations of the estimate, up to this distance [m]. */
     real curvature_share;  /* Share of the stamps' variance below which the curvature of ranges is neglected. */
     /* Range at which errors that grow with distance pass through zero, and by which they change once [m] (APS011). */
     real slope_from_m;
-    real forgetting;  /* Weight in the mean NIS and in the share of rejected innovations: the last 50. */
-    real inconsistent_nis;  /* Mean NIS beyond which covariances are scaled by its square. */
-    real late_forgetting;  /* Weight in the share of late receptions: the last 200. */
+    /* Weight in the mean NIS, in the share of rejected innovations and in the mean square along axes: the last 50. */
+    real forgetting;
+    /* Mean NIS beyond which covariances are scaled by its square, phases are not used, and a new start is given up, once:
+     * it was wrong, for example by packets that were late. */
+    real wrong_nis;
+    /* Weight in the shares of late receptions and of phases beyond the gate, and in the phases' noise: the last 200. */
+    real slow_forgetting;
     real late_often_share;  /* Share of late receptions beyond which single ones are late often. */
-    /* Normalised innovation beyond which receptions have less weight where they are late often (Huber 1964). */
-    real reception_huber;
-    real difference_huber;  /* The same of time differences, always. */
+    /* Normalised innovation beyond which time differences, and receptions where they are late often, have less weight
+     * (Huber 1964). */
+    real huber;
     real max_relays_rejected;  /* Count of recent relays beyond the gate up to which they may be late ones. */
     /* Number of rejected packets in a row, single late ones left out, at which the state is wrong. */
     real lost_in_row;
     real lost_share;  /* Share of rejected innovations at which it is. */
-    real suspect;  /* Normalised innovation beyond which a reception may be a jump, and two of them differ by chance. */
+    /* Normalised innovation beyond which a reception may be a jump, two of them differ by chance, and a running mean
+     * over its expectation calls for more process noise. */
+    real suspect;
     /* Number of such receptions in a row that make a jump, and of impossible ones if a counter has restarted … */
     real in_row;
     real in_row_where_late;  /* … and where single receptions are late often. */
-    real together;  /* Sum of two such normalised innovations: by chance once in some million packets. */
-    real jump_std_m;  /* Least standard deviation of a range error that has jumped [m]. */
-    /* Factor on the process noise of a range error that has just jumped: it may still be changing … */
+    /* Factor on the process noise of a range error that has just jumped: it may still be changing. */
     real first_change_scale;
-    real change_growth;  /* … its growth while the mean of the anchor's innovations is off zero … */
-    real change_loss;  /* … and its factor otherwise. */
     real ended_std_m;  /* An obstruction has ended where the range error is known to this [m] … */
     real ended;  /* … and within this number of standard deviations of zero. */
     real obstructed_walk;  /* Density with which a range error that has jumped wanders [m²/s]. */
-    real obstruction_memory_s;  /* Time in which it returns to zero, and in which a jump is forgotten [s]. */
-    real obstruction_return_m;  /* Largest return in that time [m]: long delays are no less likely to stay. */
+    real obstruction_return_m;  /* Largest return in ``obstructed_s`` [m]: long delays are no less likely to stay. */
     real jump_rise;  /* Part of its full size by which a jump raises the process noise of all range errors. */
     real obstructed_std_m;  /* Standard deviation by which all range errors change where some have jumped [m] … */
-    real obstructed_s;  /* … and the time in which they do [s]. */
+    /* … the time in which they do, in which one that has jumped returns to zero, and in which a jump is forgotten [s]. */
+    real obstructed_s;
     real place_step_m;  /* Length of a step [m]. */
-    real place_limit;  /* A comparison counts as this many times their mean at most, as jumps are not multipath. */
-    real place_limited_mean;  /* Mean of χ² with one degree of freedom where no value counts as more than that. */
     real place_first;  /* Number of comparisons for which the stamps' noise stands beforehand. */
     real place_samples;  /* Number of comparisons that are needed … */
     real place_memory;  /* … and that are remembered. */
     real place_min_m2;  /* Least variance between two steps that counts as multipath [m²]. */
     real place_kept;  /* Least correlation over a step, and least loss of it. */
-    /* Largest standard deviation of the part of a range error that changes as the tag moves [m]. */
+    /* Largest standard deviation of the part of a range error that changes as the tag moves, and that of a pair's range
+     * that has jumped [m]. */
     real max_change_std_m;
     /* Standard deviation of each coordinate of an anchor that stands elsewhere, and of a fault since it joined [m] … */
     real lasting_std_m;
@@ -746,12 +749,9 @@ typedef struct Tuning {
     real late_std_m;
     /* Test beyond which there is a fault: χ² of eight degrees of freedom with a probability of 4·10⁻⁸. */
     real sure_chi2;
-    /* Least difference to what other anchors' faults explain, and most of the test that chosen ones leave. */
-    real rival_chi2;
     real early_weight;  /* Weight of what an early fault explains: obstacles make packets late. */
     /* Standard deviation of the range between two anchors against the survey, before it is measured [m]. */
     real open_pair_std_m;
-    real pair_jump_m2;  /* Variance of a pair's range that has jumped [m²]. */
     real pair_relays;  /* Number of relays in either direction after which their mean is a range. */
     /* Number of such ranges beyond ``suspect``, and more than the other end has, that make an anchor misplaced. */
     real misplaced_pairs;
@@ -761,22 +761,19 @@ typedef struct Tuning {
      * sure of a wrong position. It has no level, and is not predicted further. */
     real curved_std;
     real start_patience_s;  /* Time for which a start waits that is wide or contradicted: more anchors may come [s]. */
-    /* Probability with which residuals of a start are larger by chance than those that contradict it. */
+    /* Probability with which residuals of a start are larger by chance than those that contradict it, and weight below
+     * which other positions are no rivals. */
     real start_tail;
-    real new_start_s;  /* Time for which a start is new [s]: one with open range errors is not repeated within it … */
-    /* … and one whose mean NIS exceeds this is given up, once: it was wrong, for example by packets that were late. */
-    real early_nis;
+    /* Time for which a start is new [s]: one with open range errors is not repeated within it, and phases are not used,
+     * as places that still move by the stamps' noise would turn the directions to the anchors. */
+    real new_start_s;
     /* Factor on the start's covariance, as the filter is then given the packets that it rests on. */
     real start_margin;
     /* No state grows much wider over shorter silences; packets that are late by less are late from the radio [s]. */
     real short_silence_s;
     real longest_silence_s;  /* After a longer one the state is worse than a new start [s]. */
-    /* In longer superframes, where a new start takes seconds, a silence may widen the state more [s] … */
-    real slow_superframe_s;
-    real slow_curved_std;  /* … up to this part of the mean range. */
     /* In longer ones a tag may be metres away: nothing is predicted, and each round of packets is a start [s]. */
     real longest_superframe_s;
-    real height_sigmas;  /* Number of standard deviations by which a sensor's height is wrong at most. */
     real heights_in_row;  /* Number of heights in a row that do not fit, after which the position is wrong. */
     /* Standard deviation of each coordinate of an anchor after a start that was contradicted [m]. */
     real open_survey_std_m;
@@ -784,14 +781,12 @@ typedef struct Tuning {
     /* Number of anchors that are late at the start at most: on the floor or behind metal one often is. */
     real most_late;
     real late_penalty;  /* What each of them adds to χ²: odds of 1 to 3. */
-    real staying_share;  /* Part of an anchor's lateness at the start that stays: its mean … */
-    real staying_std;  /* … and its standard deviation. */
+    /* Part of an anchor's lateness at the start that stays: its mean, and its standard deviation. */
+    real staying_share;
     real window;  /* Number of ready-made time differences from which a start is looked for … */
     real window_s;  /* … or those of this time [s]. */
     real median_difference_std_m;  /* Standard deviation of the median of a pair's differences [m]. */
     real late_start_std_m;  /* Standard deviation of each anchor's error at the start, before any are estimated [m]. */
-    /* Probability below which residuals are not noise, and rivals no rivals, in a start from differences. */
-    real chance;
     /* Distance from which two positions are rivals; anchors lie elsewhere for a tag that has moved as far [m]. */
     real rival_m;
     /* Starts lie no higher above or below anchors of different heights than this, unless bounds are given [m]. */
@@ -801,8 +796,7 @@ typedef struct Tuning {
     real most_horizontal_std_m;  /* While its horizontal standard deviation is larger, there is no fix [m]. */
     real zero_variance_m2;  /* Variance of a barometer's zero at first [m²]. */
     real phase_start_std_m;  /* Standard deviation of a phase before innovations show another [m] … */
-    real phase_max_std_m;  /* … its upper bound, or that of the settings [m] … */
-    real phase_forgetting;  /* … and the weight of the newest in it, and in the share of phases beyond the gate. */
+    real phase_max_std_m;  /* … and its upper bound, or that of the settings [m]. */
     real phase_mesh_std_m;  /* Standard deviation of a phase that an anchor measured of another [m]. */
     /* What reflections change in an ambiguity as the tag walks, in variances of a phase for each metre [1/m]. */
     real phase_wander;
@@ -811,16 +805,10 @@ typedef struct Tuning {
     /* Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle. */
     real phase_share;
     real phase_step_m;  /* Length of the steps by which reflections change phases [m]. */
-    /* Distance of the estimate from the point at which phases are linearised, at which that moves [m]. */
-    real phase_line_m;
     /* Time for which an ambiguity from before a gap is kept to find by how many cycles it has changed [s]. */
     real phase_former_s;
     /* Number of phases of an anchor in a row beyond the gate at which its ambiguity begins again. */
     real phases_in_row;
-    real phase_nis;  /* Mean NIS of stamps beyond which a phase has a wrong cycle. */
-    /* Time after the start from which phases are used [s]: places that still move by the stamps' noise would turn the
-     * directions to the anchors, which phases would take for motion. */
-    real phase_after_s;
     real uncovered_chi2;  /* Test beyond which faults are larger than levels cover. */
     /* Part of the mean range beyond which, where all range errors are open, a standard deviation has no level. */
     real max_open_level_std;
@@ -829,7 +817,8 @@ typedef struct Tuning {
     real probe_m;  /* Least distance from the anchors' plane at which its two sides are compared [m]. */
     /* Standard deviation of the best place on the other side about the mirror image, over that distance. */
     real shift_part;
-    /* Squared difference over its variance from which two things differ: ranges of both sides, or two starts. */
+    /* Squared difference over its variance from which two things differ: ranges of both sides, two starts, or what faults
+     * of other anchors explain. */
     real apart_chi2;
     real sensor_valid_s;  /* Time for which a sensor's height decides between them [s]. */
 } Tuning;

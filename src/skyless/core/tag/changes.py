@@ -105,7 +105,7 @@ def wake(t: Tag, s: State, q: Acquisition, rx_counter: Ticks, slept_s: float) ->
     _forget_stamps(t, q)
     if had_height:
         q.has_bounds = True
-        q.low_m, q.high_m = height_m - c.tuning.height_sigmas * std_m, height_m + c.tuning.height_sigmas * std_m
+        q.low_m, q.high_m = height_m - c.settings.gate * std_m, height_m + c.settings.gate * std_m
 
 
 def handle_events(t: Tag, q: Acquisition) -> None:

@@ -119,7 +119,7 @@ def _is_contradicted(c: Course, s: State, rx_ticks: Ticks) -> bool:
     age_s = (rx_ticks - c.started_ticks) * TICK_S
     if age_s >= tuning.new_start_s:
         c.may_begin_again = True
-    elif c.may_begin_again and s.fix[QUALITY][0] > tuning.early_nis:
+    elif c.may_begin_again and s.fix[QUALITY][0] > tuning.wrong_nis:
         c.may_begin_again = False  # if it does not help, all is noisier than stated
         return True
     if c.is_open and age_s > tuning.new_start_s and fits_settings(s):

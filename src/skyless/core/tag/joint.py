@@ -155,7 +155,7 @@ class Estimation:
         Before a start it bounds the heights of the search. Where many in a row do not fit, the start was wrong.
         """
         if self.is_starting:
-            margin_m = TUNING.height_sigmas * std_m
+            margin_m = self.course.settings.gate * std_m
             self.search.has_bounds = True
             self.search.low_m, self.search.high_m = height_m - margin_m, height_m + margin_m
             return False

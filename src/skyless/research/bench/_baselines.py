@@ -95,7 +95,7 @@ class PlainJoint:
         self._common_mean += TUNING.mean_gain * (normalised - self._common_mean)
         square = self._common_mean**2 * (2.0 - TUNING.mean_gain) / TUNING.mean_gain
         self._walk_scale = max(
-            self._walk_scale * (TUNING.walk_scale_gain if square > TUNING.mean_limit else TUNING.scale_loss), 1.0
+            self._walk_scale * (TUNING.noise_growth if square > TUNING.suspect**2 else TUNING.noise_loss), 1.0
         )
 
     def _process_relay(self, listener: int, of: int, sequence: int, heard: int) -> None:

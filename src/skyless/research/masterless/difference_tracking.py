@@ -312,7 +312,7 @@ def find_start(
     for some in (list(some) for size in range(most + 1) for some in combinations(range(count), size)):
         sigma_m2 = usual_m2 + TUNING.late_std_m**2 * shares[some].T @ shares[some]
         found = locate(
-            anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=TUNING.chance
+            anchors_m, tdoa_m, sigma_m2, height_m=height_m, z_bounds_m=z_bounds_m, residual_tail=TUNING.start_tail
         )
         if isinstance(found, NoSolution):
             reason = reason if some else found
@@ -332,7 +332,7 @@ def find_start(
     off_m = positions - position_m
     covariance_m2 = np.tensordot(weights, covariances + off_m[:, :, None] * off_m[:, None, :], 1)
     best_m = positions[int(np.argmin(scores))]
-    has_rival = np.any((np.linalg.norm(positions - best_m, axis=1) > TUNING.rival_m) & (weights > TUNING.chance))
+    has_rival = np.any((np.linalg.norm(positions - best_m, axis=1) > TUNING.rival_m) & (weights > TUNING.start_tail))
     late = dict(zip(anchors, np.tensordot(weights, lates, 1).T.tolist(), strict=True))
     is_ambiguous = bool(has_rival) or sum(variance for _, variance in late.values()) > 0.5 * TUNING.late_std_m**2
     start = Start(position_m, covariance_m2, late, is_ambiguous, neighbourhood_m(anchors_m))

@@ -29,7 +29,6 @@ MASTERLESS: Final = DIFFERENCES.changed(
     gate=4.0,
     white=EstimatorSettings().white,
     walk=(MASTERLESS_RANDOM_WALK_FM * SPEED_OF_LIGHT_MPS) ** 2,
-    max_walk_scale=1.0,
     drop_s=EstimatorSettings().drop_s,
     rx_variance_m2=2e-3,
     slope_std_m=0.05,

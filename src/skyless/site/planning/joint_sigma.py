@@ -89,7 +89,7 @@ def walked_sigma(
     if len(in_view) <= settings.dim:
         return math.inf
     s = _state_at(settings, scene.anchors, in_view, point, has_phases)
-    s.tuning.phase_forgetting = 0.0  # nothing is learnt from innovations of zero
+    s.tuning.slow_forgetting = 0.0  # nothing is learnt from innovations of zero
     columns, found, superframe_s = _planned(clocks, relays, share, delay_m, in_view), SteadyState(), clocks.gap_s.sum()
     walked = max(1, round(1.0 / superframe_s))
     velocity = np.ascontiguousarray(velocity_mps / (walked * superframe_s))
