@@ -39,9 +39,9 @@ def test_a_vehicle_at_20_metres_a_second(tag_height_m, seed):
 
 @pytest.mark.statistical
 def test_fixes_know_what_hard_turns_cost_them():
-    """Round corners in 0.2 s at 3 m/s, 21 m/s²: the filter lags behind."""
+    """Round corners in 0.1 s at 3 m/s, 42 m/s²: the filter lags behind."""
     site, normalised = paper_lab_site(), []
-    path = Waypoints([(1.5, 2.0), (4.5, 2.0), (4.5, 6.0), (1.5, 6.0)], 3.0, loop=True, corner_s=0.2)
+    path = Waypoints([(1.5, 2.0), (4.5, 2.0), (4.5, 6.0), (1.5, 6.0)], 3.0, loop=True, corner_s=0.1)
     for seed in (1, 2):
         fleet = Fleet(site, [path], impairments_of(Request(site), site), seed, FleetSettings())
         for one in fleet.run(15.0):

@@ -1,6 +1,6 @@
-"""What ``joint`` gives on four recordings and in two simulated rooms is that of the last deliberate change of results.
+"""What ``joint`` gives on two recordings and in a simulated room is that of the last deliberate change of results.
 
-The traces are thinned fixes in ``traces/``, so that a change of the estimator's output is a diff that can be read:
+The traces are 200 fixes each in ``traces/``, so that a change of the estimator's output is a diff that can be read:
 
     python tests/positioning/test_traces.py        writes them again
 """
@@ -20,26 +20,24 @@ from skyless.sim.impairments import Body
 pytestmark = pytest.mark.site
 
 TRACES = Path(__file__).with_name("traces")
-EVERY_S = 1.0
+ROWS = 200
 RECORDED_S, SIMULATED_S = 30.0, 12.0
 HEAD = "time_s,x_m,y_m,z_m,sigma_m,hpl_m"
 RECORDINGS = {
-    "const1_trial1": ("util_flights/const1/const1-trial1-tdoa2_tdoa.csv.gz", "util_flights/anchors_const1.csv"),
     "const4_trial3": ("util_flights/const4/const4-trial3-tdoa2-traj1_tdoa.csv.gz", "util_flights/anchors_const4.csv"),
-    "kuipman": ("kuipman_tdoa3_sniffer/raw_yaml/b34daf0_output20240415.yaml", "kuipman_tdoa3_sniffer/anchors.csv"),
     "muloc": ("muloc/location1_2.npz", None),
 }
-SIMULATIONS = {"room": {}, "body": {"body": Body()}}
+SIMULATIONS = {"body": {"body": Body()}}
 TOLERANCE_M, LEVEL_TOLERANCE = 5e-3, 0.05
 """Another processor rounds otherwise, and a filter's decisions may then differ for single packets."""
 
 
-def thinned(fixes):
-    """Rows of the first fix of every second: time, position, horizontal standard deviation, level."""
+def thinned(fixes, seconds):
+    """Evenly spaced rows: time, position, horizontal standard deviation, level."""
     rows, next_s = [], -np.inf
     for time_s, position_m, covariance_m2, hpl_m in fixes:
         if time_s >= next_s:
-            next_s = time_s + EVERY_S
+            next_s = time_s + seconds / ROWS
             sigma_m = float(np.sqrt(covariance_m2[0, 0] + covariance_m2[1, 1]))
             rows.append((time_s, *position_m, sigma_m, np.nan if hpl_m is None else hpl_m))
     return np.round(np.array(rows), 3)
@@ -53,14 +51,13 @@ def recorded(name, folder):
     fixes = []
     CaptureReplay(options).run(fixes.append, lambda _: None)
     begin_s = fixes[0].time_s
-    return thinned((fix.time_s - begin_s, fix.position_m, fix.covariance_m2, fix.hpl_m) for fix in fixes)
+    return thinned(((fix.time_s - begin_s, fix.position_m, fix.covariance_m2, fix.hpl_m) for fix in fixes), RECORDED_S)
 
 
 def simulated(name):
     fleet = fleet_of(Request(site=lab_site(), seed=3, tags=1, room=Room(), **SIMULATIONS[name]))
-    return thinned(
-        (one.time_s, one.fix.position_m, one.fix.covariance_m2, one.fix.hpl_m) for one in fleet.run(SIMULATED_S)
-    )
+    fixes = ((one.time_s, one.fix.position_m, one.fix.covariance_m2, one.fix.hpl_m) for one in fleet.run(SIMULATED_S))
+    return thinned(fixes, SIMULATED_S)
 
 
 def kept(name):

@@ -41,8 +41,9 @@ def has_jumped(s: State, anchor: int, innovation: float, innovation_variance: fl
         a.outliers_in_row = 0
     else:
         stamps = 2.0 * (settings.tx_variance_m2 + settings.rx_variance_m2)
-        apart = innovation - a.outlier_m
+        apart, both = innovation - a.outlier_m, innovation + a.outlier_m
         agrees = a.outliers_in_row > 0 and apart * apart <= square(tuning.suspect) * stamps
+        agrees = agrees and both * both > square(tuning.together) * innovation_variance
         a.outliers_in_row = a.outliers_in_row + 1 if agrees else 1
         a.outlier_m = innovation
     return a.outliers_in_row >= (tuning.in_row_where_late if is_late_often(s) else tuning.in_row)

@@ -38,7 +38,7 @@ class Tuning(Record):
     # Motion
     max_scale: float = 100.0
     """Largest factor on the process noise of motion, and of a range error that has jumped."""
-    lag_limit: float = 2.6
+    lag_limit: float = 3.5
     """Mean square of the innovations along the axes, 1 where the filter is right, beyond which that noise grows."""
     better_known: float = 0.8
     """The place of a tag at rest moves when its variance has shrunk to this part."""
@@ -86,6 +86,8 @@ class Tuning(Record):
     """Number of such receptions in a row that make a jump, and of impossible ones if a counter has restarted …"""
     in_row_where_late: float = 5
     """… and where single receptions are late often."""
+    together: float = 7.0
+    """Sum of two such normalised innovations: by chance once in some million packets."""
     first_change_scale: float = 10.0
     """Factor on the process noise of a range error that has just jumped: it may still be changing."""
     ended_std_m: float = 0.05
@@ -168,6 +170,10 @@ class Tuning(Record):
     """No state grows much wider over shorter silences; packets that are late by less are late from the radio [s]."""
     longest_silence_s: float = 5.0
     """After a longer one the state is worse than a new start [s]."""
+    slow_superframe_s: float = 0.2
+    """In longer superframes, where a new start takes seconds, a silence may widen the state more [s] …"""
+    slow_curved_std: float = 0.2
+    """… up to this part of the mean range."""
     longest_superframe_s: float = 2.0
     """In longer ones a tag may be metres away: nothing is predicted, and each round of packets is a start [s]."""
     heights_in_row: float = 20

@@ -1886,7 +1886,7 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     }
     status->walked_m += SQRT(speed_squared) * dt;
     if (status->obstruction > REAL(0.0)) {
-        status->obstruction *= exp_(-dt / s->tuning.obstructed_s);
+        status->obstruction *= exp_(-dt / s->tuning.obstruction_memory_s);
     }
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         status->line_m[axis] += s->x[where->velocity + axis] * dt;
@@ -2023,7 +2023,8 @@ INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, r
     real obstructed = share * dt / tuning->obstructed_s;
     if (a->is_obstructed) {
         real change_m = s->x[s->layout.change + anchor];
-        real memory_s = tuning->obstructed_s * max_real(REAL(1.0), abs_real(change_m) / tuning->obstruction_return_m);
+        real memory_s = tuning->obstruction_memory_s * max_real(REAL(1.0), abs_real(change_m) /
+                tuning->obstruction_return_m);
         variance = REAL(0.5) * memory_s * tuning->obstructed_walk * a->change_scale;
         kept = exp_(-dt / memory_s);
     } else {
@@ -2723,7 +2724,9 @@ INTERNAL bool has_jumped(State *s, int32_t anchor, real innovation, real innovat
     } else {
         real stamps = REAL(2.0) * (settings->tx_variance_m2 + settings->rx_variance_m2);
         real apart = innovation - a->outlier_m;
+        real both = innovation + a->outlier_m;
         bool agrees = a->outliers_in_row > 0 && apart * apart <= square(tuning->suspect) * stamps;
+        agrees = agrees && both * both > square(tuning->together) * innovation_variance;
         a->outliers_in_row = agrees ? a->outliers_in_row + 1 : 1;
         a->outlier_m = innovation;
     }
@@ -2823,7 +2826,10 @@ INTERNAL real variance_scale(State *s, real innovation, real innovation_variance
     status->rejected_in_row = 0;
     status->mean_nis += forgetting * (normalised * normalised - status->mean_nis);
     status->mean_square_m2 += forgetting * (innovation * innovation - status->mean_square_m2);
-    return is_difference || is_late_often(s) ? max_real(REAL(1.0), abs_real(normalised) / tuning->huber) : REAL(1.0);
+    if (is_difference) {
+        return max_real(REAL(1.0), abs_real(normalised) / tuning->difference_huber);
+    }
+    return is_late_often(s) ? max_real(REAL(1.0), abs_real(normalised) / tuning->reception_huber) : REAL(1.0);
 }
 
 /* Let the variance of an anchor's changing range error track its estimate: the mean of its square.
@@ -6469,7 +6475,8 @@ INTERNAL bool is_out_of_reach(Course *c, State *s, int64_t rx_ticks) {
     if (silent_s < tuning->short_silence_s) {
         return false;
     }
-    return SQRT(horizontal_variance_m2(s, silent_s)) > tuning->curved_std * mean_range_m(c, s->x);
+    real part = c->superframe_s < tuning->slow_superframe_s ? tuning->curved_std : tuning->slow_curved_std;
+    return SQRT(horizontal_variance_m2(s, silent_s)) > part * mean_range_m(c, s->x);
 }
 
 /* From a position to the anchors in use. */
@@ -6788,13 +6795,14 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .alert_limit_m = (real)__builtin_nan("")}, .tuning = {.restart_m = REAL(300.0), .start_walk_scale =
             REAL(100.0), .mean_gain = REAL(0.05), .noise_growth = REAL(1.2), .max_walk_scale = REAL(10000.0),
             .noise_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row = REAL(8.0), .steady_walk_scale = REAL(4.0),
-            .max_scale = REAL(100.0), .lag_limit = REAL(2.6), .better_known = REAL(0.8), .stationary_noise_share =
+            .max_scale = REAL(100.0), .lag_limit = REAL(3.5), .better_known = REAL(0.8), .stationary_noise_share =
             REAL(2e-07), .stationary_std_mps = REAL(0.01), .held_step_m = REAL(0.15), .held_max_m = REAL(0.4),
             .curvature_share = REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02), .wrong_nis = REAL(2.0),
-            .slow_forgetting = REAL(0.005), .late_often_share = REAL(0.02), .huber = REAL(1.0), .max_relays_rejected =
-            REAL(4.0), .lost_in_row = REAL(8.0), .lost_share = REAL(0.5), .suspect = REAL(3.0), .in_row = REAL(2.0),
-            .in_row_where_late = REAL(5.0), .first_change_scale = REAL(10.0), .ended_std_m = REAL(0.05), .ended =
-            REAL(2.0), .obstructed_walk = REAL(0.004), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5),
+            .slow_forgetting = REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5),
+            .difference_huber = REAL(1.0), .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share =
+            REAL(0.5), .suspect = REAL(3.0), .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0),
+            .first_change_scale = REAL(10.0), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk =
+            REAL(0.004), .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5),
             .obstructed_std_m = REAL(0.05), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1), .place_first =
             REAL(20.0), .place_samples = REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 = REAL(0.0012),
             .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3), .recent_std_m =
@@ -6802,17 +6810,18 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             = REAL(1.0), .sure_chi2 = REAL(50.0), .early_weight = REAL(0.8), .open_pair_std_m = REAL(0.1), .pair_relays
             = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s = REAL(0.5), .curved_std = REAL(0.1),
             .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s = REAL(1.0), .start_margin =
-            REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0), .longest_superframe_s = REAL(2.0),
-            .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late =
-            REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s =
-            REAL(1.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),
-            .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
-            .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
-            .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =
-            REAL(0.1), .phase_step_m = REAL(0.02), .phase_former_s = REAL(0.5), .phases_in_row = REAL(4.0),
-            .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m
-            = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting
-            = true, .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
+            REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0), .slow_superframe_s = REAL(0.2),
+            .slow_curved_std = REAL(0.2), .longest_superframe_s = REAL(2.0), .heights_in_row = REAL(20.0),
+            .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late = REAL(2.0), .late_penalty =
+            REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s = REAL(1.0), .median_difference_std_m
+            = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5), .height_margin_m = REAL(1.0),
+            .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0), .zero_variance_m2 = REAL(10000.0),
+            .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006), .phase_mesh_std_m = REAL(0.0012),
+            .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02),
+            .phase_former_s = REAL(0.5), .phases_in_row = REAL(4.0), .uncovered_chi2 = REAL(240.0), .max_open_level_std
+            = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2
+            = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true, .misfit = -1, .relays_may_contradict =
+            true, .may_begin_again = true};
     t->owner.qa = qa;
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;

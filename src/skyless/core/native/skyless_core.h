@@ -707,9 +707,9 @@ typedef struct Tuning {
     /* Weight in the shares of late receptions and of phases beyond the gate, and in the phases' noise: the last 200. */
     real slow_forgetting;
     real late_often_share;  /* Share of late receptions beyond which single ones are late often. */
-    /* Normalised innovation beyond which time differences, and receptions where they are late often, have less weight
-     * (Huber 1964). */
-    real huber;
+    /* Normalised innovation beyond which receptions have less weight where they are late often (Huber 1964). */
+    real reception_huber;
+    real difference_huber;  /* The same of time differences, always. */
     real max_relays_rejected;  /* Count of recent relays beyond the gate up to which they may be late ones. */
     /* Number of rejected packets in a row, single late ones left out, at which the state is wrong. */
     real lost_in_row;
@@ -720,16 +720,17 @@ typedef struct Tuning {
     /* Number of such receptions in a row that make a jump, and of impossible ones if a counter has restarted … */
     real in_row;
     real in_row_where_late;  /* … and where single receptions are late often. */
+    real together;  /* Sum of two such normalised innovations: by chance once in some million packets. */
     /* Factor on the process noise of a range error that has just jumped: it may still be changing. */
     real first_change_scale;
     real ended_std_m;  /* An obstruction has ended where the range error is known to this [m] … */
     real ended;  /* … and within this number of standard deviations of zero. */
     real obstructed_walk;  /* Density with which a range error that has jumped wanders [m²/s]. */
-    real obstruction_return_m;  /* Largest return in ``obstructed_s`` [m]: long delays are no less likely to stay. */
+    real obstruction_memory_s;  /* Time in which it returns to zero, and in which a jump is forgotten [s]. */
+    real obstruction_return_m;  /* Largest return in that time [m]: long delays are no less likely to stay. */
     real jump_rise;  /* Part of its full size by which a jump raises the process noise of all range errors. */
     real obstructed_std_m;  /* Standard deviation by which all range errors change where some have jumped [m] … */
-    /* … the time in which they do, in which one that has jumped returns to zero, and in which a jump is forgotten [s]. */
-    real obstructed_s;
+    real obstructed_s;  /* … and the time in which they do [s]. */
     real place_step_m;  /* Length of a step [m]. */
     real place_first;  /* Number of comparisons for which the stamps' noise stands beforehand. */
     real place_samples;  /* Number of comparisons that are needed … */
@@ -772,6 +773,9 @@ typedef struct Tuning {
     /* No state grows much wider over shorter silences; packets that are late by less are late from the radio [s]. */
     real short_silence_s;
     real longest_silence_s;  /* After a longer one the state is worse than a new start [s]. */
+    /* In longer superframes, where a new start takes seconds, a silence may widen the state more [s] … */
+    real slow_superframe_s;
+    real slow_curved_std;  /* … up to this part of the mean range. */
     /* In longer ones a tag may be metres away: nothing is predicted, and each round of packets is a start [s]. */
     real longest_superframe_s;
     real heights_in_row;  /* Number of heights in a row that do not fit, after which the position is wrong. */

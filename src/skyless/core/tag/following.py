@@ -152,7 +152,8 @@ def _is_out_of_reach(c: Course, s: State, rx_ticks: Ticks) -> bool:
         return True
     if silent_s < tuning.short_silence_s:
         return False
-    return sqrt(horizontal_variance_m2(s, silent_s)) > tuning.curved_std * _mean_range_m(c, s.x)
+    part = tuning.curved_std if c.superframe_s < tuning.slow_superframe_s else tuning.slow_curved_std
+    return sqrt(horizontal_variance_m2(s, silent_s)) > part * _mean_range_m(c, s.x)
 
 
 def _mean_range_m(c: Course, position_m: Reals) -> float:
