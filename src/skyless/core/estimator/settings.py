@@ -61,8 +61,8 @@ class Tuning(Record):
     forgetting: float = 0.02
     """Weight in the mean NIS, in the share of rejected innovations and in the mean square along axes: the last 50."""
     wrong_nis: float = 2.0
-    """Mean NIS beyond which covariances are scaled by its square, phases are not used, and a new start is given up, once:
-    it was wrong, for example by packets that were late."""
+    """Mean NIS beyond which covariances are scaled by its square, phases are not used, and a new start is given up,
+    once: it was wrong, for example by packets that were late."""
     slow_forgetting: float = 0.005
     """Weight in the shares of late receptions and of phases beyond the gate, and in the phases' noise: the last 200."""
     late_often_share: float = 0.02
@@ -239,8 +239,8 @@ class Tuning(Record):
     shift_part: float = 0.25
     """Standard deviation of the best place on the other side about the mirror image, over that distance."""
     apart_chi2: float = 20.0
-    """Squared difference over its variance from which two things differ: ranges of both sides, two starts, or what faults
-    of other anchors explain."""
+    """Squared difference over its variance from which two things differ: ranges of both sides, two starts, or what
+    faults of other anchors explain."""
     sensor_valid_s: float = 1.0
     """Time for which a sensor's height decides between them [s]."""
 

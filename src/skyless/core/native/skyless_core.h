@@ -701,8 +701,8 @@ typedef struct Tuning {
     real slope_from_m;
     /* Weight in the mean NIS, in the share of rejected innovations and in the mean square along axes: the last 50. */
     real forgetting;
-    /* Mean NIS beyond which covariances are scaled by its square, phases are not used, and a new start is given up, once:
-     * it was wrong, for example by packets that were late. */
+    /* Mean NIS beyond which covariances are scaled by its square, phases are not used, and a new start is given up,
+     * once: it was wrong, for example by packets that were late. */
     real wrong_nis;
     /* Weight in the shares of late receptions and of phases beyond the gate, and in the phases' noise: the last 200. */
     real slow_forgetting;
@@ -821,8 +821,8 @@ typedef struct Tuning {
     real probe_m;  /* Least distance from the anchors' plane at which its two sides are compared [m]. */
     /* Standard deviation of the best place on the other side about the mirror image, over that distance. */
     real shift_part;
-    /* Squared difference over its variance from which two things differ: ranges of both sides, two starts, or what faults
-     * of other anchors explain. */
+    /* Squared difference over its variance from which two things differ: ranges of both sides, two starts, or what
+     * faults of other anchors explain. */
     real apart_chi2;
     real sensor_valid_s;  /* Time for which a sensor's height decides between them [s]. */
 } Tuning;
