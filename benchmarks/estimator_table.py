@@ -326,12 +326,17 @@ def markdown(columns: dict[str, Column]) -> str:
             f"| {100.0 * levels / fixes:.0f} % | {exceeded:.0f} |"
         )
     names = [name for name in next(iter(columns.values())) if name]
-    if all(name.endswith(FACTORS) for name in names):
+    if names and all(name.endswith(FACTORS) for name in names):
         lines += ["", f"| constant | {' | '.join(FACTORS)} |", "|---|---|---|"]
+        idle = []
         for name in sorted({name.rpartition("`")[0] for name in names}):
-            both = (changes(columns, f"{name}` {factor}") for factor in FACTORS)
-            lines.append(f"| {name}` | {' | '.join(both)} |")
-    else:
+            both = [changes(columns, f"{name}` {factor}") for factor in FACTORS]
+            if set(both) == {"nothing"}:
+                idle.append(f"{name}`")
+            else:
+                lines.append(f"| {name}` | {' | '.join(both)} |")
+        lines += ["", f"Nothing beyond the scatter in these situations: {', '.join(idle) or 'none'}."]
+    elif names:
         lines += ["", "| off | what changes |", "|---|---|"]
         lines += [f"| {name} | {changes(columns, name)} |" for name in names]
     return "\n".join(lines) + "\n"
