@@ -404,6 +404,8 @@ def main() -> None:
                 name = f"MULoc {channel}, {'phases' if has_phases else 'stamps'}"
                 cells.append((name, partial(packets, path, channel, has_phases, chosen)))
     cells = [cell for cell in cells if any(word in cell[0] for word in asked.rows)]
+    if not cells:
+        parser.error(f"--rows is {' '.join(asked.rows)}; it should be words of situations, as the tables list them")
     amounts = [asked.seed, asked.worlds, asked.first, *chosen]
     kept: list[tuple[str, dict[str, Sums]]] = []
     if asked.kept and asked.kept.exists():

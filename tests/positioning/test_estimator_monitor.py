@@ -23,9 +23,11 @@ from estimator_builders import (
     where,
 )
 from msgspec.structs import replace
+from scipy.stats import chi2
 
 from skyless.core.clock_filter import ClockFilter, clock_noise
 from skyless.core.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
+from skyless.core.estimator import monitor
 from skyless.core.estimator.estimator import Report
 from skyless.core.estimator.process import ACCEPTED, REJECTED
 from skyless.core.estimator.settings import TUNING
@@ -347,3 +349,8 @@ def test_multipath_that_was_learnt_is_estimated_also_where_the_settings_call_ran
         std = np.sqrt(P.diagonal()[used])
         assert np.linalg.eigvalsh(P[np.ix_(used, used)] / np.outer(std, std)).min() > -1e-9
     assert estimator.multipath_m is not None
+
+
+def test_the_mean_of_limited_comparisons_is_that_of_chi_squared():
+    limited = chi2(1).expect(lambda value: min(value, monitor._PLACE_LIMIT), lb=0.0, ub=np.inf)
+    assert pytest.approx(limited, abs=1e-6) == monitor._PLACE_LIMITED_MEAN

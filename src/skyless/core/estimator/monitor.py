@@ -24,9 +24,9 @@ from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, at, make_
 from skyless.core.estimator.verdicts import is_late_often
 from skyless.core.native.arithmetic import log, sqrt, square
 
-_LIMIT: Final = 2.0
+_PLACE_LIMIT: Final = 2.0
 """A comparison of range errors counts as this many times their mean at most, as jumps are not multipath."""
-_LIMITED_MEAN: Final = 0.7421917  # of χ² with one degree of freedom where no value counts as more than that
+_PLACE_LIMITED_MEAN: Final = 0.7421917  # of χ² with one degree of freedom where no value counts as more than that
 
 
 def is_warm(s: State) -> bool:
@@ -170,7 +170,7 @@ def learn_place(s: State, anchor: int, residual_m: float) -> None:
         status.place_samples = min(status.place_samples + 1, int(tuning.place_memory))
         for lag in range(2):
             half, mean = 0.5 * square(residual_m - a.place_residual_m[lag]), status.place_square_m2[lag]
-            limited = min(half, _LIMIT * mean) / _LIMITED_MEAN
+            limited = min(half, _PLACE_LIMIT * mean) / _PLACE_LIMITED_MEAN
             status.place_square_m2[lag] += (limited - mean) / (tuning.place_first + status.place_samples)
     a.place_residual_m[1] = a.place_residual_m[0]
     a.place_residual_m[0] = residual_m
@@ -216,8 +216,8 @@ def adapt_process_noise(s: State, normalised: float) -> None:
     status.lag_square += tuning.forgetting * (lag_square - status.lag_square)
     status.q_scale = _adapted(s, status.q_scale, status.lag_square > tuning.lag_limit, tuning.max_scale)
     status.common_mean += gain * (normalised - status.common_mean)
-    is_common = _is_off_zero(s, status.common_mean)
-    status.walk_scale = _adapted(s, status.walk_scale, is_common, tuning.max_walk_scale)
+    is_clock_off = _is_off_zero(s, status.common_mean)
+    status.walk_scale = _adapted(s, status.walk_scale, is_clock_off, tuning.max_walk_scale)
 
 
 def adapt_clock_noise(s: State, anchor: int, normalised: float) -> None:

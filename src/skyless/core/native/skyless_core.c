@@ -2870,7 +2870,7 @@ INTERNAL void learn_place(State *s, int32_t anchor, real residual_m) {
         for (int32_t lag = 0; lag < 2; lag++) {
             real half = REAL(0.5) * square(residual_m - a->place_residual_m[lag]);
             real mean = status->place_square_m2[lag];
-            real limited = min_real(half, LIMIT * mean) / LIMITED_MEAN;
+            real limited = min_real(half, PLACE_LIMIT * mean) / PLACE_LIMITED_MEAN;
             status->place_square_m2[lag] += (limited - mean) / (tuning->place_first + (real)status->place_samples);
         }
     }
@@ -2929,8 +2929,8 @@ INTERNAL void adapt_process_noise(State *s, real normalised) {
     status->lag_square += tuning->forgetting * (lag_square - status->lag_square);
     status->q_scale = adapted(s, status->q_scale, status->lag_square > tuning->lag_limit, tuning->max_scale);
     status->common_mean += gain * (normalised - status->common_mean);
-    bool is_common = is_off_zero(s, status->common_mean);
-    status->walk_scale = adapted(s, status->walk_scale, is_common, tuning->max_walk_scale);
+    bool is_clock_off = is_off_zero(s, status->common_mean);
+    status->walk_scale = adapted(s, status->walk_scale, is_clock_off, tuning->max_walk_scale);
 }
 
 /* Adapt the process noise of an anchor's clock to what a relay shows of it. */

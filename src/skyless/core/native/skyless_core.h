@@ -191,9 +191,6 @@ typedef double real;
 /* Numbers that ``levels.protect`` writes: ``HPL``, ``VPL``, and the tests of all kinds of faults. */
 #define LEVELS 5
 #define LIGHT_2 REAL(8.987551787368176e+16)
-/* A comparison of range errors counts as this many times their mean at most, as jumps are not multipath. */
-#define LIMIT REAL(2.0)
-#define LIMITED_MEAN REAL(0.7421917)
 /* The leading bits of ln 2: products with small whole numbers are exact. */
 #define LN_2_HIGH REAL(0.6931471803691238)
 #define LN_2_LOW REAL(1.9082149292705877e-10)
@@ -343,6 +340,9 @@ typedef double real;
 /* In a cycle; also the bit that shows that there is a phase. */
 #define PHASE_STEPS 128
 #define PHASE_USED 2
+/* A comparison of range errors counts as this many times their mean at most, as jumps are not multipath. */
+#define PLACE_LIMIT REAL(2.0)
+#define PLACE_LIMITED_MEAN REAL(0.7421917)
 #define PLANE 2
 /* Columns of V for what planning adds: walls, and four impulses along each axis. */
 #ifndef PLANNED_FAULTS
