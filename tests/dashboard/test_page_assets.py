@@ -43,14 +43,22 @@ def names(page):
 
 STYLES = """async () => {
   const { visibleTags } = await import("/page/map/tags.js");
-  return Object.fromEntries(visibleTags().seen.map(({ track, colour, other }) => [track.name, [colour, other]]));
+  return visibleTags().seen.map(({ track, colour, other, fresh }) => [track.name, fresh, colour, other]);
 }"""
 
 
 def styles(page, count):
-    """Colour of each tag as the map draws it, and whether it is faint, once there are so many."""
-    until(page, f"count => ({STYLES})().then((found) => Object.keys(found).length === count)", count)
-    return page.evaluate(STYLES)
+    """Colour of each tag as the map draws it, and whether it is faint, once there are so many and none is stale and grey.
+
+    On a busy machine positions come late, so that all tags may be grey for a while.
+    """
+    end = time.monotonic() + 30
+    while True:
+        seen = page.evaluate(STYLES)
+        if len(seen) == count and all(fresh == "fresh" for _, fresh, _, _ in seen):
+            return {tag: (colour, faint) for tag, _, colour, faint in seen}
+        assert time.monotonic() < end, seen[:3]
+        time.sleep(0.03)
 
 
 @pytest.fixture
