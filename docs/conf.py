@@ -74,7 +74,6 @@ NAVIGATION = {
         "docs/tools/omlox",
         "docs/tools/ardupilot",
         "docs/tools/px4",
-        "docs/tools/stage",
         "docs/tools/fira",
         "docs/tools/phones",
     ],

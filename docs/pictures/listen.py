@@ -1,7 +1,6 @@
 """What other programs' decoders get of a running site, as lines for a picture: ``python docs/pictures/listen.py KIND``.
 
-- ``vehicle PORT``: pymavlink as a vehicle of system 1, at the port that ``mavlink+udpout`` sends to;
-- ``stage OSC_PORT PSN_PORT``: python-osc and pypsn at the ports of ``osc+udp`` and ``psn``.
+- ``vehicle PORT``: pymavlink as a vehicle of system 1, at the port that ``mavlink+udpout`` sends to.
 
 It ends after as many lines as a picture holds.
 """
@@ -65,34 +64,6 @@ def vehicle(port: str) -> None:
                 return
 
 
-def stage(osc_port: str, psn_port: str) -> None:
-    """A few messages and packets of each kind."""
-    import pypsn
-    from pythonosc.osc_message import OscMessage
-
-    left = {"osc": 8, "psn_data_packet": 5, "psn_info_packet": 1}
-    for port, data in datagrams(int(osc_port), int(psn_port)):
-        if port == int(osc_port):
-            kind, found = "osc", OscMessage(data)
-            line = f"OSC  {found.address}  " + "  ".join(shown(value) for value in found.params)
-        else:
-            found = pypsn.parse_psn_packet(data)
-            kind = type(found).__name__
-            line = f"PSN  frame {found.info.frame_id:3}  " + "   ".join(map(tracker, found.trackers))
-        if left[kind] > 0:
-            left[kind] -= 1
-            print(line, flush=True)
-        if not any(left.values()):
-            return
-
-
-def tracker(found: Any) -> str:
-    """One tracker of PosiStageNet: its name, or its position with y up."""
-    if hasattr(found, "tracker_name"):
-        return f"{found.tracker_id} is {found.tracker_name.decode()}"
-    return f"{found.id}: {' '.join(map(shown, found.pos))}" if found.pos else f"{found.id}: no fix"
-
-
 if __name__ == "__main__":
-    KINDS: dict[str, Callable[..., None]] = {"vehicle": vehicle, "stage": stage}
+    KINDS: dict[str, Callable[..., None]] = {"vehicle": vehicle}
     KINDS[sys.argv[1]](*sys.argv[2:])

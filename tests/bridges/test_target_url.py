@@ -47,7 +47,6 @@ WRONG = {
     "nmea+serial://dev/ttyUSB0": "it should be nmea+serial:PATH",
     "nmea+pty://run/gps": "it should be nmea+pty:PATH",
     "foxglove:8765": "it should be foxglove://HOST:PORT",
-    "osc+udp:9000": "it should be osc+udp://HOST:PORT",
     "mavlink+udpout://:14550": "has no profile=; it should be ardupilot",
 }
 

@@ -48,9 +48,9 @@ STYLES = """async () => {
 
 
 def styles(page, count):
-    """Colour of each tag as the map draws it, and whether it is faint, once there are so many and none is stale and grey.
+    """Colour of each tag as the map draws it, and whether it is faint, once all are there and fresh.
 
-    On a busy machine positions come late, so that all tags may be grey for a while.
+    On a busy machine positions come late, and stale tags are grey.
     """
     end = time.monotonic() + 30
     while True:

@@ -4,15 +4,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.core.protocol1.anchor import Anchor
-from skyless.core.protocol1.codec import decode_cached
 from skyless.research.studies import efficiency, loss, motion, nlos, room, scale, sync
 from skyless.research.studies.common.plan import Plan, plan_of, seed_of
 from skyless.research.studies.common.summary import Case, interval, jackknife, world_cells, world_rows
-from skyless.research.studies.common.worlds import RunResult, box, large_lab_site, run_world, walking, without_mesh
-from skyless.sim.impairments import lab_impairments
-from skyless.sim.lab import lab_site
-from skyless.sim.world import World
+from skyless.research.studies.common.worlds import RunResult, box, large_lab_site, run_world, walking
 from skyless.site.file.check import check_site
 
 pytestmark = pytest.mark.statistical
@@ -116,16 +111,6 @@ def test_messages_lost_at_tags_are_heard_by_anchors():
     assert messages[1] == pytest.approx(0.5 * messages[0], rel=0.05)
     assert messages[2] == pytest.approx(0.5 * messages[0], rel=0.05)
     assert results[0].squared_m2 / results[0].fixes < results[1].squared_m2 / results[1].fixes
-
-
-def test_without_mesh_a_beacon_tells_of_the_master_alone():
-    site = lab_site()
-    world = World(site, lambda anchor: Anchor(site, anchor), [], lab_impairments(100.0), 1)
-    frames = [broadcast.frame for broadcast in world.run(0.5)]
-    full, bare = (decode_cached(frame) for frame in (frames[-1], without_mesh(frames[-1])))
-    assert full.heard
-    assert bare == replace(full, heard=())
-    assert without_mesh(b"noise") == b"noise"
 
 
 def test_worlds_of_one_number_are_the_same_in_all_cases():

@@ -131,7 +131,7 @@ def test_a_survey_is_that_of_the_time_since_the_motion():
 
 def test_a_live_survey_goes_on_with_the_time_since_the_motion():
     site = lab_site()
-    live = LiveSurvey(site, Facts(heights_m=dict.fromkeys(LAB, 0.0)), watches=False)
+    live = LiveSurvey(site, Facts(heights_m=dict.fromkeys(LAB, 0.0)))
     for sender, receiver, tx_ticks, rx_ticks, t_s in legs(LAB, 30.0, hung_elsewhere):
         live._add(AnchorLeg(sender, receiver, tx_ticks, rx_ticks, t_s), t_s)
     live.finish()
@@ -149,7 +149,7 @@ def test_a_live_survey_goes_on_with_the_time_since_the_motion():
 def test_the_program_and_the_command_use_the_time_since_the_motion(monkeypatch, capsys):
     ranger, site, lines = PairRanger(), lab_site(), []
     node = SurveyNode(SurveySettings(site.id, site), lambda _: Facts(), run_survey, None, lines.append)
-    live = node.live = LiveSurvey(site, Facts(heights_m=dict.fromkeys(LAB, 0.0)), watches=False)
+    live = node.live = LiveSurvey(site, Facts(heights_m=dict.fromkeys(LAB, 0.0)))
     for sender, receiver, tx_ticks, rx_ticks, t_s in legs(LAB, 30.0, hung_elsewhere):
         live._add(AnchorLeg(sender, receiver, tx_ticks, rx_ticks, t_s), t_s)
         ranger.add(sender, receiver, tx_ticks, rx_ticks, t_s)

@@ -116,14 +116,8 @@ class _TcpReader(asyncio.Protocol):
 class UdpSender:
     """Sends datagrams to one address: a host, a broadcast address or a multicast group."""
 
-    def __init__(
-        self, text: str, host: str, port: int, log: Callable[[str], None], hops: int = 1, interface: str = ""
-    ) -> None:
-        """``hops``: networks that multicast may cross; ``interface``: address of the network card that it leaves by.
-
-        Raises:
-            SkylessError: there is no such host or interface.
-        """
+    def __init__(self, text: str, host: str, port: int, log: Callable[[str], None]) -> None:
+        """Raises SkylessError: there is no such host."""
         self.dropped: Counter[str] = Counter()
         self.received: Callable[[bytes], None] | None = None
         """Called with each datagram that comes back, while it runs."""
@@ -138,15 +132,6 @@ class UdpSender:
         self._socket.setblocking(False)
         if family == socket.AF_INET:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
-            self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_TTL, hops)
-        if interface:
-            try:
-                self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_IF, socket.inet_aton(interface))
-            except OSError:
-                raise SkylessError(
-                    f"the target {text!r} has interface={interface}; it should be the IPv4 address of a network card "
-                    "of this computer"
-                ) from None
 
     def send(self, data: bytes) -> None:
         """Send a datagram; the network may lose it."""

@@ -9,7 +9,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from math import isfinite
-from typing import Final, Literal
+from typing import Final
 from urllib.parse import parse_qsl, unquote, urlsplit
 
 from msgspec import Struct
@@ -303,13 +303,3 @@ class TargetUrl:
     def _wrong_value(self, key: str, expected: str) -> SkylessError:
         given = f"{key}={self._options[key]}" if key in self._options else f"no {key}="
         return SkylessError(f"the target {self.text!r} has {given}; it should be {expected}")
-
-
-Up = Literal["y", "z"]
-UPS: Final = ("y", "z")
-
-
-def turned(vector: Vector, up: Up) -> Vector:
-    """A vector of the site, whose z is up, in axes whose ``up`` is; both are right-handed and share x."""
-    x, y, z = vector
-    return (x, z, -y) if up == "y" else vector

@@ -49,11 +49,8 @@ TARGET_KINDS: Final = {
     "foxglove": Kind("foxglove", 20.0, MAX_HZ, "live pages of Foxglove and Lichtblick"),
     "homeassistant": Kind("home_assistant", 10.0, 50.0, "tags as devices of Home Assistant, with their rooms"),
     "prometheus": Kind("prometheus", 50.0, MAX_HZ, "figures for Prometheus at /metrics"),
-    "osc+udp": Kind("osc", 60.0, MAX_HZ, "Open Sound Control: TouchDesigner, Unreal, Max", 9000),
-    "psn": Kind("psn", 60.0, 200.0, "PosiStageNet: media servers, lighting consoles"),
-    "omlox+ws": Kind("omlox_push", 10.0, 10.0, "locations for an omlox hub: omlox+ws://HOST/v2/ws/socket?zone=UUID"),
-    "omlox+wss": Kind("omlox_push", 10.0, 10.0, "the same over TLS; ?token_file= signs in"),
-    "omlox+serve": Kind("omlox_serve", 10.0, 50.0, "the reading half of an omlox hub, for its clients"),
+    "omlox+ws": Kind("omlox", 10.0, 10.0, "locations for an omlox hub: omlox+ws://HOST/v2/ws/socket?zone=UUID"),
+    "omlox+wss": Kind("omlox", 10.0, 10.0, "the same over TLS; ?token_file= signs in"),
     "webhook+https": Kind(
         "webhook", 1.0, MAX_HZ, "alarms, posted as signed JSON: webhook+https://HOST/PATH?secret_file="
     ),

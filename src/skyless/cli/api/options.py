@@ -227,8 +227,6 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
     """Probability, for each fix, that the error exceeds its protection level (integrity); 1e-4 by default."""
     alert_limit_m: Positive | None = None
     """Fixes whose protection level exceeds this, in metres, count as not available (integrity)."""
-    without_mesh: bool = False
-    """Anchors relay only when they heard the master."""
     quick: bool = False
     """Compute a fraction, with more scatter."""
     processes: Annotated[int | None, whole(1, 1024)] = None

@@ -109,7 +109,6 @@ def run_study(asked: StudyOptions) -> StudyResult:
         quick=asked.quick,
         noise_ps=asked.noise_ps or 100.0,
         qa=process_noise(asked.qa, asked.dynamics) or 0.3,
-        mesh=not asked.without_mesh,
         worlds=asked.worlds,
         seconds=asked.seconds,
         episodes=asked.episodes,

@@ -45,8 +45,6 @@ class LiveOptions(Options, frozen=True, kw_only=True):
     """Seconds to listen before the survey; 30 by default."""
     serve: bool = False
     """Stay until Ctrl-C: survey all the while, serve the page, save on its request, and watch the anchors."""
-    no_watch: bool = False
-    """Do not watch the anchors (--serve)."""
 
     @property
     def is_live(self) -> bool:
@@ -57,11 +55,9 @@ class LiveOptions(Options, frozen=True, kw_only=True):
         """See that the options fit one another. Raises SkylessError."""
         if not self.is_live:
             why = "a running site is surveyed by --mqtt or --radio"
-            self.leave_out("duration", "serve", "no_watch", "site_id", why=why)
+            self.leave_out("duration", "serve", "site_id", why=why)
         if self.serve:
             self.leave_out("duration", why="with --serve the survey does not end")
-        elif self.no_watch:
-            raise SkylessError("--no-watch is for --serve: nothing else watches")
 
 
 def gather_live(asked: LiveOptions, known: SurveyOptions) -> "tuple[Site, Callable[[], PairRanges], PairRanger]":
@@ -115,7 +111,7 @@ async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "S
         assert address is not None  # a radio needs a site file
         site_id = await find_site(address)
     radio = None if asked.radio is None else open_radios(asked.radio, "tag", (asked.radio_name,))[0]
-    settings = SurveySettings(site_id, site, file, not asked.no_watch, serves)
+    settings = SurveySettings(site_id, site, file, serves)
     return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, log, radio)
 
 

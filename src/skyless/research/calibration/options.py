@@ -266,8 +266,6 @@ class SurveyOptions(RecordingOptions, frozen=True, kw_only=True):
         Rule(_check_points),
     ] = {}
     """An anchor whose position is known, metres."""
-    point_std_m: Annotated[_Std | None, Option("point-std")] = None
-    """How well such positions are known, metres per axis; 0.005 by default."""
     delays_known: bool = False
     """The antenna delays are right; do not estimate them."""
     delay_std_m: Annotated[_Std | None, Option("delay-std")] = None

@@ -182,7 +182,7 @@ def cells(plan: Plan) -> list[Cell]:
     """
     if plan.method != "joint":
         raise SkylessError(f"--method is {plan.method!r}; protection levels are given by joint")
-    case = Case(plan.noise_ps, qa=plan.qa, mesh=plan.mesh)
+    case = Case(plan.noise_ps, qa=plan.qa, mesh=True)
     seeds = SeedSequence(plan.seed).spawn(len(FAULTS))
     found = []
     for fault, seed in zip(FAULTS, seeds, strict=True):
@@ -271,7 +271,7 @@ def _pooled(
         case=case,
         series=series,
         x=x,
-        mesh=plan.mesh,
+        mesh=True,
         noise_ps=plan.noise_ps,
         runs=len(counts),
         fixes=epochs,

@@ -95,7 +95,7 @@ def _variances(run: Run, plan: Plan, number: int) -> np.ndarray[Any, np.dtype[np
         n,
         lost_at_tags=1.0 - (1.0 - run.lost_at_tags) * (1.0 - everywhere),
         lost_at_anchors=everywhere,
-        mesh=run.mesh and run.method in RAW_METHODS,
+        mesh=run.method in RAW_METHODS,
     )
     settings = BoundSettings(
         noise.rx_stamp_ps * 1e-12,
@@ -104,7 +104,7 @@ def _variances(run: Run, plan: Plan, number: int) -> np.ndarray[Any, np.dtype[np
         qa=run.qa,
         slot_s=slot_s,
         speed_std_mps=_SPEED_STD_MPS,
-        mesh=run.mesh,
+        mesh=True,
         height_known=site.tags.height_m is not None,
     )
     traces = np.trace(received_bound(anchors_m, path_m, settings, known), axis1=1, axis2=2).reshape(superframes, n)

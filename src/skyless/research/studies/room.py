@@ -509,7 +509,7 @@ def bound_variance_m2(run: Run, biases: Biases) -> float:
         qa=ROOM_QA_M2PS3,
         slot_s=1.0,  # of no use here: the frames state when they were sent
         speed_std_mps=_BOUND_SPEED_STD_MPS,
-        mesh=run.mesh,
+        mesh=True,
         height_known=site.tags.height_m is not None,
     )
     means = []

@@ -124,7 +124,6 @@ def room_results(run: RoomRun) -> tuple[RunResult, ...]:
                 seed=room.seed,
                 method=plan.method,
                 qa=plan.qa,
-                mesh=plan.mesh,
                 warmup_s=_WARMUP_S,
                 until_s=_WARMUP_S + plan.seconds,
             )

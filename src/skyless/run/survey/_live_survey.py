@@ -52,7 +52,7 @@ State = Literal["collecting", "surveyed", "no data"]
 class LiveSurvey:
     """One site's survey."""
 
-    def __init__(self, site: Site, facts: Facts, record: SurveyRecord | None = None, *, watches: bool = True) -> None:
+    def __init__(self, site: Site, facts: Facts, record: SurveyRecord | None = None) -> None:
         """``record``: the survey that gave the site its positions. Without it the watch learns the usual ranges."""
         self.site, self.facts = site, facts
         self.serial = 0  # of the newest result
@@ -61,7 +61,6 @@ class LiveSurvey:
         self.saved_unix_s: float | None = None
         self.missed = 0  # stamps that anchors had to drop
         self.begun = 0  # how often ranges have begun again: a result of ranges from before does not count
-        self._watches = watches
         self._shown: tuple[PairRanges, float] | None = None  # the ranges in messages, and when they were made
         self._watch: _Watched | None = None
         self._results: dict[int, tuple[Survey, PairRanges]] = {}
@@ -249,7 +248,7 @@ class LiveSurvey:
         """Watch the anchors that have positions, if these are enough to say anything."""
         placed = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in self.site.anchors}
         self._watch = None
-        if self._watches and len(placed) > 2:
+        if len(placed) > 2:
             known = None if record is None else {(one.a, one.b): one.range_m for one in baseline(record).pairs}
             self._watch = _Watched(AnchorWatch(placed, self.facts.dimensions, known))
 

@@ -87,7 +87,6 @@ class SurveySettings(Struct, frozen=True):
     """None: that on MQTT."""
     file: Path | None = None
     """The site's file, which is written on request."""
-    watches: bool = True
     serves: bool = True
     """False for a program that only gathers beside one that serves: it computes, publishes and saves nothing."""
 
@@ -266,7 +265,7 @@ class SurveyNode:
         except SkylessError as error:  # options name anchors that the site on MQTT has not
             self._log(f"survey: {error}")
             facts = Facts()
-        self.live = LiveSurvey(site, facts, record, watches=self._settings.watches)
+        self.live = LiveSurvey(site, facts, record)
         self.live.set_facts(facts)
         self._next_solve_s = 0.0
 

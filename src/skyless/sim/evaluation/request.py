@@ -243,8 +243,6 @@ class Conditions(ProtectionOptions, frozen=True, kw_only=True):
         _faults("Outage"),
     ] = ()
     """When the tags' radios hear nothing: from then on, or for that time."""
-    power_bias: bool = False
-    """Give RX stamps the DW1000's bias by received power."""
     temperature: bool = False
     """Let the crystals warm up and swing."""
     carrier: bool = False

@@ -21,8 +21,6 @@ class Plan(Struct, frozen=True):
     """Noise of every TX and RX stamp, which filters know."""
     qa: float = 0.3
     """Process noise that filters assume at rest, m²/s³."""
-    mesh: bool = True
-    """Whether anchors also relay when they heard anchors that are not the master."""
     worlds: int = 12
     """Independent worlds of a case; what scatters between them gives the standard errors."""
     seconds: float = 20.0

@@ -93,7 +93,7 @@ def case_row(
         case=case.name,
         series=case.series,
         x=case.x,
-        mesh=plan.mesh if plan.method in RAW_METHODS else None,
+        mesh=True if plan.method in RAW_METHODS else None,
         noise_ps=plan.noise_ps,
         runs=len(worlds),
         fixes=fixes,

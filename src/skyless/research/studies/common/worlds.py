@@ -6,7 +6,6 @@
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import lru_cache
 from itertools import compress
 from typing import Any, Final
 
@@ -15,13 +14,11 @@ from msgspec import Struct
 from msgspec.structs import replace
 from scipy.stats import chi2
 
-from skyless.core.air.frame import Malformed
 from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.protocol1.codec import decode_cached, encode
 from skyless.core.site import AnchorSite, Site
 from skyless.research.studies.common.plan import Plan, seed_of
 from skyless.sim.evaluation.fleet import world_of
@@ -55,7 +52,6 @@ class Run(Struct, frozen=True):
     seed: int
     method: str
     qa: float
-    mesh: bool
     warmup_s: float
     """True time before which no fix is judged."""
     until_s: float
@@ -155,8 +151,6 @@ def beacons_of(run: Run) -> Iterator[Heard]:
     world = world_of(run.site, run.trajectories, run.impairments, run.seed)
     draw = stream(run.seed, _LOSS_KEY, 0)
     for broadcast in world.run(run.until_s):
-        if not run.mesh:
-            broadcast.frame = without_mesh(broadcast.frame)
         receptions = list(broadcast.receptions())
         if run.lost_at_tags:
             receptions = list(compress(receptions, draw.random(len(receptions)) >= run.lost_at_tags))
@@ -176,13 +170,6 @@ def judged(run: Run, beacons: Iterable[Heard]) -> RunResult:
             if fix is not None:
                 tally.add(tag, beacon.end_s, fix, truth_m)
     return tally.result(messages, run.until_s * len(receivers), cpu_s)
-
-
-@lru_cache(64)
-def without_mesh(frame: bytes) -> bytes:
-    """The same beacon from an anchor that relays nothing but when it heard the master."""
-    beacon = decode_cached(frame)
-    return frame if isinstance(beacon, Malformed) else encode(replace(beacon, heard=()))
 
 
 def large_lab_site(noise_ps: float) -> Site:
@@ -235,7 +222,6 @@ def worlds(
                 seed=seed,
                 method=plan.method,
                 qa=plan.qa,
-                mesh=plan.mesh,
                 warmup_s=warmup_s,
                 until_s=warmup_s + (seconds or plan.seconds),
                 lost_at_tags=lost_at_tags,

@@ -1,4 +1,8 @@
-"""``omlox+ws://HOST/v2/ws/socket``: sends each fix as a location to an omlox hub, Hub 2.0."""
+"""``omlox+ws://HOST/v2/ws/socket``: sends each fix as a location to an omlox hub, Hub 2.0.
+
+Names and types of fields: https://omlox.com/fileadmin/api/omlox_Hub_API_2.0.0.json. Coordinates are longitude and
+latitude where the site says where it is on the Earth, else metres of the site's frame.
+"""
 
 import asyncio
 import contextlib
@@ -6,20 +10,29 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import Final
+from datetime import UTC, datetime
+from math import atan2, degrees, hypot
+from typing import Any, Final
 from urllib.parse import quote
+from uuid import NAMESPACE_URL, uuid5
 
 import msgspec
 from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
 from skyless.bridges._deliveries import read_secret
-from skyless.bridges._omlox import Object, foreign_id, location
-from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl
+from skyless.bridges.nmea import COURSE_SIGMAS
+from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl, floored
+from skyless.core.earth import east_north_up
+from skyless.core.ellipse import horizontal_ellipse
+from skyless.run.geojson import coordinates
 from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.process import together
 from skyless.run.rate_limit import RateLimit
+from skyless.run.zones.monitor import floor_at
+
+Object = dict[str, Any]
 
 MAX_BATCH: Final = 100
 """Locations in one message."""
@@ -31,6 +44,51 @@ _GATHER_S: Final = 0.05
 _PAUSE_S: Final = 2.0
 _COMPLAINTS_HZ: Final = 1.0 / 60.0
 _UUID: Final = re.compile(r"[0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12}")
+
+
+def _foreign_id(site: BridgedSite) -> str:
+    """The name of a site among a hub's zones."""
+    return f"skyless-{site.id}"
+
+
+def location(fix: FixMessage, site: BridgedSite, source: str) -> Object:
+    """Where a tag was at the time of a usable fix; ``source`` is the id or foreign id of the hub's zone.
+
+    The accuracy is one horizontal standard deviation in the worst direction. Local heights count from the floor.
+    """
+    earth, (x_m, y_m, z_m) = site.georeference, fix.position_m
+    floor = None if fix.height_known else floor_at(site.floors, z_m, 0.0, None)
+    ground_m = next((one.low_m for one in site.floors if one.number == floor), 0.0)
+    local_m = [round(value, 4) for value in (x_m, y_m, z_m - ground_m)]
+    asset = site.assets.get(fix.tag)
+    named = asset is not None and asset.name
+    speed_mps = course_deg = None
+    if fix.velocity_mps is not None and fix.velocity_covariance is not None:
+        east, north, _ = east_north_up(fix.velocity_mps, 0.0 if earth is None else earth.heading_deg)
+        speed_mps = hypot(east, north)
+        variance = fix.velocity_covariance[0] + fix.velocity_covariance[4]
+        if earth is not None and speed_mps > 0.0 and speed_mps**2 > COURSE_SIGMAS**2 * variance:
+            course_deg = round(degrees(atan2(east, north)), 2) % 360.0
+    return _known(
+        position={"type": "Point", "coordinates": local_m if earth is None else coordinates(fix.position_m, earth)},
+        source=source,
+        provider_type="uwb",
+        provider_id=f"{_foreign_id(site)}-{fix.tag}",
+        timestamp_generated=datetime.fromtimestamp(fix.unix_s, UTC),
+        crs="local" if earth is None else "EPSG:4326",
+        elevation_ref="floor" if earth is None else "wgs84",
+        accuracy=round(horizontal_ellipse(floored(fix.covariance_m2))[0], 4),
+        floor=floor,
+        speed=speed_mps,
+        course=course_deg,
+        trackables=[uuid5(NAMESPACE_URL, f"skyless:{site.id}/trackable/{fix.tag}")] if named else None,
+        properties={"simulated": True} if site.simulated else None,
+    )
+
+
+def _known(**fields: object) -> Object:
+    """The fields that have a value."""
+    return {key: value for key, value in fields.items() if value is not None}
 
 
 class OmloxPush(Target):
@@ -61,7 +119,7 @@ class OmloxPush(Target):
     def on_fix(self, fix: FixMessage) -> None:
         """Let it wait for the hub."""
         assert self._site is not None
-        self._waiting.append(location(fix, self._site, self._zone or foreign_id(self._site)))
+        self._waiting.append(location(fix, self._site, self._zone or _foreign_id(self._site)))
         if len(self._waiting) > MAX_WAITING:
             self._waiting.popleft()
             self.dropped["not-sent"] += 1

@@ -1,4 +1,4 @@
-"""Targets for vehicles and stages on the real system: MAVSDK, pymavlink, python-osc and pypsn get what was given."""
+"""Targets for vehicles on the real system: MAVSDK and pymavlink get what was given."""
 
 import asyncio
 import contextlib
@@ -7,11 +7,9 @@ import math
 import socket
 import struct
 
-import pypsn
 import pytest
 from bridged_values import SITE, a_fix
 from msgspec import structs
-from pythonosc.osc_message import OscMessage
 
 from skyless.bridges.mavlink._profiles import gps_input, odometry, vision_position_estimate
 from skyless.bridges.target import BridgeContext
@@ -247,67 +245,3 @@ def test_a_vehicle_on_a_serial_line():
         line.close()
 
     within(work())
-
-
-# Stages
-
-
-def test_osc_arrives():
-    async def work():
-        receiver, port = bound()
-        with receiver:
-            async with serving(f"osc+udp://127.0.0.1:{port}?up=y") as target:
-                target.on_fix(a_fix())
-                loop = asyncio.get_running_loop()
-                found = [OscMessage(await loop.sock_recv(receiver, 4096)) for _ in range(2)]
-        assert [(one.address, one.params) for one in found] == [
-            ("/skyless/tag1/fix", [1]),
-            ("/skyless/tag1/xyz", [1.0, 1.5, -2.0]),
-        ]
-
-    within(work())
-
-
-def test_psn_is_a_steady_stream_of_frames_with_names_in_between():
-    async def work():
-        receiver, port = bound()
-        with receiver:
-            async with serving(f"psn://127.0.0.1:{port}?hz=100") as target:
-                target.on_fix(a_fix())
-                target.on_second(1_795_000_000.0)
-                packets = []
-                loop = asyncio.get_running_loop()
-                while len(packets) < 20:
-                    packets.append(pypsn.parse_psn_packet(await loop.sock_recv(receiver, 4096)))
-        (info,) = [packet for packet in packets if isinstance(packet, pypsn.psn_info_packet)]
-        assert info.name == b"hall"
-        assert [tracker.tracker_name for tracker in info.trackers] == [b"tag1"]
-        data = [packet for packet in packets if isinstance(packet, pypsn.psn_data_packet)]
-        first = data[0].info.frame_id
-        assert [packet.info.frame_id for packet in data] == list(range(first, first + len(data)))
-        assert all(tuple(packet.trackers[0].pos) == (1.0, 1.5, -2.0) for packet in data)
-        # The same fix, so that its own stamp stays the same while the frames' stamps rise.
-        assert len({packet.trackers[0].timestamp for packet in data}) == 1
-        stamps = [packet.info.timestamp for packet in data]
-        assert stamps == sorted(set(stamps))
-
-    within(work())
-
-
-def test_psn_leaves_by_the_interface_that_is_named():
-    with pytest.raises(Exception, match="interface=nowhere; it should be the IPv4 address of a network card"):
-        open_route("psn://?interface=nowhere", BridgeContext(print))
-    with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as receiver:
-        receiver.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        receiver.bind(("236.10.10.10", 56565))
-        membership = socket.inet_aton("236.10.10.10") + socket.inet_aton("127.0.0.1")
-        receiver.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
-        receiver.setblocking(False)
-
-        async def work():
-            async with serving("psn://?interface=127.0.0.1") as target:
-                target.on_fix(a_fix())
-                packet = await asyncio.get_running_loop().sock_recv(receiver, 4096)
-                assert pypsn.parse_psn_packet(packet).info.version_high == 2
-
-        within(work())
