@@ -8,8 +8,7 @@ import random
 import sys
 import time
 
-from skyless.bridges.mavlink.encoder import MavlinkEncoder
-from skyless.bridges.mavlink.messages import CRC_EXTRAS, MAGIC_1, MAGIC_2, frame
+from skyless.bridges.mavlink import CRC_EXTRAS, MAGIC_1, MAGIC_2, MavlinkEncoder, frame
 from skyless.bridges.target import BridgedSite
 
 

@@ -17,8 +17,7 @@ from bridged_values import SITE
 from msgspec.structs import replace
 
 from skyless.bridges import _deliveries
-from skyless.bridges.hub import Hub
-from skyless.bridges.target import BridgeContext
+from skyless.bridges.target import BridgeContext, Hub
 from skyless.bridges.targets import open_route
 from skyless.core.errors import SkylessError
 from skyless.run.limits import BridgeLimits

@@ -6,10 +6,9 @@ import msgspec
 from bridged_values import SITE, a_fix
 
 from skyless.bridges.home_assistant import document
-from skyless.bridges.hub import Hub
 from skyless.bridges.jsonl import JsonLines
 from skyless.bridges.program import BridgeNode
-from skyless.bridges.target import bridged_site
+from skyless.bridges.target import Hub, bridged_site
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import Asset, AssetsMessage, site_message

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import skyless
-from skyless.bridges.hub import Hub
-from skyless.bridges.target import BridgeContext, BridgedSite, floored
+from skyless.bridges.target import BridgeContext, BridgedSite, Hub, floored
 from skyless.bridges.targets import open_route
 from skyless.core.earth import geodetic, rotated
 from skyless.core.site import GeoreferenceSite

@@ -8,8 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from skyless.bridges.hub import Hub, Route, open_hub
-from skyless.bridges.target import MIN_STD_M, Target, bridged_site, floored, is_usable, require_georeference
+from skyless.bridges.target import (
+    MIN_STD_M,
+    Hub,
+    Route,
+    Target,
+    bridged_site,
+    floored,
+    is_usable,
+    open_hub,
+    require_georeference,
+)
 from skyless.core.errors import SkylessError
 from skyless.core.integrity import Alert
 from skyless.run.mqtt.messages import StatusMessage

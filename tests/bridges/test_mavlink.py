@@ -12,15 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
 
-from skyless.bridges.hub import open_hub
-from skyless.bridges.mavlink._profiles import gps_input, gps_time, no_gps_fix, odometry, vision_position_estimate
-from skyless.bridges.mavlink.encoder import MavlinkEncoder
-from skyless.bridges.mavlink.messages import (
+from skyless.bridges.mavlink import (
     CRC_EXTRAS,
     FrameReader,
     GpsGlobalOrigin,
     GpsInput,
     Heartbeat,
+    MavlinkEncoder,
     Odometry,
     SetGpsGlobalOrigin,
     Timesync,
@@ -28,8 +26,13 @@ from skyless.bridges.mavlink.messages import (
     decoded,
     encoded,
     frame,
+    gps_input,
+    gps_time,
+    no_gps_fix,
+    odometry,
+    vision_position_estimate,
 )
-from skyless.bridges.target import BridgeContext
+from skyless.bridges.target import BridgeContext, open_hub
 from skyless.bridges.targets import open_route
 from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError

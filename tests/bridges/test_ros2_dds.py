@@ -11,8 +11,7 @@ from contextlib import asynccontextmanager
 import pytest
 from bridged_values import BARE_SITE, SITE, a_fix
 
-from skyless.bridges.ros2.messages import MARKERS, POSE, RosSettings
-from skyless.bridges.ros2.target import DdsTypes, Ros2Target, make_target
+from skyless.bridges.ros2 import MARKERS, POSE, DdsTypes, Ros2Target, RosSettings, make_target
 from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.core.errors import SkylessError
 

@@ -11,15 +11,14 @@ from hypothesis import strategies as st
 from msgspec import structs
 from rosbags.typesys import Stores, get_typestore
 
-from skyless.bridges.ros2 import messages
-from skyless.bridges.ros2.messages import RosEncoder, RosSettings, ros_name, stamp_of
-from skyless.bridges.ros2.target import DdsTypes
+from skyless.bridges import ros2
+from skyless.bridges.ros2 import DdsTypes, RosEncoder, RosSettings, ros_name, stamp_of
 from skyless.bridges.target import floored
 from skyless.core.earth import geodetic, rotated
 from skyless.run.mqtt.messages import AnchorHealth, Counters, TagHealth
 
 EVERY = RosSettings(frame="map", namespace="hall/uwb", transforms=True)
-TYPES = [value for value in vars(messages).values() if isinstance(value, str) and "/msg/" in value]
+TYPES = [value for value in vars(ros2).values() if isinstance(value, str) and "/msg/" in value]
 RELEASES = [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED]
 KILTED = get_typestore(Stores.ROS2_KILTED)
 

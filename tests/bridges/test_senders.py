@@ -8,8 +8,8 @@ import stat
 
 import pytest
 
-from skyless.bridges._senders import PtySender, SerialSender, TcpServer, UdpSender
 from skyless.bridges.jsonl import JsonLines
+from skyless.bridges.targets import PtySender, SerialSender, TcpServer, UdpSender
 from skyless.core.errors import SkylessError
 from skyless.radio.serial.pseudo_terminal import Pty
 from skyless.run.limits import BRIDGES as LIMITS

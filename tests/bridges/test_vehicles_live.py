@@ -11,7 +11,7 @@ import pytest
 from bridged_values import SITE, a_fix
 from msgspec import structs
 
-from skyless.bridges.mavlink._profiles import gps_input, odometry, vision_position_estimate
+from skyless.bridges.mavlink import gps_input, odometry, vision_position_estimate
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
 from skyless.radio.serial.pseudo_terminal import Pty

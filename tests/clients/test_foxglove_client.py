@@ -10,8 +10,7 @@ import msgspec
 import pytest
 
 from skyless.bridges.foxglove import FoxgloveTarget
-from skyless.bridges.hub import Hub, Route
-from skyless.bridges.target import BridgedSite
+from skyless.bridges.target import BridgedSite, Hub, Route
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite, WallSite
 from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth

@@ -22,9 +22,8 @@ from msgspec import structs
 
 from bridges.bridged_values import SITE, a_fix
 from recordings import live_site
-from skyless.bridges.hub import open_hub
-from skyless.bridges.ros2.messages import POSE
-from skyless.bridges.target import BridgeContext, floored
+from skyless.bridges.ros2 import POSE
+from skyless.bridges.target import BridgeContext, floored, open_hub
 from skyless.bridges.targets import open_route
 from skyless.cli.main import main
 from skyless.core.earth import geodetic, rotated

@@ -12,9 +12,8 @@ from node_stage import running
 from bridges.alarm_receiver import Receiver
 from bridges.bridged_values import a_fix
 from machines.bench import LAB
-from skyless.bridges.hub import open_hub
 from skyless.bridges.program import BridgeNode
-from skyless.bridges.target import BridgeContext
+from skyless.bridges.target import BridgeContext, open_hub
 from skyless.bridges.targets import open_route
 from skyless.core.alarm_rule import AlarmRule
 from skyless.page.live import LiveSite

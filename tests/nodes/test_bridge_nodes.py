@@ -13,9 +13,8 @@ from node_stage import running
 
 from bridges.bridged_values import BERLIN, a_fix, tag_health
 from machines.bench import LAB, tape
-from skyless.bridges.hub import Hub, Route
 from skyless.bridges.program import BridgeNode, TagBridge, heard_site, run_route
-from skyless.bridges.target import Target
+from skyless.bridges.target import Hub, Route, Target
 from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.reception import Reception
 from skyless.core.any_receiver import AnyReceiver

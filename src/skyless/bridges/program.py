@@ -13,8 +13,7 @@ from zlib import crc32
 
 from msgspec import Struct, structs
 
-from skyless.bridges.hub import SILENCE_CHECK_S, Hub, Route
-from skyless.bridges.target import BridgedSite, bridged_site
+from skyless.bridges.target import SILENCE_CHECK_S, BridgedSite, Hub, Route, bridged_site
 from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.masterless_packets import Point
 from skyless.core.errors import SkylessError

@@ -1,17 +1,242 @@
 """The table of targets, and how one is opened by its address."""
 
+import asyncio
+import contextlib
+import os
+import socket
 import time
+from collections import Counter
 from collections.abc import Callable
 from difflib import get_close_matches
 from importlib import import_module
+from pathlib import Path
 from typing import Final, cast
 
 from msgspec import Struct
 
-from skyless.bridges._senders import PtySender, SerialSender, TcpServer, UdpSender
-from skyless.bridges.hub import Route
-from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, Target, TargetUrl
+from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, Route, Target, TargetUrl, cannot_listen
+from skyless.core.errors import SkylessError
+from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_port import SerialPort
+from skyless.run.limits import BRIDGES as LIMITS
 from skyless.run.mqtt.messages import FixMessage
+
+# How bytes get to readers: over TCP, UDP, a pseudo-terminal or a serial port.
+#
+# Nothing waits for a reader: what it does not accept in time is dropped and counted, so that no fix comes late
+# because of one. What waits for it in this process and in the system stays, with its own stamps, and is what it reads
+# first.
+
+_WAITING_BYTES: Final = 1 << 15
+"""Bytes that may wait for one reader in this process, or a single longer message; and as many in the system."""
+
+_MAX_DATAGRAM_BYTES: Final = 1 << 16
+
+_STUCK_S: Final = 5.0
+"""A TCP reader that has taken nothing for so long is disconnected."""
+
+_ANY_PROGRAM: Final = 0o666
+"""Mode of a pseudo-terminal: gpsd, for one, gives up its rights before it opens its devices."""
+
+
+class TcpServer:
+    """Sends the same bytes to all programs that connect."""
+
+    def __init__(self, text: str, host: str, port: int, greeting: Callable[[], list[bytes]]) -> None:
+        """``greeting`` gives what a new reader gets first."""
+        self.dropped: Counter[str] = Counter()
+        self.port = port
+        """The one that is used, where 0 was asked for and the server runs."""
+        self._text, self._host, self._greeting = text, host, greeting
+        self._readers: set[_TcpReader] = set()
+
+    def send(self, data: bytes) -> None:
+        """Send to all readers; one whose buffers are full misses it."""
+        for reader in tuple(self._readers):
+            if not reader.send(data):
+                self.dropped["slow-reader"] += 1
+
+    async def run(self) -> None:
+        """Serve until cancelled. Raises SkylessError: it cannot listen there."""
+        loop = asyncio.get_running_loop()
+        try:
+            server = await loop.create_server(
+                lambda: _TcpReader(self._readers, self._greeting, self.dropped), self._host, self.port
+            )
+        except OSError as error:
+            raise cannot_listen(self._text, self._host, self.port, error) from None
+        self.port = server.sockets[0].getsockname()[1]
+        try:
+            await asyncio.Event().wait()  # serve_forever, when cancelled, waits until all readers have left
+        finally:
+            server.close()
+            for reader in tuple(self._readers):
+                reader.end()
+
+
+class _TcpReader(asyncio.Protocol):
+    """One connection; what it sends is not read."""
+
+    def __init__(self, readers: "set[_TcpReader]", greeting: Callable[[], list[bytes]], dropped: Counter[str]) -> None:
+        self._readers, self._greeting, self._dropped = readers, greeting, dropped
+        self._transport: asyncio.Transport | None = None
+        self._stuck_since_s: float | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        """Greet it, if there are not too many."""
+        assert isinstance(transport, asyncio.Transport)
+        if len(self._readers) >= LIMITS.readers:
+            self._dropped["too-many-readers"] += 1
+            transport.abort()
+            return
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _WAITING_BYTES)
+        self._transport = transport
+        self._readers.add(self)
+        for message in self._greeting():
+            self.send(message)
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason makes no difference
+        """It has gone."""
+        self._readers.discard(self)
+
+    def send(self, data: bytes) -> bool:
+        """Whether the connection accepts it, which it does where nothing waits; one that accepts nothing is ended."""
+        if self._transport is None or self._transport.is_closing():
+            return False
+        waiting = self._transport.get_write_buffer_size()
+        if not waiting or waiting + len(data) <= _WAITING_BYTES:
+            self._stuck_since_s = None
+            self._transport.write(data)
+            return True
+        now_s = asyncio.get_running_loop().time()
+        if self._stuck_since_s is None:
+            self._stuck_since_s = now_s
+        elif now_s - self._stuck_since_s > _STUCK_S:
+            self.end()
+        return False
+
+    def end(self) -> None:
+        """Close it; what waits is dropped."""
+        if self._transport is not None:
+            self._transport.abort()
+
+
+class UdpSender:
+    """Sends datagrams to one address: a host, a broadcast address or a multicast group."""
+
+    def __init__(self, text: str, host: str, port: int, log: Callable[[str], None]) -> None:
+        """Raises SkylessError: there is no such host."""
+        self.dropped: Counter[str] = Counter()
+        self.received: Callable[[bytes], None] | None = None
+        """Called with each datagram that comes back, while it runs."""
+        self._text, self._log, self._trouble = text, log, ""
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        except (OSError, UnicodeError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "no name of a host"
+            raise SkylessError(f"the target {text!r} has a host that cannot be found: {reason}") from None
+        self._address = address
+        self._socket = socket.socket(family, kind, protocol)
+        self._socket.setblocking(False)
+        if family == socket.AF_INET:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+
+    def send(self, data: bytes) -> None:
+        """Send a datagram; the network may lose it."""
+        try:
+            self._socket.sendto(data, self._address)
+        except OSError as error:
+            self.dropped["not-sent"] += 1
+            reason = error.strerror or str(error)
+            if reason != self._trouble and not isinstance(error, BlockingIOError):
+                self._trouble = reason
+                self._log(f"{self._text}: datagrams cannot be sent: {reason}")
+
+    async def run(self) -> None:
+        """Keep the socket until cancelled."""
+        loop = asyncio.get_running_loop()
+        with self._socket:
+            if self.received is not None:
+                loop.add_reader(self._socket, self._read, self.received)
+            try:
+                await asyncio.Event().wait()
+            finally:
+                loop.remove_reader(self._socket)
+
+    def _read(self, received: Callable[[bytes], None]) -> None:
+        with contextlib.suppress(OSError):  # nothing to read after all, or what was sent found nobody
+            received(self._socket.recv(_MAX_DATAGRAM_BYTES))
+
+
+class PtySender:
+    """Sends to the program that opens a pseudo-terminal, by its path or by a link to it."""
+
+    def __init__(self, text: str, link: str, log: Callable[[str], None]) -> None:
+        """``link`` is where the user wants it; empty for none."""
+        self.dropped: Counter[str] = Counter()
+        self._text, self._link, self._log = text, Path(link) if link else None, log
+        self._pty: Pty | None = None
+        """Exists while it runs: a link left behind would lead to the terminal that the system opens next."""
+
+    def send(self, data: bytes) -> None:
+        """Write; where nobody reads, this and what nobody has read is dropped."""
+        if self._pty is None or not self._pty.send(data):
+            self.dropped["not-read"] += 1
+
+    async def run(self) -> None:
+        """Keep it until cancelled; what programs write is not read. Raises SkylessError: it cannot be made."""
+        pty = Pty(self._link, held_bytes=0, asked=f"the target {self._text!r} has the path")
+        try:
+            os.chmod(pty.path, _ANY_PROGRAM)  # noqa: PTH101 - a device, not a file of ours
+            which = "" if self._link is None else f", which is {pty.path}"
+            self._log(f"{self._text}: programs read {pty.name}{which}")
+            pty.start(lambda _data: None)
+            self._pty = pty
+            await asyncio.Event().wait()
+        finally:
+            self._pty = None
+            pty.close()
+
+
+class SerialSender:
+    """Sends on a serial port of this computer, which is opened again whenever it was unplugged."""
+
+    def __init__(self, text: str, path: str, baud: int, log: Callable[[str], None]) -> None:
+        self.dropped: Counter[str] = Counter()
+        self.received: Callable[[bytes], None] | None = None
+        """Called with what comes."""
+        self._port = SerialPort(path, baud, lambda reason: log(f"{text}: {reason}"))
+        self._write: Callable[[bytes], None] | None = None
+
+    def send(self, data: bytes) -> None:
+        """Write, or drop where there is no port or it does not keep up."""
+        if self._write is None:
+            self.dropped["no-port"] += 1
+        elif self._port.waiting_bytes() > self._port.baud // 40:  # what it carries in a quarter of a second
+            self.dropped["slow-port"] += 1
+        else:
+            self._write(data)
+
+    async def run(self) -> None:
+        """Keep the port open until cancelled."""
+        await self._port.run(self)
+
+    # What the port calls
+
+    def on_open(self, send: Callable[[bytes], None]) -> None:
+        """The port is open."""
+        self._write = send
+        self._port.clear_report()
+
+    def on_data(self, data: bytes) -> None:
+        """Bytes have come."""
+        if self.received is not None:
+            self.received(data)
+
+    def on_close(self) -> None:
+        """The port is closed."""
+        self._write = None
+
 
 MAX_HZ: Final = 1000.0
 
@@ -39,13 +264,11 @@ TARGET_KINDS: Final = {
     "nmea+udp": Kind("nmea", 10.0, 50.0, "NMEA 0183 as datagrams", 10110),
     "nmea+pty": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a pseudo-terminal"),
     "nmea+serial": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a serial port, as nmea+serial:/dev/ttyUSB0@115200"),
-    "ros2": Kind("ros2.target", 50.0, MAX_HZ, "topics of ROS 2, published by DDS without ROS being installed"),
+    "ros2": Kind("ros2", 50.0, MAX_HZ, "topics of ROS 2, published by DDS without ROS being installed"),
     "mavlink+udpout": Kind(
-        "mavlink.encoder", 30.0, 100.0, "MAVLink 2 for an autopilot; ?profile= ardupilot, px4 or gps", 14550
+        "mavlink", 30.0, 100.0, "MAVLink 2 for an autopilot; ?profile= ardupilot, px4 or gps", 14550
     ),
-    "mavlink+serial": Kind(
-        "mavlink.encoder", 30.0, 100.0, "the same on a serial port, as mavlink+serial:/dev/ttyAMA0@921600"
-    ),
+    "mavlink+serial": Kind("mavlink", 30.0, 100.0, "the same on a serial port, as mavlink+serial:/dev/ttyAMA0@921600"),
     "foxglove": Kind("foxglove", 20.0, MAX_HZ, "live pages of Foxglove and Lichtblick"),
     "homeassistant": Kind("home_assistant", 10.0, 50.0, "tags as devices of Home Assistant, with their rooms"),
     "prometheus": Kind("prometheus", 50.0, MAX_HZ, "figures for Prometheus at /metrics"),

@@ -10,7 +10,7 @@ from skyless.cli.common.output import NO_FIX, print_json, print_table, print_war
 from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:
-    from skyless.bridges.exports.rosbag import Bag
+    from skyless.bridges.rosbag import Bag
 
 app = App(name="export", help_epilogue="Example: skyless export walk.mcap --to walk_bag")
 
@@ -48,8 +48,8 @@ def export(
     bag_version
         Of the bag's metadata: 9 for ROS 2 from Jazzy on, 8 for Humble and Iron.
     """
-    from skyless.bridges.exports.rosbag import write_bag
-    from skyless.bridges.ros2.messages import FRAME_NAME, FRAME_RULE, RosSettings
+    from skyless.bridges.ros2 import FRAME_NAME, FRAME_RULE, RosSettings
+    from skyless.bridges.rosbag import write_bag
 
     check_output("to", to, file)
     if not FRAME_NAME.fullmatch(frame):

@@ -5,9 +5,8 @@ from typing import Annotated
 import msgspec
 from cyclopts import App, Parameter
 
-from skyless.bridges.hub import Hub, open_hub
 from skyless.bridges.program import BridgeNode, BridgeState
-from skyless.bridges.target import BridgeContext
+from skyless.bridges.target import BridgeContext, Hub, open_hub
 from skyless.bridges.targets import TARGET_KINDS, open_route
 from skyless.cli.common.options import JsonOptions, command
 from skyless.cli.common.output import print_json

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, Literal, cast
 
 from msgspec import Struct
 
-from skyless.bridges.ros2.messages import RosEncoder, RosMessage, RosSettings
+from skyless.bridges.ros2 import RosEncoder, RosMessage, RosSettings
 from skyless.bridges.target import bridged_site, is_usable
 from skyless.core.errors import ConfigurationError, SkylessError, writing
 from skyless.core.extras import extra_module
