@@ -14,7 +14,7 @@ from bisect import bisect_right
 from collections import Counter, defaultdict
 from itertools import pairwise
 
-from skyless.core.alarm_rule import AlarmRule
+from skyless.core.site import AlarmRule
 from skyless.run.alarms.engine import AlarmEngine, is_over
 from skyless.run.mqtt.messages import FixMessage, Zone
 from skyless.run.zones.monitor import ZoneMonitor

@@ -23,7 +23,7 @@ from core_stage import BoardCore
 from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, one_by_one, settings_of
 
 from skyless.core.estimator.state import State
-from skyless.core.native.sizes import PACKED
+from skyless.core.native.records import PACKED
 
 WITH_BOARD_SIZES = Path(__file__).parents[1] / "tests" / "firmware" / "with_board_sizes.py"
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}

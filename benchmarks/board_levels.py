@@ -11,7 +11,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from skyless.core.native.sizes import PACKED
+from skyless.core.native.records import PACKED
 from skyless.research.studies import integrity
 from skyless.research.studies.common.plan import plan_of
 

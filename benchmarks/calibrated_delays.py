@@ -12,9 +12,9 @@ from functools import partial
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.core.constants import TICK_M
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import EXACT
+from skyless.core.ticks import TICK_M
 from skyless.research.calibration.tags import at_positions
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import AnchorDisplacement, DelayError, PairError

@@ -13,13 +13,12 @@ from emulator.site.host_programs import HostLatency, Process
 from emulator.site.site_air import NodeAir
 from numpy.typing import NDArray
 
-from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.air.frame import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver
-from skyless.core.constants import TICK_S
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import Site
-from skyless.core.ticks import difference
+from skyless.core.ticks import TICK_S, difference
 from skyless.radio.dw1000.radio import SPI_LEAD_S, ChipSession
 from skyless.radio.interface import AntennaDelays, Late, RadioEvent, Sent
 from skyless.run.anchor import ASK_AGAIN_S, LEAD_GAIN, LEAD_LOSS, MAX_LEAD_S

@@ -52,7 +52,7 @@ MECHANISMS: dict[str, dict[str, float]] = {
     "Single late packets": {"late_often_share": OFF},
     "… need more in a row for a jump": {"in_row_where_late": 2},
     "… less weight of large innovations": {"reception_huber": OFF},
-    "… weak first paths": {"skyless.core.air.first_path:CLEAR_DB": OFF},
+    "… weak first paths": {"skyless.core.air.frame:CLEAR_DB": OFF},
     "Faults are opened": {"sure_chi2": OFF},
     "… creeping ones": {"creeping_std_m": 1e-6},
     "… recent ones": {"recent_std_m": 1e-6},

@@ -21,8 +21,8 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.core.constants import TICK_BITS
 from skyless.core.site import AccuracySite
+from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign.fira import DtTag
 from skyless.radio.uci.uci import UciReader
 from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, PacketTracking

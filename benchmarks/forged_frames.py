@@ -22,10 +22,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from forged_beacons import KEYS_BEGIN_S, site_of
 from msgspec.structs import replace
 
-from skyless.core.air.ieee802154 import fcs
-from skyless.core.air.reception import Reception
-from skyless.core.anchor.anchor import Anchor
-from skyless.core.anchor.authentication import BeaconAuthentication
+from skyless.core.air.frame import Reception, fcs
+from skyless.core.anchor import Anchor, BeaconAuthentication
 from skyless.core.site import Site
 from skyless.core.ticks import from_seconds, wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust

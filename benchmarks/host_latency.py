@@ -21,9 +21,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from skyless.core.air.reception import Reception
-from skyless.core.protocol1.beacon import Beacon
-from skyless.core.protocol1.codec import decode_cached
+from skyless.core.air.frame import Reception
+from skyless.core.protocol1.beacon import Beacon, decode_cached
 from skyless.core.site import ScheduleSite, Site
 from skyless.core.ticks import wrap
 from skyless.research.uncertainty.bounds import BoundSettings, received_bound

@@ -11,11 +11,11 @@ import time
 
 import numpy as np
 
-from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import covariances
-from skyless.core.native.views import view
+from skyless.core.native.records import view
+from skyless.core.ticks import TICK_M, TICK_RATE_HZ, TICK_S
 
 NODES, SUPERFRAMES, SLOT_TICKS = 7, 2048, round(5e-3 * TICK_RATE_HZ)
 TAG_M = np.array([3.0, 4.0, 0.0])

@@ -11,11 +11,9 @@ RAM.
 import random
 from collections.abc import Iterator
 
-from skyless.core.air.ieee802154 import after_rmarker_s, air_time_s, fcs, preamble_s
-from skyless.core.air.instants import gap_ticks, period_code
-from skyless.core.air.reception import Diagnostics
-from skyless.core.constants import TICK_S
-from skyless.core.ticks import from_seconds, wrap
+from skyless.core.air.almanac import gap_ticks, period_code
+from skyless.core.air.frame import Diagnostics, after_rmarker_s, air_time_s, fcs, preamble_s
+from skyless.core.ticks import TICK_S, from_seconds, wrap
 from skyless.radio.dw1000 import driver
 from skyless.sim.dw1000.chip import Chip
 

@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 
 from skyless.core.arrays import Array
-from skyless.core.constants import CARRIER_CYCLES
+from skyless.core.ticks import CARRIER_CYCLES
 from skyless.research.foreign import _muloc as muloc
 from skyless.research.masterless.packet_tracking import MASTERLESS, PacketTracking
 

@@ -24,9 +24,9 @@ import numpy as np
 from forged_beacons import KEYS_BEGIN_S, site_of
 from msgspec import Struct, to_builtins
 
-from skyless.core.alert import Alert
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.integrity import Alert
 from skyless.core.site import Site
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, Room

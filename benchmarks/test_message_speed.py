@@ -7,7 +7,7 @@ import pytest
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.method_names import METHODS
 from skyless.core.protocol1.anchor import Anchor
-from skyless.core.protocol1.codec import decode, encode
+from skyless.core.protocol1.beacon import decode, encode
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import lab_site
 from skyless.sim.stations import TagSpec

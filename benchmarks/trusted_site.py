@@ -22,10 +22,9 @@ import numpy as np
 from forged_beacons import KEYS_BEGIN_S, site_of
 from msgspec.structs import replace
 
-from skyless.core.air.beacon import Beacon
-from skyless.core.air.codec import decode
+from skyless.core.air.beacon import Beacon, decode
 from skyless.core.any_receiver import AnyReceiver
-from skyless.core.keys.key_chain import public_key
+from skyless.core.keys.chain import public_key
 from skyless.core.keys.verifier import Verifier
 from skyless.core.site import ScheduleSite, Site
 from skyless.core.trusted_receiver import SiteTrust, Trust

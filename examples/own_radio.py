@@ -11,8 +11,7 @@ import random
 from math import dist
 
 from skyless import Anchor, Receiver, Reception, lab_site
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ, difference, wrap
 
 STAMP_NOISE_S = 100e-12
 """A DW1000's stamps scatter by about as much."""

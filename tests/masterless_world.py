@@ -11,7 +11,7 @@ from math import cos, dist, sin
 import numpy as np
 
 from recordings.capture_makers import binary_record, tdoa2, tdoa3
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.sim.oscillator import OscillatorModel, advance, make_clocks
 from skyless.sim.streams import Streams
 

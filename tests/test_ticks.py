@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core import ticks
-from skyless.core.constants import TICK_M
+from skyless.core.ticks import TICK_M
 
 RATE_HZ = 128 * 499_200_000
 WRAP_S = Fraction(2**40, RATE_HZ)

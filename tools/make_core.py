@@ -8,20 +8,20 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Final
 
-from skyless.core.air import anchor_stamps, beacon_fields
+from skyless.core.air import beacon, neighbours
 from skyless.core.estimator import kalman, levels, process, state, steady_state
 from skyless.core.native import arithmetic
-from skyless.core.tag import admission, changes, following, hearing, position
+from skyless.core.tag import admission, following, hearing, position
 from translator.files import translate
 
 EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
-    beacon_fields.read_frame,
-    anchor_stamps.unwrap_stamp,
+    beacon.read_frame,
+    neighbours.unwrap_stamp,
     admission.admit_sender,
     admission.admit_stamp,
-    changes.begin_tag,
-    changes.begin_here,
-    changes.wake,
+    hearing.begin_tag,
+    hearing.begin_here,
+    hearing.wake,
     hearing.hear_frame,
     hearing.hear_fields,
     state.restart,

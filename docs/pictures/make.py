@@ -19,7 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
-from skyless.core.air.ieee802154 import air_time_s
+from skyless.core.air.frame import air_time_s
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.report.figures import BLUE, GREEN, GRID, INK, MUTED, ORANGE
 

@@ -1,4 +1,4 @@
-/* Sizes of the estimator's records on the board, before those of a computer (skyless/core/native/sizes.py). The compiler
+/* Sizes of the estimator's records on the board, before those of a computer (skyless/core/native/records.py). The compiler
  * includes this file before the core's; tests read it too. */
 #ifndef CORE_SIZES_H
 #define CORE_SIZES_H

@@ -12,7 +12,7 @@
 #define FIX_MAX_ANCHORS 8u
 #define FIX_NO_SITE 0xFFFFu
 
-/* As in core/alert.py. The first four are states of the levels (core/integrity.py); in the first two there are levels. */
+/* As in core/integrity.py. The first four are states of the levels (core/integrity.py); in the first two there are levels. */
 enum fix_alert { ALERT_NONE, ALERT_EXCLUDED, ALERT_NOT_EXCLUDED, ALERT_UNAVAILABLE, ALERT_LIMIT };
 
 struct fix_anchor {

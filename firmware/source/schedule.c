@@ -11,11 +11,11 @@
 #define PREAMBLE_US 155u
 /* Of the preamble the receiver may miss this. */
 #define SPARE_US 60u
-/* After an RMARKER: 127 bytes, at most (`core/air/ieee802154.py`). */
+/* After an RMARKER: 127 bytes, at most (`core/air/frame.py`). */
 #define FRAME_US 190u
 /* To each side: what a hand-over over the SPI and stamps need, */
 #define GUARD_US 10u
-/* what two crystals gain on each other, 40 ppm (`core/constants.py`), */
+/* what two crystals gain on each other, 40 ppm (`core/ticks.py`), */
 #define DRIFT_PPM 40u
 /* and over a sleep, that is counted by 32768 Hz and begins and ends within a period each. Users have measured that crystal
  * 100 to 120 ppm off; once known, its rate changes by less. */

@@ -55,7 +55,7 @@ bool schedule_is_done(const struct schedule *schedule, uint32_t beacons);
  * from now on. */
 void schedule_wake(struct schedule *schedule, uint64_t before_ticks, uint64_t now_ticks, uint64_t slept_us);
 
-/* Time from a beacon to its anchor's next one, by the anchor's counter (`core/air/instants.py`). */
+/* Time from a beacon to its anchor's next one, by the anchor's counter (`core/air/almanac.py`). */
 uint64_t schedule_gap_ticks(uint32_t anchor, uint32_t sequence, uint32_t period_code);
 
 #endif

@@ -22,16 +22,16 @@ if TYPE_CHECKING:
     from skyless.cli.api.survey import BiasResult as BiasResult
     from skyless.cli.api.survey import SurveyResult as SurveyResult
     from skyless.cli.api.survey import survey_site as survey_site
+    from skyless.core.air.frame import Reception as Reception
+    from skyless.core.air.frame import Transmission as Transmission
     from skyless.core.air.masterless_packets import PairTdoa as PairTdoa
-    from skyless.core.air.reception import Reception as Reception
-    from skyless.core.air.reception import Transmission as Transmission
-    from skyless.core.anchor.anchor import Anchor as Anchor
+    from skyless.core.anchor import Anchor as Anchor
     from skyless.core.errors import SkylessError as SkylessError
     from skyless.core.fix import Fix as Fix
     from skyless.core.fix import NoFixReason as NoFixReason
     from skyless.core.method_names import METHODS as METHODS
     from skyless.core.site import Site as Site
-    from skyless.core.tag.locate import locate as locate
+    from skyless.core.tag.position import locate as locate
     from skyless.core.tag.receiver import Receiver as Receiver
     from skyless.core.trusted_receiver import SiteTrust as SiteTrust
     from skyless.core.trusted_receiver import Trust as Trust
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
 
 _MODULES: Final = {
     "METHODS": "skyless.core.method_names",
-    "Anchor": "skyless.core.anchor.anchor",
+    "Anchor": "skyless.core.anchor",
     "BiasResult": "skyless.cli.api.survey",
     "Fix": "skyless.core.fix",
     "Fleet": "skyless.sim.evaluation.fleet",
@@ -55,7 +55,7 @@ _MODULES: Final = {
     "PlanResult": "skyless.cli.api.plan",
     "RatePlanResult": "skyless.cli.api.rate_plan",
     "Receiver": "skyless.core.tag.receiver",
-    "Reception": "skyless.core.air.reception",
+    "Reception": "skyless.core.air.frame",
     "ReplayResult": "skyless.cli.api.replay",
     "Request": "skyless.sim.evaluation.scenarios",
     "SimulationResult": "skyless.cli.api.simulate",
@@ -64,13 +64,13 @@ _MODULES: Final = {
     "SiteTrust": "skyless.core.trusted_receiver",
     "StudyResult": "skyless.cli.api.study",
     "SurveyResult": "skyless.cli.api.survey",
-    "Transmission": "skyless.core.air.reception",
+    "Transmission": "skyless.core.air.frame",
     "Trust": "skyless.core.trusted_receiver",
     "TrustedReceiver": "skyless.core.trusted_receiver",
     "fleet_of": "skyless.sim.evaluation.scenarios",
     "lab_site": "skyless.sim.lab",
     "load_site": "skyless.site.file.load",
-    "locate": "skyless.core.tag.locate",
+    "locate": "skyless.core.tag.position",
     "open_recording": "skyless.cli.api.replay",
     "plan": "skyless.cli.api.plan",
     "replay": "skyless.cli.api.replay",

@@ -3,11 +3,9 @@
 from hypothesis import strategies as st
 from protocol1_strategies import accuracy_pages, coordinates_m, georeference_pages, noise_pages, unsigned
 
-from skyless.core.air.almanac import KeyPage, SitePage
-from skyless.core.air.beacon import Authentication, Beacon, StatedPosition
-from skyless.core.air.codec import heard_capacity
+from skyless.core.air.almanac import LONGEST_PERIOD_CODE, KeyPage, SitePage
+from skyless.core.air.beacon import Authentication, Beacon, StatedPosition, heard_capacity
 from skyless.core.air.frame import Heard
-from skyless.core.air.instants import LONGEST_PERIOD_CODE
 
 
 def signed_steps(bits, steps_per_unit):

@@ -4,9 +4,8 @@ from hypothesis import strategies as st
 
 from skyless.core.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.core.air.frame import Heard
-from skyless.core.air.page_codec import MAX_NOISE, MAX_SUPERFRAME_TICKS
-from skyless.core.protocol1.beacon import Beacon, MasterTime
-from skyless.core.protocol1.codec import heard_capacity
+from skyless.core.air.site_pages import MAX_NOISE, MAX_SUPERFRAME_TICKS
+from skyless.core.protocol1.beacon import Beacon, MasterTime, heard_capacity
 
 
 def unsigned(bits):

@@ -3,9 +3,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core.air.almanac import SchedulePage
-from skyless.core.constants import TICK_S
-from skyless.core.protocol1.schedule import Schedule, first_slots, schedule_from_page, schedule_of
+from skyless.core.protocol1.beacon import Schedule, first_slots, schedule_from_page, schedule_of
 from skyless.core.site import AnchorSite, ScheduleSite, Site
+from skyless.core.ticks import TICK_S
 
 
 def site(first=(None,) * 7, master=11, **schedule):

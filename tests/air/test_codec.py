@@ -4,15 +4,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.core.air.almanac import SitePage
-from skyless.core.air.beacon import Authentication, Beacon, StatedPosition
-from skyless.core.air.codec import decode, encode, heard_capacity, packed_relays, signed_bytes, with_authentication
-from skyless.core.air.frame import HEARD, Heard, Malformed, PackedHeard
-from skyless.core.air.ieee802154 import air_time_s, fcs
-from skyless.core.air.instants import LONGEST_PERIOD_CODE
-from skyless.core.air.page_codec import encode_page
-from skyless.core.protocol1 import codec as protocol1_codec
-from skyless.core.protocols import decode_any
+from skyless.core.air.almanac import LONGEST_PERIOD_CODE, SitePage
+from skyless.core.air.beacon import (
+    Authentication,
+    Beacon,
+    StatedPosition,
+    decode,
+    encode,
+    heard_capacity,
+    packed_relays,
+    signed_bytes,
+    with_authentication,
+)
+from skyless.core.air.frame import HEARD, Heard, Malformed, PackedHeard, air_time_s, fcs
+from skyless.core.air.site_pages import encode_page
+from skyless.core.any_receiver import decode_any
+from skyless.core.protocol1 import beacon as protocol1_codec
 
 FLAGS_AT, PERIOD_AT = 11, 19
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import Packet, Relay
-from skyless.core.constants import TICK_M, TICK_RATE_HZ
+from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 from skyless.radio.uci.dl_tdoa import MAX_ANCHORS_KEPT, MAX_ROUNDS_AT_ONCE, DtMessage, DtRounds, host_time_s
 from skyless.radio.uci.uci import (
     DtMessageType,

@@ -5,9 +5,8 @@ import struct
 import pytest
 from protocol1_strategies import FULL
 
-from skyless.core.air.frame import Malformed
-from skyless.core.air.ieee802154 import fcs
-from skyless.core.protocol1.codec import decode, encode
+from skyless.core.air.frame import Malformed, fcs
+from skyless.core.protocol1.beacon import decode, encode
 
 LONG_ADDRESSES = 0xDC41
 SHORT_ADDRESSES = 0x8841

@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.air.ieee802154 import (
+from skyless.core.air.frame import (
     DATA_SYMBOL_S,
     HEADER_SYMBOL_S,
     PREAMBLE_SYMBOL_S,

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from skyless.core.air.instants import (
+from skyless.core.air.almanac import (
     LONGEST_PERIOD_CODE,
     OFFERED_HZ,
     SHORTEST_PERIOD_S,
@@ -15,8 +15,7 @@ from skyless.core.air.instants import (
     suitable_period_s,
     ticks_ahead,
 )
-from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
-from skyless.core.ticks import WRAP_TICKS, from_seconds, to_seconds
+from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, WRAP_TICKS, from_seconds, to_seconds
 from skyless.sim.cells import _timetable as timetable
 from skyless.site.kernels.compiled import kernel
 

@@ -8,7 +8,7 @@ from protocol1_strategies import pages
 
 from skyless.core.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.core.air.frame import Malformed
-from skyless.core.air.page_codec import decode_page, encode_page
+from skyless.core.air.site_pages import decode_page, encode_page
 
 metres = st.floats(-1e6, 1e6)
 EARTH_RADIUS_M = 6_378_137.0

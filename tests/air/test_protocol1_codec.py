@@ -7,10 +7,8 @@ from hypothesis import strategies as st
 from protocol1_strategies import FULL, beacons
 
 from skyless.core.air.almanac import AnchorPage, NoisePage
-from skyless.core.air.frame import Heard, Malformed
-from skyless.core.air.ieee802154 import fcs
-from skyless.core.protocol1.beacon import Beacon, MasterTime
-from skyless.core.protocol1.codec import decode, decode_cached, encode, heard_capacity
+from skyless.core.air.frame import Heard, Malformed, fcs
+from skyless.core.protocol1.beacon import Beacon, MasterTime, decode, decode_cached, encode, heard_capacity
 
 pytestmark = pytest.mark.site
 

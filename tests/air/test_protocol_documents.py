@@ -7,24 +7,24 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from skyless.core.air.almanac import AnchorPage
-from skyless.core.air.beacon import Beacon
-from skyless.core.air.beacon_fields import (
+from skyless.core.air.almanac import LONGEST_PERIOD_CODE, OFFERED_HZ, SHORTEST_PERIOD_S, AnchorPage, period_ticks
+from skyless.core.air.beacon import (
     HAS_AUTHENTICATION,
     HAS_CERTIFICATE,
     HAS_PAGE,
     HAS_PHASES,
     HAS_POSITION,
     RESERVED_FLAGS,
+    Beacon,
+    decode,
+    encode,
+    heard_capacity,
 )
-from skyless.core.air.codec import decode, encode, heard_capacity
-from skyless.core.air.frame import Heard, Malformed, PackedHeard
-from skyless.core.air.ieee802154 import air_time_s
-from skyless.core.air.instants import LONGEST_PERIOD_CODE, OFFERED_HZ, SHORTEST_PERIOD_S, period_ticks
+from skyless.core.air.frame import Heard, Malformed, PackedHeard, air_time_s
 from skyless.core.air.site_pages import MIN_ANCHORS
-from skyless.core.native.sizes import MAX_ANCHORS_IN_USE, MAX_NEIGHBOURS, MAX_PAGES, MAX_SENDERS
+from skyless.core.native.records import MAX_ANCHORS_IN_USE, MAX_NEIGHBOURS, MAX_PAGES, MAX_SENDERS
 from skyless.core.protocol1 import beacon as protocol1_beacon
-from skyless.core.protocol1 import codec as protocol1_codec
+from skyless.core.protocol1 import beacon as protocol1_codec
 from skyless.core.protocol1.almanac import page_for, pages_of
 from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import to_seconds

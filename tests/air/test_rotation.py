@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
-from skyless.core.air.page_codec import decode_page, encode_page
+from skyless.core.air.site_pages import decode_page, encode_page
 from skyless.core.protocol1.almanac import almanac_issue, page_for, pages_of
 from skyless.core.site import (
     EXACT,

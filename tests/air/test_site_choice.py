@@ -12,7 +12,7 @@ from skyless.core.air.site_choice import (
     choose_site,
     note_fix,
 )
-from skyless.core.native.sizes import MAX_COUNTED, MAX_SITES
+from skyless.core.native.records import MAX_COUNTED, MAX_SITES
 from skyless.core.ticks import from_seconds
 
 HOME, OTHER = 1, 77

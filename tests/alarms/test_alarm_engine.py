@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.core.alarm_rule import AlarmRule
-from skyless.core.alert import Alert
+from skyless.core.integrity import Alert
+from skyless.core.site import AlarmRule
 from skyless.run.alarms import engine as engine_module
 from skyless.run.alarms.engine import CONFIRM_S, EVALUATION_S, AlarmEngine, Concerned, is_over
 from skyless.run.alarms.near import STOREY_M, near_tags

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.core.alarm_rule import AlarmRule
 from skyless.core.errors import ConfigurationError
+from skyless.core.site import AlarmRule
 from skyless.page._alarms import read_rules
 from skyless.run.alarms.engine import Concerned
 from skyless.run.mqtt.messages import AlarmRulesMessage, Asset, WrongMessageError, site_message

@@ -15,7 +15,7 @@ import synthetic_recordings as synthetic
 from recordings import live_site
 from skyless.cli.common.output import to_json
 from skyless.cli.main import main
-from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.site import AccuracySite
 from skyless.research.calibration.options import Stay
 from skyless.research.studies import motion

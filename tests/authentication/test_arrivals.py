@@ -3,9 +3,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.constants import MAX_DRIFT
-from skyless.core.keys._arrivals import SILENCE_TICKS, Arrival, Arrivals, Stamps
-from skyless.core.ticks import from_seconds, wrap
+from skyless.core.keys.known_keys import SILENCE_TICKS, Arrival, Arrivals, Stamps
+from skyless.core.ticks import MAX_DRIFT, from_seconds, wrap
 
 MS = from_seconds(1e-3)
 

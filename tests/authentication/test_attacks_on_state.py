@@ -7,15 +7,12 @@ import pytest
 from test_known_keys import CHAIN, FIRST, KEYS, PUBLIC, SITE, TIMING
 
 from skyless.core.air.almanac import KeyPage
-from skyless.core.air.beacon import Beacon
-from skyless.core.air.codec import decode, encode, with_authentication
-from skyless.core.air.reception import Reception
-from skyless.core.anchor.authentication import NO_KEYS_S, BeaconAuthentication
-from skyless.core.keys import _known_keys as known_keys
-from skyless.core.keys import chain
-from skyless.core.keys.fault import Fault
-from skyless.core.keys.key_chain import SECTION_INTERVALS, earlier_key, mac_of
-from skyless.core.keys.verifier import Verifier
+from skyless.core.air.beacon import Beacon, decode, encode, with_authentication
+from skyless.core.air.frame import Reception
+from skyless.core.anchor import NO_KEYS_S, BeaconAuthentication
+from skyless.core.keys import chain, known_keys
+from skyless.core.keys.chain import SECTION_INTERVALS, earlier_key, mac_of
+from skyless.core.keys.verifier import Fault, Verifier
 from skyless.core.ticks import from_seconds, wrap
 from skyless.sim.lab import lab_site
 

@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
-from skyless.core.keys.chain import Chain, new_chain
-from skyless.core.keys.key_chain import SECTION_BITS, ChainTiming
+from skyless.core.keys.chain import SECTION_BITS, Chain, ChainTiming, new_chain
 from skyless.run.keys.key_files import (
     SEEDS_VARIABLE,
     SITE_PRIVATE,

@@ -7,17 +7,19 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.core.keys import _known_keys as known_keys
-from skyless.core.keys._known_keys import CertificateUse, KeyUse, KnownKeys
-from skyless.core.keys.chain import Chain, ChainKeys, section_signatures
-from skyless.core.keys.key_chain import (
+from skyless.core.keys import known_keys
+from skyless.core.keys.chain import (
     SECTION_BITS,
     SECTION_INTERVALS,
+    Chain,
+    ChainKeys,
     ChainTiming,
     earlier_key,
     public_key,
     read_certificate,
+    section_signatures,
 )
+from skyless.core.keys.known_keys import CertificateUse, KeyUse, KnownKeys
 
 SITE = 42
 TIMING = ChainTiming()

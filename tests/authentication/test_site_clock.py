@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.keys._site_clock import DRIFT, RECENT_KEYS, SiteClock
-from skyless.core.keys.key_chain import ChainTiming
+from skyless.core.keys.chain import ChainTiming
+from skyless.core.keys.verifier import DRIFT, RECENT_KEYS, SiteClock
 from skyless.core.ticks import from_seconds
 
 BOUND_S = 0.1

@@ -6,10 +6,11 @@ from pathlib import Path
 import pytest
 from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-from skyless.core.air.codec import decode, signed_bytes, with_authentication
-from skyless.core.keys.chain import Chain, ChainKeys, section_signatures
-from skyless.core.keys.key_chain import (
+from skyless.core.air.beacon import decode, signed_bytes, with_authentication
+from skyless.core.keys.chain import (
     Certificate,
+    Chain,
+    ChainKeys,
     ChainTiming,
     SectionName,
     earlier_key,
@@ -21,6 +22,7 @@ from skyless.core.keys.key_chain import (
     public_key,
     read_certificate,
     root_of,
+    section_signatures,
     sign,
 )
 

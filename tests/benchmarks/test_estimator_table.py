@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from estimator_table import MECHANISMS, changed, constants, switched
 
-from skyless.core.air.first_path import variance_factor
+from skyless.core.air.frame import variance_factor
 from skyless.core.estimator import estimator, settings
 from skyless.core.estimator.state import new_state
 

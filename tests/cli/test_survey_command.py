@@ -14,9 +14,9 @@ import pytest
 from machines.bench import LAB
 from recordings import live_site
 from skyless.cli.main import main
-from skyless.core.constants import TICK_M
 from skyless.core.errors import SkylessError
 from skyless.core.site import AnchorSite, ScheduleSite, Site
+from skyless.core.ticks import TICK_M
 from skyless.research.calibration.facts import facts_of
 from skyless.research.calibration.options import SurveyOptions
 from skyless.sim.impairments import DelayError

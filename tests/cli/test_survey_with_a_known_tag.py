@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from machines.bench import LAB
 from recordings import live_site
 from skyless.cli.main import main
-from skyless.core.constants import TICK_M
+from skyless.core.ticks import TICK_M
 from skyless.sim.impairments import DelayError
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template

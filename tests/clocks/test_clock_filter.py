@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
 from skyless.core.clock_filter import ClockFilter, ClockNoise, clock_noise
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
 
 NOISE = clock_noise(2e-11, 1e-9)
 VARIANCE_M2 = 2 * (0.03**2)

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.constants import TICK_M, TICK_RATE_HZ
 from skyless.core.protocol1.snapshots import relative_offset, relative_rate, synchronise, to_master
+from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,9 +13,8 @@ from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status
 from msgspec.structs import replace
 from starlette.exceptions import HTTPException
 
-from skyless.core.alarm_rule import AlarmRule
 from skyless.core.errors import SkylessError
-from skyless.core.site import GeoreferenceSite
+from skyless.core.site import AlarmRule, GeoreferenceSite
 from skyless.page.api import past
 from skyless.run.history.answers import (
     AlarmRow,

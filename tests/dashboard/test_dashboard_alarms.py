@@ -9,7 +9,7 @@ from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, fix, status
 from msgspec.structs import replace
 from starlette.exceptions import HTTPException
 
-from skyless.core.alarm_rule import AlarmRule
+from skyless.core.site import AlarmRule
 from skyless.page._alarms import KEPT_WAIT_S, MAX_SENT, NoAlarmError
 from skyless.page.live import LiveSite
 from skyless.run.mqtt import topics

@@ -5,7 +5,7 @@ import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, fix, status
 from msgspec.structs import replace
 
-from skyless.core.alarm_rule import AlarmRule
+from skyless.core.site import AlarmRule
 from skyless.page._alarms import KEPT_WAIT_S
 from skyless.page._state import Sent
 from skyless.page.condition.evidence import EXPECTED_S, FRESH_S, GRACE_S

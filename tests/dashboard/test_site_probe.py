@@ -5,7 +5,7 @@ from msgspec.structs import replace
 
 from skyless.cli.nodes._site_probe import SiteProbe
 from skyless.cli.nodes._site_view import SiteView
-from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.ticks import TICK_RATE_HZ
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import AnchorHealth, Counters, Stamp, StampsMessage, TagHealth
 

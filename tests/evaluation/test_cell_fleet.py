@@ -3,7 +3,7 @@
 import pytest
 from msgspec.structs import replace
 
-from skyless.core.air.codec import encode
+from skyless.core.air.beacon import encode
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.site import EXACT
 from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet, SiteBeacons

@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from skyless.core.alert import Alert
 from skyless.core.fix import Fix
-from skyless.core.integrity import IntegrityRequirement
+from skyless.core.integrity import Alert, IntegrityRequirement
 from skyless.sim.evaluation.figures import CHI2_95, KEPT_FIXES, STEP_M, FixSamples, FixTable, Judged, figures_of
 from skyless.sim.evaluation.truth import TruthTrack, antenna_truth, estimated_offset_s, shifted, truth_at
 from skyless.site.tables import Truth

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyless.core.dop import plane_height_m
+from skyless.core.geometry import plane_height_m
 from skyless.sim.evaluation.truth import flies
 from skyless.site.tables import Truth
 

@@ -9,10 +9,8 @@ from cobs import cobs
 from emulator.board_library import CBoard, Processor
 from emulator.build import HAS_HOST_COMPILER
 
-from skyless.core.air.ieee802154 import after_rmarker_s, fcs
-from skyless.core.air.reception import Diagnostics
-from skyless.core.constants import TICK_RATE_HZ
-from skyless.core.ticks import from_seconds, wrap
+from skyless.core.air.frame import Diagnostics, after_rmarker_s, fcs
+from skyless.core.ticks import TICK_RATE_HZ, from_seconds, wrap
 from skyless.radio.interface import AntennaDelays
 from skyless.radio.serial.link import decode
 from skyless.sim.dw1000.chip import Chip

@@ -5,8 +5,7 @@ import random
 import pytest
 from processor_stage import build_board, needs_processor
 
-from skyless.core.air.ieee802154 import after_rmarker_s, fcs
-from skyless.core.air.reception import Diagnostics
+from skyless.core.air.frame import Diagnostics, after_rmarker_s, fcs
 from skyless.core.ticks import from_seconds, wrap
 
 pytest.importorskip("unicorn")

@@ -8,8 +8,7 @@ from cobs import cobs
 from emulator.build import FIRMWARE, build
 from processor_stage import STACK_BYTES, build_program, needs_processor
 
-from skyless.core.air.ieee802154 import after_rmarker_s, fcs
-from skyless.core.air.reception import Diagnostics
+from skyless.core.air.frame import Diagnostics, after_rmarker_s, fcs
 from skyless.core.ticks import from_seconds, wrap
 from skyless.radio.serial.link import decode
 from skyless.sim.dw1000 import registers as r

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core.air.almanac import GeoreferencePage
-from skyless.core.air.ieee802154 import fcs
+from skyless.core.air.frame import fcs
 from skyless.core.fix import NoFixReason
 from skyless.radio.serial import link
 from skyless.radio.serial.link import decode

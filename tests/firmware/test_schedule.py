@@ -7,9 +7,9 @@ from emulator.build import HAS_HOST_COMPILER
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.core.air.ieee802154 import after_rmarker_s, preamble_s
-from skyless.core.air.instants import LONGEST_PERIOD_CODE, gap_ticks
-from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.air.almanac import LONGEST_PERIOD_CODE, gap_ticks
+from skyless.core.air.frame import after_rmarker_s, preamble_s
+from skyless.core.ticks import TICK_RATE_HZ
 
 pytestmark = pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
 

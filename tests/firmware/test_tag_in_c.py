@@ -6,8 +6,7 @@ from emulator.board_library import KEPT_BYTES
 from msgspec.structs import replace
 
 from machines.bench import ROOM, tape
-from skyless.core.air.ieee802154 import after_rmarker_s
-from skyless.core.air.reception import Diagnostics
+from skyless.core.air.frame import Diagnostics, after_rmarker_s
 from skyless.core.ticks import from_seconds, to_seconds, wrap
 from skyless.radio.dw1000.driver import OFF
 from skyless.radio.serial.board_settings import BoardSettings, pack

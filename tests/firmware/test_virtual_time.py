@@ -8,8 +8,7 @@ import tty
 import pytest
 from emulator.site.virtual_time import UNIX_S, run_on, wake
 
-from skyless.core.constants import TICK_S
-from skyless.core.ticks import from_seconds
+from skyless.core.ticks import TICK_S, from_seconds
 from skyless.sim.medium import Timeline
 
 

@@ -14,12 +14,12 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[2] / "tools"))
 
 import compile_core
-from skyless.core.native import library, records, sizes
+from skyless.core.native import library, records
 
 SIZES = Path(__file__).parents[2] / "firmware" / "source" / "core_sizes.h"
 BY_HAND = f'-DSKYLESS_BY_HAND="{SIZES.with_name("core_by_hand.h")}"'
 _INCLUDED = ("-include", "stdbool.h", "-include", str(SIZES))
-DOUBLE = (f"-DMOST_WAITING={sizes.MOST_WAITING}", *_INCLUDED)
+DOUBLE = (f"-DMOST_WAITING={records.MOST_WAITING}", *_INCLUDED)
 """Options of a compiler for such records, with as many updates that wait as on a computer."""
 FLOAT = ("-DSKYLESS_FLOAT", BY_HAND, *_INCLUDED)
 
@@ -29,7 +29,7 @@ def use_board_sizes(real, folder):
     for name, value in re.findall(r"^#define (\w+) (\w+)$", SIZES.read_text(), re.MULTILINE):
         if name == "MOST_WAITING" and real == "double":
             continue
-        setattr(sizes, name, value == "true" if value in {"true", "false"} else int(value))
+        setattr(records, name, value == "true" if value in {"true", "false"} else int(value))
     if real == "float":
         records._C_TYPES[float] = ctypes.c_float
     for part in (library.SOURCE, library.SOURCE.with_suffix(".h")):
@@ -38,10 +38,9 @@ def use_board_sizes(real, folder):
     library.LIBRARIES = (made, made)
     if real == "float":
         from skyless.core.estimator.estimator import Estimator
-        from skyless.core.native import views
 
         # Fixes hold doubles.
-        Estimator.rows = property(lambda self: views.view(self.state.fix).astype("float64").tobytes())
+        Estimator.rows = property(lambda self: records.view(self.state.fix).astype("float64").tobytes())
 
 
 if __name__ == "__main__":

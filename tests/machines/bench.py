@@ -6,10 +6,9 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.air.reception import Reception
-from skyless.core.protocol1.beacon import Beacon
-from skyless.core.protocol1.codec import decode, encode
-from skyless.core.protocols import new_anchor
+from skyless.core.air.frame import Reception
+from skyless.core.any_receiver import new_anchor
+from skyless.core.protocol1.beacon import Beacon, decode, encode
 from skyless.core.site import EXACT, Site
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.lab import paper_lab_site

@@ -3,8 +3,7 @@
 from msgspec.structs import replace
 
 from bench import LAB, Heard, tape
-from skyless.core.air.beacon import Beacon
-from skyless.core.air.codec import decode, encode
+from skyless.core.air.beacon import Beacon, decode, encode
 
 FREE = replace(LAB, schedule=replace(LAB.schedule, mode="free", rate_hz=60.0))
 """The lab's seven anchors, each at random instants."""

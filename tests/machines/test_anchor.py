@@ -7,16 +7,12 @@ import pytest
 from msgspec.structs import replace
 
 from bench import LAB, PAIRS, Stage, changed
-from skyless.core.air.frame import Heard
-from skyless.core.air.page_codec import decode_page, encode_page
-from skyless.core.air.reception import Reception
-from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S
+from skyless.core.air.frame import Heard, Reception
+from skyless.core.air.site_pages import decode_page, encode_page
 from skyless.core.protocol1.almanac import page_for, pages_of
 from skyless.core.protocol1.anchor import MAX_OFFSET_STD_M, Anchor
-from skyless.core.protocol1.beacon import Beacon, MasterTime
-from skyless.core.protocol1.codec import decode, encode
-from skyless.core.protocol1.schedule import first_slots, schedule_of
-from skyless.core.ticks import difference, wrap
+from skyless.core.protocol1.beacon import Beacon, MasterTime, decode, encode, first_slots, schedule_of
+from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_RATE_HZ, TICK_S, difference, wrap
 from skyless.sim.impairments import AnchorOutage, Outage
 
 pytestmark = pytest.mark.site

@@ -12,14 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.core.air.codec import decode
-from skyless.core.air.frame import Malformed
-from skyless.core.air.reception import Reception
-from skyless.core.anchor.anchor import Anchor
-from skyless.core.anchor.authentication import BeaconAuthentication
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
-from skyless.core.keys.fault import Fault
-from skyless.core.ticks import from_seconds, wrap
+from skyless.core.air.beacon import decode
+from skyless.core.air.frame import Malformed, Reception
+from skyless.core.anchor import Anchor, BeaconAuthentication
+from skyless.core.keys.verifier import Fault
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, from_seconds, wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.sim.evaluation.scenarios import Request
 from support.adversary import FORGERIES, Adversary, any_forgery

@@ -7,14 +7,12 @@ import pytest
 from msgspec.structs import replace
 
 from bench import LAB, Stage
-from skyless.core.air.beacon import Beacon
-from skyless.core.air.codec import decode, encode
-from skyless.core.air.first_path import BLOCKED_DB, CLEAR_DB
-from skyless.core.air.instants import OFFERED_HZ, gap_ticks, period_code, period_ticks, suitable_period_s, ticks_ahead
-from skyless.core.air.reception import Diagnostics, Reception
-from skyless.core.anchor.anchor import Anchor
+from skyless.core.air.almanac import OFFERED_HZ, gap_ticks, period_code, period_ticks, suitable_period_s, ticks_ahead
+from skyless.core.air.beacon import Beacon, decode, encode
+from skyless.core.air.frame import BLOCKED_DB, CLEAR_DB, Diagnostics, Reception
+from skyless.core.anchor import Anchor
+from skyless.core.any_receiver import new_anchor
 from skyless.core.protocol1.anchor import Anchor as Protocol1Anchor
-from skyless.core.protocols import new_anchor
 from skyless.core.site import AnchorSite, ScheduleSite, Site, UnplacedAnchor
 from skyless.core.ticks import Unwrapper, difference, from_seconds, to_seconds, wrap
 from skyless.sim.impairments import AnchorOutage, Outage

@@ -8,17 +8,14 @@ from free_site import FREE, beacon_of, free_tape, with_beacon
 from msgspec.structs import replace
 
 from bench import Heard, assert_honest, tape
-from skyless.core.air.almanac import NoisePage, SitePage
-from skyless.core.air.beacon import StatedPosition
-from skyless.core.air.codec import encode
+from skyless.core.air.almanac import NoisePage, SitePage, period_code
+from skyless.core.air.beacon import StatedPosition, encode
 from skyless.core.air.frame import Heard as Relay
-from skyless.core.air.instants import period_code
-from skyless.core.air.local_almanac import site_issue, site_page_for, site_pages_of
+from skyless.core.anchor import site_issue, site_page_for, site_pages_of
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import NoFixReason
 from skyless.core.site import GeoreferenceSite
-from skyless.core.tag.beacon_receiver import NOT_DROPS
-from skyless.core.tag.receiver import Receiver
+from skyless.core.tag.receiver import NOT_DROPS, Receiver
 from skyless.core.ticks import from_seconds, wrap
 from skyless.run.recordings.reception_log import load, save
 

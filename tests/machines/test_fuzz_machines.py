@@ -13,17 +13,12 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from bench import EVERY_METHOD, LAB, ROOM, Stage, assert_honest, tape
-from skyless.core.air.beacon import Beacon
-from skyless.core.air.codec import decode
-from skyless.core.air.frame import MAX_FRAME_BYTES
-from skyless.core.air.ieee802154 import fcs
-from skyless.core.air.reception import Reception
-from skyless.core.any_receiver import AnyReceiver
-from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.air.beacon import Beacon, decode
+from skyless.core.air.frame import MAX_FRAME_BYTES, Reception, fcs
+from skyless.core.any_receiver import AnyReceiver, new_anchor
 from skyless.core.protocol1.anchor import Anchor
-from skyless.core.protocols import new_anchor
 from skyless.core.site import AnchorSite, ScheduleSite, UnplacedAnchor
-from skyless.core.ticks import wrap
+from skyless.core.ticks import TICK_RATE_HZ, wrap
 
 pytestmark = pytest.mark.site
 

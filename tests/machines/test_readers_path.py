@@ -8,7 +8,7 @@ import pytest
 
 import skyless
 from skyless import Request, fleet_of, lab_site
-from skyless.core.air.codec import decode_cached
+from skyless.core.air.beacon import decode_cached
 
 pytestmark = pytest.mark.site
 
@@ -18,10 +18,7 @@ LISTED = [
     name for row in re.findall(r"^\| \d \|.*", DOCUMENT, re.MULTILINE) for name in re.findall(r"`(core/[\w/.]+)`", row)
 ]
 SMALL = {
-    "core/air/ieee802154.py",
     "core/air/frame.py",
-    "core/air/first_path.py",
-    "core/air/reception.py",
     "core/air/site_choice.py",
     "core/ticks.py",
 }

@@ -8,16 +8,14 @@ from msgspec.structs import replace
 
 from bench import EVERY_METHOD, LAB, LOFT, PAIRS, ROOM, Heard, Stage, assert_honest, changed, listen, tape
 from skyless.core.air.almanac import AccuracyPage, AnchorPage, NoisePage, SchedulePage
-from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.fix import NoFixReason
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
-from skyless.core.native.sizes import MAX_NEIGHBOURS
+from skyless.core.native.records import MAX_NEIGHBOURS
 from skyless.core.protocol1.anchor import Anchor
-from skyless.core.protocol1.beacon import MasterTime
-from skyless.core.protocol1.codec import decode
+from skyless.core.protocol1.beacon import MasterTime, decode
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.snapshots import SnapshotMethod
-from skyless.core.ticks import wrap
+from skyless.core.ticks import TICK_RATE_HZ, wrap
 from skyless.sim.impairments import AnchorOutage, Outage
 
 pytestmark = pytest.mark.site

@@ -7,15 +7,14 @@ import pytest
 from msgspec.structs import replace
 
 from bench import ROOM, tape
-from skyless.core.air.beacon import Beacon, StatedPosition
-from skyless.core.air.codec import decode, encode
+from skyless.core.air.beacon import Beacon, StatedPosition, decode, encode
 from skyless.core.air.frame import Heard
 from skyless.core.air.neighbours import RELAYED_TICKS, Neighbour, find_neighbour, is_confirmed, neighbour_of
 from skyless.core.estimator.state import find_anchor
 from skyless.core.native.library import compiled
 from skyless.core.native.records import unpacked
 from skyless.core.tag.acquisition import Acquisition
-from skyless.core.tag.changes import wake
+from skyless.core.tag.hearing import wake
 from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import fix_time_ticks, from_seconds, to_seconds, wrap
 

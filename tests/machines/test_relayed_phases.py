@@ -9,11 +9,9 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 from bench import Stage
-from skyless.core.air.codec import decode
-from skyless.core.air.ieee802154 import fcs
-from skyless.core.air.reception import Reception
-from skyless.core.any_receiver import AnyReceiver
-from skyless.core.protocols import new_anchor
+from skyless.core.air.beacon import decode
+from skyless.core.air.frame import Reception, fcs
+from skyless.core.any_receiver import AnyReceiver, new_anchor
 from skyless.core.ticks import wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.research.masterless.own_estimator import OwnReceiver

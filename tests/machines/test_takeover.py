@@ -9,14 +9,11 @@ from msgspec.structs import replace
 
 from bench import EVERY_METHOD, LAB, ROOM, SNAPSHOTS, Stage, assert_honest
 from skyless.core.any_receiver import AnyReceiver
-from skyless.core.constants import TICK_S
-from skyless.core.protocol1._master_term import is_newer
-from skyless.core.protocol1._site_clock import SiteTime
-from skyless.core.protocol1._watch import MAX_CHANCE, MasterWatch
-from skyless.core.protocol1.anchor import Anchor
-from skyless.core.protocol1.codec import decode
-from skyless.core.protocol1.election import Role
-from skyless.core.ticks import Unwrapper
+from skyless.core.protocol1.anchor import Anchor, Role
+from skyless.core.protocol1.beacon import decode
+from skyless.core.protocol1.clock import SiteTime, is_newer
+from skyless.core.protocol1.receiver import MAX_CHANCE, MasterWatch
+from skyless.core.ticks import TICK_S, Unwrapper
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import AnchorOutage, Outage
 

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from skyless.core.native.library import compiled
-from skyless.core.native.sizes import MAX_ANCHORS
-from skyless.core.native.views import view
+from skyless.core.native.records import MAX_ANCHORS, view
 from skyless.core.tag.position import FOUND, IMPOSSIBLE, MIRROR, RESIDUALS, SINGULAR, UNCERTAIN, Found, find_position
-from skyless.core.tag.problem import FREE, HEIGHT, PLANE, LocateProblem
+from skyless.core.tag.search import FREE, HEIGHT, PLANE, LocateProblem
 
 pytestmark = [pytest.mark.site, pytest.mark.skipif(not shutil.which("gcc"), reason="there is no gcc")]
 

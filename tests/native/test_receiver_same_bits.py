@@ -6,10 +6,9 @@ from msgspec.structs import replace
 from test_same_bits import bits
 
 from machines.bench import ROOM, tape
-from skyless.core.air.codec import decode, encode
-from skyless.core.air.frame import PackedHeard
-from skyless.core.air.local_almanac import site_issue, site_page_for, site_pages_of
-from skyless.core.air.reception import Diagnostics
+from skyless.core.air.beacon import decode, encode
+from skyless.core.air.frame import Diagnostics, PackedHeard
+from skyless.core.anchor import site_issue, site_page_for, site_pages_of
 from skyless.core.tag import receiver
 from skyless.core.tag.hearing import hear_frame
 

@@ -19,19 +19,15 @@ from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, one_by_on
 import wasm_core
 from make_core import BY_HAND, EXPORTS, NAME
 from skyless.core.air.almanac import GeoreferencePage, NoisePage, SitePage
-from skyless.core.air.beacon import Beacon, StatedPosition
-from skyless.core.air.codec import encode
-from skyless.core.air.frame import Heard
-from skyless.core.air.ieee802154 import fcs
+from skyless.core.air.beacon import Beacon, StatedPosition, encode
+from skyless.core.air.frame import Heard, fcs
+from skyless.core.estimator.estimator import packed_state
 from skyless.core.estimator.process import BatchPacket, BatchRow, Packet, Place, Relay
-from skyless.core.estimator.saved import packed_state
 from skyless.core.estimator.state import WORK_ROWS, State
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay
-from skyless.core.native import small_matrices, tails
-from skyless.core.native.records import c_type
-from skyless.core.native.sizes import MAX_ANCHORS
-from skyless.core.native.views import view
-from skyless.core.tag import descent, minima, position, problem, starts
+from skyless.core.native import arithmetic
+from skyless.core.native.records import MAX_ANCHORS, c_type, view
+from skyless.core.tag import position, search
 from translator.body import Translator
 from translator.files import translate
 from translator.types import INT, REAL, Elements, Number, Results, Struct, parameter_type
@@ -240,7 +236,7 @@ SKIPPED = {"track", "find_steady_state", "find_walked", "process_superframe", "p
 """Their arguments are tables; the runs below, and the tests of planning and bounds, cover them …"""
 SKIPPED |= {"begin_filter", "add_choice", "complete"}
 """… and these ``test_receiver_same_bits``."""
-OF_POSITIONS = {module.__name__ for module in (descent, minima, position, problem, small_matrices, starts, tails)}
+OF_POSITIONS = {module.__name__ for module in (search, search, position, search, arithmetic, search, arithmetic)}
 """``test_position_same_bits`` covers these."""
 ONE_BY_ONE = {name for name, function in FUNCTIONS.items() if function.__module__ not in OF_POSITIONS}
 POINTED = ctypes.Structure | ctypes.Array

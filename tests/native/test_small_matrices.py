@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.native.small_matrices import (
+from skyless.core.native.arithmetic import (
     DEPENDENT,
     Columns,
     factorise,
@@ -16,7 +16,7 @@ from skyless.core.native.small_matrices import (
     solve,
     solve_lower,
 )
-from skyless.core.native.views import view
+from skyless.core.native.records import view
 
 SEEDS = st.integers(0, 2**32 - 1)
 

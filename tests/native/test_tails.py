@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.special import chdtrc, erfcx, ndtr, ndtri
 
-from skyless.core.native.tails import FAR_TAIL, chi2_tail, mean_if_positive, normal_quantile, normal_tail
+from skyless.core.native.arithmetic import FAR_TAIL, chi2_tail, mean_if_positive, normal_quantile, normal_tail
 
 
 @given(z=st.floats(-9.0, 37.0))

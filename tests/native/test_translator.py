@@ -109,7 +109,7 @@ OF_SIZES = """
 from typing import Annotated, Final
 
 from skyless.core.native.records import Reals, Record, record
-from skyless.core.native.sizes import MAX_RELAYS, PACKED
+from skyless.core.native.records import MAX_RELAYS, PACKED
 
 HALF: Final = MAX_RELAYS // 2 if PACKED else MAX_RELAYS
 

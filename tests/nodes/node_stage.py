@@ -10,10 +10,9 @@ from typing import ClassVar
 import msgspec
 from msgspec.structs import replace
 
-from skyless.core.air.reception import Reception
-from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.air.frame import Reception
 from skyless.core.protocol1.anchor import Anchor
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
 from skyless.radio.interface import Restarted, Sent
 from skyless.run.anchor import AnchorNode
 from skyless.run.mqtt.messages import Counters

@@ -15,7 +15,7 @@ from machines.bench import LAB
 from skyless.bridges.program import BridgeNode
 from skyless.bridges.target import BridgeContext, open_hub
 from skyless.bridges.targets import open_route
-from skyless.core.alarm_rule import AlarmRule
+from skyless.core.site import AlarmRule
 from skyless.page.live import LiveSite
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import AlarmRulesMessage, SiteMessage, Zone, ZonesMessage

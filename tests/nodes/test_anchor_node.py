@@ -10,12 +10,10 @@ import pytest
 from msgspec.structs import replace
 from node_stage import LAB, LEAD_S, FakeLink, FakeRadio, played, receptions, running_anchor
 
-from skyless.core.constants import TICK_RATE_HZ
-from skyless.core.protocol1.codec import decode
-from skyless.core.protocol1.election import SILENT_SUPERFRAMES
-from skyless.core.protocol1.schedule import schedule_of
+from skyless.core.protocol1.anchor import SILENT_SUPERFRAMES
+from skyless.core.protocol1.beacon import decode, schedule_of
 from skyless.core.site import ScheduleSite, site_digest
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
 from skyless.radio.interface import Gone, Late, Restarted, Sent
 from skyless.run import anchor, process
 from skyless.run.anchor import (

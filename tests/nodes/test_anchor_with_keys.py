@@ -9,15 +9,13 @@ from msgspec.structs import replace
 from node_stage import FakeRadio, played
 
 from skyless.cli.main import main
-from skyless.core.air.codec import decode
-from skyless.core.air.reception import Reception
-from skyless.core.anchor.anchor import Anchor
-from skyless.core.anchor.authentication import BeaconAuthentication
-from skyless.core.constants import TICK_S
+from skyless.core.air.beacon import decode
+from skyless.core.air.frame import Reception
+from skyless.core.anchor import Anchor, BeaconAuthentication
 from skyless.core.errors import SkylessError
-from skyless.core.keys.fault import Fault
+from skyless.core.keys.verifier import Fault
 from skyless.core.site import UnplacedAnchor, site_digest
-from skyless.core.ticks import difference
+from skyless.core.ticks import TICK_S, difference
 from skyless.radio.interface import Restarted
 from skyless.run.anchor import AnchorNode, Anchors, health_of
 from skyless.run.keys.key_files import SEEDS_VARIABLE, chain_public_file, chain_seed_file, seed_bytes

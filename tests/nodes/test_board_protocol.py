@@ -7,19 +7,15 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.core.air.almanac import GeoreferencePage
-from skyless.core.air.frame import Heard
-from skyless.core.air.ieee802154 import fcs
+from skyless.core.air.frame import Heard, Reception, Transmission, fcs
 from skyless.core.air.masterless_packets import Packet, Relay
-from skyless.core.air.reception import Reception, Transmission
-from skyless.core.alert import Alert
-from skyless.core.anchor.anchor import Anchor as FreeAnchor
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.core.integrity import IntegrityRequirement
+from skyless.core.anchor import Anchor as FreeAnchor
+from skyless.core.integrity import Alert, IntegrityRequirement
 from skyless.core.protocol1.anchor import Anchor
-from skyless.core.protocol1.beacon import Beacon
-from skyless.core.protocol1.codec import encode
+from skyless.core.protocol1.beacon import Beacon, encode
 from skyless.core.site import GeoreferenceSite
 from skyless.core.tag.receiver import Receiver
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.radio.foreign.foreign_radios import SnifferStream
 from skyless.radio.interface import Late, Restarted, Sent
 from skyless.radio.serial import link

@@ -16,10 +16,10 @@ from machines.bench import LAB, tape
 from skyless.bridges.program import BridgeNode, TagBridge, heard_site, run_route
 from skyless.bridges.target import Hub, Route, Target
 from skyless.core.air.almanac import GeoreferencePage
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.errors import SkylessError
-from skyless.core.tag.beacon_receiver import HeardSite
+from skyless.core.tag.receiver import HeardSite
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from node_stage import PLACE_M, FakeRadio, receptions
 
-from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.air.frame import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.run.fix_log import FIX_LEAVES_S, MAX_AGE_S, MAX_RECEPTION_AGE_S, Lateness
 from skyless.run.mqtt.messages import Counters, RequestMessage

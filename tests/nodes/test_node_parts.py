@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from node_stage import receptions
 
 from skyless.core.errors import SkylessError
-from skyless.core.protocol1.codec import decode
+from skyless.core.protocol1.beacon import decode
 from skyless.run.fix_log import Latencies, PhaseLog
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.process import (

@@ -15,7 +15,7 @@ from mqtt_brokers import MOSQUITTO, Embedded, Mosquitto
 
 from machines.bench import LAB, tape
 from skyless.cli.main import main
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
 from skyless.research.replays.site import SiteReplay
 from skyless.run import record
 from skyless.run.mqtt.address import MqttAddress

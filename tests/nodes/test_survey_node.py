@@ -12,9 +12,9 @@ import pytest
 from msgspec.structs import replace
 from node_stage import FakeLink, running
 
-from skyless.core.air.codec import decode
+from skyless.core.air.beacon import decode
+from skyless.core.any_receiver import new_anchor
 from skyless.core.errors import SkylessError
-from skyless.core.protocols import new_anchor
 from skyless.core.site import FloorPlanSite, ScheduleSite, UnplacedAnchor, site_digest
 from skyless.run.anchor import StampLog
 from skyless.run.mqtt import topics

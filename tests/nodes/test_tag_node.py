@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from node_stage import LAB, PLACE_M, FakeLink, FakeRadio, receptions, receptions_of, running, undated
 
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
 from skyless.radio.interface import Gone, Restarted
 from skyless.run import anchor, process
 from skyless.run import tag as tag_module

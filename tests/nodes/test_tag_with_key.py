@@ -6,8 +6,8 @@ from keyed_site import FIRST, FREE, KEYS, OTHER_KEYS, tape
 from msgspec.structs import replace
 from node_stage import PLACE_M, FakeRadio
 
-from skyless.core.air.codec import decode
-from skyless.core.air.reception import Reception
+from skyless.core.air.beacon import decode
+from skyless.core.air.frame import Reception
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.radio.interface import Restarted
 from skyless.run.keys.node_keys import UNVERIFIED_S, Remembered, TagMemory

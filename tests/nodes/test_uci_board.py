@@ -4,13 +4,11 @@ from collections import Counter
 
 import pytest
 
-from skyless.core.air.frame import Heard
+from skyless.core.air.frame import Diagnostics, Heard, Reception
 from skyless.core.air.masterless_packets import Packet
-from skyless.core.air.reception import Diagnostics, Reception
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
 from skyless.core.protocol1.anchor import Anchor
-from skyless.core.protocol1.beacon import Beacon
-from skyless.core.protocol1.codec import encode
+from skyless.core.protocol1.beacon import Beacon, encode
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
 from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.foreign_radios import UciRadio
 from skyless.radio.interface import Restarted

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyless.core.constants import TICK_M, TICK_S
+from skyless.core.ticks import TICK_M, TICK_S
 from skyless.research.bench.monte_carlo_speed import bench_chain, draw_loop
 from skyless.research.paper.monte_carlo import (
     CHUNK_DRAWS,

@@ -5,10 +5,10 @@ import pytest
 from msgspec.structs import replace
 from scipy.stats import binom
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.core.geometry import anchor_positions
-from skyless.core.protocol1.schedule import schedule_of
+from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site, TagsSite, WallSite
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.channel import ChannelModel, pack_walls

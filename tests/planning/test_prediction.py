@@ -7,8 +7,7 @@ from scipy.linalg import solve_discrete_are
 
 from dense_covariance import position_covariance
 from skyless.core.clock_filter import ClockNoise, clock_noise
-from skyless.core.dop import dops_at
-from skyless.core.geometry import anchor_positions
+from skyless.core.geometry import anchor_positions, dops_at
 from skyless.core.method_names import FILTERS
 from skyless.core.protocol1.snapshots import (
     SnapshotMethod,

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.core.air.frame import MAX_FRAME_BYTES
-from skyless.core.air.ieee802154 import air_time_s
+from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
+from skyless.core.any_receiver import beacon_period_s
 from skyless.core.geometry import RADIO_REACH_M
-from skyless.core.protocols import beacon_period_s
 from skyless.core.site import AnchorSite, ScheduleSite, Site, TagsSite, WallSite
 from skyless.sim.cells.world import CellWorld, anchors_of
 from skyless.sim.evaluation.cell_fleet import period_codes_of

@@ -7,10 +7,10 @@ import pytest
 from msgspec.structs import replace
 
 import skyless
-from skyless.core.constants import TICK_S
 from skyless.core.geometry import anchor_positions
-from skyless.core.protocol1.schedule import schedule_of
+from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.site import ScheduleSite
+from skyless.core.ticks import TICK_S
 from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.planning.predict import PlanSettings, Predictor

@@ -12,13 +12,12 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.lib.recfunctions import repack_fields
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.core.estimator.estimator import Estimator, Packets
-from skyless.core.estimator.saved import packed_state
+from skyless.core.estimator.estimator import Estimator, Packets, packed_state
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import FAULT_KINDS, covariances
-from skyless.core.native.views import view
+from skyless.core.native.records import view
 from skyless.core.observation import Observation
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
 from skyless.sim.lab import paper_lab_site
 

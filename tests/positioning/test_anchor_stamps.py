@@ -4,9 +4,8 @@ from collections import Counter
 
 import pytest
 
-from skyless.core.air.anchor_stamps import ANCHOR_RESTART, RESTART_SILENCE_PERIODS, STAMP_FITS, unwrap_stamp
-from skyless.core.air.neighbours import Neighbours
-from skyless.core.native.sizes import MAX_NEIGHBOURS
+from skyless.core.air.neighbours import ANCHOR_RESTART, RESTART_SILENCE_PERIODS, STAMP_FITS, Neighbours, unwrap_stamp
+from skyless.core.native.records import MAX_NEIGHBOURS
 from skyless.core.ticks import from_seconds, wrap
 
 HALF_S = from_seconds(0.5)

@@ -20,13 +20,11 @@ from estimator_builders import (
 )
 from msgspec.structs import replace
 
-from skyless.core.constants import SUBTICKS, TICK_M, TICK_RATE_HZ
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import Alert
-from skyless.core.protocol1._master_scale import MasterScale
-from skyless.core.protocol1._master_term import MasterTerm
+from skyless.core.protocol1.clock import MasterScale, MasterTerm
 from skyless.core.tag.joint import Estimation
-from skyless.core.ticks import TICK_MASK
+from skyless.core.ticks import SUBTICKS, TICK_M, TICK_MASK, TICK_RATE_HZ
 
 pytestmark = pytest.mark.site
 

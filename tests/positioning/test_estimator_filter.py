@@ -37,13 +37,13 @@ from msgspec.structs import replace
 from textbook_filter import TextbookFilter
 
 from skyless.core.air.frame import HEARD
-from skyless.core.constants import TICK_RATE_HZ, TICK_S
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.kalman import predict
 from skyless.core.estimator.levels import FIRST_TEST
 from skyless.core.estimator.process import JOINED, REJECTED, STALE
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import FAULT_KINDS, LASTING, State, add_anchor, new_state, remove_anchor
+from skyless.core.ticks import TICK_RATE_HZ, TICK_S
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM
 from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
 

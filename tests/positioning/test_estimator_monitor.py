@@ -26,14 +26,13 @@ from msgspec.structs import replace
 from scipy.stats import chi2
 
 from skyless.core.clock_filter import ClockFilter, clock_noise
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
 from skyless.core.estimator import monitor
 from skyless.core.estimator.estimator import Report
+from skyless.core.estimator.faults import is_lost
 from skyless.core.estimator.process import ACCEPTED, REJECTED
 from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import find_anchor
-from skyless.core.estimator.verdicts import is_lost
-from skyless.core.ticks import TICK_MASK
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_MASK, TICK_S
 from skyless.research.studies.episodes import WHITE_FM
 
 pytestmark = pytest.mark.site

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.air.first_path import MAX_VARIANCE_FACTOR, variance_factor, variance_factor_of
-from skyless.core.air.reception import Diagnostics
+from skyless.core.air.frame import MAX_VARIANCE_FACTOR, Diagnostics, variance_factor, variance_factor_of
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import Fix
 from skyless.core.protocol1.anchor import Anchor

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.constants import TICK_M, TICK_RATE_HZ
 from skyless.core.protocol1.snapshots import (
     bracketed_covariance,
     bracketed_tdoa,
@@ -13,6 +12,7 @@ from skyless.core.protocol1.snapshots import (
     literal_delayed_covariance,
     literal_tdoa,
 )
+from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 
 pytestmark = pytest.mark.site
 

@@ -5,7 +5,7 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.core.any_receiver import AnyReceiver
-from skyless.core.estimator.saved import packed_state, unpacked_state
+from skyless.core.estimator.estimator import packed_state, unpacked_state
 from skyless.research.studies.common.worlds import Heard, Run, beacons_of
 from skyless.sim.carrier import CarrierModel
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of

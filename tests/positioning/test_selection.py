@@ -5,8 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.core.air.beacon import Beacon
-from skyless.core.air.codec import fields_of
+from skyless.core.air.beacon import Beacon, fields_of
 from skyless.core.air.frame import Heard
 from skyless.core.air.neighbours import (
     RELAYED_TICKS,
@@ -18,14 +17,8 @@ from skyless.core.air.neighbours import (
 )
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import add_anchor, new_state
-from skyless.core.native.sizes import MAX_NEIGHBOURS
-from skyless.core.tag.selection import (
-    BETTER_DB,
-    add_power,
-    add_relays,
-    fitting_relays,
-    replaced_by,
-)
+from skyless.core.native.records import MAX_NEIGHBOURS
+from skyless.core.tag.admission import BETTER_DB, add_power, add_relays, fitting_relays, replaced_by
 from skyless.core.ticks import NEVER, from_seconds, wrap
 
 

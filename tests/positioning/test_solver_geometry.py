@@ -11,18 +11,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from skyless.core.dop import dilution_of_precision
 from skyless.core.fix import NoFixReason
-from skyless.core.native.sizes import MAX_ANCHORS
-from skyless.core.tag.descent import EXHAUSTED, GAIN_TOLERANCE
-from skyless.core.tag.locate import (
-    NoSolution,
-    PseudorangeSolution,
-    Solution,
-    locate,
-    locate_pseudoranges,
-)
-from skyless.core.tag.position import UNSETTLED
+from skyless.core.geometry import dilution_of_precision
+from skyless.core.native.records import MAX_ANCHORS
+from skyless.core.tag.position import UNSETTLED, NoSolution, PseudorangeSolution, Solution, locate, locate_pseudoranges
+from skyless.core.tag.search import EXHAUSTED, GAIN_TOLERANCE
 
 pytestmark = pytest.mark.site
 
@@ -330,18 +323,18 @@ def test_a_singular_covariance_is_refused():
 
 
 def test_iterations_that_do_not_settle_are_told(monkeypatch):
-    from skyless.core.tag import locate as located
+    from skyless.core.tag import position as located
 
     monkeypatch.setattr(located, "_find_position", lambda *_: UNSETTLED)
     refused(locate(LAB, np.zeros(5), sigma(5), height_m=0), NoFixReason.NOT_CONVERGED)
 
 
 def test_an_iteration_that_does_not_settle_counts_as_such(monkeypatch):
-    from skyless.core.tag import locate as located
-    from skyless.core.tag import minima, position
+    from skyless.core.tag import position, search
+    from skyless.core.tag import position as located
 
     monkeypatch.setattr(located, "_find_position", position.find_position)
-    monkeypatch.setattr(minima, "descend", lambda _: EXHAUSTED)
+    monkeypatch.setattr(search, "descend", lambda _: EXHAUSTED)
     refused(locate(LAB, np.zeros(5), sigma(5), height_m=0), NoFixReason.NOT_CONVERGED)
 
 
@@ -396,8 +389,8 @@ AS_PLAIN_PYTHON = """
 import sys, warnings
 warnings.simplefilter("error")
 import numpy as np
-from skyless.core.tag.locate import locate, NoSolution
-from skyless.core.dop import dops_at
+from skyless.core.tag.position import locate, NoSolution
+from skyless.core.geometry import dops_at
 draw = np.random.default_rng(9)
 anchors = draw.uniform(0, 8, (7, 3))
 for kind in range(4):

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from skyless.core.fix import NoFixReason
-from skyless.core.tag.locate import NoSolution, Solution, locate, locate_pseudoranges
+from skyless.core.tag.position import NoSolution, Solution, locate, locate_pseudoranges
 
 pytestmark = pytest.mark.site
 

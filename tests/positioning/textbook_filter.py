@@ -8,8 +8,8 @@ from itertools import pairwise, permutations
 
 import numpy as np
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.settings import TUNING
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 
 
 class Newest:

@@ -2,8 +2,7 @@
 
 import asyncio
 
-from skyless.core.constants import TICK_RATE_HZ
-from skyless.core.ticks import wrap
+from skyless.core.ticks import TICK_RATE_HZ, wrap
 from skyless.radio.ether_wire import Join, Joined, Send
 from skyless.run.ether import Ether
 from skyless.sim.evaluation.scenarios import Request, impairments_of

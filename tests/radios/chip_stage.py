@@ -2,9 +2,8 @@
 
 from collections import Counter
 
-from skyless.core.air.reception import Diagnostics, Reception, Transmission
-from skyless.core.constants import TICK_S
-from skyless.core.ticks import wrap
+from skyless.core.air.frame import Diagnostics, Reception, Transmission
+from skyless.core.ticks import TICK_S, wrap
 from skyless.radio.dw1000.radio import ChipSession
 from skyless.radio.interface import AntennaDelays, Sent
 from skyless.sim.dw1000.chip import Chip, ModelBus

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from skyless.core.constants import TICK_RATE_HZ
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
 from skyless.radio.serial.serial_port import MAX_BOARD_DRIFT, BoardClock
 
 

@@ -6,8 +6,7 @@ from hypothesis import event, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
-from skyless.core.air.ieee802154 import after_rmarker_s, fcs
-from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.air.frame import Diagnostics, Reception, Transmission, after_rmarker_s, fcs
 from skyless.core.ticks import from_seconds, wrap
 from skyless.radio.dw1000 import driver as dw1000
 from skyless.radio.interface import AntennaDelays, Late, Sent

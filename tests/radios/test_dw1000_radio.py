@@ -12,11 +12,9 @@ from air_stage import LAB, make_ether
 from chip_stage import HandClock, TimedNode
 from radio_events import radio_events
 
-from skyless.core.air.ieee802154 import fcs
-from skyless.core.air.reception import Diagnostics, Reception, Transmission
-from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.air.frame import Diagnostics, Reception, Transmission, fcs
 from skyless.core.errors import SkylessError
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
 from skyless.radio.dw1000 import spi
 from skyless.radio.dw1000.radio import Dw1000Radio
 from skyless.radio.dw1000.spi import SpiPort

@@ -4,9 +4,8 @@ import pytest
 from air_stage import LAB, Stage, in_loop
 from msgspec.structs import replace
 
-from skyless.core.air.ieee802154 import after_rmarker_s
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.core.ticks import difference
+from skyless.core.air.frame import after_rmarker_s
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S, difference
 from skyless.radio.ether_wire import Arrival, Clocks, Done, Joined, Send
 
 FRAME = b"a frame" * 10

@@ -9,10 +9,9 @@ import pytest
 from air_stage import make_ether
 from radio_events import radio_events
 
-from skyless.core.air.reception import Reception, Transmission
-from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.air.frame import Reception, Transmission
 from skyless.core.errors import SkylessError
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
 from skyless.radio.ether_wire import Join, Joined, Refused, Send, Unpacker, from_ether, pack
 from skyless.radio.interface import Gone, Late, Restarted, Sent
 from skyless.run.ether import Client

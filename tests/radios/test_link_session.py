@@ -6,7 +6,7 @@ from collections import Counter
 import pytest
 from serial_stage import quantised
 
-from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.air.frame import Diagnostics, Reception, Transmission
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
 from skyless.radio.serial import link
 from skyless.radio.serial.serial_radio import BOARD_SILENCE_S, MAX_PENDING_FRAMES, STATUS_S, LinkSession

@@ -18,9 +18,9 @@ from chip_stage import ChipAnchor
 from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import Packet
-from skyless.core.constants import CARRIER_CYCLES, TICK_M, TICK_RATE_HZ
 from skyless.core.protocol1.anchor import Anchor
-from skyless.core.protocol1.codec import decode
+from skyless.core.protocol1.beacon import decode
+from skyless.core.ticks import CARRIER_CYCLES, TICK_M, TICK_RATE_HZ
 from skyless.research.foreign import _muloc as muloc
 from skyless.sim.carrier import PERIOD_TICKS
 from skyless.sim.evaluation.scenarios import Request, impairments_of

@@ -12,8 +12,7 @@ import pytest
 from radio_events import fixes_of, radio_events
 from serial_stage import PlayedBoard, linked, quantised
 
-from skyless.core.air.ieee802154 import fcs
-from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.air.frame import Diagnostics, Reception, Transmission, fcs
 from skyless.core.errors import SkylessError
 from skyless.core.protocol1.anchor import Anchor
 from skyless.radio.foreign.foreign_radios import ListenerRadio

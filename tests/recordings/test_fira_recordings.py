@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 import synthetic_recordings as synthetic
 from skyless.core.air.masterless_packets import Packet
-from skyless.core.constants import TICK_M, TICK_RATE_HZ
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite
+from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 from skyless.radio.foreign import fira
 from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.uci.uci import (

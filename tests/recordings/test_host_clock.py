@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from live_site import PLACES, SITE, UNIX_S, messages, record
 from msgspec.structs import replace
 
-from skyless.core.air.reception import Reception
-from skyless.core.constants import TICK_S
+from skyless.core.air.frame import Reception
+from skyless.core.ticks import TICK_S
 from skyless.research.replays.site import SiteReplay
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import FixMessage, ReceptionsMessage, TrueMotion, TruthMessage

@@ -14,17 +14,15 @@ from msgspec.structs import astuple, replace
 from numpy.lib.recfunctions import repack_fields
 
 from machines.bench import LAB, PAIRS, ROOM, tape
-from skyless.core.air.page_codec import encode_page
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
+from skyless.core.air.site_pages import encode_page
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.estimator.state import Anchor, KeptPacket, Link, Status
 from skyless.core.method_names import METHODS
-from skyless.core.native.records import packed, unpacked
-from skyless.core.native.sizes import PACKETS_KEPT
-from skyless.core.protocol1.codec import decode, encode
-from skyless.core.tag.admission import Admission
-from skyless.core.tag.course import Course
-from skyless.core.tag.tag import Tag
+from skyless.core.native.records import PACKETS_KEPT, packed, unpacked
+from skyless.core.protocol1.beacon import decode, encode
+from skyless.core.tag.admission import Admission, Tag
+from skyless.core.tag.following import Course
 from skyless.core.ticks import Unwrapper
 from skyless.run.recordings.reception_log import RefusedError, load, save
 

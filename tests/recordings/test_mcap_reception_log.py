@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from machines.bench import LAB, tape
-from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.air.frame import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.research.replays.site import reception_of
 from skyless.run.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage

@@ -10,9 +10,9 @@ from live_site import SITE, UNIX_S, messages, record
 from msgspec.structs import replace
 
 from skyless.cli.main import main
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.core.any_receiver import new_anchor
 from skyless.core.errors import ConfigurationError
-from skyless.core.protocols import new_anchor
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.research.calibration.recorded_stamps import ranges_of
 from skyless.research.surveys._anchor_stamps import RecordedAnchor
 from skyless.run.mqtt.messages import SiteMessage, Stamp, StampsMessage

@@ -3,10 +3,9 @@
 import struct
 from dataclasses import dataclass, field
 
-from skyless.core.air.instants import gap_ticks
-from skyless.core.air.reception import Reception, Transmission
-from skyless.core.constants import DEFAULT_ANTENNA_DELAY_TICKS, TICK_RATE_HZ
-from skyless.core.ticks import Unwrapper, from_seconds, wrap
+from skyless.core.air.almanac import gap_ticks
+from skyless.core.air.frame import Reception, Transmission
+from skyless.core.ticks import DEFAULT_ANTENNA_DELAY_TICKS, TICK_RATE_HZ, Unwrapper, from_seconds, wrap
 
 FRAME_BYTES = 123
 MAX_RELAYS = 6
@@ -23,7 +22,7 @@ def on_grid(ticks: int) -> int:
 
 @dataclass
 class FreeAnchor:
-    """Instants, sequence numbers and relays as in ``skyless.core.anchor.anchor``."""
+    """Instants, sequence numbers and relays as in ``skyless.core.anchor``."""
 
     id: int
     code: int

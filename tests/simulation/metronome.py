@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import msgspec
 
-from skyless.core.air.reception import Reception, Transmission
+from skyless.core.air.frame import Reception, Transmission
 from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import TICK_MASK, from_seconds
 from skyless.sim.impairments import Impairments

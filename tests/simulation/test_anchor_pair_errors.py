@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from metronome import IDEAL, Metronome, faulty, sent, staggered
 
-from skyless.core.constants import TICK_M
-from skyless.core.ticks import difference
+from skyless.core.ticks import TICK_M, difference
 from skyless.sim.impairments import AnchorDisplacement, DelayError, PairError
 from skyless.sim.lab import lab_site
 from skyless.sim.world import World

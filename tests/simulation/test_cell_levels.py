@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from beaconing import FRAME_BYTES, FreeAnchor, contents
 
-from skyless.core.air.instants import period_code, period_ticks
+from skyless.core.air.almanac import period_code, period_ticks
 from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import from_seconds, to_seconds
 from skyless.sim.cells.world import CellWorld, anchors_of

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from skyless.core.constants import TICK_RATE_HZ, TICK_S
+from skyless.core.ticks import TICK_RATE_HZ, TICK_S
 from skyless.sim.cells._clocks import CHECKPOINT_KNOTS, KNOT_TICKS, CellClocks, own_time, true_time
 from skyless.sim.cells._keyed import key_of, mixed, normal, normal_pair, purpose_key, uniform
 from skyless.sim.oscillator import OscillatorModel, Temperature
@@ -125,7 +125,7 @@ def test_temperatures_are_refused():
 
 PLAIN = """
 import numpy as np
-from skyless.core.air.instants import period_code
+from skyless.core.air.almanac import period_code
 from skyless.sim.cells.world import CellAnchors, CellWorld
 from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Static

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from metronome import IDEAL, Metronome, site_of
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.core.ticks import difference
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S, difference
 from skyless.sim.cells._reception import (
     COLLISION,
     HALF_DUPLEX,

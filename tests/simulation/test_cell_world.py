@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import kstest
 
-from skyless.core.air.instants import period_code
-from skyless.core.constants import DEFAULT_ANTENNA_DELAY_TICKS, TICK_M, TICK_S
+from skyless.core.air.almanac import period_code
+from skyless.core.ticks import DEFAULT_ANTENNA_DELAY_TICKS, TICK_M, TICK_S
 from skyless.sim.cells._clocks import KNOT_TICKS
 from skyless.sim.cells._grid import anchors_within, list_neighbours, make_grid
 from skyless.sim.cells._paths import TagPath

@@ -8,10 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.air.ieee802154 import after_rmarker_s, fcs, preamble_s
-from skyless.core.air.reception import Diagnostics
-from skyless.core.constants import TICK_RATE_HZ
-from skyless.core.ticks import wrap
+from skyless.core.air.frame import Diagnostics, after_rmarker_s, fcs, preamble_s
+from skyless.core.ticks import TICK_RATE_HZ, wrap
 from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000.chip import Chip, Sensors
 from skyless.sim.dw1000.registers import Access, decode_header

@@ -5,8 +5,7 @@ import re
 import dw1000_published as published
 import pytest
 
-from skyless.core.air.ieee802154 import fcs
-from skyless.core.air.reception import Diagnostics
+from skyless.core.air.frame import Diagnostics, fcs
 from skyless.core.ticks import wrap
 from skyless.radio.dw1000 import driver as dw1000
 from skyless.sim.dw1000 import registers as r

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import chi2
 
-from skyless.core.constants import TICK_RATE_HZ, TICK_S
+from skyless.core.ticks import TICK_RATE_HZ, TICK_S
 from skyless.sim.oscillator import (
     OscillatorModel,
     Temperature,

@@ -12,10 +12,9 @@ import pytest
 from metronome import DELAY_TICKS, IDEAL, Metronome, faulty, sent, site_of, staggered
 from scipy.stats import binom, chi2, expon, kstest
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import AccuracySite, WallSite
-from skyless.core.ticks import Unwrapper, difference
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S, Unwrapper, difference
 from skyless.sim.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage, lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.oscillator import OscillatorModel

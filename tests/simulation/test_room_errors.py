@@ -10,10 +10,9 @@ from metronome import IDEAL, Metronome, faulty, site_of, staggered
 from scipy.integrate import quad
 from scipy.stats import chi2, kstest, uniform
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import WallSite
-from skyless.core.ticks import difference
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S, difference
 from skyless.sim.impairments import AnchorBias, AnchorDisplacement, Body, Impairments, WarmUp, lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.oscillator import OscillatorModel, clock_rate, drift_phase_s, make_clocks, warm_up

@@ -5,7 +5,7 @@ import pytest
 from metronome import IDEAL, Metronome, site_of
 from scipy.stats import binom
 
-from skyless.core.air.ieee802154 import air_time_s
+from skyless.core.air.frame import air_time_s
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World

@@ -6,18 +6,24 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SitePage
-from skyless.core.air.beacon import Beacon, StatedPosition
-from skyless.core.air.codec import fields_of
-from skyless.core.air.local_almanac import LocalAlmanac, site_issue, site_page_for, site_pages_of
+from skyless.core.air.beacon import Beacon, StatedPosition, fields_of
 from skyless.core.air.neighbours import Neighbours, find_neighbour, neighbour_of
-from skyless.core.air.page_codec import MAX_NOISE, decode_page, encode_page
-from skyless.core.air.site_pages import PRESENT_TICKS, SAME_PAGES, SitePages, note_page
+from skyless.core.air.site_pages import (
+    MAX_NOISE,
+    PRESENT_TICKS,
+    SAME_PAGES,
+    SitePages,
+    decode_page,
+    encode_page,
+    note_page,
+)
+from skyless.core.anchor import LocalAlmanac, site_issue, site_page_for, site_pages_of
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.native.sizes import MAX_NEIGHBOURS, MAX_PAGES
+from skyless.core.native.records import MAX_NEIGHBOURS, MAX_PAGES
 from skyless.core.site import GeoreferenceSite
-from skyless.core.tag.factory import estimator_settings
 from skyless.core.tag.hearing import keep_place
-from skyless.core.tag.site_settings import DROP_S, fill_ages, read_accuracy
+from skyless.core.tag.joint import DROP_S, fill_ages, read_accuracy
+from skyless.core.tag.receiver import estimator_settings
 from skyless.core.ticks import from_seconds
 from skyless.sim.lab import lab_site
 

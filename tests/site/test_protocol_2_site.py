@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.air.instants import OFFERED_HZ, SHORTEST_PERIOD_S
+from skyless.core.air.almanac import OFFERED_HZ, SHORTEST_PERIOD_S
+from skyless.core.any_receiver import beacon_period_s
 from skyless.core.errors import ConfigurationError
 from skyless.core.geometry import pairs_within
-from skyless.core.protocols import beacon_period_s
 from skyless.core.site import UnplacedAnchor
 from skyless.site.file.advice import warnings_of
 from skyless.site.file.load import load_site

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from skyless.core.constants import TICK_M
 from skyless.core.errors import SkylessError
+from skyless.core.ticks import TICK_M
 from skyless.research.studies.catalogue import STUDIES
 from skyless.research.studies.common.plan import plan_of
 from skyless.research.studies.common.summary import CLUSTER_FIXES, clustered_interval

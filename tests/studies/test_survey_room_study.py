@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyless.core.constants import TICK_M
+from skyless.core.ticks import TICK_M
 from skyless.research.studies import survey_room as study
 from skyless.research.studies.catalogue import STUDIES
 from skyless.research.studies.common.plan import Plan

@@ -16,13 +16,19 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.almanac import AccuracyPage, KeyPage, NoisePage, SitePage
-from skyless.core.air.beacon import Authentication, Beacon, StatedPosition
-from skyless.core.air.codec import INTERVAL_BITS, MAC_BYTES, decode, encode, with_authentication
-from skyless.core.air.frame import HEARD, Heard, PackedHeard
-from skyless.core.air.ieee802154 import fcs
+from skyless.core.air.beacon import (
+    INTERVAL_BITS,
+    MAC_BYTES,
+    Authentication,
+    Beacon,
+    StatedPosition,
+    decode,
+    encode,
+    with_authentication,
+)
+from skyless.core.air.frame import HEARD, Heard, PackedHeard, fcs
 from skyless.core.arrays import Array
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.core.keys.key_chain import (
+from skyless.core.keys.chain import (
     KEY_BYTES,
     SECTION_BITS,
     USUAL_TIMING,
@@ -34,7 +40,7 @@ from skyless.core.keys.key_chain import (
     read_certificate,
     sign,
 )
-from skyless.core.ticks import difference, nearest, wrap
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ, difference, nearest, wrap
 
 DRAG_MPS: Final = 0.5
 """Speed at which false measurements draw a tag away."""

@@ -13,12 +13,10 @@ from unittest.mock import patch
 
 import numpy as np
 
-from skyless.core.air.ieee802154 import after_rmarker_s
-from skyless.core.air.reception import Transmission
+from skyless.core.air.frame import Transmission, after_rmarker_s
 from skyless.core.arrays import Array, Integers, Records
-from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_S
 from skyless.core.site import Site
-from skyless.core.ticks import WRAP_TICKS, difference, from_seconds, wrap
+from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_S, WRAP_TICKS, difference, from_seconds, wrap
 from skyless.sim.cells._clocks import KNOT_TICKS, CellClocks, Knots, own_time, true_time
 from skyless.sim.cells._keyed import START, TAG_NODES, key_of, purpose_key, uniform
 from skyless.sim.cells._reception import (

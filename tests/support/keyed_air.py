@@ -15,18 +15,15 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.air.frame import Malformed
-from skyless.core.air.reception import Reception, Transmission
-from skyless.core.anchor.authentication import BeaconAuthentication
+from skyless.core.air.frame import Malformed, Reception, Transmission
+from skyless.core.anchor import BeaconAuthentication
+from skyless.core.any_receiver import AnchorMachine, SiteBeacon, decode_any, new_anchor
 from skyless.core.arrays import Array
-from skyless.core.constants import TICK_RATE_HZ, TICK_S
 from skyless.core.fix import Fix
-from skyless.core.keys.chain import Chain, section_signatures
-from skyless.core.keys.key_chain import SECTION_BITS, SEED_BYTES, USUAL_TIMING, ChainTiming
-from skyless.core.protocols import AnchorMachine, SiteBeacon, decode_any, new_anchor
+from skyless.core.keys.chain import SECTION_BITS, SEED_BYTES, USUAL_TIMING, Chain, ChainTiming, section_signatures
 from skyless.core.site import AnchorSite, Site
 from skyless.core.tag.receiver import Receiver
-from skyless.core.ticks import Unwrapper, difference, from_seconds, wrap
+from skyless.core.ticks import TICK_RATE_HZ, TICK_S, Unwrapper, difference, from_seconds, wrap
 from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.sim.evaluation.scenarios import Request, impairments_of, trajectories_of
 from skyless.sim.stations import TagSpec

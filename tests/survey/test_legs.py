@@ -7,9 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.core.air.frame import Heard
-from skyless.core.air.reception import Reception
-from skyless.core.protocols import new_anchor
+from skyless.core.air.frame import Heard, Reception
+from skyless.core.any_receiver import new_anchor
 from skyless.core.ticks import from_seconds, wrap
 from skyless.research.surveys._anchor_stamps import RecordedAnchor
 from skyless.sim.impairments import AnchorOutage, Outage, lab_impairments

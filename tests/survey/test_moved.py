@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skyless.cli.main import main
-from skyless.core.constants import TICK_M, TICK_RATE_HZ
+from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 from skyless.run.survey._live_survey import LiveSurvey
 from skyless.run.survey.program import SurveyNode, SurveySettings
 from skyless.sim.lab import lab_site

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import chi2
 
-from skyless.core.constants import TICK_M, TICK_RATE_HZ
+from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 from skyless.site.survey.stamps.pair_ranger import Legs, PairRanger, flights_of
 from skyless.site.survey.stamps.repeats import earliest_cluster, half_sample_mode
 from skyless.site.survey.two_way import Leg, bracketed_flight_ticks

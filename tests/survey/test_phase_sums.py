@@ -8,9 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.core.constants import CARRIER_CYCLES, TICK_RATE_HZ
-from skyless.core.protocols import new_anchor
-from skyless.core.ticks import wrap
+from skyless.core.any_receiver import new_anchor
+from skyless.core.ticks import CARRIER_CYCLES, TICK_RATE_HZ, wrap
 from skyless.research.foreign import _muloc as muloc
 from skyless.sim.carrier import CarrierModel
 from skyless.sim.impairments import AnchorDisplacement, AnchorOutage, Outage, lab_impairments

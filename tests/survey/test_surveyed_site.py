@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.core.air.local_almanac import site_issue, site_pages_of
-from skyless.core.constants import TICK_M
+from skyless.core.anchor import site_issue, site_pages_of
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import EXACT, AccuracySite, ScheduleSite, UnplacedAnchor
+from skyless.core.ticks import TICK_M
 from skyless.sim.lab import paper_lab_site
 from skyless.site.file.check import check_site
 from skyless.site.file.load import load_site

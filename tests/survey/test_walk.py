@@ -9,8 +9,8 @@ import pytest
 from msgspec.structs import replace
 
 from machines.bench import LAB, ROOM
-from skyless.core.constants import TICK_M
 from skyless.core.protocol1.anchor import Anchor
+from skyless.core.ticks import TICK_M
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import DelayError
 from skyless.sim.stations import TagSpec

@@ -11,9 +11,9 @@ import skyless
 from machines.bench import LAB, Heard
 from recordings import live_site
 from skyless.cli.main import main
-from skyless.core.constants import TICK_M
 from skyless.core.errors import SkylessError
 from skyless.core.protocol1.anchor import Anchor
+from skyless.core.ticks import TICK_M
 from skyless.research.calibration.recorded_stamps import ranges_of
 from skyless.research.calibration.tags import walk_of
 from skyless.run.recordings.recording import McapRecording

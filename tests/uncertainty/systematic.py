@@ -8,7 +8,7 @@ from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from skyless.core.arrays import Array
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.uncertainty.chain import Chain
 
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.dop import Dops, dilution_of_precision, dops_at
+from skyless.core.geometry import Dops, dilution_of_precision, dops_at
 
 GOLDEN = (1 + math.sqrt(5)) / 2
 

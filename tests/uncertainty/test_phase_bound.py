@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from textbook_bound import LAB, RAISED, SLOT_S, positions, settings_of, textbook, walk
 
-from skyless.core.constants import TICK_S
 from skyless.core.estimator.compiled import process_known
 from skyless.core.estimator.state import covariances
+from skyless.core.ticks import TICK_S
 from skyless.research.uncertainty.bounds import Biases, Sendings, _prior, received_bound, tracking_bound
 
 PHASES = {"phase_std_m": 0.002, "phase_wander": 1e-4}

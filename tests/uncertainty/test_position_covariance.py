@@ -8,7 +8,7 @@ import pytest
 from dense_covariance import position_covariance
 from skyless.core.clock_filter import stamp_variance_m2
 from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covariance, literal_delayed_covariance
-from skyless.core.tag.locate import Solution, locate
+from skyless.core.tag.position import Solution, locate
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 LAB_3D = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])

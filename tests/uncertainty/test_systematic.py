@@ -11,8 +11,8 @@ from systematic import (
     synchronisation_error_m,
 )
 
-from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.protocol1.snapshots import bracketed_tdoa, literal_tdoa
+from skyless.core.ticks import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.research.bench.monte_carlo_speed import bench_chain
 from skyless.research.paper.monte_carlo import Quantity, ideal_values
 from skyless.research.uncertainty.chain import Reference

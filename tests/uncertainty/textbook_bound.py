@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.studies.episodes import random_path
 from skyless.research.uncertainty.bounds import OFFSET_STD_M, POSITION_STD_M, RATE_STD_MPS, Biases, BoundSettings
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from types import FunctionType, ModuleType
 from typing import Any, Final, NamedTuple, get_type_hints
 
-from skyless.core.native import arithmetic, sizes
+from skyless.core.native import arithmetic, records
 from skyless.core.native.records import Record, has_defaults
 from translator.capacities import expression, follows, home_of, names_in
 from translator.scopes import Scopes, assigned
@@ -120,7 +120,7 @@ class Translator:
         value, source = getattr(home, name), source_of(home)
         if c_name(name) not in self.constants:
             code = self.expression(home, source.values.get(name)) if isinstance(value, int) else ""
-            self.constants[c_name(name)] = Constant(value, code, source.docs.get(name, ""), home is sizes)
+            self.constants[c_name(name)] = Constant(value, code, source.docs.get(name, ""), home is records)
         return self.constants[c_name(name)].value
 
     def signature(self, function: FunctionType) -> tuple[list[tuple[str, Type]], Type | None]:

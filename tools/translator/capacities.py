@@ -4,7 +4,7 @@ import ast
 import sys
 from types import ModuleType
 
-from skyless.core.native import sizes
+from skyless.core.native import records
 from translator.sources import source_of
 
 
@@ -19,7 +19,7 @@ def follows(module: ModuleType, node: ast.AST | None) -> bool:
     """Whether sizes are in an expression of a module, or in constants in it."""
     for name in names_in(node):
         home = home_of(module, name)
-        if home is sizes or follows(home, source_of(home).values.get(name)):
+        if home is records or follows(home, source_of(home).values.get(name)):
             return True
     return False
 

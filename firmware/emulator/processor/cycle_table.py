@@ -10,8 +10,7 @@ from typing import Final
 
 from emulator.processor.lone_board import DELAYS, LoneBoard
 from emulator.processor.paths import BYTE, COMMAND, END_OF_TRANSMISSION, IDLE, POLL, RECEPTION, TRANSMISSION, PathCost
-from skyless.core.air.ieee802154 import after_rmarker_s, fcs
-from skyless.core.air.reception import Diagnostics
+from skyless.core.air.frame import Diagnostics, after_rmarker_s, fcs
 from skyless.core.ticks import from_seconds, wrap
 from skyless.radio.serial.link import RX_ON, WANTS_PHASES, Writer
 

@@ -6,8 +6,7 @@ from typing import Final
 
 from emulator.processor.nrf52832 import Image
 from emulator.seat import Seat
-from skyless.core.constants import TICK_S
-from skyless.core.ticks import from_seconds, wrap
+from skyless.core.ticks import TICK_S, from_seconds, wrap
 from skyless.radio.interface import AntennaDelays
 from skyless.sim.dw1000.chip import Chip
 from skyless.sim.medium import Timeline

@@ -20,7 +20,7 @@ from emulator.processor.processors import MIN_TICKS, TICKS_PER_CYCLE, Processors
 from emulator.processor.radio import OnAir, Radio
 from emulator.processor.serial_peripherals import Spim, Uarte
 from emulator.seat import Seat
-from skyless.core.constants import TICK_S
+from skyless.core.ticks import TICK_S
 from skyless.sim.dw1000.registers import SYS_CTRL, SYS_STATUS
 
 WAKE_UP_CYCLES: Final = 3 * 64

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Final, Protocol
 from weakref import WeakKeyDictionary
 
 from emulator.processor.cycles import CPU_HZ
-from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.ticks import TICK_RATE_HZ
 from skyless.sim.medium import Timeline
 
 TICKS_PER_CYCLE: Final = TICK_RATE_HZ / CPU_HZ

@@ -24,9 +24,8 @@ from emulator.site.serial_wire import SerialWire, WireSettings
 from emulator.site.site_air import SITE_TURNAROUND_S, SiteAir
 from emulator.site.virtual_time import run_on
 from emulator.site.watched_radio import WatchedRadio
-from skyless.core.air.reception import Diagnostics
-from skyless.core.protocol1.beacon import Beacon
-from skyless.core.protocol1.codec import decode_cached
+from skyless.core.air.frame import Diagnostics
+from skyless.core.protocol1.beacon import Beacon, decode_cached
 from skyless.core.site import Site
 from skyless.core.ticks import difference, wrap
 from skyless.radio.interface import AntennaDelays

@@ -9,8 +9,7 @@ from typing import Final
 from emulator.board_library import CBoard, Processor
 from emulator.seat import Seat
 from emulator.site.host_programs import Process
-from skyless.core.constants import TICK_S
-from skyless.core.ticks import from_seconds
+from skyless.core.ticks import TICK_S, from_seconds
 
 BYTE_S: Final = 10e-6
 """On the UART: ten bits at 1 Mbaud."""

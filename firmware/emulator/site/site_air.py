@@ -3,8 +3,7 @@
 from collections import Counter
 from typing import Any, Final
 
-from skyless.core.air.ieee802154 import preamble_s
-from skyless.core.air.reception import Transmission
+from skyless.core.air.frame import Transmission, preamble_s
 from skyless.core.ticks import difference, from_seconds, wrap
 from skyless.sim.medium import Medium
 from skyless.sim.oscillator import clock_rate

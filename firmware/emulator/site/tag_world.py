@@ -10,7 +10,7 @@ from typing import Final
 
 from emulator.seat import MakeBoard, Seat
 from emulator.site.site_air import NodeAir
-from skyless.core.air.reception import Diagnostics
+from skyless.core.air.frame import Diagnostics
 from skyless.core.arrays import Array
 from skyless.core.ticks import from_seconds
 from skyless.radio.interface import AntennaDelays

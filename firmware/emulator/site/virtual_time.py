@@ -14,8 +14,7 @@ from contextlib import AbstractContextManager
 from typing import Any, Final, TypeVar
 from unittest import mock
 
-from skyless.core.constants import TICK_S
-from skyless.core.ticks import from_seconds
+from skyless.core.ticks import TICK_S, from_seconds
 from skyless.sim.medium import Timeline
 
 UNIX_S: Final = 1_800_000_000.0

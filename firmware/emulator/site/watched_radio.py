@@ -2,7 +2,7 @@
 
 import time
 
-from skyless.core.air.reception import Reception, Transmission
+from skyless.core.air.frame import Reception, Transmission
 from skyless.radio.interface import Late, Listener, Radio, RadioEvent, ignore
 
 

@@ -45,7 +45,7 @@ from skyless.run.process import HEALTH_S, Log, every, keep, reader, together
 from skyless.run.zones.zone_list import read_zones, zones_of
 
 if TYPE_CHECKING:  # it compiles kernels, which a bridge of a broker does not need
-    from skyless.core.tag.beacon_receiver import SiteListener
+    from skyless.core.tag.receiver import SiteListener
 
 _SILENT_S: Final = 5.0  # after so long without a fix a line says where to look
 

@@ -10,7 +10,7 @@ from cyclopts import App
 from skyless.cli.common.options import JsonOptions, command
 from skyless.cli.common.output import console, print_json, print_table
 from skyless.cli.common.progress import progress_bar
-from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.arguments import Option, Options, Positive, Rule, Text, numbers, point
 from skyless.core.errors import SkylessError
 from skyless.research.replays.options import check_estimator, read_estimator

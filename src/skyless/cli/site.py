@@ -13,16 +13,15 @@ from msgspec.structs import replace
 from skyless.cli.common.options import JsonOptions, check_folder, command
 from skyless.cli.common.output import console, print_facts, print_json, print_table, print_warnings, write_file
 from skyless.cli.nodes.options import SiteId
-from skyless.core.air.frame import MAX_FRAME_BYTES
-from skyless.core.air.ieee802154 import air_time_s
-from skyless.core.air.instants import OFFERED_HZ
+from skyless.core.air.almanac import OFFERED_HZ
+from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
+from skyless.core.any_receiver import beacon_period_s
 from skyless.core.arguments import number, numbers, read_height, whole
-from skyless.core.constants import TICK_S
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import RADIO_REACH_M, anchors_in_reach
-from skyless.core.protocol1.schedule import first_slots, schedule_of
-from skyless.core.protocols import beacon_period_s
+from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import FloorSite, ScheduleSite, Site
+from skyless.core.ticks import TICK_S
 from skyless.sim.lab import lab_site
 from skyless.site.file.check import ANY_ADDRESS, check_site
 from skyless.site.file.load import load_site

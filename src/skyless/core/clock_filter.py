@@ -11,7 +11,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 
 MAX_RELATIVE_RATE: Final = 40e-6
 """Two crystals of ±20 ppm each, the widest that IEEE 802.15.4 allows."""

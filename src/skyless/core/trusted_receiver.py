@@ -16,16 +16,13 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.beacon import Beacon
-from skyless.core.air.frame import Malformed
-from skyless.core.air.reception import Reception
-from skyless.core.constants import TICK_S
+from skyless.core.air.frame import Malformed, Reception
+from skyless.core.any_receiver import decode_any
 from skyless.core.fix import Fix
-from skyless.core.keys.fault import Fault
-from skyless.core.keys.key_chain import public_key
-from skyless.core.keys.verifier import LONGEST_WAIT_TICKS, ReceivedFrame, Verifier
-from skyless.core.protocols import decode_any
+from skyless.core.keys.chain import public_key
+from skyless.core.keys.verifier import LONGEST_WAIT_TICKS, Fault, ReceivedFrame, Verifier
 from skyless.core.tag.receiver import Receiver
-from skyless.core.ticks import FixTime, from_seconds
+from skyless.core.ticks import TICK_S, FixTime, from_seconds
 
 if TYPE_CHECKING:
     from collections.abc import Callable

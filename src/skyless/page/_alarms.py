@@ -9,7 +9,7 @@ from typing import Final
 
 from msgspec.structs import replace
 
-from skyless.core.alarm_rule import AlarmRule
+from skyless.core.site import AlarmRule
 from skyless.page._kept import Kept, SiteLink
 from skyless.page._state import encode
 from skyless.run.alarms.engine import MAX_KEPT, AlarmEngine, Key, is_over

@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.air.frame import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.errors import SkylessError
 from skyless.core.estimator.estimator import Estimator
@@ -17,10 +17,9 @@ from skyless.core.estimator.state import State, covariances
 from skyless.core.fix import Fix
 from skyless.core.integrity import HPL
 from skyless.core.native.library import SOURCE, source_digest
-from skyless.core.native.records import Record, first
-from skyless.core.native.views import view
+from skyless.core.native.records import Record, first, view
+from skyless.core.tag.admission import Tag
 from skyless.core.tag.receiver import Receiver
-from skyless.core.tag.tag import Tag
 from skyless.page.task_process import serve_tasks
 from skyless.page.tasks import WhatIfTask
 from skyless.run.mqtt.messages import RawReception, SegmentStart

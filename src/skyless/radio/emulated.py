@@ -10,9 +10,8 @@ from typing import Final
 
 import msgspec
 
-from skyless.core.air.reception import Diagnostics, Reception, Transmission
-from skyless.core.constants import TICK_RATE_HZ
-from skyless.core.ticks import wrap
+from skyless.core.air.frame import Diagnostics, Reception, Transmission
+from skyless.core.ticks import TICK_RATE_HZ, wrap
 from skyless.radio import ether_wire as wire
 from skyless.radio.interface import Gone, Late, Listener, RadioEvent, Restarted, Sent, ignore
 

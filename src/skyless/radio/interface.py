@@ -6,8 +6,8 @@ from typing import Protocol
 
 from msgspec import Struct
 
-from skyless.core.air.reception import Reception, Transmission
-from skyless.core.constants import DEFAULT_ANTENNA_DELAY_TICKS
+from skyless.core.air.frame import Reception, Transmission
+from skyless.core.ticks import DEFAULT_ANTENNA_DELAY_TICKS
 from skyless.radio.tag_reports import Reported
 
 

@@ -13,10 +13,10 @@ from msgspec import Struct
 from msgspec.structs import astuple
 
 from skyless.core.air.almanac import GeoreferencePage
-from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.ticks import TICK_RATE_HZ
 
 BODY_AT: Final = 2
 """Where a record's body begins, after kind and number."""

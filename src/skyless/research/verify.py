@@ -10,10 +10,10 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
+from skyless.core.any_receiver import superframe_s as period_s
 from skyless.core.arrays import Matrix
 from skyless.core.method_names import FILTERS
-from skyless.core.native.sizes import MAX_ANCHORS_IN_USE
-from skyless.core.protocols import superframe_s as period_s
+from skyless.core.native.records import MAX_ANCHORS_IN_USE
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of, stated_room
 from skyless.sim.trajectory import Static

@@ -3,7 +3,7 @@
 import time
 from typing import Final
 
-from skyless.core.air.reception import Diagnostics, Reception, Transmission
+from skyless.core.air.frame import Diagnostics, Reception, Transmission
 from skyless.core.ticks import difference, from_seconds
 from skyless.radio.dw1000.driver import ChipError
 from skyless.radio.dw1000.radio import Dw1000Radio

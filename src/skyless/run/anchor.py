@@ -11,15 +11,13 @@ from typing import Final, Literal
 
 from msgspec.structs import replace
 
-from skyless.core.air.frame import Malformed
-from skyless.core.air.reception import Reception
-from skyless.core.anchor.authentication import BeaconAuthentication
-from skyless.core.constants import TICK_RATE_HZ
+from skyless.core.air.frame import Malformed, Reception
+from skyless.core.anchor import BeaconAuthentication
+from skyless.core.any_receiver import AnchorMachine, decode_any, new_anchor
 from skyless.core.errors import SkylessError
-from skyless.core.protocol1.election import Role
-from skyless.core.protocols import AnchorMachine, decode_any, new_anchor
+from skyless.core.protocol1.anchor import Role
 from skyless.core.site import Site, is_same_but_placed, largest_change_m, site_digest
-from skyless.core.ticks import difference
+from skyless.core.ticks import TICK_RATE_HZ, difference
 from skyless.radio.interface import Gone, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radio.tag_reports import Reported
 from skyless.run.keys.node_keys import KEYS_S, AnchorKeys, AnchorReport, recent_faults

@@ -11,14 +11,11 @@ from typing import Final, Literal, Protocol
 
 from msgspec.structs import replace
 
-from skyless.core.air.frame import Malformed
-from skyless.core.air.ieee802154 import is_intact
-from skyless.core.air.reception import Diagnostics, Reception, Transmission
-from skyless.core.constants import TICK_M
+from skyless.core.air.frame import Diagnostics, Malformed, Reception, Transmission, is_intact
+from skyless.core.any_receiver import SiteBeacon, decode_any
 from skyless.core.protocol1.almanac import AlmanacAssembly
 from skyless.core.protocol1.beacon import Beacon
-from skyless.core.protocols import SiteBeacon, decode_any
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import TICK_M, difference, wrap
 from skyless.radio.foreign.bitcraze import TDOA3
 from skyless.radio.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radio.serial import link

@@ -7,12 +7,12 @@ from msgspec.structs import replace
 
 from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.fix import Fix, NoFixReason
-from skyless.core.tag.beacon_receiver import HeardSite
+from skyless.core.tag.receiver import HeardSite
 from skyless.radio.tag_reports import AnchorPlace, BoardFix, BoardStatus, TagReport
 
 
 class BoardReceiver:
-    """One tag (``skyless.core.tag.beacon_receiver.SiteListener``)."""
+    """One tag (``skyless.core.tag.receiver.SiteListener``)."""
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()

@@ -8,11 +8,10 @@ import time
 from collections.abc import Callable
 from typing import Final
 
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
 from skyless.core.fix import Fix
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.tag.beacon_receiver import NOT_DROPS
-from skyless.core.tag.receiver import Receiver
+from skyless.core.tag.receiver import NOT_DROPS, Receiver
 from skyless.radio.serial import link
 from skyless.radio.serial.board_settings import ANY_SITE, MODES, OUTPUTS, BoardSettings, pack, unpack
 from skyless.radio.tag_reports import BODY_AT, fix_body, georeference_body, place_body, status_body

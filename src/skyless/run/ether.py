@@ -8,11 +8,9 @@ from typing import Final
 
 import msgspec
 
-from skyless.core.air.frame import MAX_FRAME_BYTES
-from skyless.core.air.reception import Transmission
-from skyless.core.constants import TICK_S
+from skyless.core.air.frame import MAX_FRAME_BYTES, Transmission
 from skyless.core.site import Site
-from skyless.core.ticks import wrap
+from skyless.core.ticks import TICK_S, wrap
 from skyless.radio import ether_wire as wire
 from skyless.radio.interface import ignore
 from skyless.run.fix_log import MAX_RECEPTION_AGE_S

@@ -10,9 +10,9 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from typing import Final
 
+from skyless.core.any_receiver import decode_any
 from skyless.core.fix import Fix
 from skyless.core.protocol1.beacon import Beacon as Protocol1Beacon
-from skyless.core.protocols import decode_any
 from skyless.run.mqtt.messages import Counters, FixMessage, Phase, TagHealth, fix_message
 from skyless.run.process import HEALTH_S
 from skyless.run.rate_limit import RateLimit

@@ -10,12 +10,11 @@ from typing import Final
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
-from skyless.core.tag.beacon_receiver import NOT_DROPS, SiteListener, TagReceiver
-from skyless.core.tag.receiver import Receiver
+from skyless.core.tag.receiver import NOT_DROPS, Receiver, SiteListener, TagReceiver
 from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.radio.tag_reports import BoardFix, Reported

@@ -15,7 +15,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array, Integers, Records
-from skyless.core.constants import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
+from skyless.core.ticks import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.sim.range_errors import RangeErrorModel, RangeErrors
 from skyless.sim.streams import ANCHOR_KEY, TAG_KEY, stream
 

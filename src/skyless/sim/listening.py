@@ -12,8 +12,7 @@ from typing import Final
 import numpy as np
 
 from skyless.core.arrays import Array, Integers, Records
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
-from skyless.core.ticks import TICK_MASK
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_MASK, TICK_S
 from skyless.sim.oscillator import advance, clock_rate
 from skyless.sim.range_errors import slope_error_m
 from skyless.sim.stations import body_m, coordinate_m, velocity_mps

@@ -16,12 +16,10 @@ from typing import Final, Generic, TypeVar
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.air.ieee802154 import after_rmarker_s, preamble_s
-from skyless.core.air.reception import Transmission
+from skyless.core.air.frame import Transmission, after_rmarker_s, preamble_s
 from skyless.core.arrays import Array, Records
-from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S
 from skyless.core.site import Site
-from skyless.core.ticks import difference, from_seconds, wrap
+from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S, difference, from_seconds, wrap
 from skyless.sim.carrier import Carriers
 from skyless.sim.impairments import Impairments
 from skyless.sim.listening import OUTCOMES, RECEPTION_RECORD, receive_frame

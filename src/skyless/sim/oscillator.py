@@ -16,8 +16,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array, Integers, Records
-from skyless.core.constants import TICK_RATE_HZ, TICK_S
-from skyless.core.ticks import WRAP_TICKS
+from skyless.core.ticks import TICK_RATE_HZ, TICK_S, WRAP_TICKS
 from skyless.sim.streams import draw_normal
 from skyless.site.kernels.compiled import kernel, part
 

@@ -8,8 +8,8 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Records
-from skyless.core.constants import TICK_S
 from skyless.core.site import AnchorSite
+from skyless.core.ticks import TICK_S
 from skyless.sim.impairments import AnchorDisplacement, DelayError, Impairments, Outage
 from skyless.sim.trajectory import Piece, Trajectory
 from skyless.site.kernels.compiled import kernel, part

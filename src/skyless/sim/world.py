@@ -12,12 +12,11 @@ from typing import Final
 
 import numpy as np
 
-from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.air.frame import Diagnostics, Reception
+from skyless.core.any_receiver import BeaconSender
 from skyless.core.arrays import Array, Integers
-from skyless.core.constants import TICK_S
-from skyless.core.protocols import BeaconSender
 from skyless.core.site import Site
-from skyless.core.ticks import difference, from_seconds, wrap
+from skyless.core.ticks import TICK_S, difference, from_seconds, wrap
 from skyless.sim.impairments import Impairments
 from skyless.sim.medium import Delivery, Medium, Tally
 from skyless.sim.stations import TagSpec

@@ -6,7 +6,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.core.alarm_rule import AlarmRule
+from skyless.core.site import AlarmRule
 
 MAX_RULES: Final = 200
 GROUP: Final = "group:"

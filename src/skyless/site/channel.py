@@ -11,8 +11,8 @@ import numpy as np
 from msgspec import Struct, structs
 
 from skyless.core.arrays import Array, Records
-from skyless.core.constants import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS
 from skyless.core.site import FloorSite, WallSite
+from skyless.core.ticks import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS
 from skyless.site.kernels.compiled import kernel, part
 
 FREE_SPACE_LOSS_1_M_DB: Final = 20.0 * math.log10(4.0 * math.pi * CHANNEL_5_HZ / SPEED_OF_LIGHT_MPS)

@@ -18,7 +18,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import Point
-from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.arrays import Array
 from skyless.core.errors import ConfigurationError
 from skyless.core.input_files import finite, read_lines

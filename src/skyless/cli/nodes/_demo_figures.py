@@ -7,7 +7,7 @@ from typing import Any, Final
 from msgspec import Struct
 
 from skyless.cli.nodes._site_view import SiteView
-from skyless.core.alert import Alert
+from skyless.core.integrity import Alert
 from skyless.run.fix_log import Latencies
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, TagHealth, TruthBuffer, TruthMessage
 from skyless.run.mqtt.topics import truth_topic

@@ -18,11 +18,11 @@ from skyless.cli.nodes._demo_figures import DemoFigures
 from skyless.cli.nodes._demo_story import MOVED, furnished, messages_of, survey_record
 from skyless.cli.nodes._site_view import SiteView
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, site_named
+from skyless.core.any_receiver import beacon_period_s
 from skyless.core.arguments import Method, Picoseconds, Positive, Seed, TagCount, tag_count, whole
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
 from skyless.core.method_names import DEFAULT_METHOD
-from skyless.core.protocols import beacon_period_s
 from skyless.core.whole_files import replace_files
 from skyless.page.condition.evidence import Health, ProcessorUse
 from skyless.run.broker import Broker, BrokerSettings, start_broker

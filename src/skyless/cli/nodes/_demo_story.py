@@ -8,8 +8,7 @@ from typing import Final
 import msgspec
 from msgspec.structs import replace
 
-from skyless.core.alarm_rule import AlarmRule
-from skyless.core.site import FloorPlanSite, GeoreferenceSite, Site
+from skyless.core.site import AlarmRule, FloorPlanSite, GeoreferenceSite, Site
 from skyless.run.mqtt.messages import Asset, AssetsMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import assets_topic, zones_topic
 from skyless.site.file.template import rectangle

@@ -14,9 +14,9 @@ from collections.abc import Callable
 from typing import Final, TextIO
 
 from skyless.cli.common.output import cm, to_json
-from skyless.core.alert import Alert
 from skyless.core.arguments import Options
 from skyless.core.errors import SkylessError
+from skyless.core.integrity import Alert
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.process import Log
 

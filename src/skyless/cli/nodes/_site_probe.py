@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from skyless.cli.nodes._site_view import GONE, LINK_NAME, SiteView
+from skyless.core.any_receiver import beacon_period_s
 from skyless.core.geometry import RADIO_REACH_M
-from skyless.core.protocols import beacon_period_s
 from skyless.core.site import Site, site_digest
 from skyless.run.doctor.check import Check, Result, judged, residuals_check, sentence
 from skyless.run.doctor.clocks import CounterPairs, counters_check

@@ -223,7 +223,7 @@ def _on_sniffers(
 
 def _system(asked: TagOptions) -> "PacketTagSettings":
     """What sniffers cannot hear, and FiRa boards may not. Raises SkylessError."""
-    from skyless.core.dop import GUESSED_STD_M, plane_height_m
+    from skyless.core.geometry import GUESSED_STD_M, plane_height_m
     from skyless.research.live.packet_tags import TDOA_SITE, PacketTagSettings
     from skyless.site.tables import read_anchors, read_calibration
 

@@ -4,14 +4,18 @@ A beacon is an IEEE 802.15.4 data frame of at most 127 bytes, little endian thro
 word of 32 bits and a high byte.
 """
 
+import math
 import struct
+from binascii import crc_hqx
 from collections.abc import Iterator
 from enum import StrEnum
 from typing import Final
 
 from msgspec import Struct
 
-from skyless.core.ticks import nearest, wrap
+from skyless.core.native.arithmetic import exp
+from skyless.core.native.records import Bytes, Ticks
+from skyless.core.ticks import CHIP_RATE_HZ, nearest, wrap
 
 MAX_FRAME_BYTES: Final = 127
 """Longest PSDU (IEEE 802.15.4-2015, aMaxPhyPacketSize)."""
@@ -121,3 +125,183 @@ def not_a_beacon(frame: bytes, version: int) -> Malformed | None:
 def has_version(frame: bytes, version: int) -> bool:
     """Whether bytes look like a beacon of a version (its magic number)."""
     return frame[_MAGIC_AT] == version.to_bytes(2, "little")
+
+
+# Frames of IEEE 802.15.4: their check sequence, how long they are on the air, and where the RMARKER lies.
+#
+# The RMARKER, the instant that every stamp means, is the first chip of the PHY header: the preamble and the
+# start-of-frame delimiter come before it, the header and the data after (HRP UWB PHY, IEEE 802.15.4-2015, clause
+# 16.2). Durations hold for the settings of ``docs/protocol.md``: 64 MHz PRF, 6.81 Mbit/s, standard delimiter of 8
+# symbols.
+
+PREAMBLE_SYMBOLS: Final = 128
+SFD_SYMBOLS: Final = 8
+
+PREAMBLE_SYMBOL_S: Final = 508 / CHIP_RATE_HZ
+"""One symbol of preamble or delimiter at 64 MHz PRF: a code of 127 elements, each spread over 4 chips; 1017.63 ns."""
+HEADER_SYMBOL_S: Final = 512 / CHIP_RATE_HZ
+"""One symbol of the PHY header, which is sent at 850 kbit/s; 1025.64 ns."""
+DATA_SYMBOL_S: Final = 64 / CHIP_RATE_HZ
+"""One bit of the data at 6.81 Mbit/s; 128.21 ns."""
+
+_HEADER_SYMBOLS: Final = 21
+"""19 bits (13 of contents, 6 of SECDED) and 2 that flush the convolutional code."""
+_BLOCK_BITS: Final = 330
+"""Data bits in one Reed–Solomon block (clause 16.3.3), the last one shortened."""
+_PARITY_BITS: Final = 48
+
+_REVERSED: Final = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+"""Each byte with its bits in reverse order: the radio sends bit 0 first, ``crc_hqx`` processes bit 7 first."""
+
+
+def preamble_s(preamble_symbols: int = PREAMBLE_SYMBOLS, sfd_symbols: int = SFD_SYMBOLS) -> float:
+    """Time on the air before the RMARKER: preamble and start-of-frame delimiter, 138.4 µs by default."""
+    return (preamble_symbols + sfd_symbols) * PREAMBLE_SYMBOL_S
+
+
+def after_rmarker_s(psdu_bytes: int) -> float:
+    """Time on the air from the RMARKER on: PHY header, and the PSDU (FCS included) with its Reed–Solomon parity."""
+    data_bits = 8 * psdu_bytes
+    blocks = -(-data_bits // _BLOCK_BITS)
+    return _HEADER_SYMBOLS * HEADER_SYMBOL_S + (data_bits + _PARITY_BITS * blocks) * DATA_SYMBOL_S
+
+
+def air_time_s(psdu_bytes: int, preamble_symbols: int = PREAMBLE_SYMBOLS, sfd_symbols: int = SFD_SYMBOLS) -> float:
+    """Time that a frame (FCS included) is on the air, first chip to last."""
+    return preamble_s(preamble_symbols, sfd_symbols) + after_rmarker_s(psdu_bytes)
+
+
+def fcs(data: bytes) -> bytes:
+    """Frame check sequence of ``data`` (clause 7.2.10): CRC-16 of x¹⁶ + x¹² + x⁵ + 1, initially 0, low byte first."""
+    return crc_hqx(data.translate(_REVERSED), 0).to_bytes(2, "big").translate(_REVERSED)
+
+
+def is_intact(frame: bytes) -> bool:
+    """Whether a frame's last two bytes are the FCS of those before; the CRC over all of it is then 0."""
+    return crc_hqx(frame.translate(_REVERSED), 0) == 0
+
+
+# Whole numbers in frames, the lowest byte first.
+
+SIGN: Final = 0x80000000
+"""The highest bit of four bytes; as a float32 alone it is −0."""
+
+
+def unsigned(data: Bytes, at: int, size: int) -> Ticks:
+    """That in this number of bytes."""
+    number: Ticks = 0
+    for byte in range(size - 1, -1, -1):
+        number = number << 8 | data[at + byte]
+    return number
+
+
+def two_bytes(data: Bytes, at: int) -> int:
+    """That in two bytes, which needs no 64 bits."""
+    return data[at] | data[at + 1] << 8
+
+
+def signed(data: Bytes, at: int) -> Ticks:
+    """That in four bytes, which may be negative."""
+    number = unsigned(data, at, 4)
+    return number if number < SIGN else number - 2 * SIGN
+
+
+# What passes between a radio and the protocol machines.
+
+
+class Diagnostics(Struct, frozen=True, gc=False):
+    """What a radio measured of one frame in addition to its time. A value is None where the radio does not report it.
+
+    Powers are those of the chip's formulas without corrections (``core/air/frame.py``).
+    """
+
+    rx_power_dbm: float | None = None
+    first_path_power_dbm: float | None = None
+    carrier_offset_ppm: float | None = None
+
+
+class Reception(Struct, frozen=True, gc=False):
+    """One frame as a radio received it.
+
+    ``frame`` is the whole PSDU, FCS included. ``rx_ticks`` is the receiver's own 40-bit counter at the frame's
+    RMARKER, antenna delay already subtracted. ``host_s`` is the host's clock, needed only to bridge gaps over 8.6 s.
+    ``carrier_phase_cycles`` is the phase of the carrier at the first path, in [0, 1), where the radio measured it: it
+    falls by one cycle while ``rx_ticks`` grows by the time of one (docs/phases.md).
+    """
+
+    frame: bytes
+    rx_ticks: int
+    host_s: float | None = None
+    diagnostics: Diagnostics | None = None
+    carrier_phase_cycles: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no frame or no count of ticks. Raises TypeError."""
+        if type(self.frame) is bytes and type(self.rx_ticks) is int:
+            return  # one is made for each frame: nothing else is looked at
+        if not isinstance(self.frame, bytes):
+            raise TypeError(f"frame is {self.frame!r:.80}; it should be bytes, the whole PSDU with its FCS")
+        if not hasattr(self.rx_ticks, "__index__"):
+            raise TypeError(f"rx_ticks is {self.rx_ticks!r}; it should be an integer, ticks of the receiver")
+
+
+def phase_of(reception: Reception) -> float:
+    """The phase of a reception's carrier in cycles, below 0 where it is not known: as compiled functions take it."""
+    return -1.0 if reception.carrier_phase_cycles is None else reception.carrier_phase_cycles
+
+
+class Transmission(Struct, frozen=True, gc=False):
+    """One frame to be sent so that its RMARKER leaves the antenna at ``tx_ticks`` (40-bit, the sender's counter)."""
+
+    frame: bytes
+    tx_ticks: int
+
+
+# Receptions whose first path is weak: they may be late, and count for less.
+
+CLEAR_DB: Final = 7.0
+BLOCKED_DB: Final = 11.0
+"""Up to the former nothing changes, from the latter on all that can: the maker's 6 and 10, and 1 dB. Lines of sight of
+the UTIL data set have up to 8.4 dB, paths through metal, the only ones that are much later, from 11.3."""
+
+MAX_VARIANCE_FACTOR: Final = 36.0
+"""Factor on the variance of a blocked path: metal made messages 0.2 to 0.4 m late, 4 to 8 times what noise does."""
+
+
+_LOG_FACTOR: Final = math.log(MAX_VARIANCE_FACTOR)
+_MAX_DIFFERENCE_DB: Final = 1000.0
+"""Larger ones are no powers."""
+
+
+def variance_factor(rx_power_dbm: float, first_path_power_dbm: float) -> float:
+    """Factor on the variance of a reception, from 1 to ``MAX_VARIANCE_FACTOR``; it grows with the powers' difference.
+
+    Where a power is missing (NaN), not finite or impossible (a first path above the total) the factor is 1.
+    """
+    difference_db = rx_power_dbm - first_path_power_dbm
+    if not CLEAR_DB < difference_db <= _MAX_DIFFERENCE_DB:
+        return 1.0
+    part = min((difference_db - CLEAR_DB) / (BLOCKED_DB - CLEAR_DB), 1.0)
+    return MAX_VARIANCE_FACTOR * exp((part * part * (3.0 - 2.0 * part) - 1.0) * _LOG_FACTOR)
+
+
+def variance_factor_of(diagnostics: Diagnostics | None) -> float:
+    """The same from what a radio measured of a frame."""
+    return variance_factor(*powers_dbm(diagnostics))
+
+
+def powers_dbm(diagnostics: Diagnostics | None) -> tuple[float, float]:
+    """Received power and that of the first path, NaN where the radio does not report it."""
+    if diagnostics is None:
+        return math.nan, math.nan
+    rx_dbm, first_path_dbm = diagnostics.rx_power_dbm, diagnostics.first_path_power_dbm
+    return (math.nan if rx_dbm is None else rx_dbm), (math.nan if first_path_dbm is None else first_path_dbm)
+
+
+WEAK_FACTOR: Final = math.sqrt(MAX_VARIANCE_FACTOR)
+"""From this factor on an anchor says that the first path of a reception that it relays was weak: 9 dB."""
+
+
+def is_weak_first_path(diagnostics: Diagnostics | None) -> bool:
+    """Whether a reception may be late, as its first path is weak; False where a power is missing or impossible."""
+    return variance_factor_of(diagnostics) >= WEAK_FACTOR

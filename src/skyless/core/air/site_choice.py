@@ -2,8 +2,8 @@
 
 from typing import Annotated, Final
 
-from skyless.core.native.records import Array, Integers, Record, Ticks, record
-from skyless.core.native.sizes import MAX_COUNTED, MAX_SITES
+from skyless.core.air.site_pages import MIN_ANCHORS
+from skyless.core.native.records import MAX_COUNTED, MAX_SITES, Array, Integers, Record, Ticks, record
 from skyless.core.ticks import from_seconds
 
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)
@@ -11,9 +11,6 @@ SITE_SILENCE_TICKS: Final = from_seconds(2.0)
 
 TRIAL_TICKS: Final = from_seconds(5.0)
 """A site that has given no fix for this time is left for another one: none holds a tag by its number of anchors."""
-
-MIN_ANCHORS: Final = 3
-"""That other one has at least as many: with fewer there is no fix."""
 
 PRESENT_TICKS: Final = from_seconds(1.0)
 """Anchors received within this time count."""

@@ -5,7 +5,6 @@ All loops run over the states that are not exact (``State.n``); what stands behi
 
 from typing import Final
 
-from skyless.core.constants import TICK_S
 from skyless.core.estimator.state import (
     CHANGING_RANGE_ERRORS,
     FAULT_KINDS,
@@ -18,8 +17,8 @@ from skyless.core.estimator.state import (
     set_covariance,
 )
 from skyless.core.native.arithmetic import exp, sqrt, square
-from skyless.core.native.records import Reals, Ticks
-from skyless.core.native.sizes import MOST_WAITING, PACKED
+from skyless.core.native.records import MOST_WAITING, PACKED, Reals, Ticks
+from skyless.core.ticks import TICK_S
 
 LONGEST_S: Final = 1000.0
 """The longest time update: of more, squares of variances are no numbers in single precision."""

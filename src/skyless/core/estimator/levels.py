@@ -12,12 +12,12 @@ a jump or in yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then th
 
 from typing import Final
 
-from skyless.core.constants import TICK_S
 from skyless.core.estimator.faults import fault_chi2, whiten
 from skyless.core.estimator.monitor import covariance_scale, is_warm
 from skyless.core.estimator.state import AXES, FAULT_KINDS, LASTING, State, at
 from skyless.core.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
 from skyless.core.native.arithmetic import hypot, sqrt, square
+from skyless.core.ticks import TICK_S
 
 FIRST_TEST: Final = 2
 """Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``."""

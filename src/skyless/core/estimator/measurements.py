@@ -12,8 +12,7 @@ with offsets b, TX noise w, all in metres. ``docs/maths.md`` section 6 derives t
 
 from typing import Final
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_S
-from skyless.core.estimator.faults import end_lasting_fault, subtract_fault_input
+from skyless.core.estimator.faults import end_lasting_fault, is_late_often, subtract_fault_input
 from skyless.core.estimator.kalman import (
     compute_fault_input,
     compute_ph,
@@ -49,10 +48,9 @@ from skyless.core.estimator.state import (
     make_uncertain,
     set_covariance,
 )
-from skyless.core.estimator.verdicts import is_late_often
 from skyless.core.native.arithmetic import floor, sqrt, square
 from skyless.core.native.records import Reals, Ticks
-from skyless.core.ticks import TICK_MASK
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_MASK, TICK_S
 
 SUBTICK_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
 

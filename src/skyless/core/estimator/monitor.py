@@ -18,10 +18,9 @@ says what each of these buys.
 
 from typing import Final
 
-from skyless.core.estimator.faults import begin_obstruction
+from skyless.core.estimator.faults import begin_obstruction, is_late_often
 from skyless.core.estimator.kalman import finish_updates
 from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, at, make_uncertain
-from skyless.core.estimator.verdicts import is_late_often
 from skyless.core.native.arithmetic import log, sqrt, square
 
 _PLACE_LIMIT: Final = 2.0

@@ -15,7 +15,6 @@ learnt. Where stamps contradict, all begin again.
 
 from typing import Final
 
-from skyless.core.constants import TICK_M, TICK_S
 from skyless.core.estimator.kalman import compute_fault_input, compute_ph, finish_updates, reset_state, update
 from skyless.core.estimator.measurements import (
     add_direction_from,
@@ -30,6 +29,7 @@ from skyless.core.estimator.measurements import (
 from skyless.core.estimator.state import Ambiguity, State, at, set_covariance, use_phases
 from skyless.core.native.arithmetic import floor, log, sqrt, square
 from skyless.core.native.records import Reals, Ticks
+from skyless.core.ticks import TICK_M, TICK_S
 
 CYCLE_TICKS: Final = 128
 """Whole cycles of each channel's carrier fit into this number of ticks: ``EstimatorSettings.carrier_cycles``."""

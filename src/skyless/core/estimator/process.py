@@ -2,9 +2,7 @@
 
 from typing import Annotated, Final
 
-from skyless.core.air.frame import HEARD_BYTES, PHASE_STEPS, SHORT_BITS
-from skyless.core.air.little_endian import two_bytes, unsigned
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.core.air.frame import HEARD_BYTES, PHASE_STEPS, SHORT_BITS, two_bytes, unsigned
 from skyless.core.estimator.faults import fade_faults, open_faults
 from skyless.core.estimator.kalman import finish_updates, is_stationary, predict
 from skyless.core.estimator.levels import fit_plane, integrity_state, largest_test, protect
@@ -33,9 +31,20 @@ from skyless.core.estimator.state import (
 )
 from skyless.core.fix import POSITION, PROTECTION, QUALITY, VELOCITY
 from skyless.core.integrity import HPL, STATE, VPL
-from skyless.core.native.records import Array, Bytes, Matrix, Reals, Record, Ticks, record
-from skyless.core.native.sizes import MAX_ANCHORS, MAX_RELAYS, PACKETS_KEPT, PHASE_STATES
-from skyless.core.ticks import nearest
+from skyless.core.native.records import (
+    MAX_ANCHORS,
+    MAX_RELAYS,
+    PACKETS_KEPT,
+    PHASE_STATES,
+    Array,
+    Bytes,
+    Matrix,
+    Reals,
+    Record,
+    Ticks,
+    record,
+)
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S, nearest
 
 REJECTED, ACCEPTED, JOINED, STALE, RESTARTED_CLOCK = range(5)
 """What became of a packet; after the last its anchor joins again, and the packet is processed again."""

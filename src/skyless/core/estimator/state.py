@@ -30,8 +30,7 @@ from skyless.core.estimator.settings import TUNING, EstimatorSettings, Tuning
 from skyless.core.fix import PROTECTED_ROWS
 from skyless.core.integrity import limits_of
 from skyless.core.native.arithmetic import square
-from skyless.core.native.records import Array, Count, Integers, Matrix, Reals, Record, Ticks, record
-from skyless.core.native.sizes import (
+from skyless.core.native.records import (
     MAX_ANCHORS,
     MOST_WAITING,
     PACKED,
@@ -39,8 +38,17 @@ from skyless.core.native.sizes import (
     PHASE_STATES,
     PLANNED_FAULTS,
     SHARES_MEMORY,
+    Array,
+    Count,
+    Integers,
+    Matrix,
+    Reals,
+    Record,
+    Ticks,
+    aligned,
+    record,
+    view,
 )
-from skyless.core.native.views import aligned, view
 from skyless.core.ticks import NEVER
 
 LANES: Final = 1 if PACKED else 4

@@ -12,7 +12,6 @@ by the share, and those of relayed receptions by the share of all three that the
 
 from typing import Annotated, Final
 
-from skyless.core.constants import TICK_S
 from skyless.core.estimator.kalman import (
     compute_fault_input,
     compute_ph,
@@ -35,6 +34,7 @@ from skyless.core.estimator.phases import expected_phase, known_phase, own_phase
 from skyless.core.estimator.state import ALL_RANGE_ERRORS, AXES, FAULT_KINDS, State, at
 from skyless.core.native.arithmetic import floor, square
 from skyless.core.native.records import Array, Bytes, Reals, Record, Ticks, record
+from skyless.core.ticks import TICK_S
 
 IMPULSES: Final = 4  # moments of a superframe at which an acceleration is tried
 AFTER_ALL_TICKS: Final = 1 << 62  # a time after all others

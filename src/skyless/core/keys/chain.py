@@ -1,36 +1,225 @@
 """The key chain as the site's anchors have it: with the seed, from which every key follows, and how it is made."""
 
+import hmac
 import multiprocessing
 import os
 import secrets
 import signal
+import struct
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
+from hashlib import sha256
 from itertools import repeat
 from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
 
-from skyless.core.keys.key_chain import (
-    CERTIFICATE_SIGNATURE_BYTES,
-    SECTION_BITS,
-    SECTION_INTERVALS,
-    SEED_BYTES,
-    USUAL_TIMING,
-    Certificate,
-    ChainTiming,
-    SectionName,
-    earlier_key,
-    last_key,
-    mac_key,
-    root_of,
-    sign,
-)
+from skyless.core.air.beacon import CERTIFICATE_BYTES, MAC_BYTES
 from skyless.core.processors import cores
 
 if TYPE_CHECKING:
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+
+# Keys of a site's chain, codes made with them, and signed certificates (Ed25519): ``docs/authentication.md``.
+#
+# Time is divided into intervals, counted from the beginning of Unix time, and every interval has a key of 16 bytes.
+# The keys of ``SECTION_INTERVALS`` intervals form a section: a one-way chain of its own, in which each key is a hash
+# of the one after it. The key before a section's first is its root, which a certificate states. No state is kept
+# here.
+
+KEY_BYTES: Final = 16
+SEED_BYTES: Final = 32
+SECTION_BITS: Final = 13
+SECTION_INTERVALS: Final = 1 << SECTION_BITS
+"""Steps that a listener hashes at most to come from a root to a key; 14 minutes with intervals of 100 ms."""
+
+_SECTION: Final = struct.Struct("<HHI")
+_KEY_LABEL: Final = b"skyless key"
+_MAC_LABEL: Final = b"skyless mac"
+_SEED_LABEL: Final = b"skyless seed"
+
+
+class SectionName(Struct, frozen=True, gc=False):
+    """Which section of which chain of which site."""
+
+    site: int
+    """16 bits."""
+    serial: int
+    """Number of the chain, 16 bits: a later chain of a site has a higher one."""
+    section: int
+    """Number of its first interval divided by ``SECTION_INTERVALS``, 32 bits."""
+
+    @property
+    def first_interval(self) -> int:
+        """Its first interval."""
+        return self.section << SECTION_BITS
+
+    @property
+    def packed(self) -> bytes:
+        """Eight bytes, little endian."""
+        return _SECTION.pack(self.site, self.serial, self.section)
+
+
+def last_key(seed: bytes, name: SectionName) -> bytes:
+    """The key of a section's last interval, from which all others follow."""
+    return hmac.digest(seed, _SEED_LABEL + name.packed, "sha256")[:KEY_BYTES]
+
+
+def earlier_key(key: bytes, name: SectionName, steps: int = 1) -> bytes:
+    """The key of an interval that many intervals before that of ``key``."""
+    label = _KEY_LABEL + name.packed
+    for _ in range(steps):
+        key = sha256(label + key).digest()[:KEY_BYTES]
+    return key
+
+
+def root_of(seed: bytes, name: SectionName) -> bytes:
+    """The root of a section."""
+    return earlier_key(last_key(seed, name), name, SECTION_INTERVALS)
+
+
+def mac_key(key: bytes, name: SectionName) -> bytes:
+    """What codes of an interval are made with: not the chain's key itself, so that each serves one purpose."""
+    return sha256(_MAC_LABEL + name.packed + key).digest()[:KEY_BYTES]
+
+
+def mac_of(signed: bytes, key_of_macs: bytes) -> bytes:
+    """Code of a frame's bytes; ``key_of_macs`` as ``mac_key`` gives it."""
+    return hmac.digest(key_of_macs, signed, "sha256")[:MAC_BYTES]
+
+
+def is_mac(signed: bytes, mac: bytes, key_of_macs: bytes) -> bool:
+    """Whether a code is that of these bytes, in constant time."""
+    return hmac.compare_digest(mac, mac_of(signed, key_of_macs))
+
+
+MIN_LAG: Final = 4
+"""With shorter lags nothing is left for the clocks of tags."""
+
+CERTIFICATE_SIGNATURE_BYTES: Final = 64
+PUBLIC_KEY_BYTES: Final = 32
+
+_STATEMENT: Final = struct.Struct("<HIBIHB16s")
+_LABEL: Final = b"skyless chain"
+_SITE: Final = struct.Struct("<H")
+assert _STATEMENT.size + CERTIFICATE_SIGNATURE_BYTES == CERTIFICATE_BYTES
+
+
+class ChainTiming(Struct, frozen=True, gc=False):
+    """When keys hold and are disclosed, and the budget of clock errors that follows from it.
+
+    A frame is sent up to the end of its interval, T, by a clock that may be behind by ``anchors_apart_s``. A tag must
+    have received it before any anchor discloses its key, whose clock may be ahead by ``anchor_lead_s``, and knows the
+    time to ± B. So every genuine frame is accepted, and no other, where lag · T >= T + apart + lead + 2 B.
+    """
+
+    interval_ms: int = 100
+    """Length of an interval, 10 to 10000."""
+    lag: int = 5
+    """A key is disclosed this number of intervals after its own, 4 to 255."""
+
+    @property
+    def interval_s(self) -> float:
+        """Length of an interval."""
+        return self.interval_ms * 1e-3
+
+    @property
+    def anchors_apart_s(self) -> float:
+        """How far two anchors' clocks may be apart. Beyond it the one that is ahead is reported and left out."""
+        return 0.5 * self.interval_s
+
+    @property
+    def anchor_lead_s(self) -> float:
+        """How far an anchor may be ahead of others and still disclose keys.
+
+        It finds that out beyond ``anchors_apart_s``, and knows to an interval only when the others sent their frames.
+        """
+        return self.anchors_apart_s + self.interval_s
+
+    def interval_at(self, unix_s: float) -> int:
+        """Number of the interval at a Unix time."""
+        return int(unix_s * 1000.0) // self.interval_ms
+
+    def start_s(self, interval: int) -> float:
+        """Unix time at which an interval begins."""
+        return interval * self.interval_ms * 1e-3
+
+    def is_possible(self) -> bool:
+        """Whether a chain may have this timing."""
+        return 10 <= self.interval_ms <= 10_000 and MIN_LAG <= self.lag <= 255
+
+
+USUAL_TIMING: Final = ChainTiming()
+"""A key is known 0.4 to 0.6 s after a frame. Clocks of tags may be off by 0.1 s, those of anchors by 25 ms."""
+
+
+class Certificate(Struct, frozen=True, gc=False):
+    """What is stated of a section."""
+
+    name: SectionName
+    timing: ChainTiming
+    first: int
+    """The first interval in which this chain counts, instead of those with lower serial numbers; 40 bits."""
+    root: bytes
+    """16 bytes."""
+
+    def signed_bytes(self) -> bytes:
+        """What is signed: a label, the site, and all that is sent but the signature."""
+        return _LABEL + _SITE.pack(self.name.site) + self._statement()
+
+    def _statement(self) -> bytes:
+        name, timing = self.name, self.timing
+        return _STATEMENT.pack(
+            name.serial, self.first & 0xFFFFFFFF, self.first >> 32, name.section,
+            timing.interval_ms, timing.lag, self.root,
+        )  # fmt: skip
+
+    def sent_bytes(self, signature: bytes) -> bytes:
+        """The bytes in a frame."""
+        return self._statement() + signature
+
+
+def read_certificate(site: int, sent: bytes) -> tuple[Certificate, bytes] | None:
+    """The certificate in a frame of a site, and its signature, not yet verified; None where a value is impossible."""
+    if len(sent) != CERTIFICATE_BYTES:
+        return None
+    serial, low, high, section, interval_ms, lag, root = _STATEMENT.unpack_from(sent)
+    timing = ChainTiming(interval_ms, lag)
+    first = low | high << 32
+    if not timing.is_possible() or first >> SECTION_BITS > section:
+        return None
+    return Certificate(SectionName(site, serial, section), timing, first, root), sent[_STATEMENT.size :]
+
+
+def section_of(sent: bytes) -> int:
+    """The section that a certificate in a frame names."""
+    section: int = _STATEMENT.unpack_from(sent)[3]
+    return section
+
+
+def sign(certificate: Certificate, private: "Ed25519PrivateKey") -> bytes:
+    """The signature of the site."""
+    return private.sign(certificate.signed_bytes())
+
+
+def public_key(data: bytes) -> "Ed25519PublicKey":
+    """The key in 32 bytes. Raises ValueError: there are not as many."""
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey  # noqa: PLC0415 - loads OpenSSL
+
+    return Ed25519PublicKey.from_public_bytes(data)
+
+
+def is_signed(certificate: Certificate, signature: bytes, public: "Ed25519PublicKey") -> bool:
+    """Whether the owner of the key has signed it."""
+    from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 - loads OpenSSL
+
+    try:
+        public.verify(signature, certificate.signed_bytes())
+    except InvalidSignature:
+        return False
+    return True
+
 
 STEPS_AHEAD: Final = 256
 """Keys of the next section that are made with each frame: 0.2 ms, so that no frame waits for the whole section."""

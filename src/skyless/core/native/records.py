@@ -35,6 +35,9 @@ from typing import (
 from zlib import compress, decompressobj
 from zlib import error as zlib_error
 
+import numpy as np
+from numpy.typing import NDArray
+
 Value = TypeVar("Value")
 Read_co = TypeVar("Read_co", covariant=True)
 Made = TypeVar("Made", bound="Record")
@@ -198,3 +201,72 @@ def _offsets(made: Any, kind: type) -> tuple[int, ...]:  # noqa: ANN401 - types 
         return tuple(size * index + at for index in range(made._length_) for at in inner)
     fields = made._fields_ if issubclass(made, Record) else ()
     return tuple(getattr(made, name).offset + at for name, field in fields for at in _offsets(field, kind))
+
+
+# Sizes of records on a computer; a board has others (``firmware/source/core_sizes.h``), which its compiler gives C.
+
+MAX_ANCHORS: Final = 32
+"""Most anchors at a time."""
+PACKETS_KEPT: Final = 16
+"""Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
+MAX_RELAYS: Final = 32
+"""Most relays with a packet; 13 fit into a frame."""
+PHASE_STATES: Final = 3
+"""States of each anchor for carrier phases; 0 where they are not used."""
+PLANNED_FAULTS: Final = 13
+"""Columns of V for what planning adds: walls, and four impulses along each axis."""
+MOST_WAITING: Final = 8
+"""Most updates of the filter that wait."""
+PACKED: Final = False
+"""Whether P is kept as its lower triangle alone: half the memory, but rows that vectors do not fit."""
+MAX_NEIGHBOURS: Final = 256
+"""Most anchors that are known by their own beacons."""
+MAX_SITES: Final = 8
+"""Most sites of which anchors are counted."""
+MAX_COUNTED: Final = 32
+"""Most anchors of each that are counted."""
+MAX_ANCHORS_IN_USE: Final = 24
+"""Most anchors in the estimator's state; more cost accuracy, as each then sends less, and time."""
+RELAYS_KEPT: Final = 32
+"""Relays of each packet that are kept for the filter which begins."""
+MAX_PAGES: Final = 64
+"""Pages of issues that are not complete."""
+MAX_SENDERS: Final = 16
+"""Anchors by whose number one page is preferred to another."""
+SHARES_MEMORY: Final = False
+"""Whether the search for a start uses the memory of the state, which is not used meanwhile."""
+HAS_ORIGIN: Final = False
+"""Whether positions are from whole metres near the first anchor, as far ones lose millimetres in single precision."""
+
+
+# Records and their arrays as NumPy sees them, in the same memory.
+
+_CACHE_LINE: Final = 64
+
+
+def view(array: Any) -> NDArray[Any]:  # noqa: ANN401 - ctypes' arrays have no common type
+    """A record, or an array of numbers or records, as NumPy sees the same memory."""
+    element: Any = type(array)
+    shape: list[int] = []
+    while issubclass(element, ctypes.Array):
+        shape.append(element._length_)
+        element = element._type_
+    return np.frombuffer(array, _dtype(element)).reshape(shape)
+
+
+@cache
+def _dtype(element: type) -> np.dtype[Any]:
+    """NumPy takes longer over the fields of a record than over its memory."""
+    return np.dtype(element)
+
+
+def records(made: type[Made], array: NDArray[np.void]) -> Array[Made]:
+    """The records of a NumPy array of their type, shape (n,), in the same memory."""
+    return (made * len(array)).from_buffer(array.data)
+
+
+def aligned(made: type[Made]) -> Made:
+    """A record of zeros that begins at a cache line. Pages of it that are never used take no memory."""
+    memory = np.zeros(ctypes.sizeof(made) + _CACHE_LINE, np.uint8)
+    begin = -memory.ctypes.data % _CACHE_LINE
+    return made.from_buffer(memory[begin : begin + ctypes.sizeof(made)].data)

@@ -1,12 +1,9 @@
 /* Made by tools/make_core.py from these modules; do not edit.
 
- * skyless.core.air.anchor_stamps
- * skyless.core.air.beacon_fields
- * skyless.core.air.first_path
- * skyless.core.air.instants
- * skyless.core.air.little_endian
+ * skyless.core.air.almanac
+ * skyless.core.air.beacon
+ * skyless.core.air.frame
  * skyless.core.air.neighbours
- * skyless.core.air.page_check
  * skyless.core.air.site_choice
  * skyless.core.air.site_pages
  * skyless.core.estimator.faults
@@ -18,24 +15,15 @@
  * skyless.core.estimator.process
  * skyless.core.estimator.state
  * skyless.core.estimator.steady_state
- * skyless.core.estimator.verdicts
  * skyless.core.integrity
  * skyless.core.native.arithmetic
- * skyless.core.native.small_matrices
- * skyless.core.native.tails
  * skyless.core.tag.acquisition
  * skyless.core.tag.admission
- * skyless.core.tag.changes
- * skyless.core.tag.course
- * skyless.core.tag.descent
  * skyless.core.tag.following
  * skyless.core.tag.hearing
- * skyless.core.tag.minima
+ * skyless.core.tag.joint
  * skyless.core.tag.position
- * skyless.core.tag.problem
- * skyless.core.tag.selection
- * skyless.core.tag.site_settings
- * skyless.core.tag.starts
+ * skyless.core.tag.search
  * skyless.core.ticks
  */
 
@@ -93,10 +81,28 @@ INTERNAL real exp_(real x);
 INTERNAL real log_(real x);
 INTERNAL real hypot_(real x, real y);
 INTERNAL real square(real x);
+INTERNAL bool factorise(real *A, int32_t size);
+INTERNAL void solve_lower(real *L, int32_t size, real *x);
+INTERNAL void solve(real *L, int32_t size, real *x);
+INTERNAL void orthogonalise(Columns *m);
+INTERNAL bool has_rotated(Columns *m, int32_t one, int32_t other);
+INTERNAL real scalar_product(Columns *m, int32_t one, int32_t other);
+INTERNAL void rotate_columns(real (*A)[4], int32_t rows, int32_t one, int32_t other, real cosine, real sine);
+INTERNAL bool least_squares(Columns *m, real *right, real *x);
+INTERNAL real normal_tail(real z);
+INTERNAL real normal_quantile(real tail);
+INTERNAL real continued_fraction(real z, int32_t first);
+INTERNAL real chi2_tail(int32_t dof, real chi2);
+INTERNAL real mean_if_positive(real mean, real sigma);
 INTERNAL int64_t nearest(int64_t counter, int64_t expected_ticks, int32_t bits);
 INTERNAL bool may_elapse(int64_t counter_ticks, int64_t elapsed_ticks, real slack_ticks);
 INTERNAL int64_t unwrap(Unwrapper *u, int64_t counter, real host_s);
 INTERNAL int64_t fix_time_ticks(FixTime *time, int64_t ticks_master, int64_t rx_ticks_tag);
+INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size);
+INTERNAL int32_t two_bytes(uint8_t *data, int32_t at);
+INTERNAL int64_t signed_(uint8_t *data, int32_t at);
+INTERNAL real variance_factor(real rx_power_dbm, real first_path_power_dbm);
+INTERNAL int64_t period_ticks(int32_t code);
 INTERNAL int32_t find_neighbour(Neighbours *t, int32_t anchor);
 INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks);
 INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks);
@@ -108,30 +114,9 @@ INTERNAL void forget_row(Neighbour *n);
 INTERNAL bool is_newest(Neighbour *n, int32_t sequence, int64_t tx_counter);
 INTERNAL void keep(Neighbour *n, int32_t sequence, int64_t tx_ticks, int64_t rx_ticks, int32_t frames);
 INTERNAL int32_t reject(Neighbour *n, int32_t sequence, int64_t tx_counter, int64_t rx_ticks, bool is_silent);
-INTERNAL int64_t period_ticks(int32_t code);
-INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size);
-INTERNAL int32_t two_bytes(uint8_t *data, int32_t at);
-INTERNAL int64_t signed_(uint8_t *data, int32_t at);
 INTERNAL bool is_possible_page(uint8_t *data, int32_t at);
 INTERNAL bool is_coordinate(uint8_t *data, int32_t at);
 INTERNAL bool is_noise(uint8_t *data, int32_t at);
-INTERNAL int32_t header_fault(uint8_t *frame, int32_t length);
-INTERNAL int32_t length_fault(uint8_t *frame, int32_t length);
-INTERNAL int32_t bare_bytes(int32_t flags);
-INTERNAL void read_place(uint8_t *frame, int32_t at, StatedPlace *place);
-INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b);
-INTERNAL int32_t checksum(uint8_t *data, int32_t length);
-INTERNAL real variance_factor(real rx_power_dbm, real first_path_power_dbm);
-INTERNAL int32_t choose_site(SiteChoice *choice, int32_t site, int32_t anchor, int64_t rx_ticks);
-INTERNAL void note_fix(SiteChoice *choice, int64_t rx_ticks);
-INTERNAL void restart_choice(SiteChoice *choice, int64_t rx_ticks);
-INTERNAL int32_t find_site(SiteChoice *choice, int32_t site);
-INTERNAL int32_t index_of(SiteChoice *choice, int32_t site);
-INTERNAL void count_anchor(CountedSite *counted, int32_t anchor, int64_t rx_ticks);
-INTERNAL bool prefers(SiteChoice *choice, int32_t other, int64_t rx_ticks);
-INTERNAL bool has_failed(SiteChoice *choice, int64_t rx_ticks);
-INTERNAL void note_failed(SiteChoice *choice);
-INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks);
 INTERNAL int32_t note_page(SitePages *p, Neighbours *t, uint8_t *frame, int32_t page_at, int64_t rx_ticks);
 INTERNAL void collect(SitePages *p, Neighbours *t, uint8_t *frame, int32_t page_at);
 INTERNAL bool is_page(SitePages *p, int32_t place, uint8_t *frame, int32_t page_at);
@@ -143,11 +128,22 @@ INTERNAL int32_t options(Choices *c, int32_t kind);
 INTERNAL void add_choice(Choices *c, SitePages *p, int32_t place);
 INTERNAL int32_t issue_of(SitePages *p, Choices *c);
 INTERNAL int32_t use_chosen(SitePages *p, Choices *c, int32_t issue);
-INTERNAL real normal_tail(real z);
-INTERNAL real normal_quantile(real tail);
-INTERNAL real continued_fraction(real z, int32_t first);
-INTERNAL real chi2_tail(int32_t dof, real chi2);
-INTERNAL real mean_if_positive(real mean, real sigma);
+INTERNAL int32_t header_fault(uint8_t *frame, int32_t length);
+INTERNAL int32_t length_fault(uint8_t *frame, int32_t length);
+INTERNAL int32_t bare_bytes(int32_t flags);
+INTERNAL void read_place(uint8_t *frame, int32_t at, StatedPlace *place);
+INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b);
+INTERNAL int32_t checksum(uint8_t *data, int32_t length);
+INTERNAL int32_t choose_site(SiteChoice *choice, int32_t site, int32_t anchor, int64_t rx_ticks);
+INTERNAL void note_fix(SiteChoice *choice, int64_t rx_ticks);
+INTERNAL void restart_choice(SiteChoice *choice, int64_t rx_ticks);
+INTERNAL int32_t find_site(SiteChoice *choice, int32_t site);
+INTERNAL int32_t index_of(SiteChoice *choice, int32_t site);
+INTERNAL void count_anchor(CountedSite *counted, int32_t anchor, int64_t rx_ticks);
+INTERNAL bool prefers(SiteChoice *choice, int32_t other, int64_t rx_ticks);
+INTERNAL bool has_failed(SiteChoice *choice, int64_t rx_ticks);
+INTERNAL void note_failed(SiteChoice *choice);
+INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks);
 INTERNAL real horizontal_limit(real risk);
 INTERNAL real vertical_limit(real risk);
 INTERNAL int32_t row_of(int32_t state);
@@ -316,14 +312,6 @@ INTERNAL void add_fix(State *s, real share, SteadyState *found);
 INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_ticks, int64_t superframe);
 INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks);
 INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *relayed);
-INTERNAL bool factorise(real *A, int32_t size);
-INTERNAL void solve_lower(real *L, int32_t size, real *x);
-INTERNAL void solve(real *L, int32_t size, real *x);
-INTERNAL void orthogonalise(Columns *m);
-INTERNAL bool has_rotated(Columns *m, int32_t one, int32_t other);
-INTERNAL real scalar_product(Columns *m, int32_t one, int32_t other);
-INTERNAL void rotate_columns(real (*A)[4], int32_t rows, int32_t one, int32_t other, real cosine, real sine);
-INTERNAL bool least_squares(Columns *m, real *right, real *x);
 INTERNAL bool choose_axes(LocateProblem *p);
 INTERNAL real sigma_m(LocateProblem *p, int32_t index_);
 INTERNAL real least_sigma_m(LocateProblem *p);
@@ -485,10 +473,228 @@ INTERNAL real square(real x) {
     return x * x;
 }
 
+/* Cholesky's method */
+
+/* Replace A by its lower factor L, with L·Lᵀ = A.
+ *
+ * False where A is not positive definite, or singular, or not finite; its elements are then undefined. */
+INTERNAL bool factorise(real *A, int32_t size) {
+    for (int32_t i = 0; i < size; i++) {
+        int32_t row = floor_div_32(i * (i + 1), 2);
+        real diagonal = A[row + i];
+        for (int32_t j = 0; j < i + 1; j++) {
+            int32_t other = floor_div_32(j * (j + 1), 2);
+            real total = A[row + j];
+            for (int32_t k = 0; k < j; k++) {
+                total -= A[row + k] * A[other + k];
+            }
+            if (j < i) {
+                A[row + j] = total / A[other + j];
+            } else if (total > SINGULAR_PIVOT * diagonal && diagonal > REAL(0.0)) {
+                A[row + j] = SQRT(total);
+            } else {
+                return false;
+            }
+        }
+    }
+    return true;
+}
+
+/* Replace x by L⁻¹·x. */
+INTERNAL void solve_lower(real *L, int32_t size, real *x) {
+    for (int32_t i = 0; i < size; i++) {
+        int32_t row = floor_div_32(i * (i + 1), 2);
+        real total = x[i];
+        for (int32_t k = 0; k < i; k++) {
+            total -= L[row + k] * x[k];
+        }
+        x[i] = total / L[row + i];
+    }
+}
+
+/* Replace x by (L·Lᵀ)⁻¹·x. */
+INTERNAL void solve(real *L, int32_t size, real *x) {
+    solve_lower(L, size, x);
+    for (int32_t i = size - 1; i > -1; i--) {
+        real total = x[i];
+        for (int32_t k = i + 1; k < size; k++) {
+            total -= L[floor_div_32(k * (k + 1), 2) + i] * x[k];
+        }
+        x[i] = total / L[floor_div_32(i * (i + 1), 2) + i];
+    }
+}
+
+/* Rotations of columns */
+
+/* Rotate pairs of columns, the longer one to the front, until all are orthogonal (M. R. Hestenes 1958). */
+INTERNAL void orthogonalise(Columns *m) {
+    for (int32_t i = 0, i_end = m->columns; i < i_end; i++) {
+        for (int32_t j = 0, j_end = m->columns; j < j_end; j++) {
+            m->V[i][j] = i == j ? REAL(1.0) : REAL(0.0);
+        }
+    }
+    for (int32_t time_1 = 0; time_1 < MAX_SWEEPS; time_1++) {
+        bool is_done = true;
+        for (int32_t one = 0, one_end = m->columns - 1; one < one_end; one++) {
+            for (int32_t other = one + 1, other_end = m->columns; other < other_end; other++) {
+                if (has_rotated(m, one, other)) {
+                    is_done = false;
+                }
+            }
+        }
+        if (is_done) {
+            break;
+        }
+    }
+    for (int32_t j = 0, j_end = m->columns; j < j_end; j++) {
+        m->squares[j] = scalar_product(m, j, j);
+    }
+}
+
+/* Make two columns orthogonal and order them, by the smallest rotation; False where they are so already. */
+INTERNAL bool has_rotated(Columns *m, int32_t one, int32_t other) {
+    real square = scalar_product(m, one, one);
+    real square_other = scalar_product(m, other, other);
+    real product = scalar_product(m, one, other);
+    bool is_orthogonal = !(abs_real(product) > ORTHOGONAL * SQRT(square * square_other));
+    if (is_orthogonal && square >= square_other) {
+        return false;
+    }
+    real tangent = REAL(0.0);
+    if (!is_orthogonal) {
+        real cotangent = (square_other - square) / (REAL(2.0) * product);  /* of twice the angle */
+        tangent = REAL(1.0) / (abs_real(cotangent) + SQRT(REAL(1.0) + cotangent * cotangent));
+        if (cotangent < REAL(0.0)) {
+            tangent = -tangent;
+        }
+    }
+    real cosine = REAL(1.0) / SQRT(REAL(1.0) + tangent * tangent);
+    real sine = tangent * cosine;
+    if (square < square_other) {
+        const real new_1 = -sine;
+        const real new_2 = cosine;
+        cosine = new_1;
+        sine = new_2;
+    }
+    rotate_columns(m->A, m->rows, one, other, cosine, sine);
+    rotate_columns(m->V, m->columns, one, other, cosine, sine);
+    return true;
+}
+
+/* The scalar product of two columns. */
+INTERNAL real scalar_product(Columns *m, int32_t one, int32_t other) {
+    real total = REAL(0.0);
+    for (int32_t i = 0, i_end = m->rows; i < i_end; i++) {
+        real *row = m->A[i];
+        total += row[one] * row[other];
+    }
+    return total;
+}
+
+INTERNAL void rotate_columns(real (*A)[4], int32_t rows, int32_t one, int32_t other, real cosine, real sine) {
+    for (int32_t i = 0; i < rows; i++) {
+        real *row = A[i];
+        real first = row[one];
+        real second = row[other];
+        row[one] = cosine * first - sine * second;
+        row[other] = sine * first + cosine * second;
+    }
+}
+
+/* Find the x that minimises |A·x − right|, after ``orthogonalise``; False where A does not determine it. */
+INTERNAL bool least_squares(Columns *m, real *right, real *x) {
+    if (!(m->squares[m->columns - 1] > DEPENDENT * DEPENDENT * m->squares[0])) {
+        return false;
+    }
+    for (int32_t k = 0, k_end = m->columns; k < k_end; k++) {
+        x[k] = REAL(0.0);
+    }
+    for (int32_t j = 0, j_end = m->columns; j < j_end; j++) {
+        real total = REAL(0.0);
+        for (int32_t i = 0, i_end = m->rows; i < i_end; i++) {
+            total += m->A[i][j] * right[i];
+        }
+        total /= m->squares[j];
+        for (int32_t k = 0, k_end = m->columns; k < k_end; k++) {
+            x[k] += m->V[k][j] * total;
+        }
+    }
+    return true;
+}
+
+/* Tails of the normal and the chi2 distribution. */
+
+/* Probability that a standard normal variable exceeds z, to 10⁻¹² of itself.
+ *
+ * With its density φ it is ½ − φ(z)·Σ z²ⁿ⁺¹/(1·3·…·(2n + 1)), or φ(z)/(z + 1/(z + 2/(z + …))) after Laplace. */
+INTERNAL real normal_tail(real z) {
+    real tail = 0;
+    real size = abs_real(z);
+    real density = exp_(-REAL(0.5) * size * size) / SQRT_2_PI;
+    if (size < FAR_TAIL) {
+        real term = size;
+        real total = size;
+        for (int32_t n = 1; n < TERMS; n++) {
+            term *= size * size / (real)(2 * n + 1);
+            total += term;
+        }
+        tail = REAL(0.5) - density * total;
+    } else {
+        tail = density / continued_fraction(size, 1);
+    }
+    return z >= REAL(0.0) ? tail : REAL(1.0) - tail;
+}
+
+/* What a standard normal variable exceeds with a probability below ½, by Newton's method for its logarithm. */
+INTERNAL real normal_quantile(real tail) {
+    real z = SQRT(-REAL(2.0) * log_(tail));
+    for (int32_t time_1 = 0; time_1 < NEWTON_STEPS; time_1++) {
+        real found = normal_tail(z);
+        z += (log_(found) - log_(tail)) * found * SQRT_2_PI / exp_(-REAL(0.5) * z * z);
+    }
+    return z;
+}
+
+/* The value of z + n/(z + (n + 1)/(z + …)) for the first n. */
+INTERNAL real continued_fraction(real z, int32_t first) {
+    real fraction = z;
+    for (int32_t n = TERMS; n > first - 1; n--) {
+        fraction = z + (real)n / fraction;
+    }
+    return fraction;
+}
+
+/* Probability that chi2 with at least one degree of freedom exceeds a value, by the finite sum. */
+INTERNAL real chi2_tail(int32_t dof, real chi2) {
+    real half = REAL(0.5) * chi2;
+    if (!(half < REAL(700.0))) {
+        return REAL(0.0);
+    }
+    bool is_odd = floor_mod_32(dof, 2) == 1;
+    real term = is_odd ? REAL(2.0) * SQRT(chi2) / SQRT_2_PI : REAL(1.0);
+    real total = REAL(0.0);
+    for (int32_t k = 0; k < floor_div_32(dof, 2); k++) {
+        total += term;
+        term *= half / ((real)k + (is_odd ? REAL(1.5) : REAL(1.0)));
+    }
+    return (is_odd ? REAL(2.0) * normal_tail(SQRT(chi2)) : REAL(0.0)) + exp_(-half) * total;
+}
+
+/* Mean of a normal variable given that it is positive: E[w²], where w² was measured and may be near 0. */
+INTERNAL real mean_if_positive(real mean, real sigma) {
+    real z = mean / sigma;
+    if (z < -FAR_TAIL) {  /* where the mean and what is added to it would cancel */
+        return sigma / continued_fraction(-z, 2);
+    }
+    return mean + sigma * exp_(-REAL(0.5) * z * z) / (SQRT_2_PI * normal_tail(-z));
+}
+
 /* Time as the radio counts it: 40-bit counters of 15.65 ps ticks, unwrapped to integers.
  *
  * Ticks are subtracted as integers and only then turned into seconds or metres (``docs/maths.md`` section 3):
  * float64 seconds lose 0.6 mm after an hour, integers lose nothing. */
+
+/* Physical and radio constants, each with its source. */
 
 /* The unwrapped time that the counter shows and that lies nearest to the expected one. */
 INTERNAL int64_t nearest(int64_t counter, int64_t expected_ticks, int32_t bits) {
@@ -543,6 +749,57 @@ INTERNAL int64_t fix_time_ticks(FixTime *time, int64_t ticks_master, int64_t rx_
     time->last_ticks_master = ticks_master;
     time->last_rx_ticks_tag = rx_ticks_tag;
     return ticks_master - time->first_ticks_master;
+}
+
+/* What the frames of both protocols have in common: the header, relayed receptions, and why bytes are no beacon.
+ *
+ * A beacon is an IEEE 802.15.4 data frame of at most 127 bytes, little endian throughout. 40-bit stamps travel as a low
+ * word of 32 bits and a high byte. */
+
+/* Whole numbers in frames, the lowest byte first. */
+
+/* That in this number of bytes. */
+INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size) {
+    int64_t number = 0;
+    for (int32_t byte = size - 1; byte > -1; byte--) {
+        number = (int64_t)((uint64_t)number << 8) | data[at + byte];
+    }
+    return number;
+}
+
+/* That in two bytes, which needs no 64 bits. */
+INTERNAL int32_t two_bytes(uint8_t *data, int32_t at) {
+    return data[at] | (int32_t)((uint32_t)data[at + 1] << 8);
+}
+
+/* That in four bytes, which may be negative. */
+INTERNAL int64_t signed_(uint8_t *data, int32_t at) {
+    int64_t number = unsigned_(data, at, 4);
+    return number < SIGN ? number : number - 2 * SIGN;
+}
+
+/* Receptions whose first path is weak: they may be late, and count for less. */
+
+/* Factor on the variance of a reception, from 1 to ``MAX_VARIANCE_FACTOR``; it grows with the powers' difference.
+ *
+ * Where a power is missing (NaN), not finite or impossible (a first path above the total) the factor is 1. */
+INTERNAL real variance_factor(real rx_power_dbm, real first_path_power_dbm) {
+    real difference_db = rx_power_dbm - first_path_power_dbm;
+    if (!(CLEAR_DB < difference_db && difference_db <= MAX_DIFFERENCE_DB)) {
+        return REAL(1.0);
+    }
+    real part = min_real((difference_db - CLEAR_DB) / (BLOCKED_DB - CLEAR_DB), REAL(1.0));
+    return MAX_VARIANCE_FACTOR * exp_((part * part * (REAL(3.0) - REAL(2.0) * part) - REAL(1.0)) * LOG_FACTOR);
+}
+
+/* The almanac: all that a tag must know about a site, sent as rotating pages of 17 bytes. */
+
+/* A period is stated as a code of 8 bits, as floating-point numbers are: 16 steps for each doubling, from 4 ms on. */
+
+/* Mean time between two beacons of an anchor that states this code. */
+INTERNAL int64_t period_ticks(int32_t code) {
+    int64_t unit = UNIT_STEPS * DELAYED_TX_GRANULARITY_TICKS;
+    return unit * (int32_t)((uint32_t)(STEPS + (code & 15)) << (code >> 4));
 }
 
 /* What is kept of each anchor that is received, or that others relay: one table with a row for each. */
@@ -641,8 +898,6 @@ INTERNAL void forget_row(Neighbour *n) {
     n->relayed_ticks = NEVER;
 }
 
-/* Every anchor's counter, unwrapped along the receiver's own. */
-
 /* times: forged frames in between do not replace an anchor that still sends. */
 
 /* Unwrap the TX stamp of a frame along the anchor's own counter; what the stamp is.
@@ -711,41 +966,7 @@ INTERNAL int32_t reject(Neighbour *n, int32_t sequence, int64_t tx_counter, int6
     return IMPOSSIBLE_STAMP;
 }
 
-/* When an anchor of protocol 2 sends: at random instants that everybody can predict (``docs/protocol2.md``).
- *
- * The gap between two beacons of an anchor is a function of its identifier, of the first one's sequence number and of the
- * mean period that this one states. So a receiver of one beacon knows when the next ones leave, by the anchor's
- * counter, however many of them get lost; and two anchors whose beacons collided hardly collide again the next time.
- *
- * A period is stated as a code of 8 bits, as floating-point numbers are: 16 steps for each doubling, from 4 ms on. */
-
-/* Mean time between two beacons of an anchor that states this code. */
-INTERNAL int64_t period_ticks(int32_t code) {
-    int64_t unit = UNIT_STEPS * DELAYED_TX_GRANULARITY_TICKS;
-    return unit * (int32_t)((uint32_t)(STEPS + (code & 15)) << (code >> 4));
-}
-
-/* Whole numbers in frames, the lowest byte first. */
-
-/* That in this number of bytes. */
-INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size) {
-    int64_t number = 0;
-    for (int32_t byte = size - 1; byte > -1; byte--) {
-        number = (int64_t)((uint64_t)number << 8) | data[at + byte];
-    }
-    return number;
-}
-
-/* That in two bytes, which needs no 64 bits. */
-INTERNAL int32_t two_bytes(uint8_t *data, int32_t at) {
-    return data[at] | (int32_t)((uint32_t)data[at + 1] << 8);
-}
-
-/* That in four bytes, which may be negative. */
-INTERNAL int64_t signed_(uint8_t *data, int32_t at) {
-    int64_t number = unsigned_(data, at, 4);
-    return number < SIGN ? number : number - 2 * SIGN;
-}
+/* Protocol 2: which pages of those that beacons carry count, as the majority of the anchors states. */
 
 /* Which contents of a page are possible (``docs/protocol.md``, "Pages"); what frames carry may be anything. */
 
@@ -790,320 +1011,6 @@ INTERNAL bool is_noise(uint8_t *data, int32_t at) {
     int64_t bits = unsigned_(data, at, 4);
     return bits <= MAX_NOISE_BITS || bits == SIGN;
 }
-
-/* A beacon of protocol 2 as it is read from a frame (``docs/protocol2.md``); little endian throughout. */
-
-/* Read a whole frame, FCS included; why it is no beacon of version 2, ``INTACT`` if it is one. */
-SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, BeaconFields *b) {
-    int32_t fault = header_fault(frame, length);
-    if (fault != INTACT) {
-        return fault;
-    }
-    int32_t flags = frame[FLAGS_AT];
-    int32_t at = FIXED_BYTES;
-    b->sequence = frame[2];
-    b->period_code = frame[19];
-    const int32_t new_1 = two_bytes(frame, 3);
-    const int32_t new_2 = two_bytes(frame, 7);
-    const int32_t new_3 = two_bytes(frame, 17);
-    b->site = new_1;
-    b->anchor = new_2;
-    b->almanac_issue = new_3;
-    b->tx_ticks = unsigned_(frame, 12, 5);
-    b->has_place = (flags & HAS_POSITION) != 0;
-    b->has_phases = (flags & HAS_PHASES) != 0;
-    b->relay_bytes = 0;
-    b->certificate_at = 0;
-    b->page_at = 0;
-    b->weak = 0;
-    b->heard_count = 0;
-    b->heard_at = 0;
-    if (b->has_place) {
-        read_place(frame, at, &b->place);
-        at += POSITION_BYTES;
-    }
-    if ((flags & HAS_CERTIFICATE) != 0) {
-        b->certificate_at = at;
-        at += CERTIFICATE_BYTES;
-    } else {
-        int32_t entries = two_bytes(frame, at);
-        b->heard_at = at + COUNT_BYTES;
-        b->heard_count = entries & COUNT_MASK;
-        b->weak = entries >> COUNT_BITS;
-        at = b->heard_at + b->heard_count * HEARD_BYTES;
-    }
-    if ((flags & HAS_PAGE) != 0) {
-        b->page_at = at;
-        at += PAGE_BYTES;
-    }
-    b->authentication_at = (flags & HAS_AUTHENTICATION) != 0 ? at : 0;
-    if (b->period_code > LONGEST_PERIOD_CODE) {
-        return BAD_PERIOD;
-    }
-    if (b->heard_count > MAX_HEARD || (b->weak) >> (b->heard_count) != 0 || !read_relays(frame, b)) {
-        return BAD_HEARD;
-    }
-    return b->page_at > 0 && !is_possible_page(frame, b->page_at) ? BAD_PAGE : INTACT;
-}
-
-/* Why bytes are no beacon of version 2, as far as length, check sequence, header and flags show it. */
-INTERNAL int32_t header_fault(uint8_t *frame, int32_t length) {
-    if (length > MAX_FRAME_BYTES) {
-        return TOO_LONG;
-    }
-    if (length <= FCS_BYTES) {
-        return TOO_SHORT;
-    }
-    if (checksum(frame, length) != 0) {
-        return BAD_FCS;
-    }
-    if (length < HEADER_BYTES + FCS_BYTES || two_bytes(frame, 0) != FRAME_CONTROL || two_bytes(frame, 5) != BROADCAST) {
-        return NOT_A_BEACON;
-    }
-    int32_t magic = two_bytes(frame, 9);
-    if ((magic & MAGIC_MASK) != BEACON_MAGIC) {
-        return NOT_A_BEACON;
-    }
-    if (magic != VERSION_2) {
-        return UNKNOWN_VERSION;
-    }
-    if (length < FIXED_BYTES + COUNT_BYTES + FCS_BYTES) {
-        return TOO_SHORT;
-    }
-    return length_fault(frame, length);
-}
-
-INTERNAL int32_t length_fault(uint8_t *frame, int32_t length) {
-    int32_t flags = frame[FLAGS_AT];
-    if ((flags & RESERVED_FLAGS) != 0 || ((flags & HAS_CERTIFICATE) != 0 && (flags & ~ALONGSIDE_CERTIFICATE) != 0)) {
-        return BAD_FLAGS;
-    }
-    int32_t bare = bare_bytes(flags);
-    if (length < bare) {
-        return BAD_LENGTH;
-    }
-    if ((flags & HAS_CERTIFICATE) == 0) {
-        int32_t at = FIXED_BYTES + ((flags & HAS_POSITION) != 0 ? POSITION_BYTES : 0);
-        bare += (two_bytes(frame, at) & COUNT_MASK) * HEARD_BYTES;
-    }
-    return length == bare ? INTACT : BAD_LENGTH;
-}
-
-/* Length of a frame with these flags that relays no receptions. */
-INTERNAL int32_t bare_bytes(int32_t flags) {
-    int32_t size = FIXED_BYTES + FCS_BYTES + ((flags & HAS_CERTIFICATE) != 0 ? CERTIFICATE_BYTES : COUNT_BYTES);
-    size += (flags & HAS_POSITION) != 0 ? POSITION_BYTES : 0;
-    size += (flags & HAS_PAGE) != 0 ? PAGE_BYTES : 0;
-    return size + ((flags & HAS_AUTHENTICATION) != 0 ? AUTHENTICATION_BYTES : 0);
-}
-
-INTERNAL void read_place(uint8_t *frame, int32_t at, StatedPlace *place) {
-    for (int32_t axis = 0; axis < 3; axis++) {
-        int32_t low = two_bytes(frame, at + 3 * axis);
-        int32_t high = frame[at + 3 * axis + 2];
-        place->position_mm[axis] = low + 65536 * (high > 127 ? high - 256 : high);
-    }
-    int32_t floor_ = frame[at + 10];
-    place->std_mm = frame[at + 9];
-    place->floor_ = floor_ > 127 ? floor_ - 256 : floor_;
-    place->zone = frame[at + 11];
-}
-
-/* Copy the receptions that are not weak; False where one is of the sender, or two of the same anchor. */
-INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b) {
-    for (int32_t one = 0, one_end = b->heard_count; one < one_end; one++) {
-        int32_t at = b->heard_at + one * HEARD_BYTES;
-        int32_t anchor = two_bytes(frame, at);
-        if (anchor == b->anchor) {
-            return false;
-        }
-        for (int32_t before = 0; before < one; before++) {
-            if (two_bytes(frame, b->heard_at + before * HEARD_BYTES) == anchor) {
-                return false;
-            }
-        }
-        if ((((b->weak) >> one) & 1) == 0) {
-            for (int32_t byte = 0; byte < HEARD_BYTES; byte++) {
-                b->relays[b->relay_bytes + byte] = frame[at + byte];
-            }
-            b->relay_bytes += HEARD_BYTES;
-        }
-    }
-    return true;
-}
-
-/* CRC-16 of x¹⁶ + x¹² + x⁵ + 1, initially 0, bit 0 of each byte first (clause 7.2.10); 0 with a frame's FCS.
- *
- * A byte's four low and four high bits each shift the polynomial in once, so no table is needed. Python's own frames
- * have theirs from ``ieee802154.fcs``, which is faster there. */
-INTERNAL int32_t checksum(uint8_t *data, int32_t length) {
-    int32_t crc = 0;
-    for (int32_t at = 0; at < length; at++) {
-        int32_t low = (crc ^ data[at]) & 255;
-        int32_t mixed = (low ^ (int32_t)((uint32_t)low << 4)) & 255;
-        crc = (((crc >> 8) ^ (int32_t)((uint32_t)mixed << 8)) ^ (int32_t)((uint32_t)mixed << 3)) ^ (mixed >> 4);
-    }
-    return crc;
-}
-
-/* Receptions whose first path is weak: they may be late, and count for less. */
-
-/* Factor on the variance of a reception, from 1 to ``MAX_VARIANCE_FACTOR``; it grows with the powers' difference.
- *
- * Where a power is missing (NaN), not finite or impossible (a first path above the total) the factor is 1. */
-INTERNAL real variance_factor(real rx_power_dbm, real first_path_power_dbm) {
-    real difference_db = rx_power_dbm - first_path_power_dbm;
-    if (!(CLEAR_DB < difference_db && difference_db <= MAX_DIFFERENCE_DB)) {
-        return REAL(1.0);
-    }
-    real part = min_real((difference_db - CLEAR_DB) / (BLOCKED_DB - CLEAR_DB), REAL(1.0));
-    return MAX_VARIANCE_FACTOR * exp_((part * part * (REAL(3.0) - REAL(2.0) * part) - REAL(1.0)) * LOG_FACTOR);
-}
-
-/* Which site a tag uses, of those that it receives. */
-
-/* Count an anchor of a site; whether its beacon is to be used. */
-INTERNAL int32_t choose_site(SiteChoice *choice, int32_t site, int32_t anchor, int64_t rx_ticks) {
-    if (choice->only_site != NO_SITE && choice->only_site != site) {
-        return FOREIGN;
-    }
-    int32_t counted = index_of(choice, site);
-    choice->sites[counted].newest_ticks = rx_ticks;
-    count_anchor(&choice->sites[counted], anchor, rx_ticks);
-    if (site == choice->site) {
-        return USED;
-    }
-    if (choice->site != NO_SITE) {
-        if (!prefers(choice, counted, rx_ticks)) {
-            return FOREIGN;
-        }
-        if (has_failed(choice, rx_ticks)) {
-            note_failed(choice);
-        }
-    }
-    choice->site = site;
-    choice->has_fix = false;
-    choice->since_ticks = rx_ticks;
-    choice->heard_ticks = rx_ticks;
-    return CHANGED;
-}
-
-/* The site in use has given a fix. */
-INTERNAL void note_fix(SiteChoice *choice, int64_t rx_ticks) {
-    choice->has_fix = true;
-    choice->fix_ticks = rx_ticks;
-    choice->failed_count = 0;
-}
-
-/* The tag's counter has restarted, and reads this. */
-INTERNAL void restart_choice(SiteChoice *choice, int64_t rx_ticks) {
-    choice->since_ticks = rx_ticks;
-    choice->heard_ticks = rx_ticks;
-    choice->has_fix = false;
-    choice->count = 0;
-}
-
-INTERNAL int32_t find_site(SiteChoice *choice, int32_t site) {
-    for (int32_t one = 0, one_end = choice->count; one < one_end; one++) {
-        if (choice->sites[one].site == site) {
-            return one;
-        }
-    }
-    return -1;
-}
-
-/* Where a site is counted; a new one may take the place of that received longest ago, but not of the one in use. */
-INTERNAL int32_t index_of(SiteChoice *choice, int32_t site) {
-    int32_t found = find_site(choice, site);
-    if (found < 0) {
-        found = choice->count;
-        if (choice->count == MAX_SITES) {
-            found = choice->sites[0].site != choice->site ? 0 : 1;
-            for (int32_t one = 0; one < MAX_SITES; one++) {
-                bool is_older = choice->sites[one].newest_ticks < choice->sites[found].newest_ticks;
-                if (is_older && choice->sites[one].site != choice->site) {
-                    found = one;
-                }
-            }
-        }
-        choice->count = max_32(choice->count, found + 1);
-        choice->sites[found].site = site;
-        choice->sites[found].count = 0;
-    }
-    return found;
-}
-
-/* Note when an anchor was received; where there are too many, that received longest ago is forgotten. */
-INTERNAL void count_anchor(CountedSite *counted, int32_t anchor, int64_t rx_ticks) {
-    int32_t place = -1;
-    int32_t oldest = 0;
-    for (int32_t one = 0, one_end = counted->count; one < one_end; one++) {
-        if (counted->anchors[one].anchor == anchor) {
-            place = one;
-        }
-        if (counted->anchors[one].rx_ticks < counted->anchors[oldest].rx_ticks) {
-            oldest = one;
-        }
-    }
-    if (place < 0) {
-        place = counted->count < MAX_COUNTED ? counted->count : oldest;
-        counted->count = max_32(counted->count, place + 1);
-    }
-    counted->anchors[place].anchor = anchor;
-    counted->anchors[place].rx_ticks = rx_ticks;
-}
-
-/* Whether another site is better than the one in use. */
-INTERNAL bool prefers(SiteChoice *choice, int32_t other, int64_t rx_ticks) {
-    if (rx_ticks - choice->heard_ticks >= SITE_SILENCE_TICKS) {
-        return true;
-    }
-    if (choice->has_fix && rx_ticks - choice->fix_ticks < SITE_SILENCE_TICKS) {
-        return false;
-    }
-    int32_t present = received(choice, other, rx_ticks);
-    if (has_failed(choice, rx_ticks)) {
-        return present >= MIN_ANCHORS;
-    }
-    for (int32_t one = 0, one_end = choice->failed_count; one < one_end; one++) {
-        if (choice->failed[one] == choice->sites[other].site) {
-            return false;
-        }
-    }
-    int32_t used = find_site(choice, choice->site);
-    return present > (used >= 0 ? received(choice, used, rx_ticks) : 0);
-}
-
-/* Whether the site in use has given no fix for long. */
-INTERNAL bool has_failed(SiteChoice *choice, int64_t rx_ticks) {
-    return rx_ticks - (choice->has_fix ? choice->fix_ticks : choice->since_ticks) >= TRIAL_TICKS;
-}
-
-/* The site in use has failed; with too many of them the first is forgotten. */
-INTERNAL void note_failed(SiteChoice *choice) {
-    if (choice->failed_count == MAX_SITES) {
-        for (int32_t one = 1; one < MAX_SITES; one++) {
-            choice->failed[one - 1] = choice->failed[one];
-        }
-        choice->failed_count -= 1;
-    }
-    choice->failed[choice->failed_count] = choice->site;
-    choice->failed_count += 1;
-}
-
-/* How many anchors of a site are received. */
-INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks) {
-    CountedSite *one = &choice->sites[counted];
-    int32_t present = 0;
-    for (int32_t index_ = 0, index__end = one->count; index_ < index__end; index_++) {
-        if (0 <= rx_ticks - one->anchors[index_].rx_ticks && rx_ticks - one->anchors[index_].rx_ticks < PRESENT_TICKS) {
-            present += 1;
-        }
-    }
-    return present;
-}
-
-/* Protocol 2: which pages of those that beacons carry count, as the majority of the anchors states. */
 
 /* Process the page at this place of the newest anchor's beacon, if it is not 0; whether others are in use then. */
 INTERNAL int32_t note_page(SitePages *p, Neighbours *t, uint8_t *frame, int32_t page_at, int64_t rx_ticks) {
@@ -1294,74 +1201,309 @@ INTERNAL int32_t use_chosen(SitePages *p, Choices *c, int32_t issue) {
     return outcome;
 }
 
-/* Tails of the normal and the chi2 distribution. */
+/* Beacons of protocol 2 and their bytes (``docs/protocol2.md``); little endian throughout, 127 bytes at most. */
 
-/* Probability that a standard normal variable exceeds z, to 10⁻¹² of itself.
- *
- * With its density φ it is ½ − φ(z)·Σ z²ⁿ⁺¹/(1·3·…·(2n + 1)), or φ(z)/(z + 1/(z + 2/(z + …))) after Laplace. */
-INTERNAL real normal_tail(real z) {
-    real tail = 0;
-    real size = abs_real(z);
-    real density = exp_(-REAL(0.5) * size * size) / SQRT_2_PI;
-    if (size < FAR_TAIL) {
-        real term = size;
-        real total = size;
-        for (int32_t n = 1; n < TERMS; n++) {
-            term *= size * size / (real)(2 * n + 1);
-            total += term;
-        }
-        tail = REAL(0.5) - density * total;
+/* A beacon of protocol 2 as it is read from a frame (``docs/protocol2.md``); little endian throughout. */
+
+/* Read a whole frame, FCS included; why it is no beacon of version 2, ``INTACT`` if it is one. */
+SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, BeaconFields *b) {
+    int32_t fault = header_fault(frame, length);
+    if (fault != INTACT) {
+        return fault;
+    }
+    int32_t flags = frame[FLAGS_AT];
+    int32_t at = FIXED_BYTES;
+    b->sequence = frame[2];
+    b->period_code = frame[19];
+    const int32_t new_1 = two_bytes(frame, 3);
+    const int32_t new_2 = two_bytes(frame, 7);
+    const int32_t new_3 = two_bytes(frame, 17);
+    b->site = new_1;
+    b->anchor = new_2;
+    b->almanac_issue = new_3;
+    b->tx_ticks = unsigned_(frame, 12, 5);
+    b->has_place = (flags & HAS_POSITION) != 0;
+    b->has_phases = (flags & HAS_PHASES) != 0;
+    b->relay_bytes = 0;
+    b->certificate_at = 0;
+    b->page_at = 0;
+    b->weak = 0;
+    b->heard_count = 0;
+    b->heard_at = 0;
+    if (b->has_place) {
+        read_place(frame, at, &b->place);
+        at += POSITION_BYTES;
+    }
+    if ((flags & HAS_CERTIFICATE) != 0) {
+        b->certificate_at = at;
+        at += CERTIFICATE_BYTES;
     } else {
-        tail = density / continued_fraction(size, 1);
+        int32_t entries = two_bytes(frame, at);
+        b->heard_at = at + COUNT_BYTES;
+        b->heard_count = entries & COUNT_MASK;
+        b->weak = entries >> COUNT_BITS;
+        at = b->heard_at + b->heard_count * HEARD_BYTES;
     }
-    return z >= REAL(0.0) ? tail : REAL(1.0) - tail;
+    if ((flags & HAS_PAGE) != 0) {
+        b->page_at = at;
+        at += PAGE_BYTES;
+    }
+    b->authentication_at = (flags & HAS_AUTHENTICATION) != 0 ? at : 0;
+    if (b->period_code > LONGEST_PERIOD_CODE) {
+        return BAD_PERIOD;
+    }
+    if (b->heard_count > MAX_HEARD || (b->weak) >> (b->heard_count) != 0 || !read_relays(frame, b)) {
+        return BAD_HEARD;
+    }
+    return b->page_at > 0 && !is_possible_page(frame, b->page_at) ? BAD_PAGE : INTACT;
 }
 
-/* What a standard normal variable exceeds with a probability below ½, by Newton's method for its logarithm. */
-INTERNAL real normal_quantile(real tail) {
-    real z = SQRT(-REAL(2.0) * log_(tail));
-    for (int32_t time_1 = 0; time_1 < NEWTON_STEPS; time_1++) {
-        real found = normal_tail(z);
-        z += (log_(found) - log_(tail)) * found * SQRT_2_PI / exp_(-REAL(0.5) * z * z);
+/* Why bytes are no beacon of version 2, as far as length, check sequence, header and flags show it. */
+INTERNAL int32_t header_fault(uint8_t *frame, int32_t length) {
+    if (length > MAX_FRAME_BYTES) {
+        return TOO_LONG;
     }
-    return z;
+    if (length <= FCS_BYTES) {
+        return TOO_SHORT;
+    }
+    if (checksum(frame, length) != 0) {
+        return BAD_FCS;
+    }
+    if (length < HEADER_BYTES + FCS_BYTES || two_bytes(frame, 0) != FRAME_CONTROL || two_bytes(frame, 5) != BROADCAST) {
+        return NOT_A_BEACON;
+    }
+    int32_t magic = two_bytes(frame, 9);
+    if ((magic & MAGIC_MASK) != BEACON_MAGIC) {
+        return NOT_A_BEACON;
+    }
+    if (magic != VERSION_2) {
+        return UNKNOWN_VERSION;
+    }
+    if (length < FIXED_BYTES + COUNT_BYTES + FCS_BYTES) {
+        return TOO_SHORT;
+    }
+    return length_fault(frame, length);
 }
 
-/* The value of z + n/(z + (n + 1)/(z + …)) for the first n. */
-INTERNAL real continued_fraction(real z, int32_t first) {
-    real fraction = z;
-    for (int32_t n = TERMS; n > first - 1; n--) {
-        fraction = z + (real)n / fraction;
+INTERNAL int32_t length_fault(uint8_t *frame, int32_t length) {
+    int32_t flags = frame[FLAGS_AT];
+    if ((flags & RESERVED_FLAGS) != 0 || ((flags & HAS_CERTIFICATE) != 0 && (flags & ~ALONGSIDE_CERTIFICATE) != 0)) {
+        return BAD_FLAGS;
     }
-    return fraction;
+    int32_t bare = bare_bytes(flags);
+    if (length < bare) {
+        return BAD_LENGTH;
+    }
+    if ((flags & HAS_CERTIFICATE) == 0) {
+        int32_t at = FIXED_BYTES + ((flags & HAS_POSITION) != 0 ? POSITION_BYTES : 0);
+        bare += (two_bytes(frame, at) & COUNT_MASK) * HEARD_BYTES;
+    }
+    return length == bare ? INTACT : BAD_LENGTH;
 }
 
-/* Probability that chi2 with at least one degree of freedom exceeds a value, by the finite sum. */
-INTERNAL real chi2_tail(int32_t dof, real chi2) {
-    real half = REAL(0.5) * chi2;
-    if (!(half < REAL(700.0))) {
-        return REAL(0.0);
-    }
-    bool is_odd = floor_mod_32(dof, 2) == 1;
-    real term = is_odd ? REAL(2.0) * SQRT(chi2) / SQRT_2_PI : REAL(1.0);
-    real total = REAL(0.0);
-    for (int32_t k = 0; k < floor_div_32(dof, 2); k++) {
-        total += term;
-        term *= half / ((real)k + (is_odd ? REAL(1.5) : REAL(1.0)));
-    }
-    return (is_odd ? REAL(2.0) * normal_tail(SQRT(chi2)) : REAL(0.0)) + exp_(-half) * total;
+/* Length of a frame with these flags that relays no receptions. */
+INTERNAL int32_t bare_bytes(int32_t flags) {
+    int32_t size = FIXED_BYTES + FCS_BYTES + ((flags & HAS_CERTIFICATE) != 0 ? CERTIFICATE_BYTES : COUNT_BYTES);
+    size += (flags & HAS_POSITION) != 0 ? POSITION_BYTES : 0;
+    size += (flags & HAS_PAGE) != 0 ? PAGE_BYTES : 0;
+    return size + ((flags & HAS_AUTHENTICATION) != 0 ? AUTHENTICATION_BYTES : 0);
 }
 
-/* Mean of a normal variable given that it is positive: E[w²], where w² was measured and may be near 0. */
-INTERNAL real mean_if_positive(real mean, real sigma) {
-    real z = mean / sigma;
-    if (z < -FAR_TAIL) {  /* where the mean and what is added to it would cancel */
-        return sigma / continued_fraction(-z, 2);
+INTERNAL void read_place(uint8_t *frame, int32_t at, StatedPlace *place) {
+    for (int32_t axis = 0; axis < 3; axis++) {
+        int32_t low = two_bytes(frame, at + 3 * axis);
+        int32_t high = frame[at + 3 * axis + 2];
+        place->position_mm[axis] = low + 65536 * (high > 127 ? high - 256 : high);
     }
-    return mean + sigma * exp_(-REAL(0.5) * z * z) / (SQRT_2_PI * normal_tail(-z));
+    int32_t floor_ = frame[at + 10];
+    place->std_mm = frame[at + 9];
+    place->floor_ = floor_ > 127 ? floor_ - 256 : floor_;
+    place->zone = frame[at + 11];
+}
+
+/* Copy the receptions that are not weak; False where one is of the sender, or two of the same anchor. */
+INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b) {
+    for (int32_t one = 0, one_end = b->heard_count; one < one_end; one++) {
+        int32_t at = b->heard_at + one * HEARD_BYTES;
+        int32_t anchor = two_bytes(frame, at);
+        if (anchor == b->anchor) {
+            return false;
+        }
+        for (int32_t before = 0; before < one; before++) {
+            if (two_bytes(frame, b->heard_at + before * HEARD_BYTES) == anchor) {
+                return false;
+            }
+        }
+        if ((((b->weak) >> one) & 1) == 0) {
+            for (int32_t byte = 0; byte < HEARD_BYTES; byte++) {
+                b->relays[b->relay_bytes + byte] = frame[at + byte];
+            }
+            b->relay_bytes += HEARD_BYTES;
+        }
+    }
+    return true;
+}
+
+/* CRC-16 of x¹⁶ + x¹² + x⁵ + 1, initially 0, bit 0 of each byte first (clause 7.2.10); 0 with a frame's FCS.
+ *
+ * A byte's four low and four high bits each shift the polynomial in once, so no table is needed. Python's own frames
+ * have theirs from ``ieee802154.fcs``, which is faster there. */
+INTERNAL int32_t checksum(uint8_t *data, int32_t length) {
+    int32_t crc = 0;
+    for (int32_t at = 0; at < length; at++) {
+        int32_t low = (crc ^ data[at]) & 255;
+        int32_t mixed = (low ^ (int32_t)((uint32_t)low << 4)) & 255;
+        crc = (((crc >> 8) ^ (int32_t)((uint32_t)mixed << 8)) ^ (int32_t)((uint32_t)mixed << 3)) ^ (mixed >> 4);
+    }
+    return crc;
+}
+
+/* Which site a tag uses, of those that it receives. */
+
+/* Count an anchor of a site; whether its beacon is to be used. */
+INTERNAL int32_t choose_site(SiteChoice *choice, int32_t site, int32_t anchor, int64_t rx_ticks) {
+    if (choice->only_site != NO_SITE && choice->only_site != site) {
+        return FOREIGN;
+    }
+    int32_t counted = index_of(choice, site);
+    choice->sites[counted].newest_ticks = rx_ticks;
+    count_anchor(&choice->sites[counted], anchor, rx_ticks);
+    if (site == choice->site) {
+        return USED;
+    }
+    if (choice->site != NO_SITE) {
+        if (!prefers(choice, counted, rx_ticks)) {
+            return FOREIGN;
+        }
+        if (has_failed(choice, rx_ticks)) {
+            note_failed(choice);
+        }
+    }
+    choice->site = site;
+    choice->has_fix = false;
+    choice->since_ticks = rx_ticks;
+    choice->heard_ticks = rx_ticks;
+    return CHANGED;
+}
+
+/* The site in use has given a fix. */
+INTERNAL void note_fix(SiteChoice *choice, int64_t rx_ticks) {
+    choice->has_fix = true;
+    choice->fix_ticks = rx_ticks;
+    choice->failed_count = 0;
+}
+
+/* The tag's counter has restarted, and reads this. */
+INTERNAL void restart_choice(SiteChoice *choice, int64_t rx_ticks) {
+    choice->since_ticks = rx_ticks;
+    choice->heard_ticks = rx_ticks;
+    choice->has_fix = false;
+    choice->count = 0;
+}
+
+INTERNAL int32_t find_site(SiteChoice *choice, int32_t site) {
+    for (int32_t one = 0, one_end = choice->count; one < one_end; one++) {
+        if (choice->sites[one].site == site) {
+            return one;
+        }
+    }
+    return -1;
+}
+
+/* Where a site is counted; a new one may take the place of that received longest ago, but not of the one in use. */
+INTERNAL int32_t index_of(SiteChoice *choice, int32_t site) {
+    int32_t found = find_site(choice, site);
+    if (found < 0) {
+        found = choice->count;
+        if (choice->count == MAX_SITES) {
+            found = choice->sites[0].site != choice->site ? 0 : 1;
+            for (int32_t one = 0; one < MAX_SITES; one++) {
+                bool is_older = choice->sites[one].newest_ticks < choice->sites[found].newest_ticks;
+                if (is_older && choice->sites[one].site != choice->site) {
+                    found = one;
+                }
+            }
+        }
+        choice->count = max_32(choice->count, found + 1);
+        choice->sites[found].site = site;
+        choice->sites[found].count = 0;
+    }
+    return found;
+}
+
+/* Note when an anchor was received; where there are too many, that received longest ago is forgotten. */
+INTERNAL void count_anchor(CountedSite *counted, int32_t anchor, int64_t rx_ticks) {
+    int32_t place = -1;
+    int32_t oldest = 0;
+    for (int32_t one = 0, one_end = counted->count; one < one_end; one++) {
+        if (counted->anchors[one].anchor == anchor) {
+            place = one;
+        }
+        if (counted->anchors[one].rx_ticks < counted->anchors[oldest].rx_ticks) {
+            oldest = one;
+        }
+    }
+    if (place < 0) {
+        place = counted->count < MAX_COUNTED ? counted->count : oldest;
+        counted->count = max_32(counted->count, place + 1);
+    }
+    counted->anchors[place].anchor = anchor;
+    counted->anchors[place].rx_ticks = rx_ticks;
+}
+
+/* Whether another site is better than the one in use. */
+INTERNAL bool prefers(SiteChoice *choice, int32_t other, int64_t rx_ticks) {
+    if (rx_ticks - choice->heard_ticks >= SITE_SILENCE_TICKS) {
+        return true;
+    }
+    if (choice->has_fix && rx_ticks - choice->fix_ticks < SITE_SILENCE_TICKS) {
+        return false;
+    }
+    int32_t present = received(choice, other, rx_ticks);
+    if (has_failed(choice, rx_ticks)) {
+        return present >= MIN_ANCHORS;
+    }
+    for (int32_t one = 0, one_end = choice->failed_count; one < one_end; one++) {
+        if (choice->failed[one] == choice->sites[other].site) {
+            return false;
+        }
+    }
+    int32_t used = find_site(choice, choice->site);
+    return present > (used >= 0 ? received(choice, used, rx_ticks) : 0);
+}
+
+/* Whether the site in use has given no fix for long. */
+INTERNAL bool has_failed(SiteChoice *choice, int64_t rx_ticks) {
+    return rx_ticks - (choice->has_fix ? choice->fix_ticks : choice->since_ticks) >= TRIAL_TICKS;
+}
+
+/* The site in use has failed; with too many of them the first is forgotten. */
+INTERNAL void note_failed(SiteChoice *choice) {
+    if (choice->failed_count == MAX_SITES) {
+        for (int32_t one = 1; one < MAX_SITES; one++) {
+            choice->failed[one - 1] = choice->failed[one];
+        }
+        choice->failed_count -= 1;
+    }
+    choice->failed[choice->failed_count] = choice->site;
+    choice->failed_count += 1;
+}
+
+/* How many anchors of a site are received. */
+INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks) {
+    CountedSite *one = &choice->sites[counted];
+    int32_t present = 0;
+    for (int32_t index_ = 0, index__end = one->count; index_ < index__end; index_++) {
+        if (0 <= rx_ticks - one->anchors[index_].rx_ticks && rx_ticks - one->anchors[index_].rx_ticks < PRESENT_TICKS) {
+            present += 1;
+        }
+    }
+    return present;
 }
 
 /* Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8). */
+
+/* What a fix states of its integrity; on its own, so that programs that only read fixes load no numeric library. */
 
 /* ``limits_of`` in the plane. */
 INTERNAL real horizontal_limit(real risk) {
@@ -4808,160 +4950,7 @@ SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_t
     }
 }
 
-/* Symmetric matrices by Cholesky's method, and least squares of few unknowns by rotations of columns.
- *
- * A symmetric matrix is kept as its lower triangle, row by row: element (i, j) with j ≤ i is number i·(i + 1)/2 + j. */
-
-/* Cholesky's method */
-
-/* Replace A by its lower factor L, with L·Lᵀ = A.
- *
- * False where A is not positive definite, or singular, or not finite; its elements are then undefined. */
-INTERNAL bool factorise(real *A, int32_t size) {
-    for (int32_t i = 0; i < size; i++) {
-        int32_t row = floor_div_32(i * (i + 1), 2);
-        real diagonal = A[row + i];
-        for (int32_t j = 0; j < i + 1; j++) {
-            int32_t other = floor_div_32(j * (j + 1), 2);
-            real total = A[row + j];
-            for (int32_t k = 0; k < j; k++) {
-                total -= A[row + k] * A[other + k];
-            }
-            if (j < i) {
-                A[row + j] = total / A[other + j];
-            } else if (total > SINGULAR_PIVOT * diagonal && diagonal > REAL(0.0)) {
-                A[row + j] = SQRT(total);
-            } else {
-                return false;
-            }
-        }
-    }
-    return true;
-}
-
-/* Replace x by L⁻¹·x. */
-INTERNAL void solve_lower(real *L, int32_t size, real *x) {
-    for (int32_t i = 0; i < size; i++) {
-        int32_t row = floor_div_32(i * (i + 1), 2);
-        real total = x[i];
-        for (int32_t k = 0; k < i; k++) {
-            total -= L[row + k] * x[k];
-        }
-        x[i] = total / L[row + i];
-    }
-}
-
-/* Replace x by (L·Lᵀ)⁻¹·x. */
-INTERNAL void solve(real *L, int32_t size, real *x) {
-    solve_lower(L, size, x);
-    for (int32_t i = size - 1; i > -1; i--) {
-        real total = x[i];
-        for (int32_t k = i + 1; k < size; k++) {
-            total -= L[floor_div_32(k * (k + 1), 2) + i] * x[k];
-        }
-        x[i] = total / L[floor_div_32(i * (i + 1), 2) + i];
-    }
-}
-
-/* Rotations of columns */
-
-/* Rotate pairs of columns, the longer one to the front, until all are orthogonal (M. R. Hestenes 1958). */
-INTERNAL void orthogonalise(Columns *m) {
-    for (int32_t i = 0, i_end = m->columns; i < i_end; i++) {
-        for (int32_t j = 0, j_end = m->columns; j < j_end; j++) {
-            m->V[i][j] = i == j ? REAL(1.0) : REAL(0.0);
-        }
-    }
-    for (int32_t time_1 = 0; time_1 < MAX_SWEEPS; time_1++) {
-        bool is_done = true;
-        for (int32_t one = 0, one_end = m->columns - 1; one < one_end; one++) {
-            for (int32_t other = one + 1, other_end = m->columns; other < other_end; other++) {
-                if (has_rotated(m, one, other)) {
-                    is_done = false;
-                }
-            }
-        }
-        if (is_done) {
-            break;
-        }
-    }
-    for (int32_t j = 0, j_end = m->columns; j < j_end; j++) {
-        m->squares[j] = scalar_product(m, j, j);
-    }
-}
-
-/* Make two columns orthogonal and order them, by the smallest rotation; False where they are so already. */
-INTERNAL bool has_rotated(Columns *m, int32_t one, int32_t other) {
-    real square = scalar_product(m, one, one);
-    real square_other = scalar_product(m, other, other);
-    real product = scalar_product(m, one, other);
-    bool is_orthogonal = !(abs_real(product) > ORTHOGONAL * SQRT(square * square_other));
-    if (is_orthogonal && square >= square_other) {
-        return false;
-    }
-    real tangent = REAL(0.0);
-    if (!is_orthogonal) {
-        real cotangent = (square_other - square) / (REAL(2.0) * product);  /* of twice the angle */
-        tangent = REAL(1.0) / (abs_real(cotangent) + SQRT(REAL(1.0) + cotangent * cotangent));
-        if (cotangent < REAL(0.0)) {
-            tangent = -tangent;
-        }
-    }
-    real cosine = REAL(1.0) / SQRT(REAL(1.0) + tangent * tangent);
-    real sine = tangent * cosine;
-    if (square < square_other) {
-        const real new_1 = -sine;
-        const real new_2 = cosine;
-        cosine = new_1;
-        sine = new_2;
-    }
-    rotate_columns(m->A, m->rows, one, other, cosine, sine);
-    rotate_columns(m->V, m->columns, one, other, cosine, sine);
-    return true;
-}
-
-/* The scalar product of two columns. */
-INTERNAL real scalar_product(Columns *m, int32_t one, int32_t other) {
-    real total = REAL(0.0);
-    for (int32_t i = 0, i_end = m->rows; i < i_end; i++) {
-        real *row = m->A[i];
-        total += row[one] * row[other];
-    }
-    return total;
-}
-
-INTERNAL void rotate_columns(real (*A)[4], int32_t rows, int32_t one, int32_t other, real cosine, real sine) {
-    for (int32_t i = 0; i < rows; i++) {
-        real *row = A[i];
-        real first = row[one];
-        real second = row[other];
-        row[one] = cosine * first - sine * second;
-        row[other] = sine * first + cosine * second;
-    }
-}
-
-/* Find the x that minimises |A·x − right|, after ``orthogonalise``; False where A does not determine it. */
-INTERNAL bool least_squares(Columns *m, real *right, real *x) {
-    if (!(m->squares[m->columns - 1] > DEPENDENT * DEPENDENT * m->squares[0])) {
-        return false;
-    }
-    for (int32_t k = 0, k_end = m->columns; k < k_end; k++) {
-        x[k] = REAL(0.0);
-    }
-    for (int32_t j = 0, j_end = m->columns; j < j_end; j++) {
-        real total = REAL(0.0);
-        for (int32_t i = 0, i_end = m->rows; i < i_end; i++) {
-            total += m->A[i][j] * right[i];
-        }
-        total /= m->squares[j];
-        for (int32_t k = 0, k_end = m->columns; k < k_end; k++) {
-            x[k] += m->V[k][j] * total;
-        }
-    }
-    return true;
-}
-
-/* A set of TDoAs, in the axes in which their solution is simplest. */
+/* The minima of a set of TDoAs, and which of them are distinct. */
 
 /* Anchors are in one plane if they leave it by less than this part of the smallest TDoA sigma. */
 
@@ -5033,8 +5022,6 @@ INTERNAL real least_sigma_m(LocateProblem *p) {
     }
     return least_m;
 }
-
-/* Gauss–Newton steps, damped after Levenberg and Marquardt where they fail, to a minimum of TDoAs' residuals. */
 
 /* It also ends where a step promises to lower the cost by less than this part: steps of 10⁻⁷ sigma. */
 
@@ -5194,17 +5181,7 @@ INTERNAL real eased(real damping, real ratio) {
     return eased > MIN_DAMPING ? eased : REAL(0.0);
 }
 
-/* States from which the iterations start: from TDoAs in closed form, without a guess.
- *
- * With the reference anchor at the origin, x the tag, ρ = |x| its distance from there, and the measured
- * d_i = |x − a_i| − ρ, squaring ρ + d_i = |x − a_i| leaves equations that are linear in x and ρ:
- *
- *     a_iᵀx + d_i·ρ = (|a_i|² − d_i²)/2
- *
- * *Spherical intersection* solves them for x as a function of ρ, and |x|² = ρ² is then a quadratic with two roots;
- * *spherical interpolation* takes ρ as one more unknown (H. C. Schau and A. Z. Robinson 1987; J. O. Smith and
- * J. S. Abel 1987). Anchors in one plane determine nothing of the coordinate w across it except w² = ρ² − x² − y².
- * The equations are not weighted. */
+/* The equations are not weighted. */
 
 /* Add what the closed forms find. */
 INTERNAL void add_algebraic_starts(LocateProblem *p) {
@@ -5359,8 +5336,6 @@ INTERNAL void add(LocateProblem *p, real x, real y, real z) {
     start[2] = z;
     p->start_count += 1;
 }
-
-/* The minima of a set of TDoAs, and which of them are distinct. */
 
 /* Two minima are distinct where one lies outside the 3-sigma ellipsoid of the other. */
 
@@ -6173,57 +6148,10 @@ INTERNAL int32_t solve_without_one(Acquisition *q, int64_t now) {
     return reason;
 }
 
-/* Which frames a tag admits: of the site in use, with stamps that are possible on its sender's and its own counter. */
-
-/* Unwrap the tag's stamp of a frame, and find out whether its site is in use; ``ADMITTED`` or why not.
+/* A tag from its first packet on: it looks for a start, follows its course, and begins again where it is lost.
  *
- * ``host_s``: the host's time of it, NaN where that is not known. */
-SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real host_s)
-        {
-    a->former = a->own;
-    a->rx_ticks = unwrap(&a->own, rx_counter, host_s);
-    Neighbours *t = &a->neighbours;
-    bool went_back = a->went_back;
-    bool is_possible = -LAST_TICKS <= a->rx_ticks && a->rx_ticks <= LAST_TICKS;
-    a->went_back = t->has_newest && a->rx_ticks < t->newest_rx_ticks - COUNTER_JUMP_TICKS;
-    if (is_possible && a->went_back && !went_back) {
-        a->own = a->former;
-        return OUT_OF_ORDER;
-    }
-    if (!is_possible || a->went_back) {
-        a->went_back = false;
-        forget_times(t);
-        a->events = a->events | (is_possible ? COUNTER_JUMPED : HOST_JUMPED);
-        restart_choice(&a->choice, is_possible ? a->rx_ticks : 0);
-        if (!is_possible) {
-            a->own.has_stamp = false;
-            return IMPOSSIBLE_HOST_TIME;
-        }
-    }
-    bool had_site = a->choice.site != NO_SITE;
-    int32_t use = choose_site(&a->choice, site, anchor, a->rx_ticks);
-    if (use == FOREIGN) {
-        return FOREIGN_SITE;
-    }
-    if (use == CHANGED && had_site) {
-        t->count = 0;
-        t->has_newest = false;
-        a->events = a->events | SITE_CHANGED;
-    }
-    return ADMITTED;
-}
-
-/* Unwrap the TX stamp of a frame of the site in use; ``ADMITTED`` or why it is not used. */
-SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
-        period_ticks) {
-    int32_t stamp = skyless_unwrap_stamp(&a->neighbours, anchor, sequence, tx_counter, a->rx_ticks, period_ticks);
-    if (stamp == STAMP_FITS) {
-        a->choice.heard_ticks = a->rx_ticks;
-    } else {
-        a->own = a->former;
-    }
-    return stamp;
-}
+ * The filter's state and the search for a start are not used at the same time, so that a board may keep both in the same
+ * memory (``SHARES_MEMORY``): a filter begins with copies of what was found. */
 
 /* A tag that knows where it is: what becomes of a packet, and when it has to begin again (``following.py``). */
 
@@ -6357,11 +6285,6 @@ INTERNAL void widen(Course *c, int32_t axis) {
     }
     c->extent_m = max_real(c->extent_m, highest - lowest);
 }
-
-/* A tag from its first packet on: it looks for a start, follows its course, and begins again where it is lost.
- *
- * The filter's state and the search for a start are not used at the same time, so that a board may keep both in the same
- * memory (``SHARES_MEMORY``): a filter begins with copies of what was found. */
 
 /* Begin with the settings in ``c``, and with the packets that a search has gathered so far. */
 SKYLESS_EXPORT void skyless_begin_course(Course *c, Acquisition *q) {
@@ -6640,6 +6563,58 @@ INTERNAL bool is_chosen(Course *c, Acquisition *q, int32_t place) {
     return is_used && nearer < c->most_anchors;
 }
 
+/* Which frames a tag admits: of the site in use, with stamps that are possible on its sender's and its own counter. */
+
+/* Unwrap the tag's stamp of a frame, and find out whether its site is in use; ``ADMITTED`` or why not.
+ *
+ * ``host_s``: the host's time of it, NaN where that is not known. */
+SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real host_s)
+        {
+    a->former = a->own;
+    a->rx_ticks = unwrap(&a->own, rx_counter, host_s);
+    Neighbours *t = &a->neighbours;
+    bool went_back = a->went_back;
+    bool is_possible = -LAST_TICKS <= a->rx_ticks && a->rx_ticks <= LAST_TICKS;
+    a->went_back = t->has_newest && a->rx_ticks < t->newest_rx_ticks - COUNTER_JUMP_TICKS;
+    if (is_possible && a->went_back && !went_back) {
+        a->own = a->former;
+        return OUT_OF_ORDER;
+    }
+    if (!is_possible || a->went_back) {
+        a->went_back = false;
+        forget_times(t);
+        a->events = a->events | (is_possible ? COUNTER_JUMPED : HOST_JUMPED);
+        restart_choice(&a->choice, is_possible ? a->rx_ticks : 0);
+        if (!is_possible) {
+            a->own.has_stamp = false;
+            return IMPOSSIBLE_HOST_TIME;
+        }
+    }
+    bool had_site = a->choice.site != NO_SITE;
+    int32_t use = choose_site(&a->choice, site, anchor, a->rx_ticks);
+    if (use == FOREIGN) {
+        return FOREIGN_SITE;
+    }
+    if (use == CHANGED && had_site) {
+        t->count = 0;
+        t->has_newest = false;
+        a->events = a->events | SITE_CHANGED;
+    }
+    return ADMITTED;
+}
+
+/* Unwrap the TX stamp of a frame of the site in use; ``ADMITTED`` or why it is not used. */
+SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
+        period_ticks) {
+    int32_t stamp = skyless_unwrap_stamp(&a->neighbours, anchor, sequence, tx_counter, a->rx_ticks, period_ticks);
+    if (stamp == STAMP_FITS) {
+        a->choice.heard_ticks = a->rx_ticks;
+    } else {
+        a->own = a->former;
+    }
+    return stamp;
+}
+
 /* Which anchors of a large site a tag uses: the strongest of those that other anchors receive too. */
 
 /* Process the power of a beacon; NaN where the radio reports none. */
@@ -6715,7 +6690,7 @@ INTERNAL real place_m(Neighbour *n, int32_t *origin_mm, int32_t axis) {
     return (real)(n->place.position_mm[axis] - origin_mm[axis]) / (real)MM_PER_M;
 }
 
-/* What the estimator assumes at a site, from its pages of noise and accuracy. */
+/* ``joint``: the estimator as a positioning method: cold start, packet by packet updates, new starts when lost. */
 
 /* Relays of packets that are older than both are not used. */
 
@@ -6761,7 +6736,7 @@ INTERNAL real float_at(uint8_t *data, int32_t at) {
     return value;
 }
 
-/* What changes rarely for a tag of protocol 2: its site, the site's pages, its counter, anchors that move or join. */
+/* A tag of protocol 2: from a frame's bytes to a fix. */
 
 /* Its owner */
 
@@ -7078,8 +7053,6 @@ INTERNAL bool have_most_moved(Tag *t) {
     }
     return 2 * moved > present;
 }
-
-/* A tag of protocol 2: from a frame's bytes to a fix. */
 
 /* Process a frame from the air; what becomes of it.
  *

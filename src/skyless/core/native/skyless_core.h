@@ -1,12 +1,9 @@
 /* Made by tools/make_core.py from these modules; do not edit.
 
- * skyless.core.air.anchor_stamps
- * skyless.core.air.beacon_fields
- * skyless.core.air.first_path
- * skyless.core.air.instants
- * skyless.core.air.little_endian
+ * skyless.core.air.almanac
+ * skyless.core.air.beacon
+ * skyless.core.air.frame
  * skyless.core.air.neighbours
- * skyless.core.air.page_check
  * skyless.core.air.site_choice
  * skyless.core.air.site_pages
  * skyless.core.estimator.faults
@@ -18,24 +15,15 @@
  * skyless.core.estimator.process
  * skyless.core.estimator.state
  * skyless.core.estimator.steady_state
- * skyless.core.estimator.verdicts
  * skyless.core.integrity
  * skyless.core.native.arithmetic
- * skyless.core.native.small_matrices
- * skyless.core.native.tails
  * skyless.core.tag.acquisition
  * skyless.core.tag.admission
- * skyless.core.tag.changes
- * skyless.core.tag.course
- * skyless.core.tag.descent
  * skyless.core.tag.following
  * skyless.core.tag.hearing
- * skyless.core.tag.minima
+ * skyless.core.tag.joint
  * skyless.core.tag.position
- * skyless.core.tag.problem
- * skyless.core.tag.selection
- * skyless.core.tag.site_settings
- * skyless.core.tag.starts
+ * skyless.core.tag.search
  * skyless.core.ticks
  */
 
@@ -270,7 +258,7 @@ typedef double real;
 /* Factor on the variance of a blocked path: metal made messages 0.2 to 0.4 m late, 4 to 8 times what noise does. */
 #define MAX_VARIANCE_FACTOR REAL(36.0)
 #define MERGED_SIGMAS REAL(2.0)
-/* That other one has at least as many: with fewer there is no fix. */
+/* With fewer no majority counts, unless that is all that a tag receives for ``PRESENT_TICKS``. */
 #define MIN_ANCHORS 3
 #define MIN_DAMPING REAL(0.0001)
 /* An anchor that relays this number of receptions of anchors in use, and they fit, is there. */
@@ -1353,14 +1341,14 @@ SKYLESS_EXPORT void skyless_find_walked(State *s, PlannedMessage *messages, Plan
 SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_ticks, real *position_m, uint8_t *known,
         int32_t first, real elapsed_s, real walked_m);
 SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found);
-SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real
-        host_s);
-SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
-        period_ticks);
 SKYLESS_EXPORT void skyless_begin_course(Course *c, Acquisition *q);
 SKYLESS_EXPORT void skyless_begin_again(Course *c, State *s, Acquisition *q);
 SKYLESS_EXPORT int32_t skyless_follow(Course *c, State *s, Acquisition *q, FixTime *time, Packet *packet, Relays
         *relays, uint8_t *packed, int32_t packed_bytes);
+SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real
+        host_s);
+SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
+        period_ticks);
 SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest_m, real highest_m, real height_std_m,
         real max_acceleration_mps2, real integrity_risk, real alert_limit_m);
 SKYLESS_EXPORT void skyless_wake(Tag *t, State *s, Acquisition *q, int64_t rx_counter, real slept_s);

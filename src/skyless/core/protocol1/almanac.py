@@ -18,10 +18,9 @@ from skyless.core.air.almanac import (
     SitePage,
 )
 from skyless.core.air.frame import Malformed
-from skyless.core.air.local_almanac import filter_pages_of, georeference_page_of
-from skyless.core.air.page_check import PAGE_BYTES
-from skyless.core.air.page_codec import decode_page, encode_page
-from skyless.core.protocol1.schedule import first_slots, schedule_of
+from skyless.core.air.site_pages import PAGE_BYTES, decode_page, encode_page
+from skyless.core.anchor import filter_pages_of, georeference_page_of
+from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import AccuracySite, Site
 
 _CONFIRMATIONS: Final = 2

@@ -3,6 +3,7 @@
 It needs nothing but beacons: anchors, schedule and noise figures come from the almanac on the air.
 """
 
+import math
 from math import nan
 from typing import Final
 
@@ -10,30 +11,31 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SchedulePage
-from skyless.core.air.first_path import variance_factor_of
-from skyless.core.air.frame import Heard, Malformed
-from skyless.core.air.reception import Reception, phase_of
+from skyless.core.air.frame import Heard, Malformed, Reception, phase_of, variance_factor_of
 from skyless.core.air.site_choice import NO_SITE, note_fix
 from skyless.core.arrays import Array
-from skyless.core.constants import SUBTICKS, TICK_M
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.core.native.library import compiled
 from skyless.core.native.records import packed, unpacked
 from skyless.core.observation import Observation
-from skyless.core.protocol1._master_scale import MasterScale
-from skyless.core.protocol1._master_term import FollowedMaster, master_term_of
 from skyless.core.protocol1.almanac import AlmanacAssembly, AlmanacState
-from skyless.core.protocol1.beacon import Beacon
-from skyless.core.protocol1.codec import decode_cached, packed_relays
-from skyless.core.protocol1.schedule import Schedule, schedule_from_page
+from skyless.core.protocol1.beacon import Beacon, Schedule, decode_cached, packed_relays, schedule_from_page
+from skyless.core.protocol1.clock import FollowedMaster, MasterScale, master_term_of
 from skyless.core.protocol1.snapshots import SnapshotMethod, Snapshots, SnapshotSettings, SnapshotsState
 from skyless.core.tag.admission import ADMITTED, SITE_CHANGED, Admission, admit_sender, admit_stamp
-from skyless.core.tag.beacon_receiver import AdmissionState, BeaconReceiver, HeardSite, MethodOptions
-from skyless.core.tag.factory import as_required, estimator_settings, stamp_variances
 from skyless.core.tag.joint import Estimation, EstimationState
-from skyless.core.ticks import FLIGHT_SLACK_TICKS, may_elapse, nearest, to_seconds
+from skyless.core.tag.receiver import (
+    AdmissionState,
+    BeaconReceiver,
+    HeardSite,
+    MethodOptions,
+    as_required,
+    estimator_settings,
+    stamp_variances,
+)
+from skyless.core.ticks import FLIGHT_SLACK_TICKS, SUBTICKS, TICK_M, may_elapse, nearest, to_seconds
 
 
 class ReceiverState(Struct, frozen=True, tag="protocol-1"):
@@ -329,3 +331,74 @@ def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[Non
 
 _admit_sender: Final = compiled(admit_sender)
 _admit_stamp: Final = compiled(admit_stamp)
+
+
+# Whether the master still lives, from its own beacons and from what others relay of them.
+#
+# Every listener estimates how often each link brings news of the master. A silent master is declared dead once its
+# silence is almost impossible on those links; lost frames alone do not replace a master.
+
+MAX_CHANCE: Final = 1e-10
+"""Chance of a silence, were the master alive, below which it is declared dead."""
+
+MEMORY: Final = 64
+"""Turns of the master over which a link's share is averaged."""
+
+RECENT_TURNS: Final = 8
+"""A link that has brought nothing for this number of turns does not count."""
+
+SEQUENCES: Final = 256
+
+
+class _Link(Struct):
+    """A source of news of the master: itself, or an anchor that receives it."""
+
+    sequence: int
+    """Sequence number of the master's last beacon that it reported."""
+    turns: int = 0
+    share: float = 0.5
+    """Part of the master's turns that it reports before the next one."""
+
+
+class MasterWatch:
+    """Tracks the sequence numbers of one master's beacons; a turn is one beacon that it should send."""
+
+    def __init__(self) -> None:
+        self.news_ticks = 0
+        """Own time of the last news, unwrapped."""
+        self._sequence: int | None = None
+        self._links: dict[int, _Link] = {}
+
+    def begin(self, now_ticks: int) -> None:
+        """Watch another master, which lives at this time."""
+        self.news_ticks, self._sequence = now_ticks, None
+        self._links.clear()
+
+    def update(self, source: int, sequence: int, now_ticks: int) -> None:
+        """Process the sequence number of the master's last beacon, from itself or an anchor that received it."""
+        if self._sequence is None or 0 < (sequence - self._sequence) % SEQUENCES < SEQUENCES // 2:
+            self._sequence, self.news_ticks = sequence, now_ticks
+        link = self._links.get(source)
+        if link is None:
+            self._links[source] = _Link(sequence)
+            return
+        turns = (sequence - link.sequence) % SEQUENCES
+        if not 0 < turns < SEQUENCES // 2:
+            return
+        for turn in range(1, turns + 1):
+            link.turns = min(link.turns + 1, MEMORY)
+            link.share += ((turn == turns) - link.share) / (link.turns + 2)
+        link.sequence = sequence
+
+    def is_dead(self, missed_turns: int) -> bool:
+        """Whether this number of turns without news shows that the master is dead."""
+        return missed_turns * self._surprise() > -math.log(MAX_CHANCE)
+
+    def _surprise(self) -> float:
+        """Negative logarithm of the chance that a turn of a living master brings no news."""
+        least = 1.0 / (MEMORY + 2)
+        return sum(
+            -math.log(max(1.0 - link.share, least))
+            for link in self._links.values()
+            if self._sequence is not None and (self._sequence - link.sequence) % SEQUENCES < RECENT_TURNS
+        )

@@ -12,11 +12,10 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array, Matrix, Vector
-from skyless.core.constants import TICK_M
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.observation import Observation
-from skyless.core.tag.locate import NoSolution, Solution, locate
-from skyless.core.ticks import FLIGHT_SLACK_TICKS, FixTime, fix_time_s, may_elapse
+from skyless.core.tag.position import NoSolution, Solution, locate
+from skyless.core.ticks import FLIGHT_SLACK_TICKS, TICK_M, FixTime, fix_time_s, may_elapse
 
 
 class SnapshotMethod(StrEnum):

@@ -9,15 +9,13 @@ pseudoranges are carried to one time and solved in closed form.
 
 from typing import Annotated, Final
 
-from skyless.core.constants import MAX_DRIFT, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.process import Packet, Relay, Relays, ScaledTime, relay_rx_ticks
 from skyless.core.estimator.settings import Tuning
 from skyless.core.native.arithmetic import floor, sqrt, square
-from skyless.core.native.records import Array, Integers, Matrix, Reals, Record, Ticks, record
-from skyless.core.native.sizes import MAX_ANCHORS, RELAYS_KEPT
+from skyless.core.native.records import MAX_ANCHORS, RELAYS_KEPT, Array, Integers, Matrix, Reals, Record, Ticks, record
 from skyless.core.tag.position import FOUND, MIRROR, RESIDUALS, Found, find_position
-from skyless.core.tag.problem import LARGEST, LocateProblem
-from skyless.core.ticks import NEVER
+from skyless.core.tag.search import LARGEST, LocateProblem
+from skyless.core.ticks import MAX_DRIFT, NEVER, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 
 UNUSABLE, TOO_FEW_ANCHORS, ACQUIRING = range(20, 23)
 """Why there is no start, beside the reasons of ``find_position``; ``FOUND`` if there is one. Numbers may be absurd."""

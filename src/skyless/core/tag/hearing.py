@@ -2,24 +2,291 @@
 
 from typing import Final
 
-from skyless.core.air.beacon_fields import INTACT, read_frame
-from skyless.core.air.first_path import variance_factor
-from skyless.core.air.frame import HEARD_BYTES
-from skyless.core.air.instants import period_ticks
-from skyless.core.air.neighbours import Neighbour, StatedPlace, is_relayed
-from skyless.core.air.site_choice import MIN_ANCHORS, note_fix
-from skyless.core.constants import TICK_S
-from skyless.core.estimator.state import AXES, State, find_anchor
-from skyless.core.native.records import Bytes, Ticks
-from skyless.core.native.sizes import HAS_ORIGIN
-from skyless.core.tag.acquisition import Acquisition
-from skyless.core.tag.admission import ADMITTED, admit_sender, admit_stamp
-from skyless.core.tag.changes import handle_events, process_rare
-from skyless.core.tag.course import FIX
-from skyless.core.tag.following import START_FIX, follow
-from skyless.core.tag.selection import MIN_FITTING, MM_PER_M, add_power, add_relays, fitting_relays, place_m
-from skyless.core.tag.tag import Tag
-from skyless.core.ticks import NEVER
+from skyless.core.air.almanac import period_ticks
+from skyless.core.air.beacon import INTACT, MAX_HEARD, read_frame
+from skyless.core.air.frame import HEARD_BYTES, signed, variance_factor
+from skyless.core.air.neighbours import Neighbour, StatedPlace, find_neighbour, is_confirmed, is_relayed, wake_times
+from skyless.core.air.site_choice import note_fix, restart_choice
+from skyless.core.air.site_pages import (
+    ACCURACY_KIND,
+    HEIGHT_FLAG_AT,
+    HEIGHT_GIVEN,
+    MIN_ANCHORS,
+    NO_ISSUE,
+    NOISE_KIND,
+    OTHER_SETTINGS,
+    PRESENT_TICKS,
+    SITE_KIND,
+    SitePages,
+    note_page,
+)
+from skyless.core.estimator.process import leave, take_relays
+from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.estimator.state import AXES, State, at, find_anchor
+from skyless.core.integrity import horizontal_limit, vertical_limit
+from skyless.core.native.arithmetic import floor, sqrt
+from skyless.core.native.records import HAS_ORIGIN, MAX_ANCHORS_IN_USE, Bytes, Ticks
+from skyless.core.tag.acquisition import Acquisition, forget_all, forget_packets, gather_packet
+from skyless.core.tag.admission import (
+    ADMITTED,
+    MIN_FITTING,
+    MM_PER_M,
+    SITE_CHANGED,
+    Admission,
+    Tag,
+    add_power,
+    add_relays,
+    admit_sender,
+    admit_stamp,
+    fitting_relays,
+    place_m,
+    replaced_by,
+)
+from skyless.core.tag.following import FIX, START_FIX, Course, begin_course, follow
+from skyless.core.tag.joint import fill_ages, read_accuracy
+from skyless.core.ticks import NEVER, TICK_RATE_HZ, TICK_S, from_seconds
+
+# What changes rarely for a tag of protocol 2: its site, the site's pages, its counter, anchors that move or join.
+
+CELL_DROP_S: Final = 1.0
+"""After which silence an anchor leaves the estimator at least, where tags move from cell to cell."""
+
+MOVED_HOLD_TICKS: Final = from_seconds(0.3)
+MOVE_TICKS: Final = from_seconds(10.0)
+"""A survey moves all anchors of a site, some of them seconds after the others, and positions from before and after it
+must not be mixed. So a tag uses either the anchors that have stated another position or those that have not, until none
+has moved for ``MOVE_TICKS``. It switches to the moved ones once they are the majority and none has moved for
+``MOVED_HOLD_TICKS``."""
+
+NO_PAGES, MOVED_ANCHOR, NO_POSITION, UNCONFIRMED_ANCHOR, WEAKER_ANCHOR = range(30, 35)
+"""What becomes of a beacon besides (``following.py``)."""
+JOINS: Final = 0
+
+
+# Its owner
+
+
+def begin_tag(
+    t: Tag,
+    site: int,
+    qa: float,
+    lowest_m: float,
+    highest_m: float,
+    height_std_m: float,
+    max_acceleration_mps2: float,
+    integrity_risk: float,
+    alert_limit_m: float,
+) -> None:
+    """Begin to listen to a site or, with ``NO_SITE``, that with most anchors, and with an empty search.
+
+    The rest is of ``EstimatorSettings``.
+    """
+    t.owner = EstimatorSettings()
+    t.admission = Admission()
+    t.pages = SitePages()
+    t.course = Course()
+    t.owner.qa, t.owner.lowest_m, t.owner.highest_m = qa, lowest_m, highest_m
+    t.owner.height_std_m, t.owner.max_acceleration_mps2 = height_std_m, max_acceleration_mps2
+    t.owner.integrity_risk, t.owner.alert_limit_m = integrity_risk, alert_limit_m
+    t.admission.choice.only_site = site
+    t.course.most_anchors = MAX_ANCHORS_IN_USE
+    t.course.horizontal_k, t.course.vertical_k = horizontal_limit(integrity_risk), vertical_limit(integrity_risk)
+    t.has_settings = t.has_origin = False
+    t.most_relays = MAX_HEARD
+    _forget_moves(t)
+
+
+# Its counter and its site
+
+
+def wake(t: Tag, s: State, q: Acquisition, rx_counter: Ticks, slept_s: float) -> None:
+    """Begin again at the same site and near the same height, after a sleep in which the tag's counter was lost.
+
+    ``rx_counter``: what it reads now.
+    """
+    a, c = t.admission, t.course
+    had_height = not c.is_starting and c.dim == AXES
+    height_m, std_m = 0.0, 0.0
+    if had_height:
+        height_m, std_m = s.x[2], sqrt(s.P[at(2, 2)]) + slept_s * c.settings.start_speed_std_mps
+    wake_times(a.neighbours, a.rx_ticks, rx_counter)
+    restart_choice(a.choice, rx_counter)
+    a.own.has_stamp = a.went_back = False
+    a.time.first_ticks_master += rx_counter - a.time.last_ticks_master - floor(slept_s * TICK_RATE_HZ)
+    a.time.last_ticks_master = a.time.last_rx_ticks_tag = rx_counter
+    _forget_stamps(t, q)
+    if had_height:
+        q.has_bounds = True
+        q.low_m, q.high_m = height_m - c.settings.gate * std_m, height_m + c.settings.gate * std_m
+
+
+def handle_events(t: Tag, q: Acquisition) -> None:
+    """Forget what has become useless with the beacon at hand."""
+    t.events, t.admission.events = t.admission.events, 0
+    if t.events & SITE_CHANGED != 0:
+        t.pages = SitePages()
+        t.has_origin = False
+    if t.events != 0:
+        _forget_stamps(t, q)
+
+
+def _forget_stamps(t: Tag, q: Acquisition) -> None:
+    """The tag's counter has restarted: forget all but what the site has in common."""
+    t.pages.has_first = t.has_settings = False
+    t.course.is_starting = True
+    forget_all(q)
+    _forget_moves(t)
+    if t.pages.issue != NO_ISSUE:
+        begin_here(t, q)
+
+
+# The site's pages
+
+
+def _read_pages(t: Tag) -> None:
+    """Make the settings that the pages in use require."""
+    c, site = t.course, t.pages.used[SITE_KIND].contents
+    c.settings = t.owner
+    read_accuracy(c.settings, t.pages.used[NOISE_KIND].contents, t.pages.used[ACCURACY_KIND].contents)
+    c.superframe_s = t.period_ticks * TICK_S
+    fill_ages(c.settings, c.superframe_s, CELL_DROP_S)
+    c.dim = AXES
+    if site[HEIGHT_FLAG_AT] & HEIGHT_GIVEN != 0:
+        c.settings.height_m, c.dim = signed(site, HEIGHT_FLAG_AT + 1) / MM_PER_M, AXES - 1
+
+
+def begin_here(t: Tag, q: Acquisition) -> None:
+    """Begin with the pages in use."""
+    _read_pages(t)
+    begin_course(t.course, q)
+    t.has_settings = True
+
+
+def _begin_with_pages(t: Tag, q: Acquisition) -> None:
+    """Begin with the pages in use, at a site whose anchors have the present periods."""
+    oldest_ticks: Ticks = 0
+    neighbours = t.admission.neighbours
+    for row in range(neighbours.count):
+        if neighbours.rows[row].frames > 0:
+            oldest_ticks = max(oldest_ticks, neighbours.rows[row].rx_ticks)
+    t.period_ticks = 0
+    for row in range(neighbours.count):
+        n = neighbours.rows[row]
+        if n.frames > 0 and n.rx_ticks >= oldest_ticks - PRESENT_TICKS:
+            t.period_ticks = max(t.period_ticks, period_ticks(n.period_code))
+    if t.course.is_starting:
+        _forget_unconfirmed(t, q)
+    begin_here(t, q)
+
+
+def _forget_unconfirmed(t: Tag, q: Acquisition) -> None:
+    """Forget the packets of anchors that no other confirms."""
+    neighbours = t.admission.neighbours
+    for place in range(q.count - 1, -1, -1):
+        anchor = q.heard[place].newer.packet.place.anchor
+        row = find_neighbour(neighbours, anchor)
+        if row < 0 or not is_confirmed(neighbours.rows[row], t.admission.rx_ticks):
+            forget_packets(q, anchor)
+
+
+# Beacons that are not just the next of an anchor in use
+
+
+def process_rare(t: Tag, s: State, q: Acquisition, frame: Bytes) -> int:
+    """Process the beacon at hand with its page, while anything is new: what becomes of it."""
+    a, c = t.admission, t.course
+    n = a.neighbours.rows[a.neighbours.row]
+    was_starting = c.is_starting
+    if note_page(t.pages, a.neighbours, frame, t.beacon.page_at, a.rx_ticks) == OTHER_SETTINGS:
+        _begin_with_pages(t, q)
+    if t.has_moved:
+        _separate_moved(t, s, q, n)
+    if _is_kept_apart(t, q, n):
+        return MOVED_ANCHOR
+    if not n.has_place:
+        return NO_POSITION
+    if not t.has_settings:  # others may confirm the anchor before the pages are complete
+        take_relays(t.packet, t.relays, t.beacon.relays, t.beacon.relay_bytes)
+        gather_packet(q, t.packet, t.relays)
+        return NO_PAGES
+    outcome = _join(t, s, n)
+    if outcome != JOINS:
+        return outcome
+    outcome = follow(c, s, q, a.time, t.packet, t.relays, t.beacon.relays, t.beacon.relay_bytes)
+    if was_starting and not c.is_starting:  # from now on what anchors in use have received counts, and what those have
+        for row in range(a.neighbours.count):
+            other = a.neighbours.rows[row]
+            other.relayed_ticks = other.own_relays_ticks = NEVER
+            other.is_misfit = other.anchor == c.misfit
+    return outcome
+
+
+def _join(t: Tag, s: State, n: Neighbour) -> int:
+    """Whether an anchor is in use or may be: others have received it, and it is not weaker than those in use."""
+    c = t.course
+    if not c.is_starting and find_anchor(s, n.anchor) >= 0:
+        return JOINS
+    if not is_confirmed(n, t.admission.rx_ticks):
+        return UNCONFIRMED_ANCHOR
+    if c.is_starting or s.count < MAX_ANCHORS_IN_USE:
+        return JOINS
+    replaced = replaced_by(t.admission.neighbours, s, t.origin_mm)
+    if replaced < 0:
+        return WEAKER_ANCHOR
+    leave(s, s.anchors[replaced].identifier)
+    return JOINS
+
+
+# Anchors that have moved
+
+
+def _forget_moves(t: Tag) -> None:
+    """Use all anchors together."""
+    t.is_moving, t.uses_moved, t.moved_ticks = False, False, NEVER
+    for row in range(t.admission.neighbours.count):
+        t.admission.neighbours.rows[row].has_moved = False
+
+
+def _separate_moved(t: Tag, s: State, q: Acquisition, n: Neighbour) -> None:
+    """An anchor states another position: it leaves, and where too few are left that have not, all begin again."""
+    if t.uses_moved and n.has_moved:  # those in use move a second time
+        _forget_moves(t)
+    n.has_moved, t.is_moving = True, True
+    t.moved_ticks = max(t.moved_ticks, t.admission.rx_ticks)
+    if t.course.is_starting:
+        forget_packets(q, n.anchor)
+    else:
+        leave(s, n.anchor)
+        if s.count < MIN_ANCHORS:
+            _begin_with_pages(t, q)
+
+
+def _is_kept_apart(t: Tag, q: Acquisition, n: Neighbour) -> bool:
+    """Whether an anchor states its position before a move while the anchors in use have moved, or the reverse."""
+    if not t.is_moving:
+        return False
+    calm_ticks = t.admission.rx_ticks - t.moved_ticks
+    if calm_ticks >= MOVE_TICKS:
+        _forget_moves(t)
+        return False
+    if not t.uses_moved and n.has_moved and calm_ticks >= MOVED_HOLD_TICKS and _have_most_moved(t):
+        t.uses_moved = True
+        forget_all(q)
+        if t.has_settings:
+            _begin_with_pages(t, q)
+    return n.has_moved != t.uses_moved
+
+
+def _have_most_moved(t: Tag) -> bool:
+    """Whether most of the anchors that are there, with a position, have moved."""
+    present, moved = 0, 0
+    for row in range(t.admission.neighbours.count):
+        n = t.admission.neighbours.rows[row]
+        if n.has_place and n.was_relayed and n.rx_ticks > t.admission.rx_ticks - PRESENT_TICKS:
+            present += 1
+            moved += 1 if n.has_moved else 0
+    return 2 * moved > present
+
 
 MALFORMED: Final = 40
 """The bytes are no beacon; the fault's number is added."""

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from skyless.core.alarm_rule import AlarmRule
+from skyless.core.site import AlarmRule
 from skyless.page.condition.monitor import Condition
 from skyless.page.event_list import SiteEvent
 from skyless.run.mqtt.messages import AlarmRulesMessage, Asset, FixMessage, SiteMessage, Vector, Zone

@@ -5,9 +5,8 @@ import time
 from collections import Counter
 from typing import Final, Protocol
 
-from skyless.core.air.reception import Reception, Transmission
-from skyless.core.constants import TICK_S
-from skyless.core.ticks import difference, from_seconds, wrap
+from skyless.core.air.frame import Reception, Transmission
+from skyless.core.ticks import TICK_S, difference, from_seconds, wrap
 from skyless.radio.dw1000 import driver as dw1000
 from skyless.radio.dw1000.driver import DW1000, Bus, ChipError
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore

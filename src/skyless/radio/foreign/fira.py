@@ -7,11 +7,10 @@ from io import BufferedIOBase
 from typing import Final, Literal
 
 from skyless.core.air.masterless_packets import Packet, Point
-from skyless.core.constants import TICK_BITS
 from skyless.core.earth import east_north_up_of
 from skyless.core.input_files import Drops, chunks, lines
 from skyless.core.site import GeoreferenceSite
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import TICK_BITS, difference, wrap
 from skyless.radio.uci.dl_tdoa import DtMessage, DtRounds, host_time_s
 from skyless.radio.uci.uci import (
     CONTROL_HEADER_BYTES,

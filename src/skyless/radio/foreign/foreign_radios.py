@@ -9,9 +9,8 @@ from typing import Final, Generic, TypeVar
 import msgspec
 from msgspec import structs
 
-from skyless.core.air.frame import MAX_FRAME_BYTES
+from skyless.core.air.frame import MAX_FRAME_BYTES, Diagnostics, Reception, Transmission
 from skyless.core.air.masterless_packets import Packet, Point
-from skyless.core.air.reception import Diagnostics, Reception, Transmission
 from skyless.core.input_files import Drops, LineCutter
 from skyless.core.ticks import wrap
 from skyless.radio.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text

@@ -11,7 +11,7 @@ from typing import Final
 from msgspec import Struct
 from msgspec.structs import astuple
 
-from skyless.core.constants import DEFAULT_ANTENNA_DELAY_TICKS
+from skyless.core.ticks import DEFAULT_ANTENNA_DELAY_TICKS
 
 VERSION: Final = 1
 MODES: Final = ("radio", "tag")

@@ -12,7 +12,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.core.air.reception import Diagnostics
+from skyless.core.air.frame import Diagnostics
 from skyless.radio.serial.board_settings import BoardSettings, pack, unpack
 from skyless.radio.tag_reports import BODY_AT, TagReport, anchor_place, board_fix, board_status, georeference
 

@@ -10,9 +10,8 @@ from typing import Final, Protocol
 
 import serialx
 
-from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.errors import SkylessError
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
 
 _REOPEN_S: Final = 0.2
 

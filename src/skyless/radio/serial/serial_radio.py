@@ -9,7 +9,7 @@ from typing import Any, Final
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.air.reception import Reception, Transmission
+from skyless.core.air.frame import Reception, Transmission
 from skyless.core.ticks import wrap
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
 from skyless.radio.serial import link

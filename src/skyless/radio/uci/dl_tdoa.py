@@ -16,8 +16,7 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
-from skyless.core.constants import TICK_M, TICK_S
-from skyless.core.ticks import TICK_MASK, wrap
+from skyless.core.ticks import TICK_M, TICK_MASK, TICK_S, wrap
 from skyless.radio.uci.uci import (
     DtMessageType,
 )

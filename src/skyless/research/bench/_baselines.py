@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from skyless.core.arrays import Integers, Matrix, Vector
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.core.estimator.settings import MAX_CLOCK_RATE, TUNING, EstimatorSettings
-from skyless.core.tag.site_settings import RELAY_AGE_S
+from skyless.core.tag.joint import RELAY_AGE_S
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.site.kernels.compiled import threaded_kernel
 
 

@@ -6,9 +6,9 @@ from typing import Any, Final
 import numpy as np
 
 from skyless.core.arrays import Array, Integers
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.bench._baselines import FilterpyJoint, PlainJoint, joint_filter
 from skyless.research.studies.episodes import Case, draw_episode, settings_of
 

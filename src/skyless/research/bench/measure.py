@@ -14,13 +14,13 @@ import numpy as np
 from msgspec import Struct
 from scipy.optimize import least_squares
 
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
 from skyless.core.arrays import Array
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.extras import how_to_install
 from skyless.core.processors import cores
-from skyless.core.protocol1.codec import decode_cached
-from skyless.core.tag.locate import PseudorangeSolution, locate_pseudoranges
+from skyless.core.protocol1.beacon import decode_cached
+from skyless.core.tag.position import PseudorangeSolution, locate_pseudoranges
 from skyless.core.tag.receiver import Receiver
 from skyless.research.bench._runs import BENCH_ANCHORS_M, BENCH_NODES, JointRuns, Run
 from skyless.sim.evaluation.fleet import world_of

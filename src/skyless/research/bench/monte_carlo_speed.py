@@ -8,8 +8,8 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array
-from skyless.core.constants import TICK_S
 from skyless.core.processors import cores
+from skyless.core.ticks import TICK_S
 from skyless.research.paper.monte_carlo import draw_moments, ideal_values, noise_size, run_chain
 from skyless.research.uncertainty.chain import Chain, Reference
 

@@ -11,13 +11,12 @@ from typing import Final, cast
 from msgspec import Struct
 from msgspec.structs import replace
 
+from skyless.core.air.frame import Reception
 from skyless.core.air.masterless_packets import Packet
-from skyless.core.air.reception import Reception
-from skyless.core.constants import TICK_BITS
 from skyless.core.errors import ConfigurationError
 from skyless.core.input_files import Drops, open_source
 from skyless.core.site import Site
-from skyless.core.ticks import Unwrapper, to_seconds
+from skyless.core.ticks import TICK_BITS, Unwrapper, to_seconds
 from skyless.research.foreign import avalue
 from skyless.research.foreign.formats import FORMATS, format_of, open_recording
 from skyless.research.replays.site import SITE_FORMAT, recorded_site

@@ -7,8 +7,8 @@ from typing import Final, cast
 import numpy as np
 from msgspec.structs import replace
 
+from skyless.core.air.frame import Reception
 from skyless.core.air.masterless_packets import Point
-from skyless.core.air.reception import Reception
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import Site
 from skyless.research.calibration.options import First, Stay, SurveyOptions

@@ -15,8 +15,8 @@ from typing import Final
 import yaml
 
 from skyless.core.air.masterless_packets import Packet
-from skyless.core.constants import TICK_BITS
 from skyless.core.input_files import Drops, chunks
+from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign.bitcraze import decode_payload
 
 MAX_DOCUMENT_BYTES: Final = 1 << 13

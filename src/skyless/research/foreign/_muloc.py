@@ -24,9 +24,8 @@ from numpy.typing import NDArray
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
 from skyless.core.arrays import Array
-from skyless.core.constants import TICK_BITS, TICK_RATE_HZ
 from skyless.core.input_files import Drops, open_source
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import TICK_BITS, TICK_RATE_HZ, difference, wrap
 from skyless.site.tables import Truth
 
 CHANNELS: Final = (1, 3)

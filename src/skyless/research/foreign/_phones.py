@@ -25,9 +25,8 @@ import msgspec
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import Packet, Point
-from skyless.core.constants import TICK_BITS, TICK_RATE_HZ
 from skyless.core.input_files import Drops, lines
-from skyless.core.ticks import wrap
+from skyless.core.ticks import TICK_BITS, TICK_RATE_HZ, wrap
 from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.uci.dl_tdoa import DtMessage, DtRounds, host_time_s
 from skyless.radio.uci.uci import (

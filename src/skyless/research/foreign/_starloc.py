@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from skyless.core.air.masterless_packets import PairTdoa, Point
-from skyless.core.constants import TICK_M, TICK_S
 from skyless.core.input_files import Drops, rows
-from skyless.core.ticks import difference, wrap
+from skyless.core.ticks import TICK_M, TICK_S, difference, wrap
 from skyless.research.foreign._tdoa_tables import numbers, rows_of
 from skyless.site.tables import Truth
 

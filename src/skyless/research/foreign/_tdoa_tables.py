@@ -12,9 +12,8 @@ import numpy as np
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.arrays import Array
-from skyless.core.constants import TICK_M
 from skyless.core.input_files import Drops, has_columns, open_source, rows
-from skyless.core.ticks import difference
+from skyless.core.ticks import TICK_M, difference
 from skyless.research.foreign._crazyflie import heights_of, in_order
 from skyless.site.tables import Truth
 

@@ -14,8 +14,8 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import Packet, Relay
-from skyless.core.constants import TICK_BITS, TICK_M
 from skyless.core.input_files import Drops, open_source, rows
+from skyless.core.ticks import TICK_BITS, TICK_M
 from skyless.site.survey.two_way import TwoWayRanging
 
 RECEPTION_COLUMNS: Final = ("t_host", "order", "slave", "master", "status", "tx_ticks_u40", "rx_ticks_u40")

@@ -12,10 +12,10 @@ from typing import Final
 from msgspec import Struct, structs
 
 from skyless.core.air.masterless_packets import Packet, Point
-from skyless.core.constants import TICK_BITS
-from skyless.core.dop import GUESSED_STD_M, plane_height_m
 from skyless.core.errors import ConfigurationError
+from skyless.core.geometry import GUESSED_STD_M, plane_height_m
 from skyless.core.site import AnchorSite, GeoreferenceSite, Site, TagsSite
+from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign.bitcraze import STAMP_BITS
 from skyless.radio.foreign.foreign_radios import SnifferRadio, UciRadio
 from skyless.radio.interface import Gone, Restarted

@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.arrays import Array
-from skyless.core.constants import TICK_RATE_HZ
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.process import ACCEPTED
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import at
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.native.sizes import MAX_ANCHORS
-from skyless.core.tag.locate import NoSolution, locate
+from skyless.core.native.records import MAX_ANCHORS
+from skyless.core.tag.position import NoSolution, locate
+from skyless.core.ticks import TICK_RATE_HZ
 from skyless.site.survey.anchor_errors import KNOWN_STD_M, DifferenceCalibration
 
 DIFFERENCES: Final = EstimatorSettings(

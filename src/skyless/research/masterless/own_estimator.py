@@ -7,14 +7,13 @@ from typing import Protocol
 
 from msgspec import structs
 
-from skyless.core.air.frame import SHORT_BITS, Malformed
+from skyless.core.air.frame import SHORT_BITS, Malformed, Reception
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point, Relay
-from skyless.core.air.reception import Reception
-from skyless.core.constants import TICK_BITS
+from skyless.core.any_receiver import SiteBeacon, decode_any
 from skyless.core.errors import SkylessError
 from skyless.core.fix import Fix, NoFixReason
-from skyless.core.protocols import SiteBeacon, decode_any
 from skyless.core.site import Site
+from skyless.core.ticks import TICK_BITS
 from skyless.research.masterless.pair_engine import PairEngine
 
 

@@ -12,12 +12,22 @@ from typing import Final
 import numpy as np
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.observation import Observation
 from skyless.core.tag.joint import Estimation
-from skyless.core.ticks import LAST_TICKS, FixTime, Unwrapper, continued, fix_time_s, nearest
+from skyless.core.ticks import (
+    LAST_TICKS,
+    SPEED_OF_LIGHT_MPS,
+    TICK_M,
+    TICK_RATE_HZ,
+    TICK_S,
+    FixTime,
+    Unwrapper,
+    continued,
+    fix_time_s,
+    nearest,
+)
 from skyless.research.masterless.difference_tracking import DIFFERENCES, is_within, neighbourhood_m
 from skyless.research.masterless.pair_engine import MAX_ANCHORS, remember
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays

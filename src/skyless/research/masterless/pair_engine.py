@@ -17,8 +17,7 @@ from typing import Final
 
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point, Relay
 from skyless.core.clock_filter import MAX_RELATIVE_RATE, TwoState, predict, update
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.core.ticks import Unwrapper, difference, nearest
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S, Unwrapper, difference, nearest
 from skyless.site.survey.anchor_errors import AnchorFlights, distance_ticks
 
 PAIR_RELAY_MAX_AGE_S: Final = 0.25

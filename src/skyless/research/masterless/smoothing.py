@@ -18,13 +18,13 @@ from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.arrays import Indices, Matrix, Vector
-from skyless.core.constants import TICK_S
 from skyless.core.estimator.compiled import find_anchor
 from skyless.core.estimator.kalman import is_stationary, range_error_decay
 from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import covariances
 from skyless.core.fix import POSITION, VELOCITY, Fix
-from skyless.core.native.views import view
+from skyless.core.native.records import view
+from skyless.core.ticks import TICK_S
 from skyless.research.masterless.difference_tracking import DifferenceTracking
 
 CHUNK: Final = 2_000

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from msgspec import Struct
 
 from skyless.core.arrays import Array
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.research.paper.monte_carlo import ChainMoments, Quantity, draw_moments
 from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, grouped
 from skyless.research.studies.common.plan import Cell

@@ -5,9 +5,9 @@ from typing import Final
 import numpy as np
 
 from skyless.core.arrays import Array
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
-from skyless.core.dop import dops_at
+from skyless.core.geometry import dops_at
 from skyless.core.protocol1.snapshots import literal_covariance
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.paper.plan import P1, P2, RADIO_PS, Panel, Plan, Results, Section, Verdict
 from skyless.research.studies.common.plan import Cell
 from skyless.sim.lab import paper_lab_site

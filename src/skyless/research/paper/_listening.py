@@ -9,8 +9,8 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
+from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.receiver import Receiver
-from skyless.core.protocol1.schedule import schedule_of
 from skyless.core.site import Site
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.statistics import FirstFixes

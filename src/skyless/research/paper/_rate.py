@@ -7,8 +7,8 @@ import numpy as np
 from msgspec import Struct, to_builtins
 from msgspec.structs import replace
 
+from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.receiver import Receiver
-from skyless.core.protocol1.schedule import schedule_of
 from skyless.core.site import AnchorSite, ScheduleSite, Site
 from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict
 from skyless.research.studies.common.plan import Cell

@@ -11,7 +11,7 @@ from matplotlib.ticker import FuncFormatter
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
 from skyless.core.arrays import Array, Integers
 from skyless.core.protocol1.receiver import Receiver
 from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Section, Verdict, grouped

@@ -9,7 +9,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.arrays import Array
-from skyless.core.constants import TICK_M
+from skyless.core.ticks import TICK_M
 from skyless.research.paper._listening import Track, listen
 from skyless.research.paper.plan import (
     CLAIM_M,

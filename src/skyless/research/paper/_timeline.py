@@ -9,10 +9,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from msgspec import Struct
 
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
 from skyless.core.protocol1.anchor import Anchor
+from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.receiver import Receiver
-from skyless.core.protocol1.schedule import schedule_of
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict
 from skyless.research.studies.common.plan import Cell
 from skyless.sim.impairments import Outage, lab_impairments

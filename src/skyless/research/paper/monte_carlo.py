@@ -19,7 +19,6 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array
-from skyless.core.constants import TICK_M, TICK_S
 from skyless.core.processors import cores
 from skyless.core.protocol1.snapshots import (
     averaged_offset,
@@ -29,6 +28,7 @@ from skyless.core.protocol1.snapshots import (
     tag_rate,
     to_master,
 )
+from skyless.core.ticks import TICK_M, TICK_S
 from skyless.research.uncertainty.chain import Chain, Reference
 
 CHUNK_DRAWS: Final = 1 << 14

@@ -13,10 +13,10 @@ from msgspec import field, structs
 
 from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.arguments import process_noise
-from skyless.core.constants import CARRIER_CYCLES
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
+from skyless.core.ticks import CARRIER_CYCLES
 from skyless.research.foreign.avalue import anchor_distances_m
 from skyless.research.foreign.formats import Format, Recording, format_of, open_recording
 from skyless.research.masterless.difference_tracking import DIFFERENCES, DifferenceTracking

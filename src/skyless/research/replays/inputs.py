@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 
 from skyless.core.air.masterless_packets import Point
 from skyless.core.arguments import check_point, existing_file, wrong
-from skyless.core.dop import GUESSED_STD_M, plane_height_m
 from skyless.core.errors import ConfigurationError, SkylessError
+from skyless.core.geometry import GUESSED_STD_M, plane_height_m
 from skyless.core.site import Site
 from skyless.research.foreign.formats import format_of
 from skyless.research.masterless.smoothing import Height

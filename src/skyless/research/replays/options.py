@@ -5,7 +5,7 @@ from pathlib import Path
 from runpy import run_path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.arguments import (
     ComputedOptions,
     Method,

@@ -10,21 +10,18 @@ import msgspec
 import numpy as np
 from msgspec import Struct, structs
 
-from skyless.core.air import codec
-from skyless.core.air.beacon import Beacon
-from skyless.core.air.frame import Heard, Malformed
+from skyless.core.air.beacon import Beacon, encode
+from skyless.core.air.frame import Diagnostics, Heard, Malformed, Reception
 from skyless.core.air.masterless_packets import Packet
-from skyless.core.air.reception import Diagnostics, Reception
-from skyless.core.any_receiver import AnyReceiver
+from skyless.core.any_receiver import AnyReceiver, decode_any
 from skyless.core.errors import ConfigurationError
 from skyless.core.fix import Fix
 from skyless.core.input_files import Drops
 from skyless.core.integrity import RISK, IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD, METHODS
-from skyless.core.protocol1 import codec as protocol1_codec
-from skyless.core.protocols import decode_any
+from skyless.core.protocol1 import beacon as protocol1_codec
 from skyless.core.site import Site
-from skyless.core.tag.beacon_receiver import NOT_DROPS
+from skyless.core.tag.receiver import NOT_DROPS
 from skyless.core.ticks import WRAP_TICKS, wrap
 from skyless.research.replays.captures import ReplayReport, common_figures
 from skyless.run.mqtt.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart, fix_message
@@ -133,7 +130,7 @@ def with_delays(reception: Reception, changes: dict[int, DelayChange]) -> Recept
     heard = tuple(_relay(one, own) for one in beacon.heard)
     tx_ticks = wrap(beacon.tx_ticks + own.tx_ticks)
     if isinstance(beacon, Beacon):
-        frame = codec.encode(structs.replace(beacon, tx_ticks=tx_ticks, heard=heard))
+        frame = encode(structs.replace(beacon, tx_ticks=tx_ticks, heard=heard))
         return structs.replace(reception, frame=frame)
     master = changes.get(beacon.master, _UNCHANGED)
     later = master.tx_ticks if beacon.anchor == beacon.master else own.tx_ticks + own.rx_ticks + master.tx_ticks

@@ -11,9 +11,9 @@ from msgspec import Struct
 from numpy.random import Generator
 
 from skyless.core.arrays import Array, Integers
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.core.estimator.estimator import Packets
 from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 
 EPISODE_SUPERFRAMES: Final = 134
 """Two seconds, after which nothing of what was known before the first frame is left."""

@@ -16,11 +16,11 @@ from numpy.random import Generator, SeedSequence, default_rng
 from numpy.typing import NDArray
 
 from skyless.core.arrays import Array
-from skyless.core.constants import TICK_M
 from skyless.core.errors import SkylessError
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.process import ACCEPTED, JOINED
 from skyless.core.integrity import CONTRADICTED, HPL, VPL
+from skyless.core.ticks import TICK_M
 from skyless.research.studies.common.plan import Cell, Plan, Row
 from skyless.research.studies.common.summary import clustered_interval
 from skyless.research.studies.episodes import (

@@ -15,7 +15,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.beacon import Beacon
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
 from skyless.core.site import EXACT, AccuracySite, Site

@@ -17,8 +17,7 @@ from typing import Any, Final
 import numpy as np
 from msgspec.structs import asdict, replace
 
-from skyless.core.air.beacon import Beacon
-from skyless.core.air.codec import decode_cached
+from skyless.core.air.beacon import Beacon, decode_cached
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import AnchorSite, Site, TagsSite, WallSite

@@ -2,9 +2,8 @@
 
 from collections.abc import Callable
 
-from skyless.core.air.frame import Malformed
-from skyless.core.air.reception import Reception, Transmission
-from skyless.core.protocols import AnchorMachine, decode_any, new_anchor
+from skyless.core.air.frame import Malformed, Reception, Transmission
+from skyless.core.any_receiver import AnchorMachine, decode_any, new_anchor
 from skyless.core.site import Site
 from skyless.sim.impairments import Impairments
 from skyless.sim.world import World

@@ -7,8 +7,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.arrays import Array
-from skyless.core.constants import TICK_M
 from skyless.core.site import EXACT, AnchorSite, ScheduleSite, Site
+from skyless.core.ticks import TICK_M
 from skyless.research.surveys._anchor_stamps import stamps_of
 from skyless.research.surveys.layouts import SLOT_S, SurveyLayout
 from skyless.sim.impairments import DelayError, PairError, lab_impairments

@@ -7,7 +7,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array, Integers, Mask
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.surveys.layouts import SurveyLayout
 from skyless.site.survey.facts import PairBlock
 from skyless.site.survey.watch.explain import Finding, Kind, Pairs, is_significant, weight_of

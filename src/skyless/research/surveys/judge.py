@@ -8,7 +8,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.arrays import Array
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_M
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.research.surveys.air import DrawnErrors, free_axes
 from skyless.research.surveys.layouts import SLOT_S, SurveyLayout
 from skyless.site.survey.facts import Facts, PairRanges

@@ -14,9 +14,9 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.arrays import Array
-from skyless.core.constants import TICK_M
 from skyless.core.geometry import anchor_positions
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site, TagsSite
+from skyless.core.ticks import TICK_M
 from skyless.research.surveys._anchor_stamps import stamps_of
 from skyless.research.surveys.air import free_axes
 from skyless.research.surveys.judge import aligned

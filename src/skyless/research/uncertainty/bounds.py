@@ -17,10 +17,10 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from skyless.core.arrays import Array, Integers, Mask
-from skyless.core.constants import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.core.estimator.compiled import add_anchor, process_known
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import State, covariances, new_state
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S
 
 # What is known before the first frame, almost nothing: 30 m, 33 µs, ±10 ppm.
 POSITION_STD_M: Final = 30.0

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from skyless.core.arrays import Array, Matrix
-from skyless.core.constants import SPEED_OF_LIGHT_MPS
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 
 
 @dataclass(frozen=True, slots=True)

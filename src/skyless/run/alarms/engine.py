@@ -22,8 +22,8 @@ from typing import Final, Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.alarm_rule import AlarmRule, RuleKind
-from skyless.core.alert import Alert
+from skyless.core.integrity import Alert
+from skyless.core.site import AlarmRule, RuleKind
 from skyless.run.alarms.near import near_tags
 from skyless.run.mqtt.messages import AlarmMessage, Asset, FixMessage, TagHealth, WatchMessage, Zone, ZoneEvent
 from skyless.run.zones.monitor import TAG_TIMEOUT_S, ZoneMonitor

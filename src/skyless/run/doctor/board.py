@@ -3,11 +3,10 @@
 import time
 from collections import Counter
 
-from skyless.core.air.frame import Malformed
-from skyless.core.air.reception import Reception
-from skyless.core.protocols import decode_any
+from skyless.core.air.frame import Malformed, Reception
+from skyless.core.any_receiver import decode_any
 from skyless.core.site import NoiseSite
-from skyless.core.tag.beacon_receiver import TagReceiver
+from skyless.core.tag.receiver import TagReceiver
 from skyless.radio.interface import Gone, Hint, RadioEvent
 from skyless.radio.serial.link import Hello
 from skyless.radio.serial.serial_radio import SerialRadio

@@ -3,9 +3,8 @@
 import math
 from typing import Final
 
-from skyless.core.constants import TICK_S
 from skyless.core.site import NoiseSite
-from skyless.core.ticks import continued
+from skyless.core.ticks import TICK_S, continued
 from skyless.run.doctor.check import Check
 
 _TIMES_S: Final = (0.5, 4.0)

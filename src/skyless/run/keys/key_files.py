@@ -21,14 +21,14 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.errors import ConfigurationError, SkylessError
-from skyless.core.keys.chain import Chain
-from skyless.core.keys.key_chain import (
+from skyless.core.keys.chain import (
     CERTIFICATE_SIGNATURE_BYTES,
     MIN_LAG,
     PUBLIC_KEY_BYTES,
     SECTION_BITS,
     SEED_BYTES,
     Certificate,
+    Chain,
     ChainTiming,
     SectionName,
     is_signed,

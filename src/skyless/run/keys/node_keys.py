@@ -11,11 +11,11 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
-from skyless.core.air.beacon_fields import CERTIFICATE_BYTES
-from skyless.core.anchor.authentication import BeaconAuthentication
+from skyless.core.air.beacon import CERTIFICATE_BYTES
+from skyless.core.anchor import BeaconAuthentication
 from skyless.core.errors import SkylessError
 from skyless.core.keys.chain import Chain, ChainRing
-from skyless.core.keys.fault import Fault
+from skyless.core.keys.verifier import Fault
 from skyless.core.trusted_receiver import SiteTrust, TrustedReceiver
 from skyless.core.whole_files import write_whole
 from skyless.run.keys.key_files import MAX_SERIAL, SEEDS_VARIABLE, SiteKeys, parse_seeds, read_keys

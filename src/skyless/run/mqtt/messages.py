@@ -11,8 +11,7 @@ import msgspec
 from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
-from skyless.core.alarm_rule import AlarmRule, RuleKind, Severity
-from skyless.core.site import FloorPlanSite, FloorSite, Outline, Site
+from skyless.core.site import AlarmRule, FloorPlanSite, FloorSite, Outline, RuleKind, Severity, Site
 from skyless.site.survey.facts import Facts
 from skyless.site.survey.result import Survey
 
@@ -103,7 +102,7 @@ class FixMessage(Struct, frozen=True):
     integrity_risk: float | None = None
     """Probability, for each fix, that the error exceeds its level."""
     alert: str | None = None
-    """A value of ``skyless.core.alert.Alert``."""
+    """A value of ``skyless.core.integrity.Alert``."""
     verified_until_s: float | None = None
     """Up to this time, on the scale of ``time_s``, all beacons that count are verified; None where none is."""
     unverified: float = 1.0
@@ -170,7 +169,7 @@ class TagHealth(Struct, frozen=True):
     """Whether beacons have been verified within the last seconds."""
     faults: dict[str, str] = {}
     """Anchors whose beacons, or beacons in whose name, were not accepted within the last seconds, and why
-    (``skyless.core.keys.fault.Fault``)."""
+    (``skyless.core.keys.verifier.Fault``)."""
     clock_error_s: float | None = None
     """How far the host's clock is ahead of the site's where that is more than the bound; None where all is well."""
     multipath_std_m: float | None = None
@@ -225,7 +224,7 @@ class AnchorHealth(Struct, frozen=True):
     chain_ends_unix_s: float | None = None
     """When the last of its key chains ends."""
     code_fault: str | None = None
-    """Why an anchor with keys sends without codes (``skyless.core.keys.fault.Fault``); None where it has them."""
+    """Why an anchor with keys sends without codes (``skyless.core.keys.verifier.Fault``); None where it has them."""
     faults: dict[str, str] = {}
     """Other anchors whose beacons, or beacons in whose name, were not accepted within the last seconds, and why."""
 

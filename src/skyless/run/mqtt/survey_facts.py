@@ -5,7 +5,7 @@ from typing import Final
 
 import msgspec
 
-from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.run.mqtt.messages import SurveyFactsMessage
 from skyless.site.file.check import Limits
 from skyless.site.survey.facts import Facts

@@ -9,9 +9,8 @@ and receives what had waited. Which of the two it is shows within a second; unti
 import math
 from typing import Final, Generic, TypeVar
 
-from skyless.core.air.reception import Reception
-from skyless.core.constants import TICK_S
-from skyless.core.ticks import Unwrapper
+from skyless.core.air.frame import Reception
+from skyless.core.ticks import TICK_S, Unwrapper
 
 _HOST_DRIFT: Final = 1e-4
 """By how much a host's clock and a tag's may differ in rate."""

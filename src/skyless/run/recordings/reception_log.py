@@ -13,12 +13,11 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.air.reception import Diagnostics, Reception
+from skyless.core.air.frame import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver, AnyReceiverState
 from skyless.core.arrays import Array
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.tag.beacon_receiver import TagReceiver
-from skyless.core.tag.factory import ReceiverState
+from skyless.core.tag.receiver import ReceiverState, TagReceiver
 from skyless.run.mqtt.messages import Leases, RawReception, ReceptionsMessage, RequestMessage, SegmentStart
 
 _FORMAT: Final = 21

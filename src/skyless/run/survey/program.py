@@ -10,7 +10,7 @@ from typing import Final
 from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site, is_same_but_placed, site_digest
 from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted

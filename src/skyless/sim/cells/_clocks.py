@@ -12,8 +12,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from skyless.core.arrays import Array, Integers
-from skyless.core.constants import TICK_RATE_HZ
-from skyless.core.ticks import WRAP_TICKS
+from skyless.core.ticks import TICK_RATE_HZ, WRAP_TICKS
 from skyless.sim.cells._keyed import CRYSTAL, START, key_of, mixed, normal_pair, purpose_key, uniform
 from skyless.sim.oscillator import OscillatorModel
 from skyless.site.kernels.compiled import kernel

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from skyless.core.constants import TICK_S
+from skyless.core.ticks import TICK_S
 from skyless.sim.cells._clocks import KNOT_BITS, KNOT_TICKS
 from skyless.sim.cells._receptions import PIECE, Path
 from skyless.sim.trajectory import Piece, Trajectory

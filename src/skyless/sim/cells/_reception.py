@@ -12,10 +12,9 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from skyless.core.air.ieee802154 import preamble_s
+from skyless.core.air.frame import preamble_s
 from skyless.core.arrays import Array, Integers
-from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.core.ticks import TICK_MASK, from_seconds
+from skyless.core.ticks import TICK_M, TICK_MASK, TICK_RATE_HZ, TICK_S, from_seconds
 from skyless.sim.cells._clocks import Knots, own_time
 from skyless.sim.cells._keyed import CHANCE, LOSS, RX_NOISE, TX_NOISE, key_of, mixed, normal, purpose_key, uniform
 from skyless.sim.listening import OUTCOMES, Outcome

@@ -10,8 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from skyless.core.arrays import Array, Integers, Records
-from skyless.core.constants import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.core.ticks import TICK_MASK
+from skyless.core.ticks import TICK_M, TICK_MASK, TICK_RATE_HZ, TICK_S
 from skyless.sim.cells._clocks import KNOT_TICKS, Knots, true_time
 from skyless.sim.cells._grid import Grid, Neighbours, cells_within
 from skyless.sim.cells._keyed import key_of, normal, uniform
@@ -33,7 +32,7 @@ from skyless.sim.stations import coordinate_m
 from skyless.site.kernels.compiled import kernel, step
 
 RELAY_AGE_TICKS: Final = round(1.0 * TICK_RATE_HZ)
-"""Older receptions are not relayed, as in ``skyless.core.anchor.anchor``."""
+"""Older receptions are not relayed, as in ``skyless.core.anchor``."""
 
 LOOK_BACK_TICKS: Final = RELAY_AGE_TICKS + RELAY_AGE_TICKS // 1000
 """So far back that all clocks agree that it is older."""

@@ -1,15 +1,15 @@
 """Who sends when: the frames of all anchors in a span of true time, and the same frames by time and cell.
 
-Anchors send at the instants of ``skyless.core.air.instants``, each with a mean period that stays the same.
+Anchors send at the instants of ``skyless.core.air.almanac``, each with a mean period that stays the same.
 """
 
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from skyless.core.air.instants import gap_ticks, mixed, period_ticks, ticks_ahead
+from skyless.core.air.almanac import gap_ticks, mixed, period_ticks, ticks_ahead
 from skyless.core.arrays import Array, Integers
-from skyless.core.constants import DELAYED_TX_GRANULARITY_TICKS
+from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS
 from skyless.sim.cells._clocks import Knots, own_time, true_time
 from skyless.sim.cells._grid import Grid
 from skyless.sim.cells._reception import Frames, Rules, emission
@@ -133,7 +133,7 @@ class Senders(NamedTuple):
     keys: Integers
     ids: Integers
     period_codes: Integers
-    """Codes of the mean periods (``skyless.core.air.instants``)."""
+    """Codes of the mean periods (``skyless.core.air.almanac``)."""
     tx_delays_ticks: Integers
     start_ticks: Integers
     """Own counters at time 0."""

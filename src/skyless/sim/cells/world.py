@@ -13,12 +13,11 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.air.ieee802154 import after_rmarker_s
-from skyless.core.air.instants import period_ticks
+from skyless.core.air.almanac import period_ticks
+from skyless.core.air.frame import after_rmarker_s
 from skyless.core.arrays import Array, Integers
-from skyless.core.constants import TICK_S
 from skyless.core.site import Site
-from skyless.core.ticks import TICK_MASK, from_seconds
+from skyless.core.ticks import TICK_MASK, TICK_S, from_seconds
 from skyless.sim.cells._clocks import KNOT_TICKS, CellClocks
 from skyless.sim.cells._grid import anchors_within, list_neighbours, make_grid
 from skyless.sim.cells._keyed import (
@@ -139,7 +138,7 @@ class CellWorld:
         frame_bytes: int = FRAME_BYTES,
         lead_s: float = 1e-3,
     ) -> None:
-        """``period_codes``: codes of the anchors' mean periods (``skyless.core.air.instants``), shape (n,).
+        """``period_codes``: codes of the anchors' mean periods (``skyless.core.air.almanac``), shape (n,).
 
         ``dead``: which anchors neither send nor receive. ``survey_std_m``: true less configured positions, per axis.
 

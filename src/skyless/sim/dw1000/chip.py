@@ -9,9 +9,8 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.core.air.reception import Diagnostics
-from skyless.core.constants import TICK_S
-from skyless.core.ticks import wrap
+from skyless.core.air.frame import Diagnostics
+from skyless.core.ticks import TICK_S, wrap
 from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000.registers import Access, Memory, decode_header
 from skyless.sim.dw1000.transceiver import Air, Fault, Transceiver

@@ -13,18 +13,17 @@ from typing import Final, Literal, Protocol
 
 from msgspec import Struct
 
-from skyless.core.air.ieee802154 import (
+from skyless.core.air.frame import (
     HEADER_SYMBOL_S,
     PREAMBLE_SYMBOL_S,
     SFD_SYMBOLS,
+    Diagnostics,
     after_rmarker_s,
     fcs,
     is_intact,
     preamble_s,
 )
-from skyless.core.air.reception import Diagnostics
-from skyless.core.constants import CHANNEL_5_HZ, CHIP_RATE_HZ, DELAYED_TX_GRANULARITY_TICKS
-from skyless.core.ticks import difference, from_seconds, wrap
+from skyless.core.ticks import CHANNEL_5_HZ, CHIP_RATE_HZ, DELAYED_TX_GRANULARITY_TICKS, difference, from_seconds, wrap
 from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000.registers import Memory
 

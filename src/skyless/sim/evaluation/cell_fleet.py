@@ -10,13 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from skyless.core.air.almanac import Page
+from skyless.core.air.almanac import Page, period_code, suitable_period_s
 from skyless.core.air.beacon import Beacon
-from skyless.core.air.frame import Malformed, PackedHeard
-from skyless.core.air.instants import period_code, suitable_period_s
-from skyless.core.air.local_almanac import site_issue, site_page_for, site_pages_of, stated_position
-from skyless.core.air.page_codec import decode_page, encode_page
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Malformed, PackedHeard, Reception
+from skyless.core.air.site_pages import decode_page, encode_page
+from skyless.core.anchor import site_issue, site_page_for, site_pages_of, stated_position
 from skyless.core.arrays import Array, Integers
 from skyless.core.geometry import anchors_in_reach
 from skyless.core.site import Site

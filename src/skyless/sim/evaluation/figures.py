@@ -9,9 +9,9 @@ from typing import Any, Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.alert import Alert
 from skyless.core.arrays import Array, Mask, Matrix, Vector
 from skyless.core.fix import Fix
+from skyless.core.integrity import Alert
 from skyless.sim.evaluation.statistics import EvenSample
 from skyless.sim.evaluation.truth import Triple, truth_at
 from skyless.site.tables import Truth

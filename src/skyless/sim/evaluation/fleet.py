@@ -8,15 +8,14 @@ from typing import Final, Protocol
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.air.reception import Reception
-from skyless.core.any_receiver import AnyReceiver
+from skyless.core.air.frame import Reception
+from skyless.core.any_receiver import AnchorMachine, AnyReceiver, SiteBeacon, new_anchor
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
-from skyless.core.protocols import AnchorMachine, SiteBeacon, new_anchor
 from skyless.core.site import Site
-from skyless.core.tag.beacon_receiver import NOT_DROPS
+from skyless.core.tag.receiver import NOT_DROPS
 from skyless.sim.evaluation.statistics import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
 from skyless.sim.impairments import Impairments, Outage
 from skyless.sim.medium import Tally

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from msgspec import Struct
 
-from skyless.core.air.page_codec import MAX_COORDINATE_M
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.arguments import (
     ComputedOptions,
     Method,
@@ -108,7 +108,7 @@ def _read_outage(name: str, text: str) -> "AnchorOutage":
 
 
 def _read_delay_error(name: str, text: str) -> "DelayError":
-    from skyless.core.constants import TICK_S  # noqa: PLC0415
+    from skyless.core.ticks import TICK_S  # noqa: PLC0415
     from skyless.sim.impairments import DelayError  # noqa: PLC0415
 
     anchor, more = _anchor_and_more(name, text, (3,))

@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.alert import Alert
+from skyless.core.any_receiver import superframe_s
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
-from skyless.core.protocols import superframe_s
+from skyless.core.integrity import Alert
 from skyless.core.site import Site
 
 _SAMPLE_ROWS: Final = 1 << 17

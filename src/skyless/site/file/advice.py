@@ -6,7 +6,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from skyless.core.air.instants import OFFERED_HZ, suitable_period_s
+from skyless.core.air.almanac import OFFERED_HZ, suitable_period_s
 from skyless.core.arrays import Array
 from skyless.core.geometry import (
     OUTSIDE_M,

@@ -13,13 +13,12 @@ from typing import Final
 from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
-from skyless.core.air.frame import MAX_FRAME_BYTES
-from skyless.core.air.ieee802154 import air_time_s
-from skyless.core.air.page_codec import MAX_COORDINATE_M
-from skyless.core.constants import TICK_BITS, TICK_S
+from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import ConfigurationError
-from skyless.core.protocol1.schedule import Schedule, first_slots, schedule_of
+from skyless.core.protocol1.beacon import Schedule, first_slots, schedule_of
 from skyless.core.site import AnchorSite, Site, UnplacedAnchor
+from skyless.core.ticks import TICK_BITS, TICK_S
 from skyless.site.alarm_rules import KINDS, BadAlarmRulesError, check_rules
 
 ANY_ADDRESS: Final = 65_533

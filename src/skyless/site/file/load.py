@@ -9,11 +9,11 @@ from typing import Any, Final
 import msgspec
 from msgspec import Struct
 
-from skyless.core.alarm_rule import AlarmRule
 from skyless.core.arguments import existing_file, wrong
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import (
     AccuracySite,
+    AlarmRule,
     AnchorSite,
     FloorPlanSite,
     FloorSite,

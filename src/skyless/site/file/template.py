@@ -6,8 +6,8 @@ from typing import Final
 
 from msgspec import UNSET, structs
 
-from skyless.core.alarm_rule import AlarmRule
 from skyless.core.site import (
+    AlarmRule,
     AnchorSite,
     FloorPlanSite,
     FloorSite,

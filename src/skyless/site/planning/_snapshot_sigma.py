@@ -18,11 +18,11 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array, Mask, Matrix, Vector
 from skyless.core.clock_filter import ClockNoise, clock_noise
-from skyless.core.constants import TICK_S
-from skyless.core.dop import inverses
-from skyless.core.protocol1.schedule import first_slots, schedule_of
+from skyless.core.geometry import inverses
+from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.protocol1.snapshots import SnapshotMethod, bracketed_covariance, literal_covariance
 from skyless.core.site import Site
+from skyless.core.ticks import TICK_S
 from skyless.site.planning.anchor_clocks import row_of_master, stamp_variances
 from skyless.site.planning.links import FIX_SHARE, SIGMA, AnchorLinks, Scene, fill_dops, fill_errors
 

@@ -12,18 +12,17 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.air import codec
-from skyless.core.air.frame import MAX_FRAME_BYTES
-from skyless.core.air.ieee802154 import air_time_s
+from skyless.core.air import beacon
+from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
+from skyless.core.any_receiver import beacon_period_s
 from skyless.core.arrays import Integers, Mask, Matrix, Vector
 from skyless.core.clock_filter import clock_noise, predict, stamp_variance_m2, update
-from skyless.core.constants import TICK_S
 from skyless.core.geometry import anchor_positions, anchors_in_reach
-from skyless.core.protocol1 import codec as protocol1_codec
+from skyless.core.protocol1 import beacon as protocol1_codec
 from skyless.core.protocol1.anchor import MAX_OFFSET_STD_M
-from skyless.core.protocol1.schedule import first_slots, schedule_of
-from skyless.core.protocols import beacon_period_s
+from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import Site
+from skyless.core.ticks import TICK_S
 from skyless.site.channel import ChannelModel, pack_walls
 from skyless.site.kernels.compiled import jitted, kernel
 from skyless.site.planning.links import MIN_SYNC, anchor_links, link_budget, links, masters_by_links
@@ -165,7 +164,7 @@ def relays_of(anchors_m: Matrix, master: int | None, clocks: AnchorClocks, budge
     share, delay_m = links(anchors_m, anchors_m, budget, walls)
     share *= clocks.kept * (clocks.sends & clocks.sends[:, None])
     if master is None:
-        capacity = master_capacity = codec.heard_capacity(position=True)
+        capacity = master_capacity = beacon.heard_capacity(position=True)
     else:
         capacity = protocol1_codec.heard_capacity(master_heard=True, master_time=True, page=True)
         master_capacity = protocol1_codec.heard_capacity(master_heard=False, master_time=True, page=True)

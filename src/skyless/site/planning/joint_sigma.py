@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skyless.core.arrays import Integers, Matrix, Vector
-from skyless.core.constants import TICK_S
 from skyless.core.estimator.compiled import add_anchor, find_steady_state, find_walked
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import State, at, new_state
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay, SteadyState
-from skyless.core.native.sizes import MAX_ANCHORS
-from skyless.core.native.views import records, view
+from skyless.core.native.records import MAX_ANCHORS, records, view
+from skyless.core.ticks import TICK_S
 from skyless.site.planning.anchor_clocks import AnchorClocks, Relays
 from skyless.site.planning.links import FIX_SHARE, SIGMA, Scene, fill_dops, fill_errors
 

@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array, Integers, Matrix, Vector
-from skyless.core.dop import dops_at
+from skyless.core.geometry import dops_at
 from skyless.site.channel import (
     FREE_SPACE_LOSS_1_M_DB,
     ChannelModel,

@@ -10,16 +10,16 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.air.local_almanac import filter_pages_of
+from skyless.core.anchor import filter_pages_of
+from skyless.core.any_receiver import superframe_s
 from skyless.core.arrays import Matrix, Vector
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.geometry import anchor_positions
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS
-from skyless.core.native.sizes import MAX_ANCHORS_IN_USE
+from skyless.core.native.records import MAX_ANCHORS_IN_USE
 from skyless.core.protocol1.snapshots import SnapshotMethod
-from skyless.core.protocols import superframe_s
 from skyless.core.site import Site
-from skyless.core.tag.factory import estimator_settings
+from skyless.core.tag.receiver import estimator_settings
 from skyless.site.channel import ChannelModel, pack_walls
 from skyless.site.planning._snapshot_sigma import fill_snapshot_sigma, rounds_of
 from skyless.site.planning.anchor_clocks import AnchorClocks, Relays, anchor_clocks, relays_of, row_of_master

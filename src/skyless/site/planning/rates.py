@@ -11,11 +11,10 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.air.frame import MAX_FRAME_BYTES
-from skyless.core.air.ieee802154 import air_time_s
+from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
+from skyless.core.any_receiver import beacon_period_s
 from skyless.core.arrays import Array, Integers, Matrix, Vector
 from skyless.core.geometry import anchor_positions
-from skyless.core.protocols import beacon_period_s
 from skyless.core.site import Site
 from skyless.site.channel import (
     FREE_SPACE_LOSS_1_M_DB,

@@ -6,13 +6,13 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.any_receiver import superframe_s
 from skyless.core.arrays import Array, Mask
 from skyless.core.fix import NoFixReason
 from skyless.core.method_names import FILTERS
-from skyless.core.native.sizes import MAX_ANCHORS
+from skyless.core.native.records import MAX_ANCHORS
 from skyless.core.protocol1.snapshots import literal_covariance
-from skyless.core.protocols import superframe_s
-from skyless.core.tag.locate import NoSolution, locate
+from skyless.core.tag.position import NoSolution, locate
 from skyless.site.file.advice import warnings_of
 from skyless.site.planning._snapshot_sigma import delays
 from skyless.site.planning.anchor_clocks import master_warnings, stamp_variances

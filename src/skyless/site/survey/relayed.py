@@ -10,11 +10,9 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.core.air.frame import Malformed
-from skyless.core.air.reception import Reception
-from skyless.core.constants import MAX_DRIFT, TICK_M, TICK_RATE_HZ
-from skyless.core.protocols import SiteBeacon, decode_any
-from skyless.core.ticks import Unwrapper, difference
+from skyless.core.air.frame import Malformed, Reception
+from skyless.core.any_receiver import SiteBeacon, decode_any
+from skyless.core.ticks import MAX_DRIFT, TICK_M, TICK_RATE_HZ, Unwrapper, difference
 
 _LONGEST_TICKS: Final = round(0.3 * TICK_RATE_HZ)
 """Over a longer time two counters do not run evenly enough."""

@@ -8,8 +8,8 @@ from typing import Final
 import msgspec
 from msgspec import Struct
 
-from skyless.core.constants import TICK_M
 from skyless.core.errors import ConfigurationError
+from skyless.core.ticks import TICK_M
 from skyless.site.survey.facts import Gauge, PairRanges
 
 

@@ -19,9 +19,9 @@ from typing import Final
 
 from msgspec import structs
 
-from skyless.core.constants import TICK_M
 from skyless.core.errors import SkylessError
 from skyless.core.site import AccuracySite, AnchorSite, Site, UnplacedAnchor
+from skyless.core.ticks import TICK_M
 from skyless.site.file.check import SITE_LIMITS, check_site
 from skyless.site.file.rewrite import with_values
 from skyless.site.survey.result import Survey, SurveyedAnchor

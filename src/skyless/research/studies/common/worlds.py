@@ -14,7 +14,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from scipy.stats import chi2
 
-from skyless.core.air.reception import Reception
+from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix

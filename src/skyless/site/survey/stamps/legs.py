@@ -10,12 +10,10 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.core.air.frame import Heard, Malformed
+from skyless.core.air.frame import Heard, Malformed, Reception
 from skyless.core.air.masterless_packets import Relay
-from skyless.core.air.reception import Reception
-from skyless.core.constants import TICK_BITS, TICK_RATE_HZ
-from skyless.core.protocols import decode_any
-from skyless.core.ticks import Unwrapper, difference, to_seconds
+from skyless.core.any_receiver import decode_any
+from skyless.core.ticks import TICK_BITS, TICK_RATE_HZ, Unwrapper, difference, to_seconds
 from skyless.site.survey.two_way import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS
 
 _LONGEST_AGE_TICKS: Final = round(2.0 * TICK_RATE_HZ)

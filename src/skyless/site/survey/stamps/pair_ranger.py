@@ -14,8 +14,7 @@ from msgspec import Struct
 from msgspec.structs import astuple, replace
 
 from skyless.core.arrays import Array, Integers, Mask
-from skyless.core.constants import TICK_BITS, TICK_M, TICK_RATE_HZ
-from skyless.core.ticks import Unwrapper
+from skyless.core.ticks import TICK_BITS, TICK_M, TICK_RATE_HZ, Unwrapper
 from skyless.site.survey.facts import PairBlock, PairRange, PairRanges
 from skyless.site.survey.stamps.repeats import STD_OVER_MAD, earliest_cluster
 from skyless.site.survey.two_way import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS

@@ -15,8 +15,7 @@ import numpy as np
 from msgspec import Struct, field
 
 from skyless.core.arrays import Array
-from skyless.core.constants import CARRIER_CYCLES, TICK_M, TICK_RATE_HZ
-from skyless.core.ticks import difference
+from skyless.core.ticks import CARRIER_CYCLES, TICK_M, TICK_RATE_HZ, difference
 from skyless.site.survey.stamps.legs import AnchorLeg
 from skyless.site.survey.stamps.repeats import STD_OVER_MAD
 from skyless.site.survey.two_way import MAX_BRACKET_RATE

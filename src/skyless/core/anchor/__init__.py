@@ -1,1 +1,0 @@
-"""The protocol machine of an anchor of protocol 2."""
