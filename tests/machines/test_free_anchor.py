@@ -4,9 +4,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from bench import LAB, Stage
 from msgspec.structs import replace
 
-from bench import LAB, Stage
 from skyless.core.air.beacon import Beacon
 from skyless.core.air.codec import decode, encode
 from skyless.core.air.first_path import BLOCKED_DB, CLEAR_DB

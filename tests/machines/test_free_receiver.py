@@ -4,10 +4,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from bench import Heard, assert_honest, tape
 from free_site import FREE, beacon_of, free_tape, with_beacon
 from msgspec.structs import replace
 
-from bench import Heard, assert_honest, tape
 from skyless.core.air.almanac import NoisePage, SitePage
 from skyless.core.air.beacon import StatedPosition
 from skyless.core.air.codec import encode

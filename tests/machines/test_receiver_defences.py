@@ -4,9 +4,9 @@ from zlib import compress
 
 import numpy as np
 import pytest
+from bench import ROOM, tape
 from msgspec.structs import replace
 
-from bench import ROOM, tape
 from skyless.core.air.beacon import Beacon, StatedPosition
 from skyless.core.air.codec import decode, encode
 from skyless.core.air.frame import Heard
