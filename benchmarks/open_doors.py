@@ -144,9 +144,8 @@ async def clients(folder, asked):
         for one in running:
             one.cancel()
         await asyncio.gather(*running, return_exceptions=True)
-    print(
-        f"{asked.tags} tags and {asked.anchors} anchors: {refused} subscriptions refused; of page and history {refused_others}"
-    )
+    print(f"{asked.tags} tags and {asked.anchors} anchors: {refused} subscriptions refused; "
+          f"of page and history {refused_others}")  # fmt: skip
     print(f"nats-server {memory_mb:.0f} MB; the page has {shown['condition']['tags_with_fix']} tags with a fix, the "
           f"history {kept['fixes']} fixes and {kept['events']} events")  # fmt: skip
     return not refused and not refused_others and kept["fixes"] > 0 and kept["events"] > 0

@@ -118,7 +118,7 @@ def name_of(process):
 
 @contextlib.contextmanager
 def busy(loops):
-    """A number of busy loops on every core, in sessions of their own: Linux would count them and this process as one."""
+    """Busy loops on every core, in sessions of their own: Linux would count them and this process as one."""
     code = "import os, sys; os.sched_setaffinity(0, {int(sys.argv[1])})\nwhile True: pass"
     running = [
         subprocess.Popen(

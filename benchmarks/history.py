@@ -1,4 +1,4 @@
-"""What questions to a history cost: ``python benchmarks/history_queries.py [--rows 1e6] [--folder FOLDER] [--json]``.
+"""What questions to a history cost: ``python benchmarks/history.py [--rows 1e6] [--folder FOLDER] [--json]``.
 
 Writes the fixes of 500 tags at 1 Hz, half of them walking, with their zone events, as the history's own program leaves
 them after a night: files of an hour. Each question is asked in a process of its own. Processor seconds are those of all

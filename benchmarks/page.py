@@ -1,6 +1,6 @@
 """What the page's server says of a healthy large site, and how much processor time the page takes for a frame of it.
 
-``.venv/bin/python benchmarks/page_at_scale.py [--part server|page|all] [--seconds 8] [--json]``
+``.venv/bin/python benchmarks/page.py [--part server|page|all] [--seconds 8] [--quick] [--json]``
 
 Server: its live site gets the messages of healthy tags and anchors without a broker, by a clock that stands meanwhile,
 so that no load disturbs it: what it finds then, what it sends a page, and the processor time of one evaluation.
@@ -35,8 +35,9 @@ from skyless.page.live import LiveSite
 from skyless.page.sites import LiveSites
 from skyless.run.mqtt import topics
 
+QUICK = ((50, 8),)
 SERVER = ((1_900, 8), (3_000, 8), (10_000, 8), (100_000, 8), (3, 1_000), (3, 3_000), (3, 10_000), (250_000, 8))
-PAGE = ((1_000, 1_000), (100_000, 10_000))
+PAGE = ((200, 8), (1_000, 1_000), (100_000, 10_000))
 SPACING_M = 4.0
 FREE = replace(SITE.site.schedule, mode="free")
 MOVING = 2_000
@@ -148,7 +149,7 @@ def page_row(browser, tags, anchors, seconds):
     with served(tags, anchors) as address:
         page = browser.new_page(viewport={"width": 1440, "height": 900})
         page.goto(address)
-        until(page, "window.skyless?.live.sorted.length >= Math.min(1000, 500)", timeout_s=60.0)
+        until(page, f"window.skyless?.live.sorted.length >= {min(tags, 500)}", timeout_s=60.0)
         time.sleep(5.0)
         session = page.context.new_cdp_session(page)
         session.send("Performance.enable", {"timeDomain": "threadTicks"})
@@ -183,14 +184,15 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--part", choices=("server", "page", "all"), default="all")
     parser.add_argument("--seconds", type=float, default=8.0)
+    parser.add_argument("--quick", action="store_true", help="one small site")
     parser.add_argument("--json", action="store_true")
     asked = parser.parse_args()
-    server = [server_row(*size) for size in SERVER] if asked.part != "page" else []
+    server = [server_row(*size) for size in (QUICK if asked.quick else SERVER)] if asked.part != "page" else []
     page = []
     if asked.part != "server":
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-            page = [page_row(browser, *size, asked.seconds) for size in PAGE]
+            page = [page_row(browser, *size, asked.seconds) for size in (QUICK if asked.quick else PAGE)]
             browser.close()
     if asked.json:
         print(json.dumps({"server": server, "page": page}))
