@@ -1,7 +1,7 @@
 """Attacks on a site with keys: whether they move a verified fix, and what they cost. Simulated.
 
-    python benchmarks/attacks.py forged [--attack NAME …] [--rate HZ …] [--seconds 8] [--seed 1] [--room] [--json]
-    python benchmarks/attacks.py relayed [--speed 0.25] [--seconds 12.5] [--seeds 4] [--room] [--json]
+    python benchmarks/attacks.py forged [--attack NAME …] [--rate HZ …] [--seconds 8] [--seed 1] [--room]
+    python benchmarks/attacks.py relayed [--speed 0.25] [--seconds 12.5] [--seeds 4] [--room]
 
 ``forged``: an attacker with its own radios receives everything and knows all but the keys that are not disclosed yet.
 From the second second on it sends forged frames to the tag and the anchors; genuine frames that they overlap are lost.
@@ -20,7 +20,6 @@ fixes whose error is above the level without an alert, how many seeds had an ale
 """
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable
@@ -30,7 +29,7 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[1] / "tests"))
 
 import numpy as np
-from msgspec import Struct, to_builtins
+from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.alert import Alert
@@ -70,29 +69,6 @@ USUAL_RATE_HZ = 477.0
 EVERY: dict[str, Forgery] = {**FORGERIES, "any": any_forgery}
 
 
-class Row(Struct, frozen=True):
-    """What an attack did."""
-
-    attack: str
-    rate_hz: float
-    fixes: int
-    moved: int
-    most_moved_m: float
-    forged: int
-    same_anchors: bool
-    lost: float
-    first_s: float | None
-    cold_moved: int
-    """As ``moved``, of the tag that is switched on in the attack."""
-    cold_most_moved_m: float
-    open_m: float
-    open_noise_m: float
-    open_worse_s: float
-    cost_us: float
-    noise_cost_us: float
-    faults: dict[str, int]
-
-
 def site_of(*, in_room: bool) -> Site:
     """The lab without a master."""
     lab = lab_site() if in_room else paper_lab_site()
@@ -111,8 +87,8 @@ def worst_open(tape: list[Received], noise: list[Received], trust: SiteTrust) ->
     return float(found[:, 1].max()), float(expected[:, 1].max()), longest_s
 
 
-def row_of(attack: str, rate_hz: float, asked: argparse.Namespace) -> Row:
-    """Run an attack."""
+def row_of(attack: str, rate_hz: float, asked: argparse.Namespace) -> str:
+    """A line of the table."""
     site = site_of(in_room=asked.room)
     keys = made_keys(site.id, KEYS_BEGIN_S)
     request = Request(site, seed=asked.seed, room=Room() if asked.room else None)
@@ -133,23 +109,14 @@ def row_of(attack: str, rate_hz: float, asked: argparse.Namespace) -> Row:
     cold = run_tag(later, trust)
     open_m, open_noise_m, worse_s = worst_open(tape, noise, replace(trust, trust=Trust.OPEN))
     after = compare(cold, later, site.id)
-    return Row(
-        attack, rate_hz, found.fixes, found.moved, found.most_moved_m, found.forged, genuine[0] == genuine[1],
-        1.0 - found.fixes / len(runs[1].given), cold.given[0].given_s - SWITCHED_ON_S if cold.given else None,
-        after.moved, after.most_moved_m, open_m, open_noise_m, worse_s, *costs_us, dict(runs[0].counters),
-    )  # fmt: skip
-
-
-def line_of(row: Row) -> str:
-    """A line of the table."""
-    faults = ", ".join(f"{reason} {count}" for reason, count in sorted(row.faults.items(), key=lambda one: -one[1])[:3])
-    first = "none" if row.first_s is None else f"{row.first_s:.2f} s"
-    anchors = "same" if row.same_anchors else "other"
-    moved = f"{row.moved} ({1000 * row.most_moved_m:.1f} mm), {row.cold_moved} ({1000 * row.cold_most_moved_m:.1f} mm)"
+    reasons = ", ".join(f"{reason} {count}" for reason, count in runs[0].counters.most_common(3))
+    first = f"{cold.given[0].given_s - SWITCHED_ON_S:.2f} s" if cold.given else "none"
+    moved = (f"{one.moved} ({1000 * one.most_moved_m:.1f} mm)" for one in (found, after))
     return (
-        f"| {row.attack} | {row.rate_hz:g} | {row.fixes} | {moved} | {row.forged} | {anchors} "
-        f"| {100 * row.lost:.1f} % | {first} | {row.open_m:.2f} m ({row.open_noise_m:.2f}), {row.open_worse_s:.2f} s "
-        f"| {row.cost_us:.0f} ({row.noise_cost_us:.0f}) | {faults} |"
+        f"| {attack} | {rate_hz:g} | {found.fixes} | {', '.join(moved)} | {found.forged} "
+        f"| {'same' if genuine[0] == genuine[1] else 'other'} "
+        f"| {100 * (1.0 - found.fixes / len(runs[1].given)):.1f} % | {first} | {open_m:.2f} m ({open_noise_m:.2f}), "
+        f"{worse_s:.2f} s | {costs_us[0]:.0f} ({costs_us[1]:.0f}) | {reasons} |"
     )
 
 
@@ -162,13 +129,11 @@ def run_tag_once() -> None:
 
 def forged(asked):
     run_tag_once()
-    if not asked.json:
-        heads = "attack | rate/s | fixes | moved | forged | anchors | lost | first | open | µs | counted"
-        print(f"| {heads} |\n{'|---' * (heads.count('|') + 1)}|", flush=True)
+    heads = "attack | rate/s | fixes | moved | forged | anchors | lost | first | open | µs | counted"
+    print(f"| {heads} |\n{'|---' * (heads.count('|') + 1)}|", flush=True)
     for attack in asked.attack:
         for rate_hz in asked.rate or RATES_HZ.get(attack, (USUAL_RATE_HZ,)):
-            row = row_of(attack, rate_hz, asked)
-            print(json.dumps(to_builtins(row)) if asked.json else line_of(row), flush=True)
+            print(row_of(attack, rate_hz, asked), flush=True)
 
 
 LATER_S = (1.0, 3.0, 10.0)
@@ -248,10 +213,9 @@ def relayed_line(case: str, trials: list[Trial], baseline: list[Trial]) -> str:
 
 
 def relayed(asked):
-    if not asked.json:
-        heads = "delayed | " + " | ".join(f"{one:g} s later" for one in LATER_S)
-        heads += " | stated std | level | missed | noticed"
-        print(f"| {heads} |\n{'|---' * (heads.count('|') + 1)}|", flush=True)
+    heads = "delayed | " + " | ".join(f"{one:g} s later" for one in LATER_S)
+    heads += " | stated std | level | missed | noticed"
+    print(f"| {heads} |\n{'|---' * (heads.count('|') + 1)}|", flush=True)
     site = site_of(in_room=asked.room)
     keys = made_keys(site.id, KEYS_BEGIN_S)
     trust = SiteTrust(site.id, keys.public, trust=Trust.VERIFIED)
@@ -259,15 +223,11 @@ def relayed(asked):
     for seed in range(1, asked.seeds + 1):
         request = Request(site, seed=seed, room=Room() if asked.room else None)
         tape = list(AttackedAir(request, keys).run(asked.seconds or 12.5))
-        for case in CASES:
+        for case, found in trials.items():
             later = delayed(tape, delay_of(case, site, asked.speed, seed))
-            trial = judged(run_tag(later, trust), later)
-            trials[case].append(trial)
-            if asked.json:
-                print(json.dumps({"case": case, "seed": seed} | to_builtins(trial)), flush=True)
-    if not asked.json:
-        for case in CASES[1:]:
-            print(relayed_line(case, trials[case], trials["none"]), flush=True)
+            found.append(judged(run_tag(later, trust), later))
+    for case in CASES[1:]:
+        print(relayed_line(case, trials[case], trials["none"]), flush=True)
 
 
 def main():
@@ -280,7 +240,6 @@ def main():
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--room", action="store_true", help="with a real room's errors of survey and ranges")
-    parser.add_argument("--json", action="store_true", help="a JSON object for each attack or trial")
     asked = parser.parse_args()
     compile_kernels()
     {"forged": forged, "relayed": relayed}[asked.what](asked)

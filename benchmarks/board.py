@@ -24,7 +24,7 @@ sys.path.extend(
 )
 
 import numpy as np
-from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, late, one_by_one, settings_of, tracked
+from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, one_by_one, settings_of
 from msgspec.structs import replace
 
 from skyless.core.any_receiver import AnyReceiver
@@ -59,9 +59,8 @@ OF_FLOAT = (
     "one anchor +1.5 m in bursts", "rounds at 5 m/s", "still",
 )  # fmt: skip
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
-AT_REST = {"exact": (LAB_M, 0.0, {}), "the room": (ROOM_M, 0.0, ERRORS), "3-D": (ROOM_M, None, ERRORS)}
-SLOT_S, LAB_S, FEW = 0.01, 50.0, 4
-"""Between packets at rest; of the ideal lab; seeds of cases whose limit is 1.10."""
+LAB_S, FEW = 50.0, 4
+"""Seconds of the ideal lab; seeds of cases whose limit is 1.10."""
 OF_LEVELS = {"fill_fix", "protect", "fault_chi2", "whiten", "integrity_state"}
 CORES = [*((LAB_M, 0.0, relays) for relays in (5, 4, 3, 2, 0)), *((ROOM_M, z, n) for z in (0.0, None) for n in (7, 3))]
 """Anchors, the tag's height, and relays with a packet."""
@@ -93,12 +92,11 @@ def long_cases(seed, minutes):
             yield f"{place}, {moves}", None, worlds(plan, site, partial(paths, site, 1), warmup_s=0.0, room=errors)[0]
 
 
-def float_cases(seed, seconds, rest_s):
-    """Those of ``--library float``; instead of a world that of a tag at rest, from stamps alone."""
+def float_cases(seed, seconds):
+    """Those of ``--library float``."""
     plan = replace(plan_of("joint", seed, study="room"), worlds=1, tags=3, seconds=2.0 * seconds)
     found = {case.name: case.runs[0] for study in (room, motion, loss, nlos) for case in study.cases(plan)}
     yield from ((name, None, found[name]) for name in OF_FLOAT)
-    yield from ((f"at rest, {name}", None, (rest_s, seed, *case)) for name, case in AT_REST.items())
 
 
 def asked_cases(asked):
@@ -108,7 +106,7 @@ def asked_cases(asked):
         if asked.minutes:
             every = long_cases(seed, asked.minutes)
         elif asked.library == "float":
-            every = float_cases(seed, asked.seconds, asked.rest)
+            every = float_cases(seed, asked.seconds)
         else:
             every = cases(seed, asked.seconds)
         for name, limit, run in every:
@@ -143,23 +141,6 @@ def fixes_of(run, beacons):
                 exceeded = np.hypot(error_m[0], error_m[1]) > level_m
                 rows.append((tag, beacon.end_s, error_m @ error_m, nees, level_m, exceeded))
     return np.array(rows)
-
-
-def fixes_at_rest(seconds, seed, anchors_m, height_m, errors):
-    """The same of a tag that lies still, from its tenth second on."""
-    draw, count = np.random.default_rng(seed), len(anchors_m)
-    superframes = round(seconds / SLOT_S / count)
-    place_m = np.append(anchors_m[:, :2].mean(axis=0) + draw.uniform(-1.0, 1.0, 2), 0.0)
-    path_m = np.broadcast_to(place_m, (superframes * count, 3))
-    episode = episode_of(MESH, superframes, seed, anchors_m, path_m=path_m, slot_s=SLOT_S)
-    late_m = draw.normal(0.0, errors.get("range_std_m", 0.0), count)
-    estimator = begun(episode, settings_of(height_m=height_m, **errors), anchors_m, std_m=0.1)
-    run = tracked(estimator, late(episode.packets, late_m[episode.packets.anchors]))
-    error, time_s = run.errors(episode), SLOT_S * np.arange(superframes * count)
-    nees = np.einsum("ni,ni->n", error, np.linalg.solve(run.covariances, error[..., None])[..., 0]) / error.shape[1]
-    exceeded = np.hypot(error[:, 0], error[:, 1]) > run.levels[:, 0]
-    columns = (0.0 * time_s, time_s, np.square(error).sum(axis=1), nees, run.levels[:, 0], exceeded)
-    return np.column_stack(columns)[time_s > 10.0]
 
 
 def file_of(folder, name, number):
@@ -239,11 +220,8 @@ def table(asked):
 def accuracy(asked):
     if asked.write:
         for number, name, _, run in asked_cases(asked):
-            if isinstance(run, tuple):
-                fixes = fixes_at_rest(*run)
-            else:
-                fixes = fixes_of(run, damaged(run, DAMAGED[name]) if name in DAMAGED else beacons_of(run))
-            np.save(file_of(asked.write, name, number), fixes)
+            beacons = damaged(run, DAMAGED[name]) if name in DAMAGED else beacons_of(run)
+            np.save(file_of(asked.write, name, number), fixes_of(run, beacons))
         return
     lines = "\n".join(table(asked)) + "\n"
     print(lines)
@@ -301,7 +279,6 @@ def main():
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--first", type=int, default=1001, help="the first seed")
     parser.add_argument("--seconds", type=float, default=15.0, help="of a case; twice that with --library float")
-    parser.add_argument("--rest", type=float, default=3600.0, help="seconds at rest with --library float")
     parser.add_argument("--minutes", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=[""], help="words of cases")
     parser.add_argument("--into", type=Path, help="a page whose table is replaced")

@@ -1,9 +1,9 @@
 """The emulated FiRa tag's errors, next to what ``skyless plan`` predicts for the site (``tests/support/fira_site.py``).
 
-    python benchmarks/fira_accuracy.py [--worlds 20] [--seeds 3] [--json]
+    python benchmarks/fira_accuracy.py [--worlds 20] [--seeds 3]
 
 ``both ways``: two frames of each anchor in a superframe, so that rounds end with a final message and initiator and
-responders relay each other. ``one way``: one frame, so that only responders relay the poll. Columns: RMSE over all
+responders relay each other. ``one way``: one frame, so that only responders relay the poll. JSON lines: RMSE over all
 worlds and points; that of ``skyless plan`` for the same site; what the plan's own arithmetic gives for the messages
 and relays of rounds alone; the ratio of the first to each of both. Air and board are emulated.
 """
@@ -24,15 +24,14 @@ def main():
     asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     asked.add_argument("--worlds", type=int, default=20)
     asked.add_argument("--seeds", type=int, default=3)
-    asked.add_argument("--json", action="store_true")
     asked.add_argument("--seconds", type=float, default=UNTIL_S)
     arguments = asked.parse_args()
     for name, frames in ROUNDS.items():
         all_found = []
         for number in range(arguments.seeds):
             all_found.append(measure(frames, arguments.worlds, 1 + 1000 * number, until_s=arguments.seconds))
-            show(name, 1 + 1000 * number, all_found[-1], arguments.json)
-        show(name, "all", together(all_found), arguments.json)
+            show(name, 1 + 1000 * number, all_found[-1])
+        show(name, "all", together(all_found))
 
 
 def together(found):
@@ -43,17 +42,8 @@ def together(found):
     return Measured(rmse_m, planned_m, round_planned_m, rmse_m / planned_m, rmse_m / round_planned_m, fixes)
 
 
-def show(name, seed, found, as_json):
-    """Print one line of the table."""
-    if as_json:
-        print(json.dumps({"rounds": name, "seed": seed, **found._asdict()}), flush=True)
-        return
-    print(
-        f"{name:<10} seed {seed:>4}: {100 * found.rmse_m:.2f} cm, plan {100 * found.planned_m:.2f} cm, "
-        f"of rounds {100 * found.round_planned_m:.2f} cm, ratios {found.ratio:.3f} and {found.round_ratio:.3f} "
-        f"({found.fixes} fixes)",
-        flush=True,
-    )
+def show(name, seed, found):
+    print(json.dumps({"rounds": name, "seed": seed, **found._asdict()}), flush=True)
 
 
 if __name__ == "__main__":

@@ -7,7 +7,7 @@
 ``json``: a program publishes ``FixMessage`` as MQTT's messages reach NATS (with the header of QoS 0), and the gather
 packs them. ``packed``: a program publishes batches of 1,000 records into the site's stream, and a reader takes them
 into the page's columns. ``core``: the same at a site without a gather, so without a stream: the rest is JetStream's.
-Processor time is that of the processes by /proc. Latency is from a record's time to the end of the columns' update.
+Latency is from a record's time to the end of the columns' update.
 
 ``cuts`` (``tests/support/hub_stage.py``): how long a viewer at the hub sees nothing, and after which time the hub's
 stream has all that was acknowledged. There and after kills and cuts in a random order every fix must be there once
@@ -31,6 +31,7 @@ sys.path.append(str(Path(__file__).parents[1] / "tests"))
 
 import msgspec
 import numpy as np
+import psutil
 
 from skyless.page.gathered import Gathered
 from skyless.page.live import LiveSite
@@ -50,12 +51,6 @@ FIX = FixMessage(
     *((0.1234567, 0.2345678, 0.0), VARIANCE, 0.0323456, 1.234567, 1.2345678, 1.2345678, None),
     *((1, 2, 3, 4, 5, 6, 7, 8), 4.56789, 5, 0.012345, "joint", True, 0.0012345, 0.23456),
 )
-
-
-def cpu_s(pid):
-    """Processor time of a process."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 async def publish_json(client, rate, seconds):
@@ -168,18 +163,18 @@ async def stored(url):
     return rows, sequences == list(range(sequences[0], sequences[0] + len(sequences))) if sequences else False
 
 
-def measure(part, url, pids, rate, seconds):
+def measure(part, url, programs, rate, seconds):
     expected = rate * seconds
     reading = None if part == "json" else own("read", url, SITE if part == "packed" else OTHER, expected)
     if reading is not None:
         reading.stdout.readline()
         time.sleep(0.5)
-    before = {name: cpu_s(pid) for name, pid in pids.items()}
+    before = {name: sum(one.cpu_times()[:2]) for name, one in programs.items()}
     publishing = own("publish", url, part, rate, seconds)
     sent = last_line(publishing)
     read = {} if reading is None else last_line(reading)
     time.sleep(1.5)
-    used = {name: cpu_s(pid) - before[name] for name, pid in pids.items()}
+    used = {name: sum(one.cpu_times()[:2]) - before[name] for name, one in programs.items()}
     us = {name: round(1e6 * value / sent["sent"], 2) for name, value in used.items()}
     us["publisher"] = round(1e6 * sent["cpu_s"] / sent["sent"], 2)
     if read:
@@ -188,29 +183,21 @@ def measure(part, url, pids, rate, seconds):
     return sent["sent"]
 
 
-def child_of(pid, word):
-    """The process with a word in its command line among the children of another, once it runs."""
-    for _ in range(200):
-        for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():
-            if word in Path(f"/proc/{child}/cmdline").read_text().split("\0"):
-                return int(child)
-        time.sleep(0.05)
-    raise RuntimeError(f"{word} has not started")
-
-
 def gather(chosen):
     with tempfile.TemporaryDirectory() as folder:
         command = (sys.executable, "-m", "skyless.cli.main", "broker", "--gather", "--site-id", str(SITE), "--json")
         broker = subprocess.Popen([*command, "--data", f"{folder}/data"], stdout=subprocess.PIPE, text=True)
         try:
             stated = json.loads(broker.stdout.readline())
-            pids = {"broker": stated["pid"], "gather": child_of(broker.pid, "gather")}
             time.sleep(4.0)
+            children = psutil.Process(broker.pid).children()
+            gatherer = next(one for one in children if "gather" in one.cmdline())
+            programs = {"broker": psutil.Process(stated["pid"]), "gather": gatherer}
             total = 0
             for part in ("json", "core", "packed"):
                 if chosen.part in (part, "all"):
                     rate = chosen.json_rate if part == "json" else chosen.rate
-                    sent = measure(part, stated["nats"], pids, rate, chosen.seconds)
+                    sent = measure(part, stated["nats"], programs, rate, chosen.seconds)
                     total += sent if part != "core" else 0
             rows, whole = asyncio.run(stored(stated["nats"]))
             print(

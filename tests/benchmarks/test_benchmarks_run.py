@@ -1,4 +1,4 @@
-"""Every script of ``benchmarks/`` runs in a short form and prints what its table names; no figure of speed is judged."""
+"""Every script of ``benchmarks/`` runs in a short form and prints its figures; none of speed is judged."""
 
 import os
 import shutil
@@ -20,7 +20,7 @@ RUNS = {
         ["--worlds", "1", "--only", "NONE", "--rows", "90 % lost"],
         ("| | RMSE | worst tag | NEES |", "| 90 % lost |"),
     ),
-    "fira_accuracy": (["--worlds", "1", "--seeds", "1", "--seconds", "2.2", "--json"], ("round_ratio", "one way")),
+    "fira_accuracy": (["--worlds", "1", "--seeds", "1", "--seconds", "2.2"], ("round_ratio", "one way")),
     "firmware": (
         ["tag", "--only", "awake", "--seconds", "0.2", "--seeds", "1"],
         ("| always on | received a second |", "| 12 anchors"),
@@ -36,7 +36,7 @@ RUNS = {
         ("wall_s_per_s", "digest", "efficiency"),
     ),
     "open_doors": (["--tags", "20", "--anchors", "5"], ("0 subscriptions refused", "20 tags with a fix")),
-    "page": (["--part", "page", "--quick", "--seconds", "1", "--json"], ("frames_per_s", "cpu_ms_per_frame")),
+    "page": (["--part", "page", "--quick", "--seconds", "1"], ("frames_per_s", "cpu_ms_per_frame")),
     "recorded_phases": ([str(MULOC)], ("channel 5, stamps alone:", "place at rest")),
     "running_site": (["--minutes", "0.05"], ("fixes_made_per_s", "cpu_share", "age_less_own_ms")),
     "speed": (["--quick", "--json"], ("joint_room_mesh", "seconds_per_message", "rows_per_s", "all_cores_draws_per_s")),
