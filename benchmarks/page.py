@@ -4,9 +4,9 @@
 
 Server: its live site gets the messages of healthy tags and anchors without a broker, by a clock that stands meanwhile,
 so that no load disturbs it: what it finds then, what it sends a page, and the processor time of one evaluation.
-A JSON object for each site. Page: a headless Chromium shows a made-up site of that size, with the list of tags open,
-while tags move; the server process sends it what the real one would. The figure is the processor time of the page's thread for
-each frame drawn.
+Page: a headless Chromium shows a made-up site of that size, with the list of tags open, while tags move; the server
+process sends it what the real one would. The figure is the processor time of the page's thread for each frame drawn.
+Each site has its line of JSON.
 """
 
 import argparse
