@@ -1,283 +1,66 @@
-"""Alarms of a simulated site: ``.venv/bin/python benchmarks/alarms.py [SECONDS] [SEED]``.
+"""Alarms of a simulated site (``tests/alarms/alarm_world.py``): missed, twice, without a cause; how late; their cost.
 
-Tags walk in and out of a zone, fall silent and meet, with noisy fixes. What must be raised follows from their true ways
-alone. Prints how many alarms were missed, raised twice or without a cause, and how late they were; then
-the same with a page server that is killed at random moments; then the cost of a fix. The time is simulated, so that
-broker and network, which add some milliseconds, do not count.
+    python benchmarks/alarms.py [--seconds 1400] [--seed 1]
+
+Then the same with a page's server that is killed at random moments, and the processor time of a fix.
 """
 
-import math
+import argparse
 import random
 import sys
 import time
-from bisect import bisect_right
-from collections import Counter, defaultdict
-from itertools import pairwise
+from pathlib import Path
+
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "alarms"))
+
+import alarm_world as world
 
 from skyless.core.site import AlarmRule
-from skyless.run.alarms.engine import AlarmEngine, is_over
-from skyless.run.mqtt.messages import FixMessage, Zone
-from skyless.run.zones.monitor import ZoneMonitor
-
-UNIX_S = 1_795_000_000.0
-TICK_S = 0.05
-HZ = 10.0
-STD_M = 0.03
-LIMIT_M = 2.0
-SILENCE_S = 2.0
-COUNT = 24
-"""Tags that walk, tags that fall silent, and pairs that meet."""
-WALKERS, SILENT, FIRSTS = (tuple(f"{letter}{k}" for k in range(COUNT)) for letter in "wsc")
-RULES = (
-    AlarmRule("nobody", "inside", zone="hall", tags=("group:none",)),
-    AlarmRule("inside", "inside", zone="hall", tags=WALKERS, clear_after_s=0.5),
-    AlarmRule("outside", "outside", zone="hall", tags=WALKERS, clear_after_s=0.5),
-    AlarmRule("silent", "silent", tags=SILENT, after_s=SILENCE_S, clear_after_s=0.5),
-    AlarmRule("near", "near", limit=LIMIT_M, hysteresis=0.3, tags=FIRSTS, clear_after_s=0.5),
-)
-ZONES = (Zone("hall", "Hall", ((0.0, -10.0), (20.0, -10.0), (20.0, 900.0), (0.0, 900.0))),)
-
-
-def fix_of(tag: str, unix_s: float, x: float, y: float, serial: int = 1) -> FixMessage:
-    variance = STD_M**2
-    return FixMessage(
-        tag, serial, unix_s, unix_s, (x, y, 1.0), (variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance),
-        None, None, STD_M, 1.0, 1.0, 1.0, 1.0, (1, 2, 3, 4), 1.0, 1, 0.01, "joint", False, 0.001,
-    )  # fmt: skip
-
-
-class Way:
-    """A tag's true place along x by time: straight lines between knots."""
-
-    def __init__(self, knots: list[tuple[float, float]]) -> None:
-        self.knots = knots
-        self._at = 0
-
-    def x_m(self, at_s: float) -> float:
-        while self._at + 2 < len(self.knots) and self.knots[self._at + 1][0] <= at_s:
-            self._at += 1
-        (t0, x0), (t1, x1) = self.knots[self._at : self._at + 2]
-        return x0 + (x1 - x0) * (at_s - t0) / (t1 - t0)
-
-    def below(self, level_m: float) -> list[tuple[float, float]]:
-        """The spans of time in which it is below a level."""
-        crossings = [
-            (t0 + (level_m - x0) / (x1 - x0) * (t1 - t0), x1 < x0)
-            for (t0, x0), (t1, x1) in pairwise(self.knots)
-            if (x0 - level_m) * (x1 - level_m) < 0.0
-        ]
-        starts = [at_s for at_s, down in crossings if down]
-        if self.knots[0][1] < level_m:
-            starts.insert(0, self.knots[0][0])
-        ends = [at_s for at_s, down in crossings if not down]
-        return [(start, min([at_s for at_s in ends if at_s > start], default=math.inf)) for start in starts]
-
-
-def shuttle(rng: random.Random, seconds: float, low_m: float, high_m: float) -> Way:
-    """To and fro between two places, at each for a while."""
-    knots, at_s, low = [], 0.0, True
-    while at_s < seconds + 30.0:
-        stay_s, go_s = rng.uniform(1.5, 6.0), (high_m - low_m) / rng.uniform(0.8, 2.0)
-        place = low_m if low else high_m
-        knots += [(at_s, place), (at_s + stay_s, place)]
-        at_s, low = at_s + stay_s + go_s, not low
-    return Way(knots)
-
-
-class World:
-    """What happens, and the spans in which each condition holds by the true ways."""
-
-    def __init__(self, seconds: float, seed: int) -> None:
-        rng = random.Random(seed)
-        self.seconds = seconds
-        self.spans: dict[tuple[str, str], list[tuple[float, float]]] = {}
-        fixes = []
-        for k in range(COUNT):
-            way = shuttle(rng, seconds, -1.5, 1.5)
-            outside = way.below(0.0)
-            edges = [end for _, end in outside]
-            inside = [
-                (end, min([a for a, _ in outside if a > end], default=math.inf)) for end in edges if end < math.inf
-            ]
-            self.spans["outside", f"w{k}"], self.spans["inside", f"w{k}"] = outside, inside
-            fixes += [(at_s, f"w{k}", way.x_m(at_s), 5.0 * k) for at_s in instants(rng, seconds)]
-            apart = shuttle(rng, seconds, 0.7, 4.5)
-            self.spans["near", f"c{k}~c{k}b"] = apart.below(LIMIT_M)
-            y = 1000.0 + 10.0 * k
-            fixes += [(at_s, f"c{k}", 0.0, y) for at_s in instants(rng, seconds)]
-            fixes += [(at_s, f"c{k}b", apart.x_m(at_s), y) for at_s in instants(rng, seconds)]
-            heard = list(silences(rng, instants(rng, seconds)))
-            self.spans["silent", f"s{k}"] = [
-                (a + SILENCE_S, b)
-                for a, b in pairwise([*heard, math.inf])
-                if b - a > SILENCE_S and a + SILENCE_S < seconds
-            ]
-            fixes += [(at_s, f"s{k}", 3.0, 3000.0 + 5.0 * k) for at_s in heard]
-        noisy = [(at_s, tag, x + rng.gauss(0.0, STD_M), y + rng.gauss(0.0, STD_M)) for at_s, tag, x, y in fixes]
-        self.fixes = sorted(noisy)
-
-
-def instants(rng: random.Random, seconds: float) -> list[float]:
-    phase_s = rng.random() / HZ
-    return [phase_s + k / HZ + rng.uniform(0.0, 0.02) for k in range(int(seconds * HZ))]
-
-
-def silences(rng: random.Random, times_s: list[float]):
-    """The instants without those of silences, some too short to count."""
-    until_s, next_s = -1.0, rng.uniform(2.0, 8.0)
-    for at_s in times_s:
-        if at_s >= next_s:
-            until_s = at_s + rng.choice((rng.uniform(3.0, 8.0), rng.uniform(0.3, 1.6)))
-            next_s = until_s + rng.uniform(2.0, 6.0)
-        if at_s >= until_s:
-            yield at_s
-
-
-class Server:
-    """A page server: its engine, and what it publishes to a broker that keeps messages."""
-
-    def __init__(self, kept: dict, at_s: float) -> None:
-        self.monitor = ZoneMonitor()
-        self.engine = AlarmEngine(self.monitor)
-        unix_s = UNIX_S + at_s
-        self.engine.on_zone_events(self.monitor.set_zones(ZONES, unix_s), at_s)
-        self.engine.set_zones(ZONES, at_s)
-        self.engine.set_rules(RULES)
-        self.engine.resume(kept.values(), at_s, unix_s)
-        self._expired_s = at_s
-
-    def on_fix(self, fix: FixMessage, at_s: float) -> None:
-        self.engine.on_fix(fix, at_s)
-        self.engine.on_zone_events(self.monitor.update(fix, at_s), at_s)
-
-    def tick(self, at_s: float) -> list:
-        if at_s - self._expired_s >= 1.0:
-            self._expired_s = at_s
-            self.engine.on_zone_events(self.monitor.expire_tags(at_s, UNIX_S + at_s), at_s)
-        return self.engine.tick(at_s, UNIX_S + at_s)
-
-
-def run(world: World, seed: int, kill_every_s: float = math.inf):
-    """Everything that was published with its time, the alarms acknowledged, and when no server ran."""
-    rng = random.Random(seed)
-    kept: dict = {}
-    published: list = []
-    acknowledged: dict[str, float] = {}
-    down: list[tuple[float, float]] = []
-    server: Server | None = Server(kept, 0.0)
-    next_kill_s = rng.expovariate(1.0 / kill_every_s) if kill_every_s < math.inf else math.inf
-    number = 0
-    for step in range(int(world.seconds / TICK_S)):
-        at_s = step * TICK_S
-        while number < len(world.fixes) and world.fixes[number][0] <= at_s:
-            when_s, tag, x, y = world.fixes[number]
-            number += 1
-            if server is not None:
-                server.on_fix(fix_of(tag, UNIX_S + when_s, x, y), when_s)
-        if server is None:
-            if at_s >= down[-1][1]:
-                server = Server(kept, at_s)
-            continue
-        for one in [one for one in kept.values() if one.acknowledged_unix_s is None]:
-            if rng.random() < 0.02:
-                server.engine.acknowledge(one.rule, one.subject, one.id, "Ada", UNIX_S + at_s)
-        changes = server.tick(at_s)
-        dies = at_s >= next_kill_s
-        for what, message in changes[: rng.randrange(len(changes) + 1) if dies else None]:
-            key = message.rule, message.subject
-            published.append((at_s, what, message))
-            if is_over(message):
-                kept.pop(key, None)
-            else:
-                kept[key] = message
-            if what == "acknowledged":
-                acknowledged[message.id] = at_s
-        if dies:
-            server = None
-            down.append((at_s, at_s + rng.uniform(0.1, 6.0)))
-            next_kill_s = at_s + 8.0 + rng.expovariate(1.0 / kill_every_s)
-    return published, acknowledged, down, kept
-
-
-def judge(world: World, published: list, slack_s: float = 1.0) -> tuple[Counter, dict[str, list[float]]]:
-    """Counts by outcome, and how late the alarms were by rule."""
-    raised = defaultdict(list)
-    for at_s, what, message in published:
-        if what == "raised":
-            raised[message.rule, message.subject].append(at_s)
-    counts: Counter = Counter()
-    late_s = defaultdict(list)
-    for key, spans in world.spans.items():
-        mine = defaultdict(list)
-        begins_s = [begin_s - 0.3 for begin_s, _ in spans]
-        for at_s in raised.pop(key, []):
-            row = bisect_right(begins_s, at_s) - 1
-            if row < 0 or at_s > spans[row][1] + slack_s:
-                counts["without a cause"] += 1
-            else:
-                mine[row].append(at_s)
-        for row, (begin_s, _) in enumerate(spans):
-            if begin_s <= world.seconds - slack_s:
-                counts["expected"] += 1
-                counts["missed"] += not mine[row]
-                counts["twice"] += max(0, len(mine[row]) - 1)
-                late_s[key[0]] += [max(0.0, at_s - begin_s) for at_s in mine[row][:1]]
-    counts["without a cause"] += sum(map(len, raised.values()))
-    return counts, late_s
-
-
-def percentile(values: list[float], share: float) -> float:
-    return sorted(values)[min(len(values) - 1, int(share * len(values)))] if values else math.nan
 
 
 def cost_us(tags: int = 500, hz: float = 20.0, seconds: float = 10.0) -> float:
     """Microseconds of CPU that the engine takes for each fix, with rules of all kinds, tags 2 m apart."""
-    server = Server({}, 0.0)
+    server = world.Server({}, 0.0)
     rules = (
-        *RULES,
+        *world.RULES,
         AlarmRule("level", "protection-level", limit=1.0),
         AlarmRule("all", "near", limit=1.9),
         AlarmRule("quiet", "silent", after_s=5.0),
     )
     server.engine.set_rules(rules)
     rng = random.Random(1)
-    fixes = [fix_of(f"t{k}", UNIX_S, 2.0 * (k % 25) + rng.gauss(0, 0.02), 2.0 * (k // 25)) for k in range(tags)]
+    fixes = [
+        world.fix_of(f"t{k}", world.UNIX_S, 2.0 * (k % 25) + rng.gauss(0, 0.02), 2.0 * (k // 25)) for k in range(tags)
+    ]
     begin_s = time.process_time()
     for step in range(int(seconds * hz)):
         at_s = step / hz
         for fix in fixes:
             server.engine.on_fix(fix, at_s)
-        server.engine.tick(at_s, UNIX_S + at_s)
+        server.engine.tick(at_s, world.UNIX_S + at_s)
     return (time.process_time() - begin_s) / (seconds * hz * tags) * 1e6
 
 
-def lost(published: list, acknowledged: dict, kept: dict) -> list:
-    """Alarms that are unacknowledged after they were acknowledged."""
-    wrong = [one.id for one in kept.values() if one.id in acknowledged and one.acknowledged_unix_s is None]
-    return wrong + [
-        m.id for at_s, _, m in published if at_s > acknowledged.get(m.id, math.inf) and m.acknowledged_unix_s is None
-    ]
-
-
-def main() -> None:
-    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 1400.0
-    seed = int(sys.argv[2]) if len(sys.argv) > 2 else 1
-    world = World(seconds, seed)
-    published, *_ = run(world, seed)
-    counts, late_s = judge(world, published)
-    print(f"{len(world.fixes)} fixes in {seconds:g} s: {dict(counts)}")
-    every = [late for some in late_s.values() for late in some]
-    for rule, values in [*late_s.items(), ("all", every)]:
-        p50_s, p99_s = percentile(values, 0.5), percentile(values, 0.99)
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=1400.0)
+    parser.add_argument("--seed", type=int, default=1)
+    asked = parser.parse_args()
+    made = world.World(asked.seconds, asked.seed)
+    published, *_ = world.run(made, asked.seed)
+    counts, late_s = world.judge(made, published)
+    print(f"{len(made.fixes)} simulated fixes in {asked.seconds:g} s: {dict(counts)}")
+    late_s = {**late_s, "all": [late for some in late_s.values() for late in some]}
+    for rule, values in late_s.items():
+        p50_s, p99_s = (world.percentile(values, share) for share in (0.5, 0.99))
         print(f"  {rule}: {len(values)} alarms, late by p50 {p50_s:.2f}, p99 {p99_s:.2f}, at most {max(values):.2f} s")
-    published, acknowledged, down, kept = run(world, seed, kill_every_s=15.0)
-    counts, _ = judge(world, published, slack_s=9.0)
-    wrong = len(lost(published, acknowledged, kept))
-    print(f"killed {len(down)} times: {counts['twice']} raised twice, {wrong} of {len(acknowledged)} acknowledged lost")
+    published, acknowledged, down, kept = world.run(made, asked.seed, kill_every_s=15.0)
+    counts, _ = world.judge(made, published, slack_s=9.0)
+    lost = len(world.lost(published, acknowledged, kept))
+    print(f"killed {len(down)} times: {counts['twice']} raised twice, {lost} of {len(acknowledged)} acknowledged lost")
     print(f"  {counts['missed']} of {counts['expected']} not raised, as no server ran or an earlier one had not ended")
-    print(
-        f"cost: {cost_us():.2f} us of CPU a fix (500 tags at 20 Hz), {cost_us(hz=1.0, seconds=60.0):.2f} us (at 1 Hz)"
-    )
+    fast, slow = cost_us(seconds=asked.seconds / 140.0), cost_us(hz=1.0, seconds=max(asked.seconds / 24.0, 1.0))
+    print(f"cost: {fast:.2f} us of CPU a fix (500 tags at 20 Hz), {slow:.2f} us (at 1 Hz)")
 
 
 if __name__ == "__main__":

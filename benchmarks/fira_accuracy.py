@@ -1,149 +1,22 @@
-"""The emulated FiRa tag's errors, next to what ``skyless plan`` predicts for the site.
+"""The emulated FiRa tag's errors, next to what ``skyless plan`` predicts for the site (``tests/support/fira_site.py``).
 
-    python benchmarks/fira_accuracy.py [--worlds N] [--seeds N] [--json]
-
-Tags rest at six points of the lab, whose survey and ranges have the errors that its site file assumes, other ones in
-each world (those of ``skyless plan --verify``). Beacons become notifications of UCI, and these packets and fixes, as in
-``skyless board --wire uci`` and ``skyless tag --radio uci:PATH``. Fixes are judged from two seconds on.
+    python benchmarks/fira_accuracy.py [--worlds 20] [--seeds 3]
 
 ``both ways``: two frames of each anchor in a superframe, so that rounds end with a final message and initiator and
-responders relay each other. ``one way``: one frame, so that only responders relay the poll. Columns: RMSE over all
-worlds and points; that of ``skyless plan`` for the same site, method joint; what the plan's own arithmetic gives for
-the messages and relays of rounds alone, with what the tag assumes; the ratio of the first to each of both.
+responders relay each other. ``one way``: one frame, so that only responders relay the poll. JSON lines: RMSE over all
+worlds and points; that of ``skyless plan`` for the same site; what the plan's own arithmetic gives for the messages
+and relays of rounds alone; the ratio of the first to each of both. Air and board are emulated.
 """
 
 import argparse
 import json
 import math
-from collections import Counter
-from typing import NamedTuple
+import sys
+from pathlib import Path
 
-import numpy as np
-from msgspec.structs import replace
+sys.path.append(str(Path(__file__).parents[1] / "tests"))
 
-from skyless.core.site import AccuracySite
-from skyless.core.ticks import TICK_BITS
-from skyless.radio.foreign.fira import DtTag
-from skyless.radio.uci.uci import UciReader
-from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, PacketTracking
-from skyless.run.board import UciProtocol
-from skyless.sim.evaluation.fleet import world_of
-from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
-from skyless.sim.lab import paper_lab_site
-from skyless.sim.range_errors import RangeErrorModel
-from skyless.sim.trajectory import Static
-from skyless.site.planning.anchor_clocks import AnchorClocks, Relays, relays_of
-from skyless.site.planning.joint_sigma import fill_joint_sigma
-from skyless.site.planning.links import PLAN_COLUMNS, RMSE
-from skyless.site.planning.predict import PlanSettings, Predictor
-
-POINTS_M = np.array([(2.0, 3.0), (1.0, 1.0), (4.5, 6.0), (3.0, 4.0), (5.0, 2.0), (0.7, 7.0)])
-PLACES_M = np.column_stack([POINTS_M, np.zeros(len(POINTS_M))])
-WARM_UP_S, UNTIL_S = 2.0, 4.0
-QA = 0.3
-"""The default of ``skyless tag`` and ``skyless plan``."""
-
-ROUNDS = {"both ways": 2, "one way": 1}
-"""Frames of a node in a superframe."""
-
-KNOWN = {"height_m": 0.0, "qa": QA}
-
-
-class Measured(NamedTuple):
-    """Errors of all tags in all worlds."""
-
-    rmse_m: float
-    planned_m: float
-    round_planned_m: float
-    ratio: float
-    round_ratio: float
-    fixes: int
-
-
-def planned_m(site):
-    """RMSE over the points by ``skyless plan``."""
-    table = Predictor(site, PlanSettings(qa=QA)).at(PLACES_M)
-    return math.sqrt(float(np.mean(table[:, RMSE] ** 2)))
-
-
-def round_planned_m(site, settings):
-    """The same where tags receive a round's messages only, which relay the poll, or the responses in the final one."""
-    planner = Predictor(site, PlanSettings(qa=QA))
-    clocks, master = planner.clocks, planner.master
-    relays = relays_of(planner.anchors_m, master, clocks, planner.budget, planner.walls)
-    messages = len(site.anchors) + site.schedule.frames_per_node - 1
-    begins, ends, kept = [0, *relays.ends[:-1].tolist()], [], []
-    for k in range(messages):
-        is_final = k > 0 and clocks.sender[k] == master
-        rows = range(begins[k], relays.ends[k]) if k > 0 else ()
-        kept += [row for row in rows if is_final or relays.sender[row] == master]
-        ends.append(len(kept))
-    gaps_s = clocks.gap_s[:messages].copy()
-    gaps_s[0] += clocks.gap_s[messages:].sum()
-    clocks = AnchorClocks(clocks.sends, clocks.sender[:messages], gaps_s, clocks.kept)
-    rest = (column[kept].copy() for column in relays[1:])
-    table = np.zeros((len(PLACES_M), len(PLAN_COLUMNS)))
-    relays = Relays(np.array(ends, np.int64), *rest)
-    fill_joint_sigma(PLACES_M, settings, planner.scene, clocks, relays, planner.farthest_m, None, table)
-    return math.sqrt(float(np.mean(table[:, RMSE] ** 2)))
-
-
-def site_with(frames):
-    """The lab, with that many frames of each node in a superframe."""
-    site = paper_lab_site(accuracy=AccuracySite())
-    return replace(site, schedule=replace(site.schedule, frames_per_node=frames))
-
-
-def world(site, seed, number):
-    """One world with its own errors of survey and ranges; the slope has both signs in turn."""
-    errors = site.accuracy
-    ranges = RangeErrorModel(
-        constant_m=math.sqrt(3.0) * errors.range_std_m,
-        slope_m=errors.slope_std_m * (-1.0) ** number,
-        changing_m=errors.place_std_m,
-        correlation_s=errors.place_time_s,
-    )
-    request = Request(site=site, seed=seed + number, room=Room(axis_std_m=errors.survey_std_m, ranges=ranges))
-    return world_of(site, [Static(*point) for point in POINTS_M.tolist()], impairments_of(request, site), request.seed)
-
-
-class Tag:
-    """A board and the tag that is connected to it."""
-
-    def __init__(self, version):
-        drops, self._stream = Counter(), bytearray()
-        self._board = UciProtocol(self._hear, version)
-        self._reader, self._tag = UciReader(drops), DtTag(drops)
-        one_way = DL_TDOA_ONE_WAY.changed(**KNOWN)
-        self._tracking = PacketTracking(DL_TDOA.changed(**KNOWN), {}, TICK_BITS, one_way=one_way)
-
-    def _hear(self, data):
-        self._stream += data
-        return True
-
-    def fixes(self, reception):
-        """Fixes that a reception of the board completes."""
-        self._board.on_radio_event(reception)
-        packets = self._reader.feed(bytes(self._stream))
-        self._stream.clear()
-        found = [self._tracking.on_packet(one) for packet in packets for one in self._tag.on_uci(packet)]
-        return [fix for fix in found if fix is not None]
-
-
-def measure(frames, worlds, seed, version=1, until_s=UNTIL_S):
-    """Errors with that many frames of a node in a superframe."""
-    site, squares, fixes = site_with(frames), 0.0, 0
-    for number in range(worlds):
-        tags = [Tag(version) for _ in POINTS_M]
-        for broadcast in world(site, seed, number).run(until_s):
-            for tag, reception, truth_m in broadcast.receptions():
-                for fix in tags[tag].fixes(reception):
-                    if broadcast.end_s > WARM_UP_S:
-                        squares += float(np.sum((fix.position_m - truth_m)[:2] ** 2))
-                        fixes += 1
-    settings = (DL_TDOA if frames > 1 else DL_TDOA_ONE_WAY).changed(**KNOWN)
-    rmse_m, plan_m, round_m = math.sqrt(squares / fixes), planned_m(site), round_planned_m(site, settings)
-    return Measured(rmse_m, plan_m, round_m, rmse_m / plan_m, rmse_m / round_m, fixes)
+from support.fira_site import ROUNDS, UNTIL_S, Measured, measure
 
 
 def main():
@@ -151,14 +24,14 @@ def main():
     asked = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     asked.add_argument("--worlds", type=int, default=20)
     asked.add_argument("--seeds", type=int, default=3)
-    asked.add_argument("--json", action="store_true")
+    asked.add_argument("--seconds", type=float, default=UNTIL_S)
     arguments = asked.parse_args()
     for name, frames in ROUNDS.items():
         all_found = []
         for number in range(arguments.seeds):
-            all_found.append(measure(frames, arguments.worlds, 1 + 1000 * number))
-            show(name, 1 + 1000 * number, all_found[-1], arguments.json)
-        show(name, "all", together(all_found), arguments.json)
+            all_found.append(measure(frames, arguments.worlds, 1 + 1000 * number, until_s=arguments.seconds))
+            show(name, 1 + 1000 * number, all_found[-1])
+        show(name, "all", together(all_found))
 
 
 def together(found):
@@ -169,17 +42,8 @@ def together(found):
     return Measured(rmse_m, planned_m, round_planned_m, rmse_m / planned_m, rmse_m / round_planned_m, fixes)
 
 
-def show(name, seed, found, as_json):
-    """Print one line of the table."""
-    if as_json:
-        print(json.dumps({"rounds": name, "seed": seed, **found._asdict()}), flush=True)
-        return
-    print(
-        f"{name:<10} seed {seed:>4}: {100 * found.rmse_m:.2f} cm, plan {100 * found.planned_m:.2f} cm, "
-        f"of rounds {100 * found.round_planned_m:.2f} cm, ratios {found.ratio:.3f} and {found.round_ratio:.3f} "
-        f"({found.fixes} fixes)",
-        flush=True,
-    )
+def show(name, seed, found):
+    print(json.dumps({"rounds": name, "seed": seed, **found._asdict()}), flush=True)
 
 
 if __name__ == "__main__":

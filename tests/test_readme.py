@@ -195,8 +195,6 @@ ELSEWHERE = {
     "skyless study room --plot room.png": (
         "tests/studies/test_study_command.py::test_the_study_of_the_room_tells_levels_and_what_is_missed"
     ),
-    "skyless bench": "tests/cli/test_bench_command.py::"
-    "test_it_measures_everything_next_to_its_baselines_and_the_table_names_every_way",
     "skyless paper --out report": "tests/paper/test_paper_report.py::test_verdicts_are_those_of_the_long_report",
     "skyless paper --out quick-report --quick": (
         "tests/paper/test_paper_report.py::test_every_picture_is_there_twice_and_nothing_is_left_over"

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import os
 import socket
 import struct
 from contextlib import asynccontextmanager
@@ -310,7 +311,7 @@ json_values = st.recursive(
 )
 
 
-@settings(max_examples=300)
+@settings(max_examples=int(os.environ.get("SKYLESS_FUZZ_FRAMES", "300")))
 @given(data=st.text() | st.binary() | json_values.map(json.dumps))
 @pytest.mark.site
 @pytest.mark.statistical

@@ -1,6 +1,8 @@
 """MAVLink: pymavlink packs and reads the same bytes; profiles state what autopilots accept, and nothing unknown."""
 
 import math
+import os
+import random
 import re
 import struct
 from pathlib import Path
@@ -14,6 +16,8 @@ from msgspec import structs
 
 from skyless.bridges.mavlink import (
     CRC_EXTRAS,
+    MAGIC_1,
+    MAGIC_2,
     FrameReader,
     GpsGlobalOrigin,
     GpsInput,
@@ -154,7 +158,6 @@ def test_a_damaged_frame_is_dropped_and_the_next_is_read(message, data):
 
 @given(st.lists(st.binary(max_size=400), max_size=5))
 def test_no_bytes_raise_or_are_kept(pieces):
-    """``.venv/bin/python benchmarks/mavlink_noise.py`` does a million."""
     finder = FrameReader(CRC_EXTRAS)
     encoder = MavlinkEncoder("px4")
     encoder.on_site(SITE)
@@ -163,6 +166,28 @@ def test_no_bytes_raise_or_are_kept(pieces):
             decoded(one)
         encoder.on_bytes(piece, 5)
     assert len(finder._buffer) <= 280
+
+
+def test_noise_and_damaged_frames_raise_nothing_and_are_not_kept():
+    """``SKYLESS_FUZZ_FRAMES=1000000`` for a full run."""
+    draw = random.Random(1)
+    encoder = MavlinkEncoder("px4")
+    encoder.on_site(SITE)
+    for _ in range(int(os.environ.get("SKYLESS_FUZZ_FRAMES", "3000"))):
+        noise = draw.randbytes(draw.randrange(60))
+        kind = draw.randrange(4)
+        if kind == 1:
+            noise = bytes([draw.choice((MAGIC_1, MAGIC_2))]) + noise
+        elif kind > 1:
+            number = draw.choice((*CRC_EXTRAS, draw.randrange(1 << 24)))
+            extra = CRC_EXTRAS.get(number, draw.randrange(256))
+            noise = frame(number, extra, noise or b"\0", sequence=draw.randrange(256), system=1, component=1)
+        if kind == 2:
+            at = draw.randrange(len(noise))
+            noise = noise[:at] + bytes([noise[at] ^ 1 << draw.randrange(8)]) + noise[at + 1 :]
+        encoder.on_bytes(noise, draw.getrandbits(62))
+        assert len(encoder._reader._buffer) <= 280
+    assert encoder.dropped["mavlink-check"]
 
 
 def test_a_frame_that_cannot_be_checked_is_skipped():

@@ -61,7 +61,7 @@ def test_version():
 
 @pytest.mark.statistical
 def test_every_command_has_help_with_an_example():
-    for command in (["demo"], ["simulate"], ["replay"], ["bench"], ["site"], ["site", "new"], ["site", "check"]):
+    for command in (["demo"], ["simulate"], ["replay"], ["site"], ["site", "new"], ["site", "check"]):
         done = skyless(*command, "--help")
         assert done.returncode == 0
         assert f"Example: skyless {' '.join(command)}" in done.stdout

@@ -13,7 +13,7 @@ from emulator.processor.cycle_table import cycle_table
 pytestmark = pytest.mark.statistical
 
 PAGE = FIRMWARE.parent / "docs" / "hardware.md"
-RENEW = "python benchmarks/firmware_cycles.py --write renews docs/hardware.md"
+RENEW = "python benchmarks/firmware.py cycles --write renews docs/hardware.md"
 
 
 def figures(text):

@@ -11,7 +11,6 @@ from types import SimpleNamespace
 import msgspec
 import numpy as np
 import pytest
-from hub_cuts import Line
 from msgspec.structs import replace
 from pyarrow import parquet
 from small_hub import client_of, running_hub, site
@@ -31,6 +30,7 @@ from skyless.run.hub.sites import HubSites
 from skyless.run.hub.streams import make_streams_of
 from skyless.run.mqtt.address import mqtt_address
 from skyless.run.mqtt.connection import check_broker
+from support.hub_stage import Line
 from support.processes import SKYLESS, free_node_port, free_port, started
 
 SITE, ROWS, RUN = 7, 20, 5

@@ -1,5 +1,6 @@
 """Forged, altered, repeated and delayed beacons at a site with keys: none moves a verified fix."""
 
+import os
 from bisect import bisect_right
 from collections import Counter
 from functools import lru_cache
@@ -173,7 +174,7 @@ def received_at(frame, near: Received, host_s):
     )
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=int(os.environ.get("SKYLESS_FUZZ_FRAMES", "3000")) // 200, deadline=None)
 @given(seed=st.integers(0, 1 << 32), losses=st.integers(0, 100), additions=st.integers(0, 400))
 def test_any_mix_gives_the_fixes_of_the_genuine_frames(seed, losses, additions):
     """Some frames are lost for ever; among the others are forged and altered ones, and copies of those received."""

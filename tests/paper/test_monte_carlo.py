@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from skyless.core.ticks import TICK_M, TICK_S
-from skyless.research.bench.monte_carlo_speed import bench_chain, draw_loop
 from skyless.research.paper.monte_carlo import (
     CHUNK_DRAWS,
     Quantity,
@@ -13,6 +12,7 @@ from skyless.research.paper.monte_carlo import (
     noise_batches,
 )
 from skyless.research.uncertainty.chain import CORRECTED, Chain, Reference, chain_covariance
+from support.random_chain import draw_loop, random_chain
 
 pytestmark = pytest.mark.statistical
 
@@ -21,7 +21,7 @@ SHARING = list(Reference)
 
 def chain_for(reference, **changes):
     """Ten random anchors, stamps of master, anchors and tag of different noise."""
-    chain = bench_chain(10, seed=4)
+    chain = random_chain(10, seed=4)
     t_m = {Reference.APART: 0.041, Reference.FIRST_SYNC: 0.0, Reference.SECOND_SYNC: chain.sync_spacing_s}[reference]
     sigmas = {"sigma_master_s": 9e-12, "sigma_anchor_s": 4e-12, "sigma_tag_s": 6e-12}
     fields = {name: getattr(chain, name) for name in Chain.__slots__}

@@ -9,7 +9,6 @@ TESTS = Path(__file__).parents[1]
 HOLDS = {
     "site/test_site_load.py": ("test_no_file_ends_in_anything_but_a_configuration_error",),
     "authentication/test_key_files.py": ("test_any_bytes_as_a_public_key_give_one_line",),
-    "benchmarks/test_hub_cuts.py": ("test_every_fix_is_in_the_history_once_after_kills_and_cuts",),
     "bridges/test_alarm_targets.py": ("test_a_name_cannot_add_headers",),
     "bridges/test_foxglove.py": ("test_pages_of_other_sites_are_refused",),
     "dashboard/test_connections.py": (
@@ -39,6 +38,7 @@ HOLDS = {
         "test_a_damaged_file_is_named_and_no_traceback",
     ),
     "history/test_writer.py": ("test_a_full_disk_costs_the_oldest_rows_that_wait_and_is_counted",),
+    "hub/test_hub_cuts.py": ("test_every_fix_is_in_the_history_once_after_kills_and_cuts",),
     "hub/test_hub_failures.py": ("test_a_wrong_certificate_is_said_and_a_right_one_is_taken",),
     "hub/test_rogue_site.py": ("test_no_site_writes_as_another",),
     "machines/test_forged_beacons.py": ("test_no_forged_frame_moves_a_verified_fix_or_an_anchor",),

@@ -13,9 +13,9 @@ from systematic import (
 
 from skyless.core.protocol1.snapshots import bracketed_tdoa, literal_tdoa
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.research.bench.monte_carlo_speed import bench_chain
 from skyless.research.paper.monte_carlo import Quantity, ideal_values
 from skyless.research.uncertainty.chain import Reference
+from support.random_chain import random_chain
 
 MASTER, ANCHORS = np.array([0.0, 0.0, 0.5]), np.array([(6, 0, 2.5), (6, 8, 0.5), (0, 8, 2.5)], float)
 SPACING_S = 15e-3
@@ -81,7 +81,7 @@ def test_a_smoothed_rate_keeps_the_velocity():
 
 def test_what_the_ideal_chain_leaves_is_e_and_the_tags_scale():
     """``eq:GPSTDoA`` without noise, through the program's functions, to a ten-thousandth of a tick."""
-    chain = bench_chain(10, seed=6)
+    chain = random_chain(10, seed=6)
     left_m = ideal_values(chain, Reference.APART)[Quantity.LAMBDA] * TICK_M
     left_m -= (chain.tag_tof_s - chain.tag_master_tof_s) / TICK_S * TICK_M  # the true difference
     np.testing.assert_allclose(left_m, synchronisation_error_m(chain) + scale_error_m(chain), atol=1e-4 * TICK_M)
@@ -92,7 +92,7 @@ def test_the_sizes_that_the_documents_tell():
     light = TICK_M / TICK_S
 
     def one(**changes):
-        chain = bench_chain(1)
+        chain = random_chain(1)
         return type(chain)(**({name: getattr(chain, name) for name in type(chain).__slots__} | changes))
 
     far = one(anchor_rate=np.array([1 + 20e-6]), anchor_tof_s=np.array([10.0 / light]))

@@ -61,7 +61,6 @@ _GROUPS: Final = {
         ("study", "study", "Measure the receiver's errors over many simulated runs."),
         ("paper", "paper", "Reproduce the paper's figures and claims in one report."),
         ("benchmark", "benchmark", "Compare methods on every recording below a folder."),
-        ("bench", "bench", "Measure how fast filters and Monte Carlo draws run on this machine."),
     ),
 }
 """The commands, in the groups and in the order of the help."""

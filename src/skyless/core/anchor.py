@@ -3,7 +3,7 @@
 A driver (simulator, program) hands it every reception, asks when its next frame is due, and fetches that frame as late
 as its radio allows, so that it carries the latest receptions.
 
-An anchor knows no time other than its own counter. It sends at the instants of ``skyless.core.air.instants``. The more
+An anchor knows no time other than its own counter. It sends at the instants of ``skyless.core.air.almanac``. The more
 anchors it receives, the less often it sends, so that together they offer what the air carries best.
 """
 

@@ -14,7 +14,6 @@ EXTRA_OF: Final = {
     "dateparser": "history",
     "distributed": "dask",
     "duckdb": "history",
-    "filterpy": "bench",
     "gpiod": "pi",
     "matplotlib": "site",
     "mcap": "site",

@@ -36,7 +36,7 @@ _MAX_STARTS_S: Final = 60.0
 _LEAD_S: Final = 5.0e-3
 """A command of 112 bytes on the line (1.1 ms), the lag of the estimate of the board's counter, which is the shortest
 transfer of a record (1.2 ms), the board (0.3 ms), and a USB bridge that passes on 64 bytes in a millisecond; without
-such a bridge 2.5 ms would do (``benchmarks/firmware_site.py``)."""
+such a bridge 2.5 ms would do (``benchmarks/firmware.py site``)."""
 
 _REASONS: Final = {
     link.REFUSED_SETTING: "it has not these settings",

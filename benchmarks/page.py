@@ -1,11 +1,12 @@
 """What the page's server says of a healthy large site, and how much processor time the page takes for a frame of it.
 
-``.venv/bin/python benchmarks/page_at_scale.py [--part server|page|all] [--seconds 8] [--json]``
+``.venv/bin/python benchmarks/page.py [--part server|page|all] [--seconds 8] [--quick]``
 
 Server: its live site gets the messages of healthy tags and anchors without a broker, by a clock that stands meanwhile,
 so that no load disturbs it: what it finds then, what it sends a page, and the processor time of one evaluation.
 Page: a headless Chromium shows a made-up site of that size, with the list of tags open, while tags move; the server
 process sends it what the real one would. The figure is the processor time of the page's thread for each frame drawn.
+Each site has its line of JSON.
 """
 
 import argparse
@@ -35,8 +36,9 @@ from skyless.page.live import LiveSite
 from skyless.page.sites import LiveSites
 from skyless.run.mqtt import topics
 
+QUICK = ((50, 8),)
 SERVER = ((1_900, 8), (3_000, 8), (10_000, 8), (100_000, 8), (3, 1_000), (3, 3_000), (3, 10_000), (250_000, 8))
-PAGE = ((1_000, 1_000), (100_000, 10_000))
+PAGE = ((200, 8), (1_000, 1_000), (100_000, 10_000))
 SPACING_M = 4.0
 FREE = replace(SITE.site.schedule, mode="free")
 MOVING = 2_000
@@ -148,7 +150,7 @@ def page_row(browser, tags, anchors, seconds):
     with served(tags, anchors) as address:
         page = browser.new_page(viewport={"width": 1440, "height": 900})
         page.goto(address)
-        until(page, "window.skyless?.live.sorted.length >= Math.min(1000, 500)", timeout_s=60.0)
+        until(page, f"window.skyless?.live.sorted.length >= {min(tags, 500)}", timeout_s=60.0)
         time.sleep(5.0)
         session = page.context.new_cdp_session(page)
         session.send("Performance.enable", {"timeDomain": "threadTicks"})
@@ -160,9 +162,7 @@ def page_row(browser, tags, anchors, seconds):
         (frames, still, begin_ms), busy = page.evaluate(COUNT), busy_s()
         time.sleep(seconds)
         (more, still_more, end_ms), after = page.evaluate(COUNT), busy_s()
-        words = page.evaluate(
-            "document.getElementById('part').innerText + ' | ' + document.getElementById('pill-words').innerText"
-        )
+        words = page.evaluate("document.getElementById('part').innerText")
         rows = page.evaluate("document.querySelectorAll('table.tags tbody tr').length")
         page.close()
     made = max(more - frames, 1)
@@ -173,29 +173,21 @@ def page_row(browser, tags, anchors, seconds):
     }  # fmt: skip
 
 
-def table(rows):
-    for row in rows:
-        cells = (f"{k} {v:.1f}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items())
-        print("  ".join(cells), flush=True)
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--part", choices=("server", "page", "all"), default="all")
     parser.add_argument("--seconds", type=float, default=8.0)
-    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--quick", action="store_true", help="one small site")
     asked = parser.parse_args()
-    server = [server_row(*size) for size in SERVER] if asked.part != "page" else []
-    page = []
+    if asked.part != "page":
+        for size in QUICK if asked.quick else SERVER:
+            print(json.dumps(server_row(*size)), flush=True)
     if asked.part != "server":
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
-            page = [page_row(browser, *size, asked.seconds) for size in PAGE]
+            for size in QUICK if asked.quick else PAGE:
+                print(json.dumps(page_row(browser, *size, asked.seconds)), flush=True)
             browser.close()
-    if asked.json:
-        print(json.dumps({"server": server, "page": page}))
-    else:
-        table([*server, *page])
 
 
 if __name__ == "__main__":

@@ -1,12 +1,9 @@
-"""What questions to a history cost: ``python benchmarks/history_queries.py [--rows 1e6] [--folder FOLDER] [--json]``.
+"""What questions to a history cost: ``python benchmarks/history.py [--rows 1e6] [--folder FOLDER] [--json]``.
 
 Writes the fixes of 500 tags at 1 Hz, half of them walking, with their zone events, as the history's own program leaves
 them after a night: files of an hour. Each question is asked in a process of its own. Processor seconds are those of all
 threads, user and system: of the question alone, and with the start of Python and the loading of libraries. Data of
 the same size in a given folder is used again; without --folder it is removed at the end. 1e8 rows take half a gigabyte.
-
-With ``--large year`` it writes 100 tags at 10 Hz for a year, of which all but a week is thinned (9e8 rows, minutes),
-with ``--large day`` one tag at 50 Hz for a day. What a question is refused for stands in the place of what it found.
 """
 
 import argparse
@@ -28,7 +25,6 @@ from skyless.run.history.layout import (
     EVENT_COLUMNS,
     FIX_COLUMNS,
     NAME_COLUMNS,
-    THINNED,
     ZONE_COLUMNS,
     file_name,
     site_folder,
@@ -41,9 +37,6 @@ HALL_M = np.array([100.0, 60.0])
 BEGIN = datetime(2026, 11, 2, tzinfo=UTC)
 ZONES = 24
 SHIFT_S = 8 * HOUR_S
-LARGE = {"year": (100, 10.0, 7, 358), "day": (1, 50.0, 1, 0)}
-"""Tags, rate in Hz, days that are whole, days that are thinned."""
-FILE_ROWS = 2_000_000
 
 
 def table_of(columns, data):
@@ -104,68 +97,6 @@ def write_events(site, events):
     )
 
 
-def write_large(folder, tags, rate_hz, days, thinned_days):
-    """Days in which tags walk all the time in the same way, whose files are of the size that a history joins."""
-    site, first, day = site_folder(folder, SITE), 1, BEGIN - timedelta(days=thinned_days)
-    for of_day, count, metadata in ((0.1, thinned_days, {THINNED: b"yes"}), (rate_hz, days, {})):
-        per_file = min(round(86_400 * of_day), FILE_ROWS // tags)
-        block = walk(tags, per_file, of_day)
-        for _ in range(count):
-            for begin in range(0, round(86_400 * of_day), per_file):
-                seconds = day.timestamp() + begin / of_day
-                part = {**block, "t": block["t"] + round(1000 * seconds)}
-                rows = min(per_file, round(86_400 * of_day) - begin)
-                part = {name: column.reshape(tags, -1)[:, :rows].ravel() for name, column in part.items()}
-                file = site / f"day={day.date()}" / file_name(first, first + tags * rows - 1)
-                write_table(table_of(FIX_COLUMNS, part).replace_schema_metadata(metadata), file)
-                first += tags * rows
-            day += timedelta(days=1)
-    events = []
-    begin_ms, minutes = round(1000 * (BEGIN - timedelta(days=thinned_days)).timestamp()), 1440 * (days + thinned_days)
-    for minute in range(0, minutes, 10):  # each tag leaves a zone and enters the next every ten minutes
-        at, zone = begin_ms + 60_000 * minute, minute // 10
-        for tag in range(tags):
-            events += [
-                (at + tag, "leave", tag, (zone + tag) % ZONES), (at + tag, "enter", tag, (zone + tag + 1) % ZONES)
-            ]  # fmt: skip
-    write_events(site, events)
-
-
-def walk(tags, count, rate_hz):
-    """Columns of fixes of random walks, by tag and time, which begins with 0."""
-    draw = np.random.default_rng(1)
-    way = np.cumsum(draw.normal(0.0, 1.0 / np.sqrt(rate_hz), (tags, count, 2)), axis=1)
-    way = np.abs((way + HALL_M) % (2.0 * HALL_M) - HALL_M)
-    mm = np.rint(1000.0 * way).astype(np.int32).reshape(-1, 2)
-    columns = {"tag": np.repeat(np.arange(1, tags + 1), count), "x_mm": mm[:, 0], "y_mm": mm[:, 1]}
-    columns |= {"t": np.tile(np.rint(1000.0 / rate_hz * np.arange(count)).astype(np.int64), tags)}
-    same = {"z_mm": 1200, "std_mm": 40, "hpl_cm": 30, "flags": 16}
-    return columns | {name: np.full(tags * count, value) for name, value in same.items()}
-
-
-def answer_large(folder, name, shape):
-    """Ask one question of a large history in this process."""
-    tags, _, days, thinned_days = shape
-    end_s = BEGIN.timestamp() + 86_400.0 * days
-    whole, tag = Span(end_s - 86_400.0 * (days + thinned_days), end_s), f"tag{min(77, tags)}"
-    day, history = Span(end_s - 86_400.0, end_s), History(folder, SITE)
-    asked = {
-        "way of a tag, whole range": lambda: history.track(tag, whole, 20_000).fixes,
-        "heat map of all, whole range": lambda: round(sum(history.heatmap(whole).seconds)),
-        "heat map of all in cells of 0.05 m": lambda: round(sum(history.heatmap(day, 0.05).seconds)),
-        "contacts of a tag, whole range": lambda: len(history.contacts(tag, whole, 50.0)),
-        "contacts of a tag, a day": lambda: len(history.contacts(tag, day, 50.0)),
-        "contacts of a tag since 1970": lambda: len(history.contacts(tag, Span(0.0, end_s))),
-        "dwell of all, whole range": lambda: len(history.dwell(whole)),
-        "occupancy of all, whole range": lambda: len(history.occupancy(whole, step_s=43_200.0)),
-        "occupancy of all in steps of 1 s": lambda: len(history.occupancy(day, step_s=1.0)),
-        "alarms, whole range": lambda: len(history.alarms(whole)),
-        "export of a tag, whole range": lambda: history.export(folder / "way.parquet", whole, [tag]),
-        "export of all, whole range": lambda: history.export(folder / "all.parquet", whole),
-    }
-    return asked if name is None else measured(name, asked[name])
-
-
 def answer(folder, name, rows):
     """Ask one question in this process."""
     begin_s, end_s = BEGIN.timestamp(), BEGIN.timestamp() + rows / TAGS
@@ -218,28 +149,23 @@ def cpu_s():
 def main():
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rows", type=lambda text: round(float(text)), default=1_000_000)
-    parser.add_argument("--large", choices=LARGE)
     parser.add_argument("--folder", type=Path, help="where the history is written, or was")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--ask", help=argparse.SUPPRESS)
     asked = parser.parse_args()
-    ask = answer if asked.large is None else answer_large
-    size = asked.rows if asked.large is None else LARGE[asked.large]
     if asked.ask:
-        print(json.dumps(ask(asked.folder, asked.ask, size)))
+        print(json.dumps(answer(asked.folder, asked.ask, asked.rows)))
         return
     with tempfile.TemporaryDirectory() as scratch:
         folder = asked.folder or Path(scratch)
         if not site_folder(folder, SITE).exists():
-            if asked.large is None:
-                written = write_history(folder, asked.rows)
-                print(f"{asked.rows} rows of {TAGS} tags, {written / asked.rows:.2f} bytes a row", file=sys.stderr)
-            else:
-                write_large(folder, *size)
+            written = write_history(folder, asked.rows)
+            print(
+                f"{asked.rows} rows of {TAGS} simulated tags, {written / asked.rows:.2f} bytes a row", file=sys.stderr
+            )
         answers = []
-        for name in ask(folder, None, size):
+        for name in answer(folder, None, asked.rows):
             words = [sys.executable, __file__, "--folder", folder, "--rows", str(asked.rows), "--ask", name]
-            words += [] if asked.large is None else ["--large", asked.large]
             answers.append(json.loads(subprocess.run(words, capture_output=True, text=True, check=True).stdout))
     if asked.json:
         print(json.dumps(answers))

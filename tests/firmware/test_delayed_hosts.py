@@ -1,8 +1,8 @@
 """A site on slow hosts: slots are skipped and counted, and never a frame leaves with a wrong stamp."""
 
 import pytest
+from emulator.site.delayed_hosts import run_hosts
 from emulator.site.host_programs import HostLatency
-from host_latency import run_hosts
 
 pytestmark = pytest.mark.statistical
 

@@ -1,15 +1,9 @@
-"""What a hub does when servers die and lines are cut: three servers of the hub and a site, real programs on loopback.
-
-``.venv/bin/python benchmarks/hub_cuts.py [--part table|random] [--seed 1] [--actions 20]``
+"""A hub of three real servers, a site whose line can be cut, and a program that sends it numbered batches.
 
 The servers' files are those of ``skyless hub init``; the site is ``skyless broker --gather --hub``. Its line goes
-through a proxy that can be cut. A program packs 20 batches of 20 fixes a second into the site's stream and sends each
-until it is acknowledged. ``table``: how long a viewer at the hub sees nothing, and after which time the hub's stream
-has all that was acknowledged. ``random``: kills and cuts in a random order, the history's program among them; then
-every fix must be in its Parquet files once, and the batches in the hub's stream in order. The exit code is 1 otherwise.
+through a proxy. 20 batches of 20 fixes a second are sent into the site's stream, each until it is acknowledged.
 """
 
-import argparse
 import asyncio
 import contextlib
 import json
@@ -18,10 +12,8 @@ import random
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -269,49 +261,6 @@ def run(*command):
         raise RuntimeError(f"{command}: {done.stderr}")
 
 
-async def table(stage):
-    """Rows of what happened, the longest gap of the live view, and the time until the stream was complete."""
-
-    async def during(name, act, undo, seconds, settle_s):
-        stage.arrivals = [time.monotonic()]
-        act()
-        await asyncio.sleep(seconds)
-        at_s = time.monotonic()
-        undone = undo()
-        if asyncio.iscoroutine(undone):
-            await undone
-        complete_s = await stage.complete()
-        await asyncio.sleep(settle_s)
-        times = [*stage.arrivals, time.monotonic()]
-        gap_s = max(later - before for before, later in pairwise(times))
-        back_s = next((time_s - at_s for time_s in stage.arrivals if time_s > at_s), float("inf"))
-        print(f"{name:45} {gap_s:9.2f} {back_s:9.2f} {complete_s:9.1f}", flush=True)
-
-    print(f"{'':45} {'gap, s':>9} {'back, s':>9} {'complete, s':>9}   after the end of the trouble")
-    viewing = asyncio.ensure_future(stage.view())
-    await asyncio.sleep(2)
-    own, other, _ = stage.by_viewer()
-    await during("a hub's server that is not the viewer's, 10 s", other.kill, other.start, 10, 5)
-    await during("the viewer's own server, 10 s", own.kill, own.start, 10, 5)
-    await during("the line, 25 s", stage.cut, lambda: stage.cut(is_cut=False), 25, 5)
-    _, *two = stage.by_viewer()
-
-    def both(act):
-        for server in two:
-            act(server)
-
-    name = "the two servers that are not the viewer's, 10 s"
-    await during(name, lambda: both(Process.kill), lambda: both(Process.start), 10, 5)
-    await during("the site's broker, 3 s", stage.kill_broker, stage.start_broker, 3, 5)
-    await stage.stop_sending()
-    await stage.complete()
-    viewing.cancel()
-    found = await stage.sequences()
-    is_ordered = found == list(range(1, len(found) + 1))
-    print(f"{len(found)} of {stage.acknowledged} acknowledged batches at the hub, once and in order: {is_ordered}")
-    return is_ordered
-
-
 async def at_random(stage, seed, actions):
     """Whether everything is in the history once, after kills and cuts."""
     draw, folder = random.Random(seed), stage.folder / "history"
@@ -358,20 +307,3 @@ async def at_random(stage, seed, actions):
     is_whole, is_ordered = sorted(rows) == list(range(aim)), found == list(range(1, stage.acknowledged + 1))
     print(f"{len(rows)} of {aim} acknowledged fixes in the history, each once: {is_whole}; in order: {is_ordered}")
     return is_whole and is_ordered
-
-
-async def main(part, seed, actions, folder, ports, mqtt_port):
-    async with Stage(Path(folder), ports, mqtt_port) as stage:
-        return await (table(stage) if part == "table" else at_random(stage, seed, actions))
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--part", choices=("table", "random"), default="table")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--actions", type=int, default=20)
-    asked = parser.parse_args()
-    with tempfile.TemporaryDirectory() as scratch:
-        ports = (24222, 24223, 24224)
-        is_good = asyncio.run(main(asked.part, asked.seed, asked.actions, scratch, ports, 21883))
-    sys.exit(0 if is_good else 1)

@@ -6,11 +6,11 @@ import signal
 from urllib.request import urlopen
 
 import pytest
-from hub_cuts import RECORDS, Stage, at_random
 
 from skyless.run.history.hub_source import HubHistory
 from skyless.run.history.retention import Keep
 from skyless.run.hub.files import MONITOR_PORT
+from support.hub_stage import RECORDS, Stage, at_random
 from support.processes import free_node_port, free_port
 
 pytestmark = pytest.mark.statistical

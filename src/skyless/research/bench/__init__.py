@@ -1,1 +1,0 @@
-"""Speed of the program on this machine."""
