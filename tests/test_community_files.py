@@ -1,6 +1,7 @@
 """The files that platforms read: citation, forms for issues, the workflow; and the repository's one address."""
 
 import re
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 GITHUB = ROOT / ".github"
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+CONFIGURATION = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = CONFIGURATION["project"]
+TOWNCRIER = CONFIGURATION["tool"]["towncrier"]
 ADDRESS = PROJECT["urls"]["Repository"]
 FORMS = sorted(path for path in (GITHUB / "ISSUE_TEMPLATE").glob("*.yml") if path.name != "config.yml")
 
@@ -53,12 +56,80 @@ def test_the_workflow_runs_the_scripts_of_the_repository():
     workflow = loaded(GITHUB / "workflows" / "ci.yml")
     assert workflow.keys() >= {"name", True, "permissions", "jobs"}  # YAML 1.1 reads the key ``on`` as true
     assert workflow["jobs"]["test"]["strategy"]["matrix"]["python"] == ["3.11", "3.13"]
-    lines = {step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step}
-    assert lines == {"scripts/check", "scripts/test unit", "scripts/test", "scripts/docs", "scripts/audit"}
-    for line in lines:
-        assert (ROOT / line.split()[0]).stat().st_mode & 0o111, line
+    lines = scripts_of(workflow)
+    assert lines == {
+        "scripts/check", "scripts/test unit", "scripts/test", "scripts/test statistical", "scripts/test tests/firmware",
+        "scripts/docs", "scripts/audit",
+    }  # fmt: skip
+
+
+def scripts_of(workflow):
+    """The scripts of the repository that a workflow runs; each job has a limit of time."""
     for job in workflow["jobs"].values():
         assert job.keys() >= {"runs-on", "timeout-minutes", "steps"}
+    runs = {step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step}
+    lines = {line for line in runs if line.startswith("scripts/")}
+    for line in lines:
+        assert (ROOT / line.split()[0]).stat().st_mode & 0o111, line
+    return lines
+
+
+def test_statistical_tests_run_at_night_and_vulnerabilities_are_looked_for_always():
+    workflow = loaded(GITHUB / "workflows" / "ci.yml")
+    assert [entry.keys() for entry in workflow[True]["schedule"]] == [{"cron"}]
+    conditions = {name: job.get("if") for name, job in workflow["jobs"].items()}
+    assert conditions.pop("audit") is None
+    assert conditions.pop("statistical") == "github.event_name == 'schedule'"
+    assert set(conditions.values()) == {"github.event_name != 'schedule'"}
+
+
+def test_only_a_tag_publishes_and_only_what_was_tried():
+    workflow = loaded(GITHUB / "workflows" / "publish.yml")
+    assert workflow[True] == {"push": {"tags": ["v*"]}}
+    assert scripts_of(workflow) == {"scripts/publish --dry-run", "scripts/publish --dry-run --made"}
+    jobs = workflow["jobs"]
+    assert workflow["permissions"] == {}
+    assert {name: job["permissions"] for name, job in jobs.items()} == {
+        "build": {"contents": "read"},
+        "aarch64": {"contents": "read"},
+        "publish": {"id-token": "write"},
+    }
+    assert jobs["publish"]["environment"] == "pypi"
+    assert set(jobs["publish"]["needs"]) == {"build", "aarch64"}
+    assert jobs["publish"]["steps"][-1]["uses"].startswith("pypa/gh-action-pypi-publish@")
+
+
+def test_dependencies_are_updated_every_week_in_groups():
+    updates = loaded(GITHUB / "dependabot.yml")["updates"]
+    assert {update["package-ecosystem"] for update in updates} == {"uv", "github-actions"}
+    for update in updates:
+        assert update["schedule"] == {"interval": "weekly"}
+        assert len(update["groups"]) == 1
+
+
+@pytest.mark.parametrize("words", [(), ("--made",), ("--dry-run", "now")])
+def test_the_script_publishes_nothing(words):
+    done = subprocess.run([ROOT / "scripts" / "publish", *words], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "publishing is done by .github/workflows/publish.yml" in done.stderr
+
+
+def test_paths_that_the_guide_names_exist():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    paths = set(
+        re.findall(
+            r"(?<![\w./])(?:\.venv[\w./-]*|tests|scripts|benchmarks|docs|changes|src|\.github)/[\w./-]*\w/?", text
+        )
+    )
+    paths |= set(re.findall(r"`([\w-]+\.(?:py|toml|md|lock|cff))`", text))
+    assert {path for path in paths if not path.startswith(".venv") and not (ROOT / path).exists()} == set()
+
+
+def test_the_changelog_has_the_version_and_the_mark_of_towncrier():
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert TOWNCRIER["start_string"] in text
+    assert re.search(r"^## (\S+) \(", text, re.MULTILINE)[1] == PROJECT["version"]
+    assert (ROOT / TOWNCRIER["directory"] / "README.md").exists()
 
 
 def test_every_file_names_the_same_repository():
