@@ -364,7 +364,7 @@ def test_the_bound_is_of_what_the_worlds_draw():
 
 @pytest.mark.statistical
 def test_the_bound_of_the_room():
-    """What ``docs/maths.md`` says of it, from the first six of the hundred tags."""
+    """The bounds of the first two rows in ``docs/studies.md``, from six tags."""
     plan = replace(plan_of("joint", 11, study="room", worlds=2), tags=3)
     base, air = room.cases(plan)[:2]
     for case, bound_m in ((base, 0.0249), (air, 0.0167)):
