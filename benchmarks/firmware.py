@@ -36,8 +36,7 @@ from emulator.site.tag_world import TagWorld
 from msgspec.structs import replace
 
 from skyless.core.site import AnchorSite, ScheduleSite
-from skyless.radio.serial.board_settings import BoardSettings
-from skyless.radio.serial.link import Reader, decode
+from skyless.radio.serial.link import BoardSettings, Reader, decode
 from skyless.radio.tag_reports import BoardFix, BoardStatus
 from skyless.run import anchor
 from skyless.sim.compile_ahead import compile_kernels

@@ -1,8 +1,8 @@
-"""The colour of a predicted value, computed as ``site/planning/colours.py`` describes it."""
+"""The colour of a predicted value, computed as ``site/planning/picture.py`` describes it."""
 
 import math
 
-from skyless.site.planning.colours import COLOUR_STOPS
+from skyless.site.planning.picture import COLOUR_STOPS
 
 
 def fraction_of(value, low, high):

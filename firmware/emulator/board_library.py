@@ -8,8 +8,8 @@ from functools import cache, partial
 from typing import Protocol
 
 from emulator.build import build
-from skyless.radio.dw1000 import driver
-from skyless.radio.serial.board_settings import SETTINGS_BYTES, BoardSettings, unpack
+from skyless.radio.dw1000 import radio
+from skyless.radio.serial.link import SETTINGS_BYTES, BoardSettings, unpack
 
 KEPT_BYTES = 80
 PLACES = ("board_bytes", "chip_bytes", "chip", "settings", "stage", "unix_us")
@@ -17,7 +17,7 @@ PLACES = ("board_bytes", "chip_bytes", "chip", "settings", "stage", "unix_us")
 STAGES = ("NO_FRAME", "FRAME_HELD", "FRAME_HANDED_OVER")
 
 
-class Processor(driver.Bus, Protocol):
+class Processor(radio.Bus, Protocol):
     """What a board needs of its processor, as in ``struct hardware``; what most tests do not look at is done here."""
 
     lights: int = 0
@@ -66,7 +66,7 @@ def library() -> ctypes.CDLL:
         RuntimeError: it cannot be built; the message has the compiler's.
     """
     loaded = ctypes.CDLL(str(build("host")))
-    driver.declare(loaded)
+    radio.declare(loaded)
     loaded.link_number.restype = ctypes.c_uint64
     for name in ("settings_check", "settings_unpack", "fix_is_due"):
         getattr(loaded, name).restype = ctypes.c_bool
@@ -80,7 +80,7 @@ def places() -> dict[str, int]:
     return dict(zip(PLACES, found, strict=True))
 
 
-class Hardware(driver.Hardware):
+class Hardware(radio.Hardware):
     """``struct hardware``."""
 
     _fields_ = (
@@ -135,7 +135,7 @@ class CBoard:
         self._hardware = Hardware(processor)
         identity = bytes((can_transmit, *device_id, reset_cause))
         self._library.board_init(self._board, ctypes.byref(self._hardware), identity)
-        self.chip = driver.DW1000.from_buffer(self._memory, places()["chip"])
+        self.chip = radio.DW1000.from_buffer(self._memory, places()["chip"])
         """Its fields; the board alone calls the driver."""
 
     @property

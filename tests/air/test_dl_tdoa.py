@@ -9,9 +9,13 @@ from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import Packet, Relay
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
-from skyless.radio.uci.dl_tdoa import MAX_ANCHORS_KEPT, MAX_ROUNDS_AT_ONCE, DtMessage, DtRounds, host_time_s
-from skyless.radio.uci.uci import (
+from skyless.radio.foreign.uci import (
+    MAX_ANCHORS_KEPT,
+    MAX_ROUNDS_AT_ONCE,
+    DtMessage,
     DtMessageType,
+    DtRounds,
+    host_time_s,
 )
 
 PLACES_M = {1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.0), 3: (6.0, 8.0, 2.0)}

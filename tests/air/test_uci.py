@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.radio.uci.uci import (
+from skyless.radio.foreign.uci import (
     LOCATION_BYTES,
     NO_LOCATION,
     RELATIVE_LOCATION,

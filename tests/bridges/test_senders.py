@@ -11,7 +11,7 @@ import pytest
 from skyless.bridges.jsonl import JsonLines
 from skyless.bridges.targets import PtySender, SerialSender, TcpServer, UdpSender
 from skyless.core.errors import SkylessError
-from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_port import Pty
 from skyless.run.limits import BRIDGES as LIMITS
 
 

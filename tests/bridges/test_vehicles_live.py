@@ -14,7 +14,7 @@ from msgspec import structs
 from skyless.bridges.mavlink import gps_input, odometry, vision_position_estimate
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
-from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_port import Pty
 
 pymavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
 HEADING_DEG = SITE.georeference.heading_deg

@@ -23,8 +23,7 @@ from skyless.sim.impairments import DelayError
 from skyless.sim.lab import lab_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
-from skyless.site.survey.facts import Facts, Gauge, KnownDelay, Tape, count
-from skyless.site.survey.result import Survey, read_record
+from skyless.site.survey.facts import Facts, Gauge, KnownDelay, Survey, Tape, count, read_record
 from skyless.site.tables import read_anchors, read_calibration, read_ranges
 
 pytestmark = pytest.mark.site

@@ -3,7 +3,7 @@ from statistics import median_high
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.site.survey.two_way import RunningMedian
+from skyless.site.survey.legs import RunningMedian
 
 
 @given(st.lists(st.integers(-5, 5) | st.floats(-1e6, 1e6), min_size=1, max_size=60), st.integers(1, 12))

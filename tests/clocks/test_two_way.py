@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.research.foreign.avalue import anchor_distances_m
-from skyless.site.survey.two_way import Leg, TwoWayRanging, bracketed_flight_ticks
+from skyless.site.survey.legs import Leg, TwoWayRanging, bracketed_flight_ticks
 
 SECOND = 63_897_600_000
 wrapped = st.integers(0, 2**40 - 1)

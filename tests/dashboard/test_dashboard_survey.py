@@ -22,8 +22,7 @@ from skyless.run.mqtt.access import Role
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import SurveyFactsMessage, SurveyMessage, WatchFinding, WatchMessage
 from skyless.run.mqtt.survey_facts import BadFactsError
-from skyless.site.survey.facts import Facts, Gauge, Tape
-from skyless.site.survey.result import Survey, SurveyedAnchor, TapeAdvice
+from skyless.site.survey.facts import Facts, Gauge, Survey, SurveyedAnchor, Tape, TapeAdvice
 
 pytestmark = pytest.mark.site
 

@@ -9,7 +9,7 @@ import pytest
 from emulator.build import FIRMWARE, HAS_ARM_COMPILER
 
 from skyless.core.native.library import SOURCE
-from skyless.radio.dw1000.driver import SOURCES
+from skyless.radio.dw1000.radio import SOURCES
 
 needs_processor = pytest.mark.skipif(
     not HAS_ARM_COMPILER or find_spec("unicorn") is None,

@@ -10,7 +10,7 @@ from emulator.build import HAS_HOST_COMPILER
 
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite
-from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_port import Pty
 from support.board_tag import OriginInC, fix_in_c
 from support.gpsd import GPSD, gpsd
 

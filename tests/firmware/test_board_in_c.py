@@ -22,7 +22,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.core.ticks import difference, wrap
-from skyless.radio.dw1000 import driver as dw1000
+from skyless.radio.dw1000 import radio as dw1000
 from skyless.radio.serial.link import Done, Heard, Hello, NotDone, Status, TooLate
 
 pytestmark = [pytest.mark.site, needs_compiler]

@@ -9,7 +9,7 @@ from emulator.build import FIRMWARE, HAS_ARM_COMPILER, build
 from processor_stage import STACK_BYTES
 
 from skyless.core.native.library import SOURCE
-from skyless.radio.dw1000.driver import SOURCES
+from skyless.radio.dw1000.radio import SOURCES
 
 pytestmark = pytest.mark.site
 

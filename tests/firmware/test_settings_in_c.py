@@ -14,10 +14,21 @@ from msgspec.structs import asdict, replace
 from skyless.cli.nodes.flash_config import BoardOptions
 from skyless.core.arguments import OptionError
 from skyless.core.fix import NoFixReason
-from skyless.radio.dw1000.driver import IDLE, LISTENING
+from skyless.radio.dw1000.radio import IDLE, LISTENING
 from skyless.radio.serial import link
-from skyless.radio.serial.board_settings import ANY_SITE, MODES, OUTPUTS, SETTINGS_BYTES, BoardSettings, pack, unpack
-from skyless.radio.serial.link import Heard, Hello, NotDone, TagConfig
+from skyless.radio.serial.link import (
+    ANY_SITE,
+    MODES,
+    OUTPUTS,
+    SETTINGS_BYTES,
+    BoardSettings,
+    Heard,
+    Hello,
+    NotDone,
+    TagConfig,
+    pack,
+    unpack,
+)
 from skyless.radio.tag_reports import BoardStatus
 
 pytestmark = [pytest.mark.site, needs_compiler]

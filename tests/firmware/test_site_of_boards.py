@@ -27,8 +27,7 @@ from site_stage import play
 from skyless.core.earth import geodetic
 from skyless.core.site import AnchorSite, GeoreferenceSite
 from skyless.core.ticks import from_seconds
-from skyless.radio.serial.board_settings import OUTPUTS, BoardSettings
-from skyless.radio.serial.link import Writer
+from skyless.radio.serial.link import OUTPUTS, BoardSettings, Writer
 from skyless.sim.lab import lab_site
 from skyless.sim.trajectory import Static
 from support.gpsd import GPSD

@@ -7,8 +7,7 @@ from emulator.site.host_board import HostBoard
 from emulator.site.tag_world import TagWorld
 from msgspec.structs import replace
 
-from skyless.radio.serial.board_settings import BoardSettings
-from skyless.radio.serial.link import Reader, decode
+from skyless.radio.serial.link import BoardSettings, Reader, decode
 from skyless.radio.tag_reports import BoardFix
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of

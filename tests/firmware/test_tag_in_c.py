@@ -8,9 +8,8 @@ from msgspec.structs import replace
 from machines.bench import ROOM, tape
 from skyless.core.air.frame import Diagnostics, after_rmarker_s
 from skyless.core.ticks import from_seconds, to_seconds, wrap
-from skyless.radio.dw1000.driver import OFF
-from skyless.radio.serial.board_settings import BoardSettings, pack
-from skyless.radio.serial.link import ASK_HELLO, ASK_TAG_CONFIG, SET_TAG_CONFIG
+from skyless.radio.dw1000.radio import OFF
+from skyless.radio.serial.link import ASK_HELLO, ASK_TAG_CONFIG, SET_TAG_CONFIG, BoardSettings, pack
 from skyless.radio.tag_reports import BoardFix
 
 pytestmark = [pytest.mark.site, needs_compiler]

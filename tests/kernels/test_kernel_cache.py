@@ -10,8 +10,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from skyless.site.kernels import cache, compiled
-from skyless.site.kernels.cache import choose_folder
+from skyless.site import kernels
+from skyless.site.kernels import choose_folder
 
 pytestmark = pytest.mark.site
 
@@ -45,8 +45,8 @@ def test_a_folder_of_an_image_is_used_where_it_holds_kernels(tmp_path, unwritabl
 
 TWICE = """
 import json
-from skyless.site.kernels.cache import kernel_folder
-from skyless.site.kernels.compiled import kernel
+from skyless.site.kernels import kernel_folder
+from skyless.site.kernels import kernel
 
 @kernel
 def twice(value: float) -> float:
@@ -89,10 +89,10 @@ def test_a_damaged_file_is_compiled_again(run_twice, tmp_path):
 
 
 def test_where_nothing_can_be_written_a_program_compiles_for_itself(monkeypatch):
-    monkeypatch.setattr(cache, "_homes", lambda: [Path("/proc/nowhere")])
-    assert cache.kernel_folder.__wrapped__() is None
-    monkeypatch.setattr(compiled, "kernel_folder", lambda: None)
-    twice = compiled.kernel(lambda value: 2.0 * value)
+    monkeypatch.setattr(kernels, "_homes", lambda: [Path("/proc/nowhere")])
+    assert kernels.kernel_folder.__wrapped__() is None
+    monkeypatch.setattr(kernels, "kernel_folder", lambda: None)
+    twice = kernels.kernel(lambda value: 2.0 * value)
     assert twice(2.0) == 4.0
 
 
@@ -109,10 +109,10 @@ def imported(module, of):
 
 def test_the_folder_is_another_one_after_a_change_of_anything_that_a_kernel_may_use(monkeypatch):
     """Of the sources as they are: each module that some module with kernels imports, directly or not."""
-    package = Path(cache.__file__).parents[2]
+    package = Path(kernels.__file__).parents[2]
     read = {file: file.read_bytes() for file in package.rglob("*.py")}
-    of = {cache._module(file, package): text for file, text in read.items()}
-    wanted = {name for name, text in of.items() if b"skyless.site.kernels.compiled" in text}
+    of = {kernels._module(file, package): text for file, text in read.items()}
+    wanted = {name for name, text in of.items() if b"skyless.site.kernels" in text}
     seen = set()
     while wanted:
         name = wanted.pop()
@@ -120,8 +120,8 @@ def test_the_folder_is_another_one_after_a_change_of_anything_that_a_kernel_may_
         wanted |= imported(name, of) - seen
     assert {"skyless.core.clock_filter", "skyless.core.fix", "skyless.core.ticks"} <= seen
     hashed = []
-    monkeypatch.setattr(cache.hashlib, "sha1", lambda **_: SimpleNamespace(update=hashed.append, hexdigest=str))
-    cache.digest(package)
+    monkeypatch.setattr(kernels.hashlib, "sha1", lambda **_: SimpleNamespace(update=hashed.append, hexdigest=str))
+    kernels.digest(package)
     assert {name for name in seen if of[name] not in hashed} == set()
     assert of["skyless.page.live"] not in hashed
 
@@ -132,14 +132,14 @@ def test_the_folder_is_another_one_after_a_change_of_anything_that_a_kernel_may_
 def test_a_constant_from_another_module_belongs_to_the_kernels(tmp_path, line):
     package, core = tmp_path / "skyless", tmp_path / "skyless" / "core"
     core.mkdir(parents=True)
-    (core / "air.py").write_text(f"from skyless.site.kernels.compiled import kernel\n{line}\n")
+    (core / "air.py").write_text(f"from skyless.site.kernels import kernel\n{line}\n")
     (package / "other.py").write_text("")
     (core / "ticks.py").write_text("PER_S = 1\n")
-    first = cache.digest(package)
+    first = kernels.digest(package)
     (package / "other.py").write_text("WIDTH = 2\n")
-    assert cache.digest(package) == first
+    assert kernels.digest(package) == first
     (core / "ticks.py").write_text("PER_S = 2\n")
-    assert cache.digest(package) != first
+    assert kernels.digest(package) != first
 
 
 def test_a_home_that_may_not_be_searched_is_passed_over(tmp_path, monkeypatch):
@@ -159,7 +159,7 @@ def test_a_home_that_may_not_be_searched_is_passed_over(tmp_path, monkeypatch):
 def test_a_relative_folder_stays_the_same_for_programs_that_work_elsewhere(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NUMBA_CACHE_DIR", "kept")
-    assert cache.kernel_folder.__wrapped__().parent == tmp_path / "kept"
+    assert kernels.kernel_folder.__wrapped__().parent == tmp_path / "kept"
     assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "kept")
 
 
@@ -169,8 +169,8 @@ def test_a_folder_of_other_sources_that_is_used_now_and_then_is_kept(tmp_path, m
         (tmp_path / name).mkdir()
         os.utime(tmp_path / name, (0.0, 0.0))
     with monkeypatch.context() as patch:
-        patch.setattr(cache, "digest", lambda _: "used")
-        patch.setattr(cache, "_remove_unused", lambda _: None)
-        cache.kernel_folder.__wrapped__()  # another version starts
-    own = cache.kernel_folder.__wrapped__()
+        patch.setattr(kernels, "digest", lambda _: "used")
+        patch.setattr(kernels, "_remove_unused", lambda _: None)
+        kernels.kernel_folder.__wrapped__()  # another version starts
+    own = kernels.kernel_folder.__wrapped__()
     assert {path.name for path in tmp_path.iterdir()} == {"kernels-used", own.name}

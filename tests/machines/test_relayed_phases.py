@@ -17,7 +17,7 @@ from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.research.masterless.own_estimator import OwnReceiver
 from skyless.sim.carrier import CarrierModel
 from skyless.sim.evaluation.scenarios import Request
-from skyless.site.survey.relayed import RelayedDifferences
+from skyless.site.survey.legs import RelayedDifferences
 from support.keyed_air import AttackedAir, made_keys, run_tag
 
 pytestmark = pytest.mark.site

@@ -19,8 +19,7 @@ from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.radio.foreign.foreign_radios import SnifferStream
 from skyless.radio.interface import Late, Restarted, Sent
 from skyless.radio.serial import link
-from skyless.radio.serial.board_settings import BoardSettings
-from skyless.radio.serial.link import Done, Hello, NotDone, Status, TagConfig, TooLate, decode
+from skyless.radio.serial.link import BoardSettings, Done, Hello, NotDone, Status, TagConfig, TooLate, decode
 from skyless.radio.serial.link import Heard as HeardFrame
 from skyless.run.board import LinkProtocol, SnifferProtocol
 from skyless.run.board_receiver import BoardReceiver

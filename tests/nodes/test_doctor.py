@@ -14,7 +14,7 @@ from skyless.cli.main import main
 from skyless.cli.nodes.doctor import _report
 from skyless.core.site import NoiseSite
 from skyless.core.ticks import TICK_RATE_HZ
-from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_port import Pty
 from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.run.doctor import host
 from skyless.run.doctor.board import BoardProbe

@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from node_stage import LAB
 
-from skyless.radio.emulated import ClockShift
-from skyless.radio.ether_wire import Join, Joined, Refused, Unpacker, from_ether, pack
+from skyless.radio.emulated import ClockShift, Join, Joined, Refused, Unpacker, from_ether, pack
 from skyless.run import process
 from skyless.run.ether import Ether
 from skyless.sim.evaluation.scenarios import Request, impairments_of

@@ -40,8 +40,7 @@ from skyless.sim.lab import lab_site
 from skyless.sim.world import World
 from skyless.site.file.check import image_size
 from skyless.site.file.load import load_site
-from skyless.site.survey.facts import Facts, Gauge, PairRanges, Tape
-from skyless.site.survey.result import Survey, SurveyedAnchor, read_record, record_path
+from skyless.site.survey.facts import Facts, Gauge, PairRanges, Survey, SurveyedAnchor, Tape, read_record, record_path
 
 pytestmark = pytest.mark.site
 

@@ -11,12 +11,8 @@ from skyless.core.protocol1.beacon import Beacon, encode
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
 from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.foreign_radios import UciRadio
+from skyless.radio.foreign.uci import UciReader, decode_session_info, location_of
 from skyless.radio.interface import Restarted
-from skyless.radio.uci.uci import (
-    UciReader,
-    decode_session_info,
-    location_of,
-)
 from skyless.research.live.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.run.board import UciProtocol
 from skyless.run.open_radio import open_sniffers

@@ -11,8 +11,16 @@ from skyless.research.verify import random_points, verify
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.channel import ChannelModel, pack_walls
 from skyless.site.file.template import rectangular_site
-from skyless.site.planning.floor import Mounts, floor_of, sample_points, sides
-from skyless.site.planning.links import FIX_SHARE, anchor_links, link_budget, with_range
+from skyless.site.planning.links import (
+    FIX_SHARE,
+    Mounts,
+    anchor_links,
+    floor_of,
+    link_budget,
+    sample_points,
+    sides,
+    with_range,
+)
 from skyless.site.planning.maps import grid_of, plan_map, summary_of
 from skyless.site.planning.optimise import (
     Search,

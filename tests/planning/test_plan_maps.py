@@ -17,8 +17,16 @@ from skyless.core.geometry import area, distance_outside, inside
 from skyless.core.site import AnchorSite, GeoreferenceSite, WallSite
 from skyless.sim.lab import paper_lab_site
 from skyless.site.planning import maps
-from skyless.site.planning.floor import Mounts, floor_of, points_along, sides
-from skyless.site.planning.links import ANCHORS_IN_VIEW, PDOP, PLAN_COLUMNS, SIGMA
+from skyless.site.planning.links import (
+    ANCHORS_IN_VIEW,
+    PDOP,
+    PLAN_COLUMNS,
+    SIGMA,
+    Mounts,
+    floor_of,
+    points_along,
+    sides,
+)
 from skyless.site.planning.maps import csv_lines, geojson_lines, grid_of, plan_map, summary_of, to_wgs84
 from skyless.site.planning.predict import PlanSettings, Predictor
 

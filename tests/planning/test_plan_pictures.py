@@ -10,8 +10,7 @@ from msgspec.structs import replace
 
 from skyless.core.site import AnchorSite, TagsSite, WallSite
 from skyless.sim.lab import paper_lab_site
-from skyless.site.planning.floor import floor_of
-from skyless.site.planning.links import ANCHORS_IN_VIEW, PLAN_COLUMNS, SIGMA
+from skyless.site.planning.links import ANCHORS_IN_VIEW, PLAN_COLUMNS, SIGMA, floor_of
 from skyless.site.planning.maps import PlanMap, grid_of
 from skyless.site.planning.picture import RMSE_LAYER, SIGMA_LAYER, Background, Layer, draw_layer
 

@@ -18,7 +18,6 @@ from skyless.core.protocol1.snapshots import (
 from skyless.core.site import AnchorSite, NoiseSite, Site, TagsSite, WallSite
 from skyless.sim.lab import paper_lab_site
 from skyless.site.channel import ChannelModel, pack_walls
-from skyless.site.planning._snapshot_sigma import delays, phase_covariance
 from skyless.site.planning.anchor_clocks import offset_variances, stamp_variances
 from skyless.site.planning.links import (
     CLAIMED,
@@ -36,7 +35,7 @@ from skyless.site.planning.links import (
     range_of,
     with_range,
 )
-from skyless.site.planning.predict import PlanSettings, Predictor, with_noise
+from skyless.site.planning.predict import PlanSettings, Predictor, delays, phase_covariance, with_noise
 
 pytestmark = pytest.mark.statistical
 

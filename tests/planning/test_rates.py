@@ -16,8 +16,7 @@ from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Static
 from skyless.site.channel import ChannelModel, received_power_dbm
 from skyless.site.file.template import grid_site
-from skyless.site.planning.floor import floor_of
-from skyless.site.planning.links import range_of, with_range
+from skyless.site.planning.links import floor_of, range_of, with_range
 from skyless.site.planning.picture import draw_rates
 from skyless.site.planning.rates import RECEIVED_HZ, rate_map, rate_report, tag_rates
 

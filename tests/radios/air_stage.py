@@ -3,7 +3,7 @@
 import asyncio
 
 from skyless.core.ticks import TICK_RATE_HZ, wrap
-from skyless.radio.ether_wire import Join, Joined, Send
+from skyless.radio.emulated import Join, Joined, Send
 from skyless.run.ether import Ether
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.lab import lab_site

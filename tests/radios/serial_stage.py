@@ -9,7 +9,7 @@ from radio_events import radio_events
 from skyless.radio.interface import Restarted
 from skyless.radio.serial import link
 from skyless.radio.serial.link import from_steps, to_steps
-from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_port import Pty
 from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.run.board import LinkProtocol
 from support.board_tag import ANCHORS, AnchorInC, OriginInC, StatusInC, fix_in_c

@@ -10,10 +10,8 @@ from skyless.cli.main import main
 from skyless.core.errors import SkylessError
 from skyless.radio.interface import Gone, Restarted
 from skyless.radio.serial import link
-from skyless.radio.serial.board_settings import BoardSettings
-from skyless.radio.serial.board_setup import set_up
-from skyless.radio.serial.link import TagConfig
-from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, Computing, SerialRadio
+from skyless.radio.serial.link import BoardSettings, TagConfig
+from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, Computing, SerialRadio, set_up
 from skyless.radio.tag_reports import BoardFix, Reported
 from skyless.run.board_tag import BoardTag
 from support.board_tag import ANCHORS

@@ -8,7 +8,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from skyless.core.air.frame import Diagnostics, Reception, Transmission, after_rmarker_s, fcs
 from skyless.core.ticks import from_seconds, wrap
-from skyless.radio.dw1000 import driver as dw1000
+from skyless.radio.dw1000 import radio as dw1000
 from skyless.radio.interface import AntennaDelays, Late, Sent
 from skyless.sim.dw1000 import registers as r
 

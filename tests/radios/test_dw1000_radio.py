@@ -18,8 +18,7 @@ from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
 from skyless.radio.dw1000 import spi
 from skyless.radio.dw1000.radio import Dw1000Radio
 from skyless.radio.dw1000.spi import SpiPort
-from skyless.radio.emulated import EtherConnection
-from skyless.radio.ether_wire import Arrival, HeardRow, Join
+from skyless.radio.emulated import Arrival, EtherConnection, HeardRow, Join
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
 from skyless.run._dw1000_model import ModelPort
 from skyless.run.open_radio import is_simulated, open_radios

@@ -7,7 +7,7 @@ from chip_stage import HandClock
 
 from skyless.core.air.frame import Diagnostics, after_rmarker_s, air_time_s, fcs, preamble_s
 from skyless.core.ticks import TICK_S, from_seconds, wrap
-from skyless.radio.dw1000 import driver as dw1000
+from skyless.radio.dw1000 import radio as dw1000
 from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000.chip import ASLEEP_A, IDLE_A, RECEIVING_A, Chip, ModelBus
 

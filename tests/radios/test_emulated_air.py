@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from skyless.core.air.frame import after_rmarker_s
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S, difference
-from skyless.radio.ether_wire import Arrival, Clocks, Done, Joined, Send
+from skyless.radio.emulated import Arrival, Clocks, Done, Joined, Send
 
 FRAME = b"a frame" * 10
 

@@ -12,7 +12,7 @@ from radio_events import radio_events
 from skyless.core.air.frame import Reception, Transmission
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
-from skyless.radio.ether_wire import Join, Joined, Refused, Send, Unpacker, from_ether, pack
+from skyless.radio.emulated import Join, Joined, Refused, Send, Unpacker, from_ether, pack
 from skyless.radio.interface import Gone, Late, Restarted, Sent
 from skyless.run.ether import Client
 from skyless.run.open_radio import host_and_port, is_simulated, open_radios

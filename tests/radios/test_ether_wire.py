@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.radio import ether_wire
-from skyless.radio.ether_wire import (
+from skyless.radio import emulated
+from skyless.radio.emulated import (
     MAX_MESSAGE_BYTES,
     Arrival,
     Clocks,
@@ -96,11 +96,11 @@ def test_a_row_of_an_older_ether_has_no_phase():
 
 
 def test_a_machine_without_a_boot_identifier_shares_its_clock_with_itself_only_by_name(monkeypatch):
-    here = ether_wire.this_machine()
-    assert here == ether_wire.this_machine()
+    here = emulated.this_machine()
+    assert here == emulated.this_machine()
 
     def missing(*_, **__):
         raise FileNotFoundError
 
-    monkeypatch.setattr(ether_wire.Path, "read_text", missing)
-    assert ether_wire.this_machine() == ""
+    monkeypatch.setattr(emulated.Path, "read_text", missing)
+    assert emulated.this_machine() == ""

@@ -17,15 +17,10 @@ import pytest
 from recordings.capture_makers import binary_record, tdoa3, text_line
 from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferStream, UciRadio
+from skyless.radio.foreign.uci import DtMeasurement, SessionInfo, encode_packet, encode_session_info
 from skyless.radio.interface import AntennaDelays
 from skyless.radio.serial import link
 from skyless.radio.serial.serial_radio import LinkSession
-from skyless.radio.uci.uci import (
-    DtMeasurement,
-    SessionInfo,
-    encode_packet,
-    encode_session_info,
-)
 
 pytestmark = pytest.mark.site
 

@@ -18,7 +18,7 @@ from skyless.core.protocol1.anchor import Anchor
 from skyless.radio.foreign.foreign_radios import ListenerRadio
 from skyless.radio.interface import AntennaDelays, Gone, Late, Restarted, Sent
 from skyless.radio.serial import link
-from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_port import Pty
 from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.run.board import ListenerProtocol
 from skyless.run.open_radio import is_simulated, open_radios, open_sniffers

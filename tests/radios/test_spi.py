@@ -7,7 +7,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from skyless.core.errors import SkylessError
-from skyless.radio.dw1000 import driver as dw1000
+from skyless.radio.dw1000 import radio as dw1000
 from skyless.radio.dw1000.spi import SpiBus
 
 DEVICE_ID = b"\x30\x01\xca\xde"

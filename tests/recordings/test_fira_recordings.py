@@ -19,13 +19,7 @@ from skyless.core.site import GeoreferenceSite
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 from skyless.radio.foreign import fira
 from skyless.radio.foreign.fira import AnchorFrame
-from skyless.radio.uci.uci import (
-    DtMeasurement,
-    DtMessageType,
-    GeodeticPoint,
-    SessionInfo,
-    encode_wgs84,
-)
+from skyless.radio.foreign.uci import DtMeasurement, DtMessageType, GeodeticPoint, SessionInfo, encode_wgs84
 from skyless.research.foreign import _phones as phones
 from skyless.research.foreign.formats import open_recording
 from skyless.research.replays.captures import CaptureReplay

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core.errors import ConfigurationError
-from skyless.site.survey.stamps.repeats import mean_ranges
+from skyless.site.survey.legs import mean_ranges
 from skyless.site.tables import read_heights, read_ranges
 
 HEADER = "anchor_a,anchor_b,range_m\n"

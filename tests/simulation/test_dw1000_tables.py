@@ -7,7 +7,7 @@ import pytest
 
 from skyless.core.air.frame import Diagnostics, fcs
 from skyless.core.ticks import wrap
-from skyless.radio.dw1000 import driver as dw1000
+from skyless.radio.dw1000 import radio as dw1000
 from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000 import transceiver
 from skyless.sim.dw1000.chip import Chip, ModelBus, Sensors

@@ -7,8 +7,7 @@ import pytest
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import AccuracySite
 from skyless.sim.lab import lab_site
-from skyless.site.file.load import load_site
-from skyless.site.file.rewrite import with_values
+from skyless.site.file.load import load_site, with_values
 from skyless.site.file.template import site_template
 
 TEXT = """\

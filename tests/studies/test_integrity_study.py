@@ -23,7 +23,7 @@ from skyless.research.studies.integrity import (
     rows,
 )
 from skyless.sim.lab import paper_lab_site
-from skyless.site.report.figures import picture
+from skyless.site.report import picture
 
 pytestmark = pytest.mark.site
 

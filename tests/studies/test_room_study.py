@@ -21,7 +21,7 @@ from skyless.sim.evaluation.statistics import LevelCounts, LevelTally
 from skyless.sim.impairments import Body
 from skyless.sim.lab import lab_site
 from skyless.site.channel import cross_walls, pack_walls
-from skyless.site.report.figures import picture
+from skyless.site.report import picture
 
 pytestmark = pytest.mark.site
 

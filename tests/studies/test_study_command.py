@@ -95,7 +95,7 @@ def test_every_study_can_be_drawn(name, tmp_path):
     from skyless.research.studies.catalogue import STUDIES
     from skyless.research.studies.common.plan import plan_of
     from skyless.research.studies.common.worlds import RunResult, run_world
-    from skyless.site.report.figures import picture
+    from skyless.site.report import picture
 
     plan = plan_of("joint", 1, quick=True, worlds=2)
     study = STUDIES[name]

@@ -10,7 +10,7 @@ from skyless.research.studies.survey import GROUPS, Group, Variant, limits_of
 from skyless.research.surveys.air import AirErrors, drawn_errors
 from skyless.research.surveys.judge import aligned, tag_error_m
 from skyless.research.surveys.layouts import survey_layouts
-from skyless.site.report.figures import picture
+from skyless.site.report import picture
 
 pytestmark = pytest.mark.site
 

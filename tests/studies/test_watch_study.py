@@ -7,7 +7,7 @@ from skyless.research.studies.catalogue import STUDIES
 from skyless.research.studies.common.plan import Plan
 from skyless.research.surveys.drawn_faults import WatchResult, WatchRun, run_watch
 from skyless.research.surveys.layouts import survey_layouts
-from skyless.site.report.figures import picture
+from skyless.site.report import picture
 
 pytestmark = pytest.mark.site
 

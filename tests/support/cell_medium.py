@@ -38,7 +38,7 @@ from skyless.sim.listening import RECEPTION_RECORD
 from skyless.sim.medium import TURNAROUND_S, Delivery, Flight, Medium
 from skyless.sim.stations import TagSpec, coordinate_m
 from skyless.sim.world import World
-from skyless.site.kernels.compiled import kernel
+from skyless.site.kernels import kernel
 
 _TURNAROUND_TICKS: Final = from_seconds(TURNAROUND_S)
 _KEPT_TICKS: Final = from_seconds(2e-3)

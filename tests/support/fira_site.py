@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from skyless.core.site import AccuracySite
 from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign.fira import DtTag
-from skyless.radio.uci.uci import UciReader
+from skyless.radio.foreign.uci import UciReader
 from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, PacketTracking
 from skyless.run.board import UciProtocol
 from skyless.sim.evaluation.fleet import world_of
@@ -24,9 +24,8 @@ from skyless.sim.lab import paper_lab_site
 from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.trajectory import Static
 from skyless.site.planning.anchor_clocks import AnchorClocks, Relays, relays_of
-from skyless.site.planning.joint_sigma import fill_joint_sigma
 from skyless.site.planning.links import PLAN_COLUMNS, RMSE
-from skyless.site.planning.predict import PlanSettings, Predictor
+from skyless.site.planning.predict import PlanSettings, Predictor, fill_joint_sigma
 
 POINTS_M = np.array([(2.0, 3.0), (1.0, 1.0), (4.5, 6.0), (3.0, 4.0), (5.0, 2.0), (0.7, 7.0)])
 PLACES_M = np.column_stack([POINTS_M, np.zeros(len(POINTS_M))])

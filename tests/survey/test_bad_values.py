@@ -8,9 +8,9 @@ from msgspec import structs
 
 from skyless.core.errors import SkylessError
 from skyless.site.survey.facts import Facts, KnownDelay, PairRange, PairRanges, Tape
+from skyless.site.survey.legs import mean_ranges
+from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.solve import run_survey
-from skyless.site.survey.stamps.pair_ranger import PairRanger
-from skyless.site.survey.stamps.repeats import mean_ranges
 
 POSITIONS_M = {1: (0.0, 0.0, 0.0), 2: (6.0, 0.0, 0.0), 3: (6.0, 5.0, 0.0), 4: (0.0, 5.0, 0.0), 5: (3.0, 2.0, 0.0)}
 PAIRS = tuple(

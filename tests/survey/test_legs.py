@@ -17,7 +17,7 @@ from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
-from skyless.site.survey.stamps.legs import LegCollector, RelayMatcher
+from skyless.site.survey.legs import LegCollector, RelayMatcher
 
 LAB = paper_lab_site()
 FREE = lab_site()

@@ -13,10 +13,10 @@ from skyless.run.survey._live_survey import LiveSurvey
 from skyless.run.survey.program import SurveyNode, SurveySettings
 from skyless.sim.lab import lab_site
 from skyless.site.survey.facts import Facts, Gauge, PairBlock
+from skyless.site.survey.legs import AnchorLeg
+from skyless.site.survey.pair_ranger import PairRanger, RangeSteps
 from skyless.site.survey.solve import run_survey
-from skyless.site.survey.stamps.legs import AnchorLeg
-from skyless.site.survey.stamps.pair_ranger import PairRanger, RangeSteps
-from skyless.site.survey.watch.moved import change_of, drop_moved
+from skyless.site.survey.watch.monitor import change_of, drop_moved
 
 pytestmark = pytest.mark.site
 

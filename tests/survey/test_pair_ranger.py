@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from scipy.stats import chi2
 
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
-from skyless.site.survey.stamps.pair_ranger import Legs, PairRanger, flights_of
-from skyless.site.survey.stamps.repeats import earliest_cluster, half_sample_mode
-from skyless.site.survey.two_way import Leg, bracketed_flight_ticks
+from skyless.site.survey.legs import Leg, bracketed_flight_ticks, earliest_cluster, half_sample_mode
+from skyless.site.survey.pair_ranger import Legs, PairRanger, flights_of
 
 POSITION_M = {1: (0.0, 0.0), 2: (7.0, 0.0), 3: (6.0, 5.0), 4: (-1.0, 6.0)}
 SLOT_S = 2.5e-3

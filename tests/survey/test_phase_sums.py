@@ -17,8 +17,8 @@ from skyless.sim.lab import lab_site
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
-from skyless.site.survey.stamps.legs import AnchorLeg, LegCollector
-from skyless.site.survey.watch.phase_sums import BLOCK_S, PhaseWatch, circular_mean
+from skyless.site.survey.legs import AnchorLeg, LegCollector
+from skyless.site.survey.watch.explain import BLOCK_S, PhaseWatch, circular_mean
 
 SITE = replace(lab_site(), schedule=replace(lab_site().schedule, carrier_phase=True))
 HALF_WAVE_M = 0.0231

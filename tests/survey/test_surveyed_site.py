@@ -17,8 +17,9 @@ from skyless.sim.lab import paper_lab_site
 from skyless.site.file.check import check_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
-from skyless.site.survey.facts import PairRange, PairRanges
-from skyless.site.survey.result import (
+from skyless.site.survey.facts import (
+    PairRange,
+    PairRanges,
     Survey,
     SurveyedAnchor,
     SurveyRecord,
@@ -27,7 +28,7 @@ from skyless.site.survey.result import (
     read_record,
     record_path,
 )
-from skyless.site.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text, unchanged_anchors
+from skyless.site.survey.solve import delay_changes_ticks, surveyed_site, surveyed_text, unchanged_anchors
 
 pytestmark = pytest.mark.site
 

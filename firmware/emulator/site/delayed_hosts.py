@@ -1,6 +1,6 @@
 """A site whose anchors and tag are DW1000s on the SPI of slow hosts, as a Raspberry Pi, in the simulated world's time.
 
-Hosts run the driver (``skyless.radio.dw1000.driver``) on the register model; every transfer costs time, in which the
+Hosts run the driver (``skyless.radio.dw1000.radio``) on the register model; every transfer costs time, in which the
 air and the other hosts go on.
 """
 

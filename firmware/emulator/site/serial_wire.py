@@ -10,7 +10,7 @@ from msgspec import Struct
 from emulator.site.host_programs import HostLatency
 from emulator.site.virtual_time import wake
 from skyless.core.ticks import from_seconds
-from skyless.radio.serial.pseudo_terminal import Pty
+from skyless.radio.serial.serial_port import Pty
 from skyless.sim.medium import Timeline
 
 BITS_A_BYTE: Final = 10

@@ -14,8 +14,7 @@ from skyless.core.air.frame import Diagnostics
 from skyless.core.arrays import Array
 from skyless.core.ticks import from_seconds
 from skyless.radio.interface import AntennaDelays
-from skyless.radio.serial.board_settings import BoardSettings
-from skyless.radio.serial.link import Writer
+from skyless.radio.serial.link import BoardSettings, Writer
 from skyless.sim.dw1000.chip import Chip
 from skyless.sim.world import World
 

@@ -16,8 +16,7 @@ from msgspec import Struct
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, Route, Target, TargetUrl, cannot_listen
 from skyless.core.errors import SkylessError
-from skyless.radio.serial.pseudo_terminal import Pty
-from skyless.radio.serial.serial_port import SerialPort
+from skyless.radio.serial.serial_port import Pty, SerialPort
 from skyless.run.limits import BRIDGES as LIMITS
 from skyless.run.mqtt.messages import FixMessage
 

@@ -12,7 +12,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from skyless.run.history.answers import THINNED_GAP_S
-from skyless.site.report.figures import BLUE, MAP, MUTED, panel, report_style
+from skyless.site.report import BLUE, MAP, MUTED, panel, report_style
 
 _BARS: Final = 30
 _LINES: Final = 8

@@ -114,10 +114,10 @@ def _page(plan: "PlanResult", background: "Background") -> str:
     """The plan as one HTML page: numbers in a table, warnings, pictures, and what is assumed."""
     from html import escape
 
+    from skyless.site import report
     from skyless.site.planning.picture import draw_layer, layers_for
     from skyless.site.planning.report import described
-    from skyless.site.report import report_page
-    from skyless.site.report.figures import picture
+    from skyless.site.report import picture
 
     result, facts = plan.summary, dict(plan.facts())
     for anchor in result["anchors"]:
@@ -126,14 +126,14 @@ def _page(plan: "PlanResult", background: "Background") -> str:
         hears = "" if heard is None else f", hears {heard:.0%} of the master's frames"
         facts[f"anchor {anchor['id']}"] = f"{position}{hears}{silent}"
     title, warnings = f"Plan of {plan.site.name}", result["warnings"]
-    parts = [f"<h1>{escape(title)}</h1>", f"<p>{escape(described(result))}</p>", report_page.table((), facts.items())]
-    parts += ["<h2>Warnings</h2>", report_page.bullets(warnings, "warning") if warnings else "<p>None.</p>"]
+    parts = [f"<h1>{escape(title)}</h1>", f"<p>{escape(described(result))}</p>", report.table((), facts.items())]
+    parts += ["<h2>Warnings</h2>", report.bullets(warnings, "warning") if warnings else "<p>None.</p>"]
     for layer in layers_for(plan.map):
         heading = layer.title.capitalize() if layer.title.islower() else layer.title
         figure = picture(draw_layer(plan.map, layer, background), "png", 110.0)
-        parts += [f"<h2>{escape(heading)}</h2>", report_page.png_figure(figure, heading)]
-    parts += ["<h2>What is assumed</h2>", report_page.bullets(_NOTES, "note")]
-    return report_page.page(title, parts)
+        parts += [f"<h2>{escape(heading)}</h2>", report.png_figure(figure, heading)]
+    parts += ["<h2>What is assumed</h2>", report.bullets(_NOTES, "note")]
+    return report.page(title, parts)
 
 
 def _write_site(out: Path, site: "Site", source: Path) -> None:

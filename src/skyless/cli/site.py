@@ -178,7 +178,7 @@ class SheetOptions(JsonOptions, frozen=True, kw_only=True):
 @command
 def sheet(asked: SheetOptions) -> None:
     """Write the sheet for those who mount the anchors: a page A4 with plan and table for each floor."""
-    from skyless.site.planning.sheet import mounts, sheet
+    from skyless.site.planning.report import mounts, sheet
 
     output = asked.output
     kinds: dict[str, Literal["pdf", "png"]] = {".pdf": "pdf", ".png": "png"}
@@ -201,7 +201,7 @@ def sheet(asked: SheetOptions) -> None:
 def _report(site: Site) -> dict[str, Any]:
     """The report on a valid site, SI units."""
     from skyless.site.channel import ChannelModel
-    from skyless.site.file.advice import warnings_of
+    from skyless.site.file.check import warnings_of
     from skyless.site.planning.anchor_clocks import master_warnings, reception_of
 
     period_s, frame_s = beacon_period_s(site), air_time_s(MAX_FRAME_BYTES)

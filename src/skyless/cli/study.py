@@ -110,7 +110,7 @@ def _write(result: "StudyResult", output: _Output) -> None:
     plot, out, rows = output.plot, output.out, result.rows
     if plot is None and out is None:
         return
-    from skyless.site.report.figures import picture
+    from skyless.site.report import picture
 
     figure = result.plot()
     files = {} if plot is None else {plot: plot.suffix.removeprefix(".")}

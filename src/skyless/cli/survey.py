@@ -27,7 +27,7 @@ from skyless.research.calibration.options import SurveyOptions
 
 if TYPE_CHECKING:
     from skyless.cli.api.survey import BiasResult, SurveyResult
-    from skyless.site.survey.result import Survey, SurveyedPair, TapeAdvice
+    from skyless.site.survey.facts import Survey, SurveyedPair, TapeAdvice
 
 NOTHING_DETERMINED: Final = 1
 """Exit code of a survey without a position or a delay."""
@@ -130,8 +130,8 @@ def _written(found: "SurveyResult", out: Path) -> tuple[tuple[str, ...], tuple[s
     """The files that --out has written, and warnings of what is not in them. Raises SkylessError."""
     if out.suffix.lower() == ".csv":
         return _write(out, {out: _table(found.survey).encode()}), ()
-    from skyless.site.survey.result import SurveyRecord, encode_record, record_path
-    from skyless.site.survey.surveyed_site import delay_changes_ticks
+    from skyless.site.survey.facts import SurveyRecord, encode_record, record_path
+    from skyless.site.survey.solve import delay_changes_ticks
 
     site, text = found.site, found.corrected_file()
     assert site is not None

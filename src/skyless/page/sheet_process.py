@@ -4,7 +4,7 @@ import time
 
 from skyless.core.site import Site
 from skyless.page.task_process import serve_tasks
-from skyless.site.planning.sheet import sheet
+from skyless.site.planning.report import sheet
 
 
 def answer(site: Site) -> bytes:

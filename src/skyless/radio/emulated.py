@@ -4,16 +4,146 @@ import asyncio
 import math
 import os
 import socket
+import struct
 import time
 from collections import Counter
-from typing import Final
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final, Literal
 
 import msgspec
+from msgspec import Struct
 
 from skyless.core.air.frame import Diagnostics, Reception, Transmission
 from skyless.core.ticks import TICK_RATE_HZ, wrap
-from skyless.radio import ether_wire as wire
 from skyless.radio.interface import Gone, Late, Listener, RadioEvent, Restarted, Sent, ignore
+
+# Messages between processes and the emulated air over TCP: msgpack, each message after its length (u32, LE).
+
+DEFAULT_PORT: Final = 7784
+MAX_MESSAGE_BYTES: Final = 1 << 20
+_LENGTH: Final = struct.Struct("<I")
+
+
+class WireError(ValueError):
+    """The other side does not use this protocol; the connection is to be closed."""
+
+
+class Join(Struct, frozen=True, tag="join"):
+    """A process puts its nodes on the air; later messages number them in this order, from 0."""
+
+    kind: Literal["anchor", "tag"]
+    names: tuple[str, ...]
+    tx_delays_ticks: tuple[int, ...] = ()
+    """TX antenna delays that the process sets in its radios, one a node; empty: those of the ether's site."""
+
+
+class Send(Struct, frozen=True, tag="send", gc=False):
+    """A node wants to transmit."""
+
+    node: int
+    tx_ticks: int
+    frame: bytes
+
+
+class Joined(Struct, frozen=True, tag="joined"):
+    """The nodes are on the air, with new counters."""
+
+    machine: str
+    """Which machine's clock ``host_s`` is of."""
+    host_s: float
+    ticks: tuple[int, ...]
+    """The nodes' 40-bit counters at ``host_s``."""
+
+
+class Refused(Struct, frozen=True, tag="refused"):
+    """The nodes are not on the air."""
+
+    reason: str
+
+
+class Clocks(Struct, frozen=True, tag="clocks"):
+    """The nodes' counters at a later time."""
+
+    host_s: float
+    ticks: tuple[int, ...]
+
+
+class HeardRow(Struct, frozen=True, array_like=True, gc=False):
+    """A frame at one node that heard it."""
+
+    node: int
+    rx_ticks: int
+    rx_power_dbm: float
+    first_path_power_dbm: float
+    carrier_offset_ppm: float
+    carrier_phase_cycles: float | None = None
+
+
+class Arrival(Struct, frozen=True, tag="arrival"):
+    """A frame that has just ended at some of the process's nodes."""
+
+    frame: bytes
+    host_s: float
+    rows: tuple[HeardRow, ...]
+
+
+class Done(Struct, frozen=True, tag="done", gc=False):
+    """The end of a transmission."""
+
+    node: int
+    tx_ticks: int
+    late: bool
+
+
+ToEther = Join | Send
+FromEther = Joined | Refused | Clocks | Arrival | Done
+
+to_ether: Final = msgspec.msgpack.Decoder(ToEther)
+from_ether: Final = msgspec.msgpack.Decoder(FromEther)
+_encoder: Final = msgspec.msgpack.Encoder()
+
+
+def pack(message: Struct) -> bytes:
+    """Bytes of a message, its length before it."""
+    body = _encoder.encode(message)
+    return _LENGTH.pack(len(body)) + body
+
+
+class Unpacker:
+    """Cuts a stream of bytes into message bodies."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+
+    def feed(self, data: bytes) -> Iterator[bytes]:
+        """Bodies that are complete with this piece of the stream.
+
+        Raises:
+            WireError: a message is longer than any of this protocol.
+        """
+        buffer = self._buffer
+        buffer += data
+        begin = 0
+        while len(buffer) - begin >= _LENGTH.size:
+            (length,) = _LENGTH.unpack_from(buffer, begin)
+            if length > MAX_MESSAGE_BYTES:
+                raise WireError(f"a message of {length} bytes; at most {MAX_MESSAGE_BYTES} are allowed")
+            end = begin + _LENGTH.size + length
+            if end > len(buffer):
+                break
+            yield bytes(buffer[begin + _LENGTH.size : end])
+            begin = end
+        del buffer[:begin]
+
+
+def this_machine() -> str:
+    """Identifier of this machine's present run; processes with an equal one share the monotonic clock."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
+    except OSError:
+        return ""
+
 
 _RECONNECT_S: Final = 0.2
 _SHIFT_S: Final = 15.0
@@ -55,7 +185,7 @@ class EmulatedRadio:
 
     def transmit(self, transmission: Transmission) -> None:
         """Send a frame; without an ether it is late."""
-        if not self._connection.send(wire.Send(self._node, transmission.tx_ticks, transmission.frame)):
+        if not self._connection.send(Send(self._node, transmission.tx_ticks, transmission.frame)):
             self.notify(Late(transmission.tx_ticks))
 
     def notify(self, event: RadioEvent) -> None:
@@ -70,7 +200,7 @@ class EmulatedRadio:
 class EtherConnection:
     """The connection of one process; it is made again by itself."""
 
-    def __init__(self, host: str, port: int, join: wire.Join) -> None:
+    def __init__(self, host: str, port: int, join: Join) -> None:
         self._host, self._port, self._join = host, port, join
         self.radios = tuple(EmulatedRadio(self, node, name) for node, name in enumerate(join.names))
         self._transport: asyncio.Transport | None = None
@@ -91,11 +221,11 @@ class EtherConnection:
                 self._task = None
                 task.cancel()
 
-    def send(self, message: wire.Send) -> bool:
+    def send(self, message: Send) -> bool:
         """Whether the message could be handed to the connection."""
         if self._transport is None:
             return False
-        self._transport.write(wire.pack(message))
+        self._transport.write(pack(message))
         return True
 
     async def _keep_connected(self) -> None:
@@ -108,7 +238,7 @@ class EtherConnection:
             except OSError as error:
                 reason = f"no ether at {self._host}:{self._port} ({_why(error)})"
             else:
-                transport.write(wire.pack(self._join))
+                transport.write(pack(self._join))
                 try:
                     reason = await protocol.ended
                 finally:
@@ -119,7 +249,7 @@ class EtherConnection:
                 self._notify_all(Gone(reason))
             await asyncio.sleep(_RECONNECT_S)
 
-    def on_joined(self, message: wire.Joined, shift_s: float, transport: asyncio.Transport) -> None:
+    def on_joined(self, message: Joined, shift_s: float, transport: asyncio.Transport) -> None:
         """The nodes are on the air."""
         self._transport = transport
         self._set_clocks(message.host_s + shift_s, message.ticks)
@@ -138,16 +268,16 @@ class EtherConnection:
         for radio, reading in zip(self.radios, ticks, strict=True):
             radio.set_clock(reading, host_s)
 
-    def on_message(self, message: wire.Clocks | wire.Arrival | wire.Done, shift_s: float) -> None:
+    def on_message(self, message: Clocks | Arrival | Done, shift_s: float) -> None:
         """Pass a message on to the radios; ``shift_s`` converts the ether's clock into this machine's."""
-        if isinstance(message, wire.Arrival):
+        if isinstance(message, Arrival):
             host_s = message.host_s + shift_s
             for row in message.rows:
                 measured = Diagnostics(row.rx_power_dbm, row.first_path_power_dbm, row.carrier_offset_ppm)
                 self.radios[row.node].notify(
                     Reception(message.frame, row.rx_ticks, host_s, measured, row.carrier_phase_cycles)
                 )
-        elif isinstance(message, wire.Done):
+        elif isinstance(message, Done):
             event = Late(message.tx_ticks) if message.late else Sent(message.tx_ticks)
             self.radios[message.node].notify(event)
         else:
@@ -178,7 +308,7 @@ class _Stream(asyncio.Protocol):
 
     def __init__(self, connection: EtherConnection) -> None:
         self._connection = connection
-        self._unpacker = wire.Unpacker()
+        self._unpacker = Unpacker()
         self._transport: asyncio.Transport | None = None
         self._shift: ClockShift | None = None
         """Only of an ether on another machine."""
@@ -192,20 +322,20 @@ class _Stream(asyncio.Protocol):
         try:
             for body in self._unpacker.feed(data):
                 self._process(body)
-        except (wire.WireError, msgspec.MsgspecError) as error:
+        except (WireError, msgspec.MsgspecError) as error:
             self._end(f"what answers is no ether ({error})")
 
     def _process(self, body: bytes) -> None:
-        message = wire.from_ether.decode(body)
-        if isinstance(message, wire.Refused):
+        message = from_ether.decode(body)
+        if isinstance(message, Refused):
             self._end(message.reason)
-        elif isinstance(message, wire.Joined):
+        elif isinstance(message, Joined):
             assert self._transport is not None
-            if message.machine != wire.this_machine():
+            if message.machine != this_machine():
                 self._shift = ClockShift(time.monotonic() - message.host_s)
             self._connection.on_joined(message, self._shift_s, self._transport)
         else:
-            if self._shift is not None and isinstance(message, wire.Clocks):
+            if self._shift is not None and isinstance(message, Clocks):
                 self._shift.note(message.host_s, time.monotonic())
             self._connection.on_message(message, self._shift_s)
 

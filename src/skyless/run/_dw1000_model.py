@@ -5,8 +5,7 @@ from typing import Final
 
 from skyless.core.air.frame import Diagnostics, Reception, Transmission
 from skyless.core.ticks import difference, from_seconds
-from skyless.radio.dw1000.driver import ChipError
-from skyless.radio.dw1000.radio import Dw1000Radio
+from skyless.radio.dw1000.radio import ChipError, Dw1000Radio
 from skyless.radio.emulated import EmulatedRadio
 from skyless.radio.interface import AntennaDelays, Gone, Late, RadioEvent, Restarted, Sent
 from skyless.sim.dw1000.chip import Chip, ModelBus

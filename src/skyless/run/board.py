@@ -17,13 +17,7 @@ from skyless.core.protocol1.almanac import AlmanacAssembly
 from skyless.core.protocol1.beacon import Beacon
 from skyless.core.ticks import TICK_M, difference, wrap
 from skyless.radio.foreign.bitcraze import TDOA3
-from skyless.radio.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
-from skyless.radio.serial import link
-from skyless.radio.serial.board_settings import MODES
-from skyless.radio.serial.link import to_steps
-from skyless.radio.serial.pseudo_terminal import Pty
-from skyless.radio.tag_reports import BODY_AT
-from skyless.radio.uci.uci import (
+from skyless.radio.foreign.uci import (
     NO_LOCATION,
     RELATIVE_LOCATION,
     DtMeasurement,
@@ -33,6 +27,11 @@ from skyless.radio.uci.uci import (
     encode_relative,
     encode_session_info,
 )
+from skyless.radio.interface import Gone, Hint, Late, Radio, RadioEvent, Restarted, Sent
+from skyless.radio.serial import link
+from skyless.radio.serial.link import MODES, to_steps
+from skyless.radio.serial.serial_port import Pty
+from skyless.radio.tag_reports import BODY_AT
 from skyless.run.board_tag import BoardTag
 from skyless.run.process import HEALTH_S, Log, every, together
 

@@ -13,7 +13,7 @@ from skyless.core.fix import Fix
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.tag.receiver import NOT_DROPS, Receiver
 from skyless.radio.serial import link
-from skyless.radio.serial.board_settings import ANY_SITE, MODES, OUTPUTS, BoardSettings, pack, unpack
+from skyless.radio.serial.link import ANY_SITE, MODES, OUTPUTS, BoardSettings, pack, unpack
 from skyless.radio.tag_reports import BODY_AT, fix_body, georeference_body, place_body, status_body
 from skyless.run.fix_log import Lateness
 from skyless.run.process import HEALTH_S

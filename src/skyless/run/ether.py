@@ -11,7 +11,7 @@ import msgspec
 from skyless.core.air.frame import MAX_FRAME_BYTES, Transmission
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_S, wrap
-from skyless.radio import ether_wire as wire
+from skyless.radio import emulated as wire
 from skyless.radio.interface import ignore
 from skyless.run.fix_log import MAX_RECEPTION_AGE_S
 from skyless.run.mqtt.address import MqttAddress

@@ -8,8 +8,7 @@ from skyless.core.air.masterless_packets import Point
 from skyless.core.errors import SkylessError
 from skyless.radio.dw1000.radio import Dw1000Radio
 from skyless.radio.dw1000.spi import DEFAULT_CHIP, DEFAULT_FAST_HZ, MAX_FAST_HZ, START_HZ, SpiBus, SpiPort, check_spi
-from skyless.radio.emulated import EtherConnection
-from skyless.radio.ether_wire import DEFAULT_PORT, Join
+from skyless.radio.emulated import DEFAULT_PORT, EtherConnection, Join
 from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio, UciRadio
 from skyless.radio.interface import AntennaDelays, Radio

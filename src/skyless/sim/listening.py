@@ -24,7 +24,7 @@ from skyless.site.channel import (
     power_bias_m,
     received_power_dbm,
 )
-from skyless.site.kernels.compiled import kernel, part
+from skyless.site.kernels import kernel, part
 
 
 class Outcome(StrEnum):

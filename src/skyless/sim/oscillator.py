@@ -18,7 +18,7 @@ from msgspec import Struct
 from skyless.core.arrays import Array, Integers, Records
 from skyless.core.ticks import TICK_RATE_HZ, TICK_S, WRAP_TICKS
 from skyless.sim.streams import draw_normal
-from skyless.site.kernels.compiled import kernel, part
+from skyless.site.kernels import kernel, part
 
 CLOCK: Final = np.dtype(
     [

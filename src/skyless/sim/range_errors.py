@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from skyless.core.arrays import Array, Records
 from skyless.sim.streams import TAG_KEY, stream
-from skyless.site.kernels.compiled import kernel
+from skyless.site.kernels import kernel
 
 _KNOTS: Final = 20
 """In a correlation length. Between two of them a straight line keeps 98.7 % of the standard deviation or more."""

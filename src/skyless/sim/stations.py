@@ -12,7 +12,7 @@ from skyless.core.site import AnchorSite
 from skyless.core.ticks import TICK_S
 from skyless.sim.impairments import AnchorDisplacement, DelayError, Impairments, Outage
 from skyless.sim.trajectory import Piece, Trajectory
-from skyless.site.kernels.compiled import kernel, part
+from skyless.site.kernels import kernel, part
 
 
 class TagSpec(Struct, frozen=True):

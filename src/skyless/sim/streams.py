@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from skyless.core.arrays import Array, Integers
-from skyless.site.kernels.compiled import part
+from skyless.site.kernels import part
 
 BLOCK: Final = 1024
 """Normals drawn ahead for each node."""

@@ -13,7 +13,7 @@ from msgspec import Struct, structs
 from skyless.core.arrays import Array, Records
 from skyless.core.site import FloorSite, WallSite
 from skyless.core.ticks import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS
-from skyless.site.kernels.compiled import kernel, part
+from skyless.site.kernels import kernel, part
 
 FREE_SPACE_LOSS_1_M_DB: Final = 20.0 * math.log10(4.0 * math.pi * CHANNEL_5_HZ / SPEED_OF_LIGHT_MPS)
 """Free-space loss over the first metre on channel 5, 48.7 dB (Friis)."""

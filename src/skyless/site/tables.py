@@ -24,7 +24,7 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.input_files import finite, read_lines
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.site.survey.facts import PairRanges
-from skyless.site.survey.stamps.repeats import mean_ranges
+from skyless.site.survey.legs import mean_ranges
 
 ANCHOR_COLUMNS: Final = ("id", "x_m", "y_m", "z_m")
 BIAS, SLOPE, NOISE = CALIBRATION_COLUMNS = ("bias_m", "bias_slope_m", "noise_m")

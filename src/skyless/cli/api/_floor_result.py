@@ -6,7 +6,7 @@ from typing import Any, Generic, TypeVar
 from skyless.cli.api._result import Result
 from skyless.core.arrays import Vector
 from skyless.core.site import Site
-from skyless.site.planning.floor import Floor
+from skyless.site.planning.links import Floor
 from skyless.site.planning.maps import PlanMap
 from skyless.site.planning.rates import RateMap
 

@@ -8,8 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from skyless.core.arrays import Integers, Vector
-from skyless.site.report.figures import BLUE, GRID, INK, MUTED, ORANGE, RED, panel, report_style
-from skyless.site.survey.result import Survey, SurveyedAnchor
+from skyless.site.report import BLUE, GRID, INK, MUTED, ORANGE, RED, panel, report_style
+from skyless.site.survey.facts import Survey, SurveyedAnchor
 
 _SIGMAS: Final = 3.0
 _SMALLEST_SHARE: Final = 0.01

@@ -20,10 +20,20 @@ from skyless.core.method_names import DEFAULT_METHOD, FILTERS
 from skyless.core.site import Site
 from skyless.research.verify import random_points, verify
 from skyless.site.channel import ChannelModel
-from skyless.site.file.advice import anchors_needed
+from skyless.site.file.check import anchors_needed
 from skyless.site.file.load import site_of
-from skyless.site.planning.floor import Floor, check_anchor_count, floor_of, mounts_of, usual_tag_heights
-from skyless.site.planning.links import ANCHORS_IN_VIEW, PLAN_COLUMNS, RMSE, SIGMA, with_range
+from skyless.site.planning.links import (
+    ANCHORS_IN_VIEW,
+    PLAN_COLUMNS,
+    RMSE,
+    SIGMA,
+    Floor,
+    check_anchor_count,
+    floor_of,
+    mounts_of,
+    usual_tag_heights,
+    with_range,
+)
 from skyless.site.planning.maps import PlanMap, grid_of, plan_map, rows_of, summary_of
 from skyless.site.planning.optimise import OneMore, Optimised, Search
 from skyless.site.planning.predict import MAX_PREDICTED, PlanSettings, Predictor

@@ -13,8 +13,7 @@ from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site
 from skyless.site.channel import ChannelModel
-from skyless.site.planning.floor import Floor
-from skyless.site.planning.links import with_range
+from skyless.site.planning.links import Floor, with_range
 from skyless.site.planning.rates import RateMap, described_rates, rate_map, rate_report
 
 if TYPE_CHECKING:

@@ -24,12 +24,10 @@ from skyless.research.foreign.formats import format_of
 from skyless.research.replays.inputs import known_truth
 from skyless.run.recordings.recording import McapRecording, is_mcap
 from skyless.site.file.load import site_of
-from skyless.site.survey.facts import Count, PairRanges, count
-from skyless.site.survey.result import Survey
-from skyless.site.survey.solve import run_survey
-from skyless.site.survey.stamps.pair_ranger import PairRanger
-from skyless.site.survey.surveyed_site import delay_differences_m, surveyed_text, unchanged_anchors
-from skyless.site.survey.watch.moved import drop_moved, with_changes
+from skyless.site.survey.facts import Count, PairRanges, Survey, count
+from skyless.site.survey.pair_ranger import PairRanger
+from skyless.site.survey.solve import delay_differences_m, run_survey, surveyed_text, unchanged_anchors
+from skyless.site.survey.watch.monitor import drop_moved, with_changes
 from skyless.site.tables import read_ranges
 
 if TYPE_CHECKING:
@@ -115,7 +113,7 @@ class SurveyResult(Result, frozen=True, eq=False):
         return surveyed_text(self.file.read_bytes().decode("utf-8-sig"), self.survey, self.site, self.file)
 
     def to_dataframe(self) -> "DataFrame":
-        """One row an anchor, with all fields of ``skyless.site.survey.result.SurveyedAnchor`` but the covariance.
+        """One row an anchor, with all fields of ``skyless.site.survey.facts.SurveyedAnchor`` but the covariance.
 
         Raises:
             SkylessError: pandas is not installed.

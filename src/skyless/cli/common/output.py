@@ -177,7 +177,7 @@ def write_file(path: Path, data: bytes) -> None:
 
 def write_picture(path: Path, figure: "Figure") -> None:
     """Write a figure in the format of the file's ending, and say so. Raises SkylessError when it cannot be written."""
-    from skyless.site.report.figures import picture
+    from skyless.site.report import picture
 
     write_file(path, picture(figure, path.suffix.removeprefix(".")))
     say_written(path)

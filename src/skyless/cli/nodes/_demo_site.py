@@ -45,7 +45,7 @@ from skyless.run.process import (
 from skyless.sim.evaluation.request import ProtectionOptions
 from skyless.sim.lab import lab_site
 from skyless.site.file.template import site_template
-from skyless.site.survey.result import encode_record, record_path
+from skyless.site.survey.facts import encode_record, record_path
 
 _NAME: Final = "demo"
 _HOST: Final = "127.0.0.1"

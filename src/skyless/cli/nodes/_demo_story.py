@@ -12,8 +12,7 @@ from skyless.core.site import AlarmRule, FloorPlanSite, GeoreferenceSite, Site
 from skyless.run.mqtt.messages import Asset, AssetsMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import assets_topic, zones_topic
 from skyless.site.file.template import rectangle
-from skyless.site.survey.facts import PairRange, PairRanges
-from skyless.site.survey.result import Survey, SurveyedAnchor, SurveyRecord
+from skyless.site.survey.facts import PairRange, PairRanges, Survey, SurveyedAnchor, SurveyRecord
 
 _NAME: Final = "Workshop"
 _PLAN: Final = Path(__file__).with_name("demo_plan.png")

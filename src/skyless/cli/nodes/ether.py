@@ -25,7 +25,7 @@ from skyless.cli.nodes.options import (
 from skyless.core.arguments import Options, Picoseconds, Seed, TagCount, Text, number, read_numbers, tag_count
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import from_seconds
-from skyless.radio.ether_wire import DEFAULT_PORT
+from skyless.radio.emulated import DEFAULT_PORT
 
 if TYPE_CHECKING:
     from skyless.sim.impairments import AnchorDisplacement

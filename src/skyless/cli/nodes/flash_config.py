@@ -11,10 +11,9 @@ from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import SiteId, log
 from skyless.core.arguments import Option, Options, number, numbers, whole, wrong
 from skyless.core.errors import SkylessError
-from skyless.radio.serial.board_settings import MODES, OUTPUTS, BoardSettings
-from skyless.radio.serial.board_setup import set_up
+from skyless.radio.serial.link import MODES, OUTPUTS, BoardSettings
 from skyless.radio.serial.serial_port import check_path
-from skyless.radio.serial.serial_radio import Computing
+from skyless.radio.serial.serial_radio import Computing, set_up
 
 _BAUDS: Final = (1_000_000, 115_200, 230_400, 460_800, 921_600)
 

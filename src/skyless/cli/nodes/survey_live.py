@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from skyless.run.survey.program import SurveyNode
     from skyless.site.survey.facts import Facts, PairRanges
-    from skyless.site.survey.stamps.pair_ranger import PairRanger
+    from skyless.site.survey.pair_ranger import PairRanger
 
 _USUAL_S = 30.0
 

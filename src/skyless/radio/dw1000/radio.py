@@ -1,16 +1,331 @@
 """A DW1000 as a radio, driven by this process; its port says where the chip is: on SPI, or a model of one."""
 
 import asyncio
+import ctypes
+import hashlib
+import os
+import shlex
+import subprocess
+import tempfile
 import time
 from collections import Counter
-from typing import Final, Protocol
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Final, Protocol, TypeVar
 
 from skyless.core.air.frame import Reception, Transmission
+from skyless.core.errors import SkylessError
 from skyless.core.ticks import TICK_S, difference, from_seconds, wrap
-from skyless.radio.dw1000 import driver as dw1000
-from skyless.radio.dw1000.driver import DW1000, Bus, ChipError
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
 from skyless.radio.serial.link import cycles, from_steps
+
+# The DW1000's driver, as the computer at its bus calls it: the C of the firmware in ``c/``, integers only.
+#
+# ``c/dw1000.h`` says which states there are and what its functions do, ``docs/dw1000.md`` where each register's value
+# is from. It has never run on a chip. The machine's C compiler (``CC``, or ``cc``) makes a library of it at the first
+# use, in the user's cache folder.
+
+SOURCES: Final = Path(__file__).parent
+COMPILED_WITH: Final = ("-std=c11", "-O2", "-fPIC", "-shared")
+
+OFF: Final = 0
+IDLE: Final = 1
+LISTENING: Final = 2
+SENDING: Final = 3
+AWAITING: Final = 4
+"""States."""
+
+RECEIVED: Final = 1
+SENT: Final = 2
+FAILED: Final = 4
+CLOCK_SLIPPED: Final = 8
+LOST: Final = 16
+NOTHING: Final = 32
+"""Results of ``poll``: a frame was received, ours was sent; a reception failed; the clock's PLL was losing lock (stamps
+around that time are unreliable); the chip does not answer or was reset; no frame came in the window."""
+
+QUEUED: Final = 0
+LATE: Final = 1
+BUSY: Final = 2
+NOT_READY: Final = 3
+"""Results of ``transmit_at`` and ``receive_at``: it will happen at its time; or not, as it was too late, the radio is
+busy, or the chip is OFF."""
+
+NOT_MEASURED: Final = -32768
+"""A measured value that is missing."""
+NO_PHASE: Final = -1
+MIN_PSDU_BYTES: Final = 3
+MAX_PSDU_BYTES: Final = 127
+"""FCS included, which the chip makes and checks (UM p. 80)."""
+MAX_TRANSFER_BYTES: Final = 132
+_DEVICE_ID_READ: Final = 0x00
+_CPLOCK: Final = 1 << 1
+
+Value = TypeVar("Value")
+
+
+class ChipError(Exception):
+    """There is no DW1000 on the bus, or it does not start; the message states what was found."""
+
+
+class Bus(Protocol):
+    """The hardware that the driver needs; each method may raise OSError."""
+
+    def transfer(self, out: bytes) -> bytes:
+        """One SPI transaction (mode 0): what the chip sends while it receives ``out``, as many octets."""
+
+    def set_spi_fast(self, fast: bool) -> None:
+        """Clock at most 20 MHz from now on, or at most 3 MHz: the chip's PLL has no lock (UM 2.3.2)."""
+
+    def reset_chip(self) -> None:
+        """Pull RSTn low for a moment and let go (never drive it high), where it is wired."""
+
+    def pause_us(self, microseconds: int) -> None:
+        """Wait at least that long."""
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """The driver in C, compiled if this is its first use.
+
+    Raises:
+        SkylessError: there is no compiler, or no folder for its result.
+    """
+    loaded = ctypes.CDLL(str(_compiled()))
+    declare(loaded)
+    return loaded
+
+
+def declare(loaded: ctypes.CDLL) -> None:
+    """State the types of the driver's functions in a library that contains them."""
+    for name in ("log10", "accumulated", "power_cdbm", "first_path_cdbm", "carrier_offset_ppb", "micros_until"):
+        getattr(loaded, f"dw1000_{name}").restype = ctypes.c_int32
+    loaded.dw1000_angle.restype = ctypes.c_uint32
+    for name in ("start", "wake", "cancel", "check", "measure"):
+        getattr(loaded, f"dw1000_{name}").restype = ctypes.c_bool
+    loaded.dw1000_now.restype = ctypes.c_uint64
+    loaded.dw1000_micros_until.argtypes = (ctypes.c_uint64, ctypes.c_uint64)
+    loaded.dw1000_receive_at.argtypes = (ctypes.c_void_p, ctypes.c_uint64, ctypes.c_uint32)
+    loaded.dw1000_transmit_at.argtypes = (ctypes.c_void_p, ctypes.c_uint64, ctypes.c_char_p, ctypes.c_uint32)
+
+
+def _compiled() -> Path:
+    """The library of exactly these sources and this compiler, in the user's cache folder."""
+    command = [*shlex.split(os.environ.get("CC", "cc")), *COMPILED_WITH, str(SOURCES / "dw1000.c"), "-o"]
+    digest = hashlib.sha256(" ".join(command).encode())
+    for path in sorted(SOURCES.glob("*.[ch]")):
+        digest.update(path.read_bytes())
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "skyless"
+    made = home / f"dw1000-{os.uname().machine}-{digest.hexdigest()[:16]}.so"
+    if made.exists():
+        return made
+    try:
+        home.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=home) as folder:
+            unfinished = Path(folder) / made.name
+            done = subprocess.run([*command, str(unfinished)], capture_output=True, text=True, check=False)
+            if done.returncode:
+                why = done.stderr.strip().partition("\n")[0]
+                raise SkylessError(f"the DW1000's driver does not compile ({command[0]}): {why}")
+            unfinished.replace(made)
+    except FileNotFoundError:
+        raise SkylessError(
+            f"the DW1000's driver is compiled at its first use, and there is no C compiler {command[0]}: install one "
+            "(Debian, Raspberry Pi OS: sudo apt install gcc libc6-dev)"
+        ) from None
+    except OSError as error:
+        raise SkylessError(
+            f"the DW1000's driver cannot be compiled into {home} ({error.strerror}); XDG_CACHE_HOME should name a "
+            "folder that may be written"
+        ) from None
+    return made
+
+
+class Hardware(ctypes.Structure):
+    """The first functions of ``struct hardware`` (``c/hardware.h``), all that the driver calls, on a Python object.
+
+    C knows no exceptions: the first is kept in ``failure``, and from then on nothing is called and C reads zeros.
+    """
+
+    _fields_ = (
+        ("transfer", ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32)),
+        ("set_spi_fast", ctypes.CFUNCTYPE(None, ctypes.c_bool)),
+        ("reset_chip", ctypes.CFUNCTYPE(None)),
+        ("pause_us", ctypes.CFUNCTYPE(None, ctypes.c_uint32)),
+    )
+
+    def __init__(self, bus: Bus) -> None:
+        super().__init__()
+        self.failure: BaseException | None = None
+        self._kept: dict[str, object] = {}
+
+        def transfer(out: int, into: int, size: int) -> None:
+            ctypes.memmove(into, self.call(bus.transfer, ctypes.string_at(out, size)) or bytes(size), size)
+
+        self.connect(
+            transfer=transfer,
+            set_spi_fast=partial(self.call, bus.set_spi_fast),
+            reset_chip=partial(self.call, bus.reset_chip),
+            pause_us=partial(self.call, bus.pause_us),
+        )
+
+    def connect(self, **functions: Callable[..., object]) -> None:
+        """Set members of the structure, and keep what they call: ctypes forgets some where a structure has a base."""
+        kinds = dict(field[:2] for kind in type(self).__mro__ for field in vars(kind).get("_fields_", ()))
+        for name, function in functions.items():
+            self._kept[name] = kinds[name](function)
+            setattr(self, name, self._kept[name])
+
+    def call(self, function: Callable[..., Value], *values: object) -> Value | int:
+        """Call it for C; 0 after a failure."""
+        if self.failure is None:
+            try:
+                return function(*values)
+            except BaseException as error:  # noqa: BLE001 - raised when C has returned
+                self.failure = error
+        return 0
+
+    def raise_failure(self) -> None:
+        """Raise what a function has raised while C was running."""
+        failure, self.failure = self.failure, None
+        if failure is not None:
+            raise failure
+
+
+class DW1000(ctypes.Structure):
+    """``struct dw1000`` of ``c/dw1000.h``: one chip. A bus that fails leaves it OFF.
+
+    Until the next ``poll``, what was received is in ``rx_ticks``, ``frame``, ``rx_power_cdbm``, ``first_path_cdbm``,
+    ``offset_ppb`` and ``phase``: that of the carrier in 2**-16 turns if ``reads_phases`` is set, or NO_PHASE. The stamp
+    of what was SENT is in ``tx_ticks``. ``errors`` are failed receptions of any kind. ``uses_both_buffers``, set before
+    the start of a radio that only listens, has the receiver on while a frame is read.
+    """
+
+    state: int
+    reads_phases: bool
+    uses_both_buffers: bool
+    received: int
+    errors: int
+    sent: int
+    rx_ticks: int
+    rx_power_cdbm: int
+    first_path_cdbm: int
+    offset_ppb: int
+    phase: int
+    tx_ticks: int
+    temperature_cc: int
+    millivolts: int
+    _fields_ = (
+        ("_functions", ctypes.c_void_p),
+        ("state", ctypes.c_int),
+        ("_is_listening", ctypes.c_bool),
+        ("reads_phases", ctypes.c_bool),
+        ("uses_both_buffers", ctypes.c_bool),
+        *((name, ctypes.c_uint32) for name in ("received", "errors", "sent")),
+        ("rx_ticks", ctypes.c_uint64),
+        ("_frame", ctypes.c_void_p),
+        ("_frame_bytes", ctypes.c_uint32),
+        *((name, ctypes.c_int32) for name in ("rx_power_cdbm", "first_path_cdbm", "offset_ppb", "phase")),
+        ("tx_ticks", ctypes.c_uint64),
+        ("temperature_cc", ctypes.c_int32),
+        *((name, ctypes.c_uint32) for name in ("millivolts", "_temperature_23", "_voltage_33")),
+        ("_status", ctypes.c_uint64),
+        *((name, ctypes.c_uint8 * MAX_TRANSFER_BYTES) for name in ("_out", "_into", "_frame_into")),
+    )
+
+    def __init__(self, bus: Bus) -> None:
+        super().__init__()
+        self._hardware = Hardware(bus)
+        library().dw1000_init(ctypes.byref(self), ctypes.byref(self._hardware))
+
+    @property
+    def frame(self) -> bytes:
+        """The frame that was received last."""
+        return ctypes.string_at(self._frame, self._frame_bytes)
+
+    def _call(self, name: str, *values: object) -> int:
+        result: int = getattr(library(), f"dw1000_{name}")(ctypes.byref(self), *values)
+        if self._hardware.failure is not None:
+            self.state = OFF
+            self._hardware.raise_failure()
+        return result
+
+    def start(self, tx_delay_ticks: int, rx_delay_ticks: int) -> None:
+        """Reset and configure the chip; antenna delays of 16 bits.
+
+        Raises:
+            ChipError: no DW1000 answers, or its clock does not lock.
+        """
+        self._status = 0
+        if self._call("start", tx_delay_ticks, rx_delay_ticks):
+            return
+        if self._out[0] != _DEVICE_ID_READ:
+            raise ChipError("the DW1000's clock does not lock: is its crystal or supply sound?")
+        when = " at full speed" if self._status & _CPLOCK else ""
+        found = bytes(self._into[4:0:-1]).hex().upper()
+        raise ChipError(f"no DW1000{when}: its identifier is DECA0130, read was {found}")
+
+    def receive(self) -> None:
+        """Listen from now on; a frame that waits to be sent is sent before."""
+        self._call("receive")
+
+    def idle(self) -> None:
+        """Turn the receiver off; a frame that waits to be sent is sent before."""
+        self._call("idle")
+
+    def receive_at(self, ticks: int, window: int) -> int:
+        """Listen for one frame from ``ticks`` of the counter on, for ``window`` · 65536 ticks; QUEUED, or why not."""
+        return self._call("receive_at", ticks, window)
+
+    def sleep(self) -> None:
+        """Let the chip sleep: it is OFF until ``wake``."""
+        self._call("sleep")
+
+    def wake(self, tx_delay_ticks: int, rx_delay_ticks: int) -> bool:
+        """Wake and configure a chip that sleeps; False where none answers."""
+        return bool(self._call("wake", tx_delay_ticks, rx_delay_ticks))
+
+    def transmit_at(self, dx_ticks: int, frame: bytes) -> int:
+        """Send a PSDU when the counter is at ``dx_ticks``; QUEUED, or why not.
+
+        Its low nine bits are ignored (UM p. 26). The stamp will be that + the TX antenna delay. The last two bytes of
+        the frame are replaced by the FCS, which the chip makes. Poll before, or a frame that has just come is lost.
+
+        Raises:
+            ValueError: no PSDU has this length.
+        """
+        if not MIN_PSDU_BYTES <= len(frame) <= MAX_PSDU_BYTES:
+            raise ValueError("a PSDU has 3 to 127 bytes")
+        return self._call("transmit_at", dx_ticks, frame, len(frame))
+
+    def cancel(self) -> bool:
+        """Cancel a frame that has not been sent; False where it has, which the next ``poll`` will return."""
+        return bool(self._call("cancel"))
+
+    def poll(self) -> int:
+        """What has happened since: a sum of RECEIVED, SENT, FAILED, CLOCK_SLIPPED, LOST; 0 for nothing.
+
+        To be called when the interrupt line is high, or periodically. The receiver is on again when it returns.
+        """
+        return self._call("poll")
+
+    def check(self) -> bool:
+        """Whether the chip still has its configuration; if not it is OFF.
+
+        A chip whose supply failed may lock again unnoticed and report nothing for ever, so this is to be called
+        periodically where nothing is received for long.
+        """
+        return bool(self._call("check"))
+
+    def now(self) -> int:
+        """The counter now, in steps of 512 ticks (UM 7.2.8)."""
+        return self._call("now")
+
+    def measure(self) -> bool:
+        """Measure ``temperature_cc`` and ``millivolts`` in some 1.1 ms, in which nothing is received."""
+        return bool(self._call("measure"))
+
 
 OVERDUE_TICKS: Final = from_seconds(1e-3)
 """A frame whose end is not reported within this time after its RMARKER is cancelled."""
@@ -21,7 +336,7 @@ SPI_LEAD_S: Final = 1.5e-3
 """The preamble, seven transfers of up to 0.1 ms, a reception that is served before, and a host's timers
 (``benchmarks/host_latency.py``)."""
 
-_FAILURES: Final = {dw1000.FAILED: "rx-error", dw1000.CLOCK_SLIPPED: "clock-slipped"}
+_FAILURES: Final = {FAILED: "rx-error", CLOCK_SLIPPED: "clock-slipped"}
 
 
 class ChipSession:
@@ -56,7 +371,7 @@ class ChipSession:
 
     def read_ticks(self) -> int | None:
         """The chip's counter, read over the bus; None for a chip that is off."""
-        return None if self.driver.state == dw1000.OFF else self.driver.now()
+        return None if self.driver.state == OFF else self.driver.now()
 
     @property
     def overdue_ticks(self) -> int | None:
@@ -67,7 +382,7 @@ class ChipSession:
         """Have a frame sent at its tick; a frame that has just been received is read first."""
         self.serve(host_s)
         dx_ticks = wrap(transmission.tx_ticks - self._delays.tx_ticks)
-        if self.driver.transmit_at(dx_ticks, transmission.frame) == dw1000.QUEUED:
+        if self.driver.transmit_at(dx_ticks, transmission.frame) == QUEUED:
             self._pending = transmission.tx_ticks
         else:
             self._listener(Late(transmission.tx_ticks))
@@ -80,17 +395,17 @@ class ChipSession:
         driver = self.driver
         events = driver.poll()
         self.idle = events == 0
-        if events & dw1000.LOST:
+        if events & LOST:
             self._counters["chip-lost"] += 1
             return False
         for event, reason in _FAILURES.items():
             if events & event:
                 self._counters[reason] += 1
-        if events & dw1000.SENT:
+        if events & SENT:
             self._on_sent()
-        if events & dw1000.RECEIVED:
+        if events & RECEIVED:
             measured = from_steps(driver.rx_power_cdbm, driver.first_path_cdbm, driver.offset_ppb)
-            phase_cycles = None if driver.phase == dw1000.NO_PHASE else cycles(driver.phase)
+            phase_cycles = None if driver.phase == NO_PHASE else cycles(driver.phase)
             self._listener(Reception(driver.frame, driver.rx_ticks, host_s, measured, phase_cycles))
         return True
 
@@ -135,7 +450,7 @@ class Dw1000Radio:
 
         Raises SkylessError where the driver cannot be compiled.
         """
-        dw1000.library()
+        library()
         self.name = name
         self.counters: Counter[str] = Counter()
         self.lead_s = SPI_LEAD_S

@@ -10,8 +10,7 @@ from typing import Any, Final
 
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
-from skyless.radio.dw1000.driver import ChipError
-from skyless.radio.dw1000.radio import Dw1000Radio
+from skyless.radio.dw1000.radio import ChipError, Dw1000Radio
 
 START_HZ: Final = 2_000_000
 """Below the 3 MHz that the chip accepts before its PLL has lock."""
@@ -40,7 +39,7 @@ _MAX_EDGE_READS: Final = 8
 
 
 class SpiBus:
-    """One chip's SPI device and lines (``skyless.radio.dw1000.driver.Bus``).
+    """One chip's SPI device and lines (``skyless.radio.dw1000.radio.Bus``).
 
     Transfers raise OSError where the kernel refuses them.
     """

@@ -11,17 +11,19 @@ from skyless.core.earth import east_north_up_of
 from skyless.core.input_files import Drops, chunks, lines
 from skyless.core.site import GeoreferenceSite
 from skyless.core.ticks import TICK_BITS, difference, wrap
-from skyless.radio.uci.dl_tdoa import DtMessage, DtRounds, host_time_s
-from skyless.radio.uci.uci import (
+from skyless.radio.foreign.uci import (
     CONTROL_HEADER_BYTES,
     STATUS_OK,
     DtMeasurement,
+    DtMessage,
     DtMessageType,
+    DtRounds,
     GeodeticPoint,
     SessionInfo,
     UciPacket,
     UciReader,
     decode_session_info,
+    host_time_s,
     location_of,
 )
 

@@ -15,9 +15,9 @@ from skyless.core.input_files import Drops, LineCutter
 from skyless.core.ticks import wrap
 from skyless.radio.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
 from skyless.radio.foreign.fira import AnchorFrame, DtTag
+from skyless.radio.foreign.uci import UciReader
 from skyless.radio.interface import Gone, Late, RadioEvent, Restarted, ignore
 from skyless.radio.serial.serial_port import BoardClock, SerialPort, line_advice
-from skyless.radio.uci.uci import UciReader
 
 ASK_BINARY: Final = b"b"
 """What makes a sniffer change from text to binary; one that cannot stays with text."""

@@ -3,18 +3,31 @@
 import asyncio
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.frame import Reception, Transmission
+from skyless.core.errors import SkylessError
 from skyless.core.ticks import wrap
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
 from skyless.radio.serial import link
-from skyless.radio.serial.board_settings import MODES, OUTPUTS, pack
-from skyless.radio.serial.link import Done, Heard, Hello, NotDone, Record, Status, TagConfig, TooLate, decode
+from skyless.radio.serial.link import (
+    MODES,
+    OUTPUTS,
+    Done,
+    Heard,
+    Hello,
+    NotDone,
+    Record,
+    Status,
+    TagConfig,
+    TooLate,
+    decode,
+    pack,
+)
 from skyless.radio.serial.serial_port import BoardClock, SerialPort
 from skyless.radio.tag_reports import Reported
 
@@ -463,3 +476,33 @@ class SerialRadio:
     def on_close(self) -> None:
         """The board has gone."""
         self._session = None
+
+
+# Asks a board for its settings and changes them, at whatever rate its port works.
+
+_ANSWER_S: Final = 1.5
+"""A board answers in milliseconds, also one that has to erase a page of its flash."""
+
+
+async def set_up(path: str, bauds: Sequence[int], computing: Computing) -> TagConfig:
+    """The settings of the board at a port, after the changes that are asked for, if any.
+
+    Raises:
+        SkylessError: the port cannot be opened, no board answers, or it is none that computes, or refuses.
+    """
+    for baud in bauds:
+        radio, events = SerialRadio(path, baud, "", computing=computing), asyncio.Queue[RadioEvent]()
+        running = asyncio.ensure_future(radio.run(events.put_nowait))
+        try:
+            event = await asyncio.wait_for(events.get(), _ANSWER_S)
+        except TimeoutError:
+            continue
+        finally:
+            config = radio.tag_config
+            running.cancel()
+            await asyncio.gather(running, return_exceptions=True)
+        if isinstance(event, Gone) or config is None:
+            raise SkylessError(event.reason if isinstance(event, Gone) else f"the board at {path} says no settings")
+        return config
+    rates = ", ".join(map(str, bauds))
+    raise SkylessError(f"no board of Skyless answers at {path}, at {rates} baud: another port, or other firmware?")

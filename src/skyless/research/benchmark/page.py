@@ -17,8 +17,7 @@ from skyless.core.arrays import Matrix
 from skyless.core.whole_files import replace_files
 from skyless.research.benchmark.run import BEST, JOINT, PLAIN, Result
 from skyless.sim.evaluation.figures import Figures
-from skyless.site.report.figures import panel, picture, report_style
-from skyless.site.report.report_page import bullets, page, svg_figure, table
+from skyless.site.report import bullets, page, panel, picture, report_style, svg_figure, table
 
 _HEADS: Final = (
     *("recording", "method", "judged", "RMSE 2-D", "3-D", "50 %", "95 %", "largest", "bias x, y, z", "σ", "NEES"),

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from skyless.core.arrays import Array, Matrix, Vector
-from skyless.site.kernels.compiled import kernel
+from skyless.site.kernels import kernel
 
 GATE, BITCRAZE = range(2)
 TDOA_STD_M: Final = {GATE: 0.22, BITCRAZE: 0.15}

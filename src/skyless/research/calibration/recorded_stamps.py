@@ -23,8 +23,8 @@ from skyless.research.replays.site import SITE_FORMAT, recorded_site
 from skyless.run.mqtt.messages import ReceptionsMessage, StampsMessage
 from skyless.run.recordings.recording import McapRecording, Recorded, is_mcap
 from skyless.site.survey.facts import PairBlock, PairRanges
-from skyless.site.survey.stamps.legs import AnchorLeg, LegCollector, RelayMatcher
-from skyless.site.survey.stamps.pair_ranger import PairRanger
+from skyless.site.survey.legs import AnchorLeg, LegCollector, RelayMatcher
+from skyless.site.survey.pair_ranger import PairRanger
 
 _REPORT_EVERY: Final = 1000
 """Records between two reports of progress."""

@@ -17,7 +17,7 @@ from skyless.run.mqtt.messages import ReceptionsMessage
 from skyless.run.recordings.host_clock import HostClock
 from skyless.run.recordings.recording import McapRecording, tags_to_replay
 from skyless.sim.evaluation.truth import TruthTrack
-from skyless.site.survey.relayed import RelayedDifferences
+from skyless.site.survey.legs import RelayedDifferences
 from skyless.site.survey.walk import EPOCH_S, EpochCollector, TagEpochs
 from skyless.site.tables import Truth
 

@@ -28,11 +28,7 @@ from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.input_files import Drops, lines
 from skyless.core.ticks import TICK_BITS, TICK_RATE_HZ, wrap
 from skyless.radio.foreign.fira import AnchorFrame
-from skyless.radio.uci.dl_tdoa import DtMessage, DtRounds, host_time_s
-from skyless.radio.uci.uci import (
-    DtMessageType,
-    GeodeticPoint,
-)
+from skyless.radio.foreign.uci import DtMessage, DtMessageType, DtRounds, GeodeticPoint, host_time_s
 
 _KINDS: Final = {"poll": DtMessageType.POLL, "response": DtMessageType.RESPONSE, "final": DtMessageType.FINAL}
 _STAMP_BYTES: Final = TICK_BITS // 8

@@ -16,7 +16,7 @@ from msgspec import Struct
 from skyless.core.air.masterless_packets import Packet, Relay
 from skyless.core.input_files import Drops, open_source, rows
 from skyless.core.ticks import TICK_BITS, TICK_M
-from skyless.site.survey.two_way import TwoWayRanging
+from skyless.site.survey.legs import TwoWayRanging
 
 RECEPTION_COLUMNS: Final = ("t_host", "order", "slave", "master", "status", "tx_ticks_u40", "rx_ticks_u40")
 BLINK_COLUMNS: Final = ("tag", "anchor", "rx_ticks_u40")

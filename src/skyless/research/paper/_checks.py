@@ -15,7 +15,7 @@ from skyless.research.paper.monte_carlo import ChainMoments, Quantity, draw_mome
 from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, grouped
 from skyless.research.studies.common.plan import Cell
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED, Chain
-from skyless.site.report.figures import BLUE, INK, RED, panel
+from skyless.site.report import BLUE, INK, RED, panel
 
 QUANTITY_NAMES: Final = ("beta", "gamma_first", "gamma_delayed", "gamma_averaged", "epsilon", "xi", "phi", "lambda")
 """β, γ(t̄), γ(t̄+D), γ̄, ε(t_i), ξ, φ, λ, in the order in which the paper derives them."""

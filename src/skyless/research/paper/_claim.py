@@ -26,7 +26,7 @@ from skyless.research.studies.common.plan import Cell
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.site.report.figures import GREEN, INK, METHOD_COLOURS, MUTED, panel
+from skyless.site.report import GREEN, INK, METHOD_COLOURS, MUTED, panel
 
 _CLAIM_FIXES: Final = 30_000
 """As many as the paper made at each position."""

@@ -13,7 +13,7 @@ from skyless.research.paper.monte_carlo import draw_lambdas
 from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, gaussian, grouped
 from skyless.research.studies.common.plan import Cell
 from skyless.research.uncertainty.chain import CORRECTED, PRINTED
-from skyless.site.report.figures import BLUE, INK, RED, panel
+from skyless.site.report import BLUE, INK, RED, panel
 
 _AGREES_SIGMAS: Final = 5.0
 _REACH_SIGMAS: Final = 5.0

@@ -11,7 +11,7 @@ from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.paper.plan import P1, P2, RADIO_PS, Panel, Plan, Results, Section, Verdict
 from skyless.research.studies.common.plan import Cell
 from skyless.sim.lab import paper_lab_site
-from skyless.site.report.figures import MAP, MAP_WHITE, draw_floor_plan, panel
+from skyless.site.report import MAP, MAP_WHITE, draw_floor_plan, panel
 
 LAB_ANCHORS_M: Final = np.array([(anchor.x_m, anchor.y_m) for anchor in paper_lab_site().anchors])
 """The lab's anchors, shape (6, 2), the master first, in the order in which they send."""

@@ -7,7 +7,7 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.research.paper.plan import Section, Verdict
-from skyless.site.report.report_page import page, svg_figure, table, text
+from skyless.site.report import page, svg_figure, table, text
 
 _CLASSES: Final = {Verdict.HOLDS: "good", Verdict.CORRECTED: "mixed", Verdict.FAILS: "bad"}
 

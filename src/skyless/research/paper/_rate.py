@@ -16,7 +16,7 @@ from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.site.report.figures import INK, METHOD_COLOURS, panel
+from skyless.site.report import INK, METHOD_COLOURS, panel
 
 _METHODS: Final = ("literal", "joint")
 _PAPER_HZ: Final = 67.0

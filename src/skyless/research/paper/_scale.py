@@ -20,7 +20,7 @@ from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.site.report.figures import BLUE, GREEN, INK, MUTED, ORANGE, panel
+from skyless.site.report import BLUE, GREEN, INK, MUTED, ORANGE, panel
 
 _JUDGED_FROM_S: Final = 0.6
 _JUDGED_UNTIL_S: Final = 1.2

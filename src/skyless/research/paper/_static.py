@@ -31,7 +31,7 @@ from skyless.sim.impairments import DelayError, Impairments, lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
 from skyless.site.channel import ChannelModel, power_bias_m, received_power_dbm
-from skyless.site.report.figures import INK, METHOD_COLOURS, MUTED, RED, panel
+from skyless.site.report import INK, METHOD_COLOURS, MUTED, RED, panel
 
 _METHODS: Final = ("literal", "joint")
 _POSITIONS: Final = {"P1": P1, "P2": P2}

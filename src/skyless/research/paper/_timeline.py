@@ -20,7 +20,7 @@ from skyless.sim.lab import paper_lab_site
 from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import Broadcast, World
-from skyless.site.report.figures import GREEN, GRID, INK, METHOD_COLOURS, MUTED, RED, panel
+from skyless.site.report import GREEN, GRID, INK, METHOD_COLOURS, MUTED, RED, panel
 
 _POSITIONS_M: Final = ((3.0, 4.0), (1.2, 1.6), (4.6, 6.3))
 _SWITCHED_ON_S: Final = (0.5, 0.512, 0.512)

@@ -15,7 +15,7 @@ from skyless.research.studies.common.plan import Cell
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Waypoints
-from skyless.site.report.figures import INK, METHOD_COLOURS, RED, draw_floor_plan, panel
+from skyless.site.report import INK, METHOD_COLOURS, RED, draw_floor_plan, panel
 
 _METHODS: Final = ("literal", "joint")
 _CORNERS_M: Final = ((1.0, 1.0), (5.0, 1.0), (5.0, 7.0), (1.0, 7.0))

@@ -24,7 +24,7 @@ from skyless.research.paper import _walk as walk
 from skyless.research.paper._html import Heading, report_page
 from skyless.research.paper.plan import Plan, Section
 from skyless.research.studies.common.runner import run_cells
-from skyless.site.report.figures import picture, report_style
+from skyless.site.report import picture, report_style
 
 _FIGURES: Final = (scenario, checks, distributions, static, walk, dop_map, timeline, rate, claim, scale)
 """In the order of the report."""

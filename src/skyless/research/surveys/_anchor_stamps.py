@@ -7,7 +7,7 @@ from skyless.core.any_receiver import AnchorMachine, decode_any, new_anchor
 from skyless.core.site import Site
 from skyless.sim.impairments import Impairments
 from skyless.sim.world import World
-from skyless.site.survey.stamps.pair_ranger import PairRanger
+from skyless.site.survey.pair_ranger import PairRanger
 
 OnLeg = Callable[[int, int, int, int, float], None]
 """Sender, receiver, TX and RX ticks, true time: as ``PairRanger.add`` accepts them."""

@@ -11,10 +11,9 @@ from skyless.core.arrays import Array
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.research.surveys.air import DrawnErrors, free_axes
 from skyless.research.surveys.layouts import SLOT_S, SurveyLayout
-from skyless.site.survey.facts import Facts, PairRanges
+from skyless.site.survey.facts import Facts, PairRanges, Survey
 from skyless.site.survey.fit.determined import aligned_covariance
 from skyless.site.survey.fit.problem import Problem, jacobian, superimposed
-from skyless.site.survey.result import Survey
 
 _GRID: Final = np.linspace(0.15, 0.85, 5)
 """Positions of tags, as shares of the site's length and width."""

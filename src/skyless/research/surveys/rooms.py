@@ -25,10 +25,8 @@ from skyless.sim.evaluation.scenarios import Room
 from skyless.sim.impairments import AnchorDisplacement, DelayError, Impairments, PairError, lab_impairments
 from skyless.sim.lab import lab_site
 from skyless.sim.range_errors import RangeErrorModel
-from skyless.site.survey.facts import Facts, PairRanges, Point, Tape
-from skyless.site.survey.result import Survey
-from skyless.site.survey.solve import run_survey
-from skyless.site.survey.surveyed_site import surveyed_site
+from skyless.site.survey.facts import Facts, PairRanges, Point, Survey, Tape
+from skyless.site.survey.solve import run_survey, surveyed_site
 
 HAND_STD_M: Final = 0.02
 """Error of positions measured by hand, per axis."""

@@ -12,8 +12,7 @@ from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
 from skyless.core.site import AlarmRule, FloorPlanSite, FloorSite, Outline, RuleKind, Severity, Site
-from skyless.site.survey.facts import Facts
-from skyless.site.survey.result import Survey
+from skyless.site.survey.facts import Facts, Survey
 
 if TYPE_CHECKING:
     from skyless.core.fix import Fix

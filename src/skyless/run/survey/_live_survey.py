@@ -12,14 +12,11 @@ from msgspec.structs import replace
 
 from skyless.core.site import Site
 from skyless.run.mqtt.messages import StampsMessage, SurveyMessage, SurveyProgress, WatchFinding, WatchMessage
-from skyless.site.survey.facts import Facts, PairBlock, PairRanges
-from skyless.site.survey.result import Survey, SurveyRecord, baseline
-from skyless.site.survey.stamps.legs import AnchorLeg
-from skyless.site.survey.stamps.pair_ranger import PairRanger, StepTable
-from skyless.site.survey.watch.explain import Finding
-from skyless.site.survey.watch.monitor import AnchorWatch
-from skyless.site.survey.watch.moved import Change, with_changes
-from skyless.site.survey.watch.phase_sums import PhaseWatch
+from skyless.site.survey.facts import Facts, PairBlock, PairRanges, Survey, SurveyRecord, baseline
+from skyless.site.survey.legs import AnchorLeg
+from skyless.site.survey.pair_ranger import PairRanger, StepTable
+from skyless.site.survey.watch.explain import Finding, PhaseWatch
+from skyless.site.survey.watch.monitor import AnchorWatch, Change, with_changes
 
 NO_DATA_S: Final = 5.0
 """Without stamps for this time a result is out of date."""

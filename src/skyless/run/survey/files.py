@@ -13,11 +13,9 @@ from skyless.core.site import FloorPlanSite, Site
 from skyless.core.whole_files import replace_files
 from skyless.run.process import Log
 from skyless.site.file.check import check_site, image_size
-from skyless.site.file.load import load_site
-from skyless.site.file.rewrite import with_values
-from skyless.site.survey.facts import PairRanges
-from skyless.site.survey.result import Survey, SurveyRecord, encode_record, read_record, record_path
-from skyless.site.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text
+from skyless.site.file.load import load_site, with_values
+from skyless.site.survey.facts import PairRanges, Survey, SurveyRecord, encode_record, read_record, record_path
+from skyless.site.survey.solve import delay_changes_ticks, surveyed_site, surveyed_text
 
 _NEAR_M: Final = 1e-3
 _ENDINGS: Final = {b"\x89PNG": ".png"}

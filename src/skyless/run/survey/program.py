@@ -45,11 +45,10 @@ from skyless.run.radio_monitor import RadioMonitor
 from skyless.run.survey._live_survey import FactsOf, LiveSurvey
 from skyless.run.survey.files import FloorImage, Saved, record_of, save_survey, saved_without_file
 from skyless.site.file.load import load_site
-from skyless.site.survey.facts import Facts, PairRanges
-from skyless.site.survey.result import Survey
-from skyless.site.survey.stamps.legs import LegCollector
-from skyless.site.survey.surveyed_site import delay_differences_m
-from skyless.site.survey.watch.moved import change_of
+from skyless.site.survey.facts import Facts, PairRanges, Survey
+from skyless.site.survey.legs import LegCollector
+from skyless.site.survey.solve import delay_differences_m
+from skyless.site.survey.watch.monitor import change_of
 
 NAME: Final = "survey"
 """Its name on MQTT: one site has one survey program."""

@@ -15,7 +15,7 @@ from skyless.core.arrays import Array, Integers
 from skyless.core.ticks import TICK_RATE_HZ, WRAP_TICKS
 from skyless.sim.cells._keyed import CRYSTAL, START, key_of, mixed, normal_pair, purpose_key, uniform
 from skyless.sim.oscillator import OscillatorModel
-from skyless.site.kernels.compiled import kernel
+from skyless.site.kernels import kernel
 
 KNOT_BITS: Final = 31
 KNOT_TICKS: Final = 1 << KNOT_BITS

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from skyless.core.arrays import Array, Integers
 from skyless.sim.cells._reception import Rules, delivery_chance, pair_key, squared_m2
-from skyless.site.kernels.compiled import kernel
+from skyless.site.kernels import kernel
 
 _MAX_CELLS: Final = 1_000_000
 """Anchors far apart get larger cells instead of more."""

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from skyless.site.kernels.compiled import kernel
+from skyless.site.kernels import kernel
 
 START, CRYSTAL, TX_NOISE, RX_NOISE, CHANCE, LOSS, _, SURVEY, RANGE_CONSTANT, RANGE_CHANGING = range(1, 11)
 """Purposes."""

@@ -24,7 +24,7 @@ from skyless.site.channel import (
     delivery_probability,
     received_power_dbm,
 )
-from skyless.site.kernels.compiled import kernel, step
+from skyless.site.kernels import kernel, step
 
 AUDIBLE_WIDTHS: Final = 12.0
 """Widths of the loss's logistic function below the sensitivity, from which on nothing is received."""

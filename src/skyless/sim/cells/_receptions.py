@@ -29,7 +29,7 @@ from skyless.sim.cells._reception import (
 from skyless.sim.cells._timetable import BIN_BITS, Buckets, Table, latest
 from skyless.sim.range_errors import slope_error_m
 from skyless.sim.stations import coordinate_m
-from skyless.site.kernels.compiled import kernel, step
+from skyless.site.kernels import kernel, step
 
 RELAY_AGE_TICKS: Final = round(1.0 * TICK_RATE_HZ)
 """Older receptions are not relayed, as in ``skyless.core.anchor``."""

@@ -13,7 +13,7 @@ from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS
 from skyless.sim.cells._clocks import Knots, own_time, true_time
 from skyless.sim.cells._grid import Grid
 from skyless.sim.cells._reception import Frames, Rules, emission
-from skyless.site.kernels.compiled import jitted, kernel, step
+from skyless.site.kernels import jitted, kernel, step
 
 BIN_BITS: Final = 25
 """Frames are sorted into bins of 2^24 ticks, 0.26 ms."""

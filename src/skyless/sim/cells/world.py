@@ -49,7 +49,7 @@ from skyless.sim.cells._timetable import (
 from skyless.sim.impairments import Impairments
 from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.trajectory import Trajectory
-from skyless.site.kernels.compiled import kernel
+from skyless.site.kernels import kernel
 
 MAX_RELAYS: Final = 6
 """In a frame: more than six hardly make fixes better."""

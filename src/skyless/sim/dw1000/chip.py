@@ -374,7 +374,7 @@ class Chip:
 
 
 class ModelBus:
-    """A driver's bus to a model of the chip (``skyless.radio.dw1000.driver.Bus``).
+    """A driver's bus to a model of the chip (``skyless.radio.dw1000.radio.Bus``).
 
     ``spend`` lets the host's time pass; a transfer reaches the chip when its time is over.
     """

@@ -24,7 +24,7 @@ from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_S
 from skyless.site.channel import ChannelModel, pack_walls
-from skyless.site.kernels.compiled import jitted, kernel
+from skyless.site.kernels import jitted, kernel
 from skyless.site.planning.links import MIN_SYNC, anchor_links, link_budget, links, masters_by_links
 
 _STEADY_CHANGE: Final = 1e-7

@@ -16,7 +16,6 @@ from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.core.earth import geodetic
 from skyless.core.geometry import inside
 from skyless.core.site import GeoreferenceSite
-from skyless.site.planning.floor import Floor
 from skyless.site.planning.links import (
     ANCHORS_IN_VIEW,
     BIAS,
@@ -28,6 +27,7 @@ from skyless.site.planning.links import (
     SIGMA_X,
     SIGMA_Y,
     SIGMA_Z,
+    Floor,
 )
 from skyless.site.planning.predict import Predictor
 

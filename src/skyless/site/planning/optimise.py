@@ -19,11 +19,18 @@ from msgspec.structs import replace
 from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.site import AnchorSite, Site
 from skyless.site.channel import pack_walls
-from skyless.site.kernels.compiled import kernel, threaded_kernel
-from skyless.site.kernels.linear_algebra import factorise, invert
+from skyless.site.kernels import factorise, invert, kernel, threaded_kernel
 from skyless.site.planning.anchor_clocks import stamp_variances
-from skyless.site.planning.floor import Floor, Mounts, sample_points
-from skyless.site.planning.links import FIX_SHARE, SIGMA, link_budget, links, masters_by_links
+from skyless.site.planning.links import (
+    FIX_SHARE,
+    SIGMA,
+    Floor,
+    Mounts,
+    link_budget,
+    links,
+    masters_by_links,
+    sample_points,
+)
 from skyless.site.planning.predict import PlanSettings, Predictor, with_noise
 
 _SEARCH_POINTS: Final = 140

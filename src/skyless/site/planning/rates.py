@@ -24,10 +24,9 @@ from skyless.site.channel import (
     pack_walls,
     received_power_dbm,
 )
-from skyless.site.file.advice import warnings_of
-from skyless.site.kernels.compiled import threaded_kernel
-from skyless.site.planning.floor import Floor
-from skyless.site.planning.links import IN_VIEW, range_of
+from skyless.site.file.check import warnings_of
+from skyless.site.kernels import threaded_kernel
+from skyless.site.planning.links import IN_VIEW, Floor, range_of
 from skyless.site.planning.maps import Grid, grid_of
 
 RECEIVED_HZ: Final = 2.0

@@ -10,7 +10,7 @@ from msgspec import Struct
 from skyless.core.air.masterless_packets import PairTdoa, Point
 from skyless.core.arrays import Array
 from skyless.core.ticks import TICK_BITS, TICK_M
-from skyless.site.survey.two_way import RunningMedian, TwoWayRanging
+from skyless.site.survey.legs import RunningMedian, TwoWayRanging
 
 MIN_NOISE_M: Final = 0.05
 """Smallest noise that is assumed: positions that a calibration has not seen differ somewhat."""

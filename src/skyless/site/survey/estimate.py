@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from skyless.core.arrays import Array, Integers, Mask, Vector
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
-from skyless.site.survey.stamps.repeats import STD_OVER_MAD
+from skyless.site.survey.legs import STD_OVER_MAD
 
 # The robust regression behind a calibration: constants of anchors, and a slope, from differences at known positions.
 

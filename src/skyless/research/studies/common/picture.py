@@ -13,7 +13,7 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array
 from skyless.research.studies.common.plan import Row
-from skyless.site.report.figures import BLUE, GREEN, GRID, INK, MUTED, ORANGE, RED, report_style
+from skyless.site.report import BLUE, GREEN, GRID, INK, MUTED, ORANGE, RED, report_style
 
 _WIDTH_IN: Final = 4.7
 _BAR_IN: Final = 0.24

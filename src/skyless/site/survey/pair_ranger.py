@@ -16,8 +16,7 @@ from msgspec.structs import astuple, replace
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.ticks import TICK_BITS, TICK_M, TICK_RATE_HZ, Unwrapper
 from skyless.site.survey.facts import PairBlock, PairRange, PairRanges
-from skyless.site.survey.stamps.repeats import STD_OVER_MAD, earliest_cluster
-from skyless.site.survey.two_way import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS
+from skyless.site.survey.legs import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS, STD_OVER_MAD, earliest_cluster
 
 _KEPT_S: Final = 5.0  # legs wait so long for the other direction, which another anchor may publish later
 _LONGEST_BRACKET_S: Final = 0.5  # between two frames of an anchor that bracket one of another; at most half a wrap
@@ -34,7 +33,7 @@ _MIN_BATCHES: Final = 6
 _MIN_OWN_SHARE: Final = 0.2  # share of a mean's variance that is the pair's own
 
 
-# Brackets: times of flight of many pairs at once, as ``bracketed_flight_ticks`` in ``site/survey/two_way.py``
+# Brackets: times of flight of many pairs at once, as ``bracketed_flight_ticks`` in ``site/survey/legs.py``
 
 
 class Legs(Struct, frozen=True, eq=False):

@@ -1,1 +1,0 @@
-"""FiRa's UCI: packets and downlink TDoA measurements."""

@@ -1,1 +1,0 @@
-"""Numeric code that is compiled by Numba: arrays, linear algebra, and how compiled code is kept."""

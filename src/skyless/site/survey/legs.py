@@ -1,0 +1,446 @@
+"""What anchors receive of one another, as anyone who receives their beacons can know it.
+
+A beacon states its TX stamp, and relays when its sender received which frame of which other anchor. A listener that has
+received that frame, too, knows both stamps of the leg. An anchor's own receptions are legs as they are.
+"""
+
+import math
+from bisect import bisect_left, insort
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from msgspec import Struct
+
+from skyless.core.air.frame import Heard, Malformed, Reception
+from skyless.core.air.masterless_packets import Relay
+from skyless.core.any_receiver import SiteBeacon, decode_any
+from skyless.core.arrays import Array, Mask
+from skyless.core.ticks import MAX_DRIFT, TICK_BITS, TICK_M, TICK_RATE_HZ, Unwrapper, difference, to_seconds
+from skyless.site.survey.facts import PairRange, PairRanges
+
+# Time of flight between two nodes that both broadcast and receive each other, by bracketing.
+#
+# Node x sends twice, at ``t1`` and ``t2`` of its clock, and y receives it at ``r1`` and ``r2`` of its own. In between
+# x receives y at ``r`` (clock of x), sent at ``t`` (clock of y). The line through (t1, r1) and (t2, r2) maps a time
+# of x to the time of y one flight later, so ``line(r) - t`` is twice the time of flight. The rate of the two clocks
+# comes from the bracket itself, and a rate that drifts acts only in the second order.
+
+
+class RunningMedian:
+    """Median of the last ``window`` values; fewer than half of them may be arbitrarily wrong."""
+
+    def __init__(self, window: int = 31) -> None:
+        self._window = window
+        self._arrived: deque[float] = deque()
+        self._sorted: list[float] = []
+
+    def __len__(self) -> int:
+        return len(self._sorted)
+
+    def add(self, value: float) -> float:
+        """Add one finite value and return the median, the upper one of an even number of values."""
+        ordered = self._sorted
+        if len(ordered) == self._window:
+            del ordered[bisect_left(ordered, self._arrived.popleft())]
+        self._arrived.append(value)
+        insort(ordered, value)
+        return ordered[len(ordered) >> 1]
+
+    @property
+    def value(self) -> float | None:
+        """The median, None before the first value."""
+        return self._sorted[len(self._sorted) >> 1] if self._sorted else None
+
+
+MAX_BRACKET_RATE: Final = 80e-6
+"""Twice what two crystals of ±20 ppm can differ: a bracket beyond it mixes stamps of different clocks."""
+
+MAX_FLIGHT_TICKS: Final = 1 << 18
+"""1.2 km of flight and antenna delay; more than that is a pairing error."""
+
+
+class Leg(Struct, frozen=True, gc=False):
+    """One broadcast and its reception by the other node."""
+
+    tx_ticks: int
+    """In the clock of the sender."""
+    rx_ticks: int
+    """In the clock of the receiver."""
+
+
+def bracketed_flight_ticks(before: Leg, back: Leg, after: Leg, bits: int) -> float | None:
+    """Time of flight in ticks of the answering node y; ``before`` and ``after`` went x → y, ``back`` y → x.
+
+    None when ``back`` does not lie between the two, or when the stamps cannot belong to one pair of clocks.
+    Counters have ``bits`` bits and the bracket must be shorter than half a wrap.
+    """
+    span_x = difference(after.tx_ticks, before.tx_ticks, bits)
+    until_back_x = difference(back.rx_ticks, before.tx_ticks, bits)
+    if not 0 < until_back_x < span_x:
+        return None
+    gained = difference(after.rx_ticks, before.rx_ticks, bits) - span_x
+    rate = gained / span_x
+    if abs(rate) > MAX_BRACKET_RATE:
+        return None
+    reply = until_back_x - difference(back.tx_ticks, before.rx_ticks, bits)
+    flight = (reply + rate * until_back_x) / 2
+    return flight if abs(flight) < MAX_FLIGHT_TICKS else None
+
+
+class TwoWayRanging:
+    """Times of flight of all pairs of nodes, reception by reception; each pair's answer is a running median."""
+
+    def __init__(self, bits: int, window: int = 1001) -> None:
+        self._bits = bits
+        self._window = window
+        self._last: dict[tuple[int, int], Leg] = {}
+        self._flights: dict[tuple[int, int], RunningMedian] = {}
+
+    def add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int) -> float | None:
+        """Add one reception; return the time of flight in ticks that it completes, if it does."""
+        leg = Leg(tx_ticks, rx_ticks)
+        before = self._last.get((sender, receiver))
+        self._last[sender, receiver] = leg
+        back = self._last.get((receiver, sender))
+        if before is None or back is None:
+            return None
+        flight = bracketed_flight_ticks(before, back, leg, self._bits)
+        if flight is not None:
+            pair = _pair(sender, receiver)
+            self._flights.setdefault(pair, RunningMedian(self._window)).add(flight)
+        return flight
+
+    def forget(self, node: int) -> None:
+        """Drop the open brackets of a node whose clock restarted; its times of flight stay."""
+        self._last = {pair: leg for pair, leg in self._last.items() if node not in pair}
+
+    def flight_ticks(self, x: int, y: int) -> float | None:
+        """Median time of flight of a pair in ticks, None before its first bracket."""
+        median = self._flights.get(_pair(x, y))
+        return None if median is None else median.value
+
+    def flights_ticks(self) -> dict[tuple[int, int], float]:
+        """Median time of flight of every pair, the smaller identifier first."""
+        return {pair: value for pair, median in self._flights.items() if (value := median.value) is not None}
+
+
+def _pair(x: int, y: int) -> tuple[int, int]:
+    return (x, y) if x < y else (y, x)
+
+
+_LONGEST_AGE_TICKS: Final = round(2.0 * TICK_RATE_HZ)
+"""Anchors relay stamps of the last second; what is older belongs to another frame of that sequence number."""
+
+_MAX_FRAMES: Final = 1 << 14
+"""More than fit on the air in ``_LONGEST_AGE_TICKS``."""
+_MAX_LEGS: Final = 1 << 16
+
+
+class AnchorLeg(Struct, frozen=True, gc=False):
+    """One broadcast of an anchor and its reception by another."""
+
+    sender: int
+    receiver: int
+    tx_ticks: int
+    """In the counter of the sender."""
+    rx_ticks: int
+    """In the counter of the receiver."""
+    t_s: float
+    """When the listener received the same broadcast, on its own clock."""
+    carrier_phase_cycles: float | None = None
+    """Phase of the carrier as the receiver heard it, where it was measured and relayed."""
+
+
+class _Received(Struct, frozen=True, gc=False):
+    tx_ticks: int
+    listener_ticks: int
+    """Unwrapped."""
+    t_s: float
+
+
+class RelayMatcher:
+    """Finds the frames that relays name, among those that one listener has received.
+
+    Memory is bounded by the frames of two seconds. ``counters``: ``legs``, and relays without one:
+    ``frame-not-received`` (the listener missed the frame that it names), ``other-frame`` (it names a frame before that
+    of this sequence number, or a counter has restarted).
+    """
+
+    def __init__(self, bits: int = TICK_BITS) -> None:
+        """``bits``: of the anchors' counters."""
+        self.counters: Counter[str] = Counter()
+        self._bits = bits
+        self._frames: dict[tuple[int, int], _Received] = {}
+        """By anchor and sequence number, in the order of reception."""
+        self._last: dict[tuple[int, int], int] = {}
+        """RX stamp of each directed pair's last leg: a stamp is relayed until there is another."""
+
+    def add(
+        self, anchor: int, sequence: int, tx_ticks: int, relays: Iterable[Relay | Heard], now_ticks: int, t_s: float
+    ) -> list[AnchorLeg]:
+        """The legs that a frame's relays complete. ``now_ticks``: the listener's counter, unwrapped, and its clock."""
+        legs = []
+        for relay in relays:
+            leg = self._leg(anchor, tx_ticks, relay, now_ticks)
+            if leg is not None:
+                legs.append(leg)
+        self._frames.pop((anchor, sequence), None)
+        self._frames[anchor, sequence] = _Received(tx_ticks, now_ticks, t_s)
+        self._prune(now_ticks)
+        return legs
+
+    def _leg(self, anchor: int, tx_ticks: int, relay: Relay | Heard, now_ticks: int) -> AnchorLeg | None:
+        """The leg that a relay describes, if the listener has received the same frame."""
+        pair = (relay.anchor, anchor)
+        if relay.anchor == anchor or self._last.get(pair) == relay.rx_ticks:
+            return None
+        frame = self._frames.get((relay.anchor, relay.sequence))
+        if frame is None:
+            self.counters["frame-not-received"] += 1
+            return None
+        # Between the two frames the listener's counter and that of the anchor that relays advance alike: a check that
+        # another frame of the same sequence number, or a counter that has restarted, does not pass.
+        age_ticks = now_ticks - frame.listener_ticks
+        rx_ticks = relay.rx_ticks_near(tx_ticks - age_ticks) if isinstance(relay, Heard) else relay.rx_ticks
+        apart_ticks = abs(difference(tx_ticks, rx_ticks + age_ticks, self._bits))
+        if not 0 < age_ticks <= _LONGEST_AGE_TICKS or apart_ticks > 2 * MAX_FLIGHT_TICKS + MAX_BRACKET_RATE * age_ticks:
+            self.counters["other-frame"] += 1
+            return None
+        self._last.pop(pair, None)
+        self._last[pair] = relay.rx_ticks
+        self.counters["legs"] += 1
+        phase_cycles = relay.phase_cycles if isinstance(relay, Heard) else relay.carrier_phase_cycles
+        return AnchorLeg(relay.anchor, anchor, frame.tx_ticks, rx_ticks, frame.t_s, phase_cycles)
+
+    def _prune(self, now_ticks: int) -> None:
+        """Remove frames that no relay can name any more."""
+        oldest_ticks = now_ticks - _LONGEST_AGE_TICKS
+        while self._frames:
+            key = next(iter(self._frames))
+            if len(self._frames) <= _MAX_FRAMES and oldest_ticks <= self._frames[key].listener_ticks:
+                break
+            del self._frames[key]
+        while len(self._last) > _MAX_LEGS:
+            del self._last[next(iter(self._last))]
+
+
+class LegCollector:
+    """The legs between the anchors of one site, from the beacons (of either protocol) that one listener receives.
+
+    ``counters``: those of ``RelayMatcher``, ``foreign-site``, and the reasons of ``decode_any``.
+    """
+
+    def __init__(self, site_id: int) -> None:
+        self._site_id = site_id
+        self._ticks = Unwrapper()
+        self._matcher = RelayMatcher()
+        self.counters = self._matcher.counters
+
+    def add(self, reception: Reception) -> list[AnchorLeg]:
+        """The legs that a reception completes."""
+        beacon = decode_any(reception.frame)
+        if isinstance(beacon, Malformed):
+            self.counters[beacon] += 1
+            return []
+        if beacon.site != self._site_id:
+            self.counters["foreign-site"] += 1
+            return []
+        now_ticks = self._ticks.unwrap(reception.rx_ticks, reception.host_s)
+        t_s = to_seconds(now_ticks) if reception.host_s is None else reception.host_s
+        return self._matcher.add(beacon.anchor, beacon.sequence, beacon.tx_ticks, beacon.relayed, now_ticks, t_s)
+
+
+# From repeated ranges of pairs to one range of each: the mean of the earliest cluster.
+#
+# A signal can come late and not early, so where a pair's ranges fall into clusters the earliest is the direct way, if
+# it holds enough of them.
+
+STD_OVER_MAD: Final = 1.4826
+"""Standard deviation of normally distributed values over the median of their distances from their median."""
+
+MIN_CLUSTER_SHARE: Final = 0.1
+"""An earlier cluster with a smaller share of all exchanges is an error."""
+
+_SIGMAS: Final = 4.0
+_DENSE_SHARE: Final = 0.3
+_DENSE_WIDTH: Final = 0.771  # standard deviations that hold this share of a normal distribution
+
+
+def earliest_cluster(value: Array, weight: Array, std: float, total: float | None = None) -> Mask:
+    """The members of the earliest cluster that holds a tenth of the weight, shape (n,); the heaviest if none does.
+
+    ``value``, ``weight``: shape (n,), n > 0; ``std``: the least standard deviation within a cluster; ``total``: of the
+    weights, where it is more than their sum.
+    """
+    order = np.argsort(value, kind="stable")
+    ordered, until = value[order], np.cumsum(weight[order])
+    width = 2.0 * _SIGMAS * max(std, _densest(ordered, until) / _DENSE_WIDTH)
+    ends = np.searchsorted(ordered, ordered + width, side="right") - 1
+    held = until[ends] - until + weight[order]
+    enough = np.flatnonzero(held >= MIN_CLUSTER_SHARE * max(until[-1], total or 0.0))
+    begin = int(enough[0]) if len(enough) else int(np.argmax(held))
+    centre = half_sample_mode(ordered[begin : ends[begin] + 1])
+    for _ in range(2):
+        inside = np.abs(value - centre) <= 0.5 * width + 1e-9
+        centre = float(np.average(value[inside], weights=weight[inside]))
+    return np.asarray(inside)
+
+
+def half_sample_mode(ordered: Array) -> float:
+    """The mode of ascending values: the densest half, of that the densest half, and so on."""
+    while len(ordered) > 3:
+        half = (len(ordered) + 1) // 2
+        begin = int(np.argmin(ordered[half - 1 :] - ordered[: len(ordered) - half + 1]))
+        ordered = ordered[begin : begin + half]
+    if len(ordered) == 3:
+        ordered = ordered[:2] if ordered[1] - ordered[0] <= ordered[2] - ordered[1] else ordered[1:]
+    return float(np.mean(ordered))
+
+
+def _densest(ordered: Array, until: Array) -> float:
+    """Length of the shortest interval that holds ``_DENSE_SHARE`` of the weight."""
+    before = np.concatenate([[0.0], until[:-1]])
+    ends = np.searchsorted(until, before + _DENSE_SHARE * until[-1] * (1.0 - 1e-9))
+    whole = ends < len(ordered)
+    return float(np.min(ordered[ends[whole]] - ordered[whole]))
+
+
+_ENOUGH: Final = 5  # ranges of a pair from which it has clusters; of fewer the median is used
+_MIN_COUNT: Final = 3  # ranges in a cluster, and of a pair whose scatter is looked at
+_MEDIAN_OVER_MEAN: Final = 1.25  # standard deviation of a median over that of the mean
+_MIN_NOISE_M: Final = 1e-3
+_UNKNOWN_NOISE_M: Final = 0.05  # of a range where no pair was measured more than once
+
+
+def mean_ranges(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> PairRanges:
+    """One range of each pair, by pair ``(a, b)`` with a < b.
+
+    Ranges that are not finite are left out, and so are pairs without any other.
+    """
+    finite_m = {pair: [value for value in values if math.isfinite(value)] for pair, values in ranges_m.items()}
+    noise_m = _noise(finite_m)
+    pairs = tuple(_mean(a, b, np.sort(values), noise_m) for (a, b), values in sorted(finite_m.items()) if values)
+    return PairRanges(pairs, tuple(sorted({anchor for pair in ranges_m for anchor in pair})))
+
+
+def _noise(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> float:
+    """Noise of one range that all pairs share: root mean square of theirs, without the quarter with the most."""
+    own, weight = [], []
+    for values in ranges_m.values():
+        if len(values) >= _MIN_COUNT:
+            own.append(_robust_std(np.asarray(values)) ** 2)
+            weight.append(len(values) - 1)
+    if not own:
+        return _UNKNOWN_NOISE_M
+    quiet = np.argsort(own)[: math.ceil(0.75 * len(own))]
+    return max(math.sqrt(float(np.average(np.array(own)[quiet], weights=np.array(weight)[quiet]))), _MIN_NOISE_M)
+
+
+def _robust_std(values: Array) -> float:
+    """Robust standard deviation; of few values corrected for their number."""
+    deviation = float(np.median(np.abs(values - np.median(values))))
+    return STD_OVER_MAD * deviation * math.sqrt(len(values) / (len(values) - 1.0))
+
+
+def _mean(a: int, b: int, values_m: Array, noise_m: float) -> PairRange:
+    count = len(values_m)
+    if count < _ENOUGH:
+        std_m = noise_m * (_MEDIAN_OVER_MEAN if count > 2 else 1.0) / math.sqrt(count)
+        return PairRange(a, b, float(np.median(values_m)), std_m, count)
+    total = max(float(count), _MIN_COUNT / MIN_CLUSTER_SHARE)
+    cluster = values_m[earliest_cluster(values_m, np.ones(count), noise_m, total)]
+    std_m = max(float(np.std(cluster, ddof=1)) if len(cluster) > 1 else 0.0, noise_m) / math.sqrt(len(cluster))
+    late_share = float(np.mean(values_m > cluster.max()))
+    return PairRange(a, b, float(cluster.mean()), std_m, len(cluster), late_share)
+
+
+# Time differences of a tag without site time: one anchor relays when it received another, and the tag receives both.
+#
+# With T, S and R for stamps of transmission, of the anchor's and of the tag's reception, ``R_b − R_a − (T_b − S_ba)``
+# is ``|p − b| − |p − a| + D_ab + h_b − h_a``: D_ab is the range that the anchors themselves measure. No position is
+# needed, and D_ab includes every delay of the way between the two anchors.
+
+_LONGEST_TICKS: Final = round(0.3 * TICK_RATE_HZ)
+"""Over a longer time two counters do not run evenly enough."""
+
+_RATE_TICKS: Final = round(0.1 * TICK_RATE_HZ)
+"""Least time over which a rate is measured; its noise is that of two stamps."""
+
+_MAX_RELAYED_FRAMES: Final = 4096
+_MAX_BEFORE: Final = 256
+
+
+class RelayedDifference(Struct, frozen=True, gc=False):
+    """One difference, of the moment when the tag received ``first``."""
+
+    first: int
+    second: int
+    difference_m: float
+    age_s: float
+    """Time since then."""
+
+
+class RelayedDifferences:
+    """One tag's receptions, as they come, to differences of all pairs of anchors that relay each other."""
+
+    def __init__(self, site_id: int) -> None:
+        self._site_id = site_id
+        self._ticks = Unwrapper()
+        self._frames: dict[tuple[int, int], int] = {}
+        """The tag's stamps, unwrapped, by anchor and sequence number, in the order of reception."""
+        self._before: dict[int, deque[tuple[int, int]]] = {}
+        """TX stamps and the tag's stamps of each anchor's last beacons."""
+        self._last: dict[tuple[int, int], int] = {}
+        """RX stamp of each directed pair's last relay: a stamp is relayed until there is another."""
+
+    def add(self, reception: Reception) -> list[RelayedDifference]:
+        """The differences that a reception completes; what is no beacon of the site gives none."""
+        beacon = decode_any(reception.frame)
+        if isinstance(beacon, Malformed) or beacon.site != self._site_id:
+            return []
+        now_ticks = self._ticks.unwrap(reception.rx_ticks, reception.host_s)
+        relative_rate = self._relative_rate(beacon, now_ticks)
+        found: list[RelayedDifference] = []
+        for heard in beacon.relayed:
+            pair = (heard.anchor, beacon.anchor)
+            frame_ticks = self._frames.get((heard.anchor, heard.sequence))
+            if frame_ticks is None or relative_rate is None or self._last.get(pair) == heard.rx_ticks:
+                continue
+            self._last[pair] = heard.rx_ticks
+            age_ticks = now_ticks - frame_ticks
+            held_ticks = difference(beacon.tx_ticks, heard.rx_ticks_near(beacon.tx_ticks - age_ticks))
+            apart_ticks = age_ticks - held_ticks
+            if not 0 < held_ticks <= _LONGEST_TICKS or abs(apart_ticks) > _most_apart(held_ticks):
+                continue
+            difference_m = (apart_ticks - relative_rate * held_ticks) * TICK_M
+            found.append(RelayedDifference(*pair, difference_m, age_ticks / TICK_RATE_HZ))
+        self._frames.pop((beacon.anchor, beacon.sequence), None)
+        self._frames[beacon.anchor, beacon.sequence] = now_ticks
+        if len(self._frames) > _MAX_RELAYED_FRAMES:
+            del self._frames[next(iter(self._frames))]
+        return found
+
+    def _relative_rate(self, beacon: SiteBeacon, now_ticks: int) -> float | None:
+        """By how much faster than the anchor's counter the tag's runs; None while that is not known.
+
+        As the tag sees it, so the tag's motion is in it, and differences are those of one moment.
+        """
+        before = self._before.setdefault(beacon.anchor, deque(maxlen=_MAX_BEFORE))
+        while before and now_ticks - before[0][1] > _LONGEST_TICKS:
+            before.popleft()
+        rate = None
+        if before and now_ticks - before[0][1] >= _RATE_TICKS:
+            sent_ticks = difference(beacon.tx_ticks, before[0][0])
+            if abs(now_ticks - before[0][1] - sent_ticks) > _most_apart(sent_ticks):
+                before.clear()
+            else:
+                rate = (now_ticks - before[0][1] - sent_ticks) / sent_ticks
+        before.append((beacon.tx_ticks, now_ticks))
+        return rate
+
+
+def _most_apart(ticks: int) -> float:
+    """Two counters do not differ by more over such a time, nor ways by more than 3 km."""
+    return 2.0 * MAX_DRIFT * abs(ticks) + 3000.0 / TICK_M

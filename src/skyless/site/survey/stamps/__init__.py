@@ -1,1 +1,0 @@
-"""From stamps of anchors to ranges."""
