@@ -35,7 +35,7 @@ from skyless.research.studies import integrity, loss, motion, nlos, room
 from skyless.research.studies.common.plan import plan_of
 from skyless.research.studies.common.worlds import Heard, beacons_of, worlds
 from skyless.sim.evaluation.scenarios import Request, Room, trajectories_of, wanderers
-from skyless.sim.lab import ideal_lab_site, lab_site
+from skyless.sim.world import ideal_lab_site, lab_site
 
 HERE = Path(__file__).parents[1]
 LAUNCHERS = {

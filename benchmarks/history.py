@@ -27,10 +27,11 @@ from skyless.run.history.layout import (
     NAME_COLUMNS,
     ZONE_COLUMNS,
     file_name,
+    schema_of,
     site_folder,
+    write_table,
 )
 from skyless.run.history.queries import History
-from skyless.run.history.tables import schema_of, write_table
 
 SITE, TAGS, HOUR_S = 1, 500, 3600
 HALL_M = np.array([100.0, 60.0])

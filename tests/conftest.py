@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from skyless.sim.compile_ahead import compile_kernels
+from skyless.sim.evaluation.fleet import compile_kernels
 from support.tiers import TIERS, file_tiers
 
 settings.register_profile("skyless", deadline=None, derandomize=True)  # a first call compiles; a run repeats itself

@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from skyless.cli.main import program
-from skyless.run.mqtt.access import Role
+from skyless.run.mqtt.address import Role
 
 pytestmark = pytest.mark.site
 

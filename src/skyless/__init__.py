@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from skyless.sim.evaluation.fleet import Fleet as Fleet
     from skyless.sim.evaluation.scenarios import Request as Request
     from skyless.sim.evaluation.scenarios import fleet_of as fleet_of
-    from skyless.sim.lab import lab_site as lab_site
+    from skyless.sim.world import lab_site as lab_site
     from skyless.site.file.load import load_site as load_site
 
     __version__: str
@@ -68,7 +68,7 @@ _MODULES: Final = {
     "Trust": "skyless.core.trusted_receiver",
     "TrustedReceiver": "skyless.core.trusted_receiver",
     "fleet_of": "skyless.sim.evaluation.scenarios",
-    "lab_site": "skyless.sim.lab",
+    "lab_site": "skyless.sim.world",
     "load_site": "skyless.site.file.load",
     "locate": "skyless.core.tag.position",
     "open_recording": "skyless.cli.api.replay",

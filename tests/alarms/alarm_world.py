@@ -11,9 +11,9 @@ from collections import Counter, defaultdict
 from itertools import pairwise
 
 from skyless.core.site import AlarmRule
-from skyless.run.alarms.engine import AlarmEngine, is_over
+from skyless.run.alarms import AlarmEngine, is_over
 from skyless.run.mqtt.messages import FixMessage, Zone
-from skyless.run.zones.monitor import ZoneMonitor
+from skyless.run.zones import ZoneMonitor
 
 UNIX_S = 1_795_000_000.0
 TICK_S = 0.05

@@ -11,11 +11,10 @@ from hypothesis import strategies as st
 
 from skyless.core.integrity import Alert
 from skyless.core.site import AlarmRule
-from skyless.run.alarms import engine as engine_module
-from skyless.run.alarms.engine import CONFIRM_S, EVALUATION_S, AlarmEngine, Concerned, is_over
-from skyless.run.alarms.near import STOREY_M, near_tags
+from skyless.run import alarms as engine_module
+from skyless.run.alarms import CONFIRM_S, EVALUATION_S, STOREY_M, AlarmEngine, Concerned, is_over, near_tags
 from skyless.run.mqtt.messages import Asset, Counters, FixMessage, TagHealth, WatchFinding, WatchMessage, Zone
-from skyless.run.zones.monitor import ZoneMonitor
+from skyless.run.zones import ZoneMonitor
 
 HALL = Zone("hall", "Hall", ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0)))
 IN, OUT = (5.0, 5.0), (15.0, 5.0)

@@ -14,7 +14,7 @@ from skyless.core.keys import chain, known_keys
 from skyless.core.keys.chain import SECTION_INTERVALS, earlier_key, mac_of
 from skyless.core.keys.verifier import Fault, Verifier
 from skyless.core.ticks import from_seconds, wrap
-from skyless.sim.lab import lab_site
+from skyless.sim.world import lab_site
 
 SITE_FILE = lab_site()
 OWN = 4

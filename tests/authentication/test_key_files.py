@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
 from skyless.core.keys.chain import SECTION_BITS, Chain, ChainTiming, new_chain
-from skyless.run.keys.key_files import (
+from skyless.run.keys import (
     SEEDS_VARIABLE,
     SITE_PRIVATE,
     SITE_PUBLIC,

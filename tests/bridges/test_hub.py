@@ -22,7 +22,7 @@ from skyless.bridges.target import (
 from skyless.core.errors import SkylessError
 from skyless.core.integrity import Alert
 from skyless.run.mqtt.messages import StatusMessage
-from skyless.sim.lab import lab_site
+from skyless.sim.world import lab_site
 
 
 class Recorded(Target):

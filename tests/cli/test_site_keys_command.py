@@ -11,7 +11,7 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.core.whole_files import replace_files
-from skyless.run.keys.key_files import read_keys, read_private, read_site_public
+from skyless.run.keys import read_keys, read_private, read_site_public
 
 pytestmark = pytest.mark.site
 

@@ -16,16 +16,7 @@ from starlette.exceptions import HTTPException
 from skyless.core.errors import SkylessError
 from skyless.core.site import AlarmRule, GeoreferenceSite
 from skyless.page.api import past
-from skyless.run.history.answers import (
-    AlarmRow,
-    Contact,
-    Dwell,
-    Heatmap,
-    Occupancy,
-    Span,
-    Track,
-    TrackPoint,
-)
+from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track, TrackPoint
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import AlarmMessage, Asset
 
@@ -113,7 +104,7 @@ def fake_history(patch):
     FakeHistory.asked.clear()
     FakeHistory.release.clear()
     patch.setitem(sys.modules, "skyless.run.history.queries", SimpleNamespace(History=FakeHistory))
-    patch.setitem(sys.modules, "skyless.run.history.times", SimpleNamespace(span_of=span_of))
+    patch.setitem(sys.modules, "skyless.run.history.answers", SimpleNamespace(span_of=span_of))
     patch.setattr(past, "TaskProcess", FakeProcess)
 
 

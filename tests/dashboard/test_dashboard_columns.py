@@ -24,7 +24,7 @@ from skyless.page.live import LiveSite
 from skyless.page.live2 import View, anchors_message, conditions_message, tags_message
 from skyless.page.sites import LiveSites
 from skyless.run.fix_batch import RECORD
-from skyless.run.gather.address import NatsAddress
+from skyless.run.gather.streams import NatsAddress
 
 VIEW = View((0.0, 0.0, 10.0, 5.0), (1000, 500))
 

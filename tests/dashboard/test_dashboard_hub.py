@@ -18,11 +18,9 @@ from websockets.asyncio.client import connect as websocket
 
 from skyless.page import hub
 from skyless.page.live import LiveSite
-from skyless.run.gather.address import NatsAddress, connect
 from skyless.run.gather.node import Gather
-from skyless.run.hub.link import SILENT_S, HubLink
-from skyless.run.hub.sites import LISTEN_S, HubSites
-from skyless.run.hub.streams import make_hub_streams
+from skyless.run.gather.streams import NatsAddress, connect
+from skyless.run.hub import LISTEN_S, SILENT_S, HubLink, HubSites, make_hub_streams
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import StatusMessage, ZonesMessage
 from support.processes import SKYLESS, running_program

@@ -14,7 +14,7 @@ from skyless.page.event_list import MAX_KEPT
 from skyless.page.live import LiveSite
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import SiteZones, WrongMessageError, ZoneEvent, ZonesMessage
-from skyless.run.zones.monitor import TAG_TIMEOUT_S
+from skyless.run.zones import TAG_TIMEOUT_S
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)

@@ -18,8 +18,7 @@ from skyless.page.overlay_process import overlay
 from skyless.page.tasks import OverlayTask
 from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.access import Role
-from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.address import MqttAddress, Role
 from skyless.run.mqtt.messages import SurveyFactsMessage, SurveyMessage, WatchFinding, WatchMessage
 from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.site.survey.facts import Facts, Gauge, Survey, SurveyedAnchor, Tape, TapeAdvice

@@ -12,8 +12,7 @@ from msgspec.structs import replace
 
 from skyless.page._events import TAKEOVER_S, EventQueue, publisher_rank
 from skyless.run.mqtt.messages import WrongMessageError, Zone, ZoneEvent, ZonesMessage
-from skyless.run.zones.monitor import CROSSING_S, MIN_MARGIN_M, TAG_TIMEOUT_S, ZoneMonitor
-from skyless.run.zones.zone_list import read_zones, zones_of
+from skyless.run.zones import CROSSING_S, MIN_MARGIN_M, TAG_TIMEOUT_S, ZoneMonitor, read_zones, zones_of
 
 INSIDE, OUTSIDE = (2.0, 2.0, 1.0), (8.0, 2.0, 1.0)
 

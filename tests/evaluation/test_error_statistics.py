@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.sim.evaluation.statistics import ErrorStatistics, EvenSample
+from skyless.sim.evaluation.figures import ErrorStatistics, EvenSample
 
 
 @given(count=st.integers(0, 5000), rows=st.sampled_from([2, 4, 64]))

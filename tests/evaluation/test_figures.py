@@ -11,8 +11,20 @@ from scipy.stats import chi2
 
 from skyless.core.fix import Fix
 from skyless.core.integrity import Alert, IntegrityRequirement
-from skyless.sim.evaluation.figures import CHI2_95, KEPT_FIXES, STEP_M, FixSamples, FixTable, Judged, figures_of
-from skyless.sim.evaluation.truth import TruthTrack, antenna_truth, estimated_offset_s, shifted, truth_at
+from skyless.sim.evaluation.figures import (
+    CHI2_95,
+    KEPT_FIXES,
+    STEP_M,
+    FixSamples,
+    FixTable,
+    Judged,
+    TruthTrack,
+    antenna_truth,
+    estimated_offset_s,
+    figures_of,
+    shifted,
+    truth_at,
+)
 from skyless.site.tables import Truth
 
 numbers = st.floats(-10, 10)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skyless.core.geometry import plane_height_m
-from skyless.sim.evaluation.truth import flies
+from skyless.sim.evaluation.figures import flies
 from skyless.site.tables import Truth
 
 CORNERS = [(0.0, 0.0), (8.0, 0.0), (8.0, 6.0), (0.0, 6.0)]

@@ -18,9 +18,9 @@ from skyless.sim.evaluation.scenarios import (
     room_of,
     trajectories_of,
 )
-from skyless.sim.lab import lab_site, paper_lab_site
-from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.impairments import RangeErrorModel
 from skyless.sim.trajectory import Roaming, Static
+from skyless.sim.world import lab_site, paper_lab_site
 
 pytestmark = pytest.mark.site
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.sim.evaluation.statistics import ErrorStatistics, ErrorSummary, EvenSample
+from skyless.sim.evaluation.figures import ErrorStatistics, ErrorSummary, EvenSample
 
 metres = st.floats(-1e3, 1e3)
 vectors = st.lists(st.tuples(metres, metres, metres), min_size=1, max_size=60)

@@ -10,7 +10,7 @@ from site_stage import HOST, boards, wire_of
 from skyless.cli.main import main, program
 from skyless.run import process
 from skyless.run.mqtt.messages import FixMessage
-from skyless.sim.compile_ahead import compile_kernels
+from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.sim.trajectory import Static
 from skyless.site.file.load import load_site
 

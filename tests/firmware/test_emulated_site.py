@@ -6,7 +6,7 @@ The programs are those of ``skyless anchor`` and ``skyless tag``, behind pseudo-
 import pytest
 from site_stage import KINDS, site_of
 
-from skyless.sim.compile_ahead import compile_kernels
+from skyless.sim.evaluation.fleet import compile_kernels
 
 pytestmark = pytest.mark.statistical
 

@@ -17,14 +17,13 @@ from skyless.core.protocol1.anchor import Anchor
 from skyless.core.ticks import from_seconds, wrap
 from skyless.radio.interface import AntennaDelays, Reception
 from skyless.radio.serial.serial_radio import LinkSession
-from skyless.sim.compile_ahead import compile_kernels
 from skyless.sim.dw1000.chip import Chip
+from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, impairments_of
-from skyless.sim.lab import paper_lab_site
+from skyless.sim.listening import TagSpec
 from skyless.sim.medium import Timeline
-from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World
+from skyless.sim.world import World, paper_lab_site
 
 pytestmark = pytest.mark.site
 

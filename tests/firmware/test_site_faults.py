@@ -6,7 +6,7 @@ import random
 import pytest
 from site_stage import HOST, IMAGE, play, site_of, until
 
-from skyless.sim.compile_ahead import compile_kernels
+from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.sim.trajectory import Static
 
 pytestmark = pytest.mark.site

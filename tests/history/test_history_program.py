@@ -15,10 +15,8 @@ from mqtt.mqtt_brokers import Embedded, stopped
 from skyless.run.history.layout import current_events, current_files, rows_of, site_folder
 from skyless.run.history.program import HistoryNode
 from skyless.run.history.queries import History
-from skyless.run.history.retention import Keep
-from skyless.run.history.writer import Writer
-from skyless.run.mqtt.access import Role, create_access, read_access
-from skyless.run.mqtt.address import MqttAddress, mqtt_address
+from skyless.run.history.writer import Keep, Writer
+from skyless.run.mqtt.address import MqttAddress, Role, create_access, mqtt_address, read_access
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
     AlarmMessage,
@@ -39,7 +37,7 @@ from skyless.run.mqtt.topics import (
     zone_event_topic,
     zones_topic,
 )
-from skyless.sim.lab import lab_site
+from skyless.sim.world import lab_site
 from support.processes import SKYLESS, free_port, running_program
 from support.waiting import until as until_
 

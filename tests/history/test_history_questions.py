@@ -18,7 +18,7 @@ from pyarrow import parquet
 from skyless.core.errors import SkylessError
 from skyless.core.integrity import Alert
 from skyless.core.site import GeoreferenceSite
-from skyless.run.history import _scans, queries
+from skyless.run.history import queries
 from skyless.run.history.answers import GAP_S, AlarmRow, Contact, Dwell, Span
 from skyless.run.history.layout import (
     ASSET_COLUMNS,
@@ -414,7 +414,7 @@ def test_what_cannot_be_answered_is_said(history, ask, error):
     ],
 )
 def test_what_is_too_much_is_refused_with_what_would_do(history, monkeypatch, limits, ask, error):
-    for module in (queries, _scans):
+    for module in (queries, queries):
         monkeypatch.setattr(module, "LIMITS", HistoryLimits(**limits))
     with pytest.raises(SkylessError, match=error):
         ask(history)

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core.errors import SkylessError
-from skyless.run.history.answers import Span
-from skyless.run.history.times import span_of
+from skyless.run.history.answers import Span, span_of
 
 ZONE = ZoneInfo("Europe/Berlin")
 NOW = datetime(2026, 11, 26, 15, 30, 10, tzinfo=ZONE)

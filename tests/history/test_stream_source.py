@@ -8,9 +8,9 @@ import pytest
 from nats.errors import Error
 
 from skyless.run.fix_batch import RECORD, Batch, encode_batch
-from skyless.run.gather.names import TagName
-from skyless.run.history import stream_source
-from skyless.run.history.stream_source import BatchTaker
+from skyless.run.gather.streams import TagName
+from skyless.run.history import program
+from skyless.run.history.program import BatchTaker
 from skyless.run.history.writer import Writer
 
 SITE, BEGIN_S = 7, 1_800_000_000
@@ -46,7 +46,7 @@ def writer(tmp_path):
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(stream_source, "_PERIOD_S", 0.0)
+    monkeypatch.setattr(program, "_PERIOD_S", 0.0)
 
 
 def take(writer, names, *messages):
@@ -79,7 +79,7 @@ def test_a_batch_waits_for_its_names(writer):
 
 @pytest.mark.usefixtures("quick")
 def test_names_that_never_come_hold_a_history_up_once(writer, monkeypatch):
-    monkeypatch.setattr(stream_source, "_NAMES_S", 0.05)
+    monkeypatch.setattr(program, "_NAMES_S", 0.05)
     names = LateNames("a")
     take(writer, names, message(1, 5, 1, 1, 2, issue=2))
     readings = names.readings

@@ -10,17 +10,15 @@ import pytest
 from pyarrow import parquet
 from small_hub import client_of, has_stream, running_hub, site
 
+from skyless.run import hub as hub_program
 from skyless.run.broker import _program
 from skyless.run.fix_batch import RECORD, Batch, encode_batch
-from skyless.run.gather import subjects
-from skyless.run.gather.address import NatsAddress
-from skyless.run.gather.names import TagName
-from skyless.run.history.hub_source import HubHistory
+from skyless.run.gather import streams
+from skyless.run.gather.streams import NatsAddress, TagName
 from skyless.run.history.layout import current_files
-from skyless.run.history.retention import Keep
-from skyless.run.hub import streams
-from skyless.run.hub.link import HubLink
-from skyless.run.hub.sites import HubSites
+from skyless.run.history.program import HubHistory
+from skyless.run.history.writer import Keep
+from skyless.run.hub import HubLink, HubSites
 from skyless.run.mqtt.messages import ZonesMessage
 from support.processes import free_port, started
 
@@ -28,10 +26,10 @@ pytestmark = pytest.mark.site
 
 HONEST, ROGUE = 7, 8
 STREAMS = {
-    subjects.FIX_STREAM: ["skyless.v2.*.fixes.>", "skyless.v3.>"],
-    subjects.NAMES_STREAM: ["skyless.v2.*.names.>"],
-    subjects.STATE_STREAM: [subjects.at(subject, "*") for subject in subjects.STATE],
-    subjects.EVENT_STREAM: [subjects.at(subject, "*") for subject in subjects.EVENTS],
+    streams.FIX_STREAM: ["skyless.v2.*.fixes.>", "skyless.v3.>"],
+    streams.NAMES_STREAM: ["skyless.v2.*.names.>"],
+    streams.STATE_STREAM: [streams.at(subject, "*") for subject in streams.STATE],
+    streams.EVENT_STREAM: [streams.at(subject, "*") for subject in streams.EVENTS],
 }
 SHAPES = (
     "v1.{}.site", "v1.{}.zones", "v1.{}.assets", "v1.{}.alarm_rules", "v1.{}.floor_plan", "v1.{}.floor_plan.1",
@@ -61,8 +59,8 @@ def payload(subject, word):
 @pytest.mark.parametrize("is_filtered", [True, False], ids=["its server filters", "it ignores the filter"])
 def test_no_site_writes_as_another(is_filtered, tmp_path, monkeypatch):
     if not is_filtered:
-        source = streams.StreamSource
-        monkeypatch.setattr(streams, "StreamSource", lambda filter_subject, **rest: source(**rest))
+        source = hub_program.StreamSource
+        monkeypatch.setattr(hub_program, "StreamSource", lambda filter_subject, **rest: source(**rest))
     with running_hub(tmp_path) as (hub, _):
         port = free_port()
         server = {
@@ -83,10 +81,10 @@ def test_no_site_writes_as_another(is_filtered, tmp_path, monkeypatch):
 async def _run(folder, hub, rogue_address, *, is_filtered):
     async with site(folder, hub.leaf("plant", HONEST)) as own:
         rogue, honest, tenant = [await client_of(one) for one in (rogue_address, own.nats, hub.address("plant"))]
-        for old in streams._OF_ALL_SITES:  # as in a hub that an earlier version has made
+        for old in hub._OF_ALL_SITES:  # as in a hub that an earlier version has made
             await tenant.jetstream().add_stream(name=old, subjects=[f"old.{old}"], max_bytes=10**6)
         for pattern, taken in STREAMS.items():
-            await rogue.jetstream().add_stream(name=subjects.at(pattern, ROGUE), subjects=taken)
+            await rogue.jetstream().add_stream(name=streams.at(pattern, ROGUE), subjects=taken)
         for subject in [f"skyless.{one.format(HONEST)}" for one in SHAPES] + list(ODD):
             await rogue.publish(subject, payload(subject, "EVIL"))
         for subject in (f"skyless.{one.format(ROGUE)}" for one in SHAPES):
@@ -104,13 +102,13 @@ async def _run(folder, hub, rogue_address, *, is_filtered):
         stream = tenant.jetstream()
 
         async def held(pattern, number):
-            found = await stream.stream_info(subjects.at(pattern, number), subjects_filter=">")
+            found = await stream.stream_info(streams.at(pattern, number), subjects_filter=">")
             return set(found.state.subjects or ())
 
         async with asyncio.timeout(90):
-            await streams.make_hub_streams(tenant, hub, "plant")
-            assert await streams.sites_at(tenant) == {HONEST, ROGUE}
-            assert not any([await has_stream(tenant, old) for old in streams._OF_ALL_SITES])
+            await hub.make_hub_streams(tenant, hub, "plant")
+            assert await hub.sites_at(tenant) == {HONEST, ROGUE}
+            assert not any([await has_stream(tenant, old) for old in hub._OF_ALL_SITES])
             # A source that was made before the line was up asks again after half a minute at most.
             while history.state().fixes < 8 or not all(known.names().get(one) and seen[one] for one in seen):
                 await asyncio.sleep(0.1)

@@ -14,7 +14,7 @@ from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import from_seconds, wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust, TrustedReceiver
 from skyless.sim.evaluation.scenarios import Request, impairments_of
-from skyless.sim.stations import TagSpec
+from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 from support.keyed_air import START_UNIX_S, anchors_with_keys, made_keys

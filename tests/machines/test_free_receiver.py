@@ -17,7 +17,7 @@ from skyless.core.fix import NoFixReason
 from skyless.core.site import GeoreferenceSite
 from skyless.core.tag.receiver import NOT_DROPS, Receiver
 from skyless.core.ticks import from_seconds, wrap
-from skyless.run.recordings.reception_log import load, save
+from skyless.run.recordings.recorder import load, save
 
 pytestmark = pytest.mark.site
 

@@ -15,8 +15,8 @@ from skyless.core.any_receiver import AnyReceiver, new_anchor
 from skyless.core.ticks import wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.research.masterless.own_estimator import OwnReceiver
-from skyless.sim.carrier import CarrierModel
 from skyless.sim.evaluation.scenarios import Request
+from skyless.sim.impairments import CarrierModel
 from skyless.site.survey.legs import RelayedDifferences
 from support.keyed_air import AttackedAir, made_keys, run_tag
 

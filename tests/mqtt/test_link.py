@@ -17,8 +17,7 @@ from skyless.run import broker as broker_module
 from skyless.run.broker import BrokerLimits
 from skyless.run.mqtt import connection
 from skyless.run.mqtt import link as link_module
-from skyless.run.mqtt.access import USERS, Role
-from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.address import USERS, MqttAddress, Role
 from skyless.run.mqtt.connection import Introduction, Reactions, check_broker, open_connection
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import StatusMessage, Zone, ZonesMessage
@@ -103,7 +102,7 @@ async def test_what_the_broker_has_kept_comes_before_what_replaces_it(make_broke
 
 NODE = """
 import asyncio, sys
-from skyless.run.mqtt.access import USERS, Role
+from skyless.run.mqtt.address import USERS, Role
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 link = Link(MqttAddress("127.0.0.1", int(sys.argv[1])), "t1", site=7, kind="tag", keepalive_s=1)

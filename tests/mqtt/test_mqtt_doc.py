@@ -9,7 +9,7 @@ import msgspec
 import pytest
 
 from skyless.run.mqtt import messages, topics
-from skyless.run.mqtt.access import ACCESS
+from skyless.run.mqtt.address import ACCESS
 
 TEXT = Path(__file__).parents[2].joinpath("docs", "mqtt.md").read_text(encoding="utf-8")
 EXAMPLES = dict(re.findall(r"### `(\S+)`\n(?:(?!###).)*?```json\n(.*?)```", TEXT, re.DOTALL))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.run.mqtt.outbox import Limits, Outbox
+from skyless.run.mqtt.connection import Limits, Outbox
 
 LIMITS = Limits(topics=3, topic_bytes=60, messages=8, bytes=90, window=4, payload=40)
 

@@ -21,7 +21,7 @@ from msgspec.structs import replace
 
 from machines.bench import ROOM, tape
 from skyless.core.tag.receiver import Receiver
-from skyless.sim.carrier import CarrierModel
+from skyless.sim.impairments import CarrierModel
 
 HEARD = np.dtype([("length", "<i4"), ("bytes", "u1", 140), ("rx_ticks", "<i8")], align=True)
 pytestmark = [pytest.mark.site, pytest.mark.skipif(not has("gcc"), reason="there is no gcc")]

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 from node_stage import LAB, PLACE_M
 
 from skyless.core.site import ScheduleSite
-from skyless.run.keys.key_files import (
+from skyless.run.keys import (
     SITE_PUBLIC,
     SitePublic,
     chain_public_bytes,
@@ -16,7 +16,7 @@ from skyless.run.keys.key_files import (
     site_public_bytes,
 )
 from skyless.sim.evaluation.scenarios import Request, impairments_of
-from skyless.sim.stations import TagSpec
+from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 from support.keyed_air import anchors_with_keys, made_keys

@@ -7,7 +7,7 @@ import time
 
 from mqtt_brokers import Mosquitto
 
-from skyless.sim.compile_ahead import compile_kernels
+from skyless.sim.evaluation.fleet import compile_kernels
 from support.processes import SKYLESS, free_port, usual_signals
 
 START_S = 120.0

@@ -18,8 +18,18 @@ from skyless.core.site import UnplacedAnchor, site_digest
 from skyless.core.ticks import TICK_S, difference
 from skyless.radio.interface import Restarted
 from skyless.run.anchor import AnchorNode, Anchors, health_of
-from skyless.run.keys.key_files import SEEDS_VARIABLE, chain_public_file, chain_seed_file, seed_bytes
-from skyless.run.keys.node_keys import CALM_S, LASTING_S, MAX_NAMED, AnchorKeys, AnchorReport, FaultLines
+from skyless.run.keys import (
+    CALM_S,
+    LASTING_S,
+    MAX_NAMED,
+    SEEDS_VARIABLE,
+    AnchorKeys,
+    AnchorReport,
+    FaultLines,
+    chain_public_file,
+    chain_seed_file,
+    seed_bytes,
+)
 from skyless.run.mqtt.messages import Counters, PlacementMessage
 from support.keyed_air import START_UNIX_S
 

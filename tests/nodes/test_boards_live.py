@@ -6,7 +6,7 @@ import time
 import pytest
 from live_nodes import PLACES, LiveSite, are_right
 
-from skyless.sim.compile_ahead import compile_kernels
+from skyless.sim.evaluation.fleet import compile_kernels
 
 pytestmark = pytest.mark.live
 

@@ -12,8 +12,7 @@ from paho.mqtt.enums import CallbackAPIVersion
 from skyless.cli.main import main
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.access import ACCESS, USERS, Role, create_access, read_access
-from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.address import ACCESS, USERS, MqttAddress, Role, create_access, read_access
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
 from support.waiting import until

@@ -8,8 +8,8 @@ import sys
 
 import pytest
 
-from skyless.run import children
-from skyless.run.children import Child, Program, end
+from skyless.run import process
+from skyless.run.process import Child, Program, end
 from support.processes import free_port
 from support.waiting import until
 
@@ -63,7 +63,7 @@ async def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last
         waits.append(seconds)
         await sleep(0)
 
-    monkeypatch.setattr(children.asyncio, "sleep", note)
+    monkeypatch.setattr(process.asyncio, "sleep", note)
     task = asyncio.ensure_future(child.run())
     for _ in range(3000):
         if len(waits) >= 3:
@@ -91,7 +91,7 @@ async def test_what_a_killed_program_wrote_last_is_not_taken_for_why_it_ended(mo
     said = []
     hold = "import subprocess; subprocess.Popen(['sleep', '5'])" if is_held else "pass"
     end = "sys.stderr.flush(); os.kill(os.getpid(), 9)"
-    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", f"import os, sys; {hold}; {code}; {end}"))
+    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", f"import os, sys; {hold}; {code}; {end}"))
     task = asyncio.ensure_future(Child(Program("tag 2", ()), said.append).run())
     await until(lambda: said, 10)
     assert said[0] == f"tag 2 ended (signal 9); {message}; started again"
@@ -99,21 +99,21 @@ async def test_what_a_killed_program_wrote_last_is_not_taken_for_why_it_ended(mo
 
 
 async def test_a_program_that_will_not_end_is_made_to(monkeypatch):
-    monkeypatch.setattr(children, "_STOP_S", 0.2)
+    monkeypatch.setattr(process, "_STOP_S", 0.2)
 
-    process = await asyncio.create_subprocess_exec(
+    child = await asyncio.create_subprocess_exec(
         "sh", "-c", "trap '' TERM; echo ready; while :; do sleep 1; done", stdout=asyncio.subprocess.PIPE
     )
-    await process.stdout.readline()
-    await end(process)
-    assert process.returncode == -signal.SIGKILL
-    await end(process)  # once more does nothing
+    await child.stdout.readline()
+    await end(child)
+    assert child.returncode == -signal.SIGKILL
+    await end(child)  # once more does nothing
 
 
 async def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypatch):
     said = []
     command = "import sys; sys.stderr.write('x' * 1_000_000)"
-    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", command))
+    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", command))
     child = Child(Program("page", ()), said.append)
     task = asyncio.ensure_future(child.run())
     await until(lambda: said or task.done(), 10)
@@ -125,7 +125,7 @@ async def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypat
 async def test_what_a_program_writes_is_logged_as_it_comes_where_that_is_asked_for(monkeypatch):
     said = []
     command = "import sys, time; print('disk full', file=sys.stderr, flush=True); time.sleep(60)"
-    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", command))
+    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", command))
     task = asyncio.ensure_future(Child(Program("history", (), logs_lines=True), said.append).run())
     await until(lambda: said or task.done(), 10)
     assert said == ["history: disk full"]
@@ -138,12 +138,12 @@ async def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_wh
     assert program.start(3) == ("record", str(tmp_path / "a-3.mcap"), "--x")
 
     said = []
-    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
+    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
     child = Child(program, said.append)
     await asyncio.wait_for(child.run(), 10)
     assert child.starts == 1
     assert len(said) == 1
-    monkeypatch.setattr(children, "_COMMAND", (sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"))
+    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"))
     task = asyncio.ensure_future(child.run())
     await until(lambda: child.starts >= 3, 10)
     await stop(task)

@@ -16,10 +16,8 @@ from skyless.core.site import NoiseSite
 from skyless.core.ticks import TICK_RATE_HZ
 from skyless.radio.serial.serial_port import Pty
 from skyless.radio.serial.serial_radio import SerialRadio
-from skyless.run.doctor import host
-from skyless.run.doctor.board import BoardProbe
-from skyless.run.doctor.check import Check
-from skyless.run.doctor.clocks import CounterPairs, assumed_deviation, counters_check
+from skyless.run import doctor
+from skyless.run.doctor import BoardProbe, Check, CounterPairs, assumed_deviation, counters_check
 from support.waiting import until
 
 SECOND = round(TICK_RATE_HZ)
@@ -104,18 +102,18 @@ def test_a_pair_begins_again_after_a_gap_in_which_its_counters_have_turned():
 
 
 def test_ports_that_may_not_be_opened_are_told_with_what_to_type(tmp_path, monkeypatch):
-    assert [check.result for check in host.port_checks(tmp_path)] == ["not checked"]
+    assert [check.result for check in doctor.port_checks(tmp_path)] == ["not checked"]
     for name in ("ttyACM0", "ttyUSB3", "tty1"):
         (tmp_path / name).touch()
     monkeypatch.setattr(os, "access", lambda path, _: path.name == "ttyUSB3")
-    shut, free = host.port_checks(tmp_path)
+    shut, free = doctor.port_checks(tmp_path)
     assert (shut.name, shut.result, free.name, free.result) == ("port ttyACM0", "failed", "port ttyUSB3", "ok")
     assert "sudo usermod -aG " in shut.advice
 
 
 @pytest.mark.parametrize(("state", "result"), [(0, "ok"), (5, "warning"), (-1, "not checked")])
 def test_the_clock_is_as_the_system_says(state, result, monkeypatch):
-    assert host.clock_check().result in ("ok", "warning", "not checked")
+    assert doctor.clock_check().result in ("ok", "warning", "not checked")
 
     class System:
         @staticmethod
@@ -123,8 +121,8 @@ def test_the_clock_is_as_the_system_says(state, result, monkeypatch):
             timex[24:32] = (2500).to_bytes(8, "little")
             return state
 
-    monkeypatch.setattr(host.ctypes, "CDLL", lambda *_, **__: System)
-    check = host.clock_check()
+    monkeypatch.setattr(doctor.ctypes, "CDLL", lambda *_, **__: System)
+    check = doctor.clock_check()
     assert check.result == result
     assert ("2.5 ms" in check.finding) == (result == "ok")
 

@@ -25,7 +25,7 @@ from skyless.run.mqtt.messages import (
     TruthMessage,
     WatchMessage,
 )
-from skyless.sim.compile_ahead import compile_kernels
+from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge
 from support.processes import free_port

@@ -16,9 +16,9 @@ from site_programs import START_S, Program
 
 from skyless.cli.main import main
 from skyless.core.keys.chain import ChainKeys
-from skyless.run.keys.key_files import read_keys
+from skyless.run.keys import read_keys
 from skyless.run.mqtt.link import Link
-from skyless.sim.compile_ahead import compile_kernels
+from skyless.sim.evaluation.fleet import compile_kernels
 from support.processes import free_port
 from support.waiting import until
 

@@ -12,7 +12,7 @@ from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio
 from skyless.radio.interface import Gone, Restarted
 from skyless.research.live.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.run.anchor import AnchorNode
-from skyless.run.radio_monitor import REPEAT_S, UNUSABLE_S, RadioMonitor
+from skyless.run.open_radio import REPEAT_S, UNUSABLE_S, RadioMonitor
 from skyless.run.tag import TagNode, TagSettings
 
 HEARD = undated(receptions(1.0))

@@ -26,7 +26,7 @@ from skyless.run.record import RecorderNode
 from skyless.run.recordings.recorder import McapFile
 from skyless.run.recordings.recording import McapRecording
 from skyless.run.tag import Tags, TagSettings
-from skyless.sim.compile_ahead import compile_kernels
+from skyless.sim.evaluation.fleet import compile_kernels
 from support.processes import SKYLESS, usual_signals
 from support.waiting import until
 

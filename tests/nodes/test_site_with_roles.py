@@ -14,11 +14,10 @@ from mqtt_brokers import Embedded
 from site_programs import START_S, Program, site_file
 
 from skyless.core.errors import SkylessError
-from skyless.run.mqtt.access import Role, create_access, read_access
-from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.address import MqttAddress, Role, create_access, read_access
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
-from skyless.sim.compile_ahead import compile_kernels
+from skyless.sim.evaluation.fleet import compile_kernels
 from support.processes import free_port
 from support.waiting import until
 

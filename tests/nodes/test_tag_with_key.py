@@ -10,7 +10,7 @@ from skyless.core.air.beacon import decode
 from skyless.core.air.frame import Reception
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.radio.interface import Restarted
-from skyless.run.keys.node_keys import UNVERIFIED_S, Remembered, TagMemory
+from skyless.run.keys import UNVERIFIED_S, Remembered, TagMemory
 from skyless.run.mqtt.messages import Counters
 from skyless.run.tag import TagNode, TagSettings
 from support.keyed_air import START_UNIX_S

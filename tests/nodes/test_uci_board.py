@@ -17,10 +17,9 @@ from skyless.research.live.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.run.board import UciProtocol
 from skyless.run.open_radio import open_sniffers
 from skyless.sim.impairments import lab_impairments
-from skyless.sim.lab import paper_lab_site
-from skyless.sim.stations import TagSpec
+from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World
+from skyless.sim.world import World, paper_lab_site
 
 LAB = paper_lab_site()
 

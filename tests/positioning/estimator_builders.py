@@ -19,7 +19,7 @@ from skyless.core.native.records import view
 from skyless.core.observation import Observation
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
-from skyless.sim.lab import paper_lab_site
+from skyless.sim.world import paper_lab_site
 
 SLOT_S = paper_lab_site().schedule.slot_s
 LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in paper_lab_site().anchors])

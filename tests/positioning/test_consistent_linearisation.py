@@ -13,8 +13,8 @@ from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.native.records import view
 from skyless.core.site import AccuracySite
 from skyless.sim.evaluation.scenarios import Room, displacements
-from skyless.sim.lab import paper_lab_site
-from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.impairments import RangeErrorModel
+from skyless.sim.world import paper_lab_site
 
 pytestmark = pytest.mark.statistical
 

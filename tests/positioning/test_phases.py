@@ -7,10 +7,9 @@ from msgspec.structs import replace
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.estimator.estimator import packed_state, unpacked_state
 from skyless.research.studies.common.worlds import Heard, Run, beacons_of
-from skyless.sim.carrier import CarrierModel
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
-from skyless.sim.lab import lab_site
-from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.impairments import CarrierModel, RangeErrorModel
+from skyless.sim.world import lab_site
 
 SITE = lab_site()
 USUAL = CarrierModel()

@@ -13,7 +13,7 @@ from skyless.radio.serial import link
 from skyless.radio.serial.link import BoardSettings, TagConfig
 from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, Computing, SerialRadio, set_up
 from skyless.radio.tag_reports import BoardFix, Reported
-from skyless.run.board_tag import BoardTag
+from skyless.run.board import BoardTag
 from support.board_tag import ANCHORS
 
 BAUD = 1_000_000

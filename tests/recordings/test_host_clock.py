@@ -12,8 +12,7 @@ from skyless.core.ticks import TICK_S
 from skyless.research.replays.site import SiteReplay
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import FixMessage, ReceptionsMessage, TrueMotion, TruthMessage
-from skyless.run.recordings.host_clock import HostClock
-from skyless.run.recordings.recording import McapRecording
+from skyless.run.recordings.recording import HostClock, McapRecording
 
 pytestmark = pytest.mark.site
 

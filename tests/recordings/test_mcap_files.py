@@ -19,7 +19,7 @@ from mcap.writer import CompressionType, Writer
 
 import skyless
 from skyless.core.errors import SkylessError
-from skyless.run.foxglove.messages import ellipse_of, schema_of
+from skyless.run.foxglove import ellipse_of, schema_of
 from skyless.run.mqtt import messages as outputs
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.recordings.recorder import McapFile

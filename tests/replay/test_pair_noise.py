@@ -7,7 +7,7 @@ import pytest
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.research.replays.noise import MAX_PAIRS, MIN_PAIR_DIFFERENCES, ROWS_PER_PAIR, NoiseByPair
-from skyless.sim.evaluation.truth import TruthTrack
+from skyless.sim.evaluation.figures import TruthTrack
 from skyless.site.tables import Truth
 
 ANCHORS_M = {1: (0.0, 0.0, 0.0), 2: (8.0, 0.0, 1.0), 3: (0.0, 6.0, 2.0)}

@@ -9,7 +9,7 @@ from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import from_seconds, to_seconds
 from skyless.sim.cells.world import CellWorld, anchors_of
 from skyless.sim.impairments import Impairments
-from skyless.sim.stations import TagSpec
+from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.site.channel import ChannelModel
 from support.cell_medium import cell_world

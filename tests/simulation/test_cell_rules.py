@@ -17,13 +17,8 @@ from skyless.sim.cells._reception import (
     disturb,
     rules_of,
 )
-from skyless.sim.impairments import (
-    AnchorDisplacement,
-    AnchorOutage,
-    Impairments,
-    Outage,
-)
-from skyless.sim.stations import TagSpec
+from skyless.sim.impairments import AnchorDisplacement, AnchorOutage, Impairments, Outage
+from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.site.channel import ChannelModel
 from support.cell_medium import cell_world

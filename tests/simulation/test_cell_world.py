@@ -14,9 +14,8 @@ from skyless.sim.cells._paths import TagPath
 from skyless.sim.cells._reception import delivery_chance, rules_of
 from skyless.sim.cells._receptions import KNOTS_A_LENGTH, PairErrors, changing_error
 from skyless.sim.cells.world import CellAnchors, CellWorld
-from skyless.sim.impairments import AnchorOutage, Impairments, Outage
+from skyless.sim.impairments import AnchorOutage, Impairments, Outage, RangeErrorModel
 from skyless.sim.oscillator import OscillatorModel
-from skyless.sim.range_errors import RangeErrorModel
 from skyless.sim.trajectory import Roaming, Static, Waypoints
 from skyless.site.channel import ChannelModel
 

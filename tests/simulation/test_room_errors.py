@@ -13,14 +13,22 @@ from scipy.stats import chi2, kstest, uniform
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import WallSite
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S, difference
-from skyless.sim.impairments import AnchorBias, AnchorDisplacement, Body, Impairments, WarmUp, lab_impairments
-from skyless.sim.lab import paper_lab_site
+from skyless.sim.impairments import (
+    AnchorBias,
+    AnchorDisplacement,
+    Body,
+    Impairments,
+    RangeErrorModel,
+    RangeErrors,
+    WarmUp,
+    lab_impairments,
+    slope_error_m,
+)
+from skyless.sim.listening import TagSpec
 from skyless.sim.oscillator import OscillatorModel, clock_rate, drift_phase_s, make_clocks, warm_up
-from skyless.sim.range_errors import RangeErrorModel, RangeErrors, slope_error_m
-from skyless.sim.stations import TagSpec
 from skyless.sim.streams import stream
 from skyless.sim.trajectory import Roaming, Static, Waypoints
-from skyless.sim.world import World
+from skyless.sim.world import World, paper_lab_site
 from skyless.site.channel import ChannelModel
 
 pytestmark = pytest.mark.site

@@ -6,7 +6,7 @@ from metronome import IDEAL, Metronome, site_of
 from scipy.stats import binom
 
 from skyless.core.air.frame import air_time_s
-from skyless.sim.stations import TagSpec
+from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
 

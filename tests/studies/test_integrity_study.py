@@ -22,7 +22,7 @@ from skyless.research.studies.integrity import (
     faulty,
     rows,
 )
-from skyless.sim.lab import paper_lab_site
+from skyless.sim.world import paper_lab_site
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site

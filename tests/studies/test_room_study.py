@@ -17,9 +17,9 @@ from skyless.research.studies.common.worlds import RunResult, box, run_world
 from skyless.research.studies.room import biases_of, bound_cells
 from skyless.research.studies.run import Parts
 from skyless.research.uncertainty.bounds import Biases
-from skyless.sim.evaluation.statistics import LevelCounts, LevelTally
+from skyless.sim.evaluation.figures import LevelCounts, LevelTally
 from skyless.sim.impairments import Body
-from skyless.sim.lab import lab_site
+from skyless.sim.world import lab_site
 from skyless.site.channel import cross_walls, pack_walls
 from skyless.site.report import picture
 

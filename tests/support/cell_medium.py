@@ -34,9 +34,8 @@ from skyless.sim.cells._reception import (
     squared_m2,
 )
 from skyless.sim.impairments import Impairments
-from skyless.sim.listening import RECEPTION_RECORD
+from skyless.sim.listening import RECEPTION_RECORD, TagSpec, coordinate_m
 from skyless.sim.medium import TURNAROUND_S, Delivery, Flight, Medium
-from skyless.sim.stations import TagSpec, coordinate_m
 from skyless.sim.world import World
 from skyless.site.kernels import kernel
 

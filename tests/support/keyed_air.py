@@ -26,7 +26,7 @@ from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import TICK_RATE_HZ, TICK_S, Unwrapper, difference, from_seconds, wrap
 from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.sim.evaluation.scenarios import Request, impairments_of, trajectories_of
-from skyless.sim.stations import TagSpec
+from skyless.sim.listening import TagSpec
 from skyless.sim.world import World
 from support.adversary import Adversary, Forgery
 

@@ -11,12 +11,10 @@ from msgspec.structs import replace
 from skyless.core.any_receiver import new_anchor
 from skyless.core.ticks import CARRIER_CYCLES, TICK_RATE_HZ, wrap
 from skyless.research.foreign import _muloc as muloc
-from skyless.sim.carrier import CarrierModel
-from skyless.sim.impairments import AnchorDisplacement, AnchorOutage, Outage, lab_impairments
-from skyless.sim.lab import lab_site
-from skyless.sim.stations import TagSpec
+from skyless.sim.impairments import AnchorDisplacement, AnchorOutage, CarrierModel, Outage, lab_impairments
+from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World
+from skyless.sim.world import World, lab_site
 from skyless.site.survey.legs import AnchorLeg, LegCollector
 from skyless.site.survey.watch.explain import BLOCK_S, PhaseWatch, circular_mean
 

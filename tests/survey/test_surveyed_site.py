@@ -13,7 +13,7 @@ from skyless.core.anchor import site_issue, site_pages_of
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import EXACT, AccuracySite, ScheduleSite, UnplacedAnchor
 from skyless.core.ticks import TICK_M
-from skyless.sim.lab import paper_lab_site
+from skyless.sim.world import paper_lab_site
 from skyless.site.file.check import check_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template

@@ -13,7 +13,7 @@ from skyless.core.protocol1.anchor import Anchor
 from skyless.core.ticks import TICK_M
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import DelayError
-from skyless.sim.stations import TagSpec
+from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Waypoints
 from skyless.sim.world import World
 from skyless.site.survey.fit.problem import Problem, solve_least_squares

@@ -19,7 +19,7 @@ from skyless.research.calibration.tags import walk_of
 from skyless.run.recordings.recording import McapRecording
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import DelayError
-from skyless.sim.stations import TagSpec
+from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Waypoints
 from skyless.sim.world import World
 from skyless.site.survey.facts import Facts

@@ -12,7 +12,7 @@ from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covar
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path
 from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
-from skyless.sim.lab import paper_lab_site
+from skyless.sim.world import paper_lab_site
 
 STAMP_M = SPEED_OF_LIGHT_MPS * STAMP_S
 TABLE = [

@@ -8,7 +8,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from matplotlib.path import Path
 
-from skyless.run.zones.zone_list import area_m2, depth_m, is_simple, perimeter_m
+from skyless.run.zones import area_m2, depth_m, is_simple, perimeter_m
 
 COORDINATE = st.floats(-50.0, 50.0).map(lambda value: round(value, 3))
 POINT = st.tuples(COORDINATE, COORDINATE)

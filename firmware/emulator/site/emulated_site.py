@@ -36,8 +36,8 @@ from skyless.run.tag import Tags, TagSettings
 from skyless.sim.dw1000.chip import Chip
 from skyless.sim.dw1000.transceiver import Fault
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
+from skyless.sim.listening import TagSpec
 from skyless.sim.medium import Delivery, Medium
-from skyless.sim.stations import TagSpec
 from skyless.sim.trajectory import Trajectory
 from skyless.sim.world import diagnostics_of
 

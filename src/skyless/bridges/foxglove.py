@@ -25,7 +25,7 @@ from websockets.http11 import Response
 from websockets.typing import Subprotocol
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl, cannot_listen, floored
-from skyless.run.foxglove.messages import (
+from skyless.run.foxglove import (
     SCENE_TOPIC,
     ellipse,
     foxglove_schema,

@@ -22,11 +22,11 @@ from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
 from skyless.core.version import installed_version
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
+from skyless.run.mqtt.connection import Limits
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import Asset, FixMessage, StatusMessage, TagPosition, TagZones, Vector, Zone
-from skyless.run.mqtt.outbox import Limits
 from skyless.run.mqtt.topics import status_topic, tag_position_topic, tag_zones_topic
-from skyless.run.zones.monitor import ZoneMonitor
+from skyless.run.zones import ZoneMonitor
 
 OUTSIDE: Final = "outside"
 """The room of a tag that is in no zone."""

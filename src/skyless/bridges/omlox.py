@@ -28,9 +28,8 @@ from skyless.core.ellipse import horizontal_ellipse
 from skyless.run.geojson import coordinates
 from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import FixMessage
-from skyless.run.process import together
-from skyless.run.rate_limit import RateLimit
-from skyless.run.zones.monitor import floor_at
+from skyless.run.process import RateLimit, together
+from skyless.run.zones import floor_at
 
 Object = dict[str, Any]
 

@@ -42,7 +42,7 @@ from skyless.run.mqtt.topics import (
     zones_topic,
 )
 from skyless.run.process import HEALTH_S, Log, every, keep, reader, together
-from skyless.run.zones.zone_list import read_zones, zones_of
+from skyless.run.zones import read_zones, zones_of
 
 if TYPE_CHECKING:  # it compiles kernels, which a bridge of a broker does not need
     from skyless.core.tag.receiver import SiteListener

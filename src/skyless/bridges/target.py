@@ -29,7 +29,7 @@ from skyless.run.mqtt.messages import (
     Vector,
     Zone,
 )
-from skyless.run.rate_limit import RateLimit
+from skyless.run.process import RateLimit
 
 MIN_STD_M: Final = 0.01
 """Least standard deviation of an axis that leaves: the gates of other programs reject fixes with honest millimetres."""

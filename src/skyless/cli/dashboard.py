@@ -159,7 +159,7 @@ def _at_hub(make: "partial[LiveSite]", serves: "partial[Services]", hub: str, ca
 def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":
     """The batches of a gather; None without a gather, of which nothing is loaded then. Raises SkylessError."""
     from skyless.run.broker import nats_of
-    from skyless.run.gather.address import nats_address
+    from skyless.run.gather.streams import nats_address
 
     address = nats_of(broker) if nats is None else nats_address(nats)
     if address is None:

@@ -20,10 +20,9 @@ from skyless.core.extras import extra_module
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
-    from skyless.run.gather.address import NatsAddress
-    from skyless.run.history.hub_source import HubHistory
-    from skyless.run.history.program import HistoryNode, HistoryState
-    from skyless.run.history.retention import Keep
+    from skyless.run.gather.streams import NatsAddress
+    from skyless.run.history.program import HistoryNode, HistoryState, HubHistory
+    from skyless.run.history.writer import Keep
     from skyless.run.mqtt.address import MqttAddress
 
     _History = HistoryNode | HubHistory
@@ -75,8 +74,8 @@ def run(
         Write one JSON object at the end instead of text.
     """
     from skyless.run import process
-    from skyless.run.gather.address import nats_address
-    from skyless.run.history.retention import Keep
+    from skyless.run.gather.streams import nats_address
+    from skyless.run.history.writer import Keep
 
     keep = Keep(keep_days, full_days, event_days)
     found: list[_History] = []
@@ -117,7 +116,7 @@ async def _of_broker(
 
 
 async def _of_hub(folder: Path, hub: "NatsAddress", site_id: int | None, keep: "Keep") -> "_History":
-    from skyless.run.history.hub_source import HubHistory
+    from skyless.run.history.program import HubHistory
 
     return HubHistory(folder, hub, site_id, keep, log)
 
@@ -176,7 +175,7 @@ def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None
     import msgspec
 
     from skyless.cli.common.progress import progress_bar
-    from skyless.run.history.imports import import_recording
+    from skyless.run.history.program import import_recording
     from skyless.run.history.writer import Writer
     from skyless.run.recordings.recording import McapRecording
 

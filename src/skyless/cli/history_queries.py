@@ -46,8 +46,8 @@ class _Asked(Options, frozen=True, kw_only=True):
 
     def opened(self) -> "tuple[History, Span]":
         """The history and the range that are asked for. Raises SkylessError."""
+        from skyless.run.history.answers import span_of
         from skyless.run.history.queries import History, sites_in
-        from skyless.run.history.times import span_of
         from skyless.run.process import data_folder
 
         folder = self.history or data_folder() / "history"

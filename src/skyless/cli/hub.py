@@ -14,8 +14,8 @@ from skyless.cli.nodes.options import log
 from skyless.core.arguments import Options, Text, number, wrong
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
-from skyless.run.gather.leaf import read_json
-from skyless.run.hub.files import PLAN, Hub, Node, read_node, with_sites, write_files
+from skyless.run.gather.node import read_json
+from skyless.run.hub import PLAN, Hub, Node, read_node, with_sites, write_files
 
 app = App(name="hub", help_epilogue="Example: skyless hub init hub --node a.example --node b.example --node c.example")
 
@@ -87,7 +87,7 @@ def apply(folder: Path, /, *, output: JsonOptions) -> None:
         Folder of skyless hub init.
     """
     extra_module("nats", "skyless hub apply")
-    from skyless.run.hub.streams import make_streams_of
+    from skyless.run.hub import make_streams_of
 
     hub = read_json(folder / PLAN, Hub, "skyless hub init")
     found = {tenant: asyncio.run(make_streams_of(hub, tenant, log)) for tenant in hub.sites}

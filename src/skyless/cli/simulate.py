@@ -51,7 +51,7 @@ def simulate(*, asked: SimulateOptions, output: _Output) -> int:
     check_output("fixes-csv", output.fixes_csv, asked.site if isinstance(asked.site, Path) else None)
     from skyless.cli.api.fixes import FixRecorder
     from skyless.cli.api.simulate import Simulation, SimulationResult
-    from skyless.sim.compile_ahead import compile_kernels
+    from skyless.sim.evaluation.fleet import compile_kernels
 
     with progress_bar("simulating") as reach:
         simulation = Simulation(replace(asked, progress=reach))

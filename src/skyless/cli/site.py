@@ -22,7 +22,7 @@ from skyless.core.geometry import RADIO_REACH_M, anchors_in_reach
 from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import FloorSite, ScheduleSite, Site
 from skyless.core.ticks import TICK_S
-from skyless.sim.lab import lab_site
+from skyless.sim.world import lab_site
 from skyless.site.file.check import ANY_ADDRESS, check_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import grid_site, rectangle, rectangular_site, site_template, unplaced_site

@@ -19,7 +19,7 @@ from skyless.core.errors import SkylessError, writing
 from skyless.core.keys.chain import Chain, ChainRing, new_chain
 from skyless.core.site import Site
 from skyless.core.whole_files import replace_files
-from skyless.run.keys.key_files import (
+from skyless.run.keys import (
     MAX_SERIAL,
     SITE_PRIVATE,
     SITE_PUBLIC,

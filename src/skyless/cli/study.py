@@ -85,7 +85,7 @@ def study(asked: StudyOptions, output: _Output) -> None:
     check_picture(output.plot)
     from skyless.cli.api.study import run_study
     from skyless.research.studies.run import WITHOUT_POSITIONS, way_on
-    from skyless.sim.compile_ahead import compile_kernels
+    from skyless.sim.evaluation.fleet import compile_kernels
 
     if asked.scheduler is None and asked.name not in WITHOUT_POSITIONS:
         with status("compiling the simulation"):

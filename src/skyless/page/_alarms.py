@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from skyless.core.site import AlarmRule
 from skyless.page._kept import Kept, SiteLink
 from skyless.page._state import encode
-from skyless.run.alarms.engine import MAX_KEPT, AlarmEngine, Key, is_over
+from skyless.run.alarms import MAX_KEPT, AlarmEngine, Key, is_over
 from skyless.run.mqtt.messages import (
     AcknowledgeMessage,
     AlarmMessage,
@@ -23,7 +23,7 @@ from skyless.run.mqtt.messages import (
     read_message,
 )
 from skyless.run.mqtt.topics import acknowledge_topic, alarm_rules_topic, alarm_topic
-from skyless.run.zones.monitor import ZoneMonitor
+from skyless.run.zones import ZoneMonitor
 from skyless.site.alarm_rules import check_rules
 
 MAX_SENT: Final = 500

@@ -9,7 +9,7 @@ from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import WrongMessageError
 
 if TYPE_CHECKING:
-    from skyless.run.hub.link import HubLink
+    from skyless.run.hub import HubLink
 
 SiteLink: TypeAlias = "Link | HubLink"
 """A site's connection: to its broker, or to a hub, where nothing can be stored."""

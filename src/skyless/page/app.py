@@ -41,14 +41,14 @@ from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, WhatIfTask
 from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt.messages import WrongMessageError
 from skyless.run.mqtt.survey_facts import BadFactsError
-from skyless.run.zones.zone_list import read_zones
+from skyless.run.zones import read_zones
 from skyless.site.alarm_rules import BadAlarmRulesError
 from skyless.site.file.check import image_size
 
 if TYPE_CHECKING:
     from skyless.page.gathered import Gathered
     from skyless.page.hub import ShownSites
-    from skyless.run.hub.sites import HubSites
+    from skyless.run.hub import HubSites
 
 _PAGE: Final = Path(__file__).parent / "browser"
 _MAX_STATES_S: Final = 60.01

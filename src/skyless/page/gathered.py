@@ -20,9 +20,8 @@ from skyless.page.live2 import View, anchors_message, conditions_message, names_
 from skyless.page.sites import Sites
 from skyless.page.sockets import TRY_LATER, send, serve_socket
 from skyless.run.fix_batch import FIELDS, BadBatchError, decode_batch, fix_of
-from skyless.run.gather import subjects
-from skyless.run.gather.address import NatsAddress, connect, rarely
-from skyless.run.gather.names import name_of
+from skyless.run.gather import streams
+from skyless.run.gather.streams import NatsAddress, connect, name_of, rarely
 from skyless.run.limits import PAGE as LIMITS
 
 PERIOD_S: Final = 0.1
@@ -53,7 +52,7 @@ class Gathered:
 
     async def run(self, sites: Sites) -> None:
         """Read until cancelled, and hand fixes over to the sites that are shown."""
-        client = await connect(self._address, "skyless dashboard", self._say, self.drops, subjects.PAGE_INBOX)
+        client = await connect(self._address, "skyless dashboard", self._say, self.drops, streams.PAGE_INBOX)
         try:
             async with asyncio.TaskGroup() as tasks:
                 served: dict[LiveSite, asyncio.Task[None]] = {}
@@ -72,7 +71,7 @@ class Gathered:
     async def _read(self, client: Client, site: int, live: LiveSite) -> None:
         """Read the batches of a site until cancelled."""
         self._sites[site] = Columns()
-        reading = await client.subscribe(subjects.at(subjects.FIXES, site), cb=self._on_batch)
+        reading = await client.subscribe(streams.at(streams.FIXES, site), cb=self._on_batch)
         try:
             await self._hand_over(client, site, live)
         finally:
@@ -110,7 +109,7 @@ class Gathered:
             await asyncio.sleep(max(_HAND_OVER_S if len(records) < MAX_DUE else 0.0, time.monotonic() - now_s))
 
     async def _on_batch(self, message: Msg) -> None:
-        site = subjects.site_in(message.subject)
+        site = streams.site_in(message.subject)
         try:
             if site in self._sites:
                 self._sites[site].update(decode_batch(message.data).records, time.monotonic())

@@ -10,9 +10,8 @@ from starlette.exceptions import HTTPException
 
 from skyless.page.live import LiveSite
 from skyless.page.sites import connected, number_of
-from skyless.run.gather.address import NatsAddress
-from skyless.run.hub.link import HubLink
-from skyless.run.hub.sites import HubSites
+from skyless.run.gather.streams import NatsAddress
+from skyless.run.hub import HubLink, HubSites
 
 LET_GO_S: Final = 60.0
 """Healths of all tags cross a site's line while it is connected, so not for longer after the last look."""

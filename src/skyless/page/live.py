@@ -30,7 +30,7 @@ from skyless.page.event_list import EventList
 from skyless.page.site_assets import AssetsFile, SiteAssets
 from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.access import Role
+from skyless.run.mqtt.address import Role
 from skyless.run.mqtt.messages import (
     AcknowledgeMessage,
     AnchorHealth,
@@ -48,8 +48,7 @@ from skyless.run.mqtt.messages import (
     ZonesMessage,
     read_message,
 )
-from skyless.run.zones.monitor import ZoneMonitor
-from skyless.run.zones.zone_list import check_zones, read_zones, zones_of
+from skyless.run.zones import ZoneMonitor, check_zones, read_zones, zones_of
 from skyless.site.file.check import check_site
 
 _STATE_PERIOD_S: Final = 0.05

@@ -30,7 +30,7 @@ from skyless.run.mqtt.messages import (
     Zone,
 )
 from skyless.run.recordings.recording import McapRecording, Recorded
-from skyless.run.zones.zone_list import zones_of
+from skyless.run.zones import zones_of
 
 _SUFFIX: Final = ".mcap"
 _MAX_OPEN: Final = 8

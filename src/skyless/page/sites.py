@@ -13,12 +13,12 @@ from starlette.exceptions import HTTPException
 
 from skyless.page._kept import SiteLink
 from skyless.page.live import LiveSite
-from skyless.run.alarms.engine import MAX_KEPT
+from skyless.run.alarms import MAX_KEPT
 from skyless.run.find_site import SiteOnBroker, watch_sites
 from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.connection import Limits
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.outbox import Limits
 from skyless.run.process import every, together
 
 

@@ -23,7 +23,7 @@ from skyless.core.tag.receiver import Receiver
 from skyless.page.task_process import serve_tasks
 from skyless.page.tasks import WhatIfTask
 from skyless.run.mqtt.messages import RawReception, SegmentStart
-from skyless.run.recordings.reception_log import RefusedError, load
+from skyless.run.recordings.recorder import RefusedError, load
 from skyless.run.recordings.recording import McapRecording
 
 _PAGE_BYTES: Final = 1024

@@ -20,7 +20,7 @@ from skyless.core.site import Site, is_same_but_placed, largest_change_m, site_d
 from skyless.core.ticks import TICK_RATE_HZ, difference
 from skyless.radio.interface import Gone, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radio.tag_reports import Reported
-from skyless.run.keys.node_keys import KEYS_S, AnchorKeys, AnchorReport, recent_faults
+from skyless.run.keys import KEYS_S, AnchorKeys, AnchorReport, recent_faults
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -34,8 +34,8 @@ from skyless.run.mqtt.messages import (
     StampsMessage,
 )
 from skyless.run.mqtt.topics import health_topic, placement_topic, request_topic, site_topic, stamps_topic
+from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import HEALTH_S, Log, SitePublisher, every, keep, link_of, reader, together
-from skyless.run.radio_monitor import RadioMonitor
 from skyless.site.file.check import check_site
 
 MAX_MOVE_M: Final = 0.5

@@ -28,15 +28,12 @@ from msgspec.structs import replace
 from skyless.core.errors import SkylessError, writing
 from skyless.core.extras import how_to_install
 from skyless.core.whole_files import replace_files
-from skyless.run.children import end
-from skyless.run.gather.address import FIRST_PORT as FIRST_NATS_PORT
-from skyless.run.gather.address import MAX_PAYLOAD, NatsAddress
-from skyless.run.gather.leaf import PING_INTERVAL, Leaf
-from skyless.run.gather.subjects import DOMAIN, NAME_REQUESTS, PAGE_INBOX, at
-from skyless.run.mqtt.access import ACCESS, Role
-from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
+from skyless.run.gather.node import PING_INTERVAL, Leaf
+from skyless.run.gather.streams import DOMAIN, MAX_PAYLOAD, NAME_REQUESTS, PAGE_INBOX, NatsAddress, at
+from skyless.run.gather.streams import FIRST_PORT as FIRST_NATS_PORT
+from skyless.run.mqtt.address import ACCESS, PASSWORD_VARIABLE, MqttAddress, Role, mqtt_address
 from skyless.run.mqtt.connection import check_broker
-from skyless.run.process import data_folder, end_with_parent, is_free, locked, reserve, reserve_next
+from skyless.run.process import data_folder, end, end_with_parent, is_free, locked, reserve, reserve_next
 
 FIRST_PORT: Final = 1883
 _PORTS_TO_TRY: Final = 100

@@ -14,8 +14,7 @@ from skyless.core.any_receiver import decode_any
 from skyless.core.fix import Fix
 from skyless.core.protocol1.beacon import Beacon as Protocol1Beacon
 from skyless.run.mqtt.messages import Counters, FixMessage, Phase, TagHealth, fix_message
-from skyless.run.process import HEALTH_S
-from skyless.run.rate_limit import RateLimit
+from skyless.run.process import HEALTH_S, RateLimit
 
 FixListener = Callable[[FixMessage], None]
 

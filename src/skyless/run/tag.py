@@ -18,16 +18,16 @@ from skyless.core.tag.receiver import NOT_DROPS, Receiver, SiteListener, TagRece
 from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.radio.tag_reports import BoardFix, Reported
-from skyless.run.board_receiver import BoardReceiver
+from skyless.run.board import BoardReceiver
 from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog, PhaseLog
-from skyless.run.keys.node_keys import Remembered, TagMemory, TagReport, trust_reason
+from skyless.run.keys import Remembered, TagMemory, TagReport, trust_reason
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import NODE_KEEPALIVE_S, Link
 from skyless.run.mqtt.messages import Counters, FixMessage, RequestMessage, TagHealth
 from skyless.run.mqtt.topics import fix_topic, health_topic, receptions_topic, request_topic
+from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import HEALTH_S, Log, Usage, data_folder, every, keep, reader, together
-from skyless.run.radio_monitor import RadioMonitor
-from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings
+from skyless.run.recordings.recorder import ReceptionLog, receiver_settings
 
 RECEPTIONS_S: Final = 0.05
 """Interval of the messages with raw receptions."""

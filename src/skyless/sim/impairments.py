@@ -1,13 +1,210 @@
 """Everything that is not ideal in a world, as one value."""
 
 import math
+from typing import Any, Final
 
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
-from skyless.sim.carrier import CarrierModel
+from skyless.core.arrays import Array, Integers, Records
+from skyless.core.ticks import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.sim.oscillator import OscillatorModel
-from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.streams import ANCHOR_KEY, TAG_KEY, stream
 from skyless.site.channel import ChannelModel
+from skyless.site.kernels import kernel
+
+# Errors of the ranges from anchors to tags that are no noise: each pair has its own, constant or changing slowly.
+#
+# Real pairs of radios have them from antennas, multipath, calibration and power. Those that change are Gauss–Markov
+# processes (exponential correlation) along time or along the path of a tag, drawn at knots and interpolated.
+
+_KNOTS: Final = 20
+"""In a correlation length. Between two of them a straight line keeps 98.7 % of the standard deviation or more."""
+
+_SLOPE_MIDDLE_M: Final = 4.0
+"""The slope's error is 0 at this distance, and reaches its size at 0 and at twice this distance."""
+
+_PURPOSE: Final = 2
+"""Purpose of a tag's stream of random numbers, other than its noise and its crystal."""
+
+
+class RangeErrorModel(Struct, frozen=True, forbid_unknown_fields=True):
+    """Range errors at tags, in metres; positive: the tag receives the anchor late.
+
+    Raises:
+        ValueError: errors that change have no correlation length, or two.
+    """
+
+    constant_m: float = 0.0
+    """Each pair's constant is uniform within plus or minus this."""
+    slope_m: float = 0.0
+    """Same for all pairs: slope_m·clip((d − 4 m)/4 m, −1, 1) at the true distance d."""
+    changing_m: float = 0.0
+    """Standard deviation of each pair's error that changes."""
+    correlation_s: float | None = None
+    """Time in which its correlation falls to 1/e."""
+    correlation_m: float | None = None
+    """Instead of that, the path length in which it falls to 1/e."""
+
+    def __post_init__(self) -> None:
+        lengths = [one for one in (self.correlation_s, self.correlation_m) if one is not None]
+        if len(lengths) > 1 or (self.changing_m > 0.0 and not lengths):
+            raise ValueError("range errors that change should have either correlation_s or correlation_m")
+        if any(not one > 0.0 for one in lengths):
+            raise ValueError(f"the correlation of range errors is {lengths[0]:g}; it should be more than 0")
+
+
+@kernel
+def slope_error_m(slope_m: float, distance_m: float) -> float:
+    """Range error that grows with the true distance (``RangeErrorModel.slope_m``)."""
+    return slope_m * min(max((distance_m - _SLOPE_MIDDLE_M) / _SLOPE_MIDDLE_M, -1.0), 1.0)
+
+
+class RangeErrors:
+    """The present errors of all pairs. Those of a tag depend on the seed, its number and its path alone."""
+
+    def __init__(self, model: RangeErrorModel, tags: int, anchors: int, seed: int, purpose: int = _PURPOSE) -> None:
+        """``purpose``: that of the tags' streams of random numbers."""
+        self.present_m: Array = np.zeros((anchors + tags, anchors))
+        """Shape (nodes, anchors) as the kernels count them, without the slope part; those of anchors stay as set."""
+        self._model, self._anchors = model, anchors
+        self._constant_m = np.zeros((tags, anchors))
+        self._step = (model.correlation_s or model.correlation_m or math.inf) / _KNOTS
+        self._travelled = np.zeros(tags)
+        """Time or path length of each tag so far."""
+        self._knots = np.zeros(tags, dtype=np.int64)
+        self._positions_m: Array | None = None
+        self._before_m, self._after_m = np.zeros((tags, anchors)), np.zeros((tags, anchors))
+        self._draws: list[np.random.Generator] = []
+        if model.constant_m > 0.0 or model.changing_m > 0.0:
+            self._draws = [stream(seed, TAG_KEY, tag, purpose) for tag in range(tags)]
+        for tag, draw in enumerate(self._draws):
+            self._constant_m[tag] = draw.uniform(-model.constant_m, model.constant_m, anchors)
+            self._before_m[tag] = model.changing_m * draw.standard_normal(anchors)
+            self._after_m[tag] = self._next(tag)
+        self.present_m[anchors:] = self._constant_m
+
+    def _next(self, tag: int) -> Array:
+        """The errors at the knot after the present one; the correlation over one step is exp(−1/_KNOTS)."""
+        kept = math.exp(-1.0 / _KNOTS)
+        gained_m = self._model.changing_m * math.sqrt(1.0 - kept**2)
+        return np.asarray(kept * self._before_m[tag] + gained_m * self._draws[tag].standard_normal(self._anchors))
+
+    def advance_to(self, t_s: float, stations: Records) -> None:
+        """Bring the errors to a true time ; ``stations`` hold the tags' motion."""
+        if self._model.changing_m == 0.0:
+            return
+        if self._model.correlation_s is not None:
+            self._travelled[:] = t_s
+        else:
+            self._walk(_positions_m(stations[self._anchors :], t_s))
+        for tag in np.flatnonzero(self._travelled >= (self._knots + 1) * self._step).tolist():
+            while self._travelled[tag] >= (self._knots[tag] + 1) * self._step:
+                self._knots[tag] += 1
+                self._before_m[tag] = self._after_m[tag]
+                self._after_m[tag] = self._next(tag)
+        part = (self._travelled / self._step - self._knots)[:, None]
+        changing_m = self._before_m + part * (self._after_m - self._before_m)
+        self.present_m[self._anchors :] = self._constant_m + changing_m
+
+    def _walk(self, positions_m: Array) -> None:
+        """Add up the path from frame to frame along straight lines."""
+        if self._positions_m is not None:
+            self._travelled += np.linalg.norm(positions_m - self._positions_m, axis=1)
+        self._positions_m = positions_m
+
+
+def _positions_m(tags: NDArray[Any], t_s: float) -> Array:
+    """Positions of tags at a true time, shape (tags, 3)."""
+    dt_s = (t_s - tags["origin_s"])[:, None]
+    turned = tags["velocity_mps"] + 0.5 * dt_s * tags["acceleration_mps2"]
+    return np.asarray(tags["position_m"] + dt_s * turned, np.float64)
+
+
+# The carrier's phase at each reception, as a DW1000 measures it besides its stamp.
+#
+#     phase = f·(X − R) + constants of both chips + reflections + noise      [cycles]
+#
+# X is the sender's counter when its frame leaves and R the receiver's when it arrives, both without the stamps'
+# noise: one crystal drives a chip's counter and its carrier. Reflections change with the path of a tag, over
+# centimetres. Constants are drawn when a radio is switched on. All draws are from streams of their own: stamps are
+# the same with and without carrier.
+
+PERIOD_TICKS: Final = 128
+"""Ticks that hold whole cycles of each channel's carrier."""
+
+_CYCLES_PER_TICK: Final = CHANNEL_5_HZ / TICK_RATE_HZ
+_WAVELENGTH_M: Final = SPEED_OF_LIGHT_MPS / CHANNEL_5_HZ
+_STEPS: Final = 2.0**16
+
+# Purposes of streams of random numbers.
+_REFLECTIONS: Final = 7
+_NOISE: Final = 8
+_CONSTANTS: Final = 9
+
+
+class CarrierModel(Struct, frozen=True, forbid_unknown_fields=True):
+    """What phases err by; sizes as far as four recorded DW1000s show them (``docs/phases.md``)."""
+
+    noise_rad: float = 0.05
+    """Gaussian noise of each phase, standard deviation."""
+    reflections: RangeErrorModel = RangeErrorModel(changing_m=0.003, correlation_m=0.05)
+    """What reflections change in the carrier's path to a tag."""
+    obstructed: float = 8.0 / 3.0
+    """How many times as much they do where a wall or something else is in the way."""
+    slips: float = 0.0
+    """Chance that a tag's phase is half a cycle off from this reception on."""
+    wild: float = 0.0
+    """Chance that a tag's phase is random."""
+
+
+class Carriers:
+    """The carriers of a site's radios; phases are in cycles, multiples of 2⁻¹⁶ in [0, 1) as drivers give them."""
+
+    def __init__(self, model: CarrierModel, anchors: list[int], tags: int, seed: int) -> None:
+        """``anchors``: their identifiers, in the order of the nodes."""
+        self._model, self._anchors = model, len(anchors)
+        self._reflections = RangeErrors(model.reflections, tags, len(anchors), seed, _REFLECTIONS)
+        keys = [(ANCHOR_KEY, anchor) for anchor in anchors] + [(TAG_KEY, tag) for tag in range(tags)]
+        self._noise = [stream(seed, *key, _NOISE) for key in keys]
+        self._powering = [stream(seed, *key, _CONSTANTS) for key in keys]
+        self._constants = np.array([draw.random(2) for draw in self._powering])
+        """Of each node as sender and as receiver, shape (nodes, 2)."""
+        self._slipped = np.zeros((len(keys), len(anchors)))
+
+    def restart(self, node: int) -> None:
+        """A node was switched on again."""
+        self._constants[node] = self._powering[node].random(2)
+
+    def advance_to(self, t_s: float, stations: Records) -> None:
+        """Bring reflections to a true time; ``stations`` hold the tags' motion."""
+        self._reflections.advance_to(t_s, stations)
+
+    def phases_cycles(self, sender: int, tx_ticks: int, late_ticks: float, heard: Records) -> Array:
+        """Phases of a frame at the nodes that received it (``RECEPTION_RECORD``), shape (n,).
+
+        ``tx_ticks``: the sender's counter when it left, ``late_ticks`` by how much later than that it really did.
+        """
+        model, nodes = self._model, heard["node"]
+        factors = np.where(heard["extra_m"] > 0.0, model.obstructed, 1.0)
+        reflected_m = factors * self._reflections.present_m[nodes, sender]
+        flown_ticks = (heard["reading_ticks"] - late_ticks) - tx_ticks % PERIOD_TICKS
+        cycles = -_CYCLES_PER_TICK * flown_ticks - reflected_m / _WAVELENGTH_M
+        cycles += self._constants[sender, 0] + self._constants[nodes, 1] + self._errors(sender, nodes)
+        return np.asarray(np.round(cycles * _STEPS) % _STEPS / _STEPS, np.float64)
+
+    def _errors(self, sender: int, nodes: Integers) -> Array:
+        """Noise, and slips of tags, in cycles."""
+        model, errors = self._model, np.empty(len(nodes))
+        for place, node in enumerate(nodes.tolist()):
+            draw = self._noise[node]
+            errors[place] = model.noise_rad / (2.0 * math.pi) * draw.standard_normal()
+            if node >= self._anchors and model.slips + model.wild > 0.0:
+                chances = draw.random(3)
+                self._slipped[node, sender] += 0.5 * (chances[0] < model.slips)
+                errors[place] += self._slipped[node, sender] + chances[2] * (chances[1] < model.wild)
+        return errors
 
 
 class AnchorBias(Struct, frozen=True, forbid_unknown_fields=True):
@@ -124,7 +321,7 @@ class Impairments(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def lab_impairments(noise_ps: float) -> Impairments:
-    """Return the world of the scenario ``lab`` (``docs/maths.md`` section 5), for the site of ``skyless.sim.lab``.
+    """Return the world of the scenario ``lab`` (``docs/maths.md`` section 5), for the site of ``skyless.sim.world``.
 
     Crystals of ±10 ppm with white FM 2·10⁻¹¹ and random-walk FM 10⁻⁹/√s, Gaussian noise of ``noise_ps`` on every TX
     and every RX stamp, stamps rounded to ticks, no loss and no obstacle.

@@ -20,12 +20,18 @@ from skyless.core.air.frame import Transmission, after_rmarker_s, preamble_s
 from skyless.core.arrays import Array, Records
 from skyless.core.site import Site
 from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S, difference, from_seconds, wrap
-from skyless.sim.carrier import Carriers
-from skyless.sim.impairments import Impairments
-from skyless.sim.listening import OUTCOMES, RECEPTION_RECORD, receive_frame
+from skyless.sim.impairments import Carriers, Impairments, RangeErrors
+from skyless.sim.listening import (
+    OUTCOMES,
+    RECEPTION_RECORD,
+    TagSpec,
+    displace,
+    make_stations,
+    receive_frame,
+    set_delays,
+    set_piece,
+)
 from skyless.sim.oscillator import advance, emit, foresee, make_clocks, restart_counter, warm_up
-from skyless.sim.range_errors import RangeErrors
-from skyless.sim.stations import TagSpec, displace, make_stations, set_delays, set_piece
 from skyless.sim.streams import ANCHOR_KEY, TAG_KEY, Streams, stream
 from skyless.site.channel import pack_channel, pack_walls
 

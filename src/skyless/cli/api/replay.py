@@ -26,8 +26,7 @@ from skyless.research.replays.captures import CaptureReplay, ReplayReport, dista
 from skyless.research.replays.options import ReplayOptions
 from skyless.research.replays.site import SiteReplay, TagReport, summary_of
 from skyless.run.recordings.recording import McapRecording, is_mcap
-from skyless.sim.evaluation.figures import FixSamples, Judged, axes_std_m
-from skyless.sim.evaluation.truth import truth_at
+from skyless.sim.evaluation.figures import FixSamples, Judged, axes_std_m, truth_at
 from skyless.site.file.load import site_of
 
 if TYPE_CHECKING:

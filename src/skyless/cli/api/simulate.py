@@ -16,6 +16,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.method_names import FILTERS
 from skyless.core.site import Site
 from skyless.research.masterless.own_estimator import OwnReceiver
+from skyless.sim.evaluation.figures import dimensions
 from skyless.sim.evaluation.fleet import FleetReport, JudgedFix, TagFleet, report
 from skyless.sim.evaluation.request import Conditions
 from skyless.sim.evaluation.scenarios import (
@@ -27,8 +28,7 @@ from skyless.sim.evaluation.scenarios import (
     room_of,
     run_fleet,
 )
-from skyless.sim.evaluation.statistics import dimensions
-from skyless.sim.lab import ideal_lab_site, lab_site, paper_lab_site
+from skyless.sim.world import ideal_lab_site, lab_site, paper_lab_site
 from skyless.site.file.load import site_of
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from skyless.run.fix_log import Latencies
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, TagHealth, TruthBuffer, TruthMessage
 from skyless.run.mqtt.topics import truth_topic
 from skyless.run.process import reader
-from skyless.sim.evaluation.statistics import ErrorStatistics
+from skyless.sim.evaluation.figures import ErrorStatistics
 
 _WARMUP_S: Final = 1.0  # fixes of a tag count for the errors from this time after its first
 

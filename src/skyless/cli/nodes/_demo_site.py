@@ -26,14 +26,15 @@ from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.whole_files import replace_files
 from skyless.page.condition.evidence import Health, ProcessorUse
 from skyless.run.broker import Broker, BrokerSettings, start_broker
-from skyless.run.children import Child, Program
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import Introduction, RefusedError, kept_messages, open_connection, trouble_with
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import EtherHealth, StatusMessage, WrongMessageError, read_message
 from skyless.run.mqtt.topics import alarm_topic, site_topic, status_topic, survey_topic, watch_topic
 from skyless.run.process import (
+    Child,
     Log,
+    Program,
     data_folder,
     hold_any,
     new_recording,
@@ -43,7 +44,7 @@ from skyless.run.process import (
     together,
 )
 from skyless.sim.evaluation.request import ProtectionOptions
-from skyless.sim.lab import lab_site
+from skyless.sim.world import lab_site
 from skyless.site.file.template import site_template
 from skyless.site.survey.facts import encode_record, record_path
 

@@ -11,8 +11,7 @@ from skyless.cli.nodes._site_view import GONE, LINK_NAME, SiteView
 from skyless.core.any_receiver import beacon_period_s
 from skyless.core.geometry import RADIO_REACH_M
 from skyless.core.site import Site, site_digest
-from skyless.run.doctor.check import Check, Result, judged, residuals_check, sentence
-from skyless.run.doctor.clocks import CounterPairs, counters_check
+from skyless.run.doctor import Check, CounterPairs, Result, counters_check, judged, residuals_check, sentence
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import FixMessage, RequestMessage, StampsMessage
 from skyless.run.process import reader

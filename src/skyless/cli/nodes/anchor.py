@@ -13,7 +13,7 @@ from skyless.core.arguments import Options
 from skyless.core.errors import SkylessError
 from skyless.radio.interface import AntennaDelays
 from skyless.run.anchor import Anchors
-from skyless.run.keys.node_keys import AnchorKeys
+from skyless.run.keys import AnchorKeys
 from skyless.run.open_radio import DEFAULT_RADIO, is_simulated, open_radios
 from skyless.site.file.check import plan_files
 

@@ -17,13 +17,11 @@ from skyless.core.arguments import Options, whole
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
 from skyless.run.broker import FIRST_PORT, Broker, BrokerSettings, start_broker
-from skyless.run.children import Child, Program
 from skyless.run.find_site import SiteOnBroker, watch_sites
-from skyless.run.gather.address import NatsAddress
-from skyless.run.gather.leaf import Leaf, StuckLineError, read_json
-from skyless.run.mqtt.access import Role, create_access, read_access
-from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
-from skyless.run.process import together
+from skyless.run.gather.node import Leaf, StuckLineError, read_json
+from skyless.run.gather.streams import NatsAddress
+from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, Role, create_access, mqtt_address, read_access
+from skyless.run.process import Child, Program, together
 
 app = App(name="broker", help_epilogue="Example: skyless broker --port 1883")
 
@@ -155,10 +153,10 @@ async def _serve_once(
         if history is not None:
             parts.append(_keep_history(_reader(settings, running), history, nats))
         if settings.hub is not None and nats is not None:
-            from skyless.run.hub import line
+            from skyless.run import hub
 
-            parts.append(line.watch_line(settings.hub, running, log))
-            parts.append(line.refuse_second(settings.hub, nats, log))
+            parts.append(hub.watch_line(settings.hub, running, log))
+            parts.append(hub.refuse_second(settings.hub, nats, log))
         await together(*parts)
 
 

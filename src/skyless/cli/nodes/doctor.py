@@ -23,9 +23,7 @@ from skyless.core.site import NoiseSite, Site
 from skyless.core.version import installed_version
 from skyless.page.condition.evidence import ProcessorUse
 from skyless.radio.serial.serial_radio import SerialRadio
-from skyless.run.doctor.board import BoardProbe
-from skyless.run.doctor.check import Check, Result, sentence
-from skyless.run.doctor.host import clock_check, port_checks
+from skyless.run.doctor import BoardProbe, Check, Result, clock_check, port_checks, sentence
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
 from skyless.run.mqtt.link import Link

@@ -71,7 +71,7 @@ def ether(*, asked: EtherOptions, broker: MqttOptions, output: JsonOptions) -> N
     air has carried.
     """
     from skyless.run.ether import Ether, EtherNode
-    from skyless.sim.compile_ahead import compile_kernels
+    from skyless.sim.evaluation.fleet import compile_kernels
     from skyless.sim.evaluation.scenarios import Request, impairments_of, patrols
 
     site, address = site_named(asked.site), broker.address()

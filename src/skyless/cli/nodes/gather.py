@@ -8,7 +8,7 @@ from skyless.cli.common.options import JsonOptions, command
 from skyless.cli.common.output import print_json
 from skyless.cli.nodes.options import GatherOptions, log, run_until_stopped
 from skyless.core.extras import extra_module
-from skyless.run.gather.address import nats_address
+from skyless.run.gather.streams import nats_address
 
 app = App(name="gather", help_epilogue="Example: skyless gather --nats nats://127.0.0.1:4222 --site-id 7")
 

@@ -15,7 +15,7 @@ from skyless.core.errors import SkylessError
 from skyless.run.find_site import SiteOnBroker, watch_sites
 
 if TYPE_CHECKING:
-    from skyless.run.hub.sites import HubSite
+    from skyless.run.hub import HubSite
 
 _LISTEN_S: Final = 2.5
 _DASH: Final = "–"
@@ -59,7 +59,7 @@ def _of_broker(broker: MqttOptions) -> "list[SiteOnBroker | HubSite]":
 
 def _of_hub(hub: str, broker: MqttOptions) -> "list[SiteOnBroker | HubSite]":
     address = hub_address(hub, broker.mqtt_ca)
-    from skyless.run.hub.sites import HubSites
+    from skyless.run.hub import HubSites
 
     known = HubSites(address, time.monotonic())
     run_until_stopped(_listen(known.run("skyless sites")))

@@ -19,7 +19,7 @@ from skyless.core.method_names import DEFAULT_METHOD, Dynamics
 from skyless.core.site import GeoreferenceSite
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.run.fix_log import FixListener
-from skyless.run.keys.key_files import read_site_public
+from skyless.run.keys import read_site_public
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.open_radio import (

@@ -15,7 +15,7 @@ from skyless.page.api.openapi import GEOJSON
 from skyless.page.live import LiveSite
 from skyless.run.geojson import coordinates, feature
 from skyless.run.mqtt.messages import Asset
-from skyless.run.zones.zone_list import signed_area_m2
+from skyless.run.zones import signed_area_m2
 
 
 def collection(live: LiveSite, kind: str) -> Response:

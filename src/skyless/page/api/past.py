@@ -63,7 +63,7 @@ class Past:
 
 
 def _span(begin: str, end: str) -> Span:
-    from skyless.run.history.times import span_of  # noqa: PLC0415 - of the extra history
+    from skyless.run.history.answers import span_of  # noqa: PLC0415 - of the extra history
 
     return span_of(begin, end or None, time.time())
 

@@ -27,8 +27,7 @@ from skyless.research.replays.inputs import known_anchors, known_truth
 from skyless.research.replays.options import ReplayOptions
 from skyless.research.replays.site import SITE_FORMAT, SiteReplay
 from skyless.run.recordings.recording import McapRecording
-from skyless.sim.evaluation.figures import Figures, FixTable, Judged, figures_of
-from skyless.sim.evaluation.truth import truth_at
+from skyless.sim.evaluation.figures import Figures, FixTable, Judged, figures_of, truth_at
 from skyless.site.survey.anchor_errors import DifferenceCalibration
 
 JOINT, SMOOTHED, CALIBRATED, PLAIN, BITCRAZE_RULE = "joint", "joint-smoothed", "joint-calibrated", "gate", "bitcraze"

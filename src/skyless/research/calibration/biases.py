@@ -18,8 +18,7 @@ from skyless.research.calibration.tags import PositionAt, position_of_stays, pos
 from skyless.research.foreign.formats import Recording, open_recording
 from skyless.research.masterless.pair_engine import PairEngine
 from skyless.research.replays.inputs import flight_height, known_anchors, known_truth
-from skyless.sim.evaluation.statistics import EvenSample
-from skyless.sim.evaluation.truth import TruthTrack
+from skyless.sim.evaluation.figures import EvenSample, TruthTrack
 from skyless.site.survey.estimate import CalibrationEstimate, Differences, estimate
 from skyless.site.tables import calibrated_table, new_table
 

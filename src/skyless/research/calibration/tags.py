@@ -14,9 +14,8 @@ from skyless.core.site import Site
 from skyless.research.calibration.options import First, Stay, SurveyOptions
 from skyless.research.replays.site import reception_of, recorded_truth
 from skyless.run.mqtt.messages import ReceptionsMessage
-from skyless.run.recordings.host_clock import HostClock
-from skyless.run.recordings.recording import McapRecording, tags_to_replay
-from skyless.sim.evaluation.truth import TruthTrack
+from skyless.run.recordings.recording import HostClock, McapRecording, tags_to_replay
+from skyless.sim.evaluation.figures import TruthTrack
 from skyless.site.survey.legs import RelayedDifferences
 from skyless.site.survey.walk import EPOCH_S, EpochCollector, TagEpochs
 from skyless.site.tables import Truth

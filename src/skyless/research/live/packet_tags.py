@@ -24,8 +24,8 @@ from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth
 from skyless.run.mqtt.topics import fix_topic, health_topic
+from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import HEALTH_S, Log, SitePublisher, Usage, every, keep, link_of, together
-from skyless.run.radio_monitor import RadioMonitor
 from skyless.site.file.check import check_site
 from skyless.site.survey.anchor_errors import DifferenceCalibration
 

@@ -12,8 +12,8 @@ from skyless.core.fix import Fix
 from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.site import Site
+from skyless.sim.evaluation.figures import FirstFixes
 from skyless.sim.evaluation.fleet import world_of
-from skyless.sim.evaluation.statistics import FirstFixes
 from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Trajectory
 

@@ -13,8 +13,8 @@ from skyless.research.paper._listening import Track, listen
 from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict, grouped
 from skyless.research.studies.common.plan import Cell
 from skyless.sim.impairments import lab_impairments
-from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Waypoints
+from skyless.sim.world import paper_lab_site
 from skyless.site.report import INK, METHOD_COLOURS, RED, draw_floor_plan, panel
 
 _METHODS: Final = ("literal", "joint")

@@ -33,8 +33,16 @@ from skyless.research.replays.inputs import (
 from skyless.research.replays.noise import NoiseByPair, PairNoise
 from skyless.research.replays.options import DIFFERENCES_MADE, PACKETS, ReplayOptions
 from skyless.research.replays.pipelines import ByOwnEstimator, ByPackets, ByPairs, Pipeline, Record, Smoothed
-from skyless.sim.evaluation.figures import Figures, FixSamples, FixTable, Judged, figures_of
-from skyless.sim.evaluation.truth import estimated_offset_s, shifted, truth_at
+from skyless.sim.evaluation.figures import (
+    Figures,
+    FixSamples,
+    FixTable,
+    Judged,
+    estimated_offset_s,
+    figures_of,
+    shifted,
+    truth_at,
+)
 from skyless.site.survey.anchor_errors import DifferenceCalibration
 from skyless.site.tables import read_calibration
 

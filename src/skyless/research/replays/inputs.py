@@ -16,7 +16,7 @@ from skyless.core.site import Site
 from skyless.research.foreign.formats import format_of
 from skyless.research.masterless.smoothing import Height
 from skyless.research.replays.options import BAROMETER, RECORDED, RecordingOptions, ReplayOptions
-from skyless.sim.evaluation.truth import FLIGHT_M, antenna_truth, flies, shifted
+from skyless.sim.evaluation.figures import FLIGHT_M, antenna_truth, flies, shifted
 from skyless.site.file.load import site_of
 from skyless.site.tables import HEIGHT_STD_M, Truth, read_anchors, read_height_readings, read_truth
 

@@ -7,8 +7,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import PairTdoa, Point
-from skyless.sim.evaluation.statistics import EvenSample
-from skyless.sim.evaluation.truth import truth_at
+from skyless.sim.evaluation.figures import EvenSample, truth_at
 from skyless.site.tables import Truth
 
 MAX_PAIRS: Final = 256

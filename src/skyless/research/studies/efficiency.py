@@ -17,7 +17,7 @@ from skyless.core.estimator.estimator import Estimator
 from skyless.research.studies.common.plan import Cell, Plan, Row
 from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, Case, Episode, draw_episode, settings_of
 from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
-from skyless.sim.lab import paper_lab_site
+from skyless.sim.world import paper_lab_site
 
 _JUDGED_SUPERFRAMES: Final = 20
 """At the end of an episode."""

@@ -26,10 +26,9 @@ from skyless.research.studies.common.summary import interval, jackknife
 from skyless.research.studies.room import biases_of
 from skyless.research.uncertainty.bounds import BoundSettings, Sendings, received_bound, relayed_receptions
 from skyless.sim.cells.world import CellWorld, TagReceptions, anchors_of
-from skyless.sim.evaluation.cell_fleet import SiteBeacons, period_codes_of
+from skyless.sim.evaluation.fleet import SiteBeacons, period_codes_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room
-from skyless.sim.impairments import Impairments
-from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.impairments import Impairments, RangeErrorModel
 from skyless.sim.trajectory import Roaming, Trajectory, Waypoints
 from skyless.site.channel import ChannelModel
 from skyless.site.file.template import grid_site

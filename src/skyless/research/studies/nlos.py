@@ -7,7 +7,7 @@ from skyless.research.studies.common.plan import Plan
 from skyless.research.studies.common.summary import Case
 from skyless.research.studies.common.worlds import anchor_of, walking
 from skyless.sim.impairments import AnchorBias
-from skyless.sim.lab import paper_lab_site
+from skyless.sim.world import paper_lab_site
 
 _MAX_RATIO: Final = 1.3
 _BURST_S: Final = 5.0

@@ -16,12 +16,10 @@ from skyless.research.studies.common.plan import Limit, Plan, Row, with_limits
 from skyless.research.studies.common.summary import Case, by_case, world_rows
 from skyless.research.studies.common.worlds import box, walking, worlds
 from skyless.research.studies.room import WALL, past_wall, still, with_levels
-from skyless.sim.carrier import CarrierModel
 from skyless.sim.evaluation.scenarios import Room, wanderer, wanderers
-from skyless.sim.impairments import Body, Impairments
-from skyless.sim.lab import lab_site, paper_lab_site
-from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.impairments import Body, CarrierModel, Impairments, RangeErrorModel
 from skyless.sim.trajectory import Trajectory
+from skyless.sim.world import lab_site, paper_lab_site
 
 _WARMUP_S: Final = 2.5
 _STAMPS: Final = ", stamps alone"

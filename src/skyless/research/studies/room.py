@@ -34,14 +34,12 @@ from skyless.research.studies.common.summary import (
 from skyless.research.studies.common.worlds import Run, RunResult, anchor_of, box, worlds
 from skyless.research.studies.motion import laps
 from skyless.research.uncertainty.bounds import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
+from skyless.sim.evaluation.figures import LevelCounts
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room, wanderer, wanderers
-from skyless.sim.evaluation.statistics import LevelCounts
-from skyless.sim.impairments import AnchorBias, Body, WarmUp
-from skyless.sim.lab import lab_site
-from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.impairments import AnchorBias, Body, RangeErrorModel, WarmUp
 from skyless.sim.trajectory import Static, Trajectory, Waypoints
-from skyless.sim.world import Broadcast
+from skyless.sim.world import Broadcast, lab_site
 
 BASE: Final = "the room"
 AIR: Final = "unbiased air"

@@ -12,8 +12,8 @@ from skyless.research.studies.common.plan import Plan
 from skyless.research.studies.common.summary import Case
 from skyless.research.studies.common.worlds import box, worlds
 from skyless.research.studies.motion import still
-from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Trajectory
+from skyless.sim.world import paper_lab_site
 
 _FLEET_WARMUP_S: Final = 1.0
 _FLEET_S: Final = 0.5

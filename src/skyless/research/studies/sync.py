@@ -10,8 +10,8 @@ from skyless.research.studies.common.plan import Plan
 from skyless.research.studies.common.summary import Case
 from skyless.research.studies.common.worlds import LAB_WARMUP_S, Run, walking
 from skyless.sim.impairments import AnchorOutage, Impairments, Outage
-from skyless.sim.lab import paper_lab_site
 from skyless.sim.oscillator import Temperature
+from skyless.sim.world import paper_lab_site
 
 _STEADY: Final = "steady"
 _SUPERFRAMES_MS: Final = (15.0, 30.0, 60.0, 120.0, 300.0, 1000.0)

@@ -6,7 +6,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array
-from skyless.sim.lab import lab_site
+from skyless.sim.world import lab_site
 
 SLOT_S: Final = 2.5e-3
 _ROOM_M: Final = (

@@ -22,9 +22,15 @@ from skyless.research.surveys.air import free_axes
 from skyless.research.surveys.judge import aligned
 from skyless.research.surveys.layouts import SurveyLayout
 from skyless.sim.evaluation.scenarios import Room
-from skyless.sim.impairments import AnchorDisplacement, DelayError, Impairments, PairError, lab_impairments
-from skyless.sim.lab import lab_site
-from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.impairments import (
+    AnchorDisplacement,
+    DelayError,
+    Impairments,
+    PairError,
+    RangeErrorModel,
+    lab_impairments,
+)
+from skyless.sim.world import lab_site
 from skyless.site.survey.facts import Facts, PairRanges, Point, Survey, Tape
 from skyless.site.survey.solve import run_survey, surveyed_site
 

@@ -4,10 +4,14 @@ import asyncio
 import contextlib
 import secrets
 import time
-from typing import Final
+from collections import Counter, deque
+from collections.abc import Mapping
+from itertools import count
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 import msgspec
-from msgspec import Struct
+from msgspec import Meta, Struct
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
@@ -15,17 +19,145 @@ from nats.errors import Error
 from nats.js import JetStreamContext
 from nats.js.errors import APIError
 
+from skyless.core.errors import SkylessError
 from skyless.core.version import installed_version
-from skyless.run.fix_batch import BadBatchError, Batch, decode_batch, encode_batch
-from skyless.run.gather import subjects
-from skyless.run.gather.address import NatsAddress, connect, rarely
-from skyless.run.gather.condition import SiteCondition
-from skyless.run.gather.names import NEVER_WRITTEN, Names
-from skyless.run.gather.packer import Packer
-from skyless.run.gather.streams import make_streams, messages
+from skyless.run.fix_batch import MAX_RECORDS, BadBatchError, Batch, Records, decode_batch, encode_batch, records_of
+from skyless.run.gather import streams
+from skyless.run.gather.streams import NEVER_WRITTEN, Names, NatsAddress, connect, make_streams, messages, rarely
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import RefusedError, kept_messages, trouble_with
+from skyless.run.mqtt.messages import FixMessage, SiteMessage, StatusMessage, WrongMessageError, read_message
 from skyless.run.process import Log, together
+
+# Fixes of one site from JSON to batches. No I/O: the caller passes in the time.
+
+MAX_WAITING: Final = 100_000
+"""Fixes that wait for the stream. The oldest are dropped beyond it, and counted."""
+
+
+class Packer:
+    """Takes fixes one by one and gives them in batches. ``run`` is the random number of this start."""
+
+    def __init__(self, run: int) -> None:
+        self.fixes, self.simulated = 0, False
+        self.drops: Counter[str] = Counter()
+        self._run, self._sequences = run, count(1)
+        self._waiting: deque[FixMessage] = deque(maxlen=MAX_WAITING)
+        self._next: list[FixMessage] = []
+        self._decoder = msgspec.json.Decoder(FixMessage)
+
+    @property
+    def waiting(self) -> int:
+        """Fixes that are in no batch yet."""
+        return len(self._waiting) + len(self._next)
+
+    def add(self, name: str, payload: bytes) -> None:
+        """Add a ``FixMessage`` in JSON that came under a tag's name. What cannot be used is counted in ``drops``."""
+        try:
+            fix = self._decoder.decode(payload)
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            self.drops["wrong"] += 1
+            return
+        if fix.tag != name:
+            self.drops["wrong"] += 1
+            return
+        if len(self._waiting) == MAX_WAITING:
+            self.drops["late"] += 1
+        self.fixes += 1
+        self._waiting.append(fix)
+
+    def next_tags(self) -> list[str]:
+        """The tag of each fix of the next batch: of the oldest that wait. They need numbers first."""
+        if not self._next:
+            self._next = [self._waiting.popleft() for _ in range(min(len(self._waiting), MAX_RECORDS))]
+        return [fix.tag for fix in self._next]
+
+    def next_batch(self, numbers: Mapping[str, int], issue: int, now_unix_s: float) -> Batch | None:
+        """The fixes of ``next_tags``; None where none of these tags has a number."""
+        fixes, self._next = self._next, []
+        taken = [(numbers[fix.tag], fix) for fix in fixes if fix.tag in numbers]
+        if len(taken) < len(fixes):
+            self.drops["no-number"] += len(fixes) - len(taken)
+        if not taken:
+            return None
+        records = records_of(taken, simulated=self.simulated)
+        return Batch(self._run, next(self._sequences), round(1e6 * now_unix_s), issue, records)
+
+
+# The condition of a site in one word with its reasons, from what passes a gather. No I/O.
+#
+# It is coarser than that of the site's page, which reads every health: it is for a list of many sites.
+
+HEARD_S: Final = 10.0
+"""A tag without a fix for so long is not heard."""
+_DROPS_S: Final = 60.0
+_MAX_WAITING: Final = 5_000
+_MAX_NAMED: Final = 3
+
+ConditionWord = Literal["good", "degraded", "bad"]
+
+
+class SiteCondition:
+    """What a gather knows of its site."""
+
+    def __init__(self, now_s: float) -> None:
+        self.site: SiteMessage | None = None
+        self._begin_s = now_s
+        self._programs: dict[tuple[str, str], StatusMessage] = {}
+        self._heard_s: dict[int, float] = {}
+        self._dropped: deque[tuple[float, int]] = deque()
+
+    def on_message(self, kind: str, name: str, payload: bytes) -> None:
+        """Take the site, or a program's status. One that cannot be read changes nothing, or says that it is offline."""
+        with contextlib.suppress(WrongMessageError):
+            if kind == "site":
+                self.site = read_message(payload, SiteMessage)
+            else:
+                self._programs.pop((kind, name), None)
+                self._programs[kind, name] = read_message(payload, StatusMessage)
+
+    def on_batch(self, records: Records, now_s: float) -> None:
+        """Take the fixes of a batch of this gather or of another program."""
+        self._heard_s.update(dict.fromkeys(records["tag"].tolist(), now_s))
+
+    def online(self) -> dict[str, int]:
+        """Programs that are online, by kind."""
+        return dict(Counter(kind for (kind, _), status in self._programs.items() if status.online))
+
+    def versions(self) -> dict[str, int]:
+        """Programs that are online, by version."""
+        return dict(Counter(status.version or "unknown" for status in self._programs.values() if status.online))
+
+    def tags_heard(self, now_s: float) -> int:
+        """Tags with a fix in the last ten seconds."""
+        self._heard_s = {tag: heard_s for tag, heard_s in self._heard_s.items() if now_s - heard_s < HEARD_S}
+        return len(self._heard_s)
+
+    def reasons(self, drops: Mapping[str, int], waiting: int, now_s: float) -> tuple[ConditionWord, list[str]]:
+        """The condition, and why it is not good. ``drops`` are the gather's since its start."""
+        self._dropped.append((now_s, sum(drops.values())))
+        while now_s - self._dropped[0][0] > _DROPS_S:
+            self._dropped.popleft()
+        bad, degraded = [], []
+        if self.site is None:
+            bad.append("the site is not published: no anchor or emulated air is running")
+        if not self.tags_heard(now_s) and now_s - self._begin_s > HEARD_S:
+            bad.append(f"no tag has had a fix for {HEARD_S:g} s")
+        if offline := self._offline_anchors():
+            named = ", ".join(offline[:_MAX_NAMED]) + (" and others" if len(offline) > _MAX_NAMED else "")
+            degraded.append(f"{len(offline)} of the anchors offline: {named}")
+        if waiting > _MAX_WAITING:
+            degraded.append(f"{waiting} fixes wait for the stream")
+        if dropped := self._dropped[-1][1] - self._dropped[0][1]:
+            degraded.append(f"{dropped} fixes were dropped in the last minute")
+        return "bad" if bad else "degraded" if degraded else "good", bad + degraded
+
+    def _offline_anchors(self) -> list[str]:
+        """Anchors of the site that have said that they are offline, or whose broker has said so."""
+        names = [] if self.site is None else [str(anchor.id) for anchor in self.site.site.anchors]
+        found = ((name, self._programs.get(("anchor", name))) for name in names)
+        return [name for name, status in found if status is not None and not status.online]
+
 
 PERIOD_S: Final = 0.1
 SUMMARY_S: Final = 1.0
@@ -79,7 +211,7 @@ class Gather:
         self.site = site
         self._address, self._keep_bytes, self._log, self._broker = address, keep_bytes, log, broker
         self._say = rarely(log)
-        self._host = subjects.own_host()
+        self._host = streams.own_host()
         self._packer = Packer(secrets.randbits(32))
         self._client: Client | None = None
         self._names: Names | None = None
@@ -120,10 +252,10 @@ class Gather:
         stream = client.jetstream()
         try:
             site = self.site = await self._first_site(client) if self.site is None else self.site
-            fixes = await client.subscribe(subjects.at(subjects.JSON_FIXES, site), _QUEUE, self._on_fix)
-            await client.subscribe(subjects.at(subjects.FIXES, site), cb=self._on_batch)
-            for pattern in (subjects.STATUSES, subjects.SITES):
-                await client.subscribe(subjects.at(pattern, site), cb=self._on_message)
+            fixes = await client.subscribe(streams.at(streams.JSON_FIXES, site), _QUEUE, self._on_fix)
+            await client.subscribe(streams.at(streams.FIXES, site), cb=self._on_batch)
+            for pattern in (streams.STATUSES, streams.SITES):
+                await client.subscribe(streams.at(pattern, site), cb=self._on_message)
             try:
                 await together(self._send(stream, site), self._summarise(client, site))
             finally:
@@ -134,7 +266,7 @@ class Gather:
 
     async def _first_site(self, client: Client) -> int:
         heard = await client.subscribe("skyless.v1.*.>")
-        while (site := subjects.site_in((await heard.next_msg(None)).subject)) is None:
+        while (site := streams.site_in((await heard.next_msg(None)).subject)) is None:
             pass
         await heard.unsubscribe()
         self._log(f"gathers site {site}; --site-id names another")
@@ -143,7 +275,7 @@ class Gather:
     # Messages
 
     async def _on_fix(self, message: Msg) -> None:
-        self._packer.add(subjects.tag_in(message.subject), message.data)
+        self._packer.add(streams.tag_in(message.subject), message.data)
 
     async def _on_batch(self, message: Msg) -> None:
         with contextlib.suppress(BadBatchError):
@@ -162,7 +294,7 @@ class Gather:
         while True:
             try:
                 await make_streams(stream, site, self._keep_bytes)
-                self._since = str((await stream.stream_info(subjects.at(subjects.FIX_STREAM, site))).created)
+                self._since = str((await stream.stream_info(streams.at(streams.FIX_STREAM, site))).created)
                 await self._copy_state(stream, site)
                 names = Names(stream, site)
                 await names.read()
@@ -176,21 +308,21 @@ class Gather:
 
     async def _copy_state(self, stream: JetStreamContext, site: int) -> None:
         """Read the state that the stream has. What the broker has kept from before the stream was made is put there."""
-        state, known = subjects.at(subjects.STATE_STREAM, site), set[str]()
+        state, known = streams.at(streams.STATE_STREAM, site), set[str]()
         async for message in messages(stream, state):
             known.add(message.subject)
             if message.subject.endswith((".site", ".status")):
                 await self._on_message(message)
         if self._broker is None:
             return
-        filters = [subjects.topic_of(subjects.at(one, site)).replace("*", "+") for one in subjects.STATE]
+        filters = [streams.topic_of(streams.at(one, site)).replace("*", "+") for one in streams.STATE]
         try:
             kept = await kept_messages(self._broker, filters)
         except (OSError, RefusedError) as error:
             self._say(f"what the broker has kept is not copied: {trouble_with(self._broker, error)}")
             return
         for topic, payload in kept.items():
-            if (subject := subjects.subject_of(topic)) not in known:
+            if (subject := streams.subject_of(topic)) not in known:
                 with contextlib.suppress(APIError):  # it has come at this moment
                     await stream.publish(subject, payload, headers=dict(NEVER_WRITTEN))
 
@@ -199,7 +331,7 @@ class Gather:
 
         A batch that the stream refuses, as on a full disk, has reached those who read now, and is not sent again.
         """
-        subject = subjects.at(subjects.FIXES, site, self._host)
+        subject = streams.at(streams.FIXES, site, self._host)
         while self._ready is not None or (tags := self._packer.next_tags()):
             if self._ready is None:
                 await names.give(tags, self._host, time.time())  # first: every number in the stream has a name
@@ -221,5 +353,48 @@ class Gather:
 
     async def _summarise(self, client: Client, site: int) -> None:
         while True:
-            await client.publish(subjects.at(subjects.SUMMARY, site), msgspec.json.encode(self.summary))
+            await client.publish(streams.at(streams.SUMMARY, site), msgspec.json.encode(self.summary))
             await asyncio.sleep(SUMMARY_S)
+
+
+# The file of a site's line to a hub: ``skyless hub init`` writes it, ``skyless broker --hub`` reads it.
+
+Kind = TypeVar("Kind")
+
+
+PING_INTERVAL: Final = "10s"
+"""nats-server gives a connection up after two pings without an answer, of 2 minutes each without this."""
+
+
+class StuckLineError(Exception):
+    """nats-server does not try to reach the hub any more (nats-server #7615): it is to be started again."""
+
+
+class Leaf(Struct, frozen=True, kw_only=True):
+    """What nats-server of a site needs to reach the hub."""
+
+    version: Literal[1] = 1
+    site: Annotated[int, Meta(ge=0, le=0xFFFD)]
+    tenant: str
+    urls: Annotated[list[str], Meta(min_length=1)]
+    """The port for sites of each node, nats://HOST:PORT or tls://HOST:PORT."""
+    user: str
+    password: str
+    ca: str | None
+    """Certificates to trust, an absolute path; None without TLS."""
+
+    def configuration(self) -> dict[str, Any]:
+        """What nats-server needs. MQTT's own subjects stay at the site: sites of a tenant share its account."""
+        urls = [url.replace("://", f"://{self.user}:{self.password}@", 1) for url in self.urls]
+        remote: dict[str, Any] = {"urls": urls, "deny_imports": ["$MQTT.>"], "deny_exports": ["$MQTT.>"]}
+        if self.ca is not None:
+            remote["tls"] = {"ca_file": self.ca}
+        return {"no_advertise": True, "remotes": [remote]}
+
+
+def read_json(file: Path, kind: type[Kind], maker: str) -> Kind:
+    """A file of a hub. Raises SkylessError: it cannot be read, or ``maker`` has not made it."""
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=kind)
+    except (OSError, msgspec.DecodeError, UnicodeError) as error:
+        raise SkylessError(f"{file} cannot be used: {getattr(error, 'strerror', error)}; {maker} makes it") from None

@@ -1,8 +1,14 @@
 """What is asked of a history, and the answers: the command line, the HTTP interface and the page give the same."""
 
+import contextlib
+import math
+import re
+from datetime import date, datetime
 from typing import Final
 
 from msgspec import Struct
+
+from skyless.core.errors import SkylessError
 
 GAP_S: Final = 5.0
 THINNED_GAP_S: Final = 65.0
@@ -98,3 +104,74 @@ class AlarmRow(Struct, frozen=True):
     ended_unix_s: float | None
     acknowledged_unix_s: float | None
     acknowledged_by: str
+
+
+# Ranges of time as people type them: "yesterday", "14:00", "2 hours ago", ISO dates, seconds since 1970.
+
+_EXAMPLES: Final = "a time such as 14:00, yesterday 8:00, 2 hours ago, 2026-01-31 06:00, or seconds since 1970"
+_TIMES_OF_DAY: Final = ("%H:%M", "%H:%M:%S", "%I:%M%p", "%I:%M %p", "%I%p", "%I %p")
+_EARLIEST_S: Final = 1e8
+"""Smaller numbers than this, in the year 1973, are rather an hour or a year. 0 is allowed: from the beginning."""
+_LATEST_S: Final = 1e11
+"""Larger numbers are milliseconds."""
+_AT_AN_HOUR: Final = re.compile(r"\bat (\d{1,2})$")
+
+
+def span_of(from_text: str, to_text: str | None, now_unix_s: float) -> Span:
+    """The range between two times, in the time zone of this machine where they name none.
+
+    A time of day without a date is today's, at the end of the range that of the day on which the range begins. A day
+    without a time means its beginning. Without ``to_text`` the range ends now.
+
+    Raises:
+        SkylessError: a text that is no time, a range that begins in the future, or ends before it begins.
+    """
+    now = datetime.fromtimestamp(now_unix_s)
+    begin_s = _unix_s("from", from_text, now, now.date())
+    if begin_s > now_unix_s:
+        raise SkylessError(f"from is {from_text!r}, which is in the future ({_shown(begin_s)}); it should be past")
+    end_s = now_unix_s
+    if to_text is not None:
+        end_s = _unix_s("to", to_text, now, datetime.fromtimestamp(begin_s).date())
+    if end_s <= begin_s:
+        text = "now" if to_text is None else repr(to_text)
+        raise SkylessError(f"to is {text} ({_shown(end_s)}); it should be later than from ({_shown(begin_s)})")
+    return Span(begin_s, end_s)
+
+
+def _unix_s(name: str, text: str, now: datetime, day: date) -> float:
+    text = " ".join(text.split())
+    with contextlib.suppress(ValueError):
+        number = float(text)
+        if number == 0.0 or _EARLIEST_S <= number <= _LATEST_S:
+            return number
+    try:
+        found_s = _read(text, now, day).timestamp()
+    except (ValueError, OverflowError):
+        found_s = math.nan
+    if not 0.0 <= found_s <= _LATEST_S:
+        raise SkylessError(f"{name} is {text[:60]!r}; it should be {_EXAMPLES}")
+    return found_s
+
+
+def _read(text: str, now: datetime, day: date) -> datetime:
+    """A time with a zone, or without one, which is this machine's then. Raises ValueError."""
+    for form in _TIMES_OF_DAY:
+        with contextlib.suppress(ValueError):
+            return datetime.combine(day, datetime.strptime(text, form).time())
+    with contextlib.suppress(ValueError):
+        return datetime.fromisoformat(text)
+    from dateparser.date import DateDataParser  # noqa: PLC0415 - takes 0.1 s
+
+    settings = {"RELATIVE_BASE": now, "PREFER_DATES_FROM": "past", "DATE_ORDER": "YMD"}
+    settings |= {"RETURN_TIME_AS_PERIOD": True, "PARSERS": ["relative-time", "absolute-time"]}
+    parser = DateDataParser(languages=["en"], settings=settings)
+    found = parser.get_date_data(_AT_AN_HOUR.sub(r"\1:00", text))
+    when: datetime | None = found.date_obj
+    if when is None or not (found.period in {"time", "day"} or text.endswith("ago")):
+        raise ValueError  # a month or a year is no time
+    return when if found.period == "time" else when.replace(hour=0, minute=0, second=0, microsecond=0)
+
+
+def _shown(unix_s: float) -> str:
+    return datetime.fromtimestamp(unix_s).isoformat(" ", "seconds")

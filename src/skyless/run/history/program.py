@@ -5,26 +5,43 @@ import platform
 import re
 import time
 import zlib
+from collections import Counter
 from collections.abc import Callable, Coroutine
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from functools import partial
-from typing import Any, Final
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, cast
 
+import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 from msgspec import Struct
 from msgspec.structs import replace
+from nats.errors import Error
+from numpy.typing import NDArray
 
 from skyless.core.errors import SkylessError
-from skyless.run.fix_batch import MAX_RECORDS, records_of
-from skyless.run.gather.address import NatsAddress
-from skyless.run.history.events import REMEMBERED_KINDS, EventLog
-from skyless.run.history.layout import current_events
-from skyless.run.history.retention import Keep, tidy
-from skyless.run.history.tables import read_events
-from skyless.run.history.writer import FILE_ROWS, Writer
+from skyless.run.fix_batch import MAX_RECORDS, BadBatchError, Batch, Records, decode_batch, records_of
+from skyless.run.gather import streams
+from skyless.run.gather.streams import Names, NatsAddress, connect, follow, rarely
+from skyless.run.history.layout import (
+    FIX_COLUMNS,
+    REMEMBERED_KINDS,
+    Event,
+    EventLog,
+    current_events,
+    current_files,
+    day_of,
+    read_events,
+    read_table,
+    unix_ms,
+)
+from skyless.run.history.writer import FILE_ROWS, Intake, Keep, Writer, tidy
+from skyless.run.hub import LIST_S, sites_at
+from skyless.run.limits import HISTORY as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.link import Handler, Link
+from skyless.run.mqtt.link import Handler, Link, Subscriptions
 from skyless.run.mqtt.messages import (
     AlarmMessage,
     AssetsMessage,
@@ -35,7 +52,129 @@ from skyless.run.mqtt.messages import (
     ZonesMessage,
 )
 from skyless.run.process import Log, every, keep, reader, together
-from skyless.run.zones.zone_list import read_zones
+from skyless.run.recordings.recording import McapRecording
+from skyless.run.zones import read_zones
+
+if TYPE_CHECKING:
+    from collections.abc import AsyncGenerator
+
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+    from nats.js import JetStreamContext
+
+# Fixes of a large site for its history: from the stream that a gather fills, instead of from MQTT.
+
+_PERIOD_S: Final = 0.2
+_STREAM_RETRY_S: Final = 2.0
+_MAX_WAITING: Final = 100_000
+"""While more rows than this wait for the disk, others stay in the stream."""
+_NAMES_S: Final = 60.0
+"""How long the names of a batch may come later than itself: at a hub, streams catch up one after the other."""
+_MAX_SENDERS: Final = 1000
+
+
+class BatchTaker:
+    """Gives the batches of a stream to a history, each once."""
+
+    def __init__(self, names: Names, writer: Writer, log: Log) -> None:
+        self._names, self._writer, self._say = names, writer, rarely(log)
+        self._sequences: dict[int, int] = {}
+        """The last sequence of each run of a sender."""
+        self._given_up = 0
+        """Names with numbers up to this did not come in time."""
+
+    async def take(self, message: "Msg") -> None:
+        """Take the batch of a message, unless it is known. Waits for the disk, and for the names of its tags."""
+        while self._writer.fixes.waiting > _MAX_WAITING:
+            await asyncio.sleep(_PERIOD_S)
+        place = message.metadata.sequence.stream
+        if place <= self._writer.fixes.position:
+            return
+        try:
+            batch = decode_batch(message.data)
+        except BadBatchError:
+            self._writer.drops["wrong-batch"] += 1
+            return
+        if not self._is_next(batch):
+            return
+        await self._read_names(batch.names_issue)
+        now_s = time.time()
+        self._writer.fixes.add(self._renumbered(batch.records, now_s), now_s, place)
+
+    def _is_next(self, batch: Batch) -> bool:
+        """Whether a batch is new. Those before it that the stream does not have any more are counted."""
+        before = self._sequences.pop(batch.run, None)
+        self._sequences[batch.run] = max(batch.sequence, before or 0)
+        if len(self._sequences) > _MAX_SENDERS:
+            del self._sequences[next(iter(self._sequences))]
+        if before is not None and batch.sequence > before + 1:
+            lost = batch.sequence - before - 1
+            self._writer.drops["lost-batches"] += lost
+            self._say(f"site {self._writer.site}: {lost} batches were dropped before they could be read")
+        return before is None or batch.sequence > before
+
+    async def _read_names(self, issue: int) -> None:
+        deadline_s = time.monotonic() + _NAMES_S
+        while self._names.issue < issue > self._given_up:
+            try:
+                await self._names.read()
+            except Error as error:
+                self._say(f"the names of site {self._writer.site} cannot be read: {error or type(error).__name__}")
+                deadline_s = time.monotonic() + _NAMES_S
+            if self._names.issue < issue:
+                if time.monotonic() > deadline_s:
+                    self._given_up = issue
+                await asyncio.sleep(_PERIOD_S)
+
+    def _renumbered(self, records: Records, now_s: float) -> Records:
+        """Records that are kept, with the numbers that this history gives to their tags; the others are counted."""
+        writer = self._writer
+        given, rows = np.unique(records["tag"], return_inverse=True)
+        tags = (self._names.tags.get(int(number)) for number in given)
+        own = np.array([(tag and writer.tag_number(tag.name, now_s)) or 0 for tag in tags], np.uint32)[rows]
+        in_time = (records["unix_us"] >= 1e6 * LIMITS.first_unix_s) & (records["unix_us"] <= 1e6 * LIMITS.last_unix_s)
+        writer.drops["no-name"] += int(np.count_nonzero(own == 0))
+        writer.drops["wrong-time"] += int(np.count_nonzero((own != 0) & ~in_time))
+        kept: Records = records[(own != 0) & in_time].copy()
+        kept["tag"] = own[(own != 0) & in_time]
+        return kept
+
+
+async def first_place(stream: "JetStreamContext", name: str, intake: Intake, say: Log) -> int:
+    """The place in a stream up to which an intake has all. Waits for the stream."""
+    while True:
+        try:
+            last = (await stream.stream_info(name)).state.last_seq
+            break
+        except Error as error:
+            say(f"waits for the stream {name}, which a gather or skyless hub apply makes: {error or 'no answer'}")
+            await asyncio.sleep(_STREAM_RETRY_S)
+    if intake.position > last:
+        say(f"the stream {name} was deleted and made again; it is taken from its beginning")
+        intake.position = 0
+    return intake.position
+
+
+async def take_batches(stream: "JetStreamContext", writer: Writer, say: Log) -> None:
+    """Give the batches of a site's stream to a history until cancelled, from where it stopped the last time.
+
+    The place in the stream is kept together with the rows, so that each batch is taken once.
+    """
+    name, own = streams.at(streams.FIX_STREAM, writer.site), streams.at(streams.FIXES, writer.site)
+    taker = BatchTaker(Names(stream, writer.site), writer, say)
+    async for message in follow(stream, name, own, say, await first_place(stream, name, writer.fixes, say)):
+        await taker.take(message)
+
+
+async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:
+    """The same with a connection of its own."""
+    say = rarely(log)
+    client = await connect(address, "skyless history", say, writer.drops)
+    try:
+        await take_batches(client.jetstream(), writer, say)
+    finally:
+        await client.close()
+
 
 _STORE_S: Final = 0.1
 _SYNC_S: Final = 1.0
@@ -200,7 +339,7 @@ class HistoryNode:
         """Keep it until cancelled."""
         sources = [keep(self.link, self._log)]
         if self._nats is not None:
-            from skyless.run.history.stream_source import take_stream  # noqa: PLC0415 - only large sites have NATS
+
 
             sources.append(take_stream(self._nats, self._writer, self._log))
         await self._history.run(*sources)
@@ -208,3 +347,194 @@ class HistoryNode:
     def state(self) -> HistoryState:
         """Progress so far."""
         return replace(self._history.state(), trouble=self.link.trouble)
+
+
+# The history of the sites of a hub: fixes, events and the rest from its streams.
+
+
+class _Site:
+    """One site that is kept, from its own streams: what they have under another site's subjects is not read."""
+
+    def __init__(self, stream: "JetStreamContext", writer: Writer, keep: Keep, log: Log) -> None:
+        self.writer, self.history = writer, SiteHistory(writer, keep, log)
+        self._stream, self._say = stream, rarely(log)
+        self._subscriptions = Subscriptions()
+        self.history.attach(self._subscriptions.add, fixes=False)
+
+    async def run(self) -> None:
+        """Keep it until cancelled."""
+        await self.history.run(self._take_state(), self._take_events(), self._take_fixes())
+
+    async def _take_fixes(self) -> None:
+        await take_batches(self._stream, self.writer, self._say)
+
+    async def _take_state(self) -> None:
+        async for message in self._follow(streams.STATE_STREAM, is_state=True):
+            self._receive(message)
+
+    async def _take_events(self) -> None:
+        name, intake = streams.at(streams.EVENT_STREAM, self.writer.site), self.writer.events
+        after = await first_place(self._stream, name, intake, self._say)
+        async for message in self._follow(streams.EVENT_STREAM, after):
+            self.history.event_place = message.metadata.sequence.stream
+            self._receive(message)
+
+    def _follow(self, pattern: str, after: int = 0, *, is_state: bool = False) -> "AsyncGenerator[Msg, None]":
+        name, own = streams.at(pattern, self.writer.site), f"skyless.v1.{self.writer.site}.>"
+        return follow(self._stream, name, own, self._say, after, newest_of_each=is_state)
+
+    def _receive(self, message: "Msg") -> None:
+        self._subscriptions.receive(streams.topic_of(message.subject), message.data)
+
+
+class HubHistory:
+    """Keeps the history of all sites of a tenant at a hub, or of one, until cancelled."""
+
+    def __init__(self, folder: Path, address: NatsAddress, site: int | None, keep: Keep, log: Log) -> None:
+        self._folder, self._address, self._keep, self._log = folder, address, keep, log
+        self._only = site
+        self._say = rarely(log)
+        self._sites: dict[int, _Site] = {}
+        self._drops: Counter[str] = Counter()
+        self._begin_s = time.monotonic()
+        self._client: Client | None = None
+        self._stream: JetStreamContext
+        self._tasks: asyncio.TaskGroup
+
+    def state(self) -> HistoryState:
+        """Progress so far, of all sites."""
+        states = [site.history.state() for site in self._sites.values()]
+        client = self._client
+        is_connected = client is not None and (client.is_connected or client.is_closed)  # it is closed at the end
+        return HistoryState(
+            seconds=time.monotonic() - self._begin_s,
+            fixes=sum(state.fixes for state in states),
+            events=sum(state.events for state in states),
+            tags=sum(state.tags for state in states),
+            waiting=sum(state.waiting for state in states),
+            lost=sum(state.lost for state in states),
+            drops=dict(sum((Counter(state.drops) for state in states), self._drops)),
+            trouble=None if is_connected else f"the hub {self._address} cannot be reached",
+            disk=next((state.disk for state in states if state.disk), None),
+        )
+
+    async def run(self) -> None:
+        """Keep it. Raises SkylessError: a folder of a site cannot be written."""
+        client = self._client = await connect(self._address, "skyless history", self._say, self._drops)
+        self._stream = client.jetstream()
+        try:
+            async with asyncio.TaskGroup() as self._tasks:
+                for folder in self._folder.glob("site=*"):
+                    if (number := folder.name.removeprefix("site=")).isdecimal():
+                        self._keep_site(int(number))
+                self._tasks.create_task(self._find_sites(client))
+        except* SkylessError as errors:
+            raise errors.exceptions[0] from None
+        finally:
+            await client.close()
+
+    def _keep_site(self, number: int) -> None:
+        if number not in self._sites and self._only in {None, number}:
+            writer = Writer(self._folder, number, "hub ")
+            site = self._sites[number] = _Site(self._stream, writer, self._keep, self._log)
+            self._tasks.create_task(site.run())
+
+    async def _find_sites(self, client: "Client") -> None:
+        """Keep all sites that the hub has."""
+        while True:
+            try:
+                for number in sorted(await sites_at(client)):
+                    self._keep_site(number)
+            except Error as error:
+                self._say(f"the sites at the hub cannot be listed: {error or type(error).__name__}")
+            await asyncio.sleep(LIST_S)
+
+
+# Recordings become history, without what it has already, from the same file or from the running site.
+
+_CHUNK: Final = 100_000
+_MARGIN: Final = timedelta(days=1)
+"""A message may have arrived a little earlier or later at the running history."""
+
+
+class Imported(Struct, frozen=True):
+    """What became of a recording."""
+
+    fixes: int
+    known_fixes: int
+    """Those that the history had."""
+    events: int
+    drops: dict[str, int]
+
+
+def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[float], None]) -> Imported:
+    """Write its fixes, zone events and zones. ``reach`` is called with the time that has been read, Unix time in s.
+
+    A tag has one fix in a millisecond.
+
+    Raises:
+        SkylessError: the history cannot be read.
+        OSError: the disk does not take it; what it took is there, and a repetition adds the rest.
+    """
+    writer.write()  # what an earlier import, or a run, has left in the journal
+    writer.set_zones(() if recording.zones is None else recording.zones.zones)
+    simulated = recording.site is not None and recording.site.simulated
+    known, known_events = _known(recording, writer)
+    log = EventLog()
+    chunk: list[tuple[int, FixMessage]] = []
+    counts = {"fixes": 0, "known_fixes": 0, "events": 0}
+    day, arrived_s = None, 0.0
+
+    def add() -> None:
+        records = records_of(chunk, simulated=simulated)
+        keys, rows = np.unique(_keys(records["tag"], unix_ms(records)), return_index=True)
+        new = records[rows[~np.isin(keys, known)]]
+        writer.fixes.add(new, arrived_s)
+        writer.store()
+        if writer.unwritten >= FILE_ROWS:
+            writer.write()
+        counts["fixes"] += len(new)
+        counts["known_fixes"] += len(chunk) - len(new)
+        chunk.clear()
+
+    for found in recording.messages({"fix", "event"}):
+        if isinstance(found.message, ZoneEvent):
+            events = [event for event in log.of(found.message, found.time_s) if event not in known_events]
+            writer.events.add(events, found.time_s)
+            counts["events"] += len(events)
+            continue
+        of_day = datetime.fromtimestamp(found.time_s, UTC).date()
+        if chunk and (of_day != day or len(chunk) >= _CHUNK):
+            add()
+            reach(found.time_s)
+        day, arrived_s = of_day, found.time_s
+        fix = cast("FixMessage", found.message)
+        number = writer.number(fix, found.time_s)
+        if number is not None:
+            chunk.append((number, fix))
+    add()
+    writer.write()
+    return Imported(**counts, drops=dict(writer.drops + recording.drops))
+
+
+def _known(recording: McapRecording, writer: Writer) -> tuple[NDArray[np.int64], set[Event]]:
+    """Keys of the fixes, and the events, that the history has of the time of a recording."""
+    summary = recording.summary()
+    if summary.start_s is None or summary.end_s is None:
+        return np.empty(0, np.int64), set()
+    begin = datetime.fromtimestamp(summary.start_s, UTC) - _MARGIN
+    end = datetime.fromtimestamp(summary.end_s, UTC) + _MARGIN
+    span = (pc.field("t") >= begin) & (pc.field("t") <= end)
+    files, events = (
+        [file for file in current(writer.root, writer.site) if str(begin.date()) <= day_of(file) <= str(end.date())]
+        for current in (current_files, current_events)
+    )
+    columns = {name: FIX_COLUMNS[name] for name in ("tag", "t")}
+    tables = [read_table(file, columns, span) for file in files]
+    keys = [_keys(table["tag"].to_numpy(), table["t"].cast(pa.int64()).to_numpy()) for table in tables]
+    return np.concatenate([np.empty(0, np.int64), *keys]), set(read_events(events, span))
+
+
+def _keys(tag: NDArray[Any], ms: NDArray[np.int64]) -> NDArray[np.int64]:
+    """A number for each tag and millisecond; times have 43 bits (``LIMITS.last_unix_s``), tags fewer than 20."""
+    return (tag.astype(np.int64) << 43) | ms

@@ -2,15 +2,22 @@
 
 import os
 import re
+import secrets
 import ssl
+from collections.abc import Mapping
+from enum import StrEnum
 from pathlib import Path
 from typing import Final
 from urllib.parse import SplitResult, unquote, urlsplit
 
 from msgspec import Struct
 from msgspec.structs import replace
+from paho.mqtt.client import topic_matches_sub
 
-from skyless.core.errors import SkylessError
+from skyless.core.errors import SkylessError, writing
+from skyless.core.whole_files import replace_files
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.topics import EVERY_NODE, EVERY_SITE
 
 PASSWORD_VARIABLE: Final = "SKYLESS_MQTT_PASSWORD"
 _PORTS: Final = {"mqtt": 1883, "mqtts": 8883}
@@ -139,3 +146,183 @@ def hide_password(url: str) -> str:
 def is_loopback(host: str) -> bool:
     """Whether a host is this machine."""
     return _LOOPBACK.fullmatch(host) is not None
+
+
+# Roles at the broker (``docs/mqtt.md``, Roles): which topics each may publish and subscribe to, and their passwords.
+#
+# Passwords are in a private folder with one file for each role, ``<role>.env``. A file sets the variables that a
+# program of the role reads, in the form of systemd, Docker and the shell: it is copied to the machines of that role
+# only.
+
+
+class Role(StrEnum):
+    """What a client is for; except for the stranger's, also its user name."""
+
+    ANCHORS = "anchors"
+    """Anchors, and the emulated air."""
+    TAGS = "tags"
+    PAGE = "page"
+    """What shows, records and passes on: dashboard, watch, doctor, record, bridge; also Home Assistant itself."""
+    SURVEY = "survey"
+    """What moves anchors: survey, and a dashboard whose users set up the site."""
+    OPERATOR = "operator"
+    """A person, and programs that are all of a site in one: the demo, tags in a system without Skyless's anchors."""
+    STRANGER = "stranger"
+    """A client without user and password, where the operator admits it."""
+
+
+class Access(Struct, frozen=True):
+    """Topic filters of a role."""
+
+    publish: tuple[str, ...]
+    subscribe: tuple[str, ...]
+
+
+EVERYTHING: Final = "#"
+
+
+def _status(*kinds: str) -> tuple[str, ...]:
+    return tuple(topics.status_topic(EVERY_SITE, kind, EVERY_NODE) for kind in kinds)
+
+
+def _health(*kinds: str) -> tuple[str, ...]:
+    return tuple(topics.health_topic(EVERY_SITE, kind, EVERY_NODE) for kind in kinds)
+
+
+_SHOWN: Final = (
+    topics.request_topic(EVERY_SITE),
+    topics.floor_plan_topic(EVERY_SITE),
+    topics.zones_topic(EVERY_SITE),
+    topics.zone_event_topic(EVERY_SITE, "+"),
+    topics.tag_zones_topic(EVERY_SITE, EVERY_NODE),
+    topics.tag_position_topic(EVERY_SITE, EVERY_NODE),
+    topics.assets_topic(EVERY_SITE),
+    topics.alarm_rules_topic(EVERY_SITE),
+    topics.alarm_topic(EVERY_SITE, "+", "+"),
+    topics.acknowledge_topic(EVERY_SITE, "+", "+"),
+)
+"""What the page publishes, whether its users may set up the site or not."""
+
+ACCESS: Final = {
+    Role.ANCHORS: Access(
+        publish=(
+            topics.site_topic(EVERY_SITE),
+            topics.floor_plan_topic(EVERY_SITE),
+            topics.plan_of_floor_topic(EVERY_SITE, "+"),
+            topics.stamps_topic(EVERY_SITE, EVERY_NODE),
+            topics.truth_topic(EVERY_SITE),
+            *_status("anchor", "ether"),
+            *_health("anchor", "ether"),
+        ),
+        # A node reads its own status, to correct a late last will.
+        subscribe=(topics.request_topic(EVERY_SITE), topics.placement_topic(EVERY_SITE), *_status("anchor", "ether")),
+    ),
+    Role.TAGS: Access(
+        publish=(
+            topics.fix_topic(EVERY_SITE, EVERY_NODE),
+            topics.receptions_topic(EVERY_SITE, EVERY_NODE),
+            *_status("tag"),
+            *_health("tag"),
+        ),
+        subscribe=(topics.request_topic(EVERY_SITE), *_status("tag")),
+    ),
+    Role.PAGE: Access(
+        publish=(
+            *_SHOWN,
+            *_status("dashboard", "recorder", "history", "bridge", "homeassistant", "watch", "doctor"),
+            "homeassistant/device/+/config",
+            "homeassistant/status",
+        ),
+        subscribe=("skyless/#", "homeassistant/#"),
+    ),
+    Role.SURVEY: Access(
+        publish=(
+            *_SHOWN,
+            topics.survey_topic(EVERY_SITE),
+            topics.survey_facts_topic(EVERY_SITE),
+            topics.survey_save_topic(EVERY_SITE),
+            topics.placement_topic(EVERY_SITE),
+            topics.watch_topic(EVERY_SITE),
+            *_status("dashboard", "survey"),
+        ),
+        subscribe=("skyless/#",),
+    ),
+    Role.OPERATOR: Access(publish=(EVERYTHING,), subscribe=(EVERYTHING,)),
+    Role.STRANGER: Access(
+        publish=(),
+        subscribe=(topics.site_topic(EVERY_SITE), topics.fix_topic(EVERY_SITE, EVERY_NODE)),
+    ),
+}
+
+
+def may_subscribe(user: str | None, topic_filter: str) -> bool | None:
+    """Whether the roles let a user subscribe to a filter; None where it is not known, as without roles."""
+    if user is not None and user not in ACCESS:
+        return None
+    granted = any(topic_matches_sub(one, topic_filter) for one in ACCESS[Role(user or Role.STRANGER)].subscribe)
+    return granted or (None if user is None else False)
+
+
+USERS: Final = tuple(role for role in Role if role is not Role.STRANGER)
+"""Roles with a password."""
+
+_PASSWORD_BYTES: Final = 24
+_PASSWORD_LINE: Final = re.compile(r"[A-Za-z0-9_-]{12,200}")
+"""Nothing that means something to a shell, systemd or nats-server."""
+_PLAIN_ADDRESS: Final = re.compile(r"[\w.:@/\[\]-]+", re.ASCII)
+_MAX_BYTES: Final = 65_536
+_OTHERS: Final = 0o077
+
+
+def create_access(folder: Path, address: MqttAddress) -> tuple[Path, ...]:
+    """Make the files that a folder lacks, with random passwords; those that stand there stay. Their paths.
+
+    Raises:
+        SkylessError: none is missing, the address has a user, or the folder cannot be written.
+    """
+    if address.user is not None or not _PLAIN_ADDRESS.fullmatch(str(address)):
+        raise SkylessError(f"--mqtt is {str(address)!r}; it should be the broker's address without a user")
+    missing = {role: folder / f"{role}.env" for role in USERS if not os.path.lexists(folder / f"{role}.env")}
+    if not missing:
+        raise SkylessError(f"{folder} has the files of all roles; one that is to be replaced should be removed first")
+    with writing(folder):
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        files = {file: _text(role, replace(address, user=str(role))).encode() for role, file in missing.items()}
+        replace_files(files, secret=files)
+    return tuple(missing.values())
+
+
+def _text(role: Role, address: MqttAddress) -> str:
+    return (
+        f"# Skyless: the role {role} at the MQTT broker (docs/mqtt.md). Only for machines of this role.\n"
+        f"SKYLESS_MQTT={address}\n"
+        f"{PASSWORD_VARIABLE}={secrets.token_urlsafe(_PASSWORD_BYTES)}\n"
+    )
+
+
+def read_access(folder: Path) -> Mapping[Role, str]:
+    """The password of each role.
+
+    Raises:
+        SkylessError: a file is missing, others than its owner may use it, or it has no usable password.
+    """
+    return {role: _password(folder / f"{role}.env") for role in USERS}
+
+
+def _password(file: Path) -> str:
+    try:
+        with file.open("rb") as source:
+            mode = os.fstat(source.fileno()).st_mode & 0o777
+            text = source.read(_MAX_BYTES).decode(errors="replace")
+    except FileNotFoundError:
+        raise SkylessError(f"{file} is missing; skyless broker access {file.parent} makes it") from None
+    except OSError as error:
+        raise SkylessError(f"{file} cannot be read: {error.strerror}") from None
+    if mode & _OTHERS:
+        raise SkylessError(f"{file} has mode {mode:03o}; only its owner should have access: chmod 600 {file}")
+    values = re.findall(rf"^[ \t]*{PASSWORD_VARIABLE}=(.*?)[ \t\r]*$", text, re.MULTILINE)
+    if len(values) != 1 or not _PASSWORD_LINE.fullmatch(values[0]):
+        raise SkylessError(
+            f"{file} should have one line {PASSWORD_VARIABLE}=… with 12 to 200 letters, digits, hyphens and underscores"
+        )
+    return str(values[0])

@@ -16,11 +16,12 @@ from msgspec import Struct
 from paho.mqtt.matcher import MQTTMatcher
 
 from skyless.core.version import installed_version
-from skyless.run.mqtt.access import may_subscribe
-from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.address import MqttAddress, may_subscribe
 from skyless.run.mqtt.connection import (
     Connection,
     Introduction,
+    Limits,
+    Outbox,
     Reactions,
     RefusedError,
     Will,
@@ -28,7 +29,6 @@ from skyless.run.mqtt.connection import (
     trouble_with,
 )
 from skyless.run.mqtt.messages import Counters, StatusMessage
-from skyless.run.mqtt.outbox import Limits, Outbox
 from skyless.run.mqtt.topics import status_topic
 
 _log = logging.getLogger("skyless.run.mqtt")

@@ -338,7 +338,7 @@ class SegmentStart(Struct, frozen=True):
     settings: dict[str, str | float | int | None]
     """Arguments of the receiver."""
     state: bytes | None
-    """Its state (``skyless.run.recordings.reception_log``); None for a receiver that had heard nothing yet."""
+    """Its state (``skyless.run.recordings.recorder``); None for a receiver that had heard nothing yet."""
 
 
 class Zone(Struct, frozen=True):

@@ -40,10 +40,17 @@ from skyless.run.mqtt.topics import (
     survey_topic,
     watch_topic,
 )
+from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import Log, every, keep, outlasting, reader, together
-from skyless.run.radio_monitor import RadioMonitor
-from skyless.run.survey._live_survey import FactsOf, LiveSurvey
-from skyless.run.survey.files import FloorImage, Saved, record_of, save_survey, saved_without_file
+from skyless.run.survey.live_survey import (
+    FactsOf,
+    FloorImage,
+    LiveSurvey,
+    Saved,
+    record_of,
+    save_survey,
+    saved_without_file,
+)
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, PairRanges, Survey
 from skyless.site.survey.legs import LegCollector

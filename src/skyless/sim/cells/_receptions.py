@@ -27,8 +27,8 @@ from skyless.sim.cells._reception import (
     squared_m2,
 )
 from skyless.sim.cells._timetable import BIN_BITS, Buckets, Table, latest
-from skyless.sim.range_errors import slope_error_m
-from skyless.sim.stations import coordinate_m
+from skyless.sim.impairments import slope_error_m
+from skyless.sim.listening import coordinate_m
 from skyless.site.kernels import kernel, step
 
 RELAY_AGE_TICKS: Final = round(1.0 * TICK_RATE_HZ)

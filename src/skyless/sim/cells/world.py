@@ -46,8 +46,7 @@ from skyless.sim.cells._timetable import (
     make_buckets,
     scheduled_table,
 )
-from skyless.sim.impairments import Impairments
-from skyless.sim.range_errors import RangeErrorModel
+from skyless.sim.impairments import Impairments, RangeErrorModel
 from skyless.sim.trajectory import Trajectory
 from skyless.site.kernels import kernel
 

@@ -1,1 +1,0 @@
-"""Alarms: which rules are raised, for whom, and when they end."""

@@ -1,1 +1,0 @@
-"""Checks of a computer and its boards, for ``skyless doctor``."""

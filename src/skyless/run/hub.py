@@ -1,0 +1,549 @@
+"""What a site publishes on MQTT, as a hub has it: for programs that only read."""
+
+import asyncio
+import contextlib
+import json
+import logging
+import re
+import secrets
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import msgspec
+from msgspec import Struct
+from msgspec.structs import replace
+from nats.errors import Error
+from nats.js.api import ExternalStream, StreamConfig, StreamSource
+from nats.js.errors import NotFoundError
+
+from skyless.core.errors import SkylessError, writing
+from skyless.core.whole_files import replace_files
+from skyless.run.broker import Broker
+from skyless.run.find_site import KnownSites
+from skyless.run.gather import streams
+from skyless.run.gather.node import PING_INTERVAL, Leaf, StuckLineError, Summary
+from skyless.run.gather.streams import (
+    DOMAIN,
+    EVENT_BYTES,
+    FIRST_PORT,
+    KEEP_EVENTS_S,
+    KEEP_S,
+    MAX_PAYLOAD,
+    NEWEST_OF_EACH,
+    SOURCED,
+    SUMMARY,
+    NatsAddress,
+    at,
+    connect,
+    follow,
+    make_stream,
+    rarely,
+)
+from skyless.run.mqtt.address import PASSWORD_VARIABLE, is_loopback
+from skyless.run.mqtt.link import Handler, Subscriptions
+from skyless.run.process import Log, together
+
+if TYPE_CHECKING:
+    from nats.aio.client import Client
+    from nats.aio.msg import Msg
+
+SILENT_S: Final = 5.0
+"""The line to a site counts as cut when its gather has not been heard for so long."""
+_CHECK_S: Final = 0.5
+_KEPT: Final = (*streams.STATE, *streams.EVENTS, streams.JSON_FIXES)
+"""What comes from streams, fixes as batches."""
+
+_log = logging.getLogger("skyless.run.hub")
+
+
+class HubLink:
+    """Takes the place of ``Link`` at a hub: handlers get the messages of one site by MQTT's topics.
+
+    Retained messages and events come from the hub's streams, so that they are complete after every cut; healths and
+    the like come while the line is up. Fixes come in batches only, not here. What is published is dropped: a site is
+    changed at the site.
+    """
+
+    def __init__(self, address: NatsAddress, site: int, name: str) -> None:
+        self.address, self.site = address, site
+        self.connected = False
+        """Whether the hub is connected and the site's gather is heard there."""
+        self.trouble: str | None = "not connected yet"
+        self.on_state: list[Callable[[bool], None]] = []
+        """Called with ``connected`` whenever it changes."""
+        self.unacknowledged, self.unread_s, self.refused = 0, 0.0, frozenset[str]()
+        self.drops: Counter[str] = Counter()
+        self._name = name
+        self._subscriptions = Subscriptions()
+        self._heard_s = float("-inf")
+        self._say = rarely(_log.warning)
+
+    def subscribe(self, topic_filter: str, handler: Handler, qos: int = 0) -> None:
+        """Call ``handler`` with every message of a filter. All of a link's handlers stand before it runs."""
+        self._subscriptions.add(topic_filter, handler, qos)
+
+    def publish(
+        self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False, until_s: float = 0.0
+    ) -> None:
+        """Drop a message."""
+
+    def forget(self, topic: str) -> None:
+        """Nothing is repeated."""
+
+    async def run(self) -> None:
+        """Read until cancelled."""
+        client = await connect(self.address, self._name, self._say, self.drops)
+        try:
+            await client.subscribe(streams.at(streams.SUMMARY, self.site), cb=self._on_summary)
+            for topic_filter in self._subscriptions.filters:
+                if self._is_live(topic_filter):
+                    await client.subscribe(streams.subject_of(topic_filter), cb=self._on_message)
+            await together(
+                self._follow(client, streams.STATE_STREAM),
+                self._follow(client, streams.EVENT_STREAM),
+                self._watch(client),
+            )
+        finally:
+            await client.close()
+            self._set_state("stopped")
+
+    def _is_live(self, topic_filter: str) -> bool:
+        """Whether the messages of a filter are in no stream."""
+        levels = streams.subject_of(topic_filter).split(".")
+        for subject in _KEPT:
+            kept = streams.at(subject, self.site).split(".")
+            if len(kept) == len(levels) and all(one in ("*", level) for one, level in zip(kept, levels, strict=True)):
+                return False
+        return True
+
+    async def _follow(self, client: "Client", pattern: str) -> None:
+        name, own = streams.at(pattern, self.site), f"skyless.v1.{self.site}.>"
+        found = follow(client.jetstream(), name, own, self._say, newest_of_each=True)
+        async for message in found:
+            await self._on_message(message)
+
+    async def _watch(self, client: "Client") -> None:
+        """State whether the site is heard."""
+        while True:
+            if not client.is_connected:
+                self._set_state(f"the hub {self.address} cannot be reached")
+            elif time.monotonic() - self._heard_s > SILENT_S:
+                self._set_state(f"site {self.site} is not heard: its line to the hub is cut, or no gather runs there")
+            else:
+                self._set_state(None)
+            await asyncio.sleep(_CHECK_S)
+
+    def _set_state(self, trouble: str | None) -> None:
+        self.trouble = trouble
+        if self.connected != (trouble is None):
+            self.connected = trouble is None
+            for callback in self.on_state:
+                callback(self.connected)
+
+    async def _on_summary(self, _message: "Msg") -> None:
+        self._heard_s = time.monotonic()
+
+    async def _on_message(self, message: "Msg") -> None:
+        self._subscriptions.receive(streams.topic_of(message.subject), message.data)
+
+
+# The files of a hub: one states what was asked and all passwords, and the others are made of it.
+#
+# Each tenant is an account of plain nats-server: one user that may do everything, and one for each site.
+
+CLUSTER_PORT: Final = 2000
+LEAF_PORT: Final = 3200
+MONITOR_PORT: Final = 4000
+"""What is added to a node's port for other servers of the hub, for sites, and for monitoring on the node itself."""
+PLAN: Final = "hub.json"
+
+_NODE: Final = re.compile(r"([A-Za-z0-9][A-Za-z0-9.-]*)(?::(\d{1,5}))?")
+_CLUSTER: Final = "hub.node"
+_ADMIN: Final = "hub.admin"
+_SITE: Final = "{}.site{}"
+"""Users; names of tenants have no dot."""
+
+
+class Node(Struct, frozen=True):
+    """A server of a hub."""
+
+    host: str
+    port: int
+
+    @property
+    def name(self) -> str:
+        """Name of the server and of its folder."""
+        return self.host if self.port == FIRST_PORT else f"{self.host}-{self.port}"
+
+
+def read_node(option: str, text: str) -> Node:
+    """HOST or HOST:PORT. Raises SkylessError."""
+    found = _NODE.fullmatch(text)
+    most = 0xFFFF - MONITOR_PORT
+    if found is None or not 1 <= int(found[2] or FIRST_PORT) <= most:
+        raise SkylessError(f"{option} is {text!r}; it should be HOST or HOST:PORT, the port at most {most}")
+    return Node(found[1], int(found[2] or FIRST_PORT))
+
+
+class Hub(Struct, frozen=True):
+    """What was asked of a hub, and all of its passwords."""
+
+    nodes: tuple[Node, ...]
+    fixes_gb: float = 50.0
+    """Fixes that each server keeps of each tenant."""
+    data: str = "/var/lib/skyless-hub"
+    certificates: str = "/etc/skyless-hub"
+    sites: dict[str, list[int]] = {}
+    """Of each tenant."""
+    passwords: dict[str, str] = {}
+    """By user."""
+
+    @property
+    def ca(self) -> str | None:
+        """Certificates that all machines trust; None without TLS, on one machine alone."""
+        return None if all(is_loopback(node.host) for node in self.nodes) else f"{self.certificates}/ca.pem"
+
+    def address(self, user: str, added: int = 0) -> NatsAddress:
+        """Where a user connects; what is ``added`` to the ports says for what."""
+        hosts = ",".join(f"{node.host}:{node.port + added}" for node in self.nodes)
+        url, ca = (f"nats://{hosts}", None) if self.ca is None else (f"tls://{hosts}", Path(self.ca))
+        return NatsAddress(url, user, self.passwords[user], ca)
+
+    def leaf(self, tenant: str, site: int) -> Leaf:
+        """What a site needs."""
+        user = _SITE.format(tenant, site)
+        urls = self.address(user, LEAF_PORT).servers
+        return Leaf(site=site, tenant=tenant, urls=urls, user=user, password=self.passwords[user], ca=self.ca)
+
+
+def with_sites(hub: Hub, tenant: str, sites: Iterable[int]) -> Hub:
+    """The hub with a tenant and its sites; passwords that are there stay."""
+    numbers = hub.sites | {tenant: sorted({*hub.sites.get(tenant, ()), *sites})}
+    users = [_CLUSTER, _ADMIN, *numbers, *(_SITE.format(name, site) for name in numbers for site in numbers[name])]
+    return replace(hub, sites=numbers, passwords={user: secrets.token_urlsafe(24) for user in users} | hub.passwords)
+
+
+def write_files(hub: Hub, folder: Path) -> list[Path]:
+    """Write what has changed, for the owner alone. The files' paths. Raises SkylessError."""
+    values: dict[Path, object] = {folder / node.name / "nats-server.conf": _server(hub, node) for node in hub.nodes}
+    for tenant, sites in hub.sites.items():
+        values |= {folder / "sites" / f"{tenant}-site{site}.json": hub.leaf(tenant, site) for site in sites}
+    values[folder / PLAN] = hub
+    files = {file: msgspec.json.format(msgspec.json.encode(value), indent=1) for file, value in values.items()}
+    trusted = "" if hub.ca is None else f"SKYLESS_MQTT_CA={hub.ca}\n"
+    for tenant in hub.sites:
+        text = f"SKYLESS_HUB={hub.address(tenant)}\n{PASSWORD_VARIABLE}={hub.passwords[tenant]}\n{trusted}"
+        files[folder / "tenants" / f"{tenant}.env"] = text.encode()
+    with writing(folder):
+        changed = {file: data for file, data in files.items() if not file.exists() or file.read_bytes() != data}
+        for file in changed:
+            file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+        replace_files(changed, secret=changed)
+    return list(changed)
+
+
+def _server(hub: Hub, node: Node) -> dict[str, Any]:
+    """The configuration of nats-server, whose format takes JSON."""
+    host, tls, folder = node.host, {}, hub.certificates
+    if hub.ca is not None:
+        files = {"cert_file": f"{folder}/cert.pem", "key_file": f"{folder}/key.pem", "ca_file": hub.ca}
+        host, tls = "0.0.0.0", {"tls": files}
+    accounts: dict[str, Any] = {"SYS": {"users": [_user(hub, _ADMIN)]}}
+    for tenant, sites in hub.sites.items():
+        users = [_user(hub, tenant), *(_user(hub, _SITE.format(tenant, site), _access(site)) for site in sites)]
+        accounts[tenant] = {"jetstream": "enabled", "users": users}
+    whole: dict[str, Any] = {
+        "server_name": node.name,
+        "listen": f"{host}:{node.port}",
+        "http": f"127.0.0.1:{node.port + MONITOR_PORT}",
+        "max_payload": MAX_PAYLOAD,
+        "ping_interval": PING_INTERVAL,
+        "jetstream": {"domain": "hub", "store_dir": f"{hub.data}/{node.name}"},
+        "leafnodes": {"listen": f"{host}:{node.port + LEAF_PORT}", "no_advertise": True, **tls},
+        "accounts": accounts,
+        "system_account": "SYS",
+        **tls,
+    }
+    if len(hub.nodes) > 1:
+        own, others = _user(hub, _CLUSTER), [other for other in hub.nodes if other != node]
+        whole["cluster"] = {
+            "name": "hub",
+            "listen": f"{host}:{node.port + CLUSTER_PORT}",
+            "no_advertise": True,
+            "authorization": own,
+            "routes": [f"nats://{':'.join(own.values())}@{one.host}:{one.port + CLUSTER_PORT}" for one in others],
+            **tls,
+        }
+    return whole
+
+
+def _user(hub: Hub, name: str, access: dict[str, Any] | None = None) -> dict[str, Any]:
+    return {"user": name, "password": hub.passwords[name], **(access or {})}
+
+
+def _access(site: int) -> dict[str, Any]:
+    """A site publishes what is its own, and takes what the hub's streams ask of it, but no command."""
+    publish = [f"skyless.v1.{site}.>", f"skyless.v2.{site}.>", f"{at(SOURCED, site)}.>", "$JSC.R.>", "$JS.R.>", "_R_.>"]
+    asked = f"$JS.{at(DOMAIN, site)}.API"
+    subscribe = {"allow": [f"{asked}.>", "$JS.ACK.>", "$JS.FC.>", at(SUMMARY, site)], "deny": [f"{asked}.STREAM.>"]}
+    return {"permissions": {"publish": {"allow": publish}, "subscribe": subscribe}}
+
+
+# A site's line to the hub: whether it is up, and whether another site has the same number there.
+
+_LINE_CHECK_S: Final = 2.0
+_SILENT_CHECKS: Final = 3
+_STUCK_S: Final = 300.0
+_UP: Final = "Leafnode connection created"
+
+
+async def watch_line(leaf: Leaf, broker: Broker, log: Log) -> None:
+    """Log when the line is lost and when it is back, until cancelled. Raises StuckLineError.
+
+    The log of nats-server names every try. A line that the hub refuses, or where it does not answer,
+    is up for a moment.
+    """
+    newest, said, unsteady, tried_s = "", "", 0, time.monotonic()
+    while True:
+        await asyncio.sleep(_LINE_CHECK_S)
+        text = (broker.data / "nats-server.log").read_text(encoding="utf-8", errors="replace")
+        found = re.findall(rf"^\[{broker.pid}\] (.*leaf.*)$", text, re.MULTILINE | re.IGNORECASE)
+        before, newest = newest, found[-1] if found else newest
+        newest_lines = found[-3:]
+        faults = [line for line in newest_lines if "[ERR]" in line]
+        if not faults and unsteady >= _SILENT_CHECKS:  # the hub takes connections, and nothing comes back
+            faults = [line for line in newest_lines if _UP not in line]
+        is_up = _UP in newest
+        unsteady = 0 if is_up and newest == before else unsteady + 1
+        state = ""
+        if not unsteady:
+            state = f"the line to the hub is up, as site {leaf.site} of {leaf.tenant}"
+        elif faults:
+            state = f"no line to the hub; the site works on without it: {faults[-1].partition('] ')[2]}"
+        kind = re.sub(r"\d+", "", state.rpartition(": ")[2])  # the same at every try
+        if state and kind != said:
+            said = kind
+            log(state)
+        if is_up or newest != before:
+            tried_s = time.monotonic()
+        elif time.monotonic() > tried_s + _STUCK_S:
+            raise StuckLineError
+
+
+async def refuse_second(leaf: Leaf, address: NatsAddress, log: Log) -> None:
+    """Watch that no other site with this number was at the hub before this one. Raises SkylessError."""
+    own = ""
+    async with await connect(address, "skyless broker", rarely(log), Counter()) as client:
+        heard = await client.subscribe(streams.at(streams.SUMMARY, leaf.site))
+        async for message in heard.messages:
+            with contextlib.suppress(Error, msgspec.DecodeError):
+                stream = streams.at(streams.FIX_STREAM, leaf.site)
+                own = own or str((await client.jetstream().stream_info(stream)).created)
+                other = msgspec.json.decode(message.data, type=Summary)
+                if other.since and other.since < own:
+                    raise SkylessError(
+                        f"--hub is of site {leaf.site}, which is already at this hub: {other.site!r}, gathered at host "
+                        f"{other.host}; give this site another number"
+                    )
+
+
+# The streams of a hub, which take what the sites' own streams have whenever their lines are up.
+#
+# Each site has its own, so that none can push out what another has sent. A source asks for the subjects of its site,
+# which the site's server may ignore: so readers ask the hub for those subjects again, and take the site from the
+# stream.
+
+_READY_S: Final = 60.0
+_RETRY_S: Final = 1.0
+_LISTEN_S: Final = 2.5
+_NAMES_BYTES: Final = 30_000_000
+_STATE_BYTES: Final = 100_000_000
+"""What a site can store at most: names of 200,000 tags; floor plans, and statuses of as many programs."""
+_OF_ALL_SITES: Final = ("FIXES", "NAMES", "STATE", "EVENTS")
+"""Streams of earlier hubs, in which each site could write as another."""
+
+
+async def make_hub_streams(client: "Client", hub: Hub, tenant: str) -> None:
+    """Make the streams of a tenant, or change those that are there. Raises nats.errors.Error."""
+    stream, sites = client.jetstream(), hub.sites[tenant]
+    for name in _OF_ALL_SITES:
+        with contextlib.suppress(NotFoundError):
+            await stream.delete_stream(name)
+    share = 1.0 / max(1, len(sites))
+    of_each: tuple[tuple[int, str, dict[str, Any]], ...] = (
+        (1, streams.STATE_STREAM, NEWEST_OF_EACH | {"max_bytes": _STATE_BYTES}),
+        (2, streams.NAMES_STREAM, NEWEST_OF_EACH | {"max_bytes": _NAMES_BYTES}),
+        (1, streams.EVENT_STREAM, {"max_age": KEEP_EVENTS_S, "max_bytes": round(4 * EVENT_BYTES * share)}),
+        (2, streams.FIX_STREAM, {"max_age": KEEP_S, "max_bytes": round(1e9 * hub.fixes_gb * share)}),
+    )
+    there = await sites_at(client)
+    for site in sorted(sites, key=lambda site: site not in there):  # those that are there make room first
+        api, deliver = f"$JS.{streams.at(streams.DOMAIN, site)}.API", streams.at(streams.SOURCED, site)
+        for version, pattern, limits in of_each:
+            name, own = streams.at(pattern, site), f"skyless.v{version}.{site}.>"
+            source = StreamSource(name=name, filter_subject=own, external=ExternalStream(api=api, deliver=deliver))
+            config = StreamConfig(name=name, num_replicas=len(hub.nodes), sources=[source], **limits)
+            await make_stream(stream, config)
+
+
+async def sites_at(client: "Client") -> set[int]:
+    """The sites of a tenant that have streams at its hub. Raises nats.errors.Error."""
+    found, total = set[str](), 1
+    while len(found) < total:
+        answer = await client.request("$JS.API.STREAM.NAMES", json.dumps({"offset": len(found)}).encode())
+        page = json.loads(answer.data)
+        names, total = page.get("streams") or (), page.get("total", 0)
+        if not names:
+            break
+        found.update(names)
+    prefix = streams.at(streams.STATE_STREAM, "")
+    return {int(name.removeprefix(prefix)) for name in found if re.fullmatch(rf"{prefix}\d{{1,5}}", name)}
+
+
+async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary | None]:
+    """Make the streams of a tenant, or extend them. Returns what each site says; None where it is not heard.
+
+    Raises SkylessError: the hub is not ready within a minute.
+    """
+    address, say = hub.address(tenant), rarely(lambda trouble: log(f"waits for the hub: {trouble}"))
+    try:
+        async with asyncio.timeout(_READY_S):
+            client = await connect(address, "skyless hub", say, Counter())
+            while True:
+                try:
+                    await make_hub_streams(client, hub, tenant)
+                    break
+                except (Error, TimeoutError) as error:
+                    say(str(error) or type(error).__name__)
+                await asyncio.sleep(_RETRY_S)
+    except TimeoutError:
+        raise SkylessError(f"the hub {address} is not ready, or has no room for --fixes-gb {hub.fixes_gb:g}") from None
+    async with client:
+        heard = await client.subscribe(streams.at(streams.SUMMARY, streams.EVERY))
+        await asyncio.sleep(_LISTEN_S)
+        messages = [await heard.next_msg() for _ in range(heard.pending_msgs)]
+    found = dict[int | None, Summary]()
+    for one in messages:
+        with contextlib.suppress(msgspec.MsgspecError):
+            found[streams.site_in(one.subject)] = msgspec.json.decode(one.data, type=Summary)
+    return {site: found.get(site) for site in hub.sites[tenant]}
+
+
+# The sites at a hub: names from what they retain, conditions from what their gathers say every second.
+
+LISTEN_S: Final = 2.5
+"""After this time every site whose line is up has been heard."""
+LIST_S: Final = 5.0
+"""Interval at which the hub is asked which sites it has."""
+_ORDER: Final = ("bad", "cut", "degraded", "unknown", "good")
+
+
+class HubSite(Struct, frozen=True):
+    """How a site is, as a hub knows it. What is not known of one that is not heard is None."""
+
+    number: int
+    name: str
+    condition: Literal["bad", "cut", "degraded", "unknown", "good"]
+    """``cut``: it is not heard. ``unknown``: it is not heard yet, or does not say."""
+    reason: str
+    """The first one; empty where all is well."""
+    tags_heard: int | None = None
+    anchors_online: int | None = None
+    versions: dict[str, int] | None = None
+    """Programs that are online, by version."""
+    heard_unix_s: float | None = None
+    """When this program heard it last."""
+
+
+class HubSites:
+    """The sites of a tenant at a hub."""
+
+    def __init__(self, address: NatsAddress, now_s: float) -> None:
+        self.address = address
+        self._began_s = now_s
+        self._known = KnownSites()
+        self._heard: dict[int, tuple[float, float, Summary]] = {}
+        """The newest summary of each, and when it came, by both clocks."""
+        self._client: Client | None = None
+
+    @property
+    def connected(self) -> bool:
+        """Whether the hub is."""
+        return self._client is not None and self._client.is_connected
+
+    @property
+    def has_answered(self) -> bool:
+        """Whether the hub has been connected."""
+        return self._client is not None
+
+    def add_site(self, topic: str, payload: bytes) -> None:
+        """A site has published itself."""
+        self._known.add(topic, payload)
+
+    def add_summary(self, number: int, payload: bytes, now_s: float, unix_s: float) -> None:
+        """The gather of a site has said how it is. What cannot be read changes nothing."""
+        with contextlib.suppress(msgspec.MsgspecError):
+            self._heard[number] = now_s, unix_s, msgspec.json.decode(payload, type=Summary)
+
+    def names(self) -> dict[int, str]:
+        """The names of the sites by their numbers."""
+        heard = {number: summary.site for number, (_, _, summary) in self._heard.items()}
+        known = {site.number: site.name for site in self._known.sites()}
+        return heard | known | {number: name for number, name in heard.items() if name}
+
+    def sites(self, now_s: float) -> list[HubSite]:
+        """The sites, those in trouble first."""
+        found = [self._site(number, name, now_s) for number, name in self.names().items()]
+        return sorted(found, key=lambda site: (_ORDER.index(site.condition), site.number))
+
+    def _site(self, number: int, name: str, now_s: float) -> HubSite:
+        if number not in self._heard:
+            if now_s - self._began_s < LISTEN_S:
+                return HubSite(number, name, "unknown", "waiting for its gather")
+            return HubSite(number, name, "cut", f"not heard for {_lasting(now_s - self._began_s)} or longer")
+        heard_s, unix_s, summary = self._heard[number]
+        if now_s - heard_s > SILENT_S:
+            return HubSite(number, name, "cut", f"not heard for {_lasting(now_s - heard_s)}", heard_unix_s=unix_s)
+        condition: Literal["bad", "degraded", "unknown", "good"]
+        match summary.condition:
+            case "bad" | "degraded" | "good" as condition:
+                reason = "".join(summary.reasons[:1])
+            case _:
+                condition, reason = "unknown", f"its gather, version {summary.version}, states no condition"
+        anchors = summary.online.get("anchor", 0)
+        return HubSite(number, name, condition, reason, summary.tags_heard, anchors, summary.versions, unix_s)
+
+    async def run(self, name: str) -> None:
+        """Listen until cancelled. ``name`` is shown at the hub."""
+        say = rarely(logging.getLogger("skyless.run.hub").warning)
+        client = self._client = await connect(self.address, name, say, Counter())
+
+        async def on_summary(message: "Msg") -> None:
+            if (number := streams.site_in(message.subject)) is not None:
+                self.add_summary(number, message.data, time.monotonic(), time.time())
+
+        try:
+            await client.subscribe(streams.at(streams.SUMMARY, streams.EVERY), cb=on_summary)
+            while True:
+                try:
+                    for number in await sites_at(client) - {site for site, name in self.names().items() if name}:
+                        subject = streams.at(streams.SITES, number)
+                        with contextlib.suppress(NotFoundError):  # it has not come to the hub yet
+                            name = streams.at(streams.STATE_STREAM, number)
+                            found = await client.jetstream().get_last_msg(name, subject, direct=True)
+                            self.add_site(streams.topic_of(subject), found.data or b"")
+                except Error as error:
+                    say(f"the sites at the hub cannot be listed: {error or type(error).__name__}")
+                await asyncio.sleep(LIST_S)
+        finally:
+            await client.close()
+
+
+def _lasting(seconds: float) -> str:
+    for size_s, word in ((86_400.0, "d"), (3_600.0, "h"), (60.0, "min")):
+        if seconds >= 2 * size_s:
+            return f"{seconds / size_s:.0f} {word}"
+    return f"{seconds:.0f} s"

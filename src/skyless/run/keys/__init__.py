@@ -1,1 +1,0 @@
-"""Keys of anchors and tags on disk."""

@@ -1,1 +1,0 @@
-"""Zones: where tags enter and leave."""
