@@ -31,8 +31,8 @@ from skyless.core.any_receiver import AnyReceiver
 from skyless.core.estimator.state import State
 from skyless.core.native.records import PACKED
 from skyless.core.tag.receiver import Receiver
-from skyless.research.studies import integrity, loss, motion, nlos, room
-from skyless.research.studies.common.plan import plan_of
+from skyless.research.studies import integrity, lab, room
+from skyless.research.studies.common.runner import plan_of
 from skyless.research.studies.common.worlds import Heard, beacons_of, worlds
 from skyless.sim.evaluation.scenarios import Request, Room, trajectories_of, wanderers
 from skyless.sim.world import ideal_lab_site, lab_site
@@ -95,7 +95,7 @@ def long_cases(seed, minutes):
 def float_cases(seed, seconds):
     """Those of ``--library float``."""
     plan = replace(plan_of("joint", seed, study="room"), worlds=1, tags=3, seconds=2.0 * seconds)
-    found = {case.name: case.runs[0] for study in (room, motion, loss, nlos) for case in study.cases(plan)}
+    found = {case.name: case.runs[0] for study in (room, lab, lab, lab) for case in study.cases(plan)}
     yield from ((name, None, found[name]) for name in OF_FLOAT)
 
 

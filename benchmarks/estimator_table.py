@@ -25,13 +25,13 @@ from recorded_phases import MARGINS_S, stops_of, tracked
 from skyless.core.errors import SkylessError
 from skyless.core.estimator import settings as parameters
 from skyless.core.site import EXACT, AccuracySite, Site
-from skyless.research.benchmark.recordings import Found, recordings_below
+from skyless.research.benchmark import Found, recordings_below
 from skyless.research.foreign import _muloc as muloc
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions
-from skyless.research.studies import loss, motion, nlos, room
-from skyless.research.studies.common.plan import Plan, plan_of
-from skyless.research.studies.common.summary import Case
+from skyless.research.studies import lab, room
+from skyless.research.studies.common.picture import Case
+from skyless.research.studies.common.runner import Plan, plan_of
 from skyless.research.studies.common.worlds import Run, beacons_of, judged, worlds
 from skyless.sim.evaluation.scenarios import Room, wanderers
 from skyless.sim.impairments import AnchorBias, Body
@@ -157,7 +157,9 @@ def cases(seed: int, count: int) -> list[Case]:
     plan = structs.replace(plan_of("joint", seed, study="room"), worlds=4 * count, tags=4, seconds=15.0)
     in_room = [case for case in room.cases(plan) if case.name in ROOM]
     plan = structs.replace(plan, worlds=count)
-    in_lab = [case for case in (*loss.cases(plan), *nlos.cases(plan), *motion.cases(plan)) if case.name in LAB]
+    in_lab = [
+        case for case in (*lab.loss_cases(plan), *lab.nlos_cases(plan), *lab.motion_cases(plan)) if case.name in LAB
+    ]
     named = {ROOM.get(case.name) or LAB[case.name]: case for case in (*in_room, *in_lab)}
     named |= {case.name: case for case in in_both_protocols(structs.replace(plan, tags=2, seconds=12.0))}
     named |= {case.name: case for case in starts(structs.replace(plan, tags=16, seconds=START_S))}

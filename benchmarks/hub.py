@@ -33,8 +33,8 @@ import msgspec
 import numpy as np
 import psutil
 
-from skyless.page.gathered import Gathered
 from skyless.page.live import LiveSite
+from skyless.page.live2 import Gathered
 from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, decode_batch, encode_batch
 from skyless.run.gather import streams
 from skyless.run.gather.streams import NatsAddress, connect, messages

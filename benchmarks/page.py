@@ -31,7 +31,7 @@ from page_browser import CHROMIUM, FLAGS, until
 from test_dashboard_condition import anchor_health, tag_health
 
 from skyless.page.app import Services, make_app
-from skyless.page.guard import AccessRules
+from skyless.page.connections import AccessRules
 from skyless.page.live import LiveSite
 from skyless.page.sites import LiveSites
 from skyless.run.mqtt import topics

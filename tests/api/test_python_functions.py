@@ -18,10 +18,10 @@ from skyless.cli.main import main
 from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.site import AccuracySite
 from skyless.research.calibration.options import Stay
-from skyless.research.studies import motion
-from skyless.research.studies.catalogue import STUDIES, _of_worlds
+from skyless.research.studies import lab
 from skyless.research.studies.common.picture import Look
-from skyless.research.studies.common.plan import MEASURED
+from skyless.research.studies.common.runner import MEASURED
+from skyless.research.studies.run import STUDIES, _of_worlds
 from skyless.sim.impairments import AnchorBias
 from skyless.sim.world import paper_lab_site
 from skyless.site.file.load import load_site
@@ -49,7 +49,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module", autouse=True)
 def short_study():
     """Of the study ``motion`` two cases only."""
-    cases = _of_worlds("motion", "motion", lambda plan: motion.cases(plan)[:2], Look("Motion", ("rmse", "nees")))
+    cases = _of_worlds("motion", "motion", lambda plan: lab.motion_cases(plan)[:2], Look("Motion", ("rmse", "nees")))
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(STUDIES, "motion", cases)
         yield

@@ -4,9 +4,9 @@ import msgspec
 from paho.mqtt.client import topic_matches_sub
 from starlette.testclient import TestClient
 
-from skyless.page.api.past import Past
+from skyless.page.api.questions import Past
 from skyless.page.app import Services, make_app
-from skyless.page.guard import AccessRules
+from skyless.page.connections import AccessRules
 from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites
 from skyless.run.mqtt.address import MqttAddress

@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 
 from skyless.core.errors import SkylessError
 from skyless.core.site import AlarmRule, GeoreferenceSite
-from skyless.page.api import past
+from skyless.page.api import questions
 from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track, TrackPoint
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import AlarmMessage, Asset
@@ -105,7 +105,7 @@ def fake_history(patch):
     FakeHistory.release.clear()
     patch.setitem(sys.modules, "skyless.run.history.queries", SimpleNamespace(History=FakeHistory))
     patch.setitem(sys.modules, "skyless.run.history.answers", SimpleNamespace(span_of=span_of))
-    patch.setattr(past, "TaskProcess", FakeProcess)
+    patch.setattr(questions, "TaskProcess", FakeProcess)
 
 
 class FakeProcess:
@@ -117,7 +117,7 @@ class FakeProcess:
     async def run(self, question):
         loop = asyncio.get_running_loop()
         try:
-            return msgspec.json.encode(await loop.run_in_executor(self._pool, past._answer, question))
+            return msgspec.json.encode(await loop.run_in_executor(self._pool, questions._answer, question))
         except SkylessError as error:
             raise HTTPException(self._fault, str(error)) from None
 

@@ -23,7 +23,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocketDisconnect
 
 import skyless
-from skyless.page._state import SILENT_S
+from skyless.page.state import SILENT_S
 from support.processes import free_port
 
 PAGE = Path(skyless.__file__).parent / "page" / "browser"

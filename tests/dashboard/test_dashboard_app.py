@@ -12,7 +12,7 @@ from starlette.websockets import WebSocketDisconnect
 
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite
-from skyless.page.guard import AccessRules, Guard
+from skyless.page.connections import AccessRules, Guard
 from skyless.page.live import (
     GONE_S,
     IDLE_S,

@@ -7,9 +7,9 @@ from msgspec.structs import replace
 
 from skyless.core.site import AlarmRule
 from skyless.page._alarms import KEPT_WAIT_S
-from skyless.page._state import Sent
 from skyless.page.condition.evidence import EXPECTED_S, FRESH_S, GRACE_S
 from skyless.page.live import LiveSite
+from skyless.page.state import Sent
 from skyless.run.fix_batch import FIELDS, fix_of, records_of
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import AlarmMessage, AlarmRulesMessage, ZoneEvent, ZonesMessage

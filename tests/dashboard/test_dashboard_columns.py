@@ -13,16 +13,14 @@ from msgspec.structs import replace
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from skyless.page import columns as columns_module
 from skyless.page import live2
-from skyless.page._state import read_request
+from skyless.page import live2 as columns_module
 from skyless.page.app import Services, make_app
-from skyless.page.columns import Columns
-from skyless.page.gathered import Gathered
-from skyless.page.guard import AccessRules
+from skyless.page.connections import AccessRules
 from skyless.page.live import LiveSite
-from skyless.page.live2 import View, anchors_message, conditions_message, tags_message
+from skyless.page.live2 import Columns, Gathered, View, anchors_message, conditions_message, tags_message
 from skyless.page.sites import LiveSites
+from skyless.page.state import read_request
 from skyless.run.fix_batch import RECORD
 from skyless.run.gather.streams import NatsAddress
 

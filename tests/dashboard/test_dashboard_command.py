@@ -13,7 +13,7 @@ import pytest
 from skyless.cli.dashboard import _address, _listening, _rules
 from skyless.cli.main import main
 from skyless.core.errors import SkylessError
-from skyless.page.serve import PORT, ListenAddress, bind
+from skyless.page.app import PORT, ListenAddress, bind
 from skyless.run.process import reserve
 from skyless.sim.world import lab_site
 from support.processes import free_port
@@ -136,7 +136,7 @@ def test_the_site_file_and_the_number_must_agree(capsys, tmp_path):
 
 def test_the_server_loads_nothing_heavy():
     """Overlays have a process of their own; NumPy and Numba in this one would cost its start a second and 150 MB."""
-    look = "import skyless.page.serve, skyless.page.playback, sys; print(*sys.modules)"
+    look = "import skyless.page.app, skyless.page.playback, sys; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout.split()
     assert "skyless.page.app" in loaded
     assert not {"numpy", "numba", "scipy", "matplotlib"} & set(loaded)
@@ -146,7 +146,7 @@ BUSY = """
 import sys
 from skyless.cli.main import main
 from skyless.page.api import past
-from skyless.page.task_process import TaskProcess
+from skyless.page.tasks import TaskProcess
 
 past.TaskProcess = lambda module, fault: TaskProcess("never_answers", fault)
 sys.exit(main(sys.argv[1:]))

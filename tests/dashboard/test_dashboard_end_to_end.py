@@ -16,7 +16,7 @@ from dashboard_builders import SITE, SITE_ID, SQUARE, fix, truth
 from websockets.protocol import State
 
 from skyless.page.app import Services, make_app
-from skyless.page.guard import AccessRules
+from skyless.page.connections import AccessRules
 from skyless.page.live import IDLE_S
 from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health, tag_health
 
-from skyless.page._events import ALERT_INTERVAL_S, MAX_LOGGED, SILENT_S, EventLog
 from skyless.page.condition._reasons import Reason
 from skyless.page.condition.monitor import Condition
+from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, SILENT_S, EventLog
 from skyless.run.mqtt.messages import SurveyMessage, WatchFinding, WatchMessage
 from skyless.site.survey.facts import Facts
 

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from starlette.exceptions import HTTPException
 from websockets.asyncio.client import connect as websocket
 
-from skyless.page import hub
+from skyless.page import sites
 from skyless.page.live import LiveSite
 from skyless.run.gather.node import Gather
 from skyless.run.gather.streams import NatsAddress, connect
@@ -63,23 +63,23 @@ def test_the_table_has_trouble_first_and_nothing_is_good_that_is_not_heard():
 
 
 async def test_a_site_is_let_go_when_nobody_looks_and_the_next_look_connects_it_again(monkeypatch):
-    monkeypatch.setattr(hub, "LET_GO_S", 0.0)
-    monkeypatch.setattr(hub, "_CHECK_S", 0.01)
+    monkeypatch.setattr(sites, "LET_GO_S", 0.0)
+    monkeypatch.setattr(sites, "_CHECK_S", 0.01)
     for one in (HubLink, HubSites):
         monkeypatch.setattr(one, "run", lambda *_: asyncio.sleep(60))
-    sites = hub.ShownSites(NatsAddress("nats://none"), "here", lambda: LiveSite("here", "nats://none", at_hub=True))
-    sites.known.add_site(topics.site_topic(NUMBER), msgspec.json.encode({"site": {"name": "Hall"}}))
-    running = asyncio.ensure_future(sites.run())
+    shown = sites.ShownSites(NatsAddress("nats://none"), "here", lambda: LiveSite("here", "nats://none", at_hub=True))
+    shown.known.add_site(topics.site_topic(NUMBER), msgspec.json.encode({"site": {"name": "Hall"}}))
+    running = asyncio.ensure_future(shown.run())
     await asyncio.sleep(0)
-    live = sites.of(str(NUMBER))
+    live = shown.of(str(NUMBER))
     page = live.open_page()
     await asyncio.sleep(0.1)
-    assert sites.all == [live]
+    assert shown.all == [live]
     live.pages.discard(page)
-    await until(lambda: not sites.all)
-    assert sites.of(str(NUMBER)) is not live
+    await until(lambda: not shown.all)
+    assert shown.of(str(NUMBER)) is not live
     with pytest.raises(HTTPException, match="number of a site at this hub"):
-        sites.of("8")
+        shown.of("8")
     running.cancel()
     await asyncio.gather(running, return_exceptions=True)
 

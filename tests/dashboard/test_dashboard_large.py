@@ -9,8 +9,8 @@ from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 from test_dashboard_live import drained, of
 
-from skyless.page._state import MAX_ROWS, PageRequest, read_request
 from skyless.page.condition import evidence
+from skyless.page.state import MAX_ROWS, PageRequest, read_request
 from skyless.run.mqtt import topics
 
 SPACING_M = 4.0

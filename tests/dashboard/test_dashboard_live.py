@@ -9,8 +9,7 @@ from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status, truth
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 
-from skyless.page._events import SILENT_S
-from skyless.page.event_list import MAX_KEPT
+from skyless.page.events import MAX_KEPT, SILENT_S
 from skyless.page.live import LiveSite
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import SiteZones, WrongMessageError, ZoneEvent, ZonesMessage

@@ -8,7 +8,7 @@ import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, browser_of, fix, truth
 from starlette.exceptions import HTTPException
 
-from skyless.page.guard import AccessRules
+from skyless.page.connections import AccessRules
 from skyless.page.live import LiveSite
 from skyless.page.playback import Playback
 from skyless.run.mqtt import topics

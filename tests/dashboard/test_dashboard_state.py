@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.page._state import EXPIRY_S, MAX_HEALTHS, UNHEARD_S, PageRequest, Sent, SiteState
+from skyless.page.state import EXPIRY_S, MAX_HEALTHS, UNHEARD_S, PageRequest, Sent, SiteState
 from skyless.run.mqtt.messages import AnchorHealth, Counters, EtherHealth
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")

@@ -13,8 +13,8 @@ from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
 from skyless.core.site import FloorPlanSite, UnplacedAnchor
-from skyless.page._site_survey import SiteSurvey
 from skyless.page.overlay_process import overlay
+from skyless.page.state import SiteSurvey
 from skyless.page.tasks import OverlayTask
 from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics

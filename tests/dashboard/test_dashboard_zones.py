@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from matplotlib.path import Path
 from msgspec.structs import replace
 
-from skyless.page._events import TAKEOVER_S, EventQueue, publisher_rank
+from skyless.page.events import TAKEOVER_S, EventQueue, publisher_rank
 from skyless.run.mqtt.messages import WrongMessageError, Zone, ZoneEvent, ZonesMessage
 from skyless.run.zones import CROSSING_S, MIN_MARGIN_M, TAG_TIMEOUT_S, ZoneMonitor, read_zones, zones_of
 

@@ -18,9 +18,9 @@ from openapi_spec_validator import OpenAPIV31SpecValidator
 from starlette.exceptions import HTTPException
 
 from skyless.core.earth import geodetic
-from skyless.page.api import past
+from skyless.page.api import questions
 from skyless.page.api.routes import ROUTES
-from skyless.page.guard import AccessRules
+from skyless.page.connections import AccessRules
 from skyless.run.assets import write_csv
 from skyless.run.fix_batch import RECORD
 from skyless.run.history.layout import site_folder
@@ -289,7 +289,7 @@ def test_wrong_questions_to_the_history(client, path, query, words):
 
 
 def test_a_slow_question_ends_and_holds_up_nothing_else(client, monkeypatch):
-    monkeypatch.setattr(past, "LIMITS", PageLimits(question_s=0.2, questions=2))
+    monkeypatch.setattr(questions, "LIMITS", PageLimits(question_s=0.2, questions=2))
     answers = []
     asking = [
         threading.Thread(target=lambda: answers.append(client.get("history/track", params={"tag": "slow", **SPAN})))
@@ -318,9 +318,9 @@ def test_a_real_history_answers_and_a_question_that_takes_too_long_is_ended(live
     writer.close()
     fill(live, wire)
     with browser_of(live, history=tmp_path, base_url=f"{API}/") as client:
-        monkeypatch.setattr(past, "LIMITS", PageLimits(question_s=0.01))
+        monkeypatch.setattr(questions, "LIMITS", PageLimits(question_s=0.01))
         assert client.get("history/tags").status_code == 503
-        monkeypatch.setattr(past, "LIMITS", PageLimits())
+        monkeypatch.setattr(questions, "LIMITS", PageLimits())
         assert client.get("history/tags").json() == {"tags": ["t1"]}
         asked = {"from": "1699999999", "to": "1700000001"}
         assert client.get("history/track", params={"tag": "t1", **asked}).json()["fixes"] == 1

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from starlette.websockets import WebSocketDisconnect
 
-from skyless.page.api import stream
-from skyless.page.api.stream import SiteStream
-from skyless.page.event_list import MAX_KEPT
-from skyless.page.guard import AccessRules
+from skyless.page.api import routes
+from skyless.page.api.routes import SiteStream
+from skyless.page.connections import AccessRules
+from skyless.page.events import MAX_KEPT
 from skyless.run.limits import PageLimits
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import ZoneEvent
@@ -136,7 +136,7 @@ def test_wrong_questions_are_closed_with_a_reason(site, query):
 
 
 def test_there_are_only_so_many(site, monkeypatch):
-    monkeypatch.setattr(stream, "LIMITS", PageLimits(streams=1))
+    monkeypatch.setattr(routes, "LIMITS", PageLimits(streams=1))
     with browser_of(site) as client, client.websocket_connect(STREAM) as first:
         first.receive_json()
         with client.websocket_connect(STREAM) as second, pytest.raises(WebSocketDisconnect) as closed:

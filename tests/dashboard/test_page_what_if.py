@@ -21,7 +21,7 @@ from skyless.core.estimator.state import State
 from skyless.core.native.library import SOURCE, source_digest
 from skyless.core.native.records import records
 from skyless.page.app import Services, make_app
-from skyless.page.guard import AccessRules
+from skyless.page.connections import AccessRules
 from skyless.page.live import LiveSite
 from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites

@@ -18,8 +18,8 @@ from msgspec.structs import replace
 from nats.js.errors import NotFoundError
 
 from skyless.core.errors import SkylessError
-from skyless.page.gathered import Gathered
 from skyless.page.live import LiveSite
+from skyless.page.live2 import Gathered
 from skyless.page.sites import LiveSites
 from skyless.run.broker import BrokerSettings, nats_of, start_broker
 from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, decode_batch, encode_batch
@@ -367,7 +367,7 @@ def test_the_broker_runs_a_gather_and_states_its_address(tmp_path):
         assert process.wait(20) == 0
 
 
-@pytest.mark.parametrize("modules", ["cli.nodes.broker, skyless.run.broker", "cli.dashboard, skyless.page.serve"])
+@pytest.mark.parametrize("modules", ["cli.nodes.broker, skyless.run.broker", "cli.dashboard, skyless.page.app"])
 def test_without_a_gather_nothing_of_nats_is_loaded(modules):
     heavy = "{'nats', 'duckdb', 'pyarrow'} & {name.partition('.')[0] for name in sys.modules}"
     program = f"import sys, skyless, skyless.{modules}\nassert not {heavy}"

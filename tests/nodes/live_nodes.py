@@ -6,7 +6,7 @@ import contextlib
 import numpy as np
 
 from skyless.radio.interface import AntennaDelays
-from skyless.research.live.packet_tags import PacketTagNode, PacketTagSettings
+from skyless.research.masterless.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.run.anchor import AnchorNode
 from skyless.run.board import Board
 from skyless.run.ether import Ether

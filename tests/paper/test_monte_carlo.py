@@ -11,7 +11,7 @@ from skyless.research.paper.monte_carlo import (
     draw_moments,
     noise_batches,
 )
-from skyless.research.uncertainty.chain import CORRECTED, Chain, Reference, chain_covariance
+from skyless.research.uncertainty import CORRECTED, Chain, Reference, chain_covariance
 from support.random_chain import draw_loop, random_chain
 
 pytestmark = pytest.mark.statistical

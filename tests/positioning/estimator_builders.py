@@ -18,7 +18,7 @@ from skyless.core.estimator.state import FAULT_KINDS, covariances
 from skyless.core.native.records import view
 from skyless.core.observation import Observation
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
+from skyless.research.studies.efficiency import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
 from skyless.sim.world import paper_lab_site
 
 SLOT_S = paper_lab_site().schedule.slot_s

@@ -44,8 +44,8 @@ from skyless.core.estimator.process import JOINED, REJECTED, STALE
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import FAULT_KINDS, LASTING, State, add_anchor, new_state, remove_anchor
 from skyless.core.ticks import TICK_RATE_HZ, TICK_S
-from skyless.research.studies.episodes import EPISODE_SPEED_STD_MPS, WHITE_FM
-from skyless.research.uncertainty.bounds import BoundSettings, tracking_bound
+from skyless.research.studies.efficiency import EPISODE_SPEED_STD_MPS, WHITE_FM
+from skyless.research.uncertainty import BoundSettings, tracking_bound
 
 pytestmark = pytest.mark.site
 

@@ -33,7 +33,7 @@ from skyless.core.estimator.process import ACCEPTED, REJECTED
 from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import find_anchor
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_MASK, TICK_S
-from skyless.research.studies.episodes import WHITE_FM
+from skyless.research.studies.efficiency import WHITE_FM
 
 pytestmark = pytest.mark.site
 

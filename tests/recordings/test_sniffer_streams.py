@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from skyless.core.air.masterless_packets import Packet
 from skyless.core.input_files import CHUNK_BYTES, open_source
 from skyless.radio.foreign import bitcraze
-from skyless.research.foreign import _bitcraze_captures as bitcraze_captures
+from skyless.research.foreign import crazyflie as bitcraze_captures
 
 READERS = {
     "binary": (bitcraze.read_binary, binary_record),

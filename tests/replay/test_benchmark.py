@@ -9,9 +9,8 @@ import pytest
 
 import synthetic_recordings as synthetic
 from skyless.cli.main import main
-from skyless.research.benchmark import run
-from skyless.research.benchmark.plain import BITCRAZE, GATE, plain_track
-from skyless.research.benchmark.recordings import recordings_below
+from skyless.research import benchmark
+from skyless.research.benchmark import BITCRAZE, GATE, plain_track, recordings_below
 
 pytestmark = pytest.mark.statistical
 
@@ -113,7 +112,7 @@ def test_what_exists_is_not_computed_again(folder, tmp_path, monkeypatch):
     kept[0].write_bytes(b"damaged")
     assert main(asked) == 0
     assert (tmp_path / "results.json").read_bytes() == before
-    monkeypatch.setattr(run, "_results", lambda *_: pytest.fail("computed again"))
+    monkeypatch.setattr(benchmark, "_results", lambda *_: pytest.fail("computed again"))
     assert main(asked) == 0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skyless.core.air.masterless_packets import PairTdoa
-from skyless.research.replays.noise import MAX_PAIRS, MIN_PAIR_DIFFERENCES, ROWS_PER_PAIR, NoiseByPair
+from skyless.research.replays.captures import MAX_PAIRS, MIN_PAIR_DIFFERENCES, ROWS_PER_PAIR, NoiseByPair
 from skyless.sim.evaluation.figures import TruthTrack
 from skyless.site.tables import Truth
 

@@ -6,10 +6,9 @@ from scipy.stats import chi2
 
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import TICK_M
-from skyless.research.studies.catalogue import STUDIES
-from skyless.research.studies.common.plan import plan_of
-from skyless.research.studies.common.summary import CLUSTER_FIXES, clustered_interval
-from skyless.research.studies.episodes import Case, draw_episode
+from skyless.research.studies.common.picture import CLUSTER_FIXES, clustered_interval
+from skyless.research.studies.common.runner import plan_of
+from skyless.research.studies.efficiency import Case, draw_episode
 from skyless.research.studies.integrity import (
     ALL_FAULTS,
     FAULT_BURST_S,
@@ -22,6 +21,7 @@ from skyless.research.studies.integrity import (
     faulty,
     rows,
 )
+from skyless.research.studies.run import STUDIES
 from skyless.sim.world import paper_lab_site
 from skyless.site.report import picture
 

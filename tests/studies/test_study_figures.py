@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.research.studies import efficiency, loss, motion, nlos, room, scale, sync
-from skyless.research.studies.common.plan import Plan, plan_of, seed_of
-from skyless.research.studies.common.summary import Case, interval, jackknife, world_cells, world_rows
+from skyless.research.studies import efficiency, lab, large, room
+from skyless.research.studies.common.picture import Case, interval, jackknife, world_cells, world_rows
+from skyless.research.studies.common.runner import Plan, plan_of, seed_of
 from skyless.research.studies.common.worlds import RunResult, box, large_lab_site, run_world, walking
 from skyless.site.file.check import check_site
 
@@ -114,14 +114,14 @@ def test_messages_lost_at_tags_are_heard_by_anchors():
 
 
 def test_worlds_of_one_number_are_the_same_in_all_cases():
-    for module in (loss, nlos, motion, sync):
+    for module in (lab, lab, lab, lab):
         seeds = {tuple(run.seed for run in case.runs) for case in module.cases(SMALL)}
         assert len(seeds) == 1
     assert len({seed_of(seed, number) for seed in range(20) for number in range(20)}) == 400
 
 
 @pytest.mark.parametrize("quick", [False, True])
-@pytest.mark.parametrize("module", [loss, nlos, motion, sync, room, scale])
+@pytest.mark.parametrize("module", [lab, lab, lab, lab, room, large])
 def test_cases_can_be_told_apart_and_compared(module, quick):
     plan = plan_of("joint", 1, quick=quick, worlds=2)
     cases = module.cases(plan)
@@ -137,8 +137,8 @@ def test_cases_can_be_told_apart_and_compared(module, quick):
 @pytest.mark.parametrize("quick", [False, True])
 def test_the_limits_that_were_asked_for_are_there(quick):
     plan = plan_of("joint", 1, quick=quick, worlds=2)
-    limits = {case.name: case.limit for case in (*loss.cases(plan), *nlos.cases(plan)) if case.limit}
-    for kind in (loss.AT_TAGS, loss.EVERYWHERE):
+    limits = {case.name: case.limit for case in (*lab.loss_cases(plan), *lab.nlos_cases(plan)) if case.limit}
+    for kind in (lab.AT_TAGS, lab.EVERYWHERE):
         assert (limits.pop(f"50 % {kind}"), limits.pop(f"90 % {kind}")) == (1.3, 2.5)
     late = {"20 % late by exp(1 m)", "one anchor +0.3 m", "one anchor +1.5 m in bursts"}
     assert limits == dict.fromkeys(late, 1.3)
@@ -147,9 +147,9 @@ def test_the_limits_that_were_asked_for_are_there(quick):
 @pytest.mark.parametrize(
     ("kind", "speed_mps"),
     [
-        *((motion.rounds, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
-        *((motion.zigzag, speed_mps) for speed_mps in (1.0, 3.0)),
-        *((motion.stop_and_go, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
+        *((lab.rounds, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
+        *((lab.zigzag, speed_mps) for speed_mps in (1.0, 3.0)),
+        *((lab.stop_and_go, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
     ],
 )
 def test_paths_keep_to_speed_acceleration_and_room(kind, speed_mps):
@@ -169,7 +169,7 @@ def test_paths_keep_to_speed_acceleration_and_room(kind, speed_mps):
 
 def test_a_long_superframe_has_its_anchors_evenly_spread():
     plan = replace(SMALL, quick=True)
-    for case in sync.cases(plan):
+    for case in lab.sync_cases(plan):
         site = case.runs[0].site
         if case.x is None:
             continue

@@ -11,8 +11,8 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
-from skyless.research.studies.common import kept
-from skyless.research.studies.common.plan import Cell, Plan, Study
+from skyless.research.studies.common import runner
+from skyless.research.studies.common.runner import Cell, Plan, Study
 from skyless.research.studies.run import Parts, run_study
 
 NUMBERS, DEADLY, PLAN = range(5), 3, Plan(qa=0.1)
@@ -79,7 +79,7 @@ def test_another_study_is_refused_and_what_differs_is_named(log, folder, monkeyp
         with pytest.raises(SkylessError, match=f"^--resume is .*parts', of another study: {said}; give another folder"):
             other()
     with monkeypatch.context() as patch:
-        patch.setattr(kept, "program_digest", lambda: "another")
+        patch.setattr(runner, "program_digest", lambda: "another")
         with pytest.raises(SkylessError, match=r"source digest is .* there, 'another' here"):
             ran(log, folder)
     (folder / "study.json").write_text("{")

@@ -13,11 +13,10 @@ import pytest
 from distributed import Client, LocalCluster
 
 from skyless.core.errors import SkylessError
-from skyless.research.studies import loss
+from skyless.research.studies import lab
 from skyless.research.studies.common import runner
-from skyless.research.studies.common.plan import MEASURED, Cell, Plan
-from skyless.research.studies.common.runner import run_cells, run_cells_on_dask
-from skyless.research.studies.common.summary import world_cells, world_rows
+from skyless.research.studies.common.picture import world_cells, world_rows
+from skyless.research.studies.common.runner import MEASURED, Cell, Plan, run_cells, run_cells_on_dask
 from skyless.research.studies.integrity import FAULTS
 
 pytestmark = pytest.mark.statistical
@@ -31,7 +30,7 @@ def cluster():
         yield made
 
 
-CASES = loss.cases(PLAN)[:2]
+CASES = lab.loss_cases(PLAN)[:2]
 
 
 def rows_of(results):
@@ -109,7 +108,7 @@ def test_a_worker_with_another_program_is_named(cluster, monkeypatch, digest, me
 
 
 def test_another_seed_gives_other_rows():
-    work = [world_cells(loss.cases(Plan(method="joint", seed=seed, worlds=2, seconds=1.0)))[0] for seed in (3, 4)]
+    work = [world_cells(lab.loss_cases(Plan(method="joint", seed=seed, worlds=2, seconds=1.0)))[0] for seed in (3, 4)]
     first, second = (cell.function() for cell in work)
     assert first.squared_m2 != second.squared_m2
 

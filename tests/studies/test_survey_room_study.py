@@ -5,10 +5,9 @@ import pytest
 
 from skyless.core.ticks import TICK_M
 from skyless.research.studies import survey_room as study
-from skyless.research.studies.catalogue import STUDIES
-from skyless.research.studies.common.plan import Plan
+from skyless.research.studies.common.runner import Plan
+from skyless.research.studies.run import STUDIES
 from skyless.research.studies.survey_room import SURVEYED, TRUTH, Group, groups, limits_of
-from skyless.research.surveys.layouts import survey_layouts
 from skyless.research.surveys.rooms import (
     ROOM_RANGES,
     RoomErrors,
@@ -16,6 +15,7 @@ from skyless.research.surveys.rooms import (
     drawn_room,
     hand_site,
     ranges_of,
+    survey_layouts,
     surveyed_room,
     true_site,
 )

@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from skyless.research.studies import survey as study
-from skyless.research.studies.catalogue import STUDIES
-from skyless.research.studies.common.plan import Plan
+from skyless.research.studies.common.runner import Plan
+from skyless.research.studies.run import STUDIES
 from skyless.research.studies.survey import GROUPS, Group, Variant, limits_of
-from skyless.research.surveys.air import AirErrors, drawn_errors
-from skyless.research.surveys.judge import aligned, tag_error_m
-from skyless.research.surveys.layouts import survey_layouts
+from skyless.research.surveys.rooms import AirErrors, aligned, drawn_errors, survey_layouts, tag_error_m
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site

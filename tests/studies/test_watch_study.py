@@ -3,10 +3,10 @@
 import pytest
 
 from skyless.research.studies import watch
-from skyless.research.studies.catalogue import STUDIES
-from skyless.research.studies.common.plan import Plan
+from skyless.research.studies.common.runner import Plan
+from skyless.research.studies.run import STUDIES
 from skyless.research.surveys.drawn_faults import WatchResult, WatchRun, run_watch
-from skyless.research.surveys.layouts import survey_layouts
+from skyless.research.surveys.rooms import survey_layouts
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site

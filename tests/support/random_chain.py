@@ -4,7 +4,7 @@ import numpy as np
 
 from skyless.core.ticks import TICK_S
 from skyless.research.paper.monte_carlo import ideal_values, noise_size, run_chain
-from skyless.research.uncertainty.chain import Chain, Reference
+from skyless.research.uncertainty import Chain, Reference
 
 
 def random_chain(anchors=10, seed=1):

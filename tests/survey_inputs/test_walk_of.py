@@ -14,8 +14,7 @@ from skyless.cli.main import main
 from skyless.core.errors import SkylessError
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.ticks import TICK_M
-from skyless.research.calibration.recorded_stamps import ranges_of
-from skyless.research.calibration.tags import walk_of
+from skyless.research.calibration.biases import ranges_of, walk_of
 from skyless.run.recordings.recording import McapRecording
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import DelayError

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from skyless.core.arrays import Array
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
-from skyless.research.uncertainty.chain import Chain
+from skyless.research.uncertainty import Chain
 
 
 def synchronisation_error_m(chain: Chain) -> Array:

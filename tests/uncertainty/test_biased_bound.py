@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 from textbook_bound import LAB, RAISED, positions, settings_of, textbook, walk
 
-from skyless.research.uncertainty.bounds import Biases, tracking_bound
+from skyless.research.uncertainty import Biases, tracking_bound
 
 pytestmark = pytest.mark.site
 

@@ -3,15 +3,9 @@
 import numpy as np
 import pytest
 
-from skyless.research.studies import loss
-from skyless.research.studies.common.plan import Plan
-from skyless.research.uncertainty.bounds import (
-    BoundSettings,
-    Sendings,
-    known_receptions,
-    received_bound,
-    tracking_bound,
-)
+from skyless.research.studies import lab
+from skyless.research.studies.common.runner import Plan
+from skyless.research.uncertainty import BoundSettings, Sendings, known_receptions, received_bound, tracking_bound
 from skyless.sim.world import lab_site
 
 LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors])
@@ -59,11 +53,11 @@ def test_the_limits_of_the_study_lie_below_the_bound():
     """With mesh 1.40 and 3.26 at tags, 1.46 and 3.9 everywhere; limits are 1.3 and 2.5."""
     plan = Plan(seed=1, worlds=4)
     bounds = {
-        (case.series, case.x): loss.bound_m(case.runs, plan) for case in loss.cases(plan) if case.x in (0, 0.5, 0.9)
+        (case.series, case.x): lab.bound_m(case.runs, plan) for case in lab.loss_cases(plan) if case.x in (0, 0.5, 0.9)
     }
-    clean = bounds[loss.AT_TAGS, 0.0]
-    for share, limit in loss.MAX_RATIOS.items():
-        at_tags, everywhere = (bounds[kind, share] / clean for kind in (loss.AT_TAGS, loss.EVERYWHERE))
+    clean = bounds[lab.AT_TAGS, 0.0]
+    for share, limit in lab.MAX_RATIOS.items():
+        at_tags, everywhere = (bounds[kind, share] / clean for kind in (lab.AT_TAGS, lab.EVERYWHERE))
         assert limit < at_tags < everywhere
         assert everywhere < 1.9 * limit
 

@@ -15,8 +15,8 @@ from skyless.core.protocol1.snapshots import (
     tag_rate,
     to_master,
 )
-from skyless.research.uncertainty import chain
-from skyless.research.uncertainty.chain import CORRECTED, PRINTED, Chain
+from skyless.research import uncertainty
+from skyless.research.uncertainty import CORRECTED, PRINTED, Chain
 
 pytestmark = pytest.mark.statistical
 
@@ -59,7 +59,7 @@ QUANTITIES = (
 @pytest.fixture(autouse=True)
 def light_is_a_symbol(monkeypatch):
     """The speed of light as a float is not exact when squared."""
-    monkeypatch.setattr(chain, "SPEED_OF_LIGHT_MPS", LIGHT)
+    monkeypatch.setattr(uncertainty, "SPEED_OF_LIGHT_MPS", LIGHT)
 
 
 def plain(function):

@@ -7,7 +7,7 @@ from textbook_bound import LAB, RAISED, SLOT_S, positions, settings_of, textbook
 from skyless.core.estimator.compiled import process_known
 from skyless.core.estimator.state import covariances
 from skyless.core.ticks import TICK_S
-from skyless.research.uncertainty.bounds import Biases, Sendings, _prior, received_bound, tracking_bound
+from skyless.research.uncertainty import Biases, Sendings, _prior, received_bound, tracking_bound
 
 PHASES = {"phase_std_m": 0.002, "phase_wander": 1e-4}
 ROOM = Biases(survey_std_m=0.02, constant_std_m=0.029, slope_std_m=0.05)

@@ -14,7 +14,7 @@ from systematic import (
 from skyless.core.protocol1.snapshots import bracketed_tdoa, literal_tdoa
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.research.paper.monte_carlo import Quantity, ideal_values
-from skyless.research.uncertainty.chain import Reference
+from skyless.research.uncertainty import Reference
 from support.random_chain import random_chain
 
 MASTER, ANCHORS = np.array([0.0, 0.0, 0.5]), np.array([(6, 0, 2.5), (6, 8, 0.5), (0, 8, 2.5)], float)

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
-from skyless.research.studies.episodes import random_path
-from skyless.research.uncertainty.bounds import OFFSET_STD_M, POSITION_STD_M, RATE_STD_MPS, Biases, BoundSettings
+from skyless.research.studies.efficiency import random_path
+from skyless.research.uncertainty import OFFSET_STD_M, POSITION_STD_M, RATE_STD_MPS, Biases, BoundSettings
 
 LAB = np.array([(0, 0, 0), (6, 0, 0), (6, 4, 0), (6, 8, 0), (0, 8, 0), (0, 4, 0)], float)
 RAISED = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])

@@ -24,7 +24,7 @@ from skyless.core.site import ScheduleSite, Site
 from skyless.core.ticks import TICK_S, difference, wrap
 from skyless.radio.dw1000.radio import SPI_LEAD_S, ChipSession
 from skyless.radio.interface import AntennaDelays, Late, RadioEvent, Sent
-from skyless.research.uncertainty.bounds import BoundSettings, received_bound
+from skyless.research.uncertainty import BoundSettings, received_bound
 from skyless.run.anchor import ASK_AGAIN_S, LEAD_GAIN, LEAD_LOSS, MAX_LEAD_S
 from skyless.sim.dw1000.chip import Chip, ModelBus
 from skyless.sim.evaluation.scenarios import Request, impairments_of, trajectories_of

@@ -18,7 +18,7 @@ from skyless.research.replays.options import check_estimator, read_estimator
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from skyless.research.masterless.own_estimator import OwnEstimator
+    from skyless.research.masterless.smoothing import OwnEstimator
 
 _QUICK_S: Final = 12.0
 
@@ -63,9 +63,15 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) 
     """
     if not folder.is_dir():
         raise SkylessError(f"FOLDER is {str(folder)!r}; it should be a folder with recordings")
-    from skyless.research.benchmark.page import SUMMARY_HEADS, summary_rows, write
-    from skyless.research.benchmark.recordings import recordings_below
-    from skyless.research.benchmark.run import Asked, results_of, with_best
+    from skyless.research.benchmark import (
+        SUMMARY_HEADS,
+        Asked,
+        recordings_below,
+        results_of,
+        summary_rows,
+        with_best,
+        write,
+    )
 
     found = [one for one in recordings_below(folder) if asked.only in one.name]
     if not found:

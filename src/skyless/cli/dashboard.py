@@ -17,11 +17,10 @@ from skyless.core.extras import extra_module
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from skyless.page.app import Services
-    from skyless.page.gathered import Gathered
-    from skyless.page.guard import AccessRules
+    from skyless.page.app import ListenAddress, Services
+    from skyless.page.connections import AccessRules
     from skyless.page.live import LiveSite
-    from skyless.page.serve import ListenAddress
+    from skyless.page.live2 import Gathered
     from skyless.run.mqtt.address import MqttAddress
     from skyless.run.mqtt.messages import SiteMessage
 
@@ -84,12 +83,11 @@ def dashboard(
     """
     import asyncio
 
-    from skyless.page.api.past import Past
-    from skyless.page.app import Services
+    from skyless.page.api.questions import Past
+    from skyless.page.app import Services, bind, serve
     from skyless.page.condition.evidence import ProcessorUse
     from skyless.page.live import LiveSite
     from skyless.page.playback import Playback
-    from skyless.page.serve import bind, serve
 
     if recordings is not None and not recordings.is_dir():
         raise SkylessError(f"--recordings is {str(recordings)!r}; it should be a folder")
@@ -149,8 +147,8 @@ def _at_broker(
 def _at_hub(make: "partial[LiveSite]", serves: "partial[Services]", hub: str, ca: Path | None) -> "_Served":
     """The sites at a hub. Raises SkylessError."""
     address = hub_address(hub, ca)
-    from skyless.page.gathered import Gathered
-    from skyless.page.hub import ShownSites
+    from skyless.page.live2 import Gathered
+    from skyless.page.sites import ShownSites
 
     sites = ShownSites(address, "skyless dashboard", partial(make, broker=str(address), at_hub=True))
     return str(address), serves(sites=sites, gathered=Gathered(address), hub=sites), sites.run()
@@ -165,7 +163,7 @@ def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":
     if address is None:
         return None
     extra_module("nats", "--nats" if nats is not None else f"the gather of {broker}")
-    from skyless.page.gathered import Gathered
+    from skyless.page.live2 import Gathered
 
     return Gathered(address)
 
@@ -192,7 +190,7 @@ def _load(name: str) -> "tuple[SiteMessage, dict[int | None, bytes]]":
 
 def _listening(listen: str | None) -> "ListenAddress":
     """Where to listen. Raises SkylessError."""
-    from skyless.page.serve import PORT, ListenAddress
+    from skyless.page.app import PORT, ListenAddress
 
     if listen is None:
         return ListenAddress("127.0.0.1", None)
@@ -207,7 +205,7 @@ def _rules(
     import secrets
     import socket
 
-    from skyless.page.guard import AccessRules
+    from skyless.page.connections import AccessRules
     from skyless.run.web import own_names
 
     for option, value in (("--token", token), ("--reader-token", reader_token)):

@@ -21,7 +21,7 @@ from skyless.core.whole_files import write_whole
 
 if TYPE_CHECKING:
     from skyless.cli.api.study import StudyResult
-    from skyless.research.studies.common.plan import Row
+    from skyless.research.studies.common.runner import Row
 
 _OF_ERRORS: Final = (
     "Simulated. ± standard errors. NEES: per dimension, with the interval where 99 % of honest ones lie.",

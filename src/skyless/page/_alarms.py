@@ -10,8 +10,8 @@ from typing import Final
 from msgspec.structs import replace
 
 from skyless.core.site import AlarmRule
-from skyless.page._kept import Kept, SiteLink
-from skyless.page._state import encode
+from skyless.page.events import Kept, SiteLink
+from skyless.page.state import encode
 from skyless.run.alarms import MAX_KEPT, AlarmEngine, Key, is_over
 from skyless.run.mqtt.messages import (
     AcknowledgeMessage,

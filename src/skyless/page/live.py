@@ -20,14 +20,11 @@ from starlette.exceptions import HTTPException
 from skyless.core.errors import ConfigurationError
 from skyless.core.version import installed_version
 from skyless.page._alarms import SiteAlarms
-from skyless.page._events import EventLog, EventQueue, publisher_rank
-from skyless.page._kept import Kept, SiteLink
-from skyless.page._site_survey import SiteSurvey
-from skyless.page._state import PageRequest, Sent, SiteState, encode
 from skyless.page.condition.evidence import Evidence
 from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor, offline_anchors
-from skyless.page.event_list import EventList
+from skyless.page.events import EventList, EventLog, EventQueue, Kept, SiteLink, publisher_rank
 from skyless.page.site_assets import AssetsFile, SiteAssets
+from skyless.page.state import PageRequest, Sent, SiteState, SiteSurvey, encode
 from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import Role

@@ -12,8 +12,7 @@ from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD, METHODS
 from skyless.core.site import Site
-from skyless.page.task_process import serve_tasks
-from skyless.page.tasks import OverlayTask
+from skyless.page.tasks import OverlayTask, serve_tasks
 from skyless.site.planning.links import FIX_SHARE, HDOP, PDOP, SIGMA
 from skyless.site.planning.maps import Grid, plan_map
 from skyless.site.planning.picture import COLOUR_STOPS, scale_of

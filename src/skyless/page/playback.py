@@ -15,8 +15,8 @@ from msgspec import Struct
 from starlette.exceptions import HTTPException
 
 from skyless.core.errors import SkylessError
-from skyless.page._events import Event, EventLog
-from skyless.page._state import SiteState
+from skyless.page.events import Event, EventLog
+from skyless.page.state import SiteState
 from skyless.run.mqtt.messages import (
     REACH_S,
     AnchorHealth,

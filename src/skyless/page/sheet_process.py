@@ -3,7 +3,7 @@
 import time
 
 from skyless.core.site import Site
-from skyless.page.task_process import serve_tasks
+from skyless.page.tasks import serve_tasks
 from skyless.site.planning.report import sheet
 
 

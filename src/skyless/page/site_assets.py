@@ -7,8 +7,8 @@ from typing import Final
 
 from skyless.core.errors import SkylessError
 from skyless.core.whole_files import replace_files
-from skyless.page._kept import Kept
-from skyless.page._state import encode
+from skyless.page.events import Kept
+from skyless.page.state import encode
 from skyless.run.assets import assets_at, check_assets, read_assets, read_csv, write_csv
 from skyless.run.mqtt.messages import Asset, AssetsMessage, WrongMessageError
 

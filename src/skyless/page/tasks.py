@@ -1,12 +1,21 @@
 """What the server has computed by processes of their own (``task_process.py``)."""
 
+import asyncio
+import os
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Literal
+from typing import Final, Literal, TypeVar
 
-from msgspec import Struct
+import msgspec
+from msgspec import Raw, Struct
 from msgspec.structs import replace
+from starlette.exceptions import HTTPException
 
+from skyless.core.errors import SkylessError
 from skyless.core.site import AnchorSite, Site
+from skyless.run.limits import PAGE as LIMITS
 from skyless.site.file.check import check_site
 
 Kind = Literal["pdop", "hdop", "sigma"]
@@ -51,3 +60,103 @@ class MovedAnchors(Struct, frozen=True):
         moved = replace(site, anchors=anchors)
         check_site(moved, Path("the moved anchors"))
         return moved
+
+
+# A process of its own for what would delay the pages, or would load NumPy into the server: one task at a time.
+#
+# Tasks and answers are lines of JSON.
+
+_TIMEOUT_S: Final = 120.0
+_IDLE_S: Final = 60.0
+"""A process without a task for this long is ended: it has loaded a hundred megabytes."""
+
+_NICE: Final = 19  # positioning on this machine has priority
+
+_Task = TypeVar("_Task", bound=Struct)
+
+
+class _Answer(Struct):
+    value: Raw = Raw(b"null")
+    error: str | None = None
+
+
+class TaskProcess:
+    """Runs a module that does tasks, one after the other."""
+
+    def __init__(self, module: str, fault: int = 422) -> None:
+        """``module`` calls ``serve_tasks`` when it is run; ``fault`` is the status of what it answers with an error."""
+        self._module, self._fault = module, fault
+        self._lock = asyncio.Lock()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._idle: asyncio.TimerHandle | None = None
+        self._stopped = False
+
+    def stop(self) -> None:
+        """Stop the task at hand. No other starts."""
+        self._stopped = True
+        self._kill()
+
+    async def run(self, task: Struct) -> bytes:
+        """The answer to a task, as JSON. Raises HTTPException."""
+        async with self._lock:
+            if self._stopped:
+                raise HTTPException(422, "the dashboard is stopping")
+            if self._idle is not None:
+                self._idle.cancel()
+            try:
+                async with asyncio.timeout(_TIMEOUT_S):
+                    line = await asyncio.to_thread(self._exchange, msgspec.json.encode(task))
+            except TimeoutError:
+                self._kill()
+                raise HTTPException(422, f"it takes longer than {_TIMEOUT_S:g} s") from None
+            except BaseException:
+                self._kill()  # what it would answer belongs to no later task
+                raise
+            self._idle = asyncio.get_running_loop().call_later(_IDLE_S, self._kill)
+        if not line:
+            raise HTTPException(422, "it could not be computed; the dashboard's terminal shows why")
+        answer = msgspec.json.decode(line, type=_Answer)
+        if answer.error is not None:
+            raise HTTPException(self._fault, answer.error)
+        return bytes(answer.value)
+
+    def _exchange(self, task: bytes) -> bytes:
+        """The process's answer, empty where it has failed."""
+        process = self._process
+        if process is None or process.poll() is not None:
+            self._process = process = subprocess.Popen(
+                (sys.executable, "-m", self._module),
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                start_new_session=True,  # Ctrl-C stops the dashboard, which kills this process itself
+            )
+        if process.stdin is None or process.stdout is None:
+            raise HTTPException(422, "its process has no pipes")
+        try:
+            process.stdin.write(task + b"\n")
+            process.stdin.flush()
+            return process.stdout.readline()
+        except (OSError, ValueError):  # ValueError: it was killed meanwhile, and its pipes are closed
+            return b""
+
+    def _kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
+            self._process = None
+
+
+def serve_tasks(kind: type[_Task], answer: Callable[[_Task], object]) -> None:
+    """Answer the tasks of standard input on standard output, until it is closed. A SkylessError is an answer, too."""
+    os.nice(_NICE)
+    for line in sys.stdin.buffer:
+        try:
+            value = msgspec.json.encode(answer(msgspec.json.decode(line, type=kind)))
+            found = _Answer(Raw(value))
+            if len(value) > LIMITS.answer_bytes:
+                size, most = (f"{1e-6 * count:.0f} MB" for count in (len(value), LIMITS.answer_bytes))
+                found = _Answer(error=f"the answer has {size}, and may have {most}; ask for less")
+        except SkylessError as error:
+            found = _Answer(error=str(error))
+        sys.stdout.buffer.write(msgspec.json.encode(found) + b"\n")
+        sys.stdout.buffer.flush()

@@ -20,8 +20,7 @@ from skyless.core.native.library import SOURCE, source_digest
 from skyless.core.native.records import Record, first, view
 from skyless.core.tag.admission import Tag
 from skyless.core.tag.receiver import Receiver
-from skyless.page.task_process import serve_tasks
-from skyless.page.tasks import WhatIfTask
+from skyless.page.tasks import WhatIfTask, serve_tasks
 from skyless.run.mqtt.messages import RawReception, SegmentStart
 from skyless.run.recordings.recorder import RefusedError, load
 from skyless.run.recordings.recording import McapRecording

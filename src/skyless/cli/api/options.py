@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from skyless.core.site import Site
-    from skyless.research.masterless.own_estimator import OwnEstimator
+    from skyless.research.masterless.smoothing import OwnEstimator
 
 _USUAL_DURATION_S = 60.0
 """Duration of a simulation without a goal."""
@@ -190,7 +190,7 @@ class PlanOptions(_Planned, frozen=True, kw_only=True):
 
 
 def _check_study(name: str, value: str) -> Any:  # noqa: ANN401 - the name
-    from skyless.research.studies.catalogue import STUDIES
+    from skyless.research.studies.run import STUDIES
 
     return check_choice(name, value, tuple(STUDIES))
 

@@ -15,7 +15,7 @@ from skyless.core.arguments import python_function
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import FILTERS
 from skyless.core.site import Site
-from skyless.research.masterless.own_estimator import OwnReceiver
+from skyless.research.masterless.smoothing import OwnReceiver
 from skyless.sim.evaluation.figures import dimensions
 from skyless.sim.evaluation.fleet import FleetReport, JudgedFix, TagFleet, report
 from skyless.sim.evaluation.request import Conditions
@@ -80,7 +80,7 @@ class SimulationResult(Result, frozen=True, eq=False):
         Raises:
             SkylessError: there is no such tag.
         """
-        from skyless.research.replays.plot import track_figure
+        from skyless.research.replays.options import track_figure
 
         rows = self.fixes.track(tag)
         return track_figure(rows, f"{self.site.name}, {tag or self.tags[0]}, simulated: {len(rows)} fixes")

@@ -13,9 +13,8 @@ from skyless.cli.common.output import cm
 from skyless.core.arguments import check_choice, process_noise, python_function
 from skyless.core.arrays import Vector
 from skyless.core.integrity import RISK
-from skyless.research.studies.catalogue import STUDIES
-from skyless.research.studies.common.plan import Plan, Row, plan_of
-from skyless.research.studies.run import Parts
+from skyless.research.studies.common.runner import Plan, Row, plan_of
+from skyless.research.studies.run import STUDIES, Parts
 from skyless.research.studies.run import run_study as rows_of_study
 
 if TYPE_CHECKING:

@@ -15,13 +15,10 @@ from skyless.core.arguments import python_function
 from skyless.core.arrays import Integers, Vector
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site
-from skyless.research.calibration.biases import Biases, biases_of
-from skyless.research.calibration.facts import facts_of
-from skyless.research.calibration.options import SurveyOptions
-from skyless.research.calibration.recorded_stamps import ranges_of
-from skyless.research.calibration.tags import known_tags, walks_of
+from skyless.research.calibration.biases import Biases, biases_of, known_tags, ranges_of, walks_of
+from skyless.research.calibration.options import SurveyOptions, facts_of
 from skyless.research.foreign.formats import format_of
-from skyless.research.replays.inputs import known_truth
+from skyless.research.replays.options import known_truth
 from skyless.run.recordings.recording import McapRecording, is_mcap
 from skyless.site.file.load import site_of
 from skyless.site.survey.facts import Count, PairRanges, Survey, count

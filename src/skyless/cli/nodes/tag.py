@@ -36,7 +36,7 @@ from skyless.sim.evaluation.request import ProtectionOptions
 
 if TYPE_CHECKING:
     from skyless.core.air.masterless_packets import Point
-    from skyless.research.live.packet_tags import PacketTagSettings
+    from skyless.research.masterless.packet_tags import PacketTagSettings
 
 _TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
@@ -196,7 +196,7 @@ def _on_sniffers(
     bridge: TagBridge | None,
 ) -> Coroutine[Any, Any, None]:
     """Tags that hear the packets of another system."""
-    from skyless.research.live.packet_tags import PacketTags
+    from skyless.research.masterless.packet_tags import PacketTags
 
     settings = _system(asked)
     radios = open_sniffers(asked.radio, names, settings.anchors_m)
@@ -224,7 +224,7 @@ def _on_sniffers(
 def _system(asked: TagOptions) -> "PacketTagSettings":
     """What sniffers cannot hear, and FiRa boards may not. Raises SkylessError."""
     from skyless.core.geometry import GUESSED_STD_M, plane_height_m
-    from skyless.research.live.packet_tags import TDOA_SITE, PacketTagSettings
+    from skyless.research.masterless.packet_tags import TDOA_SITE, PacketTagSettings
     from skyless.site.tables import read_anchors, read_calibration
 
     if asked.anchors is None and not hears_positions(asked.radio):

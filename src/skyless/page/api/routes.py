@@ -1,6 +1,8 @@
 """All routes: what the server answers, and its OpenAPI document, come from it and the functions' signatures."""
 
+import asyncio
 import inspect
+import time
 from collections.abc import Awaitable, Callable
 from typing import Any, Final, Literal, get_origin
 
@@ -10,14 +12,135 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.websockets import WebSocket
 
-from skyless.page.api import geojson, past, present, stream
-from skyless.page.api.json_answer import JSON, json_answer
-from skyless.page.api.openapi import CSV, GEOJSON, ROOT, document
-from skyless.page.api.parameters import RENAMED, MapQuery, SiteQuery, read_query
-from skyless.page.api.past import Past
+from skyless.core.version import installed_version
+from skyless.page.api import questions
+from skyless.page.api.answers import (
+    CSV,
+    GEOJSON,
+    JSON,
+    RENAMED,
+    ROOT,
+    MapQuery,
+    SiteQuery,
+    TagNames,
+    document,
+    json_answer,
+    names,
+    read_query,
+)
+from skyless.page.api.questions import Past, usable
+from skyless.page.connections import POLICY_VIOLATION, TRY_LATER, send, serve_socket
+from skyless.page.live import LiveSite
 from skyless.page.sites import Sites
 from skyless.run.assets import MAX_BYTES
+from skyless.run.limits import PAGE as LIMITS
+from skyless.run.mqtt.messages import AlarmMessage
+
+# The stream of a site over a WebSocket: the newest fix of each tag, and what happens (``docs/http.md``).
+#
+# Each stream looks at the site ten times a second and keeps no queue: after a pause, its reader gets the newest
+# state.
+
+PERIOD_S: Final = 0.1
+_PAUSES: Final = 9.0  # of very many tags a stream is sent less often, so that it takes a tenth of a processor at most
+_MAX_REASON_BYTES: Final = 120  # of the 123 that the protocol allows
+
+
+class StreamQuery(SiteQuery, frozen=True):
+    """Which tags a stream is about."""
+
+    tags: TagNames = ""
+
+
+class SiteStream:
+    """What one reader has been sent."""
+
+    def __init__(self, live: LiveSite, tags: frozenset[str]) -> None:
+        """An empty set of tags means all."""
+        self._live, self._tags = live, tags
+        self._fixes = 0  # serial of the last fix
+        self._event = live.event_list.last
+        self._alarms: dict[tuple[str, str], AlarmMessage] = {}  # by rule and subject
+
+    def hello(self) -> bytes:
+        """The first message."""
+        live = self._live
+        name = None if live.site is None else live.site.site.name
+        fields = {"version": installed_version(), "site": live.number, "name": name, "history": live.has_history}
+        return msgspec.json.encode({"type": "hello", **fields})
+
+    def new(self) -> list[bytes]:
+        """What is new to the reader."""
+        return [*self._new_fixes(), *self._new_zone_events(), *self._new_alarms()]
+
+    def _carries(self, *tags: str) -> bool:
+        return not (self._tags and self._tags.isdisjoint(tags))
+
+    def _new_fixes(self) -> list[bytes]:
+        serial, self._fixes = self._fixes, self._live.state.serial
+        if serial == self._fixes:
+            return []
+        fixes = usable(given for given in self._live.recent_fixes(after=serial) if self._carries(given[0].tag))
+        return [msgspec.json.encode({"type": "fixes", "fixes": fixes})] if fixes else []
+
+    def _new_zone_events(self) -> list[bytes]:
+        number, self._event = self._event, self._live.event_list.last
+        events = (event.zone_event for event, _ in self._live.event_list.since(number))
+        return [_message("zone_event", event) for event in events if event is not None and self._carries(event.tag)]
+
+    def _new_alarms(self) -> list[bytes]:
+        now = {(alarm.rule, alarm.subject): alarm for alarm in self._live.alarms.messages}
+        before, self._alarms = self._alarms, now
+        changed = [(alarm, False) for key, alarm in now.items() if before.get(key) != alarm]
+        changed += [(alarm, True) for key, alarm in before.items() if key not in now]
+        return [
+            _message("alarm", alarm, over=over)
+            for alarm, over in changed
+            if not alarm.tags or self._carries(*alarm.tags)
+        ]
+
+
+def _message(kind: str, value: Struct, **more: object) -> bytes:
+    return msgspec.json.encode({"type": kind, **more, **msgspec.structs.asdict(value)})
+
+
+def endpoint(sites: Sites) -> Callable[[WebSocket], Awaitable[None]]:
+    """The WebSocket's handler."""
+    open_streams: set[WebSocket] = set()
+
+    async def serve(socket: WebSocket) -> None:
+        await socket.accept()
+        try:
+            query = read_query(socket.query_params, StreamQuery)
+            live = sites.of(query.site_text)
+        except HTTPException as error:
+            await socket.close(POLICY_VIOLATION, error.detail.encode()[:_MAX_REASON_BYTES].decode(errors="ignore"))
+            return
+        if len(open_streams) >= LIMITS.streams:
+            await socket.close(TRY_LATER, f"{LIMITS.streams} streams are open")
+            return
+        open_streams.add(socket)
+        live.streams += 1
+        try:
+            await serve_socket(socket, _send_news(socket, SiteStream(live, frozenset(names(query.tags)))))
+        finally:
+            open_streams.discard(socket)
+            live.streams -= 1
+
+    return serve
+
+
+async def _send_news(socket: WebSocket, stream: SiteStream) -> None:
+    messages, spent_s = [stream.hello()], 0.0
+    while True:
+        await send(socket, messages)
+        await asyncio.sleep(max(PERIOD_S, _PAUSES * spent_s))
+        begin_s = time.monotonic()
+        messages = stream.new()
+        spent_s = time.monotonic() - begin_s
+
 
 MAX_BODY_BYTES: Final = 2 * MAX_BYTES
 
@@ -65,28 +188,28 @@ class ApiRoute:
 
 
 ROUTES: Final = (
-    ApiRoute("GET", "/site", present.site),
-    ApiRoute("GET", "/anchors", present.anchors, is_map=True),
-    ApiRoute("GET", "/tags", present.tags),
-    ApiRoute("GET", "/tags/{tag}", present.tag),
-    ApiRoute("GET", "/fixes", present.fixes, is_map=True),
-    ApiRoute("GET", "/zones", present.zones, is_map=True),
-    ApiRoute("GET", "/events", present.events),
-    ApiRoute("GET", "/assets", present.assets),
-    ApiRoute("PUT", "/assets", present.put_assets),
-    ApiRoute("GET", "/assets.csv", present.assets_csv, CSV),
-    ApiRoute("PUT", "/assets.csv", present.put_assets_csv),
-    ApiRoute("GET", "/alarms", present.alarms),
-    ApiRoute("POST", "/alarms/{rule}/{subject}/acknowledge", present.acknowledge),
-    ApiRoute("GET", "/alarm_rules", present.alarm_rules),
-    ApiRoute("PUT", "/alarm_rules", present.put_alarm_rules),
-    ApiRoute("GET", "/history/tags", past.tags),
-    ApiRoute("GET", "/history/track", past.track),
-    ApiRoute("GET", "/history/heatmap", past.heatmap),
-    ApiRoute("GET", "/history/dwell", past.dwell),
-    ApiRoute("GET", "/history/occupancy", past.occupancy),
-    ApiRoute("GET", "/history/contacts", past.contacts),
-    ApiRoute("GET", "/history/alarms", past.alarms),
+    ApiRoute("GET", "/site", questions.site),
+    ApiRoute("GET", "/anchors", questions.anchors, is_map=True),
+    ApiRoute("GET", "/tags", questions.tags),
+    ApiRoute("GET", "/tags/{tag}", questions.tag),
+    ApiRoute("GET", "/fixes", questions.fixes, is_map=True),
+    ApiRoute("GET", "/zones", questions.zones, is_map=True),
+    ApiRoute("GET", "/events", questions.events),
+    ApiRoute("GET", "/assets", questions.assets),
+    ApiRoute("PUT", "/assets", questions.put_assets),
+    ApiRoute("GET", "/assets.csv", questions.assets_csv, CSV),
+    ApiRoute("PUT", "/assets.csv", questions.put_assets_csv),
+    ApiRoute("GET", "/alarms", questions.alarms),
+    ApiRoute("POST", "/alarms/{rule}/{subject}/acknowledge", questions.acknowledge),
+    ApiRoute("GET", "/alarm_rules", questions.alarm_rules),
+    ApiRoute("PUT", "/alarm_rules", questions.put_alarm_rules),
+    ApiRoute("GET", "/history/tags", questions.past_tags),
+    ApiRoute("GET", "/history/track", questions.track),
+    ApiRoute("GET", "/history/heatmap", questions.heatmap),
+    ApiRoute("GET", "/history/dwell", questions.dwell),
+    ApiRoute("GET", "/history/occupancy", questions.occupancy),
+    ApiRoute("GET", "/history/contacts", questions.contacts),
+    ApiRoute("GET", "/history/alarms", questions.past_alarms),
 )
 
 
@@ -100,7 +223,7 @@ def api_routes(sites: Sites, history: Past) -> list[BaseRoute]:
     return [
         Route(f"{ROOT}/openapi.json", openapi),
         *(Route(ROOT + route.path, _endpoint(route, sites, history), methods=[route.method]) for route in ROUTES),
-        WebSocketRoute(f"{ROOT}/stream", stream.endpoint(sites)),
+        WebSocketRoute(f"{ROOT}/stream", endpoint(sites)),
     ]
 
 
@@ -110,7 +233,7 @@ def _endpoint(route: ApiRoute, sites: Sites, history: Past) -> Callable[[Request
         live = sites.of(query.site_text)
         given = {name: getattr(query, name) for name in route.parameters}
         if isinstance(query, MapQuery) and query.format == "geojson":
-            return geojson.collection(live, route.key)
+            return questions.collection(live, route.key)
         if route.body is not None:
             given["body"] = _read_body(await read_bytes(request, MAX_BODY_BYTES), route.body)
         if route.is_past:

@@ -1,26 +1,228 @@
 """By how much each anchor of another system seems late, from a tag at known positions, in bounded memory."""
 
-from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from math import dist, log
+import math
+import os
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from math import dist, inf, log
+from os import PathLike
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import msgspec
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
+from skyless.core.air.frame import Reception
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
-from skyless.core.errors import SkylessError
-from skyless.core.input_files import Drops
+from skyless.core.errors import ConfigurationError, SkylessError
+from skyless.core.input_files import Drops, open_source
+from skyless.core.site import Site
+from skyless.core.ticks import TICK_BITS, Unwrapper, to_seconds
 from skyless.research.calibration.options import First, Stay, SurveyOptions
-from skyless.research.calibration.tags import PositionAt, position_of_stays, position_of_truth
-from skyless.research.foreign.formats import Recording, open_recording
+from skyless.research.foreign import avalue
+from skyless.research.foreign.formats import FORMATS, Recording, format_of, open_recording
 from skyless.research.masterless.pair_engine import PairEngine
-from skyless.research.replays.inputs import flight_height, known_anchors, known_truth
+from skyless.research.replays.options import flight_height, known_anchors, known_truth
+from skyless.research.replays.site import SITE_FORMAT, reception_of, recorded_site, recorded_truth
+from skyless.run.mqtt.messages import ReceptionsMessage, StampsMessage
+from skyless.run.recordings.recording import HostClock, McapRecording, Recorded, is_mcap, tags_to_replay
 from skyless.sim.evaluation.figures import EvenSample, TruthTrack
 from skyless.site.survey.estimate import CalibrationEstimate, Differences, estimate
-from skyless.site.tables import calibrated_table, new_table
+from skyless.site.survey.facts import PairBlock, PairRanges
+from skyless.site.survey.legs import AnchorLeg, LegCollector, RelayedDifferences, RelayMatcher
+from skyless.site.survey.pair_ranger import PairRanger
+from skyless.site.survey.walk import EPOCH_S, EpochCollector, TagEpochs
+from skyless.site.tables import Truth, calibrated_table, new_table
+
+# Tags of a recording of ``skyless record`` that were carried around, or stood at known positions.
+
+_TAG_STD_M: Final = 0.02
+"""Standard deviation of a tag's known position, per axis."""
+
+_OFFSET_STD_M: Final = 0.03
+"""Each anchor's own constant at the tag, which is no delay: reflections that are always there. It is less than in a
+walk, as delays are what is looked for."""
+
+_HEIGHT_STD_M: Final = 0.1
+"""How well the height of a tag that is carried around is known."""
+
+PositionAt = Callable[[float], Point | None]
+"""Where the tag's antenna was at a time of the recording; None where that is not known."""
+
+
+def position_of_truth(truth: TruthTrack, above_m: float | None) -> PositionAt:
+    """Truth by time, where it is high enough."""
+
+    def position_at(time_s: float) -> Point | None:
+        at_m = truth.at(time_s)
+        return None if at_m is None or (above_m is not None and at_m[2] <= above_m) else at_m
+
+    return position_at
+
+
+def position_of_stays(stays: Sequence[Stay], height_m: float | None, begin_s: float) -> PositionAt:
+    """Known positions by time; of stays that overlap the first counts.
+
+    Raises:
+        SkylessError: a stay has no height, and the site does not know it either.
+    """
+    stays_m: list[tuple[Stay, Point]] = []
+    for stay in stays:
+        z_m = height_m if stay.z_m is None else stay.z_m
+        if z_m is None:
+            raise SkylessError(f"--at {stay.x_m:g},{stay.y_m:g} lacks its height: it should be x,y,z")
+        stays_m.append((stay, (stay.x_m, stay.y_m, z_m)))
+
+    def position_at(time_s: float) -> Point | None:
+        since_s = time_s - begin_s
+        return next((position_m for stay, position_m in stays_m if stay.from_s <= since_s <= stay.to_s), None)
+
+    return position_at
+
+
+def walks_of(recording: McapRecording, site: int, asked: SurveyOptions) -> tuple[TagEpochs, ...]:
+    """What the tags of --walk received while they were carried around. Raises SkylessError."""
+    return tuple(
+        replace(
+            walk_of(recording, site, walk.tag, (walk.from_s, walk.to_s), asked.walk_height_m),
+            name=f"the walk of {walk.tag}",
+        )
+        for walk in asked.walks
+        if not isinstance(walk, str)
+    )
+
+
+def known_tags(
+    recording: McapRecording, site: Site, asked: SurveyOptions, truth: Truth | None
+) -> tuple[TagEpochs, ...]:
+    """What tags received while it was known where they were.
+
+    ``truth``: that of a table, in Unix time. Raises SkylessError.
+    """
+    raw = tags_to_replay(recording.summary())
+    names, recorded = ", ".join(raw), recorded_truth(recording)
+    if asked.tag is not None and asked.tag not in raw:
+        raise ConfigurationError(asked.recording or "", "tag", asked.tag, f"one of {names}")
+    if asked.tag is None and len(raw) > 1 and not asked.recorded_truth:
+        raise SkylessError(f"--tag is missing; it should name the tag whose position is known, one of {names}")
+    found = []
+    for tag in raw if asked.tag is None else (asked.tag,):
+        epochs = walk_of(recording, site.id, tag)
+        begin_s = float(epochs.t_s[0]) - EPOCH_S / 2.0
+        if asked.stays:
+            known = position_of_stays(
+                [one for one in asked.stays if isinstance(one, Stay)], site.tags.height_m, begin_s
+            )
+        else:
+            known = position_of_truth(TruthTrack(truth or recorded.get(tag)), asked.above_m)
+        end_s = _end_s(epochs, begin_s, asked.first)
+        found.append(at_positions(epochs, tag, lambda t_s: known(t_s) if t_s <= end_s else None))  # noqa: B023 - at once
+    if not any(len(epochs.t_s) for epochs in found):
+        raise SkylessError(
+            "the tag was nowhere at a known position; --at, --truth or --recorded-truth should say where it was"
+        )
+    return tuple(epochs for epochs in found if len(epochs.t_s))
+
+
+def _end_s(epochs: TagEpochs, begin_s: float, first: object) -> float:
+    """Until when a tag is used."""
+    if not isinstance(first, First):
+        return inf
+    if first.seconds is not None:
+        return begin_s + first.seconds
+    last_s = float(epochs.t_s[-1])
+    if first.part is not None:
+        return begin_s + first.part * (last_s - begin_s)
+    sums = np.cumsum(np.bincount(epochs.epoch, epochs.count, len(epochs.t_s)))
+    return float(epochs.t_s[min(int(np.searchsorted(sums, first.count or 0)), len(sums) - 1)])
+
+
+def walk_of(
+    recording: McapRecording, site: int, tag: str, span: tuple[float, float] = (0.0, inf), height_m: float | None = None
+) -> TagEpochs:
+    """Differences of a tag that was carried around; ``span``: from and to, in seconds since its first reception.
+
+    ``height_m``: of the tag above the floor, if it is known within some 0.1 m; free otherwise.
+
+    Raises:
+        SkylessError: the recording has no receptions of the tag, or none in the span that give a difference.
+    """
+    names = recording.summary().raw_tags
+    if tag not in names:
+        wanted = f"one of {', '.join(names)}" if names else "of a tag whose receptions were recorded"
+        raise ConfigurationError(recording.summary().path, "tag", tag, wanted)
+    collector = EpochCollector()
+    receptions, differences = NewReceptions(), RelayedDifferences(site)
+    begin_s: float | None = None
+    for found in recording.messages({"receptions"}):
+        if found.channel.name != tag:
+            continue
+        message = cast("ReceptionsMessage", found.message)
+        if receptions.begins(message):
+            differences = RelayedDifferences(site)
+        for reception, unix_s in receptions.read(message):
+            begin_s = unix_s if begin_s is None else begin_s
+            if span[0] <= unix_s - begin_s <= span[1]:
+                for one in differences.add(reception):
+                    collector.add(unix_s - one.age_s, one.first, one.second, one.difference_m)
+    epochs = collector.epochs()
+    if not len(epochs.t_s):
+        raise SkylessError(f"the receptions of {tag} give no differences between anchors in {span[0]:g}:{span[1]:g} s")
+    if height_m is None:
+        return epochs
+    known_m = epochs.known_m.copy()
+    known_m[:, 2] = height_m
+    return replace(epochs, known_m=known_m, known_std_m=(*epochs.known_std_m[:2], _HEIGHT_STD_M))
+
+
+def at_positions(epochs: TagEpochs, tag: str, position_at: PositionAt) -> TagEpochs:
+    """The epochs with known positions. Epochs without one are left out."""
+    known = [position_at(t_s) for t_s in epochs.t_s.tolist()]
+    is_known = np.array([one is not None for one in known], dtype=bool)
+    rows = is_known[epochs.epoch]
+    number = np.cumsum(is_known) - 1
+    return replace(
+        epochs,
+        t_s=epochs.t_s[is_known],
+        epoch=number[epochs.epoch[rows]],
+        first=epochs.first[rows],
+        second=epochs.second[rows],
+        difference_m=epochs.difference_m[rows],
+        since_s=epochs.since_s[rows],
+        count=epochs.count[rows],
+        known_m=np.array([one for one in known if one is not None]).reshape(-1, 3),
+        known_std_m=(_TAG_STD_M, _TAG_STD_M, _TAG_STD_M),
+        offset_std_m=_OFFSET_STD_M,
+        name=f"{tag} at known positions",
+    )
+
+
+class NewReceptions:
+    """One tag's receptions, as they come, each once."""
+
+    def __init__(self) -> None:
+        self._clock: HostClock[Reception] = HostClock()
+        self._segment = ""
+        self._next = 0
+
+    def begins(self, message: ReceptionsMessage) -> bool:
+        """Whether the tag has started again; receptions before are of another counter."""
+        if message.segment == self._segment:
+            return False
+        self._segment, self._next, self._clock = message.segment, message.first, HostClock()
+        return True
+
+    def read(self, message: ReceptionsMessage) -> Iterator[tuple[Reception, float]]:
+        """Receptions, each once, with Unix time: of this run and of runs before, as their times become known."""
+        new = message.receptions[max(self._next - message.first, 0) :]
+        self._next = max(self._next, message.first + len(message.receptions))
+        for raw in new:
+            reception = reception_of(raw)
+            if reception is not None:
+                yield from self._clock.add(reception, message.unix_less_host_s, reception)
+
 
 _MANY_OUTLIERS: Final = 0.05
 _UNEXPLAINED_SHARE: Final = 0.5
@@ -164,3 +366,198 @@ def _row(pair: PairTdoa, anchor_positions_m: dict[int, Point], position_at: Posi
     range_a, range_b = max(dist(at_m, a_m), _NEAREST_M), max(dist(at_m, b_m), _NEAREST_M)
     excess_m = pair.tdoa_m - (range_b - range_a)
     return pair.time_s, float(pair.anchor_a), float(pair.anchor_b), excess_m, log(range_b / range_a)
+
+
+# Ranges of pairs of anchors out of a recording: of a running site, or of another system whose anchors range.
+
+_REPORT_EVERY: Final = 1000
+"""Records between two reports of progress."""
+
+_MAX_SEEN: Final = 1 << 16
+"""Legs that are known to have been added: several listeners relay the same ones."""
+
+
+class RecordedRanges(Struct, frozen=True):
+    """Ranges out of a recording, and what could not be used."""
+
+    ranges: PairRanges
+    ranger: PairRanger
+    """What made the ranges, and can drop those from before an anchor was moved."""
+    format: str
+    site: Site | None
+    """The recorded site. None for recordings of other systems."""
+    drops: dict[str, int]
+    """What could not be used, by reason."""
+    damage: dict[str, int] = {}
+    """Those of the drops that are damage of the file, which other readers of it meet as well."""
+
+
+def ranges_of(
+    path: str | PathLike[str],
+    format_name: str | None = None,
+    *,
+    identifier: int | None = None,
+    block_s: float = 1.0,
+    on_block: Callable[[PairBlock], None] | None = None,
+    from_s: float = 0.0,
+    to_s: float = math.inf,
+    on_progress: Callable[[float], None] | None = None,
+) -> RecordedRanges:
+    """Ranges of a recording of ``skyless record``, or of another system's; ``format_name`` chooses its format.
+
+    ``identifier``: of the site, where it should be checked. ``block_s``, ``on_block``: of ``PairRanger``. ``from_s``,
+    ``to_s``: the part in use, in seconds since the first leg. ``on_progress`` is given the share of the recording that
+    has been read, now and then.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or its format has no stamps of anchors.
+    """
+    if format_name == SITE_FORMAT or (format_name is None and is_mcap(path)):
+        part = _Part(PairRanger(TICK_BITS, block_s, on_block=on_block), from_s, to_s, on_progress)
+        return _of_site(path, identifier, part)
+    known = format_of(path, format_name)
+    if known.tx_bits is None:
+        stamped = ", ".join(one.name for one in FORMATS if one.tx_bits is not None)
+        raise ConfigurationError(path, "format", known.name, f"one with stamps of anchors: {SITE_FORMAT}, {stamped}")
+    part = _Part(PairRanger(known.tx_bits, block_s, on_block=on_block), from_s, to_s, on_progress)
+    drops = _add_receptions(path, part) if known.name == "avalue" else _add_packets(path, known.name, part)
+    return RecordedRanges(part.finish(), part.ranger, known.name, None, dict(drops + part.drops()))
+
+
+class _Part:
+    """The legs of a part of a recording, each once."""
+
+    def __init__(
+        self, ranger: PairRanger, from_s: float, to_s: float, on_progress: Callable[[float], None] | None
+    ) -> None:
+        self.ranger = ranger
+        self._from_s, self._to_s = from_s, to_s
+        self._on_progress, self._records = on_progress, 0
+        self._begin_s: float | None = None
+        self._seen: OrderedDict[tuple[int, int, int], None] = OrderedDict()
+
+    def add(self, leg: AnchorLeg) -> None:
+        """Add a leg that lies in the part."""
+        key = (leg.sender, leg.receiver, leg.rx_ticks)
+        if key in self._seen:
+            return
+        self._seen[key] = None
+        if len(self._seen) > _MAX_SEEN:
+            self._seen.popitem(last=False)
+        if self._begin_s is None:
+            self._begin_s = leg.t_s
+        if self._from_s <= leg.t_s - self._begin_s < self._to_s:
+            self.ranger.add(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s)
+
+    def report(self, share: Callable[[], float]) -> None:
+        """Count a record, and report progress now and then."""
+        self._records += 1
+        if self._on_progress is not None and self._records % _REPORT_EVERY == 0:
+            self._on_progress(min(max(share(), 0.0), 1.0))
+
+    def finish(self) -> PairRanges:
+        """The ranges of all legs."""
+        self.ranger.finish()
+        return self.ranger.ranges()
+
+    def drops(self) -> Counter[str]:
+        """What the ranger could not use."""
+        return _drops(self.ranger.counters)
+
+
+def _drops(counters: Counter[str]) -> Counter[str]:
+    return Counter({name: count for name, count in counters.items() if name != "legs" and count})
+
+
+def _of_site(path: str | PathLike[str], identifier: int | None, part: _Part) -> RecordedRanges:
+    """From what tags received, and from anchors' own stamps where they were recorded."""
+    drops: Counter[str] = Counter()
+    collectors: dict[str, LegCollector] = {}
+    runs: dict[int, str] = {}
+    with McapRecording(path) as recording:
+        site = recorded_site(recording, identifier)
+        known = {anchor.id for anchor in site.anchors}
+        summary = recording.summary()
+        begin_s, end_s = summary.start_s or 0.0, summary.end_s or 1.0
+        for found in recording.messages({"receptions", "stamps"}):
+            time_s = found.time_s
+            part.report(lambda: (time_s - begin_s) / max(end_s - begin_s, 1.0))  # noqa: B023 - called at once
+            if found.channel.site != str(site.id):
+                drops["foreign-site"] += 1
+                continue
+            if isinstance(found.message, StampsMessage):
+                legs = _of_anchor(found.message, part.ranger, runs)
+            else:
+                collector = collectors.setdefault(found.channel.name, LegCollector(site.id))
+                legs = _of_tag(found, collector)
+            for leg in legs:
+                if {leg.sender, leg.receiver} <= known:
+                    part.add(leg)
+                else:
+                    drops["unknown-anchor"] += 1
+        damage = _damage(recording)
+    for collector in collectors.values():
+        drops += _drops(collector.counters)
+    return RecordedRanges(
+        part.finish(), part.ranger, SITE_FORMAT, site, dict(damage + drops + part.drops()), dict(damage)
+    )
+
+
+def _damage(recording: McapRecording) -> Counter[str]:
+    """What could not be read of the file, after it was read."""
+    summary = recording.summary()
+    damage = Counter(summary.drops)
+    if summary.unread_bytes:
+        damage["unfinished-record"] += 1
+    return damage
+
+
+def _of_anchor(message: StampsMessage, ranger: PairRanger, runs: dict[int, str]) -> list[AnchorLeg]:
+    """What an anchor received; its time is that of the message."""
+    if runs.setdefault(message.anchor, message.run) != message.run:
+        runs[message.anchor] = message.run
+        ranger.forget(message.anchor)
+    return [
+        AnchorLeg(stamp.anchor, message.anchor, stamp.tx_ticks, stamp.rx_ticks, message.unix_s)
+        for stamp in message.stamps
+    ]
+
+
+def _of_tag(found: Recorded, collector: LegCollector) -> list[AnchorLeg]:
+    """What a tag learned of anchors, in Unix time."""
+    message = cast("ReceptionsMessage", found.message)
+    legs: list[AnchorLeg] = []
+    for raw in message.receptions:
+        host_s = None if raw.host_s is None else raw.host_s + message.unix_less_host_s
+        legs += collector.add(Reception(raw.frame, raw.rx_ticks, found.time_s if host_s is None else host_s))
+    return legs
+
+
+def _add_packets(path: str | PathLike[str], format_name: str, part: _Part) -> Counter[str]:
+    """Add what a listener of another system's packets learned; its own counter gives the times.
+
+    Antenna delays that the stamps include are subtracted, so that ranges are near the distances.
+    """
+    with open_recording(path, format_name) as recording:
+        matcher, ticks = RelayMatcher(recording.format.tx_bits or TICK_BITS), Unwrapper()
+        size = Path(path).stat().st_size
+        for packet in recording:
+            part.report(lambda: recording.bytes_read / max(size, 1))
+            if not isinstance(packet, Packet):
+                continue
+            now_ticks = ticks.unwrap(packet.rx_ticks, packet.host_s)
+            t_s = to_seconds(now_ticks)
+            for leg in matcher.add(packet.anchor, packet.sequence, packet.tx_ticks, packet.relays, now_ticks, t_s):
+                part.add(replace(leg, rx_ticks=leg.rx_ticks - recording.format.delays_ticks))
+        return recording.drops + _drops(matcher.counters)
+
+
+def _add_receptions(path: str | PathLike[str], part: _Part) -> Counter[str]:
+    """Add what Avalue's anchors received of one another."""
+    drops: Drops = Counter()
+    with open_source(path) as stream:
+        size = Path(path).stat().st_size
+        for heard in avalue.cross_receptions(stream, drops):
+            part.report(lambda: os.lseek(stream.fileno(), 0, os.SEEK_CUR) / max(size, 1))
+            part.add(AnchorLeg(heard.sender, heard.receiver, heard.tx_ticks, heard.rx_ticks, heard.host_s))
+    return drops

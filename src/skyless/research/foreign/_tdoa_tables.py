@@ -14,7 +14,7 @@ from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.arrays import Array
 from skyless.core.input_files import Drops, has_columns, open_source, rows
 from skyless.core.ticks import TICK_M, difference
-from skyless.research.foreign._crazyflie import heights_of, in_order
+from skyless.research.foreign.crazyflie import heights_of, in_order
 from skyless.site.tables import Truth
 
 # Tables of TDoAs with tdoa_m = |p − b| − |p − a|: by the names of ``PairTdoa``, or those of the UTIL flights and logs.

@@ -16,13 +16,12 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.input_files import Drops, has_columns, header_of, open_source, read_head
 from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign import bitcraze, fira
-from skyless.research.foreign import _bitcraze_captures as bitcraze_captures
-from skyless.research.foreign import _crazyflie as crazyflie
 from skyless.research.foreign import _muloc as muloc
 from skyless.research.foreign import _phones as phones
 from skyless.research.foreign import _starloc as starloc
 from skyless.research.foreign import _tdoa_tables as tdoa_tables
-from skyless.research.foreign import avalue
+from skyless.research.foreign import avalue, crazyflie
+from skyless.research.foreign import crazyflie as bitcraze_captures
 from skyless.site.tables import Truth, read_truth
 
 Record = Packet | PairTdoa

@@ -13,8 +13,8 @@ from skyless.core.arrays import Array
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.research.paper.monte_carlo import ChainMoments, Quantity, draw_moments
 from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, grouped
-from skyless.research.studies.common.plan import Cell
-from skyless.research.uncertainty.chain import CORRECTED, PRINTED, Chain
+from skyless.research.studies.common.runner import Cell
+from skyless.research.uncertainty import CORRECTED, PRINTED, Chain
 from skyless.site.report import BLUE, INK, RED, panel
 
 QUANTITY_NAMES: Final = ("beta", "gamma_first", "gamma_delayed", "gamma_averaged", "epsilon", "xi", "phi", "lambda")

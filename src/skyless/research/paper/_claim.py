@@ -22,7 +22,7 @@ from skyless.research.paper.plan import (
     Verdict,
     grouped,
 )
-from skyless.research.studies.common.plan import Cell
+from skyless.research.studies.common.runner import Cell
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.trajectory import Static
 from skyless.sim.world import paper_lab_site

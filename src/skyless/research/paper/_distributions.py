@@ -11,8 +11,8 @@ from skyless.core.arrays import Array, Integers
 from skyless.research.paper._checks import NOISES, draw_seed, first_number, paper_chain
 from skyless.research.paper.monte_carlo import draw_lambdas
 from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, gaussian, grouped
-from skyless.research.studies.common.plan import Cell
-from skyless.research.uncertainty.chain import CORRECTED, PRINTED
+from skyless.research.studies.common.runner import Cell
+from skyless.research.uncertainty import CORRECTED, PRINTED
 from skyless.site.report import BLUE, INK, RED, panel
 
 _AGREES_SIGMAS: Final = 5.0

@@ -26,7 +26,7 @@ from skyless.research.paper.plan import (
     gaussian,
     grouped,
 )
-from skyless.research.studies.common.plan import Cell
+from skyless.research.studies.common.runner import Cell
 from skyless.sim.impairments import DelayError, Impairments, lab_impairments
 from skyless.sim.trajectory import Static
 from skyless.sim.world import paper_lab_site

@@ -29,7 +29,7 @@ from skyless.core.protocol1.snapshots import (
     to_master,
 )
 from skyless.core.ticks import TICK_M, TICK_S
-from skyless.research.uncertainty.chain import Chain, Reference
+from skyless.research.uncertainty import Chain, Reference
 
 CHUNK_DRAWS: Final = 1 << 14
 """Draws with one key, which one thread sums up at a time."""

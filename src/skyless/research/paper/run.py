@@ -21,8 +21,7 @@ from skyless.research.paper import _scenario as scenario
 from skyless.research.paper import _static as static
 from skyless.research.paper import _timeline as timeline
 from skyless.research.paper import _walk as walk
-from skyless.research.paper._html import Heading, report_page
-from skyless.research.paper.plan import Plan, Section
+from skyless.research.paper.plan import Heading, Plan, Section, report_page
 from skyless.research.studies.common.runner import run_cells
 from skyless.site.report import picture, report_style
 

@@ -2,16 +2,16 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from msgspec import field, structs
+from msgspec import Struct, field, structs
 
-from skyless.core.air.masterless_packets import Packet, Point
+from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arguments import process_noise
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.estimator.settings import EstimatorSettings
@@ -22,18 +22,20 @@ from skyless.research.foreign.formats import Format, Recording, format_of, open_
 from skyless.research.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.research.masterless.pair_engine import PairEngine
-from skyless.research.replays.inputs import (
+from skyless.research.masterless.smoothing import Event, Height, OwnEstimator, heard, smoothed
+from skyless.research.replays.options import (
+    DIFFERENCES_MADE,
+    PACKETS,
     YAML_SUFFIXES,
+    ReplayOptions,
     flight_height,
     height_to_hold,
     known_anchors,
     known_heights,
     known_truth,
 )
-from skyless.research.replays.noise import NoiseByPair, PairNoise
-from skyless.research.replays.options import DIFFERENCES_MADE, PACKETS, ReplayOptions
-from skyless.research.replays.pipelines import ByOwnEstimator, ByPackets, ByPairs, Pipeline, Record, Smoothed
 from skyless.sim.evaluation.figures import (
+    EvenSample,
     Figures,
     FixSamples,
     FixTable,
@@ -44,7 +46,235 @@ from skyless.sim.evaluation.figures import (
     truth_at,
 )
 from skyless.site.survey.anchor_errors import DifferenceCalibration
-from skyless.site.tables import read_calibration
+from skyless.site.tables import Truth, read_calibration
+
+# Noise of the time differences of a recording, pair by pair, in bounded memory.
+
+MAX_PAIRS: Final = 256
+ROWS_PER_PAIR: Final = 2048
+MIN_PAIR_DIFFERENCES: Final = 20
+"""Differences of a pair from which its noise can be estimated."""
+
+_NOWHERE: Final = (np.nan, np.nan, np.nan)
+
+
+class PairNoise(Struct, frozen=True):
+    """Differences of one pair of anchors."""
+
+    anchor_a: int
+    anchor_b: int
+    count: int
+    median_m: float
+    """Median of the difference, or of its error where the truth is known."""
+    noise_m: float
+    """1.4826 times the median absolute deviation, a standard deviation that outliers do not touch."""
+    against_truth: bool
+
+
+class NoiseByPair:
+    """Keeps an even sample of every pair's differences, less what the truth predicts where it is known."""
+
+    def __init__(self, truth: Truth | None, anchors_m: Mapping[int, Point]) -> None:
+        self.truth = truth
+        self._anchors_m = anchors_m
+        self._samples: dict[tuple[int, int], EvenSample] = {}
+
+    def add(self, pair: PairTdoa) -> None:
+        """Add one difference."""
+        key = (pair.anchor_a, pair.anchor_b)
+        sample = self._samples.get(key)
+        if sample is None:
+            if len(self._samples) >= MAX_PAIRS:
+                return
+            sample = self._samples[key] = EvenSample(8, ROWS_PER_PAIR)
+        a_m = pair.a_m or self._anchors_m.get(pair.anchor_a, _NOWHERE)
+        b_m = pair.b_m or self._anchors_m.get(pair.anchor_b, _NOWHERE)
+        sample.add((pair.time_s, pair.tdoa_m, *a_m, *b_m))
+
+    def pairs(self) -> tuple[PairNoise, ...]:
+        """What is known of each pair that was heard often enough."""
+        found = []
+        for (a, b), sample in sorted(self._samples.items()):
+            time_s, tdoa_m, places_m = sample.rows[:, 0], sample.rows[:, 1], sample.rows[:, 2:].reshape(-1, 2, 3)
+            to_a_m, to_b_m = np.linalg.norm(truth_at(self.truth, time_s)[:, None] - places_m, axis=2).T
+            errors_m = tdoa_m - (to_b_m - to_a_m)
+            known = np.isfinite(errors_m)
+            against_truth = bool(known.sum() >= MIN_PAIR_DIFFERENCES)
+            values_m = errors_m[known] if against_truth else tdoa_m
+            if len(values_m) >= MIN_PAIR_DIFFERENCES:
+                median = float(np.median(values_m))
+                noise = 1.4826 * float(np.median(np.abs(values_m - median)))
+                found.append(PairNoise(a, b, sample.seen, median, noise, against_truth))
+        return tuple(found)
+
+
+# The ways from records of a recording to fixes: by differences, smoothed, by packets, by an estimator of one's own.
+
+Record = Packet | PairTdoa
+
+Measured = tuple[float, Record, bool]
+"""A time, what the estimator was given, and whether it used that."""
+
+_SAMPLED: Final = 128
+_SAMPLED_OF: Final = 1024
+"""The first 128 of each 1024 packets are made into time differences as well, to measure the recording's noise."""
+
+
+class Pipeline:
+    """A way from records to fixes; this one's are made into time differences of pairs, where they are none already."""
+
+    contradictions_m: Mapping[tuple[int, int], float] = {}
+    """Pairs of anchors whose own ranging contradicts the table."""
+    reason = NoFixReason.NO_BEACONS
+    """Why there was no fix of late."""
+
+    def __init__(self, engine: PairEngine | None, noise: NoiseByPair) -> None:
+        self._engine, self._noise = engine, noise
+        self.measured: Sequence[Measured] = ()
+        """What the last ``process``, or ``rest``, gave the estimator."""
+
+    def process(self, record: Record) -> tuple[float | None, Fix | None]:
+        """Process one record: the time of its differences, and a fix if it made one."""
+        raise NotImplementedError
+
+    def process_height(self, height: Height) -> None:
+        """Process a reading of the tag's height sensor, which came before the next record; left out by default."""
+
+    def rest(self, _on_progress: Callable[[float], None]) -> Iterable[Fix]:
+        """Fixes that only the whole recording makes, at its end; ``on_progress`` gets the share that is done."""
+        self.measured = ()
+        return ()
+
+    @property
+    def drops(self) -> Counter[str]:
+        """What could not be used, by reason."""
+        return Counter() if self._engine is None else Counter(self._engine.drops)
+
+    def _pairs(self, record: Record) -> Sequence[PairTdoa]:
+        """The differences of one record."""
+        if isinstance(record, Packet):
+            assert self._engine is not None
+            found: Sequence[PairTdoa] = self._engine.on_packet(record)
+        else:
+            found = (record,)
+        for pair in found:
+            self._noise.add(pair)
+        return found
+
+
+def _measured(pairs: Iterable[PairTdoa], used: Iterable[bool]) -> Sequence[Measured]:
+    return [(pair.time_s, pair, is_used) for pair, is_used in zip(pairs, used, strict=True)]
+
+
+class ByPairs(Pipeline):
+    """Time differences and the filter of pairs."""
+
+    def __init__(self, tracking: DifferenceTracking, engine: PairEngine | None, noise: NoiseByPair) -> None:
+        super().__init__(engine, noise)
+        self._tracking = tracking
+
+    def process(self, record: Record) -> tuple[float | None, Fix | None]:
+        """See ``Pipeline``."""
+        pairs = self._pairs(record)
+        if not pairs:
+            self.measured = ()
+            return None, None
+        fix = self._tracking.fix() if self._tracking.update(pairs) else None
+        self.measured, self.reason = _measured(pairs, self._tracking.used), self._tracking.reason
+        return pairs[0].time_s, fix
+
+    def process_height(self, height: Height) -> None:
+        """See ``Pipeline``."""
+        self._tracking.update_height(height.height_m, height.std_m, height.is_barometer)
+
+    @property
+    def drops(self) -> Counter[str]:
+        """See ``Pipeline``."""
+        names = "outlier", "outlier-height", "unknown-anchor"
+        return super().drops + Counter({name: self._tracking.counters[name] for name in names})
+
+
+class Smoothed(ByPairs):
+    """The same, smoothed: all fixes come at the end."""
+
+    def __init__(self, tracking: DifferenceTracking, engine: PairEngine | None, noise: NoiseByPair) -> None:
+        super().__init__(tracking, engine, noise)
+        self._events: list[Event] = []
+
+    def process(self, record: Record) -> tuple[float | None, Fix | None]:
+        """See ``Pipeline``."""
+        pairs = self._pairs(record)
+        self._events.extend(pairs)
+        return (pairs[0].time_s if pairs else None), None
+
+    def process_height(self, height: Height) -> None:
+        """See ``Pipeline``."""
+        self._events.append(height)
+
+    def rest(self, on_progress: Callable[[float], None]) -> Iterable[Fix]:
+        """See ``Pipeline``."""
+        found, numbers, count = [], set(), max(len(self._events), 1)
+        for number, fix in smoothed(self._tracking, self._events):
+            found.append(fix)
+            numbers.add(number)
+            on_progress(1.0 - number / count)
+        pairs = {number: event for number, event in enumerate(self._events) if isinstance(event, PairTdoa)}
+        self.measured, self.reason = _measured(pairs.values(), map(numbers.__contains__, pairs)), self._tracking.reason
+        return reversed(found)
+
+
+class ByPackets(Pipeline):
+    """Packets as they are; a part of them is made into differences as well, to measure the recording's noise."""
+
+    def __init__(self, tracking: PacketTracking, engine: PairEngine, noise: NoiseByPair) -> None:
+        super().__init__(engine, noise)
+        self._tracking, self._heard = tracking, 0
+
+    def process(self, record: Record) -> tuple[float | None, Fix | None]:
+        """See ``Pipeline``."""
+        assert isinstance(record, Packet)
+        if self._heard % _SAMPLED_OF < _SAMPLED:
+            self._pairs(record)
+        self._heard += 1
+        fix = self._tracking.on_packet(record)
+        self.measured = ((self._tracking.newest_s, record, self._tracking.used),)
+        self.reason, self.contradictions_m = self._tracking.reason, self._tracking.contradictions_m
+        return self._tracking.time_s, fix
+
+    def process_height(self, height: Height) -> None:
+        """See ``Pipeline``."""
+        self._tracking.tracking.update_height(height.height_m, height.std_m)
+
+    @property
+    def drops(self) -> Counter[str]:
+        """See ``Pipeline``."""
+        return self._tracking.drops
+
+
+class ByOwnEstimator(Pipeline):
+    """Time differences and an estimator of the reader's own, which gets no heights."""
+
+    def __init__(
+        self, estimator: OwnEstimator, anchors_m: Mapping[int, Point], engine: PairEngine | None, noise: NoiseByPair
+    ) -> None:
+        super().__init__(engine, noise)
+        self._estimator = estimator
+        self._anchors_m = dict(anchors_m)
+        self._drops: Counter[str] = Counter()
+
+    def process(self, record: Record) -> tuple[float | None, Fix | None]:
+        """See ``Pipeline``."""
+        pairs = self._pairs(record)
+        fixes = [heard(self._estimator, pair, self._anchors_m, self._drops) for pair in pairs]
+        self.measured = _measured(pairs, [fix is not None for fix in fixes])
+        self.reason = NoFixReason.NO_ALMANAC if self._drops else NoFixReason.ACQUIRING
+        return (pairs[0].time_s if pairs else None), next((fix for fix in reversed(fixes) if fix), None)
+
+    @property
+    def drops(self) -> Counter[str]:
+        """See ``Pipeline``."""
+        return super().drops + self._drops
+
 
 PROFILES: Final[Mapping[str, EstimatorSettings]] = {
     "miluv": DIFFERENCES.changed(qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),

@@ -21,9 +21,9 @@ from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.process import ACCEPTED, JOINED
 from skyless.core.integrity import CONTRADICTED, HPL, VPL
 from skyless.core.ticks import TICK_M
-from skyless.research.studies.common.plan import Cell, Plan, Row
-from skyless.research.studies.common.summary import clustered_interval
-from skyless.research.studies.episodes import (
+from skyless.research.studies.common.picture import clustered_interval
+from skyless.research.studies.common.runner import Cell, Plan, Row
+from skyless.research.studies.efficiency import (
     EPISODE_SPEED_STD_MPS,
     EPISODE_SUPERFRAMES,
     Case,

@@ -21,8 +21,7 @@ from skyless.core.air.beacon import Beacon, decode_cached
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import AnchorSite, Site, TagsSite, WallSite
-from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.studies.common.summary import (
+from skyless.research.studies.common.picture import (
     Case,
     WorldRow,
     by_case,
@@ -31,9 +30,10 @@ from skyless.research.studies.common.summary import (
     world_cells,
     world_rows,
 )
+from skyless.research.studies.common.runner import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.studies.common.worlds import Run, RunResult, anchor_of, box, worlds
-from skyless.research.studies.motion import laps
-from skyless.research.uncertainty.bounds import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
+from skyless.research.studies.lab import laps
+from skyless.research.uncertainty import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
 from skyless.sim.evaluation.figures import LevelCounts
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room, wanderer, wanderers

@@ -14,11 +14,22 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array
-from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.surveys.air import AirErrors, drawn_errors, free_axes, ranges_in_air
-from skyless.research.surveys.judge import Outcome, judged, survey_bound_m, tag_error_m
-from skyless.research.surveys.layouts import SurveyLayout, survey_layouts
-from skyless.research.surveys.rooms import HAND_STD_M, SKETCH_STD_M, TAPE_STD_M
+from skyless.research.studies.common.runner import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.research.surveys.rooms import (
+    HAND_STD_M,
+    SKETCH_STD_M,
+    TAPE_STD_M,
+    AirErrors,
+    Outcome,
+    SurveyLayout,
+    drawn_errors,
+    free_axes,
+    judged,
+    ranges_in_air,
+    survey_bound_m,
+    survey_layouts,
+    tag_error_m,
+)
 from skyless.site.survey.facts import Facts, Point, Tape
 from skyless.site.survey.solve import run_survey
 

@@ -12,11 +12,10 @@ from typing import Any, Final
 from msgspec import Struct
 
 from skyless.core.site import Site
-from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.studies.common.summary import Case, case_row
+from skyless.research.studies.common.picture import Case, case_row
+from skyless.research.studies.common.runner import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.studies.common.worlds import Run, RunResult, run_world
 from skyless.research.studies.room import with_levels
-from skyless.research.surveys.layouts import survey_layouts
 from skyless.research.surveys.rooms import (
     ROOM_RANGES,
     DrawnRoom,
@@ -28,6 +27,7 @@ from skyless.research.surveys.rooms import (
     kept_site,
     ranges_of,
     site_at,
+    survey_layouts,
     surveyed_room,
     true_site,
 )

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.research.studies.common.plan import Cell, Limit, Plan, Row, missed_limits, seed_of
+from skyless.research.studies.common.runner import Cell, Limit, Plan, Row, missed_limits, seed_of
 from skyless.research.surveys.drawn_faults import (
     Event,
     WatchResult,
@@ -20,7 +20,7 @@ from skyless.research.surveys.drawn_faults import (
     run_watch,
     striking_windows,
 )
-from skyless.research.surveys.layouts import survey_layouts
+from skyless.research.surveys.rooms import survey_layouts
 
 _LAYOUTS: Final = ("lab", "room", "hall")
 _EVENTS: Final = 50

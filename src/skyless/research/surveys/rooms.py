@@ -7,20 +7,20 @@ A file's positions are moved to the true frame by the best rigid alignment of al
 no error of the site's shape, and tags then walk the same ways for every file.
 """
 
-from typing import Final
+import math
+from collections.abc import Callable
+from typing import Final, Literal
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
+from skyless.core.air.frame import Malformed, Reception, Transmission
+from skyless.core.any_receiver import AnchorMachine, decode_any, new_anchor
 from skyless.core.arrays import Array
 from skyless.core.geometry import anchor_positions
-from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site, TagsSite
-from skyless.core.ticks import TICK_M
-from skyless.research.surveys._anchor_stamps import stamps_of
-from skyless.research.surveys.air import free_axes
-from skyless.research.surveys.judge import aligned
-from skyless.research.surveys.layouts import SurveyLayout
+from skyless.core.site import EXACT, AccuracySite, AnchorSite, ScheduleSite, Site, TagsSite
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.sim.evaluation.scenarios import Room
 from skyless.sim.impairments import (
     AnchorDisplacement,
@@ -30,9 +30,332 @@ from skyless.sim.impairments import (
     RangeErrorModel,
     lab_impairments,
 )
-from skyless.sim.world import lab_site
+from skyless.sim.world import World, lab_site
+from skyless.site.channel import ChannelModel
 from skyless.site.survey.facts import Facts, PairRanges, Point, Survey, Tape
+from skyless.site.survey.fit.determined import aligned_covariance
+from skyless.site.survey.fit.problem import Problem, jacobian, superimposed
+from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.solve import run_survey, surveyed_site
+
+# Sites on which surveys of anchors are studied.
+
+SLOT_S: Final = 2.5e-3
+_ROOM_M: Final = (
+    (0.0, 0.0, 0.4),
+    (8.0, 0.0, 2.6),
+    (8.0, 6.0, 0.4),
+    (0.0, 6.0, 2.6),
+    (4.0, 0.0, 2.6),
+    (8.0, 3.0, 0.4),
+    (4.0, 6.0, 2.6),
+    (0.0, 3.0, 0.4),
+)
+
+
+class SurveyLayout(Struct, frozen=True, eq=False):
+    """Anchors 1 to n."""
+
+    name: str
+    dimensions: Literal[2, 3]
+    position_m: Array
+    """Shape (n, 3)."""
+    tag_height_m: float
+
+    @property
+    def anchors(self) -> tuple[int, ...]:
+        """Identifiers, in the order of the positions."""
+        return tuple(range(1, len(self.position_m) + 1))
+
+    @property
+    def heights_m(self) -> dict[int, float]:
+        """What a survey in two dimensions is given; empty in three."""
+        heights = dict(zip(self.anchors, self.position_m[:, 2].tolist(), strict=True))
+        return heights if self.dimensions == 2 else {}
+
+
+def survey_layouts() -> dict[str, SurveyLayout]:
+    """``lab``: the reference site. ``room``: 8 m × 6 m in 3-D. ``hall``: 3 × 4 anchors, 12 m apart, at 6 m."""
+    lab = np.array([[anchor.x_m, anchor.y_m, 0.0] for anchor in lab_site().anchors])
+    room = np.array(_ROOM_M)
+    room += np.random.default_rng(7).uniform(-0.3, 0.3, room.shape)
+    hall = np.array([(12.0 * column, 12.0 * row, 6.0) for row in range(3) for column in range(4)])
+    hall[:, :2] += np.random.default_rng(8).uniform(-1.0, 1.0, (len(hall), 2))
+    return {
+        "lab": SurveyLayout("lab", 2, lab, 0.0),
+        "room": SurveyLayout("room", 3, room, 1.2),
+        "hall": SurveyLayout("hall", 2, hall, 1.2),
+    }
+
+
+# Ranges of a site's anchors from simulated air: real machines, and what they receive of one another.
+
+OnLeg = Callable[[int, int, int, int, float], None]
+"""Sender, receiver, TX and RX ticks, true time: as ``PairRanger.add`` accepts them."""
+
+
+def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *, settle_s: float = 0.0) -> PairRanger:
+    """Ranges of ``seconds`` of a site, from all that its anchors receive.
+
+    ``settle_s``: time that passes before the first leg. The last block is closed.
+    """
+    whole = PairRanger()
+    until_s = settle_s + seconds
+
+    def on_leg(sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float) -> None:
+        if t_s >= settle_s:
+            whole.add(sender, receiver, tx_ticks, rx_ticks, t_s)
+
+    def new_recorded(anchor: int) -> RecordedAnchor:
+        return RecordedAnchor(new_anchor(site, anchor), site.id, on_leg)
+
+    for _ in World(site, new_recorded, (), impairments, seed).run(until_s):
+        pass
+    whole.finish()
+    return whole
+
+
+class RecordedAnchor:
+    """An anchor whose receptions of its site are handed on as legs."""
+
+    def __init__(self, machine: AnchorMachine, site_id: int, on_leg: OnLeg) -> None:
+        self._machine, self._site_id, self._on_leg = machine, site_id, on_leg
+
+    @property
+    def id(self) -> int:
+        """Identifier of the anchor."""
+        return self._machine.id
+
+    def hear(self, reception: Reception) -> None:
+        """Process one frame, and hand on its leg."""
+        self._machine.hear(reception)
+        beacon = decode_any(reception.frame)
+        if not isinstance(beacon, Malformed) and beacon.site == self._site_id and beacon.anchor != self.id:
+            t_s = 0.0 if reception.host_s is None else reception.host_s
+            self._on_leg(beacon.anchor, self.id, beacon.tx_ticks, reception.rx_ticks, t_s)
+
+    def next_transmission_ticks(self, now_ticks: int) -> int | None:
+        """That of the wrapped machine."""
+        return self._machine.next_transmission_ticks(now_ticks)
+
+    def transmission(self, tx_ticks: int) -> Transmission:
+        """That of the wrapped machine."""
+        return self._machine.transmission(tx_ticks)
+
+
+# The air of one run: sites with errors that are drawn, and what their anchors receive of one another.
+
+LATE_M: Final = (0.2, 1.0)
+"""By how much late pairs are."""
+_SENSITIVITY_DBM: Final = -105.0
+"""All anchors receive one another."""
+_SETTLE_S: Final = 1.0
+"""Until anchors of protocol 2 send regularly."""
+
+
+class AirErrors(Struct, frozen=True):
+    """How errors are drawn."""
+
+    delay_std_m: float = 0.0
+    pair_std_m: float = 0.0
+    """Constant error of each pair."""
+    late_share: float = 0.0
+    missing_share: float = 0.0
+    """Shares of all pairs that are late, and that have no ranges."""
+
+
+class DrawnErrors(Struct, frozen=True, eq=False):
+    """What is wrong with the air of one run."""
+
+    delay_m: Array
+    """Shape (n,)."""
+    late: frozenset[tuple[int, int]]
+    missing: frozenset[tuple[int, int]]
+    errors: tuple[PairError, ...]
+
+
+def free_axes(layout: SurveyLayout) -> Array:
+    """Coordinates that are estimated: 1, the others 0."""
+    return np.array([1.0, 1.0, 1.0 if layout.dimensions == 3 else 0.0])
+
+
+def drawn_errors(errors_of: AirErrors, layout: SurveyLayout, draw: np.random.Generator) -> DrawnErrors:
+    """Delays, and errors of pairs; each pair is late or missing for itself."""
+    anchors = layout.anchors
+    delay_m = draw.normal(0.0, errors_of.delay_std_m, len(anchors)) if errors_of.delay_std_m else np.zeros(len(anchors))
+    late, missing, errors = [], [], []
+    for index, a in enumerate(anchors):
+        for b in anchors[index + 1 :]:
+            error_m = draw.normal(0.0, errors_of.pair_std_m) if errors_of.pair_std_m else 0.0
+            is_late, is_missing, late_m = draw.random() < errors_of.late_share, draw.random(), draw.uniform(*LATE_M)
+            if is_missing < errors_of.missing_share:
+                missing.append((a, b))
+                errors.append(PairError(a, b, blocked=True))
+                continue
+            if is_late:
+                late.append((a, b))
+            if is_late or error_m:
+                errors.append(PairError(a, b, late_m=error_m + (late_m if is_late else 0.0)))
+    return DrawnErrors(delay_m, frozenset(late), frozenset(missing), tuple(errors))
+
+
+def ranges_in_air(layout: SurveyLayout, drawn: DrawnErrors, seconds: float, noise_ps: float, seed: int) -> PairRanges:
+    """What the anchors of a site in such air receive of one another."""
+    anchors = tuple(
+        AnchorSite(anchor, x_m, y_m, z_m)
+        for anchor, (x_m, y_m, z_m) in zip(layout.anchors, layout.position_m.tolist(), strict=True)
+    )
+    schedule = ScheduleSite(slot_s=SLOT_S)
+    if drawn.missing:  # a master would have to reach all
+        schedule = ScheduleSite(mode="free")
+    site = Site(layout.name, 1, 1, anchors, schedule, accuracy=EXACT)
+    delays = tuple(
+        DelayError(anchor, float(delay_m / TICK_M), float(delay_m / TICK_M))
+        for anchor, delay_m in zip(layout.anchors, drawn.delay_m, strict=True)
+    )
+    air = replace(
+        lab_impairments(noise_ps),
+        delay_errors=delays,
+        anchor_pair_errors=drawn.errors,
+        channel=ChannelModel(sensitivity_dbm=_SENSITIVITY_DBM),
+    )
+    settle_s = _SETTLE_S if drawn.missing else 0.0
+    return stamps_of(site, air, seconds, seed, settle_s=settle_s).ranges()
+
+
+# A survey against the truth: errors after the best rigid alignment, its bound, and what a tag makes of it.
+
+_GRID: Final = np.linspace(0.15, 0.85, 5)
+"""Positions of tags, as shares of the site's length and width."""
+
+
+class Outcome(Struct, frozen=True):
+    """One survey, judged. Lengths are rms over anchors, after the best rigid alignment."""
+
+    variant: str
+    bound_m: float
+    """Cramér–Rao bound of the anchors' distance error."""
+    is_determined: bool
+    """All anchors; the figures below are None otherwise."""
+    is_open: bool
+    """Whether it says that something is not determined, even if only delays against positions."""
+    is_flagged: bool
+    """Whether it says that it is ambiguous, that nothing checks it, or that an anchor is not determined."""
+    hand_tag_m: float
+    """Error of a tag's position, rms, by positions measured by hand and no knowledge of delays."""
+    error_m: float | None = None
+    said_m: float | None = None
+    nees: float | None = None
+    delay_m: float | None = None
+    """Error of delays less their mean."""
+    tag_m: float | None = None
+    """Error of a tag's position, rms, by the survey."""
+    late: int = 0
+    found: int = 0
+    """Late pairs that were left out."""
+    direct: int = 0
+    excluded_wrongly: int = 0
+
+
+def survey_bound_m(
+    layout: SurveyLayout, ranges: PairRanges, facts: Facts, drawn: DrawnErrors, seconds: float, noise_ps: float
+) -> float:
+    """Bound of the anchors' distance error, rms, of the pairs in the air, had it been known which are late."""
+    n = len(layout.position_m)
+    if facts.keep_positions:
+        return facts.sketch_std_m * math.sqrt(layout.dimensions)
+    superframes = seconds / (n * SLOT_S)
+    stamp_m2 = (noise_ps * 1e-12 * SPEED_OF_LIGHT_MPS) ** 2 + TICK_M**2 / 12.0
+    index = {anchor: number for number, anchor in enumerate(layout.anchors)}
+    direct = [pair for pair in ranges.pairs if (pair.a, pair.b) not in drawn.late]
+    first, second = (np.array([index[getattr(pair, end)] for pair in direct]) for end in "ab")
+    tape_first, tape_second = (np.array([index[getattr(tape, end)] for tape in facts.tapes], int) for end in "ab")
+    problem = Problem(
+        is_free=np.tile(free_axes(layout) > 0.0, (n, 1)),
+        first=first,
+        second=second,
+        range_m=np.zeros(len(first)),
+        variance_m2=np.full(len(first), stamp_m2 / (2.0 * superframes) + facts.pair_std_m**2),
+        delay_m=np.zeros(n),
+        delay_variance_m2=np.full(n, facts.delay_std_m**2 + stamp_m2 / (4.0 * superframes)),
+        coordinate_m=layout.position_m,
+        coordinate_variance_m2=np.full((n, 3), facts.sketch_std_m**2 if facts.sketch_m else np.inf),
+        tape_first=tape_first,
+        tape_second=tape_second,
+        tape_m=np.zeros(len(tape_first)),
+        tape_variance_m2=np.array([tape.std_m**2 for tape in facts.tapes]),
+    )
+    covariance = aligned_covariance(
+        problem, jacobian(problem, layout.position_m), layout.position_m, np.ones(n, dtype=bool)
+    )
+    return math.sqrt(float(np.trace(covariance[: 3 * n, : 3 * n])) / n)
+
+
+def judged(layout: SurveyLayout, survey: Survey, drawn: DrawnErrors, outcome: Outcome) -> Outcome:
+    """The outcome with what came of the survey."""
+    is_determined = all(one.determined for one in survey.anchors) and len(survey.anchors) == len(layout.anchors)
+    flagged = bool(survey.ambiguities) or survey.unchecked is not None or not is_determined
+    excluded = {(pair.a, pair.b) for pair in survey.pairs if pair.excluded}
+    used = {(pair.a, pair.b) for pair in survey.pairs}
+    outcome = replace(
+        outcome,
+        is_determined=is_determined,
+        is_open=bool(survey.not_determined),
+        is_flagged=flagged,
+        late=len(drawn.late),
+        found=len(drawn.late & excluded),
+        direct=len(used - drawn.late),
+        excluded_wrongly=len(excluded - drawn.late),
+    )
+    if not is_determined:
+        return outcome
+    found_m = np.array([(one.x_m, one.y_m, one.z_m) for one in survey.anchors], float)
+    delay_m = np.array([one.delay_m or 0.0 for one in survey.anchors])
+    true_m = aligned(layout.position_m, found_m, layout.dimensions)
+    error_m = found_m - true_m
+    k = layout.dimensions
+    squares = [
+        float(error @ np.linalg.pinv(np.array(one.covariance_m2)[:k, :k], rcond=1e-9, hermitian=True) @ error)
+        for one, error in zip(survey.anchors, error_m[:, :k], strict=True)
+        if one.covariance_m2 is not None
+    ]
+    off_m = delay_m - drawn.delay_m
+    said_m2 = [k * (one.std_m or 0.0) ** 2 for one in survey.anchors]
+    return replace(
+        outcome,
+        error_m=math.sqrt(float(np.mean(np.sum(error_m**2, axis=1)))),
+        said_m=math.sqrt(float(np.mean(said_m2))),
+        nees=float(np.mean(squares)) / k if squares else None,
+        delay_m=float(np.std(off_m)),
+        tag_m=tag_error_m(layout, aligned(found_m, layout.position_m, k), delay_m, drawn.delay_m),
+    )
+
+
+def aligned(true_m: Array, found_m: Array, axes: int) -> Array:
+    """True positions, shape (n, 3), turned, mirrored and shifted to fit the found ones best; in 2-D on the floor."""
+    moved = true_m.copy()
+    moved[:, :axes] = superimposed(true_m[:, :axes], found_m[:, :axes], np.ones(len(true_m)))
+    return moved
+
+
+def tag_error_m(layout: SurveyLayout, found_m: Array, delay_m: Array, true_delay_m: Array) -> float:
+    """What tags' positions are off without noise, rms over a grid, by positions (n, 3) and delays (n,) of anchors.
+
+    The tag's clock is free; its height is estimated in 3-D.
+    """
+    low_m, high_m = layout.position_m.min(axis=0), layout.position_m.max(axis=0)
+    k, squares = layout.dimensions, []
+    for x in _GRID:
+        for y in _GRID:
+            at_m = low_m + (high_m - low_m) * np.array([x, y, 0.0])
+            at_m[2] = layout.tag_height_m
+            apart = at_m - layout.position_m
+            unit = apart / np.linalg.norm(apart, axis=1)[:, None]
+            late_m = np.sum(unit * (found_m - layout.position_m), axis=1) + true_delay_m - delay_m
+            design = np.column_stack([unit[:, :k], np.ones(len(unit))])
+            squares.append(float(np.sum(np.linalg.lstsq(design, late_m, rcond=None)[0][:k] ** 2)))
+    return math.sqrt(float(np.mean(squares)))
+
 
 HAND_STD_M: Final = 0.02
 """Error of positions measured by hand, per axis."""

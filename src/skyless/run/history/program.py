@@ -339,8 +339,6 @@ class HistoryNode:
         """Keep it until cancelled."""
         sources = [keep(self.link, self._log)]
         if self._nats is not None:
-
-
             sources.append(take_stream(self._nats, self._writer, self._log))
         await self._history.run(*sources)
 

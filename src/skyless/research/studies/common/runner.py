@@ -6,6 +6,7 @@
 import logging
 import multiprocessing
 import os
+import pickle
 import re
 import signal
 import threading
@@ -13,16 +14,191 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
+from hashlib import sha256
 from multiprocessing.connection import Connection
+from pathlib import Path
 from socket import gethostname
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 from uuid import uuid4
+
+import msgspec
+import numpy as np
+from matplotlib.figure import Figure
+from msgspec import Struct
+from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
+from skyless.core.integrity import RISK
 from skyless.core.processors import cores
-from skyless.core.version import program_digest
-from skyless.research.studies.common.plan import Cell
+from skyless.core.version import installed_version, program_digest
+from skyless.core.whole_files import write_whole
+
+# What a study is: independent cells of work, and rows of a table that come of their results.
+
+
+class Plan(Struct, frozen=True):
+    """How much is simulated, and with what."""
+
+    method: str = "joint"
+    seed: int = 1
+    quick: bool = False
+    noise_ps: float = 100.0
+    """Noise of every TX and RX stamp, which filters know."""
+    qa: float = 0.3
+    """Process noise that filters assume at rest, m²/s³."""
+    worlds: int = 12
+    """Independent worlds of a case; what scatters between them gives the standard errors."""
+    seconds: float = 20.0
+    """True time for which each world is judged."""
+    tags: int = 4
+    """In each world."""
+    episodes: int = 2000
+    """Episodes in a case of the studies ``efficiency`` and ``integrity``."""
+    integrity_risk: float = RISK
+    """Stated probability that a fix's error exceeds its protection level (``integrity``)."""
+    alert_limit_m: float | None = None
+    """Fixes with a higher level count as not available (``integrity``)."""
+
+
+_QUICK_PLAN: Final = Plan(worlds=6, seconds=10.0, tags=2, episodes=200)
+
+_QUICK_PLANS: Final = {"room": replace(_QUICK_PLAN, worlds=3, seconds=5.0)}
+
+_USUAL: Final = {
+    "room": Plan(worlds=20, seconds=15.0, tags=5),
+    "large": Plan(worlds=24, seconds=30.0),
+    "survey": Plan(worlds=200, seconds=10.0),
+    "survey-room": Plan(worlds=8, seconds=15.0, tags=8),
+    "watch": Plan(worlds=20),
+}
+"""Amounts of studies that need others than the usual ones; ``room`` has fewer in all but its main cases."""
+
+
+def plan_of(method: str, seed: int, *, study: str = "", quick: bool = False, **given: Any) -> Plan:  # noqa: ANN401 - of Plan
+    """The usual amounts, or with ``quick`` few, where none are given."""
+    usual = _QUICK_PLANS.get(study, _QUICK_PLAN) if quick else _USUAL.get(study, Plan())
+    known = {name: value for name, value in given.items() if value is not None}
+    return replace(usual, method=method, seed=seed, quick=quick, **known)
+
+
+class Cell(Struct, frozen=True):
+    """Work that shares nothing with the other cells: it may run in any process of any machine."""
+
+    name: str
+    """Name of the case to which it belongs."""
+    function: Callable[[], Any]
+    """A function defined at the top of a module, with its arguments."""
+    weight_s: float
+    """About how long it takes: the longest are begun first."""
+
+
+class Limit(Struct, frozen=True):
+    """What a figure of a row should be at least, at most, or both."""
+
+    figure: str
+    """Name of the row's field."""
+    least: float | None = None
+    most: float | None = None
+
+    def __str__(self) -> str:
+        low, high = ("" if one is None else f"{one:g}" for one in (self.least, self.most))
+        return f"{self.figure}:{low}..{high}"
+
+
+class Row(Struct, frozen=True, kw_only=True):
+    """Results of a case; lengths in metres, None where it does not apply. All is simulated.
+
+    Studies add figures of their own. All depends on the plan alone, except for ``MEASURED``.
+    """
+
+    study: str
+    method: str
+    case: str
+    series: str
+    """Cases of a series differ in one thing."""
+    x: float | None = None
+    """How much of that thing, where it is a number."""
+    mesh: bool | None = None
+    """None for methods that make no use of what anchors hear of each other."""
+    noise_ps: float
+    runs: int
+    """Independent runs: worlds, or episodes."""
+    fixes: int = 0
+    """Fixes that were judged."""
+    rmse_m: float | None = None
+    rmse_error_m: float | None = None
+    """Standard error of ``rmse_m``."""
+    p95_m: float | None = None
+    max_m: float | None = None
+    said_m: float | None = None
+    """Predicted by the fixes: the root of the mean trace of their covariances."""
+    nees: float | None = None
+    """Mean normalised error squared over the degrees of freedom: 1 for fixes whose covariances are right."""
+    nees_interval: tuple[float, float] | None = None
+    """Where ``nees`` lies with a probability of 99 % if they are."""
+    available: float | None = None
+    """Superframes with a fix over all superframes."""
+    bound_m: float | None = None
+    """Cramér–Rao bound of what the tag knew."""
+    ratio: float | None = None
+    """RMSE over the bound, or over the RMSE of another case."""
+    ratio_error: float | None = None
+    limit: float | None = None
+    """Largest ``ratio`` that is accepted."""
+    limits: tuple[Limit, ...] = ()
+    """All limits of rows with more than one."""
+    missed: tuple[str, ...] = ()
+    """Figures outside of them."""
+    passed: bool | None = None
+
+
+AnyRow = TypeVar("AnyRow", bound=Row)
+
+
+def with_limits(row: AnyRow, limits: Sequence[Limit]) -> AnyRow:
+    """The row with its limits and the figures that miss them; without a fix all but that no level is given."""
+    if row.limit is not None:
+        limits = (*limits, Limit("ratio", most=row.limit))
+    if not limits:
+        return row
+    without = () if row.fixes else tuple(one.figure for one in limits if one.figure not in {"level", "exceeded"})
+    missed = missed_limits(row, limits)
+    missed = tuple(one.figure for one in limits if one.figure in missed or one.figure in without)
+    return replace(row, limits=tuple(limits), missed=missed, passed=not missed)
+
+
+def missed_limits(row: Row, limits: Sequence[Limit]) -> tuple[str, ...]:
+    """Figures outside of their limits. What does not exist exceeds nothing (levels that no fix gives)."""
+    return tuple(limit.figure for limit in limits if not _holds(getattr(row, limit.figure), limit))
+
+
+def _holds(value: float | None, limit: Limit) -> bool:
+    if value is None:
+        return limit.least is None
+    return (limit.least is None or value >= limit.least) and (limit.most is None or value <= limit.most)
+
+
+class Study(Struct, frozen=True):
+    """A study by its parts."""
+
+    name: str
+    title: str
+    cells: Callable[[Plan], list[Cell]]
+    rows: Callable[[Plan, Sequence[Any]], Sequence[Row]]
+    """Takes the results in the order of the cells."""
+    draw: Callable[[Sequence[Any]], Figure]
+    """Draws rows of its own kind."""
+
+
+MEASURED: Final = ("cpu_us_per_message", "cpu_ms_per_tag_s")
+"""Fields of a row that are not the same the next time."""
+
+
+def seed_of(seed: int, *numbers: int) -> int:
+    """A seed for one of many runs, independent of those of others."""
+    return int(np.random.SeedSequence([seed, *numbers]).generate_state(1, np.uint64)[0])
+
 
 _POLL_S: Final = 0.2
 _CONNECT_S: Final = 10.0
@@ -208,3 +384,68 @@ def _cluster(scheduler: str) -> Iterator[tuple[Any, Executor]]:
         executor = client.get_executor(pure=False)
         stack.callback(executor.shutdown, wait=False)
         yield client, executor
+
+
+# Results of a study's finished cells in a folder, from which a later call goes on.
+#
+# Each is a file of its own, which is there whole or not at all, and begins with a digest of the study and of itself.
+# They are pickles of Python: a folder of somebody else can run any program.
+
+
+class KeptResults:
+    """The folder of one study."""
+
+    def __init__(self, folder: str | Path, study: str, plan: Plan) -> None:
+        """Raises SkylessError: the folder cannot be used, or is of another study, plan or program."""
+        self._folder = folder = Path(folder)
+        program = {"version": installed_version(), "source digest": program_digest()}
+        asked = {"study": study, **msgspec.to_builtins(plan), **program}
+        self._head = msgspec.json.encode(asked)
+        head = folder / "study.json"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            there = msgspec.json.decode(head.read_bytes(), type=dict[str, Any]) if head.exists() else asked
+        except OSError as error:
+            raise SkylessError(f"--resume is {str(folder)!r}, which cannot be used: {error.strerror}") from None
+        except (msgspec.MsgspecError, UnicodeError):
+            raise SkylessError(f"--resume: {head} is damaged; give another folder") from None
+        for name, value in asked.items():
+            if there.get(name) != value:
+                raise SkylessError(
+                    f"--resume is {str(folder)!r}, of another study: {name} is {there.get(name)!r} there, "
+                    f"{value!r} here; give another folder"
+                )
+        self._write(head, self._head)
+
+    def read(self, cells: int) -> tuple[dict[int, Any], tuple[str, ...]]:
+        """The results that are there, by the numbers of their cells; and the files that are damaged."""
+        results, damaged = {}, []
+        for number in range(cells):
+            file = self._file(number)
+            try:
+                read = file.read_bytes()
+            except OSError:
+                continue
+            digest, data = read[:32], read[32:]
+            if digest == self._digest(data):
+                results[number] = pickle.loads(data)
+            else:
+                damaged.append(str(file))
+        return results, tuple(damaged)
+
+    def keep(self, number: int, result: object) -> None:
+        """Write the result of a cell. Raises SkylessError."""
+        data = pickle.dumps(result)
+        self._write(self._file(number), self._digest(data) + data)
+
+    def _file(self, number: int) -> Path:
+        return self._folder / f"{number:05}.part"
+
+    def _digest(self, data: bytes) -> bytes:
+        return sha256(self._head + data).digest()
+
+    def _write(self, file: Path, data: bytes) -> None:
+        try:
+            write_whole(file, data)
+        except OSError as error:
+            raise SkylessError(f"--resume: {file} cannot be written: {error.strerror}") from None

@@ -6,13 +6,16 @@ or the recording's times.
 
 from collections import deque
 from collections.abc import Callable
-from typing import Final, Literal
+from itertools import islice, takewhile
+from typing import TYPE_CHECKING, Final, Generic, Literal, TypeAlias, TypeVar
 
 from msgspec import Struct
+from msgspec.structs import asdict
 
-from skyless.page._state import SILENT_S
 from skyless.page.condition.evidence import ALERT_WORDS, ALERTS, Health, LeaderTracker
 from skyless.page.condition.monitor import Condition
+from skyless.page.state import SILENT_S, encode
+from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
     AlarmMessage,
     AnchorHealth,
@@ -20,8 +23,12 @@ from skyless.run.mqtt.messages import (
     StatusMessage,
     SurveyMessage,
     WatchMessage,
+    WrongMessageError,
     ZoneEvent,
 )
+
+if TYPE_CHECKING:
+    from skyless.run.hub import HubLink
 
 MAX_LOGGED: Final = 500
 """Events that are kept. The oldest are dropped."""
@@ -319,3 +326,114 @@ class EventQueue:
 
 def _same(a: ZoneEvent, b: ZoneEvent) -> bool:
     return (a.zone, a.tag, a.kind) == (b.zone, b.tag, b.kind) and abs(a.unix_s - b.unix_s) < _SAME_EVENT_S
+
+
+# What has happened at a site since the server's start, with a number for each event: programs read it in pages.
+
+MAX_KEPT: Final = 2_000
+"""Events that are kept. The oldest are dropped."""
+
+
+class SiteEvent(Struct, frozen=True):
+    """One event: a tag entered or left a zone, or a line of the page's list of events."""
+
+    id: int
+    """Counts from 1 since the server's start."""
+    unix_s: float
+    kind: Kind | Literal["zone"]
+    level: Severity
+    subject: str
+    """What it is about, such as ``tag/t1`` or ``anchor/3``; empty for the site."""
+    text: str
+    """For people."""
+    zone_event: ZoneEvent | None = None
+    """Of the kind ``zone``."""
+
+
+class EventList:
+    """The newest events, and what pages are sent of each. Readers ask for what is before or since a number."""
+
+    def __init__(self) -> None:
+        self.last = 0
+        """Number of the newest event."""
+        self._events: deque[tuple[SiteEvent, bytes]] = deque(maxlen=MAX_KEPT)
+
+    def add_zone_event(self, event: ZoneEvent) -> None:
+        """A tag has entered or left a zone."""
+        self.last += 1
+        text = f"tag {event.tag} {'entered' if event.kind == 'enter' else 'left'} {event.name or event.zone}"
+        found = SiteEvent(self.last, event.unix_s, "zone", "note", f"tag/{event.tag}", text, event)
+        self._events.append((found, encode("zone_event", asdict(event))))
+
+    def add_logged(self, event: Event) -> None:
+        """A line of the page's list."""
+        self.last += 1
+        found = SiteEvent(self.last, event.unix_s, event.kind, event.level, event.name, event.text)
+        self._events.append((found, encode("log", {"events": [event]})))
+
+    def before(self, number: int, limit: int) -> list[SiteEvent]:
+        """At most ``limit`` events before a number, the newest first."""
+        return list(islice((event for event, _ in reversed(self._events) if event.id < number), limit))
+
+    def since(self, number: int) -> list[tuple[SiteEvent, bytes]]:
+        """Events after a number with their messages, the oldest first."""
+        return list(takewhile(lambda kept: kept[0].id > number, reversed(self._events)))[::-1]
+
+
+# A list that pages edit and the broker keeps: zones, rules of alarms, assets.
+
+SiteLink: TypeAlias = "Link | HubLink"
+"""A site's connection: to its broker, or to a hub, where nothing can be stored."""
+
+_Message = TypeVar("_Message", bound=Struct)
+
+
+class Kept(Generic[_Message]):
+    """The message of one topic: what the broker keeps there, or what was stored here last."""
+
+    def __init__(self, empty: _Message, read: Callable[[bytes], _Message]) -> None:
+        """``empty`` is what a topic without a message means; ``read`` raises ValueError."""
+        self.message = empty
+        self.fault: str | None = None
+        """Why what the broker keeps cannot be read."""
+        self._empty, self._read = empty, read
+        self._link: SiteLink | None = None
+        self._topic = ""
+        self._is_on_its_way = False  # the message was stored here and has not come back from the broker
+
+    def attach(self, link: SiteLink, topic: str) -> None:
+        """The broker is known; what was stored here before goes to it."""
+        self._link, self._topic = link, topic
+        if self._is_on_its_way:
+            self.store(self.message)
+
+    def receive(self, payload: bytes) -> bool:
+        """Take what comes from the broker; whether the message is another one now. Raises WrongMessageError."""
+        try:
+            message = self._read(payload) if payload else self._empty
+        except ValueError as error:
+            self.fault = f"what the broker keeps at {self._topic} cannot be read: {error}"
+            raise WrongMessageError(str(error)) from None
+        self.fault = None
+        if message == self.message:
+            self._is_on_its_way = False
+            return False
+        if self._is_on_its_way:
+            return False  # older than what was stored here
+        if self._link is not None:
+            self._link.forget(self._topic)  # what was stored here must not come back after a reconnect
+        self.message = message
+        return True
+
+    def check_store(self, site: str, shown: str) -> None:
+        """Check that a page of a site may replace the list of the one shown. Raises WrongMessageError."""
+        if site and site != shown:
+            raise WrongMessageError(f"site is {site[:100]!r}; it should be {shown[:100]!r}, which is shown now")
+        if self.fault is not None:
+            raise WrongMessageError(f"{self.fault}; nothing was overwritten. Clear that topic to begin again")
+
+    def store(self, message: _Message) -> None:
+        """Replace the message, also at the broker."""
+        self.message, self._is_on_its_way = message, True
+        if self._link is not None:
+            self._link.publish(self._topic, message, qos=1, retain=True)

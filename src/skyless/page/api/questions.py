@@ -1,0 +1,383 @@
+"""Answers about the site as it is now, and what changes it."""
+
+import asyncio
+import time
+from collections.abc import Iterable, Iterator
+from math import hypot, sqrt
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from msgspec import Struct
+from msgspec.structs import asdict, replace
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from skyless.bridges.target import bridged_site, is_usable, require_georeference
+from skyless.core.errors import SkylessError
+from skyless.core.site import GeoreferenceSite
+from skyless.core.version import installed_version
+from skyless.page.api.answers import (
+    GEOJSON,
+    Acknowledgement,
+    After,
+    AlarmRulesAnswer,
+    Anchor,
+    Before,
+    Begin,
+    CellSize,
+    Distance,
+    End,
+    EventsAnswer,
+    Find,
+    Group,
+    Limit,
+    Points,
+    RuleId,
+    SiteAnswer,
+    Step,
+    Subject,
+    Tag,
+    TagName,
+    TagNames,
+    TagsAnswer,
+    ZoneId,
+    ZoneTags,
+    json_answer,
+    names,
+)
+from skyless.page.live import LiveSite
+from skyless.page.tasks import TaskProcess, serve_tasks
+from skyless.run.assets import read_csv, write_csv
+from skyless.run.geojson import coordinates, feature
+from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track
+from skyless.run.history.layout import site_folder
+from skyless.run.limits import PAGE as LIMITS
+from skyless.run.mqtt.messages import (
+    AlarmMessage,
+    AlarmRulesMessage,
+    Asset,
+    AssetsMessage,
+    FixMessage,
+)
+from skyless.run.zones import signed_area_m2
+
+if TYPE_CHECKING:
+    from skyless.run.history.queries import History
+
+_ALL: Final = 2**53
+_STORED_S: Final = 5.0
+_POLL_S: Final = 0.02
+
+
+def site(live: LiveSite) -> SiteAnswer:
+    """The site, and how it is."""
+    return SiteAnswer(
+        **asdict(live.require_site()),
+        condition=live.condition,
+        connected=live.connected,
+        history=live.has_history,
+        version=installed_version(),
+    )
+
+
+def anchors(live: LiveSite) -> tuple[Anchor, ...]:
+    """Its anchors."""
+    return tuple(
+        Anchor(anchor.id, (anchor.x_m, anchor.y_m, anchor.z_m), _online(live, "anchor", str(anchor.id)))
+        for anchor in live.require_site().site.anchors
+    )
+
+
+def _online(live: LiveSite, kind: str, name: str) -> bool | None:
+    status = live.state.statuses.get((kind, name))
+    return None if status is None else status.online
+
+
+def tags(
+    live: LiveSite, *, group: Group = "", zone: ZoneId = "", find: Find = "", limit: Limit = 100, after: After = ""
+) -> TagsAnswer:
+    """Tags by name, in pages."""
+    find = find.casefold()
+    found: list[str] = []
+    for name in sorted(name for name in _names(live) if name > after):
+        asset = live.assets.by_tag.get(name, Asset(name))
+        if group and asset.group != group:
+            continue
+        if find not in name.casefold() and find not in asset.name.casefold():
+            continue
+        if zone and zone not in _zones(live, name):
+            continue
+        found.append(name)
+        if len(found) > limit:
+            break
+    shown = found[:limit]
+    return TagsAnswer(_tags(live, shown), shown[-1] if len(found) > limit else None)
+
+
+def _names(live: LiveSite) -> set[str]:
+    return {name for kind, name in live.state.statuses if kind == "tag"}.union(live.state.tags)
+
+
+def tag(live: LiveSite, *, tag: TagName) -> Tag:
+    """One tag."""
+    if tag not in _names(live):
+        raise HTTPException(404, f"tag is {tag[:60]!r}; no tag of this name has reported at this site")
+    return _tags(live, [tag])[0]
+
+
+def _tags(live: LiveSite, names: list[str]) -> tuple[Tag, ...]:
+    fixes = {fix.tag: fix for fix in usable(given for given in live.recent_fixes() if given[0].tag in names)}
+    return tuple(
+        Tag(
+            **asdict(live.assets.by_tag.get(name, Asset(name))),
+            online=_online(live, "tag", name),
+            zones=_zones(live, name),
+            fix=fixes.get(name),
+        )
+        for name in names
+    )
+
+
+def _zones(live: LiveSite, tag: str) -> tuple[str, ...]:
+    return tuple(zone.id for zone in live.monitor.zones_with(tag))
+
+
+def fixes(live: LiveSite) -> tuple[FixMessage, ...]:
+    """The newest usable fix of each tag."""
+    return tuple(sorted(usable(live.recent_fixes()), key=lambda fix: fix.tag))
+
+
+def usable(given: Iterable[tuple[FixMessage, float]]) -> list[FixMessage]:
+    """Those of fixes that may be used, with the time by the server's clock, which is given with each."""
+    return [replace(fix, unix_s=round(ended_unix_s, 4)) for fix, ended_unix_s in given if is_usable(fix)]
+
+
+def zones(live: LiveSite) -> tuple[ZoneTags, ...]:
+    """Zones, and who is in them."""
+    inside = {name: _zones(live, name) for name in sorted(live.state.tags)}
+    return tuple(
+        ZoneTags(**asdict(zone), tags=tuple(name for name, zones in inside.items() if zone.id in zones))
+        for zone in live.monitor.zones
+    )
+
+
+def events(live: LiveSite, *, limit: Limit = 100, before: Before = _ALL) -> EventsAnswer:
+    """What has happened, the newest first, in pages."""
+    found = live.event_list.before(before, limit + 1)
+    return EventsAnswer(tuple(found[:limit]), found[limit - 1].id if len(found) > limit else None)
+
+
+def assets(live: LiveSite) -> AssetsMessage:
+    """What tags are attached to."""
+    return live.assets.message
+
+
+def put_assets(live: LiveSite, *, body: AssetsMessage) -> AssetsMessage:
+    """Replace all assets."""
+    live.require_site()
+    live.assets.store(body.assets, body.site)
+    return live.assets.message
+
+
+def assets_csv(live: LiveSite) -> bytes:
+    """The assets as a table."""
+    return write_csv(live.assets.message.assets)
+
+
+def put_assets_csv(live: LiveSite, *, body: bytes) -> AssetsMessage:
+    """Replace all assets by a table."""
+    return put_assets(live, body=AssetsMessage(read_csv(body)))
+
+
+def alarms(live: LiveSite) -> tuple[AlarmMessage, ...]:
+    """Alarms that are not over."""
+    return live.alarms.messages
+
+
+def alarm_rules(live: LiveSite) -> AlarmRulesAnswer:
+    """The rules of alarms."""
+    name = "" if live.site is None else live.site.site.name
+    return AlarmRulesAnswer(live.alarms.rules, name, file_rules=live.alarms.file_rules)
+
+
+def put_alarm_rules(live: LiveSite, *, body: AlarmRulesMessage) -> AlarmRulesAnswer:
+    """Replace the rules that were made on the page."""
+    live.require_site()
+    live.alarms.store_rules(body.rules, body.site)
+    return replace(alarm_rules(live), rules=body.rules)  # they hold from the next tick on
+
+
+async def acknowledge(live: LiveSite, *, rule: RuleId, subject: Subject, body: Acknowledgement) -> Acknowledgement:
+    """Acknowledge an alarm: answered when the broker has it."""
+    live.acknowledge(rule, subject, body.id, body.by)
+    try:
+        async with asyncio.timeout(_STORED_S):
+            while not live.alarms.is_acknowledged(rule, subject, body.id):
+                await asyncio.sleep(_POLL_S)
+    except TimeoutError:
+        raise HTTPException(503, "the broker has not taken it yet; look whether the alarm is acknowledged") from None
+    return body
+
+
+# Questions to the history: a process of its own answers them one after the other.
+#
+# So a long one takes neither memory nor time from the server, which raises alarms as well, and can be ended.
+
+
+class _Question(Struct, frozen=True):
+    folder: str
+    site: int
+    name: str
+    given: dict[str, Any]
+
+
+class Past:
+    """The history of the sites that the server shows."""
+
+    def __init__(self, folder: Path | None) -> None:
+        """Without a folder there is none."""
+        self._folder = folder
+        self._process = TaskProcess("skyless.page.api.questions", fault=400)
+        self._waiting = 0
+
+    async def ask(self, site: int | None, name: str, given: dict[str, Any]) -> bytes:
+        """The answer of a site's history to a function of this file, as JSON. Raises HTTPException."""
+        if self._folder is None:
+            raise HTTPException(404, "this server has no history: start the page's server with --history FOLDER")
+        if site is None:
+            raise HTTPException(404, "no site is known yet")
+        if not site_folder(self._folder, site).is_dir():
+            raise HTTPException(404, f"{self._folder} holds no history of site {site}; skyless history run writes one")
+        if self._waiting >= LIMITS.questions:
+            raise HTTPException(503, f"{LIMITS.questions} questions to the history are waiting; ask again later")
+        self._waiting += 1
+        try:
+            async with asyncio.timeout(LIMITS.question_s):
+                return await self._process.run(_Question(str(self._folder), site, name, given))
+        except TimeoutError:
+            fault = f"the history has not answered within {LIMITS.question_s:g} s; ask for a shorter time"
+            raise HTTPException(503, fault) from None
+        finally:
+            self._waiting -= 1
+
+    def stop(self) -> None:
+        """End the question at hand, and begin no further one."""
+        self._process.stop()
+
+
+def _span(begin: str, end: str) -> Span:
+    from skyless.run.history.answers import span_of  # noqa: PLC0415 - of the extra history
+
+    return span_of(begin, end or None, time.time())
+
+
+def past_tags(history: "History") -> tuple[str, ...]:
+    """Tags that it has."""
+    return history.tags()
+
+
+def track(history: "History", *, tag: TagName, begin: Begin, end: End = "", points: Points = 2000) -> Track:
+    """The way of a tag."""
+    return history.track(tag, _span(begin, end), points)
+
+
+def heatmap(history: "History", *, begin: Begin, end: End = "", cell_m: CellSize = 0.25, tag: TagNames = "") -> Heatmap:
+    """How long tags were where."""
+    return history.heatmap(_span(begin, end), cell_m, names(tag))
+
+
+def dwell(
+    history: "History", *, begin: Begin, end: End = "", tag: TagNames = "", zone: ZoneId = ""
+) -> tuple[Dwell, ...]:
+    """How long tags were in zones."""
+    return history.dwell(_span(begin, end), names(tag), zone or None)
+
+
+def occupancy(
+    history: "History", *, begin: Begin, end: End = "", zone: ZoneId = "", step_s: Step = 300.0
+) -> tuple[Occupancy, ...]:
+    """How many tags were in zones."""
+    return history.occupancy(_span(begin, end), zone or None, step_s)
+
+
+def contacts(
+    history: "History", *, tag: TagName, begin: Begin, end: End = "", distance_m: Distance = 2.0
+) -> tuple[Contact, ...]:
+    """Whom a tag was near to."""
+    return history.contacts(tag, _span(begin, end), distance_m)
+
+
+def past_alarms(history: "History", *, begin: Begin, end: End = "") -> tuple[AlarmRow, ...]:
+    """Alarms of the past."""
+    return history.alarms(_span(begin, end))
+
+
+def _answer(question: _Question) -> object:
+    """What the process answers; a tuple as an object with one key. Raises SkylessError."""
+    from skyless.run.history.queries import History  # noqa: PLC0415 - of the extra history
+
+    functions = {one.__name__: one for one in (past_tags, track, heatmap, dwell, occupancy, contacts, past_alarms)}
+    found = functions[question.name](History(Path(question.folder), question.site), **question.given)
+    return {question.name: found} if isinstance(found, tuple) else found
+
+
+if __name__ == "__main__":
+    serve_tasks(_Question, _answer)
+
+
+# Tags, anchors and zones of a site as GeoJSON (RFC 7946), for programs that draw maps.
+
+
+def collection(live: LiveSite, kind: str) -> Response:
+    """The tags with fixes, the anchors or the zones: longitude, latitude (WGS 84), height above the ellipsoid.
+
+    Raises:
+        HTTPException: no site is known yet, or it is not georeferenced.
+    """
+    site = live.require_site()
+    try:
+        origin = require_georeference(bridged_site(site.site, simulated=site.simulated), "GeoJSON")
+    except SkylessError as error:
+        raise HTTPException(409, str(error)) from None
+    found = {"type": "FeatureCollection", "features": list(_FEATURES[kind](live, origin))}
+    return json_answer(found, media_type=GEOJSON)
+
+
+def _fixes(live: LiveSite, origin: GeoreferenceSite) -> Iterator[dict[str, Any]]:
+    """Points of those whose use no alert forbids."""
+    for fix, ended_unix_s in live.recent_fixes():
+        if not is_usable(fix):
+            continue
+        asset = live.assets.by_tag.get(fix.tag, Asset(fix.tag))
+        properties = {
+            "tag": fix.tag,
+            "name": asset.name or None,
+            "group": asset.group or None,
+            "colour": asset.colour or None,
+            "unix_s": round(ended_unix_s, 3),
+            "age_s": round(max(live.wall_clock() - ended_unix_s, 0.0), 3),
+            "std_m": round(fix.std_m, 4),
+            "horizontal_std_m": round(sqrt(max(fix.covariance_m2[0] + fix.covariance_m2[4], 0.0)), 4),
+            "speed_mps": None if fix.velocity_mps is None else round(hypot(*fix.velocity_mps), 3),
+            "method": fix.method,
+            "alert": fix.alert,
+        }
+        yield feature("Point", coordinates(fix.position_m, origin), properties, id=fix.tag)
+
+
+def _anchors(live: LiveSite, origin: GeoreferenceSite) -> Iterator[dict[str, Any]]:
+    for anchor in live.require_site().site.anchors:
+        position_m = anchor.x_m, anchor.y_m, anchor.z_m
+        properties = {"anchor": anchor.id, "position_m": position_m}
+        yield feature("Point", coordinates(position_m, origin), properties, id=anchor.id)
+
+
+def _zone_features(live: LiveSite, origin: GeoreferenceSite) -> Iterator[dict[str, Any]]:
+    for zone in live.monitor.zones:
+        corners = zone.polygon_m if signed_area_m2(zone.polygon_m) >= 0.0 else zone.polygon_m[::-1]
+        ring = [coordinates((x, y, 0.0), origin)[:2] for x, y in (*corners, corners[0])]
+        properties = {"zone": zone.id, "name": zone.name, "colour": zone.colour}
+        yield feature("Polygon", [ring], properties, id=zone.id)
+
+
+_FEATURES: Final = {"fixes": _fixes, "anchors": _anchors, "zones": _zone_features}

@@ -1,0 +1,653 @@
+"""One recording by one method, judged; results that exist already are read instead."""
+
+import csv
+import hashlib
+import re
+from collections import defaultdict
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from functools import cache
+from html import escape
+from io import StringIO
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+from matplotlib.figure import Figure
+from msgspec import Struct, structs
+
+import skyless
+from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.arrays import Array, Matrix, Vector
+from skyless.core.errors import ConfigurationError, SkylessError
+from skyless.core.fix import Fix
+from skyless.core.whole_files import replace_files, write_whole
+from skyless.research.calibration.biases import biases_of, tdoas_of
+from skyless.research.calibration.options import SurveyOptions
+from skyless.research.foreign.formats import format_of, open_recording
+from skyless.research.masterless.smoothing import OwnEstimator
+from skyless.research.replays.captures import CaptureReplay
+from skyless.research.replays.options import ReplayOptions, known_anchors, known_truth
+from skyless.research.replays.site import SITE_FORMAT, SiteReplay
+from skyless.run.recordings.recording import McapRecording, is_mcap
+from skyless.sim.evaluation.figures import Figures, FixTable, Judged, figures_of, truth_at
+from skyless.site.kernels import kernel
+from skyless.site.report import bullets, page, panel, picture, report_style, svg_figure, table
+from skyless.site.survey.anchor_errors import DifferenceCalibration
+
+# Which recordings lie below a folder, and what belongs to each: its truth and its anchors.
+
+_TABLE: Final = re.compile(r"_(?:tdoa|data)(?=\.)")
+_TRUTHS: Final = ("_pose", "_truth", "_lighthouse")
+"""``NAME_tdoa.csv`` has its truth in ``NAME_pose.csv``, or with another of these words."""
+
+_ANCHORS: Final = ("anchors*.csv", "anchors/anchors*.csv", "anchor_positions.yaml")
+
+_SMALLEST: Final = 200
+"""Bytes that a recording has at least."""
+
+
+class Found(Struct, frozen=True):
+    """A recording and what belongs to it."""
+
+    name: str
+    """Its path from the folder, without endings."""
+    path: Path
+    format: str
+    truth: Path | None = None
+    """A table of the body's positions beside it."""
+    anchors: Path | None = None
+    has_body_truth: bool = False
+    """Whether the truth, of the table or in the recording itself, is of the body that carries the antenna."""
+
+
+def recordings_below(folder: Path) -> Iterator[Found]:
+    """All recordings that can be read, by their content, in the order of their names."""
+    paths = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+    truths = {companion for path in paths if (companion := truth_of(path))}
+    for path in paths:
+        if path in truths or path.stat().st_size < _SMALLEST or "anchors" in path.name:
+            continue
+        name, truth = re.sub(r"\.[\w.]+$", "", str(path.relative_to(folder))), truth_of(path)
+        if is_mcap(path):
+            yield Found(name, path, SITE_FORMAT)
+            continue
+        try:
+            kind = format_of(path)
+        except ConfigurationError:
+            continue
+        is_of_body = truth is not None
+        if truth is None and kind.truth_is_of_body and kind.read_truth is not None:
+            is_of_body = kind.read_truth(path, None) is not None
+        yield Found(name, path, kind.name, truth, anchors_of(path, folder), is_of_body)
+
+
+def truth_of(path: Path) -> Path | None:
+    """The table of truth that lies beside a recording."""
+    companions = (path.with_name(_TABLE.sub(word, path.name)) for word in _TRUTHS if _TABLE.search(path.name))
+    return next((one for one in companions if one.is_file()), None)
+
+
+def anchors_of(path: Path, folder: Path) -> Path | None:
+    """The nearest table of anchors: one of ``_ANCHORS`` beside the recording or above.
+
+    Of several the one whose ending stands in the recording's path, as ``const1`` of ``anchors_const1.csv``.
+    """
+    for place in (one for one in path.parents if one == folder or folder in one.parents):
+        tables = sorted(table for name in _ANCHORS for table in place.glob(name))
+        fitting = [table for table in tables if table.stem.partition("_")[2] in path.parts]
+        if fitting or len(tables) == 1:
+            return (fitting or tables)[0]
+    return None
+
+
+# What ``joint`` is compared with: extended Kalman filters of position and velocity, with two rules of gating.
+#
+# Both get time differences, start at the truth where it is known, know no faults and never start again.
+#
+# - *Gate*: a difference is used if its innovation is within three standard deviations of what the filter expects.
+# - *Bitcraze*: the rule of its firmware since 2023, as described in "New Loco TDoA outlier filter"
+#   (https://www.bitcraze.io/2023/03/new-loco-tdoa-outlier-filter/): a difference that exceeds the distance of its
+#   anchors is refused; an error up to two standard deviations of a measurement adds the time since the one before to a
+#   sum of at most 0.3 s, a larger one subtracts it. The filter closes when the sum is nearly full, and then refuses
+#   errors of more than two and a half standard deviations; it opens again when the sum is nearly empty.
+
+GATE, BITCRAZE = range(2)
+TDOA_STD_M: Final = {GATE: 0.22, BITCRAZE: 0.15}
+"""Noise of a difference: without tuning, and the default of Bitcraze's firmware."""
+
+QA_M2PS3: Final = 2.0
+"""Density of the acceleration. From 1 to 9 errors of most flights change by less than a tenth; from 4 on some noisy
+logs diverge."""
+
+GATE_STD: Final = 3.0
+START_STD_M: Final = 0.1
+START_STD_MPS: Final = 0.1
+SUM_S: Final = 0.3
+LONGEST_ADDED_S: Final = 0.03
+CLOSES, OPENS = 0.9, 0.1
+TRUSTED_STD, ACCEPTED_STD = 2.0, 2.5
+
+
+def plain_track(
+    rule: int, time_s: Vector, tdoa_m: Vector, a_m: Matrix, b_m: Matrix, start: Vector, is_planar: bool
+) -> tuple[Matrix, Array]:
+    """Positions after each of n differences, shape (n, 3), and their covariances, shape (n, 3, 3).
+
+    ``a_m`` and ``b_m``: the anchors' positions, shape (n, 3); a difference is the range to b less that to a. ``start``:
+    position and velocity, shape (6,); the height stays as it is where ``is_planar``.
+    """
+    axes = np.array([1.0, 1.0, 0.0 if is_planar else 1.0])
+    P = np.diag(np.concatenate([axes * START_STD_M**2, axes * START_STD_MPS**2]))
+    positions_m, covariances_m2 = np.empty((len(time_s), 3)), np.empty((len(time_s), 3, 3))
+    a_m, b_m, qa = np.ascontiguousarray(a_m), np.ascontiguousarray(b_m), QA_M2PS3 * axes
+    time_s, tdoa_m = np.ascontiguousarray(time_s), np.ascontiguousarray(tdoa_m)
+    _run(time_s, tdoa_m, a_m, b_m, rule, TDOA_STD_M[rule], qa, start.copy(), P, positions_m, covariances_m2)
+    return positions_m, covariances_m2
+
+
+@kernel
+def _run(
+    time_s: Vector,
+    tdoa_m: Vector,
+    a_m: Matrix,
+    b_m: Matrix,
+    rule: int,
+    std_m: float,
+    qa: Vector,
+    x: Vector,
+    P: Matrix,
+    positions_m: Matrix,
+    covariances_m2: Array,
+) -> None:
+    F, Q, H = np.eye(6), np.zeros((6, 6)), np.zeros(6)
+    last_s, good_s, is_open = time_s[0], 0.0, True
+    for n in range(len(time_s)):
+        dt_s = time_s[n] - last_s
+        last_s = time_s[n]
+        for i in range(3):
+            F[i, i + 3] = dt_s
+            Q[i, i] = qa[i] * dt_s**3 / 3
+            Q[i, i + 3] = Q[i + 3, i] = qa[i] * dt_s**2 / 2
+            Q[i + 3, i + 3] = qa[i] * dt_s
+        x[:] = F @ x
+        P[:] = F @ P @ F.T + Q
+        to_a, to_b = x[:3] - a_m[n], x[:3] - b_m[n]
+        range_a, range_b = np.linalg.norm(to_a), np.linalg.norm(to_b)
+        H[:3] = to_b / range_b - to_a / range_a
+        PH = P @ H
+        S = H @ PH + std_m * std_m
+        innovation = tdoa_m[n] - (range_b - range_a)
+        if rule == GATE:
+            used = innovation * innovation <= GATE_STD * GATE_STD * S
+        elif abs(tdoa_m[n]) >= np.linalg.norm(a_m[n] - b_m[n]):
+            used = False
+        else:
+            added_s = min(dt_s, LONGEST_ADDED_S)
+            if abs(innovation) < TRUSTED_STD * std_m:
+                good_s = min(good_s + added_s, SUM_S)
+            else:
+                good_s = max(good_s - added_s, 0.0)
+            used = is_open or abs(innovation) < ACCEPTED_STD * std_m
+            is_open = good_s <= CLOSES * SUM_S if is_open else good_s < OPENS * SUM_S
+        if used:
+            x += PH * (innovation / S)
+            P -= np.outer(PH, PH) / S
+            P[:] = (P + P.T) / 2
+        positions_m[n] = x[:3]
+        covariances_m2[n] = P[:3, :3]
+
+
+# Estimators without a filter, as they are written in an afternoon: a gradient, and least squares over a window.
+
+_STEP: Final = 0.2
+"""Share of a difference's error that a step takes away."""
+
+_WINDOW, _BETWEEN, _ITERATIONS = 30, 10, 5
+"""Differences that are fitted at a time, those from one fit to the next, and iterations of each."""
+
+
+class Gradient:
+    """Goes a step down the gradient of each difference's error, from the middle of the first two anchors."""
+
+    def __init__(self) -> None:
+        self._position_m: Vector | None = None
+
+    def hear(self, observation: PairTdoa) -> Fix | None:
+        """Process one time difference; see ``OwnEstimator``."""
+        a_m, b_m = np.array([observation.a_m]), np.array([observation.b_m])
+        if self._position_m is None:
+            self._position_m = (a_m + b_m)[0] / 2.0
+        (error_m,), (slope,) = _errors(self._position_m, a_m, b_m, np.array([observation.tdoa_m]))
+        self._position_m += _STEP * error_m * slope / max(float(slope @ slope), 0.1)
+        return Fix.of(observation.time_s, self._position_m.tolist())
+
+
+class LeastSquares:
+    """Fits a position to the newest differences, by Gauss and Newton from the one before."""
+
+    def __init__(self) -> None:
+        self._rows: list[tuple[float, ...]] = []
+        self._position_m: Vector | None = None
+
+    def hear(self, observation: PairTdoa) -> Fix | None:
+        """Process one time difference; see ``OwnEstimator``."""
+        self._rows.append((*(observation.a_m or ()), *(observation.b_m or ()), observation.tdoa_m))
+        if len(self._rows) < _WINDOW:
+            return None
+        rows = np.array(self._rows)
+        del self._rows[:_BETWEEN]
+        position_m = rows[:, :3].mean(axis=0) if self._position_m is None else self._position_m.copy()
+        for _ in range(_ITERATIONS):
+            errors_m, slopes = _errors(position_m, rows[:, :3], rows[:, 3:6], rows[:, 6])
+            position_m += np.linalg.lstsq(slopes, errors_m, rcond=1e-2)[0]
+        self._position_m = position_m
+        return Fix.of(observation.time_s, position_m.tolist())
+
+
+def _errors(position_m: Vector, a_m: Array, b_m: Array, tdoa_m: Vector) -> tuple[Vector, Array]:
+    """Differences less those at a position, shape (n,), and their slopes there, shape (n, 3)."""
+    to_a, to_b = position_m - a_m, position_m - b_m
+    range_a, range_b = (np.maximum(np.linalg.norm(to, axis=1), 1e-3) for to in (to_a, to_b))
+    return tdoa_m - (range_b - range_a), to_b / range_b[:, None] - to_a / range_a[:, None]
+
+
+JOINT, SMOOTHED, CALIBRATED, PLAIN, BITCRAZE_RULE = "joint", "joint-smoothed", "joint-calibrated", "gate", "bitcraze"
+RULES: Final = {PLAIN: GATE, BITCRAZE_RULE: BITCRAZE}
+SIMPLE: Final = {"gradient": Gradient, "least-squares": LeastSquares}
+BEST: Final = "best simple"
+"""The best of ``PLAIN`` and ``SIMPLE`` on each recording, known afterwards."""
+
+DRAWN: Final = 600
+"""Fixes of a recording that its pictures show."""
+
+SPEED_OVER_S: Final = 0.1
+"""The plain filters' velocity at the start is that of the truth over so long."""
+
+
+class Result(Struct, frozen=True):
+    """A recording by a method."""
+
+    recording: str
+    method: str
+    figures: Figures | None
+    reason: str = ""
+    """Why there are no figures."""
+    drawn: tuple[tuple[float | None, ...], ...] = ()
+    """Rows of time, position, truth, and levels of an even sample of the fixes; None where it is not known."""
+
+
+class Asked(Struct, frozen=True):
+    """How recordings are replayed."""
+
+    lever_arm_m: tuple[float, float, float] | None
+    first_s: float | None
+    calibrate_on: Sequence[str]
+    estimators: Mapping[str, Callable[[], OwnEstimator]]
+    """By their classes' names."""
+    programs: tuple[Path, ...]
+    """The files of the estimators."""
+    smooth: bool = True
+
+    def is_calibrated_on(self, found: Found) -> bool:
+        """Whether the anchors are calibrated on this recording."""
+        named = any(word in found.name for word in self.calibrate_on)
+        return named and found.truth is not None and found.anchors is not None
+
+
+def methods_of(found: Found, asked: Asked, calibrated: Collection[Path | None]) -> Iterator[str]:
+    """The methods that a recording is replayed by; ``calibrated``: tables of anchors that are calibrated."""
+    yield JOINT
+    if found.format == SITE_FORMAT:
+        return
+    yield from (*((SMOOTHED,) if asked.smooth else ()), PLAIN, BITCRAZE_RULE, *SIMPLE)
+    if found.anchors in calibrated and not asked.is_calibrated_on(found):
+        yield CALIBRATED
+    yield from asked.estimators
+
+
+def results_of(
+    found: Sequence[Found], asked: Asked, kept: Path, on_progress: Callable[[float], None]
+) -> Iterator[Result]:
+    """All results, as they come; those in the folder ``kept`` are not computed again."""
+    calibrated = {one.anchors for one in found if asked.is_calibrated_on(one)}
+    cells = [(one, method) for one in found for method in methods_of(one, asked, calibrated)]
+    calibrations: dict[Path, DifferenceCalibration] = {}
+    for number, (one, method) in enumerate(cells):
+        file = kept / f"{_key(one, method, asked)}.json"
+        results = _kept(file)
+        if results is None:
+            try:
+                if method == CALIBRATED and not calibrations:
+                    calibrations = _calibrations(found, asked)
+                results = tuple(_results(one, method, asked, calibrations))
+            except SkylessError as error:
+                results = (Result(one.name, method, None, str(error)),)
+            write_whole(file, msgspec.json.encode(results))
+        on_progress((number + 1) / len(cells))
+        yield from results
+
+
+def with_best(results: Sequence[Result]) -> Iterator[Result]:
+    """The results, and for each recording that of ``PLAIN`` or ``SIMPLE`` with the smallest error once more."""
+    yield from results
+    simple = [(_error_m(one), one) for one in results if one.method in {PLAIN, *SIMPLE} and one.figures]
+    for recording in dict.fromkeys(one.recording for _, one in simple):
+        errors = [(m, one) for m, one in simple if one.recording == recording and np.isfinite(m)]
+        if errors:
+            yield structs.replace(min(errors, key=lambda error: error[0])[1], method=BEST, drawn=())
+
+
+def _error_m(result: Result) -> float:
+    """The RMSE, in 3-D where the recording has heights; infinite where there is none."""
+    figures = result.figures
+    return np.inf if figures is None else figures.rmse_3d_m or figures.rmse_2d_m or np.inf
+
+
+def _kept(file: Path) -> tuple[Result, ...] | None:
+    """Results of an earlier run; None where there are none, or they are damaged."""
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=tuple[Result, ...])
+    except (FileNotFoundError, msgspec.DecodeError):
+        return None
+
+
+@cache
+def _newest_source() -> int:
+    """When the program was last changed."""
+    return max(source.stat().st_mtime_ns for source in Path(skyless.__file__).parent.rglob("*.py"))
+
+
+def _key(found: Found, method: str, asked: Asked) -> str:
+    """Name of a result: whatever could change it makes another one."""
+    programs = asked.programs if method in asked.estimators else ()
+    files = [one for one in (found.path, found.truth, found.anchors, *programs) if one]
+    states = [(str(one), one.stat().st_size, one.stat().st_mtime_ns) for one in files if one.is_file()]
+    given = (
+        _newest_source(),
+        states,
+        method,
+        asked.lever_arm_m,
+        asked.first_s,
+        tuple(asked.calibrate_on) * (method == CALIBRATED),
+    )
+    return hashlib.sha256(repr(given).encode()).hexdigest()[:24]
+
+
+def _results(
+    found: Found, method: str, asked: Asked, calibrations: Mapping[Path, DifferenceCalibration]
+) -> Iterator[Result]:
+    if found.format == SITE_FORMAT:
+        yield from _site_results(found)
+        return
+    estimator = {**SIMPLE, **asked.estimators}.get(method)
+    options = structs.replace(_options(found, asked), smooth=method == SMOOTHED, estimator=estimator)
+    calibration = None
+    if method == CALIBRATED:
+        assert found.anchors is not None
+        calibration = calibrations[found.anchors]
+    run = CaptureReplay(options, calibration)
+    if method in RULES:
+        table, judged = _plain(found, options, run, RULES[method])
+        yield _result(found.name, method, table, judged, None)
+        return
+    report = run.run(None, lambda _: None)
+    if report.reason is not None:
+        raise SkylessError(f"no fix: {report.reason}")
+    yield _result(found.name, method, run.samples.table(), run.judged, run.samples.count)
+
+
+def _site_results(found: Found) -> Iterator[Result]:
+    with McapRecording(found.path) as recording:
+        run = SiteReplay(recording)
+        run.run(None, lambda _: None)
+    for tag, samples in run.samples.items():
+        yield _result(f"{found.name} {tag}", JOINT, samples.table(), run.judged(tag), samples.count)
+
+
+def _options(found: Found, asked: Asked) -> ReplayOptions:
+    arm_m = asked.lever_arm_m if found.has_body_truth else None
+    return ReplayOptions(
+        found.path,
+        anchors=found.anchors,
+        truth=found.truth,
+        lever_arm_m=arm_m,
+        uncalibrated=True,
+        first_s=asked.first_s,
+    )
+
+
+def _calibrations(found: Sequence[Found], asked: Asked) -> dict[Path, DifferenceCalibration]:
+    """What ``skyless survey`` finds on the named recordings, by their tables of anchors."""
+    calibrations: dict[Path, DifferenceCalibration] = {}
+    for one in found:
+        if asked.is_calibrated_on(one) and one.anchors is not None:
+            options = _options(one, asked)
+            truth = known_truth(one.path, options)
+            assert truth is not None
+            rows = np.column_stack([truth.t_s, truth.position_m])
+            survey = SurveyOptions(recording=one.path, truth=rows, anchors=known_anchors(one.anchors, None)[0])
+            calibrations.setdefault(one.anchors, biases_of(survey).estimate.calibration())
+    return calibrations
+
+
+def _plain(found: Found, options: ReplayOptions, run: CaptureReplay, rule: int) -> tuple[FixTable, Judged]:
+    anchors_m = run.known_m
+    with open_recording(found.path, anchors_m=anchors_m) as recording:
+        rows = [row for pair in tdoas_of(recording, anchors_m) if (row := _row(pair, anchors_m)) is not None]
+    if not rows:
+        raise SkylessError("no time difference of known anchors")
+    table = np.array(rows)
+    judged = structs.replace(run.judged, begin_s=float(table[0, 0]), end_s=float(table[-1, 0]))
+    if options.first_s is not None:
+        table = table[table[:, 0] - table[0, 0] <= options.first_s]
+    truth_m = truth_at(judged.truth, table[:, 0])
+    known = np.flatnonzero(np.isfinite(truth_m[:, 0]))
+    start, begin = np.zeros(6), 0
+    start[:3] = table[:, 2:5].mean(axis=0)
+    if len(known):
+        begin = int(known[0])
+        start[:3] = truth_m[begin]
+        soon_m = truth_at(judged.truth, table[begin : begin + 1, 0] + SPEED_OVER_S)[0]
+        start[3:] = np.nan_to_num((soon_m - start[:3]) / SPEED_OVER_S)
+    if run.height_m is not None:
+        start[2], start[5] = run.height_m, 0.0
+    columns = table[begin:, 0], table[begin:, 1], table[begin:, 2:5], table[begin:, 5:8]
+    position_m, covariance_m2 = plain_track(rule, *columns, start, run.height_m is not None)
+    count = len(position_m)
+    return FixTable(columns[0], position_m, covariance_m2, np.full((count, 2), np.nan), np.full(count, -1.0)), judged
+
+
+def _row(pair: PairTdoa, anchors_m: Mapping[int, tuple[float, float, float]]) -> tuple[float, ...] | None:
+    a_m, b_m = pair.a_m or anchors_m.get(pair.anchor_a), pair.b_m or anchors_m.get(pair.anchor_b)
+    return None if a_m is None or b_m is None else (pair.time_s, pair.tdoa_m, *a_m, *b_m)
+
+
+def _result(name: str, method: str, table: FixTable, judged: Judged, count: int | None) -> Result:
+    kept = slice(None, None, max(len(table.time_s) // DRAWN, 1))
+    times_s: Vector = table.time_s[kept]
+    rows: Matrix = np.column_stack([
+        times_s, table.position_m[kept], judged.of(times_s)[0], table.levels_m[kept]
+    ])  # fmt: skip
+    drawn = tuple(tuple(None if np.isnan(value) else round(value, 4) for value in row) for row in rows.tolist())
+    return Result(name, method, figures_of(table, judged, count), drawn=drawn)
+
+
+# A benchmark as a page, a table and JSON.
+
+_HEADS: Final = (
+    *("recording", "method", "judged", "RMSE 2-D", "3-D", "50 %", "95 %", "largest", "bias x, y, z", "σ", "NEES"),
+    *("beyond 95 %", "levels", "exceeded h, v", "median level", "available", "first fix", "ATE", "RPE"),
+)
+_NUMBERS: Final = tuple(
+    name
+    for name in Figures.__struct_fields__
+    if name not in {"left_out", "alerts", "median_m", "std_m", "rmse_axes_m", "bias_m"}
+)
+_TRIPLES: Final = ("median_m", "std_m", "rmse_axes_m", "bias_m")
+_DIVERGED_M: Final = 1.0
+"""What has a larger error has lost the tag: no ratio to it is made."""
+
+
+def write(folder: Path, results: Sequence[Result], title: str, command: str) -> None:
+    """Write ``index.html``, ``results.csv`` and ``results.json`` into the folder. Raises OSError."""
+    without_drawn = [structs.replace(one, drawn=()) for one in results]
+    table_of_all = StringIO()
+    rows = csv.writer(table_of_all)
+    axes = (f"{name[:-1]}{axis}_m" for name in _TRIPLES for axis in "xyz")
+    rows.writerow(["recording", "method", "reason", *_NUMBERS, *axes])
+    rows.writerows(_csv_row(one) for one in results)
+    files = {
+        "results.json": msgspec.json.format(msgspec.json.encode(without_drawn), indent=1),
+        "results.csv": table_of_all.getvalue().encode(),
+        "index.html": _page(results, title, command).encode(),
+    }
+    replace_files({folder / name: data for name, data in files.items()})
+
+
+def _csv_row(result: Result) -> list[object]:
+    found = result.figures or Figures()
+    triples = (value for name in _TRIPLES for value in getattr(found, name) or (None, None, None))
+    return [result.recording, result.method, result.reason, *(getattr(found, name) for name in _NUMBERS), *triples]
+
+
+def ratios(results: Sequence[Result], method: str, other_method: str = PLAIN) -> dict[str, float | int]:
+    """Geometric means of a method's errors over another's, of recordings that both were judged on."""
+    others = {one.recording: one.figures for one in results if one.method == other_method and one.figures is not None}
+    found: dict[str, list[float]] = defaultdict(list)
+    for one in results:
+        other = others.get(one.recording)
+        if one.method == method and one.figures is not None and other is not None:
+            for name in ("rmse_2d_m", "rmse_3d_m"):
+                mine_m, its_m = getattr(one.figures, name), getattr(other, name)
+                if mine_m is not None and its_m is not None and its_m < _DIVERGED_M:
+                    found[name].append(float(np.log(mine_m / its_m)))
+    means: dict[str, float | int] = {name: float(np.exp(np.mean(logs))) for name, logs in found.items()}
+    return {**means, "recordings": len(found["rmse_2d_m"])}
+
+
+def summary_rows(results: Sequence[Result]) -> Iterator[tuple[str, ...]]:
+    """One line for each method: ratios to the plain filter and to the best simple one, NEES, and levels exceeded."""
+    for method in dict.fromkeys(one.method for one in results):
+        found = [ratios(results, method, other) for other in (PLAIN, BEST)]
+        judged = [one.figures for one in results if one.method == method and one.figures and one.figures.judged]
+        nees = [one.nees for one in judged if one.nees is not None]
+        exceeded = (sum(getattr(one, f"exceeded_{way}") for one in judged) for way in ("horizontal", "vertical"))
+        yield (
+            method,
+            f"{len(judged)}",
+            *(_number(ratio.get(name), ".3f") for ratio in found for name in ("rmse_2d_m", "rmse_3d_m")),
+            f"{np.median(nees):.2f} ({min(nees):.2f} to {max(nees):.2f})" if nees else "–",
+            f"{sum(one.levels for one in judged)}",
+            ", ".join(map(str, exceeded)),
+        )
+
+
+SUMMARY_HEADS: Final = (
+    *("method", "recordings", "2-D / gate", "3-D / gate", "2-D / best simple", "3-D / best simple"),
+    *("NEES", "levels", "exceeded h, v"),
+)
+
+
+def _page(results: Sequence[Result], title: str, command: str) -> str:
+    by_recording: Mapping[str, list[Result]] = defaultdict(list)
+    for one in results:
+        by_recording[one.recording].append(one)
+    failed = [f"{one.recording}, {one.method}: {one.reason}" for one in results if one.figures is None]
+    rows = [_table_row(one) for one in results if one.figures is not None]
+    parts = [
+        f"<header><h1>{escape(title)}</h1>\n<p>Fixes are of methods as they stand. "
+        "Figures are defined in <code>docs/recordings.md</code>; lengths in metres. Made by "
+        f"<code>{escape(command)}</code>; the same figures are in <code>results.csv</code> and "
+        "<code>results.json</code>.</p></header>",
+        "<section><h2>Methods</h2>",
+        table(SUMMARY_HEADS, summary_rows(results)),
+        "<p class='note'>Ratios are geometric means of RMSE over that of the plain filter with a gate (gate), "
+        "and over that of the best of it, gradient and least squares on each recording (best simple), of recordings "
+        "where that is below 1 m.</p>"
+        "</section><section><h2>Recordings</h2>",
+        table(_HEADS, rows),
+        "</section>",
+    ]
+    if failed:
+        parts.append("<section><h2>Left out</h2>" + bullets(failed, "warning") + "</section>")
+    parts += [_section(number, name, ones) for number, (name, ones) in enumerate(by_recording.items())]
+    return page(title, parts)
+
+
+def _table_row(result: Result) -> tuple[str, ...]:
+    found = result.figures
+    assert found is not None
+    over = "3d" if found.rmse_3d_m is not None else "2d"
+    of_all = (getattr(found, f"{name}_{over}_m") for name in ("p50", "p95", "max"))
+    return (
+        *(result.recording, result.method, f"{found.judged}, {found.judged_s:.0f} s"),
+        *(_number(value, ".3f") for value in (found.rmse_2d_m, found.rmse_3d_m, *of_all)),
+        "–" if found.bias_m is None else ", ".join(f"{value:.3f}" for value in found.bias_m),
+        _number(getattr(found, f"sigma_{over}_m"), ".3f"),
+        _number(found.nees, ".2f"),
+        _number(found.beyond_95, ".1%"),
+        f"{found.levels}",
+        f"{found.exceeded_horizontal}, {found.exceeded_vertical}",
+        _number(found.hpl_m, ".2f"),
+        _number(found.availability, ".1%"),
+        _number(found.first_fix_s, ".2f"),
+        *(_number(value, ".3f") for value in (found.ate_m, found.rpe_m)),
+    )
+
+
+def _number(value: float | None, form: str) -> str:
+    return "–" if value is None else format(value, form)
+
+
+def _section(number: int, name: str, results: Sequence[Result]) -> str:
+    drawn = {one.method: np.array(one.drawn, dtype=np.float64) for one in results if one.drawn}
+    if not drawn:
+        return ""
+    with report_style():
+        panels = {
+            "Map; the line is the truth": _map(drawn),
+            "Error over time": _over_time(drawn),
+            f"Horizontal errors of {JOINT} and its protection levels (Stanford diagram)": _levels(drawn),
+        }
+        figures = "\n".join(
+            svg_figure(picture(figure, "svg", 60.0), f"recording{number}_{place}", caption)
+            for place, (caption, figure) in enumerate(panels.items())
+        )
+    return f"<section><h2>{escape(name)}</h2><div class='panels'>{figures}</div></section>"
+
+
+def _map(drawn: Mapping[str, Matrix]) -> Figure:
+    """Of rows of time, position, truth and levels by method."""
+    figure, axes = panel("")
+    truth_m = next(iter(drawn.values()))[:, 4:6]
+    for method, rows in drawn.items():
+        axes.plot(rows[:, 1], rows[:, 2], ".", markersize=2, rasterized=True, label=method)
+    axes.plot(*truth_m.T, color="black", linewidth=0.7)
+    if np.isfinite(truth_m).any():  # a filter that has lost its tag shall not fill the map
+        low_m, high_m = np.nanmin(truth_m, axis=0) - 1.0, np.nanmax(truth_m, axis=0) + 1.0
+        axes.set(xlim=(low_m[0], high_m[0]), ylim=(low_m[1], high_m[1]))
+    axes.set(xlabel="x in m", ylabel="y in m", aspect="equal")
+    return figure
+
+
+def _over_time(drawn: Mapping[str, Matrix]) -> Figure:
+    figure, axes = panel("")
+    begin_s = min(rows[0, 0] for rows in drawn.values())
+    for method, rows in drawn.items():
+        error_m = np.linalg.norm(rows[:, 1:4] - rows[:, 4:7], axis=1)
+        axes.plot(rows[:, 0] - begin_s, error_m, linewidth=0.7, label=method)
+    axes.set(xlabel="time in s", ylabel="error in m", yscale="log")
+    axes.legend(fontsize="x-small")
+    return figure
+
+
+def _levels(drawn: Mapping[str, Matrix]) -> Figure:
+    figure, axes = panel("")
+    rows = drawn.get(JOINT, np.empty((0, 9)))
+    error_m = np.linalg.norm(rows[:, 1:3] - rows[:, 4:6], axis=1)
+    most_m = 1.05 * float(np.nanmax([*error_m, *rows[:, 7], 0.1]))
+    axes.plot(error_m, rows[:, 7], ".", markersize=2, rasterized=True)
+    axes.plot([0.0, most_m], [0.0, most_m], color="black", linewidth=0.7)
+    axes.set(xlabel="error in m", ylabel="level in m", xlim=(0.0, most_m), ylim=(0.0, most_m))
+    return figure

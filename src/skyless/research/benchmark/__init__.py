@@ -1,1 +1,0 @@
-"""Every recording below a folder by every method, beside each other."""

@@ -1,1 +1,0 @@
-"""Tags on radios of other makers."""
