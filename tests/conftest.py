@@ -94,7 +94,7 @@ def own_data_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 def no_progress() -> Iterator[None]:
     """What commands write on standard error does not depend on how fast the machine is."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("skyless.cli.common.progress._LINE_S", math.inf)
+        patch.setattr("skyless.cli.common._LINE_S", math.inf)
         yield
 
 

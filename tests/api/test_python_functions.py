@@ -13,7 +13,7 @@ from msgspec.structs import replace
 import skyless
 import synthetic_recordings as synthetic
 from recordings import live_site
-from skyless.cli.common.output import to_json
+from skyless.cli.common import to_json
 from skyless.cli.main import main
 from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.site import AccuracySite

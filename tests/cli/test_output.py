@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from msgspec import Struct
 
 import skyless
-from skyless.cli.common.output import print_json, to_json
+from skyless.cli.common import print_json, to_json
 
 pytestmark = pytest.mark.site
 

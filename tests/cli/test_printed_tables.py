@@ -1,6 +1,6 @@
 """Tables fit the screen: heads are wrapped, numbers are not, and what is too wide goes into further tables."""
 
-from skyless.cli.common.output import print_table
+from skyless.cli.common import print_table
 
 HEADS = ("case", "RMSE in cm", "", *(f"figure number {n}" for n in range(20)))
 ROW = ("a body in between", "2.43 ± 0.05", "0.91–1.09", *(f"{n}.{n:05} ± 0.1" for n in range(20)))

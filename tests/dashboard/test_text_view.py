@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from rich.console import Console
 
-from skyless.cli.common.output import plain
-from skyless.cli.nodes._site_screen import drawn
-from skyless.cli.nodes._site_view import AnchorRow, Picture, SiteView, TagRow
+from skyless.cli.common import plain
+from skyless.cli.nodes.site_view import AnchorRow, Picture, SiteView, TagRow, drawn
 from skyless.page.condition._reasons import Reason
 from skyless.page.condition.monitor import Condition
 from skyless.run.mqtt import topics

@@ -81,7 +81,7 @@ def test_no_site_writes_as_another(is_filtered, tmp_path, monkeypatch):
 async def _run(folder, hub, rogue_address, *, is_filtered):
     async with site(folder, hub.leaf("plant", HONEST)) as own:
         rogue, honest, tenant = [await client_of(one) for one in (rogue_address, own.nats, hub.address("plant"))]
-        for old in hub._OF_ALL_SITES:  # as in a hub that an earlier version has made
+        for old in hub_program._OF_ALL_SITES:  # as in a hub that an earlier version has made
             await tenant.jetstream().add_stream(name=old, subjects=[f"old.{old}"], max_bytes=10**6)
         for pattern, taken in STREAMS.items():
             await rogue.jetstream().add_stream(name=streams.at(pattern, ROGUE), subjects=taken)
@@ -108,7 +108,7 @@ async def _run(folder, hub, rogue_address, *, is_filtered):
         async with asyncio.timeout(90):
             await hub.make_hub_streams(tenant, hub, "plant")
             assert await hub.sites_at(tenant) == {HONEST, ROGUE}
-            assert not any([await has_stream(tenant, old) for old in hub._OF_ALL_SITES])
+            assert not any([await has_stream(tenant, old) for old in hub_program._OF_ALL_SITES])
             # A source that was made before the line was up asks again after half a minute at most.
             while history.state().fixes < 8 or not all(known.names().get(one) and seen[one] for one in seen):
                 await asyncio.sleep(0.1)

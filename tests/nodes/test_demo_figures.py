@@ -6,8 +6,8 @@ import msgspec
 import pytest
 from node_stage import FakeLink
 
-from skyless.cli.nodes._demo_figures import DemoFigures, sentence
-from skyless.cli.nodes._site_view import SiteView
+from skyless.cli.nodes.demo_site import DemoFigures, sentence
+from skyless.cli.nodes.site_view import SiteView
 from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth, TrueMotion, TruthMessage
 
 NOW_S = time.time()

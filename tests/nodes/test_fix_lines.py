@@ -14,7 +14,7 @@ from node_stage import LAB, PLACE_M, FakeRadio, receptions
 
 from skyless.cli.main import main
 from skyless.cli.nodes import tag as command
-from skyless.cli.nodes._fix_lines import CSV_COLUMNS, FixLines, csv_row, line_for_people
+from skyless.cli.nodes.tag import CSV_COLUMNS, FixLines, csv_row, line_for_people
 from skyless.run.mqtt.messages import FixMessage
 
 pytestmark = pytest.mark.site
@@ -80,7 +80,7 @@ class Gone(io.StringIO):
 
 @pytest.mark.parametrize(("error", "code", "said"), [(BrokenPipeError(), 1, ""), (OSError(ENOSPC, "full"), 2, "full")])
 def test_a_reader_that_goes_away_ends_the_program(capfd, monkeypatch, error, code, said):
-    monkeypatch.setattr("skyless.cli.nodes._fix_lines._standard_output", lambda: Gone(error))
+    monkeypatch.setattr("skyless.cli.nodes.tag._standard_output", lambda: Gone(error))
     monkeypatch.setattr("skyless.cli.main._drop_output", lambda: None)
     monkeypatch.setattr(command, "open_radios", lambda *_, **__: [Endless("one")])
     assert main([*TAG, "--csv"]) == code
@@ -115,8 +115,8 @@ async def test_a_reader_that_takes_nothing_delays_no_fix(monkeypatch):
             return len(text)
 
     logged = []
-    monkeypatch.setattr("skyless.cli.nodes._fix_lines._standard_output", Slow)
-    monkeypatch.setattr("skyless.cli.nodes._fix_lines._CLOSE_S", 0.0)
+    monkeypatch.setattr("skyless.cli.nodes.tag._standard_output", Slow)
+    monkeypatch.setattr("skyless.cli.nodes.tag._CLOSE_S", 0.0)
     lines = FixLines(str, None, logged.append)
     writing = asyncio.ensure_future(lines.run())
     await asyncio.sleep(0)

@@ -15,7 +15,7 @@ import msgspec
 import pytest
 from mqtt_brokers import Embedded
 
-from skyless.cli.nodes._site_view import site_number
+from skyless.cli.nodes.site_view import site_number
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link

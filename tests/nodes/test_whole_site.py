@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from skyless.cli.nodes import _demo_site
-from skyless.cli.nodes._demo_site import DemoOptions, WholeSite
+from skyless.cli.nodes import demo_site
+from skyless.cli.nodes.demo_site import DemoOptions, WholeSite
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.address import MqttAddress
 
@@ -36,8 +36,8 @@ class Lasting:
 @pytest.fixture
 def link(monkeypatch):
     link = Lasting()
-    monkeypatch.setattr(_demo_site, "Link", lambda *_arguments, **_options: link)
-    monkeypatch.setattr(_demo_site, "Child", Lasting)
+    monkeypatch.setattr(demo_site, "Link", lambda *_arguments, **_options: link)
+    monkeypatch.setattr(demo_site, "Child", Lasting)
     return link
 
 
@@ -48,7 +48,7 @@ def test_the_demo_s_own_broker_keeps_nothing_after_its_end(link, monkeypatch):
         settings.append(asked)
         raise SkylessError("enough is known")
 
-    monkeypatch.setattr(_demo_site, "start_broker", start)
+    monkeypatch.setattr(demo_site, "start_broker", start)
     with pytest.raises(SkylessError, match="enough"):
         asyncio.run(WholeSite(DemoOptions(record="none"), print).run())
     assert [asked.temporary for asked in settings] == [True]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.image import imread
 
-from skyless.cli.common.output import write_picture
+from skyless.cli.common import write_picture
 from skyless.research.replays.options import track_figure
 
 pytestmark = pytest.mark.site

@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import App
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import console, print_json, print_table
-from skyless.cli.common.progress import progress_bar
+from skyless.cli.common import JsonOptions, command, console, print_json, print_table, progress_bar
 from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.arguments import Option, Options, Positive, Rule, Text, numbers, point
 from skyless.core.errors import SkylessError

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
-from skyless.cli.common.options import command
-from skyless.cli.common.output import print_json
+from skyless.cli.common import command, print_json
 from skyless.cli.nodes.options import HubUrl, MqttOptions, SiteId, hub_address, listen_address, site_named
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Literal
 
 from cyclopts import App
 
-from skyless.cli.common.options import JsonOptions, check_output, command
-from skyless.cli.common.output import NO_FIX, print_json, print_table, print_warnings
+from skyless.cli.common import NO_FIX, JsonOptions, check_output, command, print_json, print_table, print_warnings
 from skyless.core.errors import SkylessError
 
 if TYPE_CHECKING:

@@ -3,29 +3,424 @@
 import asyncio
 import contextlib
 import sys
+import time
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
 
+import numpy as np
 from cyclopts import App, Parameter
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from msgspec import Struct
+from msgspec.structs import asdict
 
-from skyless.cli.common.options import command, make_folder
-from skyless.cli.common.output import print_json
-from skyless.cli.history_queries import questions
+from skyless.cli.common import (
+    NO_FIX,
+    check_folder,
+    check_picture,
+    command,
+    console,
+    make_folder,
+    print_json,
+    write_picture,
+)
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
-from skyless.core.arguments import Positive
+from skyless.core.arguments import Option, Options, Positive, whole
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
+from skyless.run.history.answers import THINNED_GAP_S
+from skyless.site.report import BLUE, MAP, MUTED, panel, report_style
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable, Callable
 
     from skyless.run.gather.streams import NatsAddress
+    from skyless.run.history.answers import Span
     from skyless.run.history.program import HistoryNode, HistoryState, HubHistory
+    from skyless.run.history.queries import History
     from skyless.run.history.writer import Keep
     from skyless.run.mqtt.address import MqttAddress
 
     _History = HistoryNode | HubHistory
+
+# Pictures of the history's answers.
+
+_BARS: Final = 30
+_LINES: Final = 8
+_Zones = Mapping[str, tuple[str, tuple[tuple[float, float], ...]]]
+_Answer = Mapping[str, Any]
+"""An answer (``run/history/answers.py``) by its fields, with names beside identifiers."""
+
+
+def track_figure(track: _Answer, zones: _Zones, title: str) -> Figure:
+    """The way over the zones, interrupted at gaps."""
+    with report_style():
+        figure, axes = panel(f"{track['tag_name']}, {title}", 4.2)
+        rows = np.array([(point.unix_s, point.x_m, point.y_m) for point in track["points"]]).reshape(-1, 3)
+        usual_s = np.median(np.diff(rows[:, 0])) if len(rows) > 1 else 0.0
+        gaps = np.flatnonzero(np.diff(rows[:, 0]) > max(THINNED_GAP_S, 3.0 * usual_s)) + 1
+        for part in np.split(rows, gaps):
+            axes.plot(part[:, 1], part[:, 2], ".-", color=BLUE, markersize=1.5, linewidth=0.7)
+        _plan(axes, zones)
+        return figure
+
+
+def heatmap_figure(heatmap: _Answer, zones: _Zones, title: str) -> Figure:
+    """The time in each cell over the zones, in colours by its logarithm."""
+    with report_style():
+        figure, axes = panel(title, 4.2)
+        seconds = np.array(heatmap["seconds"]).reshape(heatmap["rows"], heatmap["columns"])
+        if (seconds > 0.0).any():
+            x0_m, y0_m, cell_m = (heatmap[name] for name in ("x0_m", "y0_m", "cell_m"))
+            extent = (x0_m, x0_m + cell_m * seconds.shape[1], y0_m, y0_m + cell_m * seconds.shape[0])
+            shown = np.ma.masked_equal(seconds, 0.0)
+            drawn = axes.imshow(shown, extent=extent, origin="lower", cmap=MAP, norm=LogNorm())
+            figure.colorbar(drawn, ax=axes, label="time in s")
+        _plan(axes, zones)
+        return figure
+
+
+def dwell_figure(dwell: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
+    """The longest times as bars."""
+    longest = sorted(dwell, key=lambda one: -one["seconds"])[:_BARS][::-1]
+    with report_style():
+        figure, axes = panel(title, 1.2 + 0.2 * max(len(longest), 3))
+        names = [f"{one['tag_name']}, {one['zone_name']}" for one in longest]
+        axes.barh(names, [one["seconds"] / 60.0 for one in longest], color=BLUE)
+        axes.set_xlabel("time in min")
+        return figure
+
+
+def occupancy_figure(occupancy: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
+    """The mean number of tags over time, of the fullest zones."""
+    zones: dict[str, list[_Answer]] = defaultdict(list)
+    for one in occupancy:
+        zones[one["zone"]].append(one)
+    fullest = sorted(zones.values(), key=lambda steps: -sum(step["mean"] for step in steps))[:_LINES]
+    with report_style():
+        figure, axes = panel(title)
+        for steps in fullest:
+            times: list[Any] = [datetime.fromtimestamp(step["unix_s"]) for step in steps]
+            axes.step(times, [step["mean"] for step in steps], where="post", label=steps[0]["zone_name"])
+        axes.set_ylabel("tags, mean of each step")
+        figure.autofmt_xdate()
+        if fullest:
+            axes.legend()
+        return figure
+
+
+def contacts_figure(contacts: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
+    """When each other tag was near."""
+    return _times_figure([(one["other_name"], one["begin_unix_s"], one["end_unix_s"]) for one in contacts], title)
+
+
+def alarms_figure(alarms: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
+    """From when to when each rule's alarms lasted; those that have not ended, until now."""
+    times = [(one["raised_unix_s"], one["ended_unix_s"] or time.time()) for one in alarms]
+    names = [f"{one['rule']}, {one['subject_name']}" for one in alarms]
+    return _times_figure([(name, *span) for name, span in zip(names, times, strict=True)], title)
+
+
+def _times_figure(times: Sequence[tuple[str, float, float]], title: str) -> Figure:
+    """A line of bars for each of the first names, from the one Unix time to the other."""
+    names = list(dict.fromkeys(name for name, _, _ in times))[:_BARS][::-1]
+    with report_style():
+        figure, axes = panel(title, 1.2 + 0.2 * max(len(names), 3))
+        for name, begin_s, end_s in times:
+            if name in names:
+                begin, end = datetime.fromtimestamp(begin_s), datetime.fromtimestamp(end_s)
+                axes.barh(name, end - begin, left=begin, color=BLUE)  # type: ignore[arg-type]
+        figure.autofmt_xdate()
+        return figure
+
+
+def _plan(axes: Axes, zones: _Zones) -> None:
+    for name, corners in zones.values():
+        if corners:
+            x_m, y_m = zip(*corners, corners[0], strict=True)
+            axes.plot(x_m, y_m, color=MUTED, linewidth=0.8)
+            axes.annotate(name, (sum(x_m[1:]) / len(corners), sum(y_m[1:]) / len(corners)), fontsize=7.0, ha="center")
+    axes.set(xlabel="x in m", ylabel="y in m", aspect="equal")
+
+
+FIGURES: Final[Mapping[str, Callable[[Any, _Zones, str], Figure]]] = {
+    "track": track_figure,
+    "heatmap": heatmap_figure,
+    "dwell": dwell_figure,
+    "occupancy": occupancy_figure,
+    "contacts": contacts_figure,
+    "alarms": alarms_figure,
+}
+"""What draws the answer to a question, by the question's name."""
+
+
+# ``skyless history track``, ``heatmap``, ``dwell``, ``occupancy``, ``contacts``, ``alarms`` and ``export``.
+
+_LONGEST_TABLE = 40
+"""Rows that are shown; --json gives all."""
+_LONGEST_LIST = 10
+"""Cells of a heat map that are shown."""
+
+_HEADINGS = {"subject_name": "of", "acknowledged_unix_s": "seen", "acknowledged_by": "by", "seconds": "duration"}
+_OF_TAGS = ("tag", "other", "subject")
+_Row = dict[str, Any]
+
+questions = App(name="history")
+
+
+class _Asked(Options, frozen=True, kw_only=True):
+    begin: Annotated[str, Option("from")] = "today"
+    """When the range begins: 14:00, yesterday 8:00, 2 hours ago, an ISO time, or seconds since 1970."""
+    end: Annotated[str | None, Option("to")] = None
+    """When the range ends, in the same words, a time of day on the day on which it begins; by default now."""
+    history: Path | None = None
+    """Folder of the history; by default history in the user's data folder."""
+    site_id: SiteId | None = None
+    """Number of the site; by default the only one in the folder."""
+    json: bool = False
+    """Write one JSON object instead of the table."""
+
+    def opened(self) -> "tuple[History, Span]":
+        """The history and the range that are asked for. Raises SkylessError."""
+        from skyless.run.history.answers import span_of
+        from skyless.run.history.queries import History, sites_in
+        from skyless.run.process import data_folder
+
+        folder = self.history or data_folder() / "history"
+        sites = sites_in(folder)
+        if self.site_id is None and len(sites) != 1:
+            several = f"the sites {', '.join(map(str, sites))}; --site-id chooses one"
+            held = f"it holds {several if sites else 'none'}"
+            raise SkylessError(f"--history is '{folder}'; it should be the folder of a site's history, and {held}")
+        history = History(folder, sites[0] if self.site_id is None else self.site_id)
+        try:
+            return history, span_of(self.begin, self.end, time.time())
+        except SkylessError as error:
+            raise SkylessError(f"--{error}") from None
+
+
+class _Drawn(_Asked, frozen=True, kw_only=True):
+    plot: Path | None = None
+    """Draw the answer into this file (PNG, SVG or PDF)."""
+
+    def check(self) -> None:
+        """See that the picture can be written."""
+        check_picture(self.plot)
+
+    def answer(self, name: str, ask: "Callable[[History, Span], Struct | Sequence[Struct]]") -> int:
+        """Ask, and write the answer as JSON or a table, and as the picture that ``history_pictures`` has for it."""
+        history, span = self.opened()
+        found = ask(history, span)
+        assets = history.assets()
+        given: Any = _named(found, assets) if isinstance(found, Struct) else [_named(one, assets) for one in found]
+        rows = _ROWS[name](given) if name in _ROWS else given
+        if self.json:
+            _print(history, span, {name: given})
+        else:
+            _table(_range(span), rows)
+        if self.plot is not None:
+            write_picture(self.plot, FIGURES[name](given, history.zones(), _range(span)))
+        return NO_FIX if isinstance(given, dict) and not rows else 0
+
+
+def _named(answer: Struct, assets: Mapping[str, str]) -> _Row:
+    """The fields of an answer; what names tags is followed by what people call them."""
+    row = {}
+    for key, value in asdict(answer).items():
+        row[key] = value
+        if key in _OF_TAGS:
+            row[f"{key}_name"] = "~".join(assets.get(tag, tag) for tag in value.split("~"))
+    return row
+
+
+def _track_rows(way: _Row) -> list[_Row]:
+    row = {name: way[name] for name in ("tag_name", "fixes", "length_m")}
+    for end, point in zip(("first", "last"), (*way["points"][:1], *way["points"][-1:]), strict=False):
+        row[end] = f"({point.x_m:.2f}, {point.y_m:.2f}) m at {_time(point.unix_s)}"
+    return [row] if way["fixes"] else []
+
+
+def _heatmap_rows(found: _Row) -> list[_Row]:
+    longest = sorted(enumerate(found["seconds"]), key=lambda one: -one[1])[:_LONGEST_LIST]
+    rows = []
+    for k, seconds in longest:
+        row, column = divmod(k, found["columns"])
+        x_m, y_m = (found[f"{name}0_m"] + found["cell_m"] * (n + 0.5) for name, n in (("x", column), ("y", row)))
+        rows.append({"x_m": x_m, "y_m": y_m, "seconds": seconds})
+    whole = {"x_m": "all", "y_m": f"{found['tags']} tags", "seconds": sum(found["seconds"])}
+    return [*rows, whole] if found["tags"] else []
+
+
+_ROWS: Mapping[str, Callable[[Any], list[_Row]]] = {
+    "track": _track_rows,
+    "heatmap": _heatmap_rows,
+    "occupancy": lambda found: [row for row in found if row["most"]],
+}
+"""The rows of the tables that do not show the answer as it is."""
+
+
+@questions.command(help_epilogue="Example: skyless history track tag7 --from 8:00 --to 16:00 --plot way.png")
+@command
+def track(tag: str, /, *, asked: _Drawn, points: Annotated[int, whole(2, 20_000)] = 2000) -> int:
+    """Where a tag was: its way, thinned to a number of points, with its length.
+
+    Parameters
+    ----------
+    tag
+        Name of the tag, or of its asset.
+    points
+        How many points of the way are given at most.
+    """
+    return asked.answer("track", lambda history, span: history.track(tag, span, points))
+
+
+@questions.command(help_epilogue="Example: skyless history heatmap --from yesterday --to today --plot heat.png")
+@command
+def heatmap(*tags: str, asked: _Drawn, cell: Positive = 0.25) -> int:
+    """How long tags, by default all, were where.
+
+    Parameters
+    ----------
+    tags
+        Names of tags, or of their assets.
+    cell
+        Side of a cell in metres.
+    """
+    return asked.answer("heatmap", lambda history, span: history.heatmap(span, cell, tags))
+
+
+@questions.command(help_epilogue="Example: skyless history dwell --from monday --zone dock")
+@command
+def dwell(*tags: str, asked: _Drawn, zone: str | None = None) -> int:
+    """How long tags, by default all, were in zones.
+
+    Parameters
+    ----------
+    tags
+        Names of tags, or of their assets.
+    zone
+        Identifier of the only zone; by default all.
+    """
+    return asked.answer("dwell", lambda history, span: history.dwell(span, tags, zone))
+
+
+@questions.command(help_epilogue="Example: skyless history occupancy --from 6:00 --zone canteen --every 600")
+@command
+def occupancy(*, asked: _Drawn, zone: str | None = None, every: Positive = 300.0) -> int:
+    """How many tags were in zones, over time.
+
+    Parameters
+    ----------
+    zone
+        Identifier of the only zone; by default all.
+    every
+        Seconds of a step of time.
+    """
+    return asked.answer("occupancy", lambda history, span: history.occupancy(span, zone, every))
+
+
+@questions.command(help_epilogue="Example: skyless history contacts tag7 --from yesterday --within 1.5")
+@command
+def contacts(tag: str, /, *, asked: _Drawn, within: Positive = 2.0) -> int:
+    """Which tags were near a tag, and when.
+
+    Parameters
+    ----------
+    tag
+        Name of the tag, or of its asset.
+    within
+        Metres in the plane at which tags are near each other.
+    """
+    return asked.answer("contacts", lambda history, span: history.contacts(tag, span, within))
+
+
+@questions.command(help_epilogue="Example: skyless history alarms --from yesterday")
+@command
+def alarms(*, asked: _Drawn) -> int:
+    """Alarms of the range, with those that had begun before it and had not ended."""
+    return asked.answer("alarms", lambda history, span: history.alarms(span))
+
+
+@questions.command(help_epilogue="Example: skyless history export fixes.csv --from yesterday --to today")
+@command
+def export(file: Path, /, *tags: str, asked: _Asked, site: Path | None = None, force: bool = False) -> None:
+    """Write the fixes of tags, by default all, as a table: CSV, Parquet, or GeoJSON with one feature a line.
+
+    Parameters
+    ----------
+    file
+        The file to write; its ending .csv, .parquet or .geojsonl is its format.
+    tags
+        Names of tags, or of their assets.
+    site
+        Site file with a georeference, which GeoJSON needs.
+    force
+        Overwrite what is there, if the file exists.
+    """
+    check_folder("FILE", file)
+    if file.exists() and not force:
+        raise SkylessError(f"{file} exists; --force overwrites it")
+    history, span = asked.opened()
+    origin = None
+    if site is not None:
+        from skyless.site.file.load import load_site
+
+        origin = load_site(site).georeference
+    count = history.export(file, span, tags, origin)
+    if asked.json:
+        _print(history, span, {"file": file, "fixes": count})
+    else:
+        console().print(f"{file}: {count} fixes, {_range(span)}", markup=False)
+
+
+def _print(history: "History", span: "Span", answer: dict[str, Any]) -> None:
+    known = {"from_unix_s": span.from_unix_s, "to_unix_s": span.to_unix_s}
+    print_json({"site": history.site, **known, "known_until_unix_s": history.known_until_unix_s(), **answer})
+
+
+def _table(title: str, rows: Sequence[_Row]) -> None:
+    """A table whose columns are the fields of its rows, by name."""
+    from rich.table import Table
+    from rich.text import Text
+
+    more = len(rows) - _LONGEST_TABLE
+    table = Table(title=title, caption=f"{more} more rows: --json gives all" if more > 0 else None)
+    names = [name for name in rows[0] if name != "id" and f"{name}_name" not in rows[0]] if rows else []
+    for name in names:
+        heading = name.removesuffix("_name").removesuffix("_unix_s")
+        heading = f"{heading.removesuffix('_m')} in m" if heading.endswith("_m") else heading.replace("_", " ")
+        table.add_column(_HEADINGS.get(name, heading), overflow="fold")
+    for row in rows[:_LONGEST_TABLE]:
+        table.add_row(*(Text(_shown(name, row[name])) for name in names))
+    console().print(table if rows else f"{title}: nothing", markup=False)
+
+
+def _shown(name: str, value: object) -> str:
+    if value is None:
+        return "–"
+    if not isinstance(value, float):
+        return str(value)
+    if name.endswith("unix_s"):
+        return _time(value)
+    if name != "seconds":
+        return f"{value:.2f}"
+    minutes, seconds = divmod(round(value), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {seconds:02} s" if minutes else f"{seconds} s"
+
+
+def _time(unix_s: float) -> str:
+    return datetime.fromtimestamp(unix_s).isoformat(" ", "seconds")
+
+
+def _range(span: "Span") -> str:
+    return f"{_time(span.from_unix_s)} to {_time(span.to_unix_s)}"
+
 
 _STATUS_S: Final = 0.5
 
@@ -174,7 +569,7 @@ def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None
     """
     import msgspec
 
-    from skyless.cli.common.progress import progress_bar
+    from skyless.cli.common import progress_bar
     from skyless.run.history.program import import_recording
     from skyless.run.history.writer import Writer
     from skyless.run.recordings.recording import McapRecording

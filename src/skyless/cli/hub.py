@@ -8,8 +8,7 @@ from typing import Annotated
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import print_json, print_table
+from skyless.cli.common import JsonOptions, command, print_json, print_table
 from skyless.cli.nodes.options import log
 from skyless.core.arguments import Options, Text, number, wrong
 from skyless.core.errors import SkylessError

@@ -135,7 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (SkylessError, CycloptsError, ModuleNotFoundError, OSError) as error:
         if (line := _line_for_the_user(error)) is None:
             raise
-        from skyless.cli.common.output import plain  # loads more than --help needs
+        from skyless.cli.common import plain  # loads more than --help needs
 
         print(f"skyless: {plain(line, chr(10))}", file=sys.stderr)
         return _USER_ERROR

@@ -7,9 +7,7 @@ from pathlib import Path
 import msgspec
 from cyclopts import App
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import console, json_form, print_json, print_table
-from skyless.cli.common.progress import progress_bar
+from skyless.cli.common import JsonOptions, command, console, json_form, print_json, print_table, progress_bar
 from skyless.core.arguments import Seed
 
 app = App(name="paper", help_epilogue="Example: skyless paper --out report --seed 1")

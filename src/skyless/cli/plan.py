@@ -8,9 +8,19 @@ from cyclopts import App
 from msgspec.structs import replace
 
 from skyless.cli.api.options import PlanOptions
-from skyless.cli.common.options import JsonOptions, check_output, check_picture, command
-from skyless.cli.common.output import new_table, print_facts, print_json, print_warnings, write_file, write_picture
-from skyless.cli.common.progress import progress_bar
+from skyless.cli.common import (
+    JsonOptions,
+    check_output,
+    check_picture,
+    command,
+    new_table,
+    print_facts,
+    print_json,
+    print_warnings,
+    progress_bar,
+    write_file,
+    write_picture,
+)
 from skyless.core.errors import ConfigurationError, SkylessError
 
 if TYPE_CHECKING:
@@ -55,8 +65,7 @@ def plan(asked: PlanOptions, output: _Output) -> None:
     site = _load(file, output)
     if output.out is not None and asked.optimise is None:
         raise SkylessError("--out writes an optimised site; --optimise N asks for one")
-    from skyless.cli.api.plan import run_plan
-    from skyless.cli.api.rate_plan import RatePlanResult
+    from skyless.cli.api.plan import RatePlanResult, run_plan
     from skyless.site.planning.report import described
 
     with progress_bar("planning") as reach:

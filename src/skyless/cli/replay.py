@@ -9,18 +9,21 @@ from typing import TYPE_CHECKING, Any, Final
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import JsonOptions, check_output, check_picture, command
-from skyless.cli.common.output import (
+from skyless.cli.common import (
     NO_FIX,
     USER_ERROR,
+    JsonOptions,
+    check_output,
+    check_picture,
+    command,
     dropped,
     new_table,
     print_facts,
     print_json,
     print_warnings,
+    progress_bar,
     write_picture,
 )
-from skyless.cli.common.progress import progress_bar
 from skyless.core.arguments import existing_file
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import METHODS, SNAPSHOTS

@@ -10,9 +10,18 @@ from cyclopts import App
 from msgspec.structs import replace
 
 from skyless.cli.api.options import SimulateOptions
-from skyless.cli.common.options import JsonOptions, check_output, command
-from skyless.cli.common.output import NO_FIX, dropped, new_table, print_facts, print_json
-from skyless.cli.common.progress import progress_bar, status
+from skyless.cli.common import (
+    NO_FIX,
+    JsonOptions,
+    check_output,
+    command,
+    dropped,
+    new_table,
+    print_facts,
+    print_json,
+    progress_bar,
+    status,
+)
 from skyless.cli.nodes.options import name_unplaced
 
 if TYPE_CHECKING:

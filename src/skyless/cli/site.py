@@ -10,8 +10,17 @@ import numpy as np
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import JsonOptions, check_folder, command
-from skyless.cli.common.output import console, print_facts, print_json, print_table, print_warnings, write_file
+from skyless.cli.common import (
+    JsonOptions,
+    check_folder,
+    command,
+    console,
+    print_facts,
+    print_json,
+    print_table,
+    print_warnings,
+    write_file,
+)
 from skyless.cli.nodes.options import SiteId
 from skyless.core.air.almanac import OFFERED_HZ
 from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s

@@ -10,9 +10,7 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import console, print_facts, print_json, print_warnings
-from skyless.cli.common.progress import progress_bar
+from skyless.cli.common import JsonOptions, command, console, print_facts, print_json, print_warnings, progress_bar
 from skyless.cli.nodes.options import site_named
 from skyless.core.arguments import Options, number
 from skyless.core.errors import SkylessError, writing

@@ -12,15 +12,24 @@ from cyclopts import App
 from msgspec.structs import replace
 
 from skyless.cli.api.options import StudyOptions
-from skyless.cli.common.options import JsonOptions, check_picture, command
-from skyless.cli.common.output import console, print_json, print_table, say_written, to_json
-from skyless.cli.common.progress import progress_bar, status
+from skyless.cli.common import (
+    JsonOptions,
+    check_picture,
+    command,
+    console,
+    print_json,
+    print_table,
+    progress_bar,
+    say_written,
+    status,
+    to_json,
+)
 from skyless.core.arguments import Rule, folder_to_write
 from skyless.core.errors import SkylessError
 from skyless.core.whole_files import write_whole
 
 if TYPE_CHECKING:
-    from skyless.cli.api.study import StudyResult
+    from skyless.cli.api.simulate import StudyResult
     from skyless.research.studies.common.runner import Row
 
 _OF_ERRORS: Final = (
@@ -83,7 +92,7 @@ class _Output(JsonOptions, frozen=True, kw_only=True):
 def study(asked: StudyOptions, output: _Output) -> None:
     """Measure errors over many simulated runs: a table with standard errors, a picture, JSON."""
     check_picture(output.plot)
-    from skyless.cli.api.study import run_study
+    from skyless.cli.api.simulate import run_study
     from skyless.research.studies.run import WITHOUT_POSITIONS, way_on
     from skyless.sim.evaluation.fleet import compile_kernels
 

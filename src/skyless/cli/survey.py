@@ -8,19 +8,23 @@ from typing import TYPE_CHECKING, Final
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import JsonOptions, check_folder, check_output, check_picture, command
-from skyless.cli.common.output import (
+from skyless.cli.common import (
+    JsonOptions,
+    check_folder,
+    check_output,
+    check_picture,
     cm,
+    command,
     console,
     number,
     print_facts,
     print_json,
     print_table,
     print_warnings,
+    progress_bar,
     write_file,
     write_picture,
 )
-from skyless.cli.common.progress import progress_bar
 from skyless.cli.nodes.survey_live import LiveOptions, gather_live, serve_live
 from skyless.core.errors import SkylessError, writing
 from skyless.research.calibration.options import SurveyOptions

@@ -2,7 +2,7 @@
 
 A field states type, default and, in its docstring, its meaning. What is ``Annotated`` adds which values are right (a
 ``Rule``), how a text of the command line is read (``Text``), and the option's name where it differs from the field's.
-``skyless.cli.common.options`` makes command lines of these structs, ``python_function`` functions. Errors and
+``skyless.cli.common`` makes command lines of these structs, ``python_function`` functions. Errors and
 docstrings write ``--option``, which becomes the argument's name in Python.
 """
 

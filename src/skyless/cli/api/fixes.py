@@ -1,19 +1,70 @@
 """Fixes of several tags as arrays, one row a fix."""
 
 from array import array
-from typing import TYPE_CHECKING, Final
+from collections.abc import Iterator, Mapping
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 from msgspec import Struct
 
-from skyless.cli.api._result import axes_columns, data_frame
+from skyless.core.air.masterless_packets import Packet, PairTdoa
 from skyless.core.arguments import wrong
 from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
+from skyless.core.extras import extra_module
 from skyless.core.fix import Fix
+from skyless.core.site import Site
 from skyless.sim.evaluation.figures import axes_std_m
+from skyless.site.planning.links import Floor
+from skyless.site.planning.maps import PlanMap
+from skyless.site.planning.rates import RateMap
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+# What all results have: a short table in a notebook, one line elsewhere, a table for pandas.
+
+
+class Result(Struct, frozen=True, eq=False):
+    """A result; two are equal only if they are the same one, as their arrays have no single answer."""
+
+    def title(self) -> str:
+        """What the result is of."""
+        raise NotImplementedError
+
+    def facts(self) -> Iterator[tuple[str, str]]:
+        """The figures that matter, each with its name and unit."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        facts = "; ".join(f"{name} {value}" for name, value in self.facts())
+        return f"{type(self).__name__}({self.title()}: {facts})"
+
+    def _repr_html_(self) -> str:
+        """The figures as a table, for notebooks."""
+        rows = "".join(
+            f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:right'>{escape(value)}</td></tr>"
+            for name, value in self.facts()
+        )
+        return f"<table><caption>{escape(self.title())}</caption><tbody>{rows}</tbody></table>"
+
+
+def data_frame(columns: Mapping[str, Any]) -> "DataFrame":
+    """Columns as a table of pandas. Raises SkylessError where pandas is not installed."""
+    frame: DataFrame = extra_module("pandas", "to_dataframe").DataFrame(dict(columns))
+    return frame
+
+
+def axes_columns(prefix: str, values: Array, suffix: str = "") -> dict[str, Array]:
+    """An array of shape (n, 3) as columns x, y, z."""
+    return {f"{prefix}{axis}{suffix}": values[:, number] for number, axis in enumerate("xyz")}
+
+
+def figures(values: Any) -> Array:  # noqa: ANN401 - whatever has numbers and None
+    """Numbers as an array of floats, NaN for None."""
+    return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
+
 
 _UNKNOWN: Final = (np.nan, np.nan, np.nan)
 _COLUMNS: Final = 26
@@ -153,3 +204,131 @@ class FixRecorder:
             truth_m=rows[:, 22:25],
             judged=rows[:, 25] > 0.0,
         )
+
+
+# What an estimator was given of a recording as arrays, one row a reception or a time difference.
+
+_NONE: Final = -1
+_WHOLE: Final = 7
+
+
+class Measurements(Struct, frozen=True, eq=False):
+    """n measurements in the order in which the estimator got them: receptions of anchors, or time differences.
+
+    Where a measurement has no such value, there is -1, or NaN in ``tdoa_m``. What packets relay of other anchors is not
+    here; ``skyless.open_recording`` gives packets whole.
+    """
+
+    tags: tuple[str, ...]
+    """Names of the tags."""
+    tag: Integers
+    """Shape (n,): which of ``tags`` measured it."""
+    time_s: Vector
+    """Shape (n,): when, on the scale of the fixes' times."""
+    anchor_a: Integers
+    """Shape (n,): the anchor that a time difference is counted from."""
+    anchor_b: Integers
+    """Shape (n,): the anchor that it is counted to, or the sender of a packet."""
+    tdoa_m: Vector
+    """Shape (n,): range to b less range to a."""
+    sequence: Integers
+    """Shape (n,): number of the packet."""
+    tx_ticks: Integers
+    """Shape (n,): when it was sent, in the sender's clock."""
+    rx_ticks: Integers
+    """Shape (n,): when the tag received it, in the tag's own clock."""
+    used: Mask
+    """Shape (n,): whether the filter took it; of an own estimator, of methods that wait for whole superframes, and with
+    ``smooth``, whether it made a fix."""
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def to_dataframe(self) -> "DataFrame":
+        """One row a measurement: ``t_s``, ``tag`` (its name), and the other arrays by their names.
+
+        Raises:
+            SkylessError: pandas is not installed.
+        """
+        others = "anchor_a", "anchor_b", "tdoa_m", "sequence", "tx_ticks", "rx_ticks", "used"
+        return data_frame(
+            {
+                "t_s": self.time_s,
+                "tag": np.array(self.tags, dtype=object)[self.tag],
+                **{name: getattr(self, name) for name in others},
+            }
+        )
+
+
+class MeasurementRecorder:
+    """Gathers measurements as they come, 72 bytes each."""
+
+    def __init__(self, tags: tuple[str, ...]) -> None:
+        self._tags = tags
+        self._whole = array("q")
+        self._numbers = array("d")
+
+    def add(self, tag: str, time_s: float, measured: Packet | PairTdoa, used: bool) -> None:
+        """Add what the estimator of a tag was given."""
+        number = self._tags.index(tag)
+        if isinstance(measured, PairTdoa):
+            self._whole.extend((number, measured.anchor_a, measured.anchor_b, _NONE, _NONE, _NONE, used))
+            self._numbers.extend((time_s, measured.tdoa_m))
+        else:
+            stamps = measured.sequence, measured.tx_ticks, measured.rx_ticks
+            self._whole.extend((number, _NONE, measured.anchor, *stamps, used))
+            self._numbers.extend((time_s, np.nan))
+
+    def measurements(self) -> Measurements:
+        """All so far."""
+        whole = np.array(self._whole, dtype=np.int64).reshape(-1, _WHOLE)
+        numbers = np.array(self._numbers).reshape(-1, 2)
+        for rows in (whole, numbers):
+            rows.setflags(write=False)
+        tag, anchor_a, anchor_b, sequence, tx_ticks, rx_ticks, used = whole.T
+        return Measurements(
+            tags=self._tags,
+            tag=tag,
+            time_s=numbers[:, 0],
+            anchor_a=anchor_a,
+            anchor_b=anchor_b,
+            tdoa_m=numbers[:, 1],
+            sequence=sequence,
+            tx_ticks=tx_ticks,
+            rx_ticks=rx_ticks,
+            used=used > 0,
+        )
+
+
+# What both kinds of plan have: a site, its floor, and a map over it.
+
+FloorMap = TypeVar("FloorMap", PlanMap, RateMap)
+
+
+class FloorResult(Result, Generic[FloorMap], frozen=True, eq=False):
+    """A map over the floor of a site."""
+
+    site: Site
+    """As planned: with the anchors that were placed, if that was asked for."""
+    file: Path
+    floor: Floor
+    """Outline and region."""
+    map: FloorMap
+    """The whole table of values."""
+    summary: dict[str, Any]
+    """The object that ``skyless plan --json`` writes, in SI units, but for the version."""
+
+    @property
+    def x_m(self) -> Vector:
+        """Shape (nx,): centres of the map's cells."""
+        return self.map.grid.x_m
+
+    @property
+    def y_m(self) -> Vector:
+        """Shape (ny,)."""
+        return self.map.grid.y_m
+
+    @property
+    def heights_m(self) -> Vector:
+        """Shape (heights,): heights of the tags."""
+        return self.map.grid.heights_m

@@ -10,10 +10,8 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.cli.api._result import Result
-from skyless.cli.api.fixes import Fixes, FixRecorder
-from skyless.cli.api.measurements import MeasurementRecorder, Measurements
-from skyless.cli.common.output import cm
+from skyless.cli.api.fixes import Fixes, FixRecorder, MeasurementRecorder, Measurements, Result
+from skyless.cli.common import cm
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arguments import python_function, wrong
 from skyless.core.arrays import Matrix

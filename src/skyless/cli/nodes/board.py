@@ -6,8 +6,7 @@ from typing import Literal
 
 from cyclopts import App
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import print_json
+from skyless.cli.common import JsonOptions, command, print_json
 from skyless.cli.nodes.options import log, run_until_stopped
 from skyless.core.arguments import Options
 from skyless.core.errors import SkylessError

@@ -8,8 +8,7 @@ from cyclopts import App, Parameter
 from skyless.bridges.program import BridgeNode, BridgeState
 from skyless.bridges.target import BridgeContext, Hub, open_hub
 from skyless.bridges.targets import TARGET_KINDS, open_route
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import print_json
+from skyless.cli.common import JsonOptions, command, print_json
 from skyless.cli.nodes.options import SiteOptions, log, run_until_stopped
 from skyless.core.errors import SkylessError
 from skyless.run.find_site import find_site

@@ -10,8 +10,7 @@ from typing import Annotated
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import JsonOptions, command, make_folder
-from skyless.cli.common.output import print_json
+from skyless.cli.common import JsonOptions, command, make_folder, print_json
 from skyless.cli.nodes.options import GatherOptions, listen_address, log, run_until_stopped
 from skyless.core.arguments import Options, whole
 from skyless.core.errors import SkylessError

@@ -10,12 +10,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 from cyclopts import App
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import console, print_json
-from skyless.cli.nodes._demo_figures import sentence
-from skyless.cli.nodes._demo_site import DemoOptions, WholeSite
-from skyless.cli.nodes._site_view import Picture
+from skyless.cli.common import JsonOptions, command, console, print_json
+from skyless.cli.nodes.demo_site import DemoOptions, WholeSite, sentence
 from skyless.cli.nodes.options import log
+from skyless.cli.nodes.site_view import Picture
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress
 from skyless.run.process import run
 
@@ -123,7 +121,7 @@ class _Stage:
 
     def drawn(self, picture: Picture, height: int = sys.maxsize) -> "RenderableType":
         """The site as ``skyless watch`` shows it, and the errors of its fixes."""
-        from skyless.cli.nodes._site_screen import drawn
+        from skyless.cli.nodes.site_view import drawn
 
         return drawn(picture, height, {name: tag.error_m for name, tag in self.whole.figures.tags.items()})
 

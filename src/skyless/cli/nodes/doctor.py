@@ -11,12 +11,9 @@ from typing import Final, get_args
 
 from cyclopts import App
 
-from skyless.cli.common.options import JsonOptions, check_folder, command
-from skyless.cli.common.output import plain, print_json, write_file
-from skyless.cli.common.progress import progress_bar
-from skyless.cli.nodes._site_probe import SiteProbe, broker_failed
-from skyless.cli.nodes._site_view import LINK_NAME, SiteView, site_number
+from skyless.cli.common import JsonOptions, check_folder, command, plain, print_json, progress_bar, write_file
 from skyless.cli.nodes.options import SiteOptions, log
+from skyless.cli.nodes.site_view import LINK_NAME, SiteProbe, SiteView, broker_failed, site_number
 from skyless.core.arguments import Options, Positive
 from skyless.core.errors import SkylessError
 from skyless.core.site import NoiseSite, Site

@@ -10,9 +10,7 @@ import msgspec
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import print_json
-from skyless.cli.common.progress import status
+from skyless.cli.common import JsonOptions, command, print_json, status
 from skyless.cli.nodes.options import (
     MqttOptions,
     WalkingSpeed,

@@ -6,8 +6,7 @@ from typing import Annotated, Any, Final, Literal
 from cyclopts import App
 from msgspec.structs import asdict, fields
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import print_json
+from skyless.cli.common import JsonOptions, command, print_json
 from skyless.cli.nodes.options import SiteId, log
 from skyless.core.arguments import Option, Options, number, numbers, whole, wrong
 from skyless.core.errors import SkylessError

@@ -4,8 +4,7 @@ from typing import Annotated
 
 from cyclopts import App, Parameter
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import print_json
+from skyless.cli.common import JsonOptions, command, print_json
 from skyless.cli.nodes.options import GatherOptions, log, run_until_stopped
 from skyless.core.extras import extra_module
 from skyless.run.gather.streams import nats_address

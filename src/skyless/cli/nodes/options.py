@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 
 from cyclopts import Parameter
 
-from skyless.cli.common.output import plain
+from skyless.cli.common import plain
 from skyless.core.arguments import Options, number, read_numbers, whole
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module

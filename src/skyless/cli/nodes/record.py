@@ -9,9 +9,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from cyclopts import App
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import print_json
-from skyless.cli.common.progress import with_status
+from skyless.cli.common import JsonOptions, command, print_json, with_status
 from skyless.cli.nodes.options import SiteOptions, log
 from skyless.core.arguments import Positive
 from skyless.core.errors import SkylessError

@@ -6,11 +6,9 @@ from typing import Final
 from cyclopts import App
 from rich.live import Live
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import console, print_json
-from skyless.cli.nodes._site_screen import drawn
-from skyless.cli.nodes._site_view import LINK_NAME, Picture, SiteView, site_number
+from skyless.cli.common import JsonOptions, command, console, print_json
 from skyless.cli.nodes.options import SiteOptions, run_until_stopped
+from skyless.cli.nodes.site_view import LINK_NAME, Picture, SiteView, drawn, site_number
 from skyless.page.condition.evidence import ProcessorUse
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link

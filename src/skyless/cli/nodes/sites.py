@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from cyclopts import App
 
-from skyless.cli.common.options import JsonOptions, command
-from skyless.cli.common.output import print_json, print_table
+from skyless.cli.common import JsonOptions, command, print_json, print_table
 from skyless.cli.nodes.options import HubUrl, MqttOptions, hub_address, run_until_stopped
 from skyless.core.errors import SkylessError
 from skyless.run.find_site import SiteOnBroker, watch_sites

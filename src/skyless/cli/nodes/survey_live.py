@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from skyless.cli.common.progress import with_status
+from skyless.cli.common import with_status
 from skyless.cli.nodes.options import MqttCa, SiteId, log, run_until_stopped
 from skyless.core.arguments import Options, Positive
 from skyless.core.errors import SkylessError

@@ -42,9 +42,9 @@ from skyless.page.api.answers import (
     TagsAnswer,
     ZoneId,
     ZoneTags,
-    json_answer,
     names,
 )
+from skyless.page.connections import json_answer
 from skyless.page.live import LiveSite
 from skyless.page.tasks import TaskProcess, serve_tasks
 from skyless.run.assets import read_csv, write_csv

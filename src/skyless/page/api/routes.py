@@ -19,19 +19,17 @@ from skyless.page.api import questions
 from skyless.page.api.answers import (
     CSV,
     GEOJSON,
-    JSON,
     RENAMED,
     ROOT,
     MapQuery,
     SiteQuery,
     TagNames,
     document,
-    json_answer,
     names,
     read_query,
 )
 from skyless.page.api.questions import Past, usable
-from skyless.page.connections import POLICY_VIOLATION, TRY_LATER, send, serve_socket
+from skyless.page.connections import JSON, POLICY_VIOLATION, TRY_LATER, json_answer, send, serve_socket
 from skyless.page.live import LiveSite
 from skyless.page.sites import Sites
 from skyless.run.assets import MAX_BYTES

@@ -2,35 +2,64 @@
 
 import asyncio
 import contextlib
-from collections import deque
+import time
+from collections import Counter, deque
 from collections.abc import Mapping
 from importlib.util import find_spec
+from itertools import combinations
+from math import dist
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 from zlib import crc32
 
+import msgspec
 from cyclopts import Parameter
+from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.cli.common.options import make_folder
-from skyless.cli.nodes._demo_figures import DemoFigures
-from skyless.cli.nodes._demo_story import MOVED, furnished, messages_of, survey_record
-from skyless.cli.nodes._site_view import SiteView
+from skyless.cli.common import make_folder
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, site_named
+from skyless.cli.nodes.site_view import SiteView
 from skyless.core.any_receiver import beacon_period_s
 from skyless.core.arguments import Method, Picoseconds, Positive, Seed, TagCount, tag_count, whole
 from skyless.core.errors import SkylessError
 from skyless.core.extras import extra_module
+from skyless.core.integrity import Alert
 from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.site import AlarmRule, FloorPlanSite, GeoreferenceSite, Site
 from skyless.core.whole_files import replace_files
 from skyless.page.condition.evidence import Health, ProcessorUse
 from skyless.run.broker import Broker, BrokerSettings, start_broker
+from skyless.run.fix_log import Latencies
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import Introduction, RefusedError, kept_messages, open_connection, trouble_with
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import EtherHealth, StatusMessage, WrongMessageError, read_message
-from skyless.run.mqtt.topics import alarm_topic, site_topic, status_topic, survey_topic, watch_topic
+from skyless.run.mqtt.messages import (
+    AnchorHealth,
+    Asset,
+    AssetsMessage,
+    EtherHealth,
+    FixMessage,
+    StatusMessage,
+    TagHealth,
+    TruthBuffer,
+    TruthMessage,
+    WrongMessageError,
+    Zone,
+    ZonesMessage,
+    read_message,
+)
+from skyless.run.mqtt.topics import (
+    alarm_topic,
+    assets_topic,
+    site_topic,
+    status_topic,
+    survey_topic,
+    truth_topic,
+    watch_topic,
+    zones_topic,
+)
 from skyless.run.process import (
     Child,
     Log,
@@ -39,14 +68,212 @@ from skyless.run.process import (
     hold_any,
     new_recording,
     outlasting,
+    reader,
     recordings_folder,
     reserve_next,
     together,
 )
+from skyless.sim.evaluation.figures import ErrorStatistics
 from skyless.sim.evaluation.request import ProtectionOptions
 from skyless.sim.world import lab_site
-from skyless.site.file.template import site_template
-from skyless.site.survey.facts import encode_record, record_path
+from skyless.site.file.template import rectangle, site_template
+from skyless.site.survey.facts import (
+    PairRange,
+    PairRanges,
+    Survey,
+    SurveyedAnchor,
+    SurveyRecord,
+    encode_record,
+    record_path,
+)
+
+# Figures of a demo: errors of its fixes against the truth, rates, alerts and latencies.
+
+_WARMUP_S: Final = 1.0  # fixes of a tag count for the errors from this time after its first
+
+_ALERTS: Final = frozenset(alert.value for alert in Alert)
+_ALERT_WORDS: Final[dict[str, str]] = {
+    Alert.EXCLUDED: "left out a message that disagreed with the others",
+    Alert.NOT_EXCLUDED: "have messages that disagree, and none could be left out",
+    Alert.UNAVAILABLE: "had no bound on their error yet",
+    Alert.LIMIT: "have a bound on their error above the alert limit",
+}
+
+
+class TagFigures(Struct):
+    """What is known of one tag."""
+
+    first_unix_s: float
+    error_m: float | None = None
+    """Of its newest fix; None where the truth is not known."""
+    health: TagHealth | None = None
+    began: tuple[float, int] | None = None
+    """Time and number of fixes of the first health message that counts."""
+
+    @property
+    def updates_per_s(self) -> float | None:
+        """Fixes per second between the first and the last health message that count."""
+        if self.health is None or self.began is None or self.health.unix_s <= self.began[0]:
+            return None
+        return (self.health.fixes - self.began[1]) / (self.health.unix_s - self.began[0])
+
+
+class DemoFigures:
+    """Gathered from what a view of the site receives."""
+
+    def __init__(self, *, planar: bool) -> None:
+        self.tags: dict[str, TagFigures] = {}
+        self.errors = ErrorStatistics(planar=planar)
+        self.variance_sum_m2 = 0.0
+        self.judged = 0
+        self.alerts: Counter[str] = Counter()
+        """How often fixes reported each state of their integrity, for methods that report one."""
+        self.arrivals = Latencies()  # from the end of a fix's last frame to its arrival in this process
+        self.latencies = Latencies()  # from there to the computed fix, as the tags report them
+        self._late_transmissions: dict[int, int] = {}  # by anchor
+        self._truths = TruthBuffer()
+
+    def follow(self, view: SiteView) -> None:
+        """Take what this view receives from now on."""
+        view.on_fix.append(self._on_fix)
+        view.on_health.append(self._on_health)
+        view.link.subscribe(truth_topic(view.number), reader(TruthMessage, self._truths.add, lambda: None))
+
+    def _on_fix(self, fix: FixMessage) -> None:
+        self.arrivals.add(time.time() - fix.unix_s)
+        self.latencies.add(fix.latency_s)
+        tag = self.tags.setdefault(fix.tag, TagFigures(fix.unix_s))
+        if fix.alert in _ALERTS:
+            self.alerts[fix.alert] += 1
+        true_m = self._truths.at(fix.tag, fix.unix_s)
+        tag.error_m = None
+        if true_m is not None:
+            dx, dy, dz = (have - true for have, true in zip(fix.position_m, true_m, strict=True))
+            dz = 0.0 if fix.height_known else dz
+            tag.error_m = (dx * dx + dy * dy + dz * dz) ** 0.5
+            if fix.unix_s - tag.first_unix_s >= _WARMUP_S:
+                self.errors.add(dx, dy, dz)
+                self.judged += 1
+                self.variance_sum_m2 += fix.std_m**2
+
+    def _on_health(self, health: object) -> None:
+        if isinstance(health, AnchorHealth):
+            self._late_transmissions[health.anchor] = health.late
+        elif isinstance(health, TagHealth) and (tag := self.tags.get(health.tag)) is not None:
+            restarted = tag.health is not None and health.fixes < tag.health.fixes
+            tag.health = health
+            if tag.began is None or restarted:
+                tag.began = health.unix_s, health.fixes
+
+    def summary(self) -> dict[str, Any]:
+        """The figures, for a program."""
+        rates = [rate for tag in self.tags.values() if (rate := tag.updates_per_s) is not None]
+        healths = [tag.health for tag in self.tags.values() if tag.health is not None]
+        firsts = sorted(health.first_fix_s for health in healths if health.first_fix_s is not None)
+        dropped = sum((Counter(health.counters) for health in healths), Counter[str]())
+        errors = self.errors.summary() if self.judged else None
+        fix_p50_s, fix_p99_s, _ = self.latencies.drain()
+        here_p50_s, here_p99_s, _ = self.arrivals.drain()
+        return {
+            "tags": len(self.tags),
+            "boards": sum(health.on_board for health in healths),
+            "fixes": sum(health.fixes for health in healths),
+            "judged": self.judged,
+            "rmse_m": None if errors is None else errors.rmse_3d_m if errors.rmse_2d_m is None else errors.rmse_2d_m,
+            "p95_m": None if errors is None else errors.p95_m,
+            "max_m": None if errors is None else errors.max_m,
+            "sigma_m": (self.variance_sum_m2 / self.judged) ** 0.5 if self.judged else None,
+            "updates_per_s": sum(rates) / len(rates) if rates else None,
+            "messages": sum(health.receptions for health in healths),
+            "dropped": dropped.total(),
+            "first_fix_s": firsts[len(firsts) // 2] if firsts else None,
+            "alerts": dict(sorted(self.alerts.items())),
+            # from the end of a frame on the air to the fix, and to a subscriber of the broker
+            "fix_latency_p50_s": fix_p50_s,
+            "fix_latency_p99_s": fix_p99_s,
+            "subscriber_latency_p50_s": here_p50_s,
+            "subscriber_latency_p99_s": here_p99_s,
+            # what was too old to be used or given
+            "late_receptions": dropped["late-reception"],
+            "late_fixes": dropped["late-fix"],
+            "late_transmissions": sum(self._late_transmissions.values()),
+        }
+
+
+def sentence(summary: dict[str, Any]) -> str:
+    """A summary with its ``duration_s``, for a person."""
+    if not summary["tags"]:
+        return "no fix was made"
+    late = ""
+    if summary["late_receptions"] or summary["late_fixes"]:
+        late = (
+            f"; this computer is too slow: {summary['late_receptions']} receptions dropped and "
+            f"{summary['late_fixes']} fixes withheld as too old"
+        )
+    if summary["rmse_m"] is None or summary["updates_per_s"] is None:
+        return f"{summary['tags']} tags with a fix; too short for errors and updates per second{late}"
+    alerts = ", ".join(f"{n} {_ALERT_WORDS[alert]}" for alert, n in summary["alerts"].items() if alert != Alert.NONE)
+    boards = f" ({summary['boards']} of them on emulated boards)" if summary["boards"] else ""
+    return (
+        f"{summary['tags']} tags{boards}, {summary['messages']} messages in {summary['duration_s']:.1f} s: "
+        f"RMSE {100 * summary['rmse_m']:.1f} cm, largest error {100 * summary['max_m']:.1f} cm, "
+        f"{summary['updates_per_s']:.0f} updates per second and tag, "
+        f"99 % of fixes within {1e3 * (summary['fix_latency_p99_s'] or 0.0):.1f} ms of the frame"
+        + (f"; fixes with an alert: {alerts or 'none'}" if summary["alerts"] else "")
+        + late
+    )
+
+
+# What the demo's own site has besides walking tags: a plan, zones, names, a rule, a georeference, a moved anchor.
+
+_SITE_NAME: Final = "Workshop"
+_PLAN: Final = Path(__file__).with_name("demo_plan.png")
+_CELL: Final = Zone("cell", "Robot cell", ((3.7, 0.4), (5.7, 0.4), (5.7, 2.7), (3.7, 2.7)), "#c2410c")
+_GOODS_IN: Final = Zone("goods-in", "Goods in", ((0.3, 5.3), (2.7, 5.3), (2.7, 7.7), (0.3, 7.7)), "#0f766e")
+_PEOPLE: Final = "people"
+_ASSETS: Final = (
+    Asset("tag1", "Trolley", "vehicles", "▲", "#b45309"),
+    Asset("tag2", "Forklift", "vehicles", "◆", "#7c3aed"),
+    Asset("tag3", "Ada", _PEOPLE, "●", "#0284c7"),
+)
+_RULE: Final = AlarmRule(
+    "robot-cell", "inside", "Person in the robot cell", zone=_CELL.id, tags=(f"group:{_PEOPLE}",), severity="critical"
+)
+MOVED: Final = "3=0,0.6@60"
+"""The anchor that is hung elsewhere after a minute, for ``skyless ether --move``."""
+
+
+def furnished(lab: Site) -> Site:
+    """The lab as a workshop. Where it is on the Earth is made up."""
+    return replace(
+        lab,
+        name=_SITE_NAME,
+        outline_m=rectangle(6.0, 8.0),
+        floor_plan=FloorPlanSite(str(_PLAN), width_m=6.0),
+        georeference=GeoreferenceSite(52.5163, 13.3777, height_m=35.0, heading_deg=20.0),
+        alarms=(_RULE,),
+    )
+
+
+def survey_record(site: Site) -> SurveyRecord:
+    """The survey that has hung its anchors, without errors: with its ranges the watch need not learn what is usual."""
+    pairs = tuple(
+        PairRange(a.id, b.id, dist((a.x_m, a.y_m, a.z_m), (b.x_m, b.y_m, b.z_m)), std_m=0.005, exchanges=1000)
+        for a, b in combinations(site.anchors, 2)
+    )
+    anchors = tuple(SurveyedAnchor(one.id, True, one.x_m, one.y_m, one.z_m) for one in site.anchors)
+    ranges = PairRanges(pairs, tuple(one.id for one in site.anchors))
+    survey = Survey(anchors, (), 0.01, len(pairs) - 2 * len(anchors) + 3, None, (), (), (), "", None, ())
+    return SurveyRecord(site.name, site.id, 0.0, ranges, survey, {})
+
+
+def messages_of(site: Site) -> dict[str, bytes]:
+    """By topic what the page would make the broker keep: zones, and the tags' names."""
+    return {
+        zones_topic(site.id): msgspec.json.encode(ZonesMessage((_CELL, _GOODS_IN), site=site.name)),
+        assets_topic(site.id): msgspec.json.encode(AssetsMessage(_ASSETS, site=site.name)),
+    }
+
 
 _NAME: Final = "demo"
 _HOST: Final = "127.0.0.1"

@@ -1,0 +1,516 @@
+"""What a running site publishes, gathered for ``skyless watch`` and ``skyless doctor``: the newest of each thing."""
+
+import asyncio
+import contextlib
+import math
+import os
+import platform
+import statistics
+import sys
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from operator import setitem
+from typing import Final, Literal, TypeVar
+
+from msgspec import Struct
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from skyless.cli.common import number, plain
+from skyless.cli.nodes.options import log
+from skyless.core.any_receiver import beacon_period_s
+from skyless.core.errors import SkylessError
+from skyless.core.geometry import RADIO_REACH_M
+from skyless.core.site import Site, site_digest
+from skyless.page.condition.evidence import ALERTS, FRESH_S, Evidence, Health, Node
+from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
+from skyless.run.assets import assets_at, read_assets
+from skyless.run.doctor import Check, CounterPairs, Result, counters_check, judged, residuals_check, sentence
+from skyless.run.find_site import find_site
+from skyless.run.mqtt import topics
+from skyless.run.mqtt.address import MqttAddress
+from skyless.run.mqtt.link import Link
+from skyless.run.mqtt.messages import (
+    NOT_DROPS,
+    AlarmMessage,
+    AnchorHealth,
+    AssetsMessage,
+    EtherHealth,
+    FixMessage,
+    RequestMessage,
+    SiteMessage,
+    StampsMessage,
+    StatusMessage,
+    TagHealth,
+    WatchMessage,
+)
+from skyless.run.process import keep, reader, together
+
+GONE: Final = ("silent", "offline")
+"""States of anchors that are not there."""
+
+LINK_NAME: Final = f"{platform.node()}-{os.getpid()}"
+_WAIT_SHARE: Final = 3.0
+
+
+class TagRow(Struct, frozen=True):
+    """A tag as it is shown."""
+
+    tag: str
+    state: Literal["fix", "no fix", "offline"]
+    age_s: float | None = None
+    """Since the last frame of the newest fix; None before the first."""
+    fix: FixMessage | None = None
+    health: TagHealth | None = None
+    """None where it does not report."""
+    name: str = ""
+    """What people call it, as the page shows it; empty where no asset names it."""
+
+
+class AnchorRow(Struct, frozen=True):
+    """An anchor as it is shown."""
+
+    anchor: str
+    state: str
+    """Its role; ``used`` where it has no program of its own; ``silent`` or ``offline``."""
+    age_s: float | None = None
+    """Since its last report."""
+    health: AnchorHealth | None = None
+
+
+class Picture(Struct, frozen=True):
+    """A site at one moment."""
+
+    site: str
+    number: int
+    simulated: bool
+    unix_s: float
+    broker: str
+    trouble: str | None
+    """Why the broker is not connected; None while it is."""
+    condition: Condition
+    tags: tuple[TagRow, ...]
+    """Those with trouble first, then by name."""
+    anchors: tuple[AnchorRow, ...]
+    alarms: tuple[AlarmMessage, ...]
+    """Those that nobody has acknowledged first."""
+    drops: dict[str, int]
+    """What tags and anchors have dropped since they started, by reason, the most frequent first."""
+    wrong_messages: int
+    """Messages that could not be read."""
+
+
+async def site_number(address: MqttAddress, longest_s: float | None) -> int:
+    """The number of the site that is online. Raises SkylessError where there is none by then, or several are."""
+    try:
+        async with asyncio.timeout(longest_s):
+            return await find_site(address)
+    except TimeoutError:
+        raise SkylessError(f"no program of a site is online at {address}; --site-id shows one all the same") from None
+
+
+class SiteView:
+    """Subscribes to a site's topics. It publishes nothing but its own status."""
+
+    def __init__(
+        self,
+        link: Link,
+        number: int,
+        clock: Callable[[], float] = time.monotonic,
+        wall_clock: Callable[[], float] = time.time,
+        used_share: Callable[[float], float | None] = lambda _: None,
+    ) -> None:
+        """``used_share`` is as for the page's ``LiveSite``."""
+        self.link, self.number, self._clock, self._wall_clock = link, number, clock, wall_clock
+        self._used_share = used_share
+        self.evidence = Evidence(platform.node(), clock())
+        self._monitor = ConditionMonitor(self.evidence)
+        self.condition = self._monitor.evaluate(clock())
+        self.site: SiteMessage | None = None
+        self._fixes: dict[str, tuple[FixMessage, float]] = {}  # with the time at which its last frame ended
+        self._alarms: dict[str, AlarmMessage] = {}
+        self._watch: tuple[WatchMessage, float] | None = None  # with the time at which it was made
+        self._wrong = 0
+        self._assets = AssetsMessage(())
+        self.on_fix: list[Callable[[FixMessage], None]] = []
+        """Called with every fix."""
+        self.on_health: list[Callable[[Health], None]] = []
+        """Called with every health of a tag, an anchor or the air."""
+        for topic, kind, handle in (
+            (topics.site_topic(number), SiteMessage, self._on_site),
+            (topics.fix_topic(number, "+"), FixMessage, self._on_fix),
+            (topics.status_topic(number, "+", "+"), StatusMessage, lambda m: self.evidence.add_status(m, clock())),
+            (topics.health_topic(number, "tag", "+"), TagHealth, lambda m: self._on_health("tag", m.tag, m)),
+            (topics.health_topic(number, "anchor", "+"), AnchorHealth, self._on_anchor),
+            (topics.health_topic(number, "ether", "+"), EtherHealth, lambda m: self._on_health("ether", "air", m)),
+            (topics.watch_topic(number), WatchMessage, self._on_watch),
+        ):  # fmt: skip
+            link.subscribe(topic, reader(kind, handle, self._on_wrong))
+        assets = reader(read_assets, self._on_assets, self._on_wrong, AssetsMessage(()))
+        link.subscribe(topics.assets_topic(number), assets)
+        link.subscribe(topics.alarm_topic(number, "+", "+"), self._on_alarm, qos=1)
+        link.on_state.append(self._on_state)
+
+    def _on_state(self, connected: bool) -> None:
+        self._watch = None
+        self._alarms.clear()  # the broker sends again what it keeps
+        self.evidence.set_connected(connected=connected, now_s=self._clock())
+
+    def _on_wrong(self) -> None:
+        self._wrong += 1
+
+    def _on_site(self, message: SiteMessage) -> None:
+        self.site = message
+        self.evidence.set_site(message.site, self._clock())
+
+    def _on_fix(self, fix: FixMessage) -> None:
+        now_s = self._clock()
+        if self.evidence.roster.admits("tag", fix.tag):
+            self._fixes[fix.tag] = fix, now_s - self.evidence.add_fix(fix, now_s)
+            for listener in self.on_fix:
+                listener(fix)
+
+    def _on_anchor(self, health: AnchorHealth) -> None:
+        self._on_health("anchor", str(health.anchor), health)
+
+    def _on_health(self, kind: str, name: str, health: Health) -> None:
+        self.evidence.add_health(kind, name, health, self._clock(), self._wall_clock())
+        for listener in self.on_health:
+            listener(health)
+
+    def _on_watch(self, message: WatchMessage) -> None:
+        """Note when it was made: the first after a connection may be an old one that the broker kept."""
+        kept_s = max(0.0, self._wall_clock() - message.unix_s) if self._watch is None else 0.0
+        self._watch = message, self._clock() - kept_s
+
+    def _on_assets(self, message: AssetsMessage) -> None:
+        self._assets = message
+
+    def _on_alarm(self, topic: str, payload: bytes) -> None:
+        if payload:
+            reader(AlarmMessage, partial(setitem, self._alarms, topic), self._on_wrong)(topic, payload)
+        else:
+            self._alarms.pop(topic, None)
+
+    async def run(self, seconds: float | None, act: Callable[[], None]) -> None:
+        """Stay connected for some time; evaluate the condition twice a second, and call ``act`` each time."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(seconds):
+                await together(keep(self.link, log), self._evaluate_often(act))
+
+    async def _evaluate_often(self, act: Callable[[], None]) -> None:
+        due_s = time.monotonic()
+        while True:
+            began_s = time.monotonic()
+            self.evaluate(began_s - due_s)
+            act()
+            # Of very many tags it takes longer, and the messages are to be read as well.
+            wait_s = max(EVALUATION_S, _WAIT_SHARE * (time.monotonic() - began_s))
+            due_s = time.monotonic() + wait_s
+            await asyncio.sleep(wait_s)
+
+    def evaluate(self, lag_s: float = 0.0) -> None:
+        """Find the condition again, as the page does. ``lag_s`` is the delay of this call."""
+        now_s = self._clock()
+        watch, made_s = self._watch or (None, now_s)
+        used, unread_s, refused = self._used_share(now_s), self.link.unread_s, self.link.refused
+        self.condition = self._monitor.evaluate(now_s, lag_s, watch, now_s - made_s, used, unread_s, refused)
+
+    def picture(self) -> Picture:
+        """The site now."""
+        now_s, site = self._clock(), self.site
+        tags, anchors = self.evidence.of("tag"), dict.fromkeys(self.evidence.site_anchors(), Node())
+        anchors |= dict(self.evidence.of("anchor"))
+        drops: Counter[str] = Counter()
+        for node in (*(node for _, node in tags), *anchors.values()):
+            if node.reports(now_s) and isinstance(node.health, TagHealth | AnchorHealth):
+                drops.update(node.health.counters)
+        return Picture(
+            site="" if site is None else site.site.name,
+            number=self.number,
+            simulated=site is not None and site.simulated,
+            unix_s=self._wall_clock(),
+            broker=str(self.link.address),
+            trouble=self.link.trouble,
+            condition=self.condition,
+            tags=self._tag_rows(tags, now_s),
+            anchors=tuple(
+                sorted((_anchor_row(*one, now_s) for one in anchors.items()), key=lambda row: row.state not in GONE)
+            ),
+            alarms=tuple(sorted(self._alarms.values(), key=_alarm_rank)),
+            drops={reason: count for reason, count in drops.most_common() if count and reason not in NOT_DROPS},
+            wrong_messages=self._wrong,
+        )
+
+    def _tag_rows(self, tags: list[tuple[str, Node]], now_s: float) -> tuple[TagRow, ...]:
+        rows = []
+        assets = {} if self.site is None else assets_at(self._assets, self.site.site.name)
+        for tag, node in tags:
+            has_fix = self.evidence.connected and node.has_fix(now_s)
+            fix, ended_s = self._fixes.get(tag, (None, now_s))
+            health = node.health if node.reports(now_s) and isinstance(node.health, TagHealth) else None
+            state: Literal["fix", "no fix", "offline"] = "fix" if has_fix else "no fix"
+            state = "offline" if node.online is False else state
+            age_s = None if fix is None else now_s - ended_s
+            name = assets[tag].name if tag in assets else ""
+            rows.append(TagRow(tag, state, age_s, fix, health, name))
+        return tuple(sorted(rows, key=_tag_rank))
+
+
+def _anchor_row(name: str, node: Node, now_s: float) -> AnchorRow:
+    health = node.health if isinstance(node.health, AnchorHealth) else None
+    state = "silent"
+    if node.online is False:
+        state = "offline"
+    elif health is None and now_s - node.used_s < FRESH_S:
+        state = "used"
+    elif health is not None and node.reports(now_s):
+        state = health.role
+    return AnchorRow(name, state, None if health is None else now_s - node.health_s, health)
+
+
+def _tag_rank(row: TagRow) -> int:
+    alert = None if row.fix is None else row.fix.alert
+    return {"no fix": 0, "fix": 3 - ALERTS.get(alert, 0), "offline": 4}[row.state]
+
+
+def _alarm_rank(alarm: AlarmMessage) -> tuple[bool, int, float]:
+    severity = ("critical", "warning", "info").index(alarm.severity)
+    return alarm.acknowledged_unix_s is not None, severity, -alarm.unix_s
+
+
+# Checks of a running site for ``skyless doctor``: the page's condition of it, and what takes longer to measure.
+
+_LEASE_S: Final = 15.0
+_MAX_FIXES: Final = 20_000
+
+
+class SiteProbe:
+    """Asks the anchors for their stamps, and gathers what is judged at the end."""
+
+    def __init__(self, view: SiteView, clock: Callable[[], float] = time.monotonic) -> None:
+        self.view, self._clock = view, clock
+        self._picture = view.picture()
+        self._found: dict[str, Check] = {}  # by kind of the condition's reason
+        self._missed: dict[str, list[float]] = {}  # by anchor
+        self._fixes: deque[FixMessage] = deque(maxlen=_MAX_FIXES)
+        self._pairs = CounterPairs()
+        self._stamps: Counter[tuple[int, int]] = Counter()  # by receiver and sender
+        self._stamps_s: dict[int, tuple[float, float]] = {}  # by receiver: when its first and last message came
+        view.link.subscribe(topics.stamps_topic(view.number, "+"), reader(StampsMessage, self._on_stamps, lambda: None))
+
+    def _on_stamps(self, message: StampsMessage) -> None:
+        now_s, anchor = self._clock(), message.anchor
+        first_s, _ = self._stamps_s.get(anchor, (now_s, now_s))
+        self._stamps_s[anchor] = first_s, now_s
+        for stamp in message.stamps:
+            if first_s != now_s:  # those of the first message came before the time that is counted
+                self._stamps[anchor, stamp.anchor] += 1
+            self._pairs.add(f"{anchor}/{message.run}", stamp.anchor, stamp.tx_ticks, stamp.rx_ticks, now_s)
+
+    def sample(self) -> None:
+        """Gather what the view has now, and ask again for stamps."""
+        self._picture = picture = self.view.picture()
+        for reason in picture.condition.reasons:
+            result: Result = "failed" if reason.level == "bad" else "warning"
+            if reason.kind not in self._found or result == "failed":
+                self._found[reason.kind] = Check(f"site: {reason.kind}", result, sentence(reason.text), reason.advice)
+        for anchor in picture.anchors:
+            if anchor.health is not None and anchor.state not in GONE:
+                self._missed.setdefault(anchor.anchor, []).append(anchor.health.missed_share)
+        self._fixes.extend(tag.fix for tag in picture.tags if tag.fix is not None and tag.state == "fix")
+        request = RequestMessage(LINK_NAME, (), _LEASE_S, stamps=True)
+        self.view.link.publish(topics.request_topic(self.view.number), request)
+
+    def known(self, file_site: Site | None, *, named: bool) -> Iterable[Check]:
+        """What will not change before the end: where ``named``, the site, and what was found to be wrong."""
+        message = self.view.site
+        if named and message is not None:
+            yield self._site(message.whole_site, file_site)
+        yield from self._found.values()
+
+    def checks(self, file_site: Site | None) -> tuple[Check, ...]:
+        """What was found; ``file_site`` is that of a site file that the running one should be."""
+        trouble, message = self._picture.trouble, self.view.site
+        if trouble is not None:
+            return (broker_failed(trouble),)
+        if message is None:
+            advice = "Start the site's anchors, or give the right --site-id."
+            return (Check("site", "failed", f"The broker has no site of number {self.view.number}.", advice),)
+        site = message.whole_site
+        measured = [counters_check(self._pairs, site.noise, "anchors' clocks")] if self._missed else []
+        if self._missed:
+            measured += [self._slots(), self._losses(site)]
+        if self._fixes:
+            measured.append(residuals_check("residuals", f"{len(self._fixes)} fixes looked at", self._fixes))
+        return self._site(site, file_site), *self._found.values(), *measured
+
+    def _site(self, site: Site, file_site: Site | None) -> Check:
+        condition, simulated = self._picture.condition, " (simulated)" if self._picture.simulated else ""
+        finding = (
+            f"{site.name}{simulated}: {condition.tags_with_fix} of {condition.tags} tags have a fix, "
+            f"{len(site.all_anchors)} anchors"
+        )
+        if file_site is not None and site_digest(file_site) != site_digest(site):
+            advice = "Start the anchors again with this file, or check the one that was surveyed last."
+            return Check("site", "warning", f"{finding}; the anchors are not those of the site file.", advice)
+        return Check("site", "ok", f"{finding}.")
+
+    def _slots(self) -> Check:
+        """Transmissions that were missed."""
+        shares = {anchor: statistics.mean(shares) for anchor, shares in self._missed.items()}
+        worst, share = max(shares.items(), key=lambda one: one[1])
+        finding = f"Anchor {worst} misses the most transmissions: {share:.1%}."
+        advice = "Its computer is too slow or busy: end other programs there, or move anchors to another computer."
+        return judged("transmissions", share, 0.1, 0.5, finding, advice)
+
+    def _losses(self, site: Site) -> Check:
+        """What anchors receive of those within the range in the open, against what these send."""
+        places = {one.id: (one.x_m, one.y_m, one.z_m) for one in site.anchors if str(one.id) in self._missed}
+        shares = {}
+        for receiver, (first_s, last_s) in self._stamps_s.items():
+            if receiver not in places or last_s - first_s < 1.0:
+                continue
+            sent = (last_s - first_s) / beacon_period_s(site)
+            for sender, place in places.items():
+                if sender != receiver and math.dist(places[receiver], place) < RADIO_REACH_M:
+                    shares[receiver, sender] = self._stamps[receiver, sender] / sent
+        if not shares:
+            advice = "See the user's role at the broker."
+            return Check("reception", "not checked", "No anchor has sent its stamps.", advice)
+        (receiver, sender), worst = min(shares.items(), key=lambda one: one[1])
+        finding = (
+            f"Anchors receive {statistics.mean(shares.values()):.0%} of what those within {RADIO_REACH_M:.0f} m send; "
+            f"anchor {receiver} receives the least, {worst:.0%} of anchor {sender}."
+        )
+        advice = "See what stands between them, and how their antennas are turned; skyless plan predicts walls."
+        return judged("reception", -worst, -0.4, -0.05, finding, advice)
+
+
+def broker_failed(trouble: str) -> Check:
+    """The check of a broker that cannot be used."""
+    advice = "Start it (skyless broker), or give another with --mqtt; --mqtt none checks no site."
+    return Check("broker", "failed", sentence(trouble), advice)
+
+
+# The text view of a site: a picture of it in a given number of lines.
+
+_COLOURS: Final = {"good": "bold green", "waiting": "bold cyan", "warning": "bold yellow", "bad": "bold red"}
+_ALERTS: Final[dict[str | None, str]] = {
+    "detected-excluded": "excluded",
+    "detected-not-excluded": "FAULT",
+    "alert-limit-exceeded": "LIMIT",
+}
+_MAX_REASONS: Final = 3
+_MIN_ROWS: Final = 3
+_T = TypeVar("_T")
+
+
+def drawn(
+    picture: Picture, height: int = sys.maxsize, errors_m: Mapping[str, float | None] | None = None
+) -> RenderableType:
+    """The picture in ``height`` lines. What does not fit is counted in the last row of its table.
+
+    ``errors_m`` are those of the tags' fixes, where the truth is known.
+    """
+    condition, alarms, anchors = picture.condition, picture.alarms, picture.anchors
+    reasons = condition.reasons
+    head = [_title(picture), *(_text(one.text, _COLOURS[one.level]) for one in reasons[:_MAX_REASONS])]
+    if len(reasons) > _MAX_REASONS:
+        head.append(_text(f"and {len(reasons) - _MAX_REASONS} more", "dim"))
+    if reasons or condition.text:
+        head.append(_text(reasons[0].advice if reasons else condition.text))
+    foot = [_text("drops " + (", ".join(f"{why} {count}" for why, count in picture.drops.items()) or "none"))]
+    if picture.wrong_messages:
+        foot.append(_text(f"unreadable messages {picture.wrong_messages}", "yellow"))
+    rows = height - len(head) - len(foot) - 2 - bool(alarms)
+    most_alarms = min(len(alarms), max(rows // 4, rows - len(picture.tags) - len(anchors), _MIN_ROWS))
+    rows -= most_alarms
+    most_anchors = min(len(anchors), max(rows // 3, rows - len(picture.tags), _MIN_ROWS))
+    columns = ("x/m", "y/m", "z/m") if errors_m is None else ("x/m", "y/m", "z/m", "error/cm")
+    return Group(
+        *head,
+        *([_table("alarms", (), alarms, most_alarms, _alarm)] if alarms else ()),
+        _table("tags", (*columns, "σ/cm", "HPL/cm", "Hz", "from", "age", ""), picture.tags, rows - most_anchors,
+               partial(_tag, errors_m=errors_m)),
+        _table("anchors", ("role", "hears", "report", "missed"), anchors, most_anchors, _anchor),
+        *foot,
+    )  # fmt: skip
+
+
+def _title(picture: Picture) -> Text:
+    level, trouble = picture.condition.level, picture.trouble
+    line = _text(f"{picture.site or 'no site yet'} (site {picture.number})", "bold")
+    line.append(" simulated" if picture.simulated else "", "dim")
+    line.append(f"  {level}  ", _COLOURS[level])
+    line.append(time.strftime("%H:%M:%S  ", time.localtime(picture.unix_s)))
+    line.append(plain(f"{picture.broker} {trouble or 'connected'}"), "red" if trouble else "dim")
+    return line
+
+
+def _text(words: str, style: str = "") -> Text:
+    return Text(plain(words), style, no_wrap=True, overflow="ellipsis")
+
+
+def _table(
+    name: str, columns: tuple[str, ...], items: Sequence[_T], most: int, cells: Callable[[_T], list[Text]]
+) -> Table:
+    """At most ``most`` rows. Columns of figures keep their width; the first column and an unnamed last one give way."""
+    table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
+    table.add_column(Text(f"{name} ({len(items)})", "bold"))
+    for title in columns:
+        table.add_column(title, justify="right" if title else "left", no_wrap=bool(title))
+    shown = len(items) if len(items) <= most else max(most - 1, 0)
+    for item in items[:shown]:
+        table.add_row(*cells(item))
+    if shown < len(items):
+        table.add_row(Text(f"and {len(items) - shown} more", "dim"))
+    return table
+
+
+def _alarm(alarm: AlarmMessage) -> list[Text]:
+    seen = alarm.acknowledged_unix_s is not None
+    since = time.strftime("%H:%M:%S", time.localtime(alarm.since_unix_s))
+    ended = " (ended)" if alarm.ended_unix_s is not None else ""
+    by = f" (seen by {alarm.acknowledged_by})" if seen else ""
+    return [_text(f"{since} {alarm.severity} {alarm.sentence}{ended}{by}", "dim" if seen else "bold red")]
+
+
+def _tag(row: TagRow, errors_m: Mapping[str, float | None] | None) -> list[Text]:
+    """The cells of a tag. What is not of now is dim, and its age is in words, in red."""
+    fix, health, fresh = row.fix, row.health, row.state == "fix"
+    style = "" if fresh else "dim"
+    errors = () if errors_m is None else (errors_m.get(row.tag),)
+    figures = ["–"] * (7 + len(errors))
+    if fix is not None:
+        lengths = (number(value, "{:.1f}", 100.0) for value in (*errors, fix.std_m, fix.hpl_m))
+        rate = number(None if health is None else health.updates_per_s, "{:.0f}")
+        figures = [*(f"{value:.2f}" for value in fix.position_m), *lengths, rate, str(len(fix.anchors))]
+    age = _text(f"{max(row.age_s or 0.0, 0.0):.1f} s")
+    if row.state == "offline":
+        age = _text("offline", "dim")
+    elif not fresh:
+        age = _text("no fix" if row.age_s is None else f"no fix for {row.age_s:.0f} s", "bold red")
+    alert = fix.alert if fix is not None and fresh else None
+    why = _text(_ALERTS.get(alert, ""), "bold red" if ALERTS.get(alert, 0) > 1 else "yellow")
+    if not fresh:
+        why = _text((health.reason if health is not None else None) or "", "dim")
+    name = f"{row.name or row.tag}{' board' if health is not None and health.on_board else ''}"
+    return [_text(name, style), *(_text(one, style) for one in figures), age, why]
+
+
+def _anchor(row: AnchorRow) -> list[Text]:
+    health, gone = row.health, row.state in GONE
+    style = "dim" if gone else ""
+    old = row.age_s is not None and row.age_s > FRESH_S
+    hears, missed = "–", "–"
+    if health is not None:
+        hears = str(sum(heard_s < FRESH_S for heard_s in health.heard_age_s.values()))
+        missed = f"{health.missed_share:.0%}"
+    return [
+        _text(row.anchor, style), _text(row.state, "bold red" if gone else ""), _text(hears, style),
+        _text(number(row.age_s, "{:.0f} s ago"), "bold red" if old else style), _text(missed, style),
+    ]  # fmt: skip
