@@ -32,8 +32,8 @@ from skyless.core.estimator.state import State
 from skyless.core.native.records import PACKED
 from skyless.core.tag.receiver import Receiver
 from skyless.research.studies import integrity, lab, room
-from skyless.research.studies.common.runner import plan_of
-from skyless.research.studies.common.worlds import Heard, beacons_of, worlds
+from skyless.research.studies.runner import plan_of
+from skyless.research.studies.worlds import Heard, beacons_of, worlds
 from skyless.sim.evaluation.scenarios import Request, Room, trajectories_of, wanderers
 from skyless.sim.world import ideal_lab_site, lab_site
 

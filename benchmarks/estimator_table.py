@@ -26,13 +26,13 @@ from skyless.core.errors import SkylessError
 from skyless.core.estimator import settings as parameters
 from skyless.core.site import EXACT, AccuracySite, Site
 from skyless.research.benchmark import Found, recordings_below
-from skyless.research.foreign import _muloc as muloc
+from skyless.research.foreign import datasets as muloc
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions
 from skyless.research.studies import lab, room
-from skyless.research.studies.common.picture import Case
-from skyless.research.studies.common.runner import Plan, plan_of
-from skyless.research.studies.common.worlds import Run, beacons_of, judged, worlds
+from skyless.research.studies.picture import Case
+from skyless.research.studies.runner import Plan, plan_of
+from skyless.research.studies.worlds import Run, beacons_of, judged, worlds
 from skyless.sim.evaluation.scenarios import Room, wanderers
 from skyless.sim.impairments import AnchorBias, Body
 from skyless.sim.trajectory import Trajectory, Waypoints

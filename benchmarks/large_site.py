@@ -20,7 +20,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from skyless.core.site import EXACT
-from skyless.research.studies.common.runner import Cell, run_cells, run_cells_on_dask
+from skyless.research.studies.runner import Cell, run_cells, run_cells_on_dask
 from skyless.sim.evaluation.fleet import CellFleet, FleetSettings
 from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Roaming

@@ -17,7 +17,7 @@ import numpy as np
 
 from skyless.core.arrays import Array
 from skyless.core.ticks import CARRIER_CYCLES
-from skyless.research.foreign import _muloc as muloc
+from skyless.research.foreign import datasets as muloc
 from skyless.research.masterless.packet_tracking import MASTERLESS, PacketTracking
 
 MARGINS_S: Final = (0.3, 0.4)
@@ -29,9 +29,9 @@ WALKED_STOPS: Final = 2
 def tracked(path: Path, channel: int, *, has_phases: bool) -> Array:
     """Time, position and covariance in two dimensions, and level, shape (fixes, 8)."""
     settings = MASTERLESS.changed(carrier_cycles=CARRIER_CYCLES[channel] if has_phases else 0, height_m=0.0)
-    tracking, rows = PacketTracking(settings, muloc.read_anchors(path), 40), []
+    tracking, rows = PacketTracking(settings, muloc.muloc_anchors(path), 40), []
     with path.open("rb") as stream:
-        for packet in muloc.read(stream, Counter(), channel):
+        for packet in muloc.read_muloc(stream, Counter(), channel):
             fix = tracking.on_packet(packet)
             if fix is not None:
                 level_m = np.nan if fix.hpl_m is None else fix.hpl_m
@@ -41,7 +41,7 @@ def tracked(path: Path, channel: int, *, has_phases: bool) -> Array:
 
 def stops_of(path: Path) -> list[tuple[float, float, Array]]:
     """Begin, end and place of each stop."""
-    truth = muloc.read_truth(path, None)
+    truth = muloc.muloc_truth(path, None)
     assert truth is not None
     begins = np.sort(np.unique(truth.position_m[:, :2], axis=0, return_index=True)[1]).tolist()
     return [

@@ -34,7 +34,7 @@ from skyless.core.processors import cores
 from skyless.core.protocol1.beacon import decode, decode_cached, encode
 from skyless.core.tag.position import locate_pseudoranges
 from skyless.core.tag.receiver import Receiver
-from skyless.research.paper.monte_carlo import draw_moments
+from skyless.research.paper.plan import draw_moments
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions
 from skyless.sim.evaluation.fleet import world_of

@@ -9,9 +9,9 @@ import pytest
 ROOT = Path(__file__).parents[1]
 DOCUMENT = (ROOT / "docs" / "limits.md").read_text(encoding="utf-8")
 STRUCTS = {
-    "PageLimits": "skyless.run.limits",
-    "HistoryLimits": "skyless.run.limits",
-    "BridgeLimits": "skyless.run.limits",
+    "PageLimits": "skyless.run.web",
+    "HistoryLimits": "skyless.run.web",
+    "BridgeLimits": "skyless.run.web",
     "BrokerLimits": "skyless.run.broker",
 }
 

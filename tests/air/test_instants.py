@@ -16,7 +16,7 @@ from skyless.core.air.almanac import (
     ticks_ahead,
 )
 from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, WRAP_TICKS, from_seconds, to_seconds
-from skyless.sim.cells import _timetable as timetable
+from skyless.sim.cells import receptions as timetable
 from skyless.site.kernels import kernel
 
 ANCHORS = st.integers(0, 0xFFFF)

@@ -19,9 +19,9 @@ from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.site import AccuracySite
 from skyless.research.calibration.options import Stay
 from skyless.research.studies import lab
-from skyless.research.studies.common.picture import Look
-from skyless.research.studies.common.runner import MEASURED
+from skyless.research.studies.picture import Look
 from skyless.research.studies.run import STUDIES, _of_worlds
+from skyless.research.studies.runner import MEASURED
 from skyless.sim.impairments import AnchorBias
 from skyless.sim.world import paper_lab_site
 from skyless.site.file.load import load_site

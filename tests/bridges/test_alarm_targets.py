@@ -20,8 +20,8 @@ from skyless.bridges import _deliveries
 from skyless.bridges.target import BridgeContext, Hub
 from skyless.bridges.targets import open_route
 from skyless.core.errors import SkylessError
-from skyless.run.limits import BridgeLimits
 from skyless.run.mqtt.messages import AlarmMessage
+from skyless.run.web import BridgeLimits
 from support.waiting import until
 
 ALARM = AlarmMessage(

@@ -28,8 +28,8 @@ from skyless.bridges.target import BridgedSite
 from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
 from skyless.core.site import WallSite
-from skyless.run.limits import BridgeLimits
 from skyless.run.mqtt.messages import Zone
+from skyless.run.web import BridgeLimits
 from support.waiting import until
 
 SITE = BridgedSite(

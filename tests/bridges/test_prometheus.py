@@ -29,8 +29,8 @@ from skyless.bridges.prometheus import (
 )
 from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.core.errors import SkylessError
-from skyless.run.limits import BridgeLimits
 from skyless.run.mqtt.messages import AnchorHealth, Counters, StatusMessage, TagHealth
+from skyless.run.web import BridgeLimits
 
 pytestmark = pytest.mark.site
 

@@ -12,7 +12,7 @@ from skyless.bridges.jsonl import JsonLines
 from skyless.bridges.targets import PtySender, SerialSender, TcpServer, UdpSender
 from skyless.core.errors import SkylessError
 from skyless.radio.serial.serial_port import Pty
-from skyless.run.limits import BRIDGES as LIMITS
+from skyless.run.web import BRIDGES as LIMITS
 
 
 @contextlib.asynccontextmanager

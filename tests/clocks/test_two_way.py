@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.research.foreign.avalue import anchor_distances_m
+from skyless.research.foreign.datasets import anchor_distances_m
 from skyless.site.survey.legs import Leg, TwoWayRanging, bracketed_flight_ticks
 
 SECOND = 63_897_600_000

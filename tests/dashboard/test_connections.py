@@ -13,7 +13,7 @@ from starlette.routing import Route
 
 from skyless.page import connections
 from skyless.page.connections import Connection, FailedAccepts, end_unfinished
-from skyless.run.limits import PageLimits
+from skyless.run.web import PageLimits
 from support.processes import free_port
 
 pytestmark = pytest.mark.site

@@ -18,9 +18,9 @@ from skyless.page.live import (
     IDLE_S,
     TooManyPagesError,
 )
-from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import site_message
+from skyless.run.web import PAGE as LIMITS
 from skyless.sim.world import lab_site
 
 pytestmark = pytest.mark.site

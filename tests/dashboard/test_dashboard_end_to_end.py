@@ -21,10 +21,10 @@ from skyless.page.live import IDLE_S
 from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites
 from skyless.run.broker import BrokerSettings, start_broker
-from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import ZonesMessage
+from skyless.run.web import PAGE as LIMITS
 from support.processes import SKYLESS, free_port, running_program
 
 pytestmark = pytest.mark.site

@@ -12,9 +12,9 @@ from skyless.page import sites as sites_module
 from skyless.page.live import LiveSite
 from skyless.page.sites import LiveSites
 from skyless.run.find_site import SiteOnBroker
-from skyless.run.limits import PAGE as LIMITS
-from skyless.run.limits import PageLimits
 from skyless.run.mqtt import topics
+from skyless.run.web import PAGE as LIMITS
+from skyless.run.web import PageLimits
 
 
 class Stage:

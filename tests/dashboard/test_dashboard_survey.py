@@ -16,11 +16,11 @@ from skyless.core.site import FloorPlanSite, UnplacedAnchor
 from skyless.page.overlay_process import overlay
 from skyless.page.state import SiteSurvey
 from skyless.page.tasks import OverlayTask
-from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress, Role
 from skyless.run.mqtt.messages import SurveyFactsMessage, SurveyMessage, WatchFinding, WatchMessage
-from skyless.run.mqtt.survey_facts import BadFactsError
+from skyless.run.survey.live_survey import BadFactsError
+from skyless.run.web import PAGE as LIMITS
 from skyless.site.survey.facts import Facts, Gauge, Survey, SurveyedAnchor, Tape, TapeAdvice
 
 pytestmark = pytest.mark.site

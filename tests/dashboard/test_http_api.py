@@ -25,9 +25,9 @@ from skyless.run.assets import write_csv
 from skyless.run.fix_batch import RECORD
 from skyless.run.history.layout import site_folder
 from skyless.run.history.writer import Writer
-from skyless.run.limits import PageLimits
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import ZoneEvent
+from skyless.run.web import PageLimits
 
 API = f"{HERE}/api/v1"
 SPAN = {"from": "100", "to": "200"}

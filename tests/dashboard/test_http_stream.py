@@ -14,9 +14,9 @@ from skyless.page.api import routes
 from skyless.page.api.routes import SiteStream
 from skyless.page.connections import AccessRules
 from skyless.page.events import MAX_KEPT
-from skyless.run.limits import PageLimits
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import ZoneEvent
+from skyless.run.web import PageLimits
 
 STREAM = "ws://localhost:8080/api/v1/stream"
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import asdict, replace
 
-from skyless.cli.nodes.flash_config import BoardOptions
+from skyless.cli.nodes.boards import FlashOptions
 from skyless.core.arguments import OptionError
 from skyless.core.fix import NoFixReason
 from skyless.radio.dw1000.radio import IDLE, LISTENING
@@ -47,7 +47,7 @@ def right(settings):
 
 
 asked = st.builds(
-    BoardOptions,
+    FlashOptions,
     mode=st.none() | st.sampled_from(MODES),
     output=st.none() | st.sampled_from(OUTPUTS),
     rate_hz=st.none() | st.sampled_from([0, 1, 5, 10, 25, 50]),
@@ -119,7 +119,7 @@ def test_damaged_bytes_are_no_settings(data, bit):
 )
 def test_what_cannot_be_set_is_refused_in_words(wrong):
     with pytest.raises(OptionError, match="it should be"):
-        BoardOptions(**wrong)
+        FlashOptions(**wrong)
 
 
 # What a board does with them

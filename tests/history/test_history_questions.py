@@ -30,7 +30,7 @@ from skyless.run.history.layout import (
     site_folder,
 )
 from skyless.run.history.queries import History, counts, sites_in
-from skyless.run.limits import HistoryLimits
+from skyless.run.web import HistoryLimits
 
 SITE, TAGS, FIXES = 7, 20, 5000
 MIDNIGHT = datetime(2026, 11, 20, tzinfo=UTC).timestamp()

@@ -25,7 +25,7 @@ from skyless.run.history.layout import (
     site_folder,
 )
 from skyless.run.history.writer import Journal, Writer
-from skyless.run.limits import HistoryLimits
+from skyless.run.web import HistoryLimits
 
 
 class Killed(BaseException):

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 
 from skyless.core.ticks import TICK_M, TICK_S
-from skyless.research.paper.monte_carlo import (
-    CHUNK_DRAWS,
-    Quantity,
-    draw_lambdas,
-    draw_moments,
-    noise_batches,
-)
+from skyless.research.paper.plan import CHUNK_DRAWS, Quantity, draw_lambdas, draw_moments, noise_batches
 from skyless.research.uncertainty import CORRECTED, Chain, Reference, chain_covariance
 from support.random_chain import draw_loop, random_chain
 

@@ -6,7 +6,7 @@ from msgspec.structs import replace
 
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.estimator.estimator import packed_state, unpacked_state
-from skyless.research.studies.common.worlds import Heard, Run, beacons_of
+from skyless.research.studies.worlds import Heard, Run, beacons_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
 from skyless.sim.impairments import CarrierModel, RangeErrorModel
 from skyless.sim.world import lab_site

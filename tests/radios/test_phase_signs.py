@@ -21,7 +21,7 @@ from skyless.core.air.masterless_packets import Packet
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import decode
 from skyless.core.ticks import CARRIER_CYCLES, TICK_M, TICK_RATE_HZ
-from skyless.research.foreign import _muloc as muloc
+from skyless.research.foreign import datasets as muloc
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import PERIOD_TICKS
 from skyless.sim.listening import TagSpec
@@ -170,7 +170,7 @@ def test_phases_of_recorded_chips_close(recordings, channel):
     if not path.is_file():
         pytest.skip(f"no recording at {path}")
     with path.open("rb") as stream:
-        check_signs(relayed(muloc.read(stream, Counter(), channel)), CARRIER_CYCLES[channel])
+        check_signs(relayed(muloc.read_muloc(stream, Counter(), channel)), CARRIER_CYCLES[channel])
 
 
 def relayed(packets: Iterable[Packet]) -> Iterator[Heard]:

@@ -7,7 +7,7 @@ import skyless
 from recordings.test_formats import muloc_file
 from skyless.core.air.masterless_packets import Relay
 from skyless.core.errors import ConfigurationError
-from skyless.research.foreign import _muloc as muloc
+from skyless.research.foreign import datasets as muloc
 from skyless.research.foreign.formats import open_recording
 
 
@@ -20,8 +20,8 @@ def test_stamps_anchors_and_stops(tmp_path):
     assert packet.tx_ticks == (5_000 + 600 * 65_536) // 512 * 512 + 32_880
     assert packet.relays == (Relay(0, 0, 5_000, None),)
     assert recording.drops == {"tx-stamp-unknown": 3}
-    assert muloc.read_anchors(path)[2] == (3.0, 4.0, 0.0)
-    truth = muloc.read_truth(path, None)
+    assert muloc.muloc_anchors(path)[2] == (3.0, 4.0, 0.0)
+    truth = muloc.muloc_truth(path, None)
     assert truth.t_s.tolist() == [0.0, 0.25, 0.5, 0.75, 1.0, 3.0, 3.25, 3.5, 3.75, 4.0]
     assert truth.position_m[[0, -1]].tolist() == [[1.0, 1.0, 0.0], [2.0, 1.0, 0.0]]
 

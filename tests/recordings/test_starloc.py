@@ -5,7 +5,7 @@ from math import dist
 import pytest
 
 import skyless
-from skyless.research.foreign import _starloc as starloc
+from skyless.research.foreign import datasets as starloc
 from skyless.research.foreign.formats import open_recording
 
 TICK_NS = 1e3 / (499.2 * 128)
@@ -50,11 +50,11 @@ def test_differences_anchors_and_truth(file):
     assert (recording.format.name, pair.time_s, pair.anchor_a, pair.anchor_b) == ("starloc", 1.01, 4, 5)
     assert pair.tdoa_m == pytest.approx(dist(TAG_M, MARKERS[15]) - dist(TAG_M, MARKERS[12]), abs=0.01)
     assert recording.drops == {"other-listener": 1, "range-without-another": 2, "malformed-number": 1}
-    assert starloc.read_anchors(file) == {4: MARKERS[12], 5: MARKERS[15]}
-    truth = starloc.read_truth(file, "2")
+    assert starloc.starloc_anchors(file) == {4: MARKERS[12], 5: MARKERS[15]}
+    truth = starloc.starloc_truth(file, "2")
     assert (truth.t_s.tolist(), truth.position_m.tolist()) == ([1.005], [list(TAG_M)])
     other = file.parent.rename(file.parent.with_name("walk_s5"))
-    assert starloc.read_anchors(other / "uwb.csv") == {}
+    assert starloc.starloc_anchors(other / "uwb.csv") == {}
 
 
 @pytest.mark.statistical

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.errors import ConfigurationError
-from skyless.research.foreign._tdoa_tables import read_tdoas
+from skyless.research.foreign.datasets import read_tdoas
 from skyless.research.foreign.formats import format_of
 from skyless.site.tables import read_anchors, read_truth
 

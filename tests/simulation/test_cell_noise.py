@@ -11,8 +11,19 @@ from hypothesis import strategies as st
 from scipy.stats import kstest
 
 from skyless.core.ticks import TICK_RATE_HZ, TICK_S
-from skyless.sim.cells._clocks import CHECKPOINT_KNOTS, KNOT_TICKS, CellClocks, own_time, true_time
-from skyless.sim.cells._keyed import key_of, mixed, normal, normal_pair, purpose_key, uniform
+from skyless.sim.cells.reception import (
+    CHECKPOINT_KNOTS,
+    KNOT_TICKS,
+    CellClocks,
+    key_of,
+    mixed,
+    normal,
+    normal_pair,
+    own_time,
+    purpose_key,
+    true_time,
+    uniform,
+)
 from skyless.sim.oscillator import OscillatorModel, Temperature
 
 pytestmark = pytest.mark.site

@@ -7,7 +7,7 @@ import pytest
 from metronome import IDEAL, Metronome, site_of
 
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S, difference
-from skyless.sim.cells._reception import (
+from skyless.sim.cells.reception import (
     COLLISION,
     HALF_DUPLEX,
     PREAMBLE_TICKS,

@@ -8,11 +8,15 @@ from scipy.stats import kstest
 
 from skyless.core.air.almanac import period_code
 from skyless.core.ticks import DEFAULT_ANTENNA_DELAY_TICKS, TICK_M, TICK_S
-from skyless.sim.cells._clocks import KNOT_TICKS
-from skyless.sim.cells._grid import anchors_within, list_neighbours, make_grid
-from skyless.sim.cells._paths import TagPath
-from skyless.sim.cells._reception import delivery_chance, rules_of
-from skyless.sim.cells._receptions import KNOTS_A_LENGTH, PairErrors, changing_error
+from skyless.sim.cells.reception import (
+    KNOT_TICKS,
+    anchors_within,
+    delivery_chance,
+    list_neighbours,
+    make_grid,
+    rules_of,
+)
+from skyless.sim.cells.receptions import KNOTS_A_LENGTH, PairErrors, TagPath, changing_error
 from skyless.sim.cells.world import CellAnchors, CellWorld
 from skyless.sim.impairments import AnchorOutage, Impairments, Outage, RangeErrorModel
 from skyless.sim.oscillator import OscillatorModel

@@ -6,8 +6,6 @@ from scipy.stats import chi2
 
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import TICK_M
-from skyless.research.studies.common.picture import CLUSTER_FIXES, clustered_interval
-from skyless.research.studies.common.runner import plan_of
 from skyless.research.studies.efficiency import Case, draw_episode
 from skyless.research.studies.integrity import (
     ALL_FAULTS,
@@ -21,7 +19,9 @@ from skyless.research.studies.integrity import (
     faulty,
     rows,
 )
+from skyless.research.studies.picture import CLUSTER_FIXES, clustered_interval
 from skyless.research.studies.run import STUDIES
+from skyless.research.studies.runner import plan_of
 from skyless.sim.world import paper_lab_site
 from skyless.site.report import picture
 

@@ -5,7 +5,7 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.research.studies import large
-from skyless.research.studies.common.runner import Plan
+from skyless.research.studies.runner import Plan
 
 pytestmark = pytest.mark.statistical
 

@@ -10,11 +10,11 @@ from skyless.cli.api.simulate import StudyResult
 from skyless.cli.study import print_rows
 from skyless.core.integrity import Alert, Integrity
 from skyless.research.studies import room
-from skyless.research.studies.common.picture import clustered_interval
-from skyless.research.studies.common.runner import Limit, plan_of, with_limits
-from skyless.research.studies.common.worlds import RunResult, box, run_world
+from skyless.research.studies.picture import clustered_interval
 from skyless.research.studies.room import biases_of, bound_cells
 from skyless.research.studies.run import STUDIES, Parts
+from skyless.research.studies.runner import Limit, plan_of, with_limits
+from skyless.research.studies.worlds import RunResult, box, run_world
 from skyless.research.uncertainty import Biases
 from skyless.sim.evaluation.figures import LevelCounts, LevelTally
 from skyless.sim.impairments import Body

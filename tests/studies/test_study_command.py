@@ -92,9 +92,9 @@ def test_the_study_of_the_room_tells_levels_and_what_is_missed(run, tmp_path):
 @pytest.mark.parametrize("name", ["nlos", "sync", "room", "phase", "scale"])
 def test_every_study_can_be_drawn(name, tmp_path):
     """From rows as they may be, without simulating: with numbers, without, with a single world."""
-    from skyless.research.studies.common.runner import plan_of
-    from skyless.research.studies.common.worlds import RunResult, run_world
     from skyless.research.studies.run import STUDIES
+    from skyless.research.studies.runner import plan_of
+    from skyless.research.studies.worlds import RunResult, run_world
     from skyless.site.report import picture
 
     plan = plan_of("joint", 1, quick=True, worlds=2)

@@ -5,9 +5,9 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.research.studies import efficiency, lab, large, room
-from skyless.research.studies.common.picture import Case, interval, jackknife, world_cells, world_rows
-from skyless.research.studies.common.runner import Plan, plan_of, seed_of
-from skyless.research.studies.common.worlds import RunResult, box, large_lab_site, run_world, walking
+from skyless.research.studies.picture import Case, interval, jackknife, world_cells, world_rows
+from skyless.research.studies.runner import Plan, plan_of, seed_of
+from skyless.research.studies.worlds import RunResult, box, large_lab_site, run_world, walking
 from skyless.site.file.check import check_site
 
 pytestmark = pytest.mark.statistical

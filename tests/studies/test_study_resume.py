@@ -11,9 +11,9 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
-from skyless.research.studies.common import runner
-from skyless.research.studies.common.runner import Cell, Plan, Study
+from skyless.research.studies import runner
 from skyless.research.studies.run import Parts, run_study
+from skyless.research.studies.runner import Cell, Plan, Study
 
 NUMBERS, DEADLY, PLAN = range(5), 3, Plan(qa=0.1)
 ROWS = [number / 3 for number in NUMBERS]

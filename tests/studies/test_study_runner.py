@@ -13,11 +13,10 @@ import pytest
 from distributed import Client, LocalCluster
 
 from skyless.core.errors import SkylessError
-from skyless.research.studies import lab
-from skyless.research.studies.common import runner
-from skyless.research.studies.common.picture import world_cells, world_rows
-from skyless.research.studies.common.runner import MEASURED, Cell, Plan, run_cells, run_cells_on_dask
+from skyless.research.studies import lab, runner
 from skyless.research.studies.integrity import FAULTS
+from skyless.research.studies.picture import world_cells, world_rows
+from skyless.research.studies.runner import MEASURED, Cell, Plan, run_cells, run_cells_on_dask
 
 pytestmark = pytest.mark.statistical
 

@@ -4,9 +4,9 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from skyless.research.studies.common.picture import CONFIDENCE, STATED_RISK, WorldRow, shade_sides
 from skyless.research.studies.integrity import IntegrityRow
 from skyless.research.studies.large import LargeRow
+from skyless.research.studies.picture import CONFIDENCE, STATED_RISK, WorldRow, shade_sides
 from skyless.research.studies.room import LevelRow
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.survey import SurveyRow

@@ -5,8 +5,8 @@ import pytest
 
 from skyless.core.ticks import TICK_M
 from skyless.research.studies import survey_room as study
-from skyless.research.studies.common.runner import Plan
 from skyless.research.studies.run import STUDIES
+from skyless.research.studies.runner import Plan
 from skyless.research.studies.survey_room import SURVEYED, TRUTH, Group, groups, limits_of
 from skyless.research.surveys.rooms import (
     ROOM_RANGES,

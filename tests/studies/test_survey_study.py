@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from skyless.research.studies import survey as study
-from skyless.research.studies.common.runner import Plan
 from skyless.research.studies.run import STUDIES
+from skyless.research.studies.runner import Plan
 from skyless.research.studies.survey import GROUPS, Group, Variant, limits_of
 from skyless.research.surveys.rooms import AirErrors, aligned, drawn_errors, survey_layouts, tag_error_m
 from skyless.site.report import picture

@@ -17,21 +17,29 @@ from skyless.core.air.frame import Transmission, after_rmarker_s
 from skyless.core.arrays import Array, Integers, Records
 from skyless.core.site import Site
 from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, TICK_M, TICK_S, WRAP_TICKS, difference, from_seconds, wrap
-from skyless.sim.cells._clocks import KNOT_TICKS, CellClocks, Knots, own_time, true_time
-from skyless.sim.cells._keyed import START, TAG_NODES, key_of, purpose_key, uniform
-from skyless.sim.cells._reception import (
+from skyless.sim.cells.reception import (
+    KNOT_TICKS,
     PREAMBLE_TICKS,
     RECEIVED,
+    START,
+    TAG_NODES,
+    CellClocks,
     Frames,
+    Knots,
     Rules,
     delivery_chance,
     disturb,
     emission,
+    key_of,
     luck,
+    own_time,
     pair_key,
+    purpose_key,
     rules_of,
     rx_stamp,
     squared_m2,
+    true_time,
+    uniform,
 )
 from skyless.sim.impairments import Impairments
 from skyless.sim.listening import RECEPTION_RECORD, TagSpec, coordinate_m

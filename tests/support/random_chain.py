@@ -3,7 +3,7 @@
 import numpy as np
 
 from skyless.core.ticks import TICK_S
-from skyless.research.paper.monte_carlo import ideal_values, noise_size, run_chain
+from skyless.research.paper.plan import ideal_values, noise_size, run_chain
 from skyless.research.uncertainty import Chain, Reference
 
 

@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from skyless.research.calibration.biases import ranges_of
 from skyless.research.surveys.drawn_faults import WatchRun, run_watch, striking_windows
 from skyless.research.surveys.rooms import survey_layouts
+from skyless.site.survey.explain import sentence_of
 from skyless.site.survey.facts import PairBlock
-from skyless.site.survey.watch.explain import sentence_of
-from skyless.site.survey.watch.monitor import AnchorWatch
+from skyless.site.survey.watch import AnchorWatch
 
 pytestmark = pytest.mark.site
 

@@ -8,10 +8,10 @@ from msgspec import structs
 from scipy.stats import chi2
 
 from skyless.research.surveys.rooms import survey_layouts
+from skyless.site.survey import determined as determination
 from skyless.site.survey.facts import Facts, Tape
-from skyless.site.survey.fit import determined as determination
-from skyless.site.survey.fit.problem import jacobian, solve_least_squares
 from skyless.site.survey.frame import align, build_problem, own_delays, usable
+from skyless.site.survey.problem import jacobian, solve_least_squares
 from skyless.site.survey.solve import run_survey
 from support.drawn_ranges import drawn_ranges
 

@@ -16,7 +16,7 @@ from skyless.site.survey.facts import Facts, Gauge, PairBlock
 from skyless.site.survey.legs import AnchorLeg
 from skyless.site.survey.pair_ranger import PairRanger, RangeSteps
 from skyless.site.survey.solve import run_survey
-from skyless.site.survey.watch.monitor import change_of, drop_moved
+from skyless.site.survey.watch import change_of, drop_moved
 
 pytestmark = pytest.mark.site
 

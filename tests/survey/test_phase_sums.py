@@ -10,13 +10,13 @@ from msgspec.structs import replace
 
 from skyless.core.any_receiver import new_anchor
 from skyless.core.ticks import CARRIER_CYCLES, TICK_RATE_HZ, wrap
-from skyless.research.foreign import _muloc as muloc
+from skyless.research.foreign import datasets as muloc
 from skyless.sim.impairments import AnchorDisplacement, AnchorOutage, CarrierModel, Outage, lab_impairments
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World, lab_site
+from skyless.site.survey.explain import BLOCK_S, PhaseWatch, circular_mean
 from skyless.site.survey.legs import AnchorLeg, LegCollector
-from skyless.site.survey.watch.explain import BLOCK_S, PhaseWatch, circular_mean
 
 SITE = replace(lab_site(), schedule=replace(lab_site().schedule, carrier_phase=True))
 HALF_WAVE_M = 0.0231
@@ -130,7 +130,7 @@ def recorded_legs(folder, channel):
     """The legs of MULoc's recording, where those of anchor 0 are of one direction only."""
     sent, t_s, before = {}, 0.0, None
     with (folder / "muloc" / "location1_2.npz").open("rb") as stream:
-        for packet in muloc.read(stream, Counter(), channel):
+        for packet in muloc.read_muloc(stream, Counter(), channel):
             t_s += 0.0 if before is None else wrap(packet.rx_ticks - before) / TICK_RATE_HZ
             before = packet.rx_ticks
             for relay in packet.relays:

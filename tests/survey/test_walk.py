@@ -16,8 +16,8 @@ from skyless.sim.impairments import DelayError
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Waypoints
 from skyless.sim.world import World
-from skyless.site.survey.fit.problem import Problem, solve_least_squares
 from skyless.site.survey.legs import RelayedDifferences
+from skyless.site.survey.problem import Problem, solve_least_squares
 from skyless.site.survey.walk import TAG_STD_M, EpochCollector, TagEpochs, WalkRows, fit_with_tag, tag_ranges
 
 RANGE_STD_M, DELAY_STD_M = 0.03, 0.15

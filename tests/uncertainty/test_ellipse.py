@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.ellipse import horizontal_ellipse
+from skyless.core.earth import horizontal_ellipse
 
 lengths_m = st.floats(0.001, 30.0)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from skyless.research.studies import lab
-from skyless.research.studies.common.runner import Plan
+from skyless.research.studies.runner import Plan
 from skyless.research.uncertainty import BoundSettings, Sendings, known_receptions, received_bound, tracking_bound
 from skyless.sim.world import lab_site
 

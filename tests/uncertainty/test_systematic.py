@@ -13,7 +13,7 @@ from systematic import (
 
 from skyless.core.protocol1.snapshots import bracketed_tdoa, literal_tdoa
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ, TICK_S
-from skyless.research.paper.monte_carlo import Quantity, ideal_values
+from skyless.research.paper.plan import Quantity, ideal_values
 from skyless.research.uncertainty import Reference
 from support.random_chain import random_chain
 

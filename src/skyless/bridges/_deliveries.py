@@ -20,8 +20,8 @@ from msgspec import Struct
 
 from skyless.bridges.target import BridgedSite, Target
 from skyless.core.errors import SkylessError
-from skyless.run.limits import BRIDGES as LIMITS
 from skyless.run.mqtt.messages import AlarmMessage
+from skyless.run.web import BRIDGES as LIMITS
 
 TIMEOUT_S: Final = 10.0
 """For each attempt, all of it."""

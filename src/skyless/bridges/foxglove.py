@@ -35,9 +35,9 @@ from skyless.run.foxglove import (
     scene,
     schema_of,
 )
-from skyless.run.limits import BRIDGES as LIMITS
 from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, TagHealth
+from skyless.run.web import BRIDGES as LIMITS
 from skyless.run.web import is_local_origin, is_own_host, own_names, same_origin
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")

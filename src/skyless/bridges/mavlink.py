@@ -10,8 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl, floored, require_georeference
-from skyless.core.earth import east_north_up, geodetic, rotated
-from skyless.core.ellipse import horizontal_ellipse
+from skyless.core.earth import east_north_up, geodetic, horizontal_ellipse, rotated
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
 from skyless.run.mqtt.messages import FixMessage, Matrix, Vector

@@ -23,9 +23,7 @@ from websockets.exceptions import WebSocketException
 from skyless.bridges._deliveries import read_secret
 from skyless.bridges.nmea import COURSE_SIGMAS
 from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl, floored
-from skyless.core.earth import east_north_up
-from skyless.core.ellipse import horizontal_ellipse
-from skyless.run.geojson import coordinates
+from skyless.core.earth import coordinates, east_north_up, horizontal_ellipse
 from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.process import RateLimit, together

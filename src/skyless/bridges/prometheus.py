@@ -16,9 +16,9 @@ from typing import Final, Literal
 
 from skyless.bridges.target import TAG_NAME, BridgeContext, BridgedSite, Target, TargetUrl, cannot_listen
 from skyless.core.version import installed_version
-from skyless.run.limits import BRIDGES as LIMITS
 from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
+from skyless.run.web import BRIDGES as LIMITS
 from skyless.run.web import is_own_host, own_names
 
 CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"

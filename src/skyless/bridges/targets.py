@@ -17,8 +17,8 @@ from msgspec import Struct
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, Route, Target, TargetUrl, cannot_listen
 from skyless.core.errors import SkylessError
 from skyless.radio.serial.serial_port import Pty, SerialPort
-from skyless.run.limits import BRIDGES as LIMITS
 from skyless.run.mqtt.messages import FixMessage
+from skyless.run.web import BRIDGES as LIMITS
 
 # How bytes get to readers: over TCP, UDP, a pseudo-terminal or a serial port.
 #

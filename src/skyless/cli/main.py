@@ -25,42 +25,50 @@ if TYPE_CHECKING:
 
 _GROUPS: Final = {
     "Start here": (
-        # name, module below skyless.cli (imported only when it is called), what it does
+        # name, module below skyless.cli (imported only when it is called) and its App (:app), what it does
         ("demo", "nodes.demo", "Show a site and walking tags in real time: no radio and no site file needed."),
-        ("simulate", "simulate", "Run a site in the simulated world and judge it against the truth."),
+        ("simulate", "plan:simulate_app", "Run a site in the simulated world and judge it against the truth."),
     ),
     "Set up and check a site": (
         ("site", "site", "Write and check site files."),
         ("plan", "plan", "Predict a site's errors before it is mounted, and place its anchors."),
         ("survey", "survey", "Find where anchors hang, and their antenna delays."),
-        ("flash-config", "nodes.flash_config", "Set up a board that computes its own position."),
+        ("flash-config", "nodes.boards:flash_app", "Set up a board that computes its own position."),
         ("doctor", "nodes.doctor", "Check a computer, its boards and a running site in two minutes."),
     ),
     "Run a site": (
         ("broker", "nodes.broker", "Run the MQTT broker that comes with Skyless."),
-        ("hub", "hub", "Set up the servers where several sites meet."),
-        ("gather", "nodes.gather", "Pack the fixes of a site with thousands of tags into a stream of NATS."),
-        ("anchor", "nodes.anchor", "Run anchors of a site."),
+        ("hub", "nodes.broker:hub_app", "Set up the servers where several sites meet."),
+        ("gather", "nodes.broker:gather_app", "Pack the fixes of a site with thousands of tags into a stream of NATS."),
+        ("anchor", "nodes.tag:anchor_app", "Run anchors of a site."),
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
         ("dashboard", "dashboard", "Show a site live in the browser."),
-        ("watch", "nodes.site_watch", "Show a running site as text, for a terminal."),
-        ("sites", "nodes.sites", "List the sites of a broker or at a hub, and how they are."),
+        ("watch", "nodes.site_view:watch_app", "Show a running site as text, for a terminal."),
+        ("sites", "nodes.site_view:sites_app", "List the sites of a broker or at a hub, and how they are."),
         ("bridge", "nodes.bridge", "Give positions to other tools: gpsd, ROS 2, autopilots, Home Assistant and more."),
     ),
     "Record and replay": (
         ("record", "nodes.record", "Record a running site into a file."),
         ("replay", "replay", "Turn a recording into fixes and judge them against the truth."),
         ("history", "history", "Keep and ask what happened at a site."),
-        ("export", "export", "Write a recording as a bag of ROS 2, for its tools, Foxglove, Rerun and PlotJuggler."),
+        (
+            "export",
+            "nodes.record:export_app",
+            "Write a recording as a bag of ROS 2, for its tools, Foxglove, Rerun and PlotJuggler.",
+        ),
     ),
     "Emulate what is not there": (
-        ("ether", "nodes.ether", "Emulate a site's air in real time, for the programs of anchors and tags."),
-        ("board", "nodes.board", "Emulate a board with a radio on a serial port, to try programs without one."),
+        ("ether", "nodes.boards:ether_app", "Emulate a site's air in real time, for the programs of anchors and tags."),
+        (
+            "board",
+            "nodes.boards:board_app",
+            "Emulate a board with a radio on a serial port, to try programs without one.",
+        ),
     ),
     "Research": (
         ("study", "study", "Measure the receiver's errors over many simulated runs."),
-        ("paper", "paper", "Reproduce the paper's figures and claims in one report."),
-        ("benchmark", "benchmark", "Compare methods on every recording below a folder."),
+        ("paper", "study:paper_app", "Reproduce the paper's figures and claims in one report."),
+        ("benchmark", "study:benchmark_app", "Compare methods on every recording below a folder."),
     ),
 }
 """The commands, in the groups and in the order of the help."""
@@ -108,7 +116,8 @@ def program() -> App:
     for number, (title, commands) in enumerate(_GROUPS.items()):
         group = Group(title, sort_key=number)
         for index, (name, module, summary) in enumerate(commands):
-            app.command(f"skyless.cli.{module}:app", name=name, help=summary, group=group, sort_key=index)
+            at = f"skyless.cli.{module}" if ":" in module else f"skyless.cli.{module}:app"
+            app.command(at, name=name, help=summary, group=group, sort_key=index)
     options = Group("Options", sort_key=len(_GROUPS))
     for option in ("--help", "--version"):
         app[option].group = (options,)

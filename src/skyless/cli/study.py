@@ -2,7 +2,9 @@
 
 import csv
 import io
+import shlex
 import sys
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias
@@ -17,6 +19,7 @@ from skyless.cli.common import (
     check_picture,
     command,
     console,
+    json_form,
     print_json,
     print_table,
     progress_bar,
@@ -24,13 +27,18 @@ from skyless.cli.common import (
     status,
     to_json,
 )
-from skyless.core.arguments import Rule, folder_to_write
+from skyless.core.air.site_pages import MAX_COORDINATE_M
+from skyless.core.arguments import Option, Options, Positive, Rule, Seed, Text, folder_to_write, numbers, point
 from skyless.core.errors import SkylessError
 from skyless.core.whole_files import write_whole
+from skyless.research.replays.options import check_estimator, read_estimator
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from skyless.cli.api.simulate import StudyResult
-    from skyless.research.studies.common.runner import Row
+    from skyless.research.masterless.smoothing import OwnEstimator
+    from skyless.research.studies.runner import Row
 
 _OF_ERRORS: Final = (
     "Simulated. ± standard errors. NEES: per dimension, with the interval where 99 % of honest ones lie.",
@@ -268,3 +276,133 @@ _NAMES: Final = {
     "alarms_per_day": "alarms a day",
 }
 """How the table names figures that missed their limits, where not by the field's own name."""
+
+
+# ``skyless paper``: the paper's figures and claims, simulated and judged, as one report.
+
+paper_app = App(name="paper", help_epilogue="Example: skyless paper --out report --seed 1")
+
+
+@paper_app.default
+@command
+def paper(*, out: Path, seed: Seed = 1, quick: bool = False, output: JsonOptions) -> None:
+    """Reproduce every figure and claim of the paper, and judge which hold.
+
+    Writes report.html, which needs no other file, every picture as PNG and SVG, and numbers.json. The full report takes
+    some minutes on two cores: at most 360 s of CPU time, and 600 MB of memory.
+
+    Parameters
+    ----------
+    out
+        Write the result here, into a folder; files of the same names are replaced, others stay.
+    seed
+        Same seed, same numbers, except for times that are measured.
+    quick
+        Compute a fraction: ready in well under a minute, with more scatter.
+    """
+    from skyless.research.paper.plan import plan_of
+    from skyless.research.paper.run import write_report
+
+    started_s = time.perf_counter()
+    try:
+        with progress_bar("simulating the paper") as reach:
+            report = write_report(plan_of(seed, quick=quick), out, reach)
+    except KeyboardInterrupt:
+        print("stopped; nothing was written", file=sys.stderr)
+        raise
+    if output.json:
+        print_json({**msgspec.to_builtins(report, enc_hook=json_form), "wall_s": time.perf_counter() - started_s})
+        return
+    rows = ((f"{n}", f"{one['title']}", f"{one['verdict']}") for n, one in enumerate(report.sections, start=1))
+    print_table("the paper, reproduced and corrected", ("", "figure", "verdict"), rows)
+    console().print(f"{report.report}: {len(report.figures)} pictures and numbers.json next to it")
+
+
+# ``skyless benchmark``: every recording below a folder by every method.
+
+_QUICK_S: Final = 12.0
+
+benchmark_app = App(name="benchmark", help_epilogue="Example: skyless benchmark recordings --quick --out compared")
+
+
+class BenchmarkOptions(Options, frozen=True, kw_only=True):
+    """Options of ``skyless benchmark``."""
+
+    out: Path = Path("benchmark")
+    """Write the result here, into a folder: index.html, results.csv and results.json. What is there already is kept."""
+    only: str = ""
+    """Only recordings whose name holds this text."""
+    lever_arm_m: Annotated[
+        tuple[float, float, float] | None,
+        Option("lever-arm"),
+        numbers(3, form="x,y,z"),
+        point(3, farthest_m=MAX_COORDINATE_M),
+    ] = None
+    """The antenna in the body's frame, in metres, added to the truth of tables."""
+    calibrate_on: Annotated[tuple[str, ...], Option("calibrate-on"), Text(lambda _, text: text, "NAME", many=True)] = ()
+    """Calibrate anchors on recordings whose names hold this text, for each table of anchors on the first; others with
+    the same table are replayed with that as well."""
+    estimator: Annotated[
+        "Callable[[], OwnEstimator] | None", Text(read_estimator, "FILE.py:CLASS"), Rule(check_estimator)
+    ] = None
+    """Your own estimator as one more method: a class with hear(observation)."""
+    first_s: Annotated[Positive | None, Option("only-first")] = None
+    """Replay only this number of seconds of each recording."""
+    quick: bool = False
+    """Compute a fraction: the first twelve seconds of each recording, without smoothing; about a minute for thirty."""
+
+
+@benchmark_app.default
+@command
+def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) -> None:
+    """Compare methods on every recording below a folder.
+
+    Finds what skyless replay can read, and beside NAME_tdoa.csv its truth, NAME_pose.csv, and above it the anchors,
+    anchors*.csv. Runs joint, joint smoothed and calibrated, a plain filter with a gate, one with Bitcraze's rule of
+    refusing outliers, a gradient, least squares, and estimators of your own. Continues where it was interrupted.
+    """
+    if not folder.is_dir():
+        raise SkylessError(f"FOLDER is {str(folder)!r}; it should be a folder with recordings")
+    from skyless.research.benchmark import (
+        SUMMARY_HEADS,
+        Asked,
+        recordings_below,
+        results_of,
+        summary_rows,
+        with_best,
+        write,
+    )
+
+    found = [one for one in recordings_below(folder) if asked.only in one.name]
+    if not found:
+        raise SkylessError(f"FOLDER is {str(folder)!r}; it should hold recordings that skyless replay can read")
+    kept = asked.out / "results"
+    try:
+        kept.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise SkylessError(f"--out is {str(asked.out)!r}; it should be a folder: {error.strerror}") from None
+    first_s = _QUICK_S if asked.quick and asked.first_s is None else asked.first_s
+    own = asked.estimator
+    estimators = {} if own is None else {getattr(own, "__name__", "own"): own}
+    code = getattr(getattr(own, "hear", own), "__code__", None)
+    programs = () if code is None else (Path(code.co_filename),)
+    how = Asked(asked.lever_arm_m, first_s, asked.calibrate_on, estimators, programs, not asked.quick)
+    try:
+        with progress_bar("replaying") as reach:
+            results = list(with_best(list(results_of(found, how, kept, reach))))
+        title = f"{len(found)} recording{'s' * (len(found) != 1)}" + (
+            "" if first_s is None else f", the first {first_s:g} s of each"
+        )
+        write(asked.out, results, title, shlex.join(["skyless", *sys.argv[1:]]))
+    except KeyboardInterrupt:
+        print("stopped; the same command continues where it was", file=sys.stderr)
+        raise
+    except OSError as error:
+        raise SkylessError(f"{asked.out} cannot be written: {error.strerror}") from None
+    summary = list(summary_rows(results))
+    if output.json:
+        rows = [dict(zip(SUMMARY_HEADS, row, strict=True)) for row in summary]
+        print_json({"recordings": len(found), "seconds": first_s, "methods": rows})
+        return
+    print_table(title, SUMMARY_HEADS, summary, figures=True)
+    console().print(f"{asked.out / 'index.html'}: each recording; results.csv and results.json beside it")

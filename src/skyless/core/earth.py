@@ -3,8 +3,9 @@
 Plain arithmetic on single values, for programs that must start quickly.
 """
 
+from collections.abc import Sequence
 from math import atan2, cos, degrees, hypot, radians, sin, sqrt
-from typing import Final
+from typing import Any, Final
 
 from skyless.core.site import GeoreferenceSite
 
@@ -97,3 +98,30 @@ def _latitude(radius_m: float, axis_m: float) -> float:
         )
         reduced = atan2(flat * sin(latitude), cos(latitude))
     return latitude
+
+
+# The ellipse of a position's covariance on the floor. Plain arithmetic, for programs that must start quickly.
+
+
+def horizontal_ellipse(covariance_m2: Sequence[float]) -> tuple[float, float, float]:
+    """Semi-axes of one standard deviation in m, the longer first, and the longer one's direction from x to y in rad.
+
+    ``covariance_m2`` is 3 × 3, row by row.
+    """
+    xx, xy, yy = covariance_m2[0], covariance_m2[1], covariance_m2[4]
+    middle, half = (xx + yy) / 2.0, hypot((xx - yy) / 2.0, xy)
+    return sqrt(max(middle + half, 0.0)), sqrt(max(middle - half, 0.0)), atan2(2.0 * xy, xx - yy) / 2.0
+
+
+# Features of GeoJSON (RFC 7946).
+
+
+def coordinates(position_m: tuple[float, float, float], origin: GeoreferenceSite) -> list[float]:
+    """Longitude, latitude (WGS 84) and height above the ellipsoid of a point of the site."""
+    latitude_deg, longitude_deg, height_m = geodetic(position_m, origin)
+    return [round(longitude_deg, 9), round(latitude_deg, 9), round(height_m, 4)]
+
+
+def feature(kind: str, at: object, properties: dict[str, Any], **members: object) -> dict[str, Any]:
+    """A feature with this kind of geometry at these coordinates."""
+    return {"type": "Feature", **members, "geometry": {"type": kind, "coordinates": at}, "properties": properties}

@@ -53,10 +53,10 @@ from skyless.page.playback import Playback, RecordingFile
 from skyless.page.sites import Sites
 from skyless.page.state import PageRequest, read_request
 from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, TaskProcess, WhatIfTask
-from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt.messages import WrongMessageError
-from skyless.run.mqtt.survey_facts import BadFactsError
 from skyless.run.process import ending_signals, reserve
+from skyless.run.survey.live_survey import BadFactsError
+from skyless.run.web import PAGE as LIMITS
 from skyless.run.zones import read_zones
 from skyless.site.alarm_rules import BadAlarmRulesError
 from skyless.site.file.check import image_size

@@ -18,7 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from skyless.run.limits import PAGE as LIMITS
+from skyless.run.web import PAGE as LIMITS
 from skyless.run.web import is_own_host, same_origin
 
 JSON: Final = "application/json"

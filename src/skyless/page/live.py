@@ -25,7 +25,6 @@ from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMon
 from skyless.page.events import EventList, EventLog, EventQueue, Kept, SiteLink, publisher_rank
 from skyless.page.site_assets import AssetsFile, SiteAssets
 from skyless.page.state import PageRequest, Sent, SiteState, SiteSurvey, encode
-from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import Role
 from skyless.run.mqtt.messages import (
@@ -45,6 +44,7 @@ from skyless.run.mqtt.messages import (
     ZonesMessage,
     read_message,
 )
+from skyless.run.web import PAGE as LIMITS
 from skyless.run.zones import ZoneMonitor, check_zones, read_zones, zones_of
 from skyless.site.file.check import check_site
 

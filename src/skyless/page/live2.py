@@ -27,7 +27,7 @@ from skyless.page.state import UNHEARD_S, read_request
 from skyless.run.fix_batch import ALERT_BITS, FIELDS, RECORD, BadBatchError, Records, decode_batch, fix_of
 from skyless.run.gather import streams
 from skyless.run.gather.streams import NatsAddress, connect, name_of, rarely
-from skyless.run.limits import PAGE as LIMITS
+from skyless.run.web import PAGE as LIMITS
 
 # The newest fix of every tag of a large site in NumPy arrays, by the tags' numbers. No I/O.
 

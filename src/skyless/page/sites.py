@@ -18,11 +18,11 @@ from skyless.run.alarms import MAX_KEPT
 from skyless.run.find_site import SiteOnBroker, watch_sites
 from skyless.run.gather.streams import NatsAddress
 from skyless.run.hub import HubLink, HubSites
-from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import Limits
 from skyless.run.mqtt.link import Link
 from skyless.run.process import every, together
+from skyless.run.web import PAGE as LIMITS
 
 
 def number_of(asked: str | None) -> int:

@@ -28,8 +28,8 @@ from skyless.run.mqtt.messages import (
     WrongMessageError,
     read_message,
 )
-from skyless.run.mqtt.survey_facts import BadFactsError, check_facts
 from skyless.run.mqtt.topics import survey_topic, watch_topic
+from skyless.run.survey.live_survey import BadFactsError, check_facts
 
 EXPIRY_S: Final = 600.0
 """Fixes and health messages older than this are dropped."""

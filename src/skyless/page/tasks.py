@@ -15,7 +15,7 @@ from starlette.exceptions import HTTPException
 
 from skyless.core.errors import SkylessError
 from skyless.core.site import AnchorSite, Site
-from skyless.run.limits import PAGE as LIMITS
+from skyless.run.web import PAGE as LIMITS
 from skyless.site.file.check import check_site
 
 Kind = Literal["pdop", "hdop", "sigma"]

@@ -11,8 +11,7 @@ from typing import Any, Final
 import msgspec
 from msgspec import Struct
 
-from skyless.core.earth import geodetic, rotated
-from skyless.core.ellipse import horizontal_ellipse
+from skyless.core.earth import geodetic, horizontal_ellipse, rotated
 from skyless.core.site import GeoreferenceSite, WallSite
 from skyless.run.mqtt.messages import FixMessage, Vector, Zone
 

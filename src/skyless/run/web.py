@@ -9,7 +9,10 @@ import ipaddress
 import platform
 import re
 from collections.abc import Collection
+from typing import Final
 from urllib.parse import urlsplit
+
+from msgspec import Struct
 
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::\d{1,5})?")
 
@@ -54,3 +57,98 @@ def is_local_origin(origin: str) -> bool:
         return parts.scheme in {"http", "https"} and is_own_host(parts.netloc, remote=False)
     except ValueError:
         return False
+
+
+# What servers and programs take at most (``docs/limits.md``); the broker's limits are in ``broker.py``.
+
+
+class PageLimits(Struct, frozen=True):
+    """Beyond them a client gets an answer that names the limit."""
+
+    connections: int = 600
+    """Connections in all: well below the 1,024 open files that a program usually may have."""
+    connections_per_address: int = 200
+    """Connections of one computer."""
+    request_s: float = 10.0
+    """For how long a connection may be without a whole request; one that waits makes room before."""
+    body_s: float = 60.0
+    """For how long a body may come."""
+    accepts_log_s: float = 60.0
+    """Interval between lines about connections that the system could not accept."""
+    pages: int = 400
+    """Open pages."""
+    pages_per_address: int = 100
+    """Open pages of one computer."""
+    streams: int = 200
+    """Open streams of the HTTP interface."""
+    message_bytes: int = 16_384
+    """A message of a page or stream."""
+    body_bytes: int = 1_000_000
+    """The body of a request; that of assets or rules may have twice the bytes of a table of assets."""
+    floor_plan_bytes: int = 8_000_000
+    """A floor plan, as on MQTT. The page's ``survey/plan.js`` has the same limit."""
+    sites: int = 20
+    """Sites of one broker that are shown."""
+    site_idle_s: float = 600.0
+    """A site without zones or alarm rules is let go when nobody has looked at it for this long."""
+    questions: int = 20
+    """Questions to the history that wait for their turn."""
+    question_s: float = 60.0
+    """For how long a question to the history is answered, its waiting included."""
+    answer_bytes: int = 16_000_000
+    """An answer of the history, or of another process of the server."""
+
+
+class HistoryLimits(Struct, frozen=True):
+    """A question beyond them is refused with what would be accepted; rows beyond them are counted as dropped."""
+
+    memory_mb: int = 64
+    """What DuckDB may use before it writes to temporary files; Python and the libraries take 100 MB besides."""
+    points: int = 20_000
+    """Points of a way."""
+    steps: int = 20_000
+    """Steps of time of all zones of an occupancy."""
+    rows: int = 100_000
+    """Rows of a table of stays or alarms."""
+    contacts: int = 100_000
+    """Contacts of a tag."""
+    contact_m: float = 50.0
+    """Distance within which tags count as in contact."""
+    cells: int = 1_000_000
+    """Cells of a heat map."""
+    exported_rows: int = 100_000_000
+    """Rows of an exported file."""
+    waiting_rows: int = 500_000
+    """Fixes, and as many events, that wait in memory while the disk does not take them."""
+    tags: int = 200_000
+    """Tags of a site."""
+    first_unix_s: float = 1e9
+    """Earlier times, before 2001, are those of a computer without a clock."""
+    last_unix_s: float = 8e9
+    """Later times, in more than 200 years, are no times."""
+
+
+class BridgeLimits(Struct, frozen=True):
+    """Beyond them a client is refused, or the oldest messages are dropped and counted."""
+
+    clients: int = 32
+    """Clients of Foxglove's protocol, connections to Prometheus's metrics."""
+    readers: int = 64
+    """Connections to one TCP server of lines."""
+    request_bytes: int = 65_536
+    """A message of a client of Foxglove's protocol."""
+    head_bytes: int = 8_192
+    """The head of a request for metrics."""
+    answer_s: float = 5.0
+    """After this time a connection to the metrics is ended, even in the middle of an answer."""
+    waiting_messages: int = 500
+    """Messages that wait for one client; beyond it the oldest are dropped."""
+    channels: int = 2_000
+    """Channels of Foxglove's protocol."""
+    deliveries: int = 1_000
+    """Mails or web hooks that wait; beyond it the oldest are dropped."""
+
+
+PAGE: Final = PageLimits()
+HISTORY: Final = HistoryLimits()
+BRIDGES: Final = BridgeLimits()

@@ -12,7 +12,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.core.ellipse import horizontal_ellipse
+from skyless.core.earth import horizontal_ellipse
 from skyless.core.site import FloorSite
 from skyless.run.mqtt.messages import (
     FixMessage,

@@ -18,9 +18,9 @@ from skyless.core.integrity import RISK
 from skyless.core.method_names import FILTERS
 from skyless.core.site import Site
 from skyless.research.masterless.smoothing import OwnReceiver
-from skyless.research.studies.common.runner import Plan, Row, plan_of
 from skyless.research.studies.run import STUDIES, Parts
 from skyless.research.studies.run import run_study as rows_of_study
+from skyless.research.studies.runner import Plan, Row, plan_of
 from skyless.sim.evaluation.figures import dimensions
 from skyless.sim.evaluation.fleet import FleetReport, JudgedFix, TagFleet, report
 from skyless.sim.evaluation.request import Conditions

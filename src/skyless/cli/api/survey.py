@@ -28,7 +28,7 @@ from skyless.site.report import BLUE, GRID, INK, MUTED, ORANGE, RED, panel, repo
 from skyless.site.survey.facts import Count, PairRanges, Survey, SurveyedAnchor, count
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.solve import delay_differences_m, run_survey, surveyed_text, unchanged_anchors
-from skyless.site.survey.watch.monitor import drop_moved, with_changes
+from skyless.site.survey.watch import drop_moved, with_changes
 from skyless.site.tables import read_ranges
 
 if TYPE_CHECKING:

@@ -9,27 +9,30 @@ import statistics
 import sys
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+from datetime import datetime
 from functools import partial
 from operator import setitem
-from typing import Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
+from cyclopts import App
 from msgspec import Struct
 from rich.console import Group, RenderableType
+from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from skyless.cli.common import number, plain
-from skyless.cli.nodes.options import log
+from skyless.cli.common import JsonOptions, command, console, number, plain, print_json, print_table
+from skyless.cli.nodes.options import HubUrl, MqttOptions, SiteOptions, hub_address, log, run_until_stopped
 from skyless.core.any_receiver import beacon_period_s
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import RADIO_REACH_M
 from skyless.core.site import Site, site_digest
-from skyless.page.condition.evidence import ALERTS, FRESH_S, Evidence, Health, Node
+from skyless.page.condition.evidence import ALERTS, FRESH_S, Evidence, Health, Node, ProcessorUse
 from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
 from skyless.run.assets import assets_at, read_assets
 from skyless.run.doctor import Check, CounterPairs, Result, counters_check, judged, residuals_check, sentence
-from skyless.run.find_site import find_site
+from skyless.run.find_site import SiteOnBroker, find_site, watch_sites
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
@@ -48,6 +51,9 @@ from skyless.run.mqtt.messages import (
     WatchMessage,
 )
 from skyless.run.process import keep, reader, together
+
+if TYPE_CHECKING:
+    from skyless.run.hub import HubSite
 
 GONE: Final = ("silent", "offline")
 """States of anchors that are not there."""
@@ -514,3 +520,122 @@ def _anchor(row: AnchorRow) -> list[Text]:
         _text(row.anchor, style), _text(row.state, "bold red" if gone else ""), _text(hears, style),
         _text(number(row.age_s, "{:.0f} s ago"), "bold red" if old else style), _text(missed, style),
     ]  # fmt: skip
+
+
+# ``skyless watch``: a running site as text.
+
+_FIND_S: Final = 5.0
+_PICTURE_S: Final = 3.0
+"""One picture is made after this time: tags and anchors report every second."""
+
+watch_app = App(name="watch", help_epilogue="Example: skyless watch --mqtt mqtts://page@hall.example")
+
+
+@watch_app.default
+@command
+def watch(*, live: SiteOptions, output: JsonOptions) -> int:
+    """Show a running site as text until Ctrl-C: its condition, alarms, tags, anchors and dropped frames.
+
+    With --json, or where standard output is no terminal, one picture is written after some seconds. The exit code is
+    then 1 for a site whose condition is bad.
+    """
+    address = live.required("the broker of the site to watch")
+    once = output.json or not sys.stdout.isatty()
+    pictures: list[Picture] = []
+    run_until_stopped(_watch(address, live.site_id, pictures, once=once))
+    if not once:
+        return 0
+    if output.json:
+        print_json(pictures[-1] if pictures else {"site": None})
+    elif pictures:
+        console().print(drawn(pictures[-1]))
+    return 0 if pictures and pictures[-1].condition.level != "bad" else 1
+
+
+async def _watch(address: MqttAddress, site_id: int | None, pictures: list[Picture], *, once: bool) -> None:
+    if site_id is None:
+        site_id = await site_number(address, _FIND_S if once else None)
+    view = SiteView(Link(address, LINK_NAME, site=site_id, kind="watch"), site_id, used_share=ProcessorUse().share)
+    if once:
+        await view.run(_PICTURE_S, lambda: pictures.append(view.picture()))
+        return
+    out = console()
+    with Live(console=out, screen=True, auto_refresh=False) as live:
+        await view.run(None, lambda: live.update(drawn(view.picture(), out.height), refresh=True))
+
+
+# ``skyless sites``: the sites of a broker or at a hub.
+
+_LISTEN_S: Final = 2.5
+_DASH: Final = "–"
+
+sites_app = App(name="sites", help_epilogue="Example: skyless sites --hub nats://plant@hub-a.example,hub-b.example")
+
+
+@sites_app.default
+@command
+def sites(*, broker: MqttOptions, hub: HubUrl = None, output: JsonOptions) -> int:
+    """List the sites at a hub, with condition, tags, anchors and versions, those in trouble first.
+
+    Without a hub, those of the broker, with the programs that are online. The exit code is 0 if there are sites and all
+    are good, or on a broker have programs online; else 1.
+
+    Parameters
+    ----------
+    hub
+        Hub whose sites are listed, nats://[USER@]HOST[:PORT],HOST... or tls://...; by default the broker is asked.
+    """
+    if hub is not None and broker.mqtt is not None:
+        raise SkylessError("--hub and --mqtt exclude each other; give one of them")
+    found = _of_broker(broker) if hub is None else _of_hub(hub, broker)
+    if output.json:
+        print_json({"sites": found})
+    else:
+        _show(found)
+    good = [site.online > 0 if isinstance(site, SiteOnBroker) else site.condition == "good" for site in found]
+    return 0 if good and all(good) else 1
+
+
+def _of_broker(broker: MqttOptions) -> "list[SiteOnBroker | HubSite]":
+    address = broker.required("the broker whose sites are listed")
+    reports: list[list[SiteOnBroker]] = []
+    states: list[bool] = []
+    run_until_stopped(_listen(watch_sites(address, reports.append, states.append)))
+    if True not in states:
+        raise SkylessError(f"the broker {address} has not answered within {_LISTEN_S:g} s")
+    return [*reports[-1]] if reports else []
+
+
+def _of_hub(hub: str, broker: MqttOptions) -> "list[SiteOnBroker | HubSite]":
+    address = hub_address(hub, broker.mqtt_ca)
+    from skyless.run.hub import HubSites
+
+    known = HubSites(address, time.monotonic())
+    run_until_stopped(_listen(known.run("skyless sites")))
+    if not known.has_answered:
+        raise SkylessError(f"the hub {address} has not answered within {_LISTEN_S:g} s")
+    return [*known.sites(time.monotonic())]
+
+
+async def _listen(listening: Coroutine[Any, Any, None]) -> None:
+    await asyncio.wait((task := asyncio.ensure_future(listening),), timeout=_LISTEN_S)
+    if task.done():
+        task.result()
+    task.cancel()
+    await asyncio.gather(task, return_exceptions=True)
+
+
+def _show(found: "list[SiteOnBroker | HubSite]") -> None:
+    of_broker = all(isinstance(site, SiteOnBroker) for site in found)
+    more = ("programs online",) if of_broker else ("condition", "reason", "tags", "anchors", "last heard")
+    rows = []
+    for site in found:
+        versions = ", ".join(f"{version} ({count})" for version, count in sorted((site.versions or {}).items()))
+        if isinstance(site, SiteOnBroker):
+            cells = [str(site.online)]
+        else:
+            counts = [_DASH if count is None else str(count) for count in (site.tags_heard, site.anchors_online)]
+            heard = _DASH if site.heard_unix_s is None else f"{datetime.fromtimestamp(site.heard_unix_s):%H:%M:%S}"
+            cells = [site.condition, site.reason, *counts, heard]
+        rows.append((str(site.number), site.name, *cells, versions or _DASH))
+    print_table("Sites" if found else "No site is known there", ("site", "name", *more, "versions"), rows)

@@ -13,6 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import Response
 
 from skyless.bridges.target import bridged_site, is_usable, require_georeference
+from skyless.core.earth import coordinates, feature
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
 from skyless.core.version import installed_version
@@ -48,10 +49,8 @@ from skyless.page.connections import json_answer
 from skyless.page.live import LiveSite
 from skyless.page.tasks import TaskProcess, serve_tasks
 from skyless.run.assets import read_csv, write_csv
-from skyless.run.geojson import coordinates, feature
 from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track
 from skyless.run.history.layout import site_folder
-from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt.messages import (
     AlarmMessage,
     AlarmRulesMessage,
@@ -59,6 +58,7 @@ from skyless.run.mqtt.messages import (
     AssetsMessage,
     FixMessage,
 )
+from skyless.run.web import PAGE as LIMITS
 from skyless.run.zones import signed_area_m2
 
 if TYPE_CHECKING:

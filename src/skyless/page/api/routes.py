@@ -33,8 +33,8 @@ from skyless.page.connections import JSON, POLICY_VIOLATION, TRY_LATER, json_ans
 from skyless.page.live import LiveSite
 from skyless.page.sites import Sites
 from skyless.run.assets import MAX_BYTES
-from skyless.run.limits import PAGE as LIMITS
 from skyless.run.mqtt.messages import AlarmMessage
+from skyless.run.web import PAGE as LIMITS
 
 # The stream of a site over a WebSocket: the newest fix of each tag, and what happens (``docs/http.md``).
 #

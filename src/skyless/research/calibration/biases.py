@@ -21,7 +21,7 @@ from skyless.core.input_files import Drops, open_source
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_BITS, Unwrapper, to_seconds
 from skyless.research.calibration.options import First, Stay, SurveyOptions
-from skyless.research.foreign import avalue
+from skyless.research.foreign import datasets
 from skyless.research.foreign.formats import FORMATS, Recording, format_of, open_recording
 from skyless.research.masterless.pair_engine import PairEngine
 from skyless.research.replays.options import flight_height, known_anchors, known_truth
@@ -557,7 +557,7 @@ def _add_receptions(path: str | PathLike[str], part: _Part) -> Counter[str]:
     drops: Drops = Counter()
     with open_source(path) as stream:
         size = Path(path).stat().st_size
-        for heard in avalue.cross_receptions(stream, drops):
+        for heard in datasets.cross_receptions(stream, drops):
             part.report(lambda: os.lseek(stream.fileno(), 0, os.SEEK_CUR) / max(size, 1))
             part.add(AnchorLeg(heard.sender, heard.receiver, heard.tx_ticks, heard.rx_ticks, heard.host_s))
     return drops

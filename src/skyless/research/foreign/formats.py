@@ -16,12 +16,12 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.input_files import Drops, has_columns, header_of, open_source, read_head
 from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign import bitcraze, fira
-from skyless.research.foreign import _muloc as muloc
 from skyless.research.foreign import _phones as phones
-from skyless.research.foreign import _starloc as starloc
-from skyless.research.foreign import _tdoa_tables as tdoa_tables
-from skyless.research.foreign import avalue, crazyflie
+from skyless.research.foreign import crazyflie, datasets
 from skyless.research.foreign import crazyflie as bitcraze_captures
+from skyless.research.foreign import datasets as muloc
+from skyless.research.foreign import datasets as starloc
+from skyless.research.foreign import datasets as tdoa_tables
 from skyless.site.tables import Truth, read_truth
 
 Record = Packet | PairTdoa
@@ -87,8 +87,8 @@ FORMATS: Final = (
     Format(
         "avalue",
         "Avalue anchors' receptions of each other (ccp.csv); one of them plays the tag",
-        partial(has_columns, avalue.RECEPTION_COLUMNS),
-        avalue.read,
+        partial(has_columns, datasets.RECEPTION_COLUMNS),
+        datasets.read_avalue,
         TICK_BITS,
         any_listener=True,
     ),
@@ -141,20 +141,20 @@ FORMATS: Final = (
         "starloc",
         "STARLOC's two-way exchanges of a tag with anchors (uwb.csv), as differences of successive ranges",
         partial(has_columns, starloc.COLUMNS),
-        starloc.read,
+        starloc.read_starloc,
         None,
         any_listener=True,
-        read_truth=starloc.read_truth,
-        read_anchors=starloc.read_anchors,
+        read_truth=starloc.starloc_truth,
+        read_anchors=starloc.starloc_anchors,
     ),
     Format(
         "muloc",
         "MULoc's arrays (npz): four anchors that hear each other and a tag, with anchors and truth",
         muloc.recognise,
-        muloc.read,
+        muloc.read_muloc,
         TICK_BITS,
-        read_truth=muloc.read_truth,
-        read_anchors=muloc.read_anchors,
+        read_truth=muloc.muloc_truth,
+        read_anchors=muloc.muloc_anchors,
         channels=muloc.CHANNELS,
     ),
     _bitcraze(
@@ -233,7 +233,7 @@ def open_recording(
     return Recording(chosen, fspath(path), read(stream, drops), stream, drops)
 
 
-_TABLES: Final = (tdoa_tables.TDOA_COLUMNS, tdoa_tables.UTIL_COLUMNS, avalue.RECEPTION_COLUMNS, starloc.COLUMNS)
+_TABLES: Final = (tdoa_tables.TDOA_COLUMNS, tdoa_tables.UTIL_COLUMNS, datasets.RECEPTION_COLUMNS, starloc.COLUMNS)
 """Columns that people may have meant where a table has others; of equals the first."""
 _HEADER: Final = re.compile(r"[A-Za-z_][\w. ]*(,[ \w.]+)+")
 
@@ -265,7 +265,7 @@ def _recognised(path: str | PathLike[str]) -> Format:
         raise ConfigurationError(path, "the file", "empty", f"a recording {_readable()}")
     if head.startswith(_MCAP):
         raise ConfigurationError(path, "the file", "a compressed MCAP", "unpacked first, as by gunzip")
-    if has_columns(avalue.BLINK_COLUMNS, head):
+    if has_columns(datasets.BLINK_COLUMNS, head):
         expected = "ccp.csv of the same system: what tags send up to anchors cannot be replayed as a tag's receptions"
         raise ConfigurationError(path, "the format", "tag blinks", expected)
     header = head.partition(b"\n")[0].decode("ascii", "replace").strip()

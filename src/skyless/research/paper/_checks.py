@@ -11,9 +11,18 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.research.paper.monte_carlo import ChainMoments, Quantity, draw_moments
-from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, grouped
-from skyless.research.studies.common.runner import Cell
+from skyless.research.paper.plan import (
+    ChainMoments,
+    Panel,
+    Plan,
+    Quantity,
+    Results,
+    Section,
+    Verdict,
+    draw_moments,
+    grouped,
+)
+from skyless.research.studies.runner import Cell
 from skyless.research.uncertainty import CORRECTED, PRINTED, Chain
 from skyless.site.report import BLUE, INK, RED, panel
 

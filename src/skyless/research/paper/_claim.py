@@ -7,7 +7,6 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array
-from skyless.research.paper._listening import Track, listen
 from skyless.research.paper.plan import (
     CLAIM_M,
     DW1000_PS,
@@ -19,10 +18,12 @@ from skyless.research.paper.plan import (
     Plan,
     Results,
     Section,
+    Track,
     Verdict,
     grouped,
+    listen,
 )
-from skyless.research.studies.common.runner import Cell
+from skyless.research.studies.runner import Cell
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.trajectory import Static
 from skyless.sim.world import paper_lab_site

@@ -9,9 +9,8 @@ from msgspec import Struct, structs
 
 from skyless.core.arrays import Array, Integers
 from skyless.research.paper._checks import NOISES, draw_seed, first_number, paper_chain
-from skyless.research.paper.monte_carlo import draw_lambdas
-from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, gaussian, grouped
-from skyless.research.studies.common.runner import Cell
+from skyless.research.paper.plan import Panel, Plan, Results, Section, Verdict, draw_lambdas, gaussian, grouped
+from skyless.research.studies.runner import Cell
 from skyless.research.uncertainty import CORRECTED, PRINTED
 from skyless.site.report import BLUE, INK, RED, panel
 

@@ -11,7 +11,7 @@ from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.site import AnchorSite, ScheduleSite, Site
 from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict
-from skyless.research.studies.common.runner import Cell
+from skyless.research.studies.runner import Cell
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.trajectory import Static

@@ -15,7 +15,7 @@ from skyless.core.air.frame import Reception
 from skyless.core.arrays import Array, Integers
 from skyless.core.protocol1.receiver import Receiver
 from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Section, Verdict, grouped
-from skyless.research.studies.common.runner import Cell
+from skyless.research.studies.runner import Cell
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.trajectory import Static

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 
 from skyless.research.paper._dop_map import LAB_ANCHORS_M
 from skyless.research.paper.plan import P1, P2, Panel, Plan, Results, Section, Verdict
-from skyless.research.studies.common.runner import Cell
+from skyless.research.studies.runner import Cell
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.world import paper_lab_site
 from skyless.site.report import BLUE, GREEN, ORANGE, PAPER, RED, draw_floor_plan, panel

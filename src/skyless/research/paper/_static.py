@@ -10,7 +10,6 @@ from msgspec.structs import replace
 
 from skyless.core.arrays import Array
 from skyless.core.ticks import TICK_M
-from skyless.research.paper._listening import Track, listen
 from skyless.research.paper.plan import (
     CLAIM_M,
     P1,
@@ -22,11 +21,13 @@ from skyless.research.paper.plan import (
     Point,
     Results,
     Section,
+    Track,
     Verdict,
     gaussian,
     grouped,
+    listen,
 )
-from skyless.research.studies.common.runner import Cell
+from skyless.research.studies.runner import Cell
 from skyless.sim.impairments import DelayError, Impairments, lab_impairments
 from skyless.sim.trajectory import Static
 from skyless.sim.world import paper_lab_site

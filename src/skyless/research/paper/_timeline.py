@@ -14,7 +14,7 @@ from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict
-from skyless.research.studies.common.runner import Cell
+from skyless.research.studies.runner import Cell
 from skyless.sim.impairments import Outage, lab_impairments
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static

@@ -9,9 +9,8 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array
 from skyless.research.paper._dop_map import EXPLAINING_CORRELATION, LAB_ANCHORS_M, literal_covariance_m2, pdop_at
-from skyless.research.paper._listening import Track, listen
-from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict, grouped
-from skyless.research.studies.common.runner import Cell
+from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Track, Verdict, grouped, listen
+from skyless.research.studies.runner import Cell
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.trajectory import Waypoints
 from skyless.sim.world import paper_lab_site

@@ -22,7 +22,7 @@ from skyless.research.paper import _static as static
 from skyless.research.paper import _timeline as timeline
 from skyless.research.paper import _walk as walk
 from skyless.research.paper.plan import Heading, Plan, Section, report_page
-from skyless.research.studies.common.runner import run_cells
+from skyless.research.studies.runner import run_cells
 from skyless.site.report import picture, report_style
 
 _FIGURES: Final = (scenario, checks, distributions, static, walk, dop_map, timeline, rate, claim, scale)

@@ -17,7 +17,7 @@ from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.ticks import CARRIER_CYCLES
-from skyless.research.foreign.avalue import anchor_distances_m
+from skyless.research.foreign.datasets import anchor_distances_m
 from skyless.research.foreign.formats import Format, Recording, format_of, open_recording
 from skyless.research.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
 from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking

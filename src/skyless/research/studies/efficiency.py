@@ -18,7 +18,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.research.studies.common.runner import Cell, Plan, Row
+from skyless.research.studies.runner import Cell, Plan, Row
 from skyless.research.uncertainty import BoundSettings, tracking_bound
 from skyless.sim.world import paper_lab_site
 

@@ -21,8 +21,6 @@ from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.process import ACCEPTED, JOINED
 from skyless.core.integrity import CONTRADICTED, HPL, VPL
 from skyless.core.ticks import TICK_M
-from skyless.research.studies.common.picture import clustered_interval
-from skyless.research.studies.common.runner import Cell, Plan, Row
 from skyless.research.studies.efficiency import (
     EPISODE_SPEED_STD_MPS,
     EPISODE_SUPERFRAMES,
@@ -31,6 +29,8 @@ from skyless.research.studies.efficiency import (
     draw_episode,
     settings_of,
 )
+from skyless.research.studies.picture import clustered_interval
+from skyless.research.studies.runner import Cell, Plan, Row
 from skyless.sim.world import paper_lab_site
 
 _ONSETS: Final = (40, 67)

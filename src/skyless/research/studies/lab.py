@@ -11,9 +11,9 @@ from numpy.random import Generator
 
 from skyless.core.arrays import Array
 from skyless.core.site import Site
-from skyless.research.studies.common.picture import RAW_METHODS, Case, world_cells, world_rows
-from skyless.research.studies.common.runner import Cell, Plan, Row, seed_of
-from skyless.research.studies.common.worlds import LAB_WARMUP_S, Run, anchor_of, box, large_lab_site, walking, worlds
+from skyless.research.studies.picture import RAW_METHODS, Case, world_cells, world_rows
+from skyless.research.studies.runner import Cell, Plan, Row, seed_of
+from skyless.research.studies.worlds import LAB_WARMUP_S, Run, anchor_of, box, large_lab_site, walking, worlds
 from skyless.research.uncertainty import BoundSettings, known_receptions, received_bound
 from skyless.sim.impairments import AnchorBias, AnchorOutage, Impairments, Outage
 from skyless.sim.oscillator import Temperature

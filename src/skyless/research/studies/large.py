@@ -21,11 +21,11 @@ from skyless.core.fix import Fix
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site
 from skyless.core.tag.joint import Estimation
 from skyless.core.tag.receiver import Receiver
-from skyless.research.studies.common.picture import Case, interval, jackknife
-from skyless.research.studies.common.runner import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.studies.common.worlds import box, worlds
 from skyless.research.studies.lab import still
+from skyless.research.studies.picture import Case, interval, jackknife
 from skyless.research.studies.room import biases_of
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.research.studies.worlds import box, worlds
 from skyless.research.uncertainty import BoundSettings, Sendings, received_bound, relayed_receptions
 from skyless.sim.cells.world import CellWorld, TagReceptions, anchors_of
 from skyless.sim.evaluation.fleet import SiteBeacons, period_codes_of

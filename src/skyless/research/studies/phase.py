@@ -12,10 +12,10 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.site import Site
-from skyless.research.studies.common.picture import Case, by_case, world_rows
-from skyless.research.studies.common.runner import Limit, Plan, Row, with_limits
-from skyless.research.studies.common.worlds import box, walking, worlds
+from skyless.research.studies.picture import Case, by_case, world_rows
 from skyless.research.studies.room import WALL, past_wall, still, with_levels
+from skyless.research.studies.runner import Limit, Plan, Row, with_limits
+from skyless.research.studies.worlds import box, walking, worlds
 from skyless.sim.evaluation.scenarios import Room, wanderer, wanderers
 from skyless.sim.impairments import Body, CarrierModel, Impairments, RangeErrorModel
 from skyless.sim.trajectory import Trajectory

@@ -21,7 +21,8 @@ from skyless.core.air.beacon import Beacon, decode_cached
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import AnchorSite, Site, TagsSite, WallSite
-from skyless.research.studies.common.picture import (
+from skyless.research.studies.lab import laps
+from skyless.research.studies.picture import (
     Case,
     WorldRow,
     by_case,
@@ -30,9 +31,8 @@ from skyless.research.studies.common.picture import (
     world_cells,
     world_rows,
 )
-from skyless.research.studies.common.runner import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.studies.common.worlds import Run, RunResult, anchor_of, box, worlds
-from skyless.research.studies.lab import laps
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.research.studies.worlds import Run, RunResult, anchor_of, box, worlds
 from skyless.research.uncertainty import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
 from skyless.sim.evaluation.figures import LevelCounts
 from skyless.sim.evaluation.fleet import world_of

@@ -10,8 +10,8 @@ from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
 from skyless.research.studies import efficiency, integrity, lab, large, phase, room, survey, survey_room, watch
-from skyless.research.studies.common.picture import Case, Look, draw, world_cells, world_rows
-from skyless.research.studies.common.runner import (
+from skyless.research.studies.picture import Case, Look, draw, world_cells, world_rows
+from skyless.research.studies.runner import (
     Cell,
     KeptResults,
     Plan,

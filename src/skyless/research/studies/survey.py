@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.arrays import Array
-from skyless.research.studies.common.runner import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.surveys.rooms import (
     HAND_STD_M,
     SKETCH_STD_M,

@@ -12,10 +12,10 @@ from typing import Any, Final
 from msgspec import Struct
 
 from skyless.core.site import Site
-from skyless.research.studies.common.picture import Case, case_row
-from skyless.research.studies.common.runner import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.studies.common.worlds import Run, RunResult, run_world
+from skyless.research.studies.picture import Case, case_row
 from skyless.research.studies.room import with_levels
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.research.studies.worlds import Run, RunResult, run_world
 from skyless.research.surveys.rooms import (
     ROOM_RANGES,
     DrawnRoom,

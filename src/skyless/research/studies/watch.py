@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.research.studies.common.runner import Cell, Limit, Plan, Row, missed_limits, seed_of
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, missed_limits, seed_of
 from skyless.research.surveys.drawn_faults import (
     Event,
     WatchResult,

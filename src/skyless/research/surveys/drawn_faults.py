@@ -9,9 +9,9 @@ from msgspec import Struct
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.surveys.rooms import SurveyLayout
+from skyless.site.survey.explain import Finding, Kind, Pairs, is_significant, weight_of
 from skyless.site.survey.facts import PairBlock
-from skyless.site.survey.watch.explain import Finding, Kind, Pairs, is_significant, weight_of
-from skyless.site.survey.watch.monitor import GRACE_S, AnchorWatch
+from skyless.site.survey.watch import GRACE_S, AnchorWatch
 
 Event = Literal["none", "moved", "delay", "link", "door", "two moved", "slow"]
 

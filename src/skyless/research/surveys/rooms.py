@@ -32,10 +32,10 @@ from skyless.sim.impairments import (
 )
 from skyless.sim.world import World, lab_site
 from skyless.site.channel import ChannelModel
+from skyless.site.survey.determined import aligned_covariance
 from skyless.site.survey.facts import Facts, PairRanges, Point, Survey, Tape
-from skyless.site.survey.fit.determined import aligned_covariance
-from skyless.site.survey.fit.problem import Problem, jacobian, superimposed
 from skyless.site.survey.pair_ranger import PairRanger
+from skyless.site.survey.problem import Problem, jacobian, superimposed
 from skyless.site.survey.solve import run_survey, surveyed_site
 
 # Sites on which surveys of anchors are studied.

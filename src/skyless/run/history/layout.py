@@ -28,8 +28,8 @@ from pyarrow import parquet
 
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import NONE_U16, Records
-from skyless.run.limits import HISTORY as LIMITS
 from skyless.run.mqtt.messages import AlarmMessage, StatusMessage, ZoneEvent
+from skyless.run.web import HISTORY as LIMITS
 
 FIX_COLUMNS: Final = {
     "tag": "uint32",

@@ -38,7 +38,6 @@ from skyless.run.history.layout import (
 )
 from skyless.run.history.writer import FILE_ROWS, Intake, Keep, Writer, tidy
 from skyless.run.hub import LIST_S, sites_at
-from skyless.run.limits import HISTORY as LIMITS
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Handler, Link, Subscriptions
@@ -53,6 +52,7 @@ from skyless.run.mqtt.messages import (
 )
 from skyless.run.process import Log, every, keep, reader, together
 from skyless.run.recordings.recording import McapRecording
+from skyless.run.web import HISTORY as LIMITS
 from skyless.run.zones import read_zones
 
 if TYPE_CHECKING:

@@ -26,11 +26,11 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from skyless.core.arguments import check_number
+from skyless.core.earth import coordinates, feature
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
 from skyless.core.whole_files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
-from skyless.run.geojson import coordinates, feature
 from skyless.run.history.answers import (
     GAP_S,
     THINNED_GAP_S,
@@ -57,7 +57,7 @@ from skyless.run.history.layout import (
     schema_of,
     site_folder,
 )
-from skyless.run.limits import HISTORY as LIMITS
+from skyless.run.web import HISTORY as LIMITS
 
 # Times in cells and near tags, which need all rows: PyArrow and NumPy take a third of DuckDB's processor time here.
 

@@ -44,9 +44,9 @@ from skyless.run.history.layout import (
     site_folder,
     write_table,
 )
-from skyless.run.limits import HISTORY as LIMITS
 from skyless.run.mqtt.messages import Asset, FixMessage, Zone
 from skyless.run.process import locked
+from skyless.run.web import HISTORY as LIMITS
 
 FILE_ROWS: Final = 1_000_000
 """Rows of a file, nearly: one more batch would be too many."""

@@ -4,22 +4,32 @@ No I/O and no clock: times are passed in, ``now_s`` by one clock that does not g
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from math import dist
 from pathlib import Path
 from typing import Final, Literal
 from zlib import crc32
 
+import msgspec
 from msgspec import Struct
 from msgspec.structs import asdict, replace
 
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import SkylessError, writing
 from skyless.core.site import FloorPlanSite, Site
 from skyless.core.whole_files import replace_files
-from skyless.run.mqtt.messages import StampsMessage, SurveyMessage, SurveyProgress, WatchFinding, WatchMessage
+from skyless.run.mqtt.messages import (
+    StampsMessage,
+    SurveyFactsMessage,
+    SurveyMessage,
+    SurveyProgress,
+    WatchFinding,
+    WatchMessage,
+)
 from skyless.run.process import Log
-from skyless.site.file.check import check_site, image_size
+from skyless.site.file.check import Limits, check_site, image_size
 from skyless.site.file.load import load_site, with_values
+from skyless.site.survey.explain import Finding, PhaseWatch
 from skyless.site.survey.facts import (
     Facts,
     PairBlock,
@@ -34,8 +44,7 @@ from skyless.site.survey.facts import (
 from skyless.site.survey.legs import AnchorLeg
 from skyless.site.survey.pair_ranger import PairRanger, StepTable
 from skyless.site.survey.solve import delay_changes_ticks, surveyed_site, surveyed_text
-from skyless.site.survey.watch.explain import Finding, PhaseWatch
-from skyless.site.survey.watch.monitor import AnchorWatch, Change, with_changes
+from skyless.site.survey.watch import AnchorWatch, Change, with_changes
 
 NO_DATA_S: Final = 5.0
 """Without stamps for this time a result is out of date."""
@@ -413,3 +422,70 @@ def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None,
     if path.exists() and path.read_bytes() != floor.image:
         path = path.with_stem(f"{path.stem}-{crc32(floor.image):08x}")
     return path.name, {path: floor.image}
+
+
+# Whether facts on MQTT or from a page can be computed with.
+
+MAX_FACTS: Final = 10_000
+"""Heights, tapes, points and the like, each."""
+
+_COORDINATE: Final = Limits(-MAX_COORDINATE_M, MAX_COORDINATE_M, "metres")
+_LENGTH: Final = Limits(0, MAX_COORDINATE_M, "metres", above=True)
+_STD: Final = Limits(0, 100, "metres")
+_POSITIVE_STD: Final = Limits(0, 100, "metres", above=True)
+
+
+class BadFactsError(ValueError):
+    """What is wrong with the facts that somebody has sent, or with a request to save."""
+
+
+def check_facts(message: SurveyFactsMessage) -> None:
+    """Check that facts can be computed with. Raises BadFactsError, which names field, value and what would be right."""
+    facts = message.facts
+    if facts.tags:
+        raise BadFactsError(f"facts.tags has {len(facts.tags)} entries; what tags received comes from recordings only")
+    for name in ("heights_m", "tapes", "points", "sketch_m", "delays"):
+        count = len(getattr(facts, name))
+        if count > MAX_FACTS:
+            raise BadFactsError(f"facts.{name} has {count} entries; at most {MAX_FACTS} are allowed")
+    for path, value, limits in _limited(message):
+        if not limits.contains(value):
+            raise BadFactsError(f"{path} is {value:g}; it should be {limits}")
+    for index, tape in enumerate(facts.tapes):
+        if tape.a == tape.b:
+            raise BadFactsError(f"facts.tapes[{index}] is from anchor {tape.a} to itself; it should be between two")
+    if facts.gauge is not None:
+        named = [anchor for anchor in msgspec.structs.astuple(facts.gauge) if anchor is not None]
+        if len(set(named)) < len(named):
+            listed = ", ".join(map(str, named))
+            raise BadFactsError(f"facts.gauge names anchors {listed}; origin, x axis and left should be different ones")
+
+
+def _limited(message: SurveyFactsMessage) -> Iterator[tuple[str, float, Limits]]:
+    """Every number of metres: its path, itself, and what is allowed."""
+    facts, plan = message.facts, message.floor_plan
+    for anchor, height_m in facts.heights_m.items():
+        yield f"facts.heights_m of anchor {anchor}", height_m, _COORDINATE
+    for index, tape in enumerate(facts.tapes):
+        yield f"facts.tapes[{index}].distance_m", tape.distance_m, _LENGTH
+        yield f"facts.tapes[{index}].std_m", tape.std_m, _POSITIVE_STD
+    for name in ("points", "sketch_m"):
+        for anchor, point in getattr(facts, name).items():
+            for axis, value in zip("xyz", point, strict=True):
+                if value is not None:
+                    yield f"facts.{name} of anchor {anchor}, {axis}", value, _COORDINATE
+    for index, delay in enumerate(facts.delays):
+        yield f"facts.delays[{index}].delay_m", delay.delay_m, _COORDINATE
+        yield f"facts.delays[{index}].std_m", delay.std_m, _POSITIVE_STD
+    yield from _stds(facts)
+    if plan is not None:
+        yield "floor_plan.width_m", plan.width_m, _LENGTH
+        yield "floor_plan.x_m", plan.x_m, _COORDINATE
+        yield "floor_plan.y_m", plan.y_m, _COORDINATE
+
+
+def _stds(facts: Facts) -> Iterator[tuple[str, float, Limits]]:
+    for name in ("height_std_m", "point_std_m", "sketch_std_m"):
+        yield f"facts.{name}", getattr(facts, name), _POSITIVE_STD
+    for name in ("delay_std_m", "common_delay_std_m", "pair_std_m"):
+        yield f"facts.{name}", getattr(facts, name), _STD

@@ -27,7 +27,6 @@ from skyless.run.mqtt.messages import (
     WatchFinding,
     WatchMessage,
 )
-from skyless.run.mqtt.survey_facts import BadFactsError, check_facts
 from skyless.run.mqtt.topics import (
     EVERY_NODE,
     floor_plan_topic,
@@ -43,10 +42,12 @@ from skyless.run.mqtt.topics import (
 from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import Log, every, keep, outlasting, reader, together
 from skyless.run.survey.live_survey import (
+    BadFactsError,
     FactsOf,
     FloorImage,
     LiveSurvey,
     Saved,
+    check_facts,
     record_of,
     save_survey,
     saved_without_file,
@@ -55,7 +56,7 @@ from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, PairRanges, Survey
 from skyless.site.survey.legs import LegCollector
 from skyless.site.survey.solve import delay_differences_m
-from skyless.site.survey.watch.monitor import change_of
+from skyless.site.survey.watch import change_of
 
 NAME: Final = "survey"
 """Its name on MQTT: one site has one survey program."""

@@ -18,32 +18,34 @@ from skyless.core.air.frame import after_rmarker_s
 from skyless.core.arrays import Array, Integers
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_MASK, TICK_S, from_seconds
-from skyless.sim.cells._clocks import KNOT_TICKS, CellClocks
-from skyless.sim.cells._grid import anchors_within, list_neighbours, make_grid
-from skyless.sim.cells._keyed import (
+from skyless.sim.cells.reception import (
+    KNOT_TICKS,
+    PREAMBLE_TICKS,
     RANGE_CHANGING,
     RANGE_CONSTANT,
     SURVEY,
     TAG_NODES,
+    CellClocks,
+    anchors_within,
     key_of,
+    list_neighbours,
+    make_grid,
     normal,
     purpose_key,
+    rules_of,
 )
-from skyless.sim.cells._paths import TagPath
-from skyless.sim.cells._reception import PREAMBLE_TICKS, rules_of
-from skyless.sim.cells._receptions import (
+from skyless.sim.cells.receptions import (
     KNOTS_A_LENGTH,
     LOOK_BACK_TICKS,
     PairErrors,
     Path,
     Scene,
-    fill_relays,
-    receive_at_tag,
-)
-from skyless.sim.cells._timetable import (
     Senders,
     Table,
+    TagPath,
+    fill_relays,
     make_buckets,
+    receive_at_tag,
     scheduled_table,
 )
 from skyless.sim.impairments import Impairments, RangeErrorModel

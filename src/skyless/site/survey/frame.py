@@ -12,7 +12,7 @@ from msgspec import Struct, structs
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.errors import SkylessError
 from skyless.site.survey.facts import Facts, Gauge, PairRange, PairRanges, Point, Tape, anchors_named, joined
-from skyless.site.survey.fit.problem import Problem, distances_m
+from skyless.site.survey.problem import Problem, distances_m
 
 # From ranges and facts to a ``Problem`` of some of the site's anchors.
 

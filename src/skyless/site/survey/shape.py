@@ -10,6 +10,8 @@ from msgspec import Struct, structs
 from scipy.special import chdtri
 
 from skyless.core.arrays import Array, Integers, Mask
+from skyless.site.survey import determined as determination
+from skyless.site.survey.determined import Links, TapeChoice, best_tapes, mending_tapes
 from skyless.site.survey.facts import (
     MIN_CHECKS,
     Facts,
@@ -21,18 +23,6 @@ from skyless.site.survey.facts import (
     distances_named,
     joined,
 )
-from skyless.site.survey.fit import determined as determination
-from skyless.site.survey.fit.determined import Links, TapeChoice, best_tapes, mending_tapes
-from skyless.site.survey.fit.problem import (
-    MoreRows,
-    Problem,
-    Solution,
-    delay_weights,
-    jacobian,
-    solve_least_squares,
-    start_positions,
-)
-from skyless.site.survey.fit.robust import OtherFit, RobustFit, fit_robustly
 from skyless.site.survey.frame import (
     Framed,
     Measured,
@@ -45,6 +35,16 @@ from skyless.site.survey.frame import (
     own_variance_m2,
     with_free_delays,
 )
+from skyless.site.survey.problem import (
+    MoreRows,
+    Problem,
+    Solution,
+    delay_weights,
+    jacobian,
+    solve_least_squares,
+    start_positions,
+)
+from skyless.site.survey.robust import OtherFit, RobustFit, fit_robustly
 from skyless.site.survey.walk import TagEpochs, fit_with_tag
 
 _MIN_REDUNDANCY: Final = 4  # ranges more than unknowns from which on residuals show how good the ranges are

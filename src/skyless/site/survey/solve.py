@@ -22,6 +22,7 @@ from skyless.core.site import AccuracySite, AnchorSite, Site, UnplacedAnchor
 from skyless.core.ticks import TICK_M
 from skyless.site.file.check import SITE_LIMITS, check_site
 from skyless.site.file.load import with_values
+from skyless.site.survey.determined import Links, count_links, position_stds_m
 from skyless.site.survey.facts import (
     MIN_CHECKS,
     Ambiguity,
@@ -34,9 +35,6 @@ from skyless.site.survey.facts import (
     are,
     joined,
 )
-from skyless.site.survey.fit.determined import Links, count_links, position_stds_m
-from skyless.site.survey.fit.problem import Problem, adjacency, delay_weights, unit_vectors
-from skyless.site.survey.fit.robust import OtherFit, RobustFit, find_ambiguities, fit_robustly
 from skyless.site.survey.frame import (
     Framed,
     Measured,
@@ -49,6 +47,8 @@ from skyless.site.survey.frame import (
     own_delays,
     usable,
 )
+from skyless.site.survey.problem import Problem, adjacency, delay_weights, unit_vectors
+from skyless.site.survey.robust import OtherFit, RobustFit, find_ambiguities, fit_robustly
 from skyless.site.survey.shape import (
     Fitted,
     advised_tapes,

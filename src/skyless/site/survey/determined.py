@@ -11,7 +11,7 @@ from msgspec import Struct, structs
 from scipy.sparse.csgraph import connected_components
 
 from skyless.core.arrays import Array, Integers, Mask
-from skyless.site.survey.fit.problem import (
+from skyless.site.survey.problem import (
     Problem,
     adjacency,
     solve_least_squares,

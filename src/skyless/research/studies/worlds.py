@@ -20,7 +20,7 @@ from skyless.core.arrays import Array
 from skyless.core.fix import Fix
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import AnchorSite, Site
-from skyless.research.studies.common.runner import Plan, seed_of
+from skyless.research.studies.runner import Plan, seed_of
 from skyless.sim.evaluation.figures import EvenSample, FirstFixes, LevelCounts, LevelTally
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import WALL_MARGIN_M, Request, impairments_of, trajectories_of

@@ -14,8 +14,8 @@ from msgspec import Struct
 from msgspec.structs import astuple, replace
 
 from skyless.core.arrays import Array, Integers, Mask
-from skyless.site.survey.fit.determined import aligned_covariance
-from skyless.site.survey.fit.problem import (
+from skyless.site.survey.determined import aligned_covariance
+from skyless.site.survey.problem import (
     Problem,
     Solution,
     Solutions,

@@ -12,10 +12,7 @@ from msgspec.structs import replace
 from scipy.special import chdtri, ndtri
 
 from skyless.core.arrays import Array, Integers, Mask
-from skyless.site.survey.facts import Facts, PairBlock, PairRange, PairRanges, Survey
-from skyless.site.survey.legs import STD_OVER_MAD
-from skyless.site.survey.pair_ranger import PairRanger, StepTable
-from skyless.site.survey.watch.explain import (
+from skyless.site.survey.explain import (
     Explanation,
     Finding,
     Pairs,
@@ -28,6 +25,9 @@ from skyless.site.survey.watch.explain import (
     silent_link,
     weight_of,
 )
+from skyless.site.survey.facts import Facts, PairBlock, PairRange, PairRanges, Survey
+from skyless.site.survey.legs import STD_OVER_MAD
+from skyless.site.survey.pair_ranger import PairRanger, StepTable
 
 _USUAL_WINDOWS: Final = 60  # windows of which the usual range is the median
 _DRIFT_WINDOWS: Final = 360

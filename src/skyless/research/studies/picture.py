@@ -16,8 +16,8 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 
 from skyless.core.arrays import Array
-from skyless.research.studies.common.runner import Cell, Limit, Plan, Row
-from skyless.research.studies.common.worlds import Run, RunResult, run_world
+from skyless.research.studies.runner import Cell, Limit, Plan, Row
+from skyless.research.studies.worlds import Run, RunResult, run_world
 from skyless.research.uncertainty import Biases
 from skyless.site.report import BLUE, GREEN, GRID, INK, MUTED, ORANGE, RED, report_style
 

@@ -1,1 +1,0 @@
-"""Fit of positions to ranges."""

@@ -1,1 +1,0 @@
-"""Anchors that moved, or changed otherwise, since their survey."""
