@@ -11,8 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from skyless.cli.site_keys import new_chain
 from skyless.core.errors import SkylessError
-from skyless.core.keys.chain import SECTION_BITS, Chain, ChainTiming, new_chain
+from skyless.core.keys.chain import SECTION_BITS, Chain, ChainTiming
 from skyless.run.keys import (
     SEEDS_VARIABLE,
     SITE_PRIVATE,

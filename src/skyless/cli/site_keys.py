@@ -1,8 +1,15 @@
 """``skyless site keys``: make, replace and show the keys of a site, with which its beacons are verified."""
 
+import multiprocessing
+import os
+import secrets
+import signal
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from datetime import datetime
+from itertools import repeat
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -14,7 +21,17 @@ from skyless.cli.common import JsonOptions, command, console, print_facts, print
 from skyless.cli.nodes.options import site_named
 from skyless.core.arguments import Options, number
 from skyless.core.errors import SkylessError, writing
-from skyless.core.keys.chain import Chain, ChainRing, new_chain
+from skyless.core.keys.chain import (
+    CERTIFICATE_SIGNATURE_BYTES,
+    SECTION_BITS,
+    SEED_BYTES,
+    USUAL_TIMING,
+    Chain,
+    ChainRing,
+    ChainTiming,
+    section_signatures,
+)
+from skyless.core.processors import cores
 from skyless.core.site import Site
 from skyless.core.whole_files import replace_files
 from skyless.run.keys import (
@@ -284,3 +301,72 @@ def _ends_s(chain: Chain) -> float:
 def _when(unix_s: float) -> str:
     """Local date and time for people."""
     return datetime.fromtimestamp(unix_s).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
+
+
+_PIECE: Final = 64
+"""Sections that a process makes at a time: 0.3 s."""
+
+_FEW: Final = 128
+"""Sections that are made sooner than processes start."""
+
+
+def new_chain(
+    site: int,
+    serial: int,
+    starts_s: float,
+    ends_s: float,
+    private: bytes,
+    reached: Callable[[float], None],
+    timing: ChainTiming = USUAL_TIMING,
+) -> Chain:
+    """A chain with a new seed between two Unix times, whose end is rounded up to whole sections (14 minutes).
+
+    ``private``: the site's private key, 32 bytes. ``reached`` is called with the share of the work that is done.
+    An interrupt ends all processes.
+    """
+    seed = secrets.token_bytes(SEED_BYTES)
+    first = timing.interval_at(starts_s)
+    begin, end = first >> SECTION_BITS, (timing.interval_at(ends_s) >> SECTION_BITS) + 1
+    pieces = [range(at, min(at + _PIECE, end)) for at in range(begin, end, _PIECE)]
+    signatures = bytearray()
+
+    def add(piece: bytes) -> None:
+        signatures.extend(piece)
+        reached(len(signatures) / CERTIFICATE_SIGNATURE_BYTES / (end - begin))
+
+    work = (repeat(seed), repeat(site), repeat(serial), repeat(timing), repeat(first), pieces, repeat(private))
+    if end - begin <= _FEW:
+        for piece in map(_signatures, *work):
+            add(piece)
+    else:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(min(cores(), len(pieces)), context, _start_worker) as pool:
+            try:
+                for piece in pool.map(_signatures, *work):
+                    add(piece)
+            except BaseException:
+                pool.shutdown(wait=True, cancel_futures=True)
+                raise
+    return Chain(site, serial, timing, first, bytes(signatures), seed)
+
+
+def _signatures(
+    seed: bytes, site: int, serial: int, timing: ChainTiming, first: int, sections: range, private: bytes
+) -> bytes:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+
+    key = Ed25519PrivateKey.from_private_bytes(private)
+    return section_signatures(seed, site, serial, timing, first, sections, key)
+
+
+def _start_worker() -> None:
+    """An interrupt reaches all processes of a terminal; the parent alone acts on it. A worker ends with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

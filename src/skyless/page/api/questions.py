@@ -316,9 +316,9 @@ def _answer(question: _Question) -> object:
     """What the process answers; a tuple as an object with one key. Raises SkylessError."""
     from skyless.run.history.queries import History  # noqa: PLC0415 - of the extra history
 
-    functions = {one.__name__: one for one in (track, heatmap, dwell, occupancy, contacts)}
-    functions |= {"tags": past_tags, "alarms": past_alarms}
-    found = functions[question.name](History(Path(question.folder), question.site), **question.given)
+    functions = (past_tags, track, heatmap, dwell, occupancy, contacts, past_alarms)
+    function = {one.__name__.removeprefix("past_"): one for one in functions}[question.name]
+    found = function(History(Path(question.folder), question.site), **question.given)
     return {question.name: found} if isinstance(found, tuple) else found
 
 
