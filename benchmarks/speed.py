@@ -30,10 +30,10 @@ from skyless.core.any_receiver import AnyReceiver
 from skyless.core.estimator.estimator import Packets
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.method_names import SNAPSHOTS
-from skyless.core.processors import cores
 from skyless.core.protocol1.beacon import decode, decode_cached, encode
 from skyless.core.tag.position import locate_pseudoranges
 from skyless.core.tag.receiver import Receiver
+from skyless.machine import cores
 from skyless.research.paper.plan import draw_moments
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyless.core.arguments import check_number, check_point, check_whole, named_as_arguments, process_noise
+from skyless.arguments import check_number, check_point, check_whole, named_as_arguments, process_noise
 from skyless.core.errors import SkylessError
 from skyless.research.replays.options import ReplayOptions
 

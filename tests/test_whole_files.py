@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from skyless.core.whole_files import replace_files, whole_file, write_whole
+from skyless.files import replace_files, whole_file, write_whole
 
 
 def test_a_failed_write_leaves_the_old_files(tmp_path):

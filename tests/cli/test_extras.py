@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from skyless.core.extras import EXTRA_OF, how_to_install, what_to_install
+from skyless.machine import EXTRA_OF, how_to_install, what_to_install
 
 pytestmark = pytest.mark.site
 

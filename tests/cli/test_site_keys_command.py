@@ -10,7 +10,7 @@ import time
 import pytest
 
 from skyless.cli.main import main
-from skyless.core.whole_files import replace_files
+from skyless.files import replace_files
 from skyless.run.keys import read_keys, read_private, read_site_public
 
 pytestmark = pytest.mark.site

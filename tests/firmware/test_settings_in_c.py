@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import asdict, replace
 
+from skyless.arguments import OptionError
 from skyless.cli.nodes.boards import FlashOptions
-from skyless.core.arguments import OptionError
 from skyless.core.fix import NoFixReason
 from skyless.radio.dw1000.radio import IDLE, LISTENING
 from skyless.radio.serial import link

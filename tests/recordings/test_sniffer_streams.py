@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.core.air.masterless_packets import Packet
-from skyless.core.input_files import CHUNK_BYTES, open_source
+from skyless.files import CHUNK_BYTES, open_source
 from skyless.radio.foreign import bitcraze
 from skyless.research.foreign import crazyflie as bitcraze_captures
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import skyless
-from skyless.core.arguments import tag_count
+from skyless.arguments import tag_count
 from skyless.core.errors import SkylessError
 from skyless.core.site import FloorSite
 from skyless.sim.evaluation.scenarios import CARRIED_M, patrols

@@ -7,9 +7,9 @@ import pytest
 from textbook_bound import LAB, RAISED, SLOT_S, STAMP_S, positions, settings_of, textbook, walk
 
 from dense_covariance import position_covariance
-from skyless.core.processors import cores
 from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covariance
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
+from skyless.machine import cores
 from skyless.research.studies.efficiency import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path
 from skyless.research.uncertainty import BoundSettings, tracking_bound
 from skyless.sim.world import paper_lab_site

@@ -23,7 +23,7 @@ from msgspec import Struct
 from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl, floored
 from skyless.core.earth import geodetic, rotated
 from skyless.core.errors import SkylessError
-from skyless.core.extras import what_to_install
+from skyless.machine import what_to_install
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, Matrix, TagHealth, Vector
 
 # From fixes to messages of ROS 2: names of topics, types, and the bytes of each message.

@@ -18,7 +18,7 @@ from msgspec import Struct
 from skyless.bridges.ros2 import RosEncoder, RosMessage, RosSettings
 from skyless.bridges.target import bridged_site, is_usable
 from skyless.core.errors import ConfigurationError, SkylessError, writing
-from skyless.core.extras import extra_module
+from skyless.machine import extra_module
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, SiteMessage, TagHealth, TruthMessage
 from skyless.run.recordings.recording import NS, McapRecording, Recorded
 

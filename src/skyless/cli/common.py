@@ -14,9 +14,9 @@ import msgspec
 from cyclopts import Parameter
 from msgspec import NODEFAULT
 
-from skyless.core.arguments import OptionError, OptionField, Options, option_field, option_fields, option_helps
+from skyless.arguments import OptionError, OptionField, Options, option_field, option_fields, option_helps
 from skyless.core.errors import SkylessError, writing
-from skyless.core.whole_files import whole_file, write_whole
+from skyless.files import whole_file, write_whole
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -192,7 +192,7 @@ def say_written(path: Path) -> None:
     print(f"wrote {path}", file=sys.stderr)
 
 
-# Command lines made of structs of options (``skyless.core.arguments``), and checks of files that commands write.
+# Command lines made of structs of options (``skyless.arguments``), and checks of files that commands write.
 
 
 class JsonOptions(Options, frozen=True, kw_only=True):

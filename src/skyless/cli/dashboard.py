@@ -11,7 +11,7 @@ from cyclopts import App, Parameter
 from skyless.cli.common import command, print_json
 from skyless.cli.nodes.options import HubUrl, MqttOptions, SiteId, hub_address, listen_address, site_named
 from skyless.core.errors import SkylessError
-from skyless.core.extras import extra_module
+from skyless.machine import extra_module
 
 if TYPE_CHECKING:
     from collections.abc import Coroutine

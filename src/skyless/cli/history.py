@@ -19,6 +19,7 @@ from matplotlib.figure import Figure
 from msgspec import Struct
 from msgspec.structs import asdict
 
+from skyless.arguments import Option, Options, Positive, whole
 from skyless.cli.common import (
     NO_FIX,
     check_folder,
@@ -30,9 +31,8 @@ from skyless.cli.common import (
     write_picture,
 )
 from skyless.cli.nodes.options import MqttOptions, SiteId, log
-from skyless.core.arguments import Option, Options, Positive, whole
 from skyless.core.errors import SkylessError
-from skyless.core.extras import extra_module
+from skyless.machine import extra_module
 from skyless.run.history.answers import THINNED_GAP_S
 from skyless.site.report import BLUE, MAP, MUTED, panel, report_style
 

@@ -16,8 +16,8 @@ from cyclopts import App, CycloptsError, Group, Parameter, UnknownCommandError
 from cyclopts.help import DefaultFormatter
 
 from skyless.core.errors import SkylessError
-from skyless.core.extras import what_to_install
 from skyless.core.version import installed_version
+from skyless.machine import what_to_install
 
 if TYPE_CHECKING:
     from cyclopts.help import HelpPanel

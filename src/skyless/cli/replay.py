@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 from cyclopts import App
 from msgspec.structs import replace
 
+from skyless.arguments import existing_file
 from skyless.cli.common import (
     NO_FIX,
     USER_ERROR,
@@ -24,7 +25,6 @@ from skyless.cli.common import (
     progress_bar,
     write_picture,
 )
-from skyless.core.arguments import existing_file
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import METHODS, SNAPSHOTS
 from skyless.research.replays.options import ReplayOptions

@@ -10,6 +10,7 @@ import numpy as np
 from cyclopts import App
 from msgspec.structs import replace
 
+from skyless.arguments import number, numbers, read_height, whole
 from skyless.cli.common import (
     JsonOptions,
     check_folder,
@@ -25,7 +26,6 @@ from skyless.cli.nodes.options import SiteId
 from skyless.core.air.almanac import OFFERED_HZ
 from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
 from skyless.core.any_receiver import beacon_period_s
-from skyless.core.arguments import number, numbers, read_height, whole
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import RADIO_REACH_M, anchors_in_reach
 from skyless.core.protocol1.beacon import first_slots, schedule_of

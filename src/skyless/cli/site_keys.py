@@ -17,9 +17,9 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from cyclopts import App
 from msgspec.structs import replace
 
+from skyless.arguments import Options, number
 from skyless.cli.common import JsonOptions, command, console, print_facts, print_json, print_warnings, progress_bar
 from skyless.cli.nodes.options import site_named
-from skyless.core.arguments import Options, number
 from skyless.core.errors import SkylessError, writing
 from skyless.core.keys.chain import (
     CERTIFICATE_SIGNATURE_BYTES,
@@ -31,9 +31,9 @@ from skyless.core.keys.chain import (
     ChainTiming,
     section_signatures,
 )
-from skyless.core.processors import cores
 from skyless.core.site import Site
-from skyless.core.whole_files import replace_files
+from skyless.files import replace_files
+from skyless.machine import cores
 from skyless.run.keys import (
     MAX_SERIAL,
     SITE_PRIVATE,

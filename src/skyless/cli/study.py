@@ -13,6 +13,7 @@ import msgspec
 from cyclopts import App
 from msgspec.structs import replace
 
+from skyless.arguments import Option, Options, Positive, Rule, Seed, Text, folder_to_write, numbers, point
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.common import (
     JsonOptions,
@@ -28,9 +29,8 @@ from skyless.cli.common import (
     to_json,
 )
 from skyless.core.air.site_pages import MAX_COORDINATE_M
-from skyless.core.arguments import Option, Options, Positive, Rule, Seed, Text, folder_to_write, numbers, point
 from skyless.core.errors import SkylessError
-from skyless.core.whole_files import write_whole
+from skyless.files import write_whole
 from skyless.research.replays.options import check_estimator, read_estimator
 
 if TYPE_CHECKING:

@@ -152,7 +152,7 @@ def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
 
     The last one is named first. Raises SkylessError.
     """
-    from skyless.core.whole_files import replace_files
+    from skyless.files import replace_files
     from skyless.run.survey.live_survey import kept_path
 
     with writing(out):

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from skyless.core.errors import SkylessError
-from skyless.core.whole_files import replace_files
+from skyless.files import replace_files
 from skyless.page.events import Kept
 from skyless.page.state import encode
 from skyless.run.assets import assets_at, check_assets, read_assets, read_csv, write_csv

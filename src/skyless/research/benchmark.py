@@ -21,7 +21,7 @@ from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.arrays import Array, Matrix, Vector
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.fix import Fix
-from skyless.core.whole_files import replace_files, write_whole
+from skyless.files import replace_files, write_whole
 from skyless.research.calibration.biases import biases_of, tdoas_of
 from skyless.research.calibration.options import SurveyOptions
 from skyless.research.foreign.formats import format_of, open_recording

@@ -26,8 +26,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError, writing
-from skyless.core.extras import how_to_install
-from skyless.core.whole_files import replace_files
+from skyless.files import replace_files
+from skyless.machine import how_to_install
 from skyless.run.gather.node import PING_INTERVAL, Leaf
 from skyless.run.gather.streams import DOMAIN, MAX_PAYLOAD, NAME_REQUESTS, PAGE_INBOX, NatsAddress, at
 from skyless.run.gather.streams import FIRST_PORT as FIRST_NATS_PORT

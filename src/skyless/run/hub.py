@@ -20,7 +20,7 @@ from nats.js.api import ExternalStream, StreamConfig, StreamSource
 from nats.js.errors import NotFoundError
 
 from skyless.core.errors import SkylessError, writing
-from skyless.core.whole_files import replace_files
+from skyless.files import replace_files
 from skyless.run.broker import Broker
 from skyless.run.find_site import KnownSites
 from skyless.run.gather import streams

@@ -42,7 +42,7 @@ from skyless.core.keys.chain import (
 )
 from skyless.core.keys.verifier import Fault
 from skyless.core.trusted_receiver import SiteTrust, TrustedReceiver
-from skyless.core.whole_files import write_whole
+from skyless.files import write_whole
 from skyless.run.process import Log
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import IO, Final
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
-from skyless.core.whole_files import replace_files
+from skyless.files import replace_files
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage

@@ -21,7 +21,7 @@ from skyless.core.air.masterless_packets import Point
 from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.arrays import Array
 from skyless.core.errors import ConfigurationError
-from skyless.core.input_files import finite, read_lines
+from skyless.files import finite, read_lines
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.site.survey.facts import PairRanges
 from skyless.site.survey.legs import mean_ranges

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 import numpy as np
 from msgspec import Struct
 
+from skyless.arguments import wrong
 from skyless.core.air.masterless_packets import Packet, PairTdoa
-from skyless.core.arguments import wrong
 from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
-from skyless.core.extras import extra_module
 from skyless.core.fix import Fix
 from skyless.core.site import Site
+from skyless.machine import extra_module
 from skyless.sim.evaluation.figures import axes_std_m
 from skyless.site.planning.links import Floor
 from skyless.site.planning.maps import PlanMap

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from skyless.core.arguments import (
+from skyless.arguments import (
     ComputedOptions,
     Method,
     Option,

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
+from skyless.arguments import check_choice, check_whole, process_noise, python_function, wrong
 from skyless.cli.api.fixes import FloorResult, data_frame
 from skyless.cli.api.options import PlanOptions
 from skyless.cli.common import cm
-from skyless.core.arguments import check_choice, check_whole, process_noise, python_function, wrong
 from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import Box

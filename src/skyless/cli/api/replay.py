@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 from msgspec.structs import replace
 
+from skyless.arguments import python_function, wrong
 from skyless.cli.api.fixes import Fixes, FixRecorder, MeasurementRecorder, Measurements, Result
 from skyless.cli.common import cm
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
-from skyless.core.arguments import python_function, wrong
 from skyless.core.arrays import Matrix
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.fix import Fix

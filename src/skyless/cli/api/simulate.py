@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 from msgspec.structs import replace
 
+from skyless.arguments import check_choice, process_noise, python_function
 from skyless.cli.api.fixes import Fixes, FixRecorder, Result, data_frame, figures
 from skyless.cli.api.options import SimulateOptions, StudyOptions
 from skyless.cli.common import cm
-from skyless.core.arguments import check_choice, process_noise, python_function
 from skyless.core.arrays import Vector
 from skyless.core.errors import SkylessError
 from skyless.core.integrity import RISK

@@ -12,9 +12,9 @@ from matplotlib.patches import Ellipse
 from msgspec import Struct
 from msgspec.structs import replace
 
+from skyless.arguments import python_function
 from skyless.cli.api.fixes import Result, data_frame, figures
 from skyless.cli.common import cm
-from skyless.core.arguments import python_function
 from skyless.core.arrays import Integers, Vector
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site

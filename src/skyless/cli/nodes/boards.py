@@ -13,18 +13,7 @@ import msgspec
 from cyclopts import App
 from msgspec.structs import asdict, fields, replace
 
-from skyless.cli.common import JsonOptions, command, print_json, status
-from skyless.cli.nodes.options import (
-    MqttOptions,
-    SiteId,
-    WalkingSpeed,
-    check_live,
-    listen_address,
-    log,
-    run_until_stopped,
-    site_named,
-)
-from skyless.core.arguments import (
+from skyless.arguments import (
     Option,
     Options,
     Picoseconds,
@@ -37,6 +26,17 @@ from skyless.core.arguments import (
     tag_count,
     whole,
     wrong,
+)
+from skyless.cli.common import JsonOptions, command, print_json, status
+from skyless.cli.nodes.options import (
+    MqttOptions,
+    SiteId,
+    WalkingSpeed,
+    check_live,
+    listen_address,
+    log,
+    run_until_stopped,
+    site_named,
 )
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import from_seconds

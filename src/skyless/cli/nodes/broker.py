@@ -11,11 +11,11 @@ from typing import Annotated
 from cyclopts import App, Parameter
 from msgspec.structs import replace
 
+from skyless.arguments import Options, Text, number, whole, wrong
 from skyless.cli.common import JsonOptions, command, make_folder, print_json, print_table
 from skyless.cli.nodes.options import GatherOptions, listen_address, log, run_until_stopped
-from skyless.core.arguments import Options, Text, number, whole, wrong
 from skyless.core.errors import SkylessError
-from skyless.core.extras import extra_module
+from skyless.machine import extra_module
 from skyless.run.broker import FIRST_PORT, Broker, BrokerSettings, start_broker
 from skyless.run.find_site import SiteOnBroker, watch_sites
 from skyless.run.gather.node import Leaf, StuckLineError, read_json

@@ -18,17 +18,17 @@ from cyclopts import Parameter
 from msgspec import Struct
 from msgspec.structs import replace
 
+from skyless.arguments import Method, Picoseconds, Positive, Seed, TagCount, tag_count, whole
 from skyless.cli.common import make_folder
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, site_named
 from skyless.cli.nodes.site_view import SiteView
 from skyless.core.any_receiver import beacon_period_s
-from skyless.core.arguments import Method, Picoseconds, Positive, Seed, TagCount, tag_count, whole
 from skyless.core.errors import SkylessError
-from skyless.core.extras import extra_module
 from skyless.core.integrity import Alert
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import AlarmRule, FloorPlanSite, GeoreferenceSite, Site
-from skyless.core.whole_files import replace_files
+from skyless.files import replace_files
+from skyless.machine import extra_module
 from skyless.page.condition.evidence import Health, ProcessorUse
 from skyless.run.broker import Broker, BrokerSettings, start_broker
 from skyless.run.fix_log import Latencies

@@ -8,12 +8,12 @@ from typing import Annotated, Any, Final
 
 from cyclopts import Parameter
 
+from skyless.arguments import Options, number, read_numbers, whole
 from skyless.cli.common import plain
-from skyless.core.arguments import Options, number, read_numbers, whole
 from skyless.core.errors import SkylessError
-from skyless.core.extras import extra_module
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import AccuracySite, Site
+from skyless.machine import extra_module
 from skyless.run.broker import running_broker
 from skyless.run.gather.streams import NatsAddress, nats_address
 from skyless.run.mqtt.address import MqttAddress, mqtt_address

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 from cyclopts import App
 
+from skyless.arguments import Positive
 from skyless.cli.common import (
     NO_FIX,
     JsonOptions,
@@ -20,7 +21,6 @@ from skyless.cli.common import (
     with_status,
 )
 from skyless.cli.nodes.options import SiteOptions, log
-from skyless.core.arguments import Positive
 from skyless.core.errors import SkylessError
 from skyless.run.find_site import find_site
 from skyless.run.mqtt.address import MqttAddress

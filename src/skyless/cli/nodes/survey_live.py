@@ -6,9 +6,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from skyless.arguments import Options, Positive
 from skyless.cli.common import with_status
 from skyless.cli.nodes.options import MqttCa, SiteId, log, run_until_stopped
-from skyless.core.arguments import Options, Positive
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site
 from skyless.research.calibration.options import SurveyOptions

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TextIO
 from cyclopts import App, Parameter
 from msgspec.structs import replace
 
+from skyless.arguments import Method, NotNegative, Options, Positive, Text, number, process_noise, read_height
 from skyless.bridges.program import TagBridge, heard_site
 from skyless.cli.common import JsonOptions, cm, command, print_json, to_json
 from skyless.cli.nodes.bridge import hub_of
 from skyless.cli.nodes.options import MqttOptions, SiteId, log, run_until_stopped, site_named
-from skyless.core.arguments import Method, NotNegative, Options, Positive, Text, number, process_noise, read_height
 from skyless.core.errors import SkylessError
 from skyless.core.integrity import Alert
 from skyless.core.method_names import DEFAULT_METHOD, Dynamics

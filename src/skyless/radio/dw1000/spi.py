@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from skyless.core.errors import SkylessError
-from skyless.core.extras import extra_module
+from skyless.machine import extra_module
 from skyless.radio.dw1000.radio import ChipError, Dw1000Radio
 
 START_HZ: Final = 2_000_000

@@ -8,8 +8,8 @@ from struct import Struct as Layout
 from typing import Final
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
-from skyless.core.input_files import Drops, chunks, lines
 from skyless.core.ticks import TICK_M
+from skyless.files import Drops, chunks, lines
 
 # Payloads of Bitcraze's loco positioning anchors, TDoA2 and TDoA3, to packets.
 #

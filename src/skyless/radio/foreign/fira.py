@@ -8,9 +8,9 @@ from typing import Final, Literal
 
 from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.earth import east_north_up_of
-from skyless.core.input_files import Drops, chunks, lines
 from skyless.core.site import GeoreferenceSite
 from skyless.core.ticks import TICK_BITS, difference, wrap
+from skyless.files import Drops, chunks, lines
 from skyless.radio.foreign.uci import (
     CONTROL_HEADER_BYTES,
     STATUS_OK,

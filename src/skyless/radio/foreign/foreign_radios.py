@@ -11,8 +11,8 @@ from msgspec import structs
 
 from skyless.core.air.frame import MAX_FRAME_BYTES, Diagnostics, Reception, Transmission
 from skyless.core.air.masterless_packets import Packet, Point
-from skyless.core.input_files import Drops, LineCutter
 from skyless.core.ticks import wrap
+from skyless.files import Drops, LineCutter
 from skyless.radio.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
 from skyless.radio.foreign.fira import AnchorFrame, DtTag
 from skyless.radio.foreign.uci import UciReader

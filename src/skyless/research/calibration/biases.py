@@ -17,9 +17,9 @@ from msgspec.structs import replace
 from skyless.core.air.frame import Reception
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.errors import ConfigurationError, SkylessError
-from skyless.core.input_files import Drops, open_source
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_BITS, Unwrapper, to_seconds
+from skyless.files import Drops, open_source
 from skyless.research.calibration.options import First, Stay, SurveyOptions
 from skyless.research.foreign import datasets
 from skyless.research.foreign.formats import FORMATS, Recording, format_of, open_recording

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.air.site_pages import MAX_COORDINATE_M
-from skyless.core.arguments import (
+from skyless.arguments import (
     Option,
     Rule,
     Text,
@@ -22,6 +21,7 @@ from skyless.core.arguments import (
     sequence,
     wrong,
 )
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import Site
 from skyless.research.replays.options import RecordingOptions

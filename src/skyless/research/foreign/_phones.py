@@ -25,8 +25,8 @@ import msgspec
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import Packet, Point
-from skyless.core.input_files import Drops, lines
 from skyless.core.ticks import TICK_BITS, TICK_RATE_HZ, wrap
+from skyless.files import Drops, lines
 from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.uci import DtMessage, DtMessageType, DtRounds, GeodeticPoint, host_time_s
 

@@ -24,8 +24,8 @@ import yaml
 
 from skyless.core.air.masterless_packets import Packet, PairTdoa
 from skyless.core.arrays import Array
-from skyless.core.input_files import Drops, chunks, open_source
 from skyless.core.ticks import TICK_BITS
+from skyless.files import Drops, chunks, open_source
 from skyless.radio.foreign.bitcraze import decode_payload
 from skyless.site.tables import HEIGHT_STD_M, Truth
 

@@ -29,8 +29,8 @@ from numpy.typing import NDArray
 
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point, Relay
 from skyless.core.arrays import Array
-from skyless.core.input_files import Drops, has_columns, open_source, rows
 from skyless.core.ticks import TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S, difference, wrap
+from skyless.files import Drops, has_columns, open_source, rows
 from skyless.research.foreign.crazyflie import heights_of, in_order
 from skyless.site.survey.legs import TwoWayRanging
 from skyless.site.tables import Truth

@@ -13,8 +13,8 @@ from typing import Final
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arrays import Array
 from skyless.core.errors import ConfigurationError
-from skyless.core.input_files import Drops, has_columns, header_of, open_source, read_head
 from skyless.core.ticks import TICK_BITS
+from skyless.files import Drops, has_columns, header_of, open_source, read_head
 from skyless.radio.foreign import bitcraze, fira
 from skyless.research.foreign import _phones as phones
 from skyless.research.foreign import crazyflie, datasets

@@ -15,7 +15,6 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
-from skyless.core.processors import cores
 from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.snapshots import (
@@ -28,6 +27,7 @@ from skyless.core.protocol1.snapshots import (
 )
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_M, TICK_S
+from skyless.machine import cores
 from skyless.research.uncertainty import Chain, Reference
 from skyless.sim.evaluation.figures import FirstFixes
 from skyless.sim.evaluation.fleet import world_of

@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
-from skyless.core.whole_files import replace_files
+from skyless.files import replace_files
 from skyless.research.paper import _checks as checks
 from skyless.research.paper import _claim as claim
 from skyless.research.paper import _distributions as distributions

@@ -11,8 +11,8 @@ from typing import Any, Final
 import numpy as np
 from msgspec import Struct, field, structs
 
+from skyless.arguments import process_noise
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
-from skyless.core.arguments import process_noise
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason

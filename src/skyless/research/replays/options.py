@@ -12,9 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from skyless.core.air.masterless_packets import Point
-from skyless.core.air.site_pages import MAX_COORDINATE_M
-from skyless.core.arguments import (
+from skyless.arguments import (
     ComputedOptions,
     Method,
     NotNegative,
@@ -33,6 +31,8 @@ from skyless.core.arguments import (
     read_numbers,
     wrong,
 )
+from skyless.core.air.masterless_packets import Point
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.arrays import Matrix, Vector
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.geometry import GUESSED_STD_M, plane_height_m

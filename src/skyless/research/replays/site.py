@@ -16,13 +16,13 @@ from skyless.core.air.masterless_packets import Packet
 from skyless.core.any_receiver import AnyReceiver, decode_any
 from skyless.core.errors import ConfigurationError
 from skyless.core.fix import Fix
-from skyless.core.input_files import Drops
 from skyless.core.integrity import RISK, IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD, METHODS
 from skyless.core.protocol1 import beacon as protocol1_codec
 from skyless.core.site import Site
 from skyless.core.tag.receiver import NOT_DROPS
 from skyless.core.ticks import WRAP_TICKS, wrap
+from skyless.files import Drops
 from skyless.research.replays.captures import ReplayReport, common_figures
 from skyless.run.mqtt.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart, fix_message
 from skyless.run.recordings.recorder import RefusedError, load

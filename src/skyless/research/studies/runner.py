@@ -28,11 +28,10 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
-from skyless.core.extras import extra_module
 from skyless.core.integrity import RISK
-from skyless.core.processors import cores
 from skyless.core.version import installed_version, program_digest
-from skyless.core.whole_files import write_whole
+from skyless.files import write_whole
+from skyless.machine import cores, extra_module
 
 # What a study is: independent cells of work, and rows of a table that come of their results.
 

@@ -21,7 +21,7 @@ from nats.js.api import ConsumerConfig, DeliverPolicy, StreamConfig
 from nats.js.errors import APIError, NotFoundError
 
 from skyless.core.errors import SkylessError
-from skyless.core.extras import extra_module
+from skyless.machine import extra_module
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, hide_password, tls_context
 from skyless.run.process import Log
 

@@ -25,11 +25,11 @@ import pyarrow
 from numpy.typing import NDArray
 from pyarrow import parquet
 
-from skyless.core.arguments import check_number
+from skyless.arguments import check_number
 from skyless.core.earth import coordinates, feature
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
-from skyless.core.whole_files import whole_file
+from skyless.files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
 from skyless.run.history.answers import (
     GAP_S,

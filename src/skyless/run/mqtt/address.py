@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from paho.mqtt.client import topic_matches_sub
 
 from skyless.core.errors import SkylessError, writing
-from skyless.core.whole_files import replace_files
+from skyless.files import replace_files
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.topics import EVERY_NODE, EVERY_SITE
 

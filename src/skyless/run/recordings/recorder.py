@@ -18,11 +18,11 @@ from skyless.core.air.frame import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver, AnyReceiverState
 from skyless.core.arrays import Array
 from skyless.core.errors import ConfigurationError, SkylessError
-from skyless.core.input_files import Drops
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import GeoreferenceSite
 from skyless.core.tag.receiver import ReceiverState, TagReceiver
 from skyless.core.version import installed_version
+from skyless.files import Drops
 from skyless.run.foxglove import SCENE_TOPIC, ellipse, foxglove_schema, location_fix, pose_in_frame, scene, schema_of
 from skyless.run.mqtt.messages import (
     FixMessage,

@@ -21,8 +21,8 @@ from msgspec import Struct
 
 from skyless.core.air.frame import Reception
 from skyless.core.errors import ConfigurationError
-from skyless.core.input_files import Drops
 from skyless.core.ticks import TICK_S, Unwrapper
+from skyless.files import Drops
 from skyless.run.mqtt import messages
 from skyless.run.mqtt.messages import (
     FixMessage,

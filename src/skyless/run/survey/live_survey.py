@@ -17,7 +17,7 @@ from msgspec.structs import asdict, replace
 from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import SkylessError, writing
 from skyless.core.site import FloorPlanSite, Site
-from skyless.core.whole_files import replace_files
+from skyless.files import replace_files
 from skyless.run.mqtt.messages import (
     StampsMessage,
     SurveyFactsMessage,

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from msgspec import Struct
 
-from skyless.core.air.site_pages import MAX_COORDINATE_M
-from skyless.core.arguments import (
+from skyless.arguments import (
     ComputedOptions,
     Method,
     NotNegative,
@@ -29,6 +28,7 @@ from skyless.core.arguments import (
     whole,
     wrong,
 )
+from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD, METHODS, PROTECTED, Dynamics
 

@@ -9,7 +9,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import ArrayLike
 
-from skyless.core.arguments import TagCount
+from skyless.arguments import TagCount
 from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import rectangle_of

@@ -13,7 +13,7 @@ from typing import Any, Final
 import msgspec
 from msgspec import Struct
 
-from skyless.core.arguments import existing_file, wrong
+from skyless.arguments import existing_file, wrong
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import (
     AccuracySite,

@@ -1,5 +1,6 @@
-"""Libraries that an extra of the package brings, and which one where a library is not installed."""
+"""What this computer has: the extras of Skyless that are installed, and processors."""
 
+import os
 import sys
 from importlib import import_module
 from pathlib import Path
@@ -52,3 +53,11 @@ def extra_module(name: str, what: str) -> ModuleType:
         return import_module(name)
     except ImportError as error:
         raise SkylessError(what_to_install(error, what)) from None
+
+
+# How many processors there are to compute with.
+
+
+def cores() -> int:
+    """Processors that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
