@@ -1,7 +1,7 @@
 """What a target is: a program or device of another kind that gets a site's fixes, named by an address.
 
 An address is ``SCHEME://HOST:PORT?KEY=VALUE`` or ``SCHEME:PATH?KEY=VALUE``. A target whose readers get bytes consists
-of an ``Encoder``, which does no I/O, and a sender (``_senders.py``).
+of an ``Encoder``, which does no I/O, and a sender (``targets.py``).
 """
 
 import os

@@ -1,7 +1,7 @@
 """The live site: messages from MQTT update its state and its zones. Open pages are sent what is new, 20 times a second.
 
 Everything here belongs to one event loop. From the same messages ``condition`` finds what is wrong at the site, and
-``_events.py`` lists what has happened.
+``events.py`` lists what has happened.
 """
 
 import asyncio

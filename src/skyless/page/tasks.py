@@ -1,4 +1,4 @@
-"""What the server has computed by processes of their own (``task_process.py``)."""
+"""What the server has computed by processes of their own."""
 
 import asyncio
 import os

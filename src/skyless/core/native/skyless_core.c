@@ -7056,7 +7056,7 @@ INTERNAL bool have_most_moved(Tag *t) {
 
 /* Process a frame from the air; what becomes of it.
  *
- * That is one of ``DROP_COUNTERS``, of ``course.py``, ``following.py`` or ``changes.py``, or ``MALFORMED`` and more.
+ * That is one of ``DROP_COUNTERS``, of ``following.py`` or this file, or ``MALFORMED`` and more.
  * ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. */
 SKYLESS_EXPORT int32_t skyless_hear_frame(Tag *t, State *s, Acquisition *q, uint8_t *frame, int32_t length, int64_t
         rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles) {

@@ -216,7 +216,7 @@ def _widen(c: Course, axis: int) -> None:
 
 
 START_FIX, SEARCHING, HAS_TOO_FEW, IS_MIRRORED, IS_UNSETTLED = range(25, 30)
-"""What becomes of a packet besides (``course.py``): a fix that is a start's alone (``Course.alone``), or why there is
+"""What becomes of a packet besides: a fix that is a start's alone (``Course.alone``), or why there is
 no start yet."""
 
 MAX_BEGINNING: Final = 2 * MAX_ANCHORS

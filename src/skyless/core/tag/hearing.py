@@ -306,7 +306,7 @@ def hear_frame(
 ) -> int:
     """Process a frame from the air; what becomes of it.
 
-    That is one of ``DROP_COUNTERS``, of ``course.py``, ``following.py`` or ``changes.py``, or ``MALFORMED`` and more.
+    That is one of ``DROP_COUNTERS``, of ``following.py`` or this file, or ``MALFORMED`` and more.
     ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known.
     """
     fault = read_frame(frame, length, t.beacon)

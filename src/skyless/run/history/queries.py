@@ -1,6 +1,6 @@
 """Questions to the history of a site: ways, times in cells and zones, contacts, alarms; and its fixes as a file.
 
-DuckDB reads the files, and PyArrow where a question needs all rows (``_scans.py``). Rows that are in the journal only,
+DuckDB reads the files, and PyArrow where a question needs all rows. Rows that are in the journal only,
 those of the last ten minutes or so, are not known yet.
 """
 

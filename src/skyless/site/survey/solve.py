@@ -1,7 +1,7 @@
 """A survey: positions and delays of all anchors from the ranges of their pairs and what the user knows.
 
-Counting comes first: only anchors with enough ranges are fitted. The fit finds a shape (``_shape.py``), which is moved
-to its frame (``_frame.py``); then follows what is not determined (``_findings.py``).
+Counting comes first: only anchors with enough ranges are fitted. The fit finds a shape (``shape.py``), which is moved
+to its frame (``frame.py``); then follows what is not determined (``shape.py``).
 
 Where positions are given and stay, only delays are sought. Positions are held in the fit, and their errors count as
 errors of the ranges. Delays then make up for a part of the positions' errors: they are farther from the truth than
