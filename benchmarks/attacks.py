@@ -32,14 +32,14 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.integrity import Alert
+from skyless.core.alert import Alert
 from skyless.core.site import ScheduleSite, Site
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, Room
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.streams import stream
-from skyless.sim.world import lab_site, paper_lab_site
 from support.adversary import FORGERIES, Forgery, any_forgery
 from support.keyed_air import (
     Attack,

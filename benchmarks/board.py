@@ -35,7 +35,7 @@ from skyless.research.studies import integrity, lab, room
 from skyless.research.studies.runner import plan_of
 from skyless.research.studies.worlds import Heard, beacons_of, worlds
 from skyless.sim.evaluation.scenarios import Request, Room, trajectories_of, wanderers
-from skyless.sim.world import ideal_lab_site, lab_site
+from skyless.sim.lab import ideal_lab_site, lab_site
 
 HERE = Path(__file__).parents[1]
 LAUNCHERS = {

@@ -35,8 +35,8 @@ from skyless.research.studies.runner import Plan, plan_of
 from skyless.research.studies.worlds import Run, beacons_of, judged, worlds
 from skyless.sim.evaluation.scenarios import Room, wanderers
 from skyless.sim.impairments import AnchorBias, Body
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.trajectory import Trajectory, Waypoints
-from skyless.sim.world import lab_site, paper_lab_site
 from skyless.site.file.template import rectangular_site
 
 OFF = 1e12

@@ -41,7 +41,7 @@ from skyless.radio.tag_reports import BoardFix, BoardStatus
 from skyless.run import anchor
 from skyless.sim.evaluation.fleet import compile_kernels, world_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
-from skyless.sim.world import lab_site, paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 
 PAGE = Path(__file__).parents[1] / "docs" / "hardware.md"
 PLACE = re.compile(r"(<!-- cycles: benchmarks/firmware.py cycles --write -->\n).*?(<!-- end -->)", re.DOTALL)

@@ -21,17 +21,9 @@ import pyarrow as pa
 
 from skyless.core.errors import SkylessError
 from skyless.run.history.answers import Span
-from skyless.run.history.layout import (
-    EVENT_COLUMNS,
-    FIX_COLUMNS,
-    NAME_COLUMNS,
-    ZONE_COLUMNS,
-    file_name,
-    schema_of,
-    site_folder,
-    write_table,
-)
+from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, file_name, site_folder
 from skyless.run.history.queries import History
+from skyless.run.history.tables import schema_of, write_table
 
 SITE, TAGS, HOUR_S = 1, 500, 3600
 HALL_M = np.array([100.0, 60.0])

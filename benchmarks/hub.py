@@ -33,11 +33,12 @@ import msgspec
 import numpy as np
 import psutil
 
+from skyless.page.gathered import Gathered
 from skyless.page.live import LiveSite
-from skyless.page.live2 import Gathered
 from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, decode_batch, encode_batch
-from skyless.run.gather import streams
-from skyless.run.gather.streams import NatsAddress, connect, messages
+from skyless.run.gather import subjects
+from skyless.run.gather.streams import messages
+from skyless.run.gather.subjects import NatsAddress, connect
 from skyless.run.mqtt.messages import FixMessage
 from support.hub_stage import SITE, Process, Stage, at_random
 from support.processes import free_node_port, free_port
@@ -81,7 +82,7 @@ async def publish_packed(client, rate, seconds, site):
         records["position_mm"][:, 0] = serials % 100_000
         sequence += 1
         data = encode_batch(Batch(run, sequence, round(1e6 * time.time()), TAGS, records))
-        subject = streams.at(streams.FIXES, site, "bench")
+        subject = subjects.at(subjects.FIXES, site, "bench")
         await client.publish(subject, data, headers={"Nats-Msg-Id": f"{run}-{sequence}"})
     return sequence * MAX_RECORDS
 
@@ -155,7 +156,7 @@ async def stored(url):
     """Rows in the stream, and whether the numbers of their batches are without a gap."""
     rows, sequences = 0, []
     client = await connect(NatsAddress(url), "bench", print, Counter())
-    async for message in messages(client.jetstream(), streams.at(streams.FIX_STREAM, SITE)):
+    async for message in messages(client.jetstream(), subjects.at(subjects.FIX_STREAM, SITE)):
         rows += len(decode_batch(message.data).records)
         sequences.append(message.metadata.sequence.stream)
     await client.close()

@@ -21,7 +21,8 @@ from msgspec.structs import replace
 
 from skyless.core.site import EXACT
 from skyless.research.studies.runner import Cell, run_cells, run_cells_on_dask
-from skyless.sim.evaluation.fleet import CellFleet, FleetSettings
+from skyless.sim.evaluation.cell_fleet import CellFleet
+from skyless.sim.evaluation.fleet import FleetSettings
 from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Roaming
 from skyless.site.file.template import grid_site

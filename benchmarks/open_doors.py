@@ -30,7 +30,7 @@ from skyless.run.mqtt.address import mqtt_address
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import FixMessage, ZoneEvent, site_message
 from skyless.run.process import end_with_parent
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 SKYLESS = (sys.executable, "-m", "skyless.cli.main")
 SITE = 1

@@ -36,7 +36,7 @@ from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, TagHealth
 from skyless.run.mqtt.topics import fix_topic, health_topic
 from skyless.run.process import end, end_with_parent
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 SITE, START_S, SETTLE_S, PRIORITY = lab_site(), 300.0, 5.0, -15
 SHOWN_SHARE = 0.02

@@ -39,8 +39,8 @@ from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.sim.world import lab_site, paper_lab_site
 from support.random_chain import draw_loop, random_chain
 
 NODES, SLOT_S, WARM_S = 7, 2.1e-3, 2.0

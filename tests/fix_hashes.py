@@ -28,7 +28,7 @@ from skyless.cli.main import main as skyless
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import AccuracySite
 from skyless.sim.evaluation.scenarios import Room
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 MACHINE = f"{llvmlite.binding.get_host_cpu_name()}, numba {numba.__version__}, numpy {np.__version__}"
 """On what hashes depend."""

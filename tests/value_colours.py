@@ -2,7 +2,7 @@
 
 import math
 
-from skyless.site.planning.picture import COLOUR_STOPS
+from skyless.site.planning.colours import COLOUR_STOPS
 
 
 def fraction_of(value, low, high):

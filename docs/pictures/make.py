@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Rectangle
 
 from skyless.core.air.frame import air_time_s
-from skyless.sim.world import lab_site, paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.report import BLUE, GREEN, GRID, INK, MUTED, ORANGE
 
 FOLDER = Path(__file__).parent

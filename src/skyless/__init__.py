@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from skyless.sim.evaluation.fleet import Fleet as Fleet
     from skyless.sim.evaluation.scenarios import Request as Request
     from skyless.sim.evaluation.scenarios import fleet_of as fleet_of
-    from skyless.sim.world import lab_site as lab_site
+    from skyless.sim.lab import lab_site as lab_site
     from skyless.site.file.load import load_site as load_site
 
     __version__: str

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.core.integrity import Alert
+from skyless.core.alert import Alert
 from skyless.core.site import AlarmRule
 from skyless.run import alarms as engine_module
 from skyless.run.alarms import CONFIRM_S, EVALUATION_S, STOREY_M, AlarmEngine, Concerned, is_over, near_tags

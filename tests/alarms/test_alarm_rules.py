@@ -14,7 +14,7 @@ from skyless.core.site import AlarmRule
 from skyless.page._alarms import read_rules
 from skyless.run.alarms import Concerned
 from skyless.run.mqtt.messages import AlarmRulesMessage, Asset, WrongMessageError, site_message
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.alarm_rules import MAX_RULES, BadAlarmRulesError, check_rules, read_hours
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template

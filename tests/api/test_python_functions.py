@@ -23,7 +23,7 @@ from skyless.research.studies.picture import Look
 from skyless.research.studies.run import STUDIES, _of_worlds
 from skyless.research.studies.runner import MEASURED
 from skyless.sim.impairments import AnchorBias
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import grid_site, site_template
 from skyless.site.planning.links import PLAN_COLUMNS

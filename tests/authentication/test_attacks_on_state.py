@@ -12,9 +12,10 @@ from skyless.core.air.frame import Reception
 from skyless.core.anchor import NO_KEYS_S, BeaconAuthentication
 from skyless.core.keys import chain, known_keys
 from skyless.core.keys.chain import SECTION_INTERVALS, earlier_key, mac_of
-from skyless.core.keys.verifier import Fault, Verifier
+from skyless.core.keys.fault import Fault
+from skyless.core.keys.verifier import Verifier
 from skyless.core.ticks import from_seconds, wrap
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 SITE_FILE = lab_site()
 OWN = 4

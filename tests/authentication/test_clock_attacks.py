@@ -14,7 +14,8 @@ from test_known_keys import CHAIN, FIRST, KEYS, PUBLIC, SITE, TIMING
 
 from skyless.core.anchor import BeaconAuthentication
 from skyless.core.keys.chain import SECTION_INTERVALS
-from skyless.core.keys.verifier import Fault, Verifier
+from skyless.core.keys.fault import Fault
+from skyless.core.keys.verifier import Verifier
 
 BOUND_S = 0.5 * ((TIMING.lag - 1) * TIMING.interval_s - TIMING.anchor_lead_s - TIMING.anchors_apart_s)
 """How far a tag's clock may be off without a genuine frame being refused."""

@@ -12,7 +12,7 @@ from skyless.bridges.target import Hub, bridged_site
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import Asset, AssetsMessage, site_message
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 FORKLIFT = Asset("tag1", "Forklift 1", "forklifts")
 NAMED = msgspec.structs.replace(SITE, assets={"tag1": FORKLIFT})

@@ -19,10 +19,10 @@ from skyless.bridges.target import (
     open_hub,
     require_georeference,
 )
+from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
-from skyless.core.integrity import Alert
 from skyless.run.mqtt.messages import StatusMessage
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 
 class Recorded(Target):

@@ -18,7 +18,7 @@ from skyless.run.history.layout import (
     file_name,
     site_folder,
 )
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.file.template import site_template
 
 pytestmark = pytest.mark.site

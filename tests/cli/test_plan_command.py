@@ -9,7 +9,7 @@ from matplotlib.image import imread, imsave
 
 from skyless.cli.main import main
 from skyless.core.site import AccuracySite
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
 

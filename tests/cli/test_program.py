@@ -12,7 +12,7 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.core.site import AccuracySite
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.site.file.template import site_template
 
 pytestmark = pytest.mark.site

@@ -14,7 +14,7 @@ import pytest
 import synthetic_recordings as synthetic
 from skyless.cli.main import main
 from skyless.run.recordings.recorder import McapFile
-from skyless.sim.world import lab_site, paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.file.template import site_template
 
 pytestmark = pytest.mark.site

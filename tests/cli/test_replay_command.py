@@ -19,7 +19,7 @@ import synthetic_recordings as synthetic
 from skyless.cli.main import main
 from skyless.cli.replay import FIXES_COLUMNS
 from skyless.core.site import AnchorSite, TagsSite
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.file.template import site_template
 
 pytestmark = pytest.mark.site

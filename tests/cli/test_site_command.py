@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.cli.main import main
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.file.load import load_site
 
 

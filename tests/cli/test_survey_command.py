@@ -17,9 +17,10 @@ from skyless.cli.main import main
 from skyless.core.errors import SkylessError
 from skyless.core.site import AnchorSite, ScheduleSite, Site
 from skyless.core.ticks import TICK_M
-from skyless.research.calibration.options import SurveyOptions, facts_of
+from skyless.research.calibration.facts import facts_of
+from skyless.research.calibration.options import SurveyOptions
 from skyless.sim.impairments import DelayError
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
 from skyless.site.survey.facts import Facts, Gauge, KnownDelay, Survey, Tape, count, read_record

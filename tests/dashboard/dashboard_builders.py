@@ -11,7 +11,7 @@ from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 SITE = SiteMessage(lab_site(100.0), simulated=True, unix_s=1000.0)
 SITE_ID = SITE.site.id

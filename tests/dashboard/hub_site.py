@@ -6,8 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
-from skyless.run.gather.streams import NatsAddress
-from skyless.run.hub import MONITOR_PORT, Hub, Node, with_sites, write_files
+from skyless.run.gather.subjects import NatsAddress
+from skyless.run.hub_files import MONITOR_PORT, Hub, Node, with_sites, write_files
 from support.processes import free_port
 
 SITE = 7

@@ -2,7 +2,7 @@
 
 import math
 
-from skyless.site.planning.picture import COLOUR_STOPS, scale_of
+from skyless.site.planning.colours import COLOUR_STOPS, scale_of
 
 WIDTH_M, DEPTH_M = 24.0, 14.0
 SLOT_S = 2.1e-3

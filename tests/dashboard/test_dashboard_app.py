@@ -21,7 +21,7 @@ from skyless.page.live import (
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import site_message
 from skyless.run.web import PAGE as LIMITS
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 pytestmark = pytest.mark.site
 

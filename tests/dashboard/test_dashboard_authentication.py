@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.core.keys.verifier import Fault
+from skyless.core.keys.fault import Fault
 from skyless.page.condition._reasons import authentication_reasons
 from skyless.page.condition.evidence import Evidence
 from skyless.run.mqtt.messages import AnchorHealth, Counters, TagHealth

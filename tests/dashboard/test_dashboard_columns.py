@@ -17,12 +17,13 @@ from skyless.page import live2
 from skyless.page import live2 as columns_module
 from skyless.page.app import Services, make_app
 from skyless.page.connections import AccessRules
+from skyless.page.gathered import Gathered
 from skyless.page.live import LiveSite
-from skyless.page.live2 import Columns, Gathered, View, anchors_message, conditions_message, tags_message
+from skyless.page.live2 import Columns, View, anchors_message, conditions_message, tags_message
 from skyless.page.sites import LiveSites
 from skyless.page.state import read_request
 from skyless.run.fix_batch import RECORD
-from skyless.run.gather.streams import NatsAddress
+from skyless.run.gather.subjects import NatsAddress
 
 VIEW = View((0.0, 0.0, 10.0, 5.0), (1000, 500))
 

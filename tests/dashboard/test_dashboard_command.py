@@ -15,7 +15,7 @@ from skyless.cli.main import main
 from skyless.core.errors import SkylessError
 from skyless.page.app import PORT, ListenAddress, bind
 from skyless.run.process import reserve
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from support.processes import free_port
 
 pytestmark = pytest.mark.site

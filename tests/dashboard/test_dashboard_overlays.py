@@ -13,9 +13,9 @@ from skyless.core.method_names import DEFAULT_METHOD, METHODS
 from skyless.core.site import AccuracySite, AnchorSite, FloorPlanSite, TagsSite
 from skyless.page.overlay_process import MAX_CELLS, grid_of, overlay
 from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, TaskProcess
-from skyless.sim.world import lab_site, paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
+from skyless.site.planning.colours import COLOUR_STOPS
 from skyless.site.planning.links import HDOP, PDOP, SIGMA
-from skyless.site.planning.picture import COLOUR_STOPS
 from skyless.site.planning.predict import PlanSettings, Predictor
 
 pytestmark = pytest.mark.site

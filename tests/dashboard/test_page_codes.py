@@ -5,7 +5,7 @@ import time
 import pytest
 from page_browser import until
 
-from skyless.core.keys.verifier import Fault
+from skyless.core.keys.fault import Fault
 
 pytestmark = pytest.mark.statistical
 

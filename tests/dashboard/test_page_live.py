@@ -8,7 +8,7 @@ import pytest
 from page_browser import THREE_FRAMES, until
 from PIL import Image
 
-from skyless.core.integrity import Alert
+from skyless.core.alert import Alert
 
 pytestmark = pytest.mark.statistical
 

@@ -14,7 +14,7 @@ import pytest
 from page_browser import THREE_FRAMES, until
 from PIL import Image
 
-from skyless.site.planning.picture import COLOUR_STOPS, scale_of
+from skyless.site.planning.colours import COLOUR_STOPS, scale_of
 from value_colours import colour_of
 
 pytestmark = pytest.mark.statistical

@@ -19,7 +19,7 @@ from skyless.core.estimator import compiled
 from skyless.core.estimator.process import REJECTED, STALE, BatchPacket, BatchRow, Place, Relay
 from skyless.core.estimator.state import State
 from skyless.core.native.library import SOURCE, source_digest
-from skyless.core.native.records import records
+from skyless.core.native.views import records
 from skyless.page.app import Services, make_app
 from skyless.page.connections import AccessRules
 from skyless.page.live import LiveSite

@@ -6,7 +6,8 @@ from msgspec.structs import replace
 from skyless.core.air.beacon import encode
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.site import EXACT
-from skyless.sim.evaluation.fleet import MAX_MACHINES, CellFleet, Fleet, FleetSettings, SiteBeacons
+from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet, SiteBeacons
+from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, fleet_of_any_size
 from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Roaming

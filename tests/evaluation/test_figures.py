@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from skyless.core.alert import Alert
 from skyless.core.fix import Fix
-from skyless.core.integrity import Alert, IntegrityRequirement
+from skyless.core.integrity import IntegrityRequirement
 from skyless.sim.evaluation.figures import (
     CHI2_95,
     KEPT_FIXES,

@@ -10,7 +10,7 @@ from skyless.core.errors import SkylessError
 from skyless.sim.evaluation.fleet import report
 from skyless.sim.evaluation.scenarios import Request, fleet_of, trajectories_of
 from skyless.sim.impairments import AnchorOutage, Outage
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 pytestmark = pytest.mark.site
 

@@ -19,8 +19,8 @@ from skyless.sim.evaluation.scenarios import (
     trajectories_of,
 )
 from skyless.sim.impairments import RangeErrorModel
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.trajectory import Roaming, Static
-from skyless.sim.world import lab_site, paper_lab_site
 
 pytestmark = pytest.mark.site
 

@@ -8,7 +8,7 @@ from scipy.stats import chi2
 
 from skyless.research.surveys.rooms import stamps_of
 from skyless.sim.impairments import lab_impairments
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 pytestmark = pytest.mark.site
 

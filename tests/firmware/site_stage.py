@@ -14,7 +14,7 @@ from msgspec.structs import replace
 
 from skyless.core.site import ScheduleSite
 from skyless.sim.evaluation.scenarios import Request, trajectories_of
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 LAB = paper_lab_site()
 

@@ -26,7 +26,7 @@ import wasm_core
 from skyless.core.estimator import process
 from skyless.core.estimator.process import BatchPacket, BatchRow, Place, Relay
 from skyless.core.estimator.state import State, covariances
-from skyless.core.native.records import records
+from skyless.core.native.views import records
 
 pytestmark = pytest.mark.site
 

@@ -20,10 +20,11 @@ from skyless.radio.serial.serial_radio import LinkSession
 from skyless.sim.dw1000.chip import Chip
 from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.medium import Timeline
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 
 pytestmark = pytest.mark.site
 

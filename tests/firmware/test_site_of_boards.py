@@ -28,8 +28,8 @@ from skyless.core.earth import geodetic
 from skyless.core.site import AnchorSite, GeoreferenceSite
 from skyless.core.ticks import from_seconds
 from skyless.radio.serial.link import OUTPUTS, BoardSettings, Writer
+from skyless.sim.lab import lab_site
 from skyless.sim.trajectory import Static
-from skyless.sim.world import lab_site
 from support.gpsd import GPSD
 from support.processes import free_port
 

@@ -11,7 +11,7 @@ from skyless.radio.serial.link import BoardSettings, Reader, decode
 from skyless.radio.tag_reports import BoardFix
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 pytestmark = [
     pytest.mark.site,

@@ -14,7 +14,7 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).parents[2] / "tools"))
 
 import compile_core
-from skyless.core.native import library, records
+from skyless.core.native import library, records, views
 
 SIZES = Path(__file__).parents[2] / "firmware" / "source" / "core_sizes.h"
 BY_HAND = f'-DSKYLESS_BY_HAND="{SIZES.with_name("core_by_hand.h")}"'
@@ -40,7 +40,7 @@ def use_board_sizes(real, folder):
         from skyless.core.estimator.estimator import Estimator
 
         # Fixes hold doubles.
-        Estimator.rows = property(lambda self: records.view(self.state.fix).astype("float64").tobytes())
+        Estimator.rows = property(lambda self: views.view(self.state.fix).astype("float64").tobytes())
 
 
 if __name__ == "__main__":

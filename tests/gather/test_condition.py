@@ -7,7 +7,7 @@ from msgspec.structs import replace
 from skyless.run.fix_batch import RECORD
 from skyless.run.gather.node import SiteCondition
 from skyless.run.mqtt.messages import StatusMessage, site_message
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 
 def a_condition():

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.core.integrity import Alert
+from skyless.core.alert import Alert
 from skyless.run.fix_batch import (
     ALERT_BITS,
     ALERTS,

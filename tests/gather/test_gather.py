@@ -18,20 +18,21 @@ from msgspec.structs import replace
 from nats.js.errors import NotFoundError
 
 from skyless.core.errors import SkylessError
+from skyless.page.gathered import Gathered
 from skyless.page.live import LiveSite
-from skyless.page.live2 import Gathered
 from skyless.page.sites import LiveSites
 from skyless.run.broker import BrokerSettings, nats_of, start_broker
 from skyless.run.fix_batch import MAX_RECORDS, RECORD, Batch, decode_batch, encode_batch
-from skyless.run.gather import streams
 from skyless.run.gather import streams as names_module
+from skyless.run.gather import subjects
 from skyless.run.gather.node import Gather, Summary
-from skyless.run.gather.streams import Names, NatsAddress, messages, nats_address
+from skyless.run.gather.streams import Names, messages
+from skyless.run.gather.subjects import NatsAddress, nats_address
 from skyless.run.mqtt.address import MqttAddress, create_access, mqtt_address, read_access
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import StatusMessage, site_message
 from skyless.run.mqtt.topics import fix_topic, status_topic
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from support.processes import SKYLESS, started
 from support.waiting import until
 
@@ -71,7 +72,7 @@ async def client_of(address):
 
 
 async def summaries(client):
-    return await client.subscribe(streams.at(streams.SUMMARY, SITE))
+    return await client.subscribe(subjects.at(subjects.SUMMARY, SITE))
 
 
 async def serving(client):
@@ -80,7 +81,7 @@ async def serving(client):
     await reading.next_msg(20)
     await reading.unsubscribe()
     async with asyncio.timeout(20):
-        while streams.at(streams.NAMES_STREAM, SITE) not in await stream_names(client):
+        while subjects.at(subjects.NAMES_STREAM, SITE) not in await stream_names(client):
             await asyncio.sleep(0.02)
 
 
@@ -100,7 +101,7 @@ async def stored(address, count, after=-1):
         stream, names = client.jetstream(), Names(client.jetstream(), SITE)
         while len(found) < count:
             with contextlib.suppress(NotFoundError):  # no gather has made it yet
-                async for message in messages(stream, streams.at(streams.FIX_STREAM, SITE), last):
+                async for message in messages(stream, subjects.at(subjects.FIX_STREAM, SITE), last):
                     last = message.metadata.sequence.stream
                     rows = enumerate(decode_batch(message.data).records, last * MAX_RECORDS)
                     found += [(number, int(row["tag"]), int(row["position_mm"][0])) for number, row in rows]
@@ -164,7 +165,7 @@ async def test_two_gathers_share_the_fixes_and_what_one_leaves_the_other_takes(t
         async with gathering(running.nats, keep_bytes=10**6) as (third, _), asyncio.timeout(20):
             while third._names is None:
                 await asyncio.sleep(0.02)
-        info = await client.jetstream().stream_info(streams.at(streams.FIX_STREAM, SITE))
+        info = await client.jetstream().stream_info(subjects.at(subjects.FIX_STREAM, SITE))
         assert info.config.max_bytes == 10**6
 
 
@@ -185,13 +186,13 @@ async def test_programs_that_give_numbers_at_once_give_each_once_and_duplicates_
             assert (names.issue, names.numbers) == (5, given[0].numbers)
         records = np.zeros(3, RECORD)
         records["tag"], records["position_mm"][:, 0] = 1, (7, 8, 9)
-        subject = streams.at(streams.FIXES, SITE, "elsewhere")
+        subject = subjects.at(subjects.FIXES, SITE, "elsewhere")
         for sequence in (1, 1, 2, 1):
             batch = Batch(5, sequence, 1, 1, records)
             await stream.publish(subject, encode_batch(batch), headers={"Nats-Msg-Id": batch.id})
         rows, _ = await stored(running.nats, 6)
         assert [x for _, _, x in rows] == [7, 8, 9] * 2
-        info = await stream.stream_info(streams.at(streams.FIX_STREAM, SITE))
+        info = await stream.stream_info(subjects.at(subjects.FIX_STREAM, SITE))
         assert info.config.max_bytes == KEEP_BYTES
         assert info.config.max_age == 24 * 3600
 
@@ -298,7 +299,7 @@ async def test_a_dashboard_reads_batches_and_names_with_the_role_of_a_page(tmp_p
             assert gathered.columns(SITE).names == {1: "a"}
         async with client_of(page) as reading:
             with pytest.raises(TimeoutError):
-                await reading.request("$JS.API.DIRECT.GET." + streams.at(streams.FIX_STREAM, SITE), timeout=0.5)
+                await reading.request("$JS.API.DIRECT.GET." + subjects.at(subjects.FIX_STREAM, SITE), timeout=0.5)
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
 
@@ -377,8 +378,9 @@ def test_without_a_gather_nothing_of_nats_is_loaded(modules):
 async def test_a_history_of_the_stream_has_each_fix_once_wherever_it_is_killed(tmp_path):
     """Rows that were taken and not stored are taken again; tags have the history's own numbers."""
     pytest.importorskip("pyarrow")
-    from skyless.run.history.layout import FIX_COLUMNS, NAME_COLUMNS, current_files, read_table
+    from skyless.run.history.layout import FIX_COLUMNS, NAME_COLUMNS, current_files
     from skyless.run.history.program import take_stream
+    from skyless.run.history.tables import read_table
     from skyless.run.history.writer import Writer
 
     folder = tmp_path / "history"

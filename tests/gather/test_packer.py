@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from skyless.run.fix_batch import MAX_RECORDS
 from skyless.run.gather import node as packer_module
-from skyless.run.gather import streams
+from skyless.run.gather import subjects
 from skyless.run.gather.node import Packer
 
 
@@ -55,8 +55,8 @@ def test_beyond_its_room_the_oldest_fixes_are_dropped_and_counted(monkeypatch):
 
 
 def test_subjects():
-    assert streams.at(streams.FIXES, 7, "hall") == "skyless.v2.7.fixes.hall"
-    assert streams.at(streams.FIXES, 7) == "skyless.v2.7.fixes.*"
-    assert streams.at(streams.NAMES, 7, 12) == "skyless.v2.7.names.12"
-    assert streams.tag_in("skyless.v1.7.tag.a//b.fix") == "a.b"
-    assert (streams.site_in("skyless.v1.7.site"), streams.site_in("skyless.v1.x.site")) == (7, None)
+    assert subjects.at(subjects.FIXES, 7, "hall") == "skyless.v2.7.fixes.hall"
+    assert subjects.at(subjects.FIXES, 7) == "skyless.v2.7.fixes.*"
+    assert subjects.at(subjects.NAMES, 7, 12) == "skyless.v2.7.names.12"
+    assert subjects.tag_in("skyless.v1.7.tag.a//b.fix") == "a.b"
+    assert (subjects.site_in("skyless.v1.7.site"), subjects.site_in("skyless.v1.x.site")) == (7, None)

@@ -6,7 +6,7 @@ import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.run.history.layout import EventLog
+from skyless.run.history.tables import EventLog
 from skyless.run.mqtt.messages import AlarmMessage, StatusMessage, ZoneEvent
 
 NOW_S = 1_795_154_400.0

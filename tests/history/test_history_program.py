@@ -37,7 +37,7 @@ from skyless.run.mqtt.topics import (
     zone_event_topic,
     zones_topic,
 )
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from support.processes import SKYLESS, free_port, running_program
 from support.waiting import until as until_
 

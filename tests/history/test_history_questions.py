@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pyarrow import parquet
 
+from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
-from skyless.core.integrity import Alert
 from skyless.core.site import GeoreferenceSite
 from skyless.run.history import queries
 from skyless.run.history.answers import GAP_S, AlarmRow, Contact, Dwell, Span

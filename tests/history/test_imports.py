@@ -15,7 +15,7 @@ from skyless.run.history.writer import Writer
 from skyless.run.mqtt.messages import SiteMessage, Zone, ZoneEvent, ZonesMessage
 from skyless.run.mqtt.topics import fix_topic, site_topic, zone_event_topic, zones_topic
 from skyless.run.recordings.recorder import McapFile, McapRecorder
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 SITE = 7
 ZONE = Zone("z1", "door", ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0)))

@@ -11,7 +11,8 @@ from pyarrow import parquet
 from test_writer import dying
 
 from skyless.run.fix_batch import records_of
-from skyless.run.history.layout import Event, current_events, current_files, file_name, fix_table, rows_of, site_folder
+from skyless.run.history.layout import current_events, current_files, file_name, rows_of, site_folder
+from skyless.run.history.tables import Event, fix_table
 from skyless.run.history.writer import Keep, Writer, thinned, tidy
 
 KEEP = Keep(days=30.0, full_days=7.0, event_days=60.0)

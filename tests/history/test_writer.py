@@ -15,15 +15,8 @@ from pyarrow import parquet
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import records_of
 from skyless.run.history import writer as writer_module
-from skyless.run.history.layout import (
-    FIX_COLUMNS,
-    Event,
-    current_events,
-    current_files,
-    fix_table,
-    rows_of,
-    site_folder,
-)
+from skyless.run.history.layout import FIX_COLUMNS, current_events, current_files, rows_of, site_folder
+from skyless.run.history.tables import Event, fix_table
 from skyless.run.history.writer import Journal, Writer
 from skyless.run.web import HistoryLimits
 

@@ -9,7 +9,7 @@ import pytest
 
 from skyless.run.history.program import HubHistory
 from skyless.run.history.writer import Keep
-from skyless.run.hub import MONITOR_PORT
+from skyless.run.hub_files import MONITOR_PORT
 from support.hub_stage import RECORDS, Stage, at_random
 from support.processes import free_node_port, free_port
 

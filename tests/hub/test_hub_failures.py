@@ -18,20 +18,22 @@ from small_hub import client_of, running_hub, site
 from skyless.cli.main import main
 from skyless.run.broker import _program
 from skyless.run.fix_batch import RECORD, Batch, encode_batch
-from skyless.run.gather import streams
+from skyless.run.gather import subjects
 from skyless.run.gather.node import Summary
-from skyless.run.gather.streams import Names, NatsAddress, connect, rarely
+from skyless.run.gather.streams import Names
+from skyless.run.gather.subjects import NatsAddress, connect, rarely
 from skyless.run.history.layout import current_files, day_of
 from skyless.run.history.program import HubHistory
 from skyless.run.history.writer import Keep
-from skyless.run.hub import LEAF_PORT, HubSites, make_streams_of
+from skyless.run.hub import HubSites, make_streams_of
+from skyless.run.hub_files import LEAF_PORT
 from skyless.run.mqtt.address import mqtt_address
 from skyless.run.mqtt.connection import check_broker
 from support.hub_stage import Line
 from support.processes import SKYLESS, free_node_port, free_port, started
 
 SITE, ROWS, RUN = 7, 20, 5
-FIX_STREAM = streams.at(streams.FIX_STREAM, SITE)
+FIX_STREAM = subjects.at(subjects.FIX_STREAM, SITE)
 FULL_BYTES = 300_000
 """A stream that is full after some 250 batches."""
 FEW, MANY = 20, 600
@@ -70,7 +72,7 @@ class Stage:
             records["position_mm"][:, 0] = ROWS * self.sent + np.arange(ROWS)
             records["tag"], records["unix_us"] = 1 + np.arange(ROWS) % 2, round(1e6 * (time.time() + clock_s))
             batch = Batch(RUN, self.sent, round(1e6 * time.time()), self.names.issue, records)
-            subject = streams.at(streams.FIXES, SITE, "sender")
+            subject = subjects.at(subjects.FIXES, SITE, "sender")
             await self.stream.publish(subject, encode_batch(batch), headers={"Nats-Msg-Id": batch.id})
 
     async def until(self, condition):
@@ -113,7 +115,7 @@ def test_a_cut_line_loses_what_the_site_cannot_keep_and_that_is_counted(tmp_path
         for count in (FEW, MANY):
             stage.to_hub.cut()
             await stage.send(count, clock_s=-3600.0)
-            stage.first = (await stage.stream.stream_info(streams.at(streams.FIX_STREAM, SITE))).state.first_seq
+            stage.first = (await stage.stream.stream_info(subjects.at(subjects.FIX_STREAM, SITE))).state.first_seq
             if count == FEW:
                 assert stage.first == 1
             stage.to_hub.cut(is_cut=False)

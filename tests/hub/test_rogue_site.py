@@ -13,8 +13,9 @@ from small_hub import client_of, has_stream, running_hub, site
 from skyless.run import hub as hub_program
 from skyless.run.broker import _program
 from skyless.run.fix_batch import RECORD, Batch, encode_batch
-from skyless.run.gather import streams
-from skyless.run.gather.streams import NatsAddress, TagName
+from skyless.run.gather import subjects
+from skyless.run.gather.streams import TagName
+from skyless.run.gather.subjects import NatsAddress
 from skyless.run.history.layout import current_files
 from skyless.run.history.program import HubHistory
 from skyless.run.history.writer import Keep
@@ -26,10 +27,10 @@ pytestmark = pytest.mark.site
 
 HONEST, ROGUE = 7, 8
 STREAMS = {
-    streams.FIX_STREAM: ["skyless.v2.*.fixes.>", "skyless.v3.>"],
-    streams.NAMES_STREAM: ["skyless.v2.*.names.>"],
-    streams.STATE_STREAM: [streams.at(subject, "*") for subject in streams.STATE],
-    streams.EVENT_STREAM: [streams.at(subject, "*") for subject in streams.EVENTS],
+    subjects.FIX_STREAM: ["skyless.v2.*.fixes.>", "skyless.v3.>"],
+    subjects.NAMES_STREAM: ["skyless.v2.*.names.>"],
+    subjects.STATE_STREAM: [subjects.at(subject, "*") for subject in subjects.STATE],
+    subjects.EVENT_STREAM: [subjects.at(subject, "*") for subject in subjects.EVENTS],
 }
 SHAPES = (
     "v1.{}.site", "v1.{}.zones", "v1.{}.assets", "v1.{}.alarm_rules", "v1.{}.floor_plan", "v1.{}.floor_plan.1",
@@ -84,7 +85,7 @@ async def _run(folder, hub, rogue_address, *, is_filtered):
         for old in hub_program._OF_ALL_SITES:  # as in a hub that an earlier version has made
             await tenant.jetstream().add_stream(name=old, subjects=[f"old.{old}"], max_bytes=10**6)
         for pattern, taken in STREAMS.items():
-            await rogue.jetstream().add_stream(name=streams.at(pattern, ROGUE), subjects=taken)
+            await rogue.jetstream().add_stream(name=subjects.at(pattern, ROGUE), subjects=taken)
         for subject in [f"skyless.{one.format(HONEST)}" for one in SHAPES] + list(ODD):
             await rogue.publish(subject, payload(subject, "EVIL"))
         for subject in (f"skyless.{one.format(ROGUE)}" for one in SHAPES):
@@ -102,7 +103,7 @@ async def _run(folder, hub, rogue_address, *, is_filtered):
         stream = tenant.jetstream()
 
         async def held(pattern, number):
-            found = await stream.stream_info(streams.at(pattern, number), subjects_filter=">")
+            found = await stream.stream_info(subjects.at(pattern, number), subjects_filter=">")
             return set(found.state.subjects or ())
 
         async with asyncio.timeout(90):

@@ -11,9 +11,10 @@ from skyless.core.any_receiver import new_anchor
 from skyless.core.protocol1.beacon import Beacon, decode, encode
 from skyless.core.site import EXACT, Site
 from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 from skyless.site.file.template import rectangular_site
 
 LAB = paper_lab_site()

@@ -1,8 +1,8 @@
 """What tests of a tag at a site of protocol 2 share: a site without a schedule, and what a tag receives."""
 
+from bench import LAB, Heard, tape
 from msgspec.structs import replace
 
-from bench import LAB, Heard, tape
 from skyless.core.air.beacon import Beacon, decode, encode
 
 FREE = replace(LAB, schedule=replace(LAB.schedule, mode="free", rate_hz=60.0))

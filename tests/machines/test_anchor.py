@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 import pytest
+from bench import LAB, PAIRS, Stage, changed
 from msgspec.structs import replace
 
-from bench import LAB, PAIRS, Stage, changed
 from skyless.core.air.frame import Heard, Reception
 from skyless.core.air.site_pages import decode_page, encode_page
 from skyless.core.protocol1.almanac import page_for, pages_of

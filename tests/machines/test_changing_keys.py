@@ -9,7 +9,7 @@ from free_site import FREE
 from msgspec.structs import replace
 
 from skyless.core.keys.chain import Chain
-from skyless.core.keys.verifier import Fault
+from skyless.core.keys.fault import Fault
 from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import from_seconds, wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust, TrustedReceiver

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from skyless.core.air.beacon import decode
 from skyless.core.air.frame import Malformed, Reception
 from skyless.core.anchor import Anchor, BeaconAuthentication
-from skyless.core.keys.verifier import Fault
+from skyless.core.keys.fault import Fault
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, from_seconds, wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.sim.evaluation.scenarios import Request

@@ -4,9 +4,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from bench import LAB, Stage
 from msgspec.structs import replace
 
-from bench import LAB, Stage
 from skyless.core.air.almanac import OFFERED_HZ, gap_ticks, period_code, period_ticks, suitable_period_s, ticks_ahead
 from skyless.core.air.beacon import Beacon, decode, encode
 from skyless.core.air.frame import BLOCKED_DB, CLEAR_DB, Diagnostics, Reception

@@ -4,10 +4,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from bench import Heard, assert_honest, tape
 from free_site import FREE, beacon_of, free_tape, with_beacon
 from msgspec.structs import replace
 
-from bench import Heard, assert_honest, tape
 from skyless.core.air.almanac import NoisePage, SitePage, period_code
 from skyless.core.air.beacon import StatedPosition, encode
 from skyless.core.air.frame import Heard as Relay
@@ -17,7 +17,7 @@ from skyless.core.fix import NoFixReason
 from skyless.core.site import GeoreferenceSite
 from skyless.core.tag.receiver import NOT_DROPS, Receiver
 from skyless.core.ticks import from_seconds, wrap
-from skyless.run.recordings.recorder import load, save
+from skyless.run.recordings.reception_log import load, save
 
 pytestmark = pytest.mark.site
 

@@ -8,11 +8,11 @@ import tracemalloc
 
 import numpy as np
 import pytest
+from bench import EVERY_METHOD, LAB, ROOM, Stage, assert_honest, tape
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from bench import EVERY_METHOD, LAB, ROOM, Stage, assert_honest, tape
 from skyless.core.air.beacon import Beacon, decode
 from skyless.core.air.frame import MAX_FRAME_BYTES, Reception, fcs
 from skyless.core.any_receiver import AnyReceiver, new_anchor

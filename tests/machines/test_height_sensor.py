@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-
 from bench import LAB, LOFT, tape
+
+from skyless.core.alert import Alert
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import Fix
-from skyless.core.integrity import Alert
 
 pytestmark = pytest.mark.site
 

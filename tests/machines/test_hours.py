@@ -7,9 +7,9 @@ import math
 import os
 
 import pytest
+from bench import LAB
 from msgspec.structs import replace
 
-from bench import LAB
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.ticks import WRAP_TICKS
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings

@@ -14,8 +14,8 @@ from skyless.core.site import EXACT
 from skyless.core.ticks import from_seconds
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, fleet_of, impairments_of
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Waypoints
-from skyless.sim.world import paper_lab_site
 from skyless.site.file.template import rectangular_site
 
 pytestmark = pytest.mark.site

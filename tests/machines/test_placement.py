@@ -9,9 +9,10 @@ from msgspec.structs import replace
 from skyless.core.any_receiver import AnyReceiver, new_anchor
 from skyless.core.site import AccuracySite, ScheduleSite, UnplacedAnchor
 from skyless.sim.impairments import DelayError, lab_impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 
 pytestmark = pytest.mark.site
 

@@ -4,9 +4,9 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from bench import EVERY_METHOD, LAB, LOFT, PAIRS, ROOM, Heard, Stage, assert_honest, changed, listen, tape
 from msgspec.structs import replace
 
-from bench import EVERY_METHOD, LAB, LOFT, PAIRS, ROOM, Heard, Stage, assert_honest, changed, listen, tape
 from skyless.core.air.almanac import AccuracyPage, AnchorPage, NoisePage, SchedulePage
 from skyless.core.fix import NoFixReason
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS

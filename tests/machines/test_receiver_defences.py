@@ -4,9 +4,9 @@ from zlib import compress
 
 import numpy as np
 import pytest
+from bench import ROOM, tape
 from msgspec.structs import replace
 
-from bench import ROOM, tape
 from skyless.core.air.beacon import Beacon, StatedPosition, decode, encode
 from skyless.core.air.frame import Heard
 from skyless.core.air.neighbours import RELAYED_TICKS, Neighbour, find_neighbour, is_confirmed, neighbour_of

@@ -4,11 +4,11 @@ from itertools import chain
 
 import numpy as np
 import pytest
+from bench import Stage
 from free_site import FREE, beacon_of
 from msgspec import UNSET
 from msgspec.structs import replace
 
-from bench import Stage
 from skyless.core.air.beacon import decode
 from skyless.core.air.frame import Reception, fcs
 from skyless.core.any_receiver import AnyReceiver, new_anchor

@@ -5,9 +5,9 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from bench import EVERY_METHOD, LAB, ROOM, SNAPSHOTS, Stage, assert_honest
 from msgspec.structs import replace
 
-from bench import EVERY_METHOD, LAB, ROOM, SNAPSHOTS, Stage, assert_honest
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.protocol1.anchor import Anchor, Role
 from skyless.core.protocol1.beacon import decode

@@ -14,7 +14,7 @@ from estimator_builders import LAB_M, ROOM_M, Case, begun, episode_of, nees, rms
 
 from skyless.core.integrity import HPL
 from skyless.sim.evaluation.scenarios import Request, fleet_of
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 pytestmark = [pytest.mark.site, pytest.mark.skipif(not has("gcc"), reason="there is no gcc")]
 

@@ -11,7 +11,8 @@ from core_build import NATIVE, has
 
 from skyless.core.errors import SkylessError
 from skyless.core.native import library
-from skyless.core.native.records import Array, Byte, Bytes, Integers, Reals, Record, Ticks, record, view
+from skyless.core.native.records import Array, Byte, Bytes, Integers, Reals, Record, Ticks, record
+from skyless.core.native.views import view
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 

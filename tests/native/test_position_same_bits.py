@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from skyless.core.native.library import compiled
-from skyless.core.native.records import MAX_ANCHORS, view
+from skyless.core.native.records import MAX_ANCHORS
+from skyless.core.native.views import view
 from skyless.core.tag.position import FOUND, IMPOSSIBLE, MIRROR, RESIDUALS, SINGULAR, UNCERTAIN, Found, find_position
 from skyless.core.tag.search import FREE, HEIGHT, PLANE, LocateProblem
 

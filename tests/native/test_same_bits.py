@@ -26,7 +26,8 @@ from skyless.core.estimator.process import BatchPacket, BatchRow, Packet, Place,
 from skyless.core.estimator.state import WORK_ROWS, State
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay
 from skyless.core.native import arithmetic
-from skyless.core.native.records import MAX_ANCHORS, c_type, view
+from skyless.core.native.records import MAX_ANCHORS, c_type
+from skyless.core.native.views import view
 from skyless.core.tag import position, search
 from translator.body import Translator
 from translator.files import translate

@@ -16,7 +16,7 @@ from skyless.core.native.arithmetic import (
     solve,
     solve_lower,
 )
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 
 SEEDS = st.integers(0, 2**32 - 1)
 

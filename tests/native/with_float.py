@@ -17,7 +17,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 import compile_core
-from skyless.core.native import library, records
+from skyless.core.native import library, records, views
 
 FLAGS = ["-DSKYLESS_FLOAT", "-Wdouble-promotion", "-Werror"]
 """No number becomes a double on the way."""
@@ -32,7 +32,7 @@ def use_float(folder):
     from skyless.core.estimator.estimator import Estimator
 
     # Fixes hold doubles.
-    Estimator.rows = property(lambda self: records.view(self.state.fix).astype(np.float64).tobytes())
+    Estimator.rows = property(lambda self: views.view(self.state.fix).astype(np.float64).tobytes())
 
 
 if __name__ == "__main__":

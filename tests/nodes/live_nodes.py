@@ -13,8 +13,8 @@ from skyless.run.ether import Ether
 from skyless.run.open_radio import open_radios, open_sniffers
 from skyless.run.tag import TagNode, TagSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.sim.world import paper_lab_site
 
 LAB = paper_lab_site()
 PLACE_M = (2.0, 3.0, LAB.tags.height_m)

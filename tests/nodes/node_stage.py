@@ -17,9 +17,10 @@ from skyless.radio.interface import Restarted, Sent
 from skyless.run.anchor import AnchorNode
 from skyless.run.mqtt.messages import Counters
 from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 
 LAB = paper_lab_site()
 PLACE_M = (2.0, 3.0, 0.0)

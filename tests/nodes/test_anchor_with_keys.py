@@ -13,7 +13,7 @@ from skyless.core.air.beacon import decode
 from skyless.core.air.frame import Reception
 from skyless.core.anchor import Anchor, BeaconAuthentication
 from skyless.core.errors import SkylessError
-from skyless.core.keys.verifier import Fault
+from skyless.core.keys.fault import Fault
 from skyless.core.site import UnplacedAnchor, site_digest
 from skyless.core.ticks import TICK_S, difference
 from skyless.radio.interface import Restarted

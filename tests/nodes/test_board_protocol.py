@@ -9,8 +9,9 @@ from msgspec.structs import replace
 from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.frame import Heard, Reception, Transmission, fcs
 from skyless.core.air.masterless_packets import Packet, Relay
+from skyless.core.alert import Alert
 from skyless.core.anchor import Anchor as FreeAnchor
-from skyless.core.integrity import Alert, IntegrityRequirement
+from skyless.core.integrity import IntegrityRequirement
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import Beacon, encode
 from skyless.core.site import GeoreferenceSite
@@ -23,9 +24,10 @@ from skyless.radio.serial.link import BoardSettings, Done, Hello, NotDone, Statu
 from skyless.radio.serial.link import Heard as HeardFrame
 from skyless.run.board import BoardReceiver, LinkProtocol, SnifferProtocol
 from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, lab_site, paper_lab_site
+from skyless.sim.world import World
 
 DELAY = 16_450
 

@@ -17,7 +17,7 @@ from skyless.run.mqtt.connection import Introduction, open_connection
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import SiteMessage, StatusMessage
 from skyless.run.mqtt.topics import site_topic, status_topic
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from support.processes import SKYLESS, free_port
 
 pytestmark = pytest.mark.site

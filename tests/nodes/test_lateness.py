@@ -15,7 +15,7 @@ from skyless.core.air.frame import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.run.fix_log import FIX_LEAVES_S, MAX_AGE_S, MAX_RECEPTION_AGE_S, Lateness
 from skyless.run.mqtt.messages import Counters, RequestMessage
-from skyless.run.recordings.recorder import ReceptionLog, receiver_settings
+from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings
 from skyless.run.tag import TagNode, TagSettings
 
 pytestmark = pytest.mark.site

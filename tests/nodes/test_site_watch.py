@@ -20,7 +20,7 @@ from skyless.core.errors import SkylessError
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import AlarmMessage, Counters, FixMessage, SiteMessage, TagHealth
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from support.processes import SKYLESS, usual_signals
 from support.waiting import until
 

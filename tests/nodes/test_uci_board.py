@@ -17,9 +17,10 @@ from skyless.research.masterless.packet_tags import PacketTagNode, PacketTagSett
 from skyless.run.board import UciProtocol
 from skyless.run.open_radio import open_sniffers
 from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 
 LAB = paper_lab_site()
 

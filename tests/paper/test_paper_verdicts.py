@@ -20,7 +20,7 @@ from skyless.research.paper._checks import PaperCheck
 from skyless.research.paper._distributions import LambdaDistribution
 from skyless.research.paper.plan import P1, P2, Verdict, plan_of
 from skyless.sim.evaluation.scenarios import Request, fleet_of
-from skyless.sim.world import lab_site, paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.report import inline_svg
 
 pytestmark = pytest.mark.site

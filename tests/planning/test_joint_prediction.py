@@ -10,7 +10,7 @@ from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site, TagsSite, WallSite
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.research.uncertainty import BoundSettings, tracking_bound
-from skyless.sim.world import lab_site, paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.channel import ChannelModel, pack_walls
 from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of, stamp_variances
 from skyless.site.planning.links import (

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, ScheduleSite, Site, TagsSite, WallSite
 from skyless.research.verify import random_points, verify
-from skyless.sim.world import lab_site, paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.channel import ChannelModel, pack_walls
 from skyless.site.file.template import rectangular_site
 from skyless.site.planning.links import (

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from skyless.core.errors import ConfigurationError
 from skyless.core.geometry import area, distance_outside, inside
 from skyless.core.site import AnchorSite, GeoreferenceSite, WallSite
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.site.planning import maps
 from skyless.site.planning.links import (
     ANCHORS_IN_VIEW,

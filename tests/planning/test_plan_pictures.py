@@ -9,7 +9,7 @@ from matplotlib.text import Annotation
 from msgspec.structs import replace
 
 from skyless.core.site import AnchorSite, TagsSite, WallSite
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.site.planning.links import ANCHORS_IN_VIEW, PLAN_COLUMNS, SIGMA, floor_of
 from skyless.site.planning.maps import PlanMap, grid_of
 from skyless.site.planning.picture import RMSE_LAYER, SIGMA_LAYER, Background, Layer, draw_layer

@@ -16,7 +16,7 @@ from skyless.core.protocol1.snapshots import (
     literal_delayed_covariance,
 )
 from skyless.core.site import AnchorSite, NoiseSite, Site, TagsSite, WallSite
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.site.channel import ChannelModel, pack_walls
 from skyless.site.planning.anchor_clocks import offset_variances, stamp_variances
 from skyless.site.planning.links import (

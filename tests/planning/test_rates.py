@@ -11,7 +11,7 @@ from skyless.core.any_receiver import beacon_period_s
 from skyless.core.geometry import RADIO_REACH_M
 from skyless.core.site import AnchorSite, ScheduleSite, Site, TagsSite, WallSite
 from skyless.sim.cells.world import CellWorld, anchors_of
-from skyless.sim.evaluation.fleet import period_codes_of
+from skyless.sim.evaluation.cell_fleet import period_codes_of
 from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Static
 from skyless.site.channel import ChannelModel, received_power_dbm

@@ -12,7 +12,7 @@ from skyless.cli.main import main
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import AnchorSite, Site, UnplacedAnchor
 from skyless.site.file.template import grid_site, rectangular_site, site_template
-from skyless.site.planning.report import mounts, sheet
+from skyless.site.planning.sheet import mounts, sheet
 
 ROOM = rectangular_site(12.0, 7.0, 8, 3.0, None)
 A4_PIXELS = (909, 1285)

@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 from matplotlib import colormaps
 from matplotlib.colors import LogNorm
 
-from skyless.site.planning.picture import round_values, scale_of, value_colours
+from skyless.site.planning.colours import round_values, scale_of
+from skyless.site.planning.picture import value_colours
 from value_colours import colour_at, colour_of
 
 pytestmark = pytest.mark.site

@@ -12,7 +12,7 @@ from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.site import ScheduleSite
 from skyless.core.ticks import TICK_S
 from skyless.research.uncertainty import BoundSettings, tracking_bound
-from skyless.sim.world import lab_site, paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.planning.predict import PlanSettings, Predictor
 
 pytestmark = pytest.mark.site

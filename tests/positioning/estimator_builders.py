@@ -15,11 +15,11 @@ from numpy.lib.recfunctions import repack_fields
 from skyless.core.estimator.estimator import Estimator, Packets, packed_state
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import FAULT_KINDS, covariances
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 from skyless.core.observation import Observation
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.research.studies.efficiency import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 SLOT_S = paper_lab_site().schedule.slot_s
 LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in paper_lab_site().anchors])

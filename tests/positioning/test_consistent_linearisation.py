@@ -10,11 +10,11 @@ from skyless import Request, fleet_of
 from skyless.core.estimator.estimator import Estimator
 from skyless.core.estimator.measurements import difference_terms, reception_terms
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 from skyless.core.site import AccuracySite
 from skyless.sim.evaluation.scenarios import Room, displacements
 from skyless.sim.impairments import RangeErrorModel
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 pytestmark = pytest.mark.statistical
 

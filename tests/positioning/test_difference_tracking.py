@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from skyless.core.air.masterless_packets import PairTdoa
+from skyless.core.alert import Alert
 from skyless.core.estimator.kalman import is_stationary
 from skyless.core.estimator.settings import TUNING
 from skyless.core.fix import NoFixReason
-from skyless.core.integrity import Alert
 from skyless.research.masterless.difference_tracking import (
     DIFFERENCES,
     DifferenceTracking,

@@ -20,8 +20,8 @@ from estimator_builders import (
 )
 from msgspec.structs import replace
 
+from skyless.core.alert import Alert
 from skyless.core.fix import Fix, NoFixReason
-from skyless.core.integrity import Alert
 from skyless.core.protocol1.clock import MasterScale, MasterTerm
 from skyless.core.tag.joint import Estimation
 from skyless.core.ticks import SUBTICKS, TICK_M, TICK_MASK, TICK_RATE_HZ

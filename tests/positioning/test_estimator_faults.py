@@ -24,6 +24,7 @@ from estimator_builders import (
 from msgspec.structs import replace
 from scipy.stats import binom, chi2
 
+from skyless.core.alert import Alert
 from skyless.core.estimator import faults
 from skyless.core.estimator.faults import explained_chi2, fade_faults, fault_chi2, open_faults, whiten
 from skyless.core.estimator.levels import FIRST_TEST, protect
@@ -36,8 +37,8 @@ from skyless.core.estimator.state import (
     make_uncertain,
     new_state,
 )
-from skyless.core.integrity import CONTRADICTED, HPL, Alert, IntegrityRequirement, integrity_of, limits_of
-from skyless.core.native.records import view
+from skyless.core.integrity import CONTRADICTED, HPL, IntegrityRequirement, integrity_of, limits_of
+from skyless.core.native.views import view
 from skyless.core.ticks import TICK_M, TICK_S
 
 pytestmark = pytest.mark.site

@@ -12,9 +12,10 @@ from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import Fix
 from skyless.core.protocol1.anchor import Anchor
 from skyless.sim.impairments import AnchorBias, Impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 from skyless.site.channel import ChannelModel, first_path_loss_db
 
 pytestmark = pytest.mark.site

@@ -8,8 +8,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from skyless.core.alert import Alert
 from skyless.core.fix import PROTECTED_ROWS, PROTECTION, QUALITY, Fix
-from skyless.core.integrity import CONTRADICTED, Alert, IntegrityRequirement
+from skyless.core.integrity import CONTRADICTED, IntegrityRequirement
 
 ANCHORS_M = np.eye(4, 3)
 

@@ -7,7 +7,7 @@ from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, settings_
 from skyless.core.estimator.levels import is_side_open
 from skyless.core.fix import NoFixReason
 from skyless.core.integrity import SOUND, UNAVAILABLE
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 from skyless.core.tag.position import NoSolution, locate_pseudoranges
 
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03}

@@ -9,7 +9,7 @@ from skyless.core.estimator.estimator import packed_state, unpacked_state
 from skyless.research.studies.worlds import Heard, Run, beacons_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
 from skyless.sim.impairments import CarrierModel, RangeErrorModel
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 SITE = lab_site()
 USUAL = CarrierModel()

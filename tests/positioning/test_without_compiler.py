@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from skyless.sim.evaluation.scenarios import Request, fleet_of
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 pytestmark = pytest.mark.site
 

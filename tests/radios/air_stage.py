@@ -6,8 +6,8 @@ from skyless.core.ticks import TICK_RATE_HZ, wrap
 from skyless.radio.emulated import Join, Joined, Send
 from skyless.run.ether import Ether
 from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import lab_site
 from skyless.sim.trajectory import Static
-from skyless.sim.world import lab_site
 
 LAB = lab_site()
 TAGS = {"tag1": Static(2.0, 3.0), "tag2": Static(4.0, 5.0)}

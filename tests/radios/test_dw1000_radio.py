@@ -20,7 +20,7 @@ from skyless.radio.dw1000.radio import Dw1000Radio
 from skyless.radio.dw1000.spi import SpiPort
 from skyless.radio.emulated import Arrival, EtherConnection, HeardRow, Join
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Restarted, Sent
-from skyless.run.ether import ModelPort
+from skyless.run.dw1000_model import ModelPort
 from skyless.run.open_radio import is_simulated, open_radios
 from skyless.sim.dw1000.chip import ModelBus
 from skyless.sim.evaluation.fleet import compile_kernels

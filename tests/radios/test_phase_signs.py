@@ -24,10 +24,11 @@ from skyless.core.ticks import CARRIER_CYCLES, TICK_M, TICK_RATE_HZ
 from skyless.research.foreign import datasets as muloc
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import PERIOD_TICKS
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 
 WINDOW_TICKS = round(0.5 * TICK_RATE_HZ)
 """A parabola over twice this follows the clocks of DW1000s."""

@@ -23,9 +23,10 @@ from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.run.board import ListenerProtocol
 from skyless.run.open_radio import is_simulated, open_radios, open_sniffers
 from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 
 LAB = paper_lab_site()
 

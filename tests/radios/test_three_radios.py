@@ -17,9 +17,10 @@ from skyless.core.protocol1.anchor import Anchor
 from skyless.radio.interface import Reception, Restarted
 from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.sim.evaluation.scenarios import Request, impairments_of
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 
 pytestmark = pytest.mark.site
 

@@ -9,7 +9,8 @@ from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import GeoreferenceSite
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import RequestMessage, SiteMessage, TrueMotion, TruthMessage, fix_message
-from skyless.run.recordings.recorder import McapFile, McapRecorder, ReceptionLog, receiver_settings
+from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings
+from skyless.run.recordings.recorder import McapFile, McapRecorder
 
 SITE = replace(LAB, georeference=GeoreferenceSite(52.5, 13.4, 34.0, 30.0))
 UNIX_S = 1.8e9

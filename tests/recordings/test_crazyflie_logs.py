@@ -12,7 +12,7 @@ import skyless
 import synthetic_recordings as synthetic
 from skyless.radio.foreign import fira
 from skyless.research.foreign.formats import format_of, open_recording
-from skyless.research.replays.options import known_anchors
+from skyless.research.replays.inputs import known_anchors
 
 ROWS = 3000
 

@@ -24,7 +24,7 @@ from skyless.core.protocol1.beacon import decode, encode
 from skyless.core.tag.admission import Admission, Tag
 from skyless.core.tag.following import Course
 from skyless.core.ticks import Unwrapper
-from skyless.run.recordings.recorder import RefusedError, load, save
+from skyless.run.recordings.reception_log import RefusedError, load, save
 
 pytestmark = pytest.mark.site
 

@@ -10,7 +10,7 @@ from skyless.core.air.frame import Diagnostics, Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.research.replays.site import reception_of
 from skyless.run.mqtt.messages import RawReception, ReceptionsMessage, RequestMessage
-from skyless.run.recordings.recorder import MAX_PENDING_RECEPTIONS, ReceptionLog, load, raw, receiver_settings
+from skyless.run.recordings.reception_log import MAX_PENDING_RECEPTIONS, ReceptionLog, load, raw, receiver_settings
 
 pytestmark = pytest.mark.site
 

@@ -9,8 +9,9 @@ from live_site import PLACES, UNIX_S, messages, record
 from msgspec.structs import replace
 
 from skyless.cli.main import main
+from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
-from skyless.core.integrity import Alert, IntegrityRequirement
+from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import METHODS
 from skyless.research.replays.site import SiteReplay
 from skyless.run.mqtt.messages import ReceptionsMessage

@@ -7,7 +7,7 @@ import pytest
 from matplotlib.image import imread
 
 from skyless.cli.common import write_picture
-from skyless.research.replays.options import track_figure
+from skyless.research.replays.plot import track_figure
 
 pytestmark = pytest.mark.site
 

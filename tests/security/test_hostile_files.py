@@ -8,8 +8,9 @@ from pyarrow import parquet
 from skyless.cli.main import main
 from skyless.core.errors import SkylessError
 from skyless.run.history.answers import Span
-from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, file_name, schema_of, site_folder
+from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, file_name, site_folder
 from skyless.run.history.queries import History
+from skyless.run.history.tables import schema_of
 
 QUESTIONS = {
     "track": lambda history, span: history.track("a", span),

@@ -8,7 +8,8 @@ from metronome import IDEAL, Metronome, faulty, sent, staggered
 
 from skyless.core.ticks import TICK_M, difference
 from skyless.sim.impairments import AnchorDisplacement, DelayError, PairError
-from skyless.sim.world import World, lab_site
+from skyless.sim.lab import lab_site
+from skyless.sim.world import World
 
 LAB = lab_site()
 

@@ -16,10 +16,11 @@ from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import AccuracySite, WallSite
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S, Unwrapper, difference
 from skyless.sim.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage, lab_impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.trajectory import Roaming, Static, Waypoints
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 from skyless.site.channel import ChannelModel, power_bias_m, received_power_dbm
 
 pytestmark = pytest.mark.site

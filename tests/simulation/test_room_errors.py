@@ -24,11 +24,12 @@ from skyless.sim.impairments import (
     lab_impairments,
     slope_error_m,
 )
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.oscillator import OscillatorModel, clock_rate, drift_phase_s, make_clocks, warm_up
 from skyless.sim.streams import stream
 from skyless.sim.trajectory import Roaming, Static, Waypoints
-from skyless.sim.world import World, paper_lab_site
+from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
 
 pytestmark = pytest.mark.site

@@ -4,7 +4,7 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.core.site import ScheduleSite, TagsSite, UnplacedAnchor, is_same_but_placed, site_digest
-from skyless.sim.world import lab_site, paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 
 LAB = lab_site()
 UNPLACED = replace(LAB, anchors=(), unplaced=tuple(UnplacedAnchor(anchor.id, anchor.slot) for anchor in LAB.anchors))

@@ -25,7 +25,7 @@ from skyless.core.tag.hearing import keep_place
 from skyless.core.tag.joint import DROP_S, fill_ages, read_accuracy
 from skyless.core.tag.receiver import estimator_settings
 from skyless.core.ticks import from_seconds
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 SITE = replace(lab_site(), schedule=replace(lab_site().schedule, mode="free"))
 PAGES = tuple(decode_page(encode_page(one)) for one in site_pages_of(SITE))

@@ -17,8 +17,9 @@ from skyless.core.geometry import rectangle_of, sides_that_meet
 from skyless.core.site import Site, site_digest
 from skyless.run.mqtt.messages import SiteMessage, site_message
 from skyless.sim.evaluation.scenarios import patrols, wanderers
-from skyless.sim.world import lab_site
-from skyless.site.file.check import check_site, warnings_of
+from skyless.sim.lab import lab_site
+from skyless.site.file.advice import warnings_of
+from skyless.site.file.check import check_site
 from skyless.site.file.load import load_site, with_values
 from skyless.site.file.template import rectangle, rectangular_site, site_template
 from skyless.site.planning.links import floor_of

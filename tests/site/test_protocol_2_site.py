@@ -11,7 +11,7 @@ from skyless.core.any_receiver import beacon_period_s
 from skyless.core.errors import ConfigurationError
 from skyless.core.geometry import pairs_within
 from skyless.core.site import UnplacedAnchor
-from skyless.site.file.check import warnings_of
+from skyless.site.file.advice import warnings_of
 from skyless.site.file.load import load_site
 from skyless.site.file.template import grid_site, site_template
 

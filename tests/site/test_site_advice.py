@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, ScheduleSite, TagsSite
-from skyless.sim.world import lab_site
-from skyless.site.file.check import warnings_of
+from skyless.sim.lab import lab_site
+from skyless.site.file.advice import warnings_of
 
 
 def site_of(points, height_m=None):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import AccuracySite
-from skyless.sim.world import lab_site, paper_lab_site
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.file.check import SITE_LIMITS
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template

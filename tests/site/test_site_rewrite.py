@@ -6,7 +6,7 @@ import pytest
 
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import AccuracySite
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.file.load import load_site, with_values
 from skyless.site.file.template import site_template
 

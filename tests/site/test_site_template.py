@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core.site import EXACT, AccuracySite, Site
-from skyless.sim.world import lab_site, paper_lab_site
-from skyless.site.file.check import warnings_of
+from skyless.sim.lab import lab_site, paper_lab_site
+from skyless.site.file.advice import warnings_of
 from skyless.site.file.load import load_site
 from skyless.site.file.template import rectangular_site, site_template
 

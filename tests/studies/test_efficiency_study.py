@@ -8,7 +8,7 @@ import pytest
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.machine import cores
 from skyless.research.studies.efficiency import Case, draw_episode, row_of, run_chunk
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 pytestmark = pytest.mark.statistical
 

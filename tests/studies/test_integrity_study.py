@@ -22,7 +22,7 @@ from skyless.research.studies.integrity import (
 from skyless.research.studies.picture import CLUSTER_FIXES, clustered_interval
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import plan_of
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site

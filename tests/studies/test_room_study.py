@@ -8,7 +8,8 @@ from msgspec.structs import replace
 
 from skyless.cli.api.simulate import StudyResult
 from skyless.cli.study import print_rows
-from skyless.core.integrity import Alert, Integrity
+from skyless.core.alert import Alert
+from skyless.core.integrity import Integrity
 from skyless.research.studies import room
 from skyless.research.studies.picture import clustered_interval
 from skyless.research.studies.room import biases_of, bound_cells
@@ -18,7 +19,7 @@ from skyless.research.studies.worlds import RunResult, box, run_world
 from skyless.research.uncertainty import Biases
 from skyless.sim.evaluation.figures import LevelCounts, LevelTally
 from skyless.sim.impairments import Body
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.channel import cross_walls, pack_walls
 from skyless.site.report import picture
 

@@ -21,8 +21,8 @@ from skyless.run.board import UciProtocol
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
 from skyless.sim.impairments import RangeErrorModel
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.sim.world import paper_lab_site
 from skyless.site.planning.anchor_clocks import AnchorClocks, Relays, relays_of
 from skyless.site.planning.links import PLAN_COLUMNS, RMSE
 from skyless.site.planning.predict import PlanSettings, Predictor, fill_joint_sigma

@@ -21,14 +21,15 @@ from nats.errors import Error
 from pyarrow import parquet
 
 from skyless.run.fix_batch import RECORD, Batch, decode_batch, encode_batch
-from skyless.run.gather import streams
-from skyless.run.gather.streams import Names, connect, follow, nats_address
+from skyless.run.gather import subjects
+from skyless.run.gather.streams import Names, follow
+from skyless.run.gather.subjects import connect, nats_address
 from skyless.run.history.layout import current_files
-from skyless.run.hub import LEAF_PORT
+from skyless.run.hub_files import LEAF_PORT
 from skyless.run.process import end_with_parent
 
 SITE = 7
-FIX_STREAM = streams.at(streams.FIX_STREAM, SITE)
+FIX_STREAM = subjects.at(subjects.FIX_STREAM, SITE)
 TAGS = 5
 RECORDS = 20
 PERIOD_S = 0.05
@@ -195,7 +196,7 @@ class Stage:
                     records["unix_us"] = round(1e6 * time.time())
                     number = self.acknowledged + 1
                     batch = Batch(run_number, number, round(1e6 * time.time()), table.issue, records)
-                    subject = streams.at(streams.FIXES, SITE, "sender")
+                    subject = subjects.at(subjects.FIXES, SITE, "sender")
                     await stream.publish(subject, encode_batch(batch), headers={"Nats-Msg-Id": batch.id}, timeout=3)
                     self.acknowledged = number
                     await asyncio.sleep(PERIOD_S)
@@ -211,7 +212,7 @@ class Stage:
             self.arrivals.append(time.monotonic())
 
         try:
-            await client.subscribe(streams.at(streams.FIXES, SITE), cb=note)
+            await client.subscribe(subjects.at(subjects.FIXES, SITE), cb=note)
             await asyncio.Event().wait()
         finally:
             await client.close()

@@ -10,7 +10,7 @@ import subprocess
 import sys
 import threading
 
-from skyless.run.hub import CLUSTER_PORT, LEAF_PORT, MONITOR_PORT
+from skyless.run.hub_files import CLUSTER_PORT, LEAF_PORT, MONITOR_PORT
 from skyless.run.process import end_with_parent
 
 SKYLESS = (sys.executable, "-m", "skyless.cli.main")

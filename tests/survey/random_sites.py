@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.survey.problem import Problem
 from skyless.site.survey.robust import redundancy
 

@@ -12,9 +12,10 @@ from skyless.core.any_receiver import new_anchor
 from skyless.core.ticks import from_seconds, wrap
 from skyless.research.surveys.rooms import RecordedAnchor
 from skyless.sim.impairments import AnchorOutage, Outage, lab_impairments
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, lab_site, paper_lab_site
+from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
 from skyless.site.survey.legs import LegCollector, RelayMatcher
 

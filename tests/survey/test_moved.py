@@ -11,7 +11,7 @@ from skyless.cli.main import main
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 from skyless.run.survey.live_survey import LiveSurvey
 from skyless.run.survey.program import SurveyNode, SurveySettings
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.survey.facts import Facts, Gauge, PairBlock
 from skyless.site.survey.legs import AnchorLeg
 from skyless.site.survey.pair_ranger import PairRanger, RangeSteps

@@ -12,9 +12,10 @@ from skyless.core.any_receiver import new_anchor
 from skyless.core.ticks import CARRIER_CYCLES, TICK_RATE_HZ, wrap
 from skyless.research.foreign import datasets as muloc
 from skyless.sim.impairments import AnchorDisplacement, AnchorOutage, CarrierModel, Outage, lab_impairments
+from skyless.sim.lab import lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import World, lab_site
+from skyless.sim.world import World
 from skyless.site.survey.explain import BLOCK_S, PhaseWatch, circular_mean
 from skyless.site.survey.legs import AnchorLeg, LegCollector
 

@@ -13,7 +13,7 @@ from skyless.core.anchor import site_issue, site_pages_of
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import EXACT, AccuracySite, ScheduleSite, UnplacedAnchor
 from skyless.core.ticks import TICK_M
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.site.file.check import check_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
@@ -28,7 +28,7 @@ from skyless.site.survey.facts import (
     read_record,
     record_path,
 )
-from skyless.site.survey.solve import delay_changes_ticks, surveyed_site, surveyed_text, unchanged_anchors
+from skyless.site.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text, unchanged_anchors
 
 pytestmark = pytest.mark.site
 

@@ -12,7 +12,7 @@ from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.machine import cores
 from skyless.research.studies.efficiency import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path
 from skyless.research.uncertainty import BoundSettings, tracking_bound
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 STAMP_M = SPEED_OF_LIGHT_MPS * STAMP_S
 TABLE = [

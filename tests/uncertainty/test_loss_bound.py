@@ -6,7 +6,7 @@ import pytest
 from skyless.research.studies import lab
 from skyless.research.studies.runner import Plan
 from skyless.research.uncertainty import BoundSettings, Sendings, known_receptions, received_bound, tracking_bound
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 
 LAB_M = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in lab_site().anchors])
 PATH_M = np.tile([2.0, 3.0, 0.0], (600, 1))

@@ -12,7 +12,7 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.site import FloorSite
 from skyless.run.mqtt.messages import FixMessage, SiteMessage, Zone, read_message, site_message
 from skyless.run.zones import ZoneMonitor, floor_at
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.file.check import plan_files
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template

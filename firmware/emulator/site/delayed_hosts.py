@@ -28,9 +28,10 @@ from skyless.research.uncertainty import BoundSettings, received_bound
 from skyless.run.anchor import ASK_AGAIN_S, LEAD_GAIN, LEAD_LOSS, MAX_LEAD_S
 from skyless.sim.dw1000.chip import Chip, ModelBus
 from skyless.sim.evaluation.scenarios import Request, impairments_of, trajectories_of
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.medium import Delivery, Medium
-from skyless.sim.world import diagnostics_of, paper_lab_site
+from skyless.sim.world import diagnostics_of
 
 WARMUP_S: Final = 3.0
 _QA: Final = 0.3

@@ -14,8 +14,8 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 
 from msgspec import Struct
 
+from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
-from skyless.core.integrity import Alert
 from skyless.core.site import FloorSite, GeoreferenceSite, Site, WallSite
 from skyless.run.mqtt.address import MqttAddress, hide_password
 from skyless.run.mqtt.messages import (

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
     from skyless.page.app import ListenAddress, Services
     from skyless.page.connections import AccessRules
+    from skyless.page.gathered import Gathered
     from skyless.page.live import LiveSite
-    from skyless.page.live2 import Gathered
     from skyless.run.mqtt.address import MqttAddress
     from skyless.run.mqtt.messages import SiteMessage
 
@@ -146,8 +146,8 @@ def _at_broker(
 def _at_hub(make: "partial[LiveSite]", serves: "partial[Services]", hub: str, ca: Path | None) -> "_Served":
     """The sites at a hub. Raises SkylessError."""
     address = hub_address(hub, ca)
-    from skyless.page.live2 import Gathered
-    from skyless.page.sites import ShownSites
+    from skyless.page.gathered import Gathered
+    from skyless.page.hub import ShownSites
 
     sites = ShownSites(address, "skyless dashboard", partial(make, broker=str(address), at_hub=True))
     return str(address), serves(sites=sites, gathered=Gathered(address), hub=sites), sites.run()
@@ -156,13 +156,13 @@ def _at_hub(make: "partial[LiveSite]", serves: "partial[Services]", hub: str, ca
 def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":
     """The batches of a gather; None without a gather, of which nothing is loaded then. Raises SkylessError."""
     from skyless.run.broker import nats_of
-    from skyless.run.gather.streams import nats_address
+    from skyless.run.gather.subjects import nats_address
 
     address = nats_of(broker) if nats is None else nats_address(nats)
     if address is None:
         return None
     extra_module("nats", "--nats" if nats is not None else f"the gather of {broker}")
-    from skyless.page.live2 import Gathered
+    from skyless.page.gathered import Gathered
 
     return Gathered(address)
 

@@ -246,7 +246,7 @@ def simulate(*, asked: SimulateOptions, output: _SimulationOutput) -> int:
 def _why_none(result: "FleetReport", simulation: "Simulation") -> str:
     """Why no fix was judged."""
     from skyless.core.geometry import RADIO_REACH_M
-    from skyless.site.file.check import too_few_anchors
+    from skyless.site.file.advice import too_few_anchors
 
     if result.tags_without_fix < result.tags:
         return f"all came before --settle, {simulation.request.settle_s:g} s; the run should last longer (--duration)"

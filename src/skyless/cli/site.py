@@ -31,7 +31,7 @@ from skyless.core.geometry import RADIO_REACH_M, anchors_in_reach
 from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import FloorSite, ScheduleSite, Site
 from skyless.core.ticks import TICK_S
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.file.check import ANY_ADDRESS, check_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import grid_site, rectangle, rectangular_site, site_template, unplaced_site
@@ -187,7 +187,7 @@ class SheetOptions(JsonOptions, frozen=True, kw_only=True):
 @command
 def sheet(asked: SheetOptions) -> None:
     """Write the sheet for those who mount the anchors: a page A4 with plan and table for each floor."""
-    from skyless.site.planning.report import mounts, sheet
+    from skyless.site.planning.sheet import mounts, sheet
 
     output = asked.output
     kinds: dict[str, Literal["pdf", "png"]] = {".pdf": "pdf", ".png": "png"}
@@ -210,7 +210,7 @@ def sheet(asked: SheetOptions) -> None:
 def _report(site: Site) -> dict[str, Any]:
     """The report on a valid site, SI units."""
     from skyless.site.channel import ChannelModel
-    from skyless.site.file.check import warnings_of
+    from skyless.site.file.advice import warnings_of
     from skyless.site.planning.anchor_clocks import master_warnings, reception_of
 
     period_s, frame_s = beacon_period_s(site), air_time_s(MAX_FRAME_BYTES)

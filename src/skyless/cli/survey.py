@@ -135,7 +135,7 @@ def _written(found: "SurveyResult", out: Path) -> tuple[tuple[str, ...], tuple[s
     if out.suffix.lower() == ".csv":
         return _write(out, {out: _table(found.survey).encode()}), ()
     from skyless.site.survey.facts import SurveyRecord, encode_record, record_path
-    from skyless.site.survey.solve import delay_changes_ticks
+    from skyless.site.survey.surveyed_site import delay_changes_ticks
 
     site, text = found.site, found.corrected_file()
     assert site is not None
@@ -153,7 +153,7 @@ def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
     The last one is named first. Raises SkylessError.
     """
     from skyless.files import replace_files
-    from skyless.run.survey.live_survey import kept_path
+    from skyless.run.survey.files import kept_path
 
     with writing(out):
         before = {kept_path(out): out.read_bytes()} if out.exists() else {}

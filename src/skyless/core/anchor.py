@@ -43,7 +43,7 @@ from skyless.core.air.frame import Heard, Malformed, Reception, Transmission, is
 from skyless.core.air.neighbours import STAMP_COUNTERS, STAMP_FITS, Neighbours, StatedPlace, unwrap_stamp
 from skyless.core.air.site_pages import NO_ISSUE, SitePages, decode_page, encode_page
 from skyless.core.keys.chain import Chain, ChainKeys, ChainRing, ChainTiming, is_mac, mac_of
-from skyless.core.keys.verifier import Fault
+from skyless.core.keys.fault import Fault
 from skyless.core.native.library import compiled
 from skyless.core.native.records import first
 from skyless.core.site import AnchorSite, Site, UnplacedAnchor

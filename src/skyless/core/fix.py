@@ -9,9 +9,10 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
+from skyless.core.alert import Alert
 from skyless.core.arrays import Array
 from skyless.core.geometry import Dops, dilution_of_precision
-from skyless.core.integrity import Alert, Integrity, IntegrityRequirement, integrity_of
+from skyless.core.integrity import Integrity, IntegrityRequirement, integrity_of
 
 # What fixes carry: rows of three numbers in one array, which costs less than separate arrays.
 

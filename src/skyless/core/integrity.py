@@ -1,26 +1,13 @@
 """Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8)."""
 
 from collections.abc import Sequence
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.alert import Alert
 from skyless.core.native.arithmetic import log, normal_quantile, sqrt
-
-# What a fix states of its integrity; on its own, so that programs that only read fixes load no numeric library.
-
-
-class Alert(StrEnum):
-    """What a fix states of its integrity."""
-
-    NONE = "none"
-    EXCLUDED = "detected-excluded"
-    NOT_EXCLUDED = "detected-not-excluded"
-    UNAVAILABLE = "unavailable"
-    LIMIT = "alert-limit-exceeded"
-
 
 RISK: Final = 1e-4
 

@@ -20,7 +20,8 @@ from skyless.core.air.frame import Malformed, Reception
 from skyless.core.any_receiver import decode_any
 from skyless.core.fix import Fix
 from skyless.core.keys.chain import public_key
-from skyless.core.keys.verifier import LONGEST_WAIT_TICKS, Fault, ReceivedFrame, Verifier
+from skyless.core.keys.fault import Fault
+from skyless.core.keys.verifier import LONGEST_WAIT_TICKS, ReceivedFrame, Verifier
 from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import TICK_S, FixTime, from_seconds
 

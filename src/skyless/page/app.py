@@ -55,15 +55,15 @@ from skyless.page.state import PageRequest, read_request
 from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, TaskProcess, WhatIfTask
 from skyless.run.mqtt.messages import WrongMessageError
 from skyless.run.process import ending_signals, reserve
-from skyless.run.survey.live_survey import BadFactsError
+from skyless.run.survey.files import BadFactsError
 from skyless.run.web import PAGE as LIMITS
 from skyless.run.zones import read_zones
 from skyless.site.alarm_rules import BadAlarmRulesError
 from skyless.site.file.check import image_size
 
 if TYPE_CHECKING:
-    from skyless.page.live2 import Gathered
-    from skyless.page.sites import ShownSites
+    from skyless.page.gathered import Gathered
+    from skyless.page.hub import ShownSites
     from skyless.run.hub import HubSites
 
 _PAGE: Final = Path(__file__).parent / "browser"

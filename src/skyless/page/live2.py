@@ -1,33 +1,18 @@
 """Messages of ``/live2``: tags of a large site as points or counts, and anchors, in binary (``docs/batches.md``)."""
 
-import asyncio
-import contextlib
-import logging
 import math
 import struct
-import time
-from collections import Counter
 from collections.abc import Sequence
 from typing import Annotated, Any, Final
 
 import msgspec
 import numpy as np
 from msgspec import Meta, Struct
-from nats.aio.client import Client
-from nats.aio.msg import Msg
-from nats.errors import Error
 from numpy.typing import NDArray
-from starlette.websockets import WebSocket
 
 from skyless.core.site import AnchorSite
-from skyless.page.connections import TRY_LATER, send, serve_socket
-from skyless.page.live import LiveSite
-from skyless.page.sites import Sites
-from skyless.page.state import UNHEARD_S, read_request
-from skyless.run.fix_batch import ALERT_BITS, FIELDS, RECORD, BadBatchError, Records, decode_batch, fix_of
-from skyless.run.gather import streams
-from skyless.run.gather.streams import NatsAddress, connect, name_of, rarely
-from skyless.run.web import PAGE as LIMITS
+from skyless.page.state import UNHEARD_S
+from skyless.run.fix_batch import ALERT_BITS, RECORD, Records
 
 # The newest fix of every tag of a large site in NumPy arrays, by the tags' numbers. No I/O.
 
@@ -187,153 +172,3 @@ def conditions_message(anchors: tuple[AnchorSite, ...], conditions: dict[str, st
     """``H``: the condition of each anchor, in the order of ``A``."""
     codes = bytes(CONDITIONS.get(conditions.get(str(anchor.id), ""), 0) for anchor in anchors)
     return _HEAD.pack(ord("H"), 0, len(codes), unix_us) + codes
-
-
-# Batches of a broker with a gather, read from NATS into columns, and the pages that see them by ``/live2``.
-
-PERIOD_S: Final = 0.1
-_HAND_OVER_S: Final = 0.05
-_HEARD_S: Final = 1.0
-"""Interval at which a site is given the names of all tags that were heard."""
-_MAX_ASKED: Final = 200
-
-_ASK_AGAIN_S: Final = 2.0
-"""A name that the stream did not have yet, as a hub's after a cut, is asked for again."""
-_EMPTY: Final = Columns()
-
-
-class Gathered:
-    """The columns of the sites that are shown, and the pages that see them."""
-
-    def __init__(self, address: NatsAddress) -> None:
-        self.drops: Counter[str] = Counter()
-        """Batches that were dropped, by reason."""
-        self.pages = 0
-        self._address = address
-        self._sites: dict[int | None, Columns] = {}
-        self._say = rarely(logging.getLogger("skyless.page").warning)
-
-    def columns(self, site: int | None) -> Columns:
-        """The columns of a site, empty before its first batch."""
-        return self._sites.get(site, _EMPTY)
-
-    async def run(self, sites: Sites) -> None:
-        """Read until cancelled, and hand fixes over to the sites that are shown."""
-        client = await connect(self._address, "skyless dashboard", self._say, self.drops, streams.PAGE_INBOX)
-        try:
-            async with asyncio.TaskGroup() as tasks:
-                served: dict[LiveSite, asyncio.Task[None]] = {}
-                while True:
-                    shown = sites.all
-                    for live in served.keys() - set(shown):
-                        served.pop(live).cancel()
-                    for live in shown:
-                        live.evidence.batches_connected = client.is_connected
-                        if live.number is not None and live not in served:
-                            served[live] = tasks.create_task(self._read(client, live.number, live))
-                    await asyncio.sleep(PERIOD_S)
-        finally:
-            await client.close()
-
-    async def _read(self, client: Client, site: int, live: LiveSite) -> None:
-        """Read the batches of a site until cancelled."""
-        self._sites[site] = Columns()
-        reading = await client.subscribe(streams.at(streams.FIXES, site), cb=self._on_batch)
-        try:
-            await self._hand_over(client, site, live)
-        finally:
-            del self._sites[site]
-            with contextlib.suppress(Error):
-                await reading.unsubscribe()
-
-    async def _hand_over(self, client: Client, site: int, live: LiveSite) -> None:
-        """Give a site fixes of its batches for ever, for all that its messages are for: zones, alarms, lists."""
-        columns, heard_s = self._sites[site], 0.0
-        stream, names, numbers = client.jetstream(), columns.names, dict[str, int]()
-        missing_s = dict[int, float]()
-        while True:
-            now_s = time.monotonic()
-            if now_s - heard_s >= _HEARD_S:
-                heard, heard_s = columns.heard_since(heard_s), now_s
-                live.on_batches([name for number in heard if (name := names.get(number))], now_s)
-            named = {name for page in live.pages for name in page.named}
-            records, arrived_s = columns.pop_due(now_s, [numbers[name] for name in named if name in numbers])
-            unknown = (number for number in records["tag"].tolist() if number not in names)
-            asked = [number for number in unknown if missing_s.get(number, 0.0) <= now_s][:_MAX_ASKED]
-            try:
-                answers = await asyncio.gather(*(name_of(stream, site, number) for number in asked))
-                for number, name in zip(asked, answers, strict=True):
-                    if name:
-                        names[number], numbers[name] = name, number
-                    else:
-                        missing_s[number] = now_s + _ASK_AGAIN_S
-            except Error as error:
-                self._say(f"the names of site {site} cannot be read: {error or type(error).__name__}")
-            for record, at_s in zip(FIELDS.iter_unpack(records.tobytes()), arrived_s.tolist(), strict=True):
-                if name := names.get(record[0]):
-                    live.on_batched_fix(fix_of(name, record), at_s)
-            # At least as long as it took, so that batches are read in time, of which the newest fixes are due next.
-            await asyncio.sleep(max(_HAND_OVER_S if len(records) < MAX_DUE else 0.0, time.monotonic() - now_s))
-
-    async def _on_batch(self, message: Msg) -> None:
-        site = streams.site_in(message.subject)
-        try:
-            if site in self._sites:
-                self._sites[site].update(decode_batch(message.data).records, time.monotonic())
-        except BadBatchError as error:
-            self.drops["wrong-batch"] += 1
-            self._say(f"a batch under {message.subject} is not shown: {error}")
-
-    async def serve(self, socket: WebSocket, live: LiveSite) -> None:
-        """Serve one accepted page until it closes."""
-        if self.pages >= LIMITS.pages:
-            await socket.close(TRY_LATER, f"too many pages are open: {self.pages}")
-            return
-        page = _Page()
-
-        async def send_news() -> None:
-            while True:
-                await send(socket, page.news(live, self.columns(live.number), time.monotonic()), "bytes")
-                await asyncio.sleep(PERIOD_S)
-
-        self.pages += 1
-        try:
-            await serve_socket(socket, send_news(), page.ask)
-        finally:
-            self.pages -= 1
-
-
-class _Page:
-    """One page. Messages are made when they are sent, so that a slow page gets only the newest."""
-
-    def __init__(self) -> None:
-        self._view: View | None = None
-        self._named: tuple[int, ...] = ()
-        self._shown: tuple[View, int, int] | None = None
-        self._anchors: tuple[AnchorSite, ...] | None = None
-        self._conditions: dict[str, str] | None = None
-
-    def ask(self, text: str) -> None:
-        """The page has another view, or asks for names."""
-        if (view := read_request(text, View)) is not None:
-            self._view, self._named = view, view.named or self._named
-
-    def news(self, live: LiveSite, columns: Columns, now_s: float) -> list[bytes]:
-        """What is new to the page."""
-        found, unix_us = [], round(1e6 * time.time())
-        anchors, conditions = () if live.site is None else live.site.site.anchors, live.state.conditions
-        if anchors != self._anchors:
-            self._anchors, self._conditions = anchors, None
-            found.append(anchors_message(anchors, unix_us))
-        if conditions != self._conditions:
-            self._conditions = conditions
-            found.append(conditions_message(anchors, conditions, unix_us))
-        if self._named:
-            found.append(names_message(columns, self._named, unix_us))
-            self._named = ()
-        if self._view is not None:
-            shown = self._view, columns.serial, int(now_s)  # without a new fix each second: their ages grow
-            if shown != self._shown:
-                self._shown = shown
-                found.append(tags_message(columns, self._view, now_s, unix_us))
-        return found

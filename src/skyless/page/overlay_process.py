@@ -13,9 +13,9 @@ from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD, METHODS
 from skyless.core.site import Site
 from skyless.page.tasks import OverlayTask, serve_tasks
+from skyless.site.planning.colours import COLOUR_STOPS, scale_of
 from skyless.site.planning.links import FIX_SHARE, HDOP, PDOP, SIGMA
 from skyless.site.planning.maps import Grid, plan_map
-from skyless.site.planning.picture import COLOUR_STOPS, scale_of
 from skyless.site.planning.predict import MAX_PREDICTED, PlanSettings, Predictor
 
 MAX_CELLS: Final = 40_000

@@ -4,7 +4,7 @@ import time
 
 from skyless.core.site import Site
 from skyless.page.tasks import serve_tasks
-from skyless.site.planning.report import sheet
+from skyless.site.planning.sheet import sheet
 
 
 def answer(site: Site) -> bytes:

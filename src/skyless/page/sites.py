@@ -7,17 +7,14 @@ at is let go some time later, unless it has zones or alarm rules, which are watc
 import asyncio
 import time
 from collections.abc import Callable
-from typing import Final, Protocol
+from typing import Protocol
 
-from msgspec import Struct
 from starlette.exceptions import HTTPException
 
 from skyless.page.events import SiteLink
 from skyless.page.live import LiveSite
 from skyless.run.alarms import MAX_KEPT
 from skyless.run.find_site import SiteOnBroker, watch_sites
-from skyless.run.gather.streams import NatsAddress
-from skyless.run.hub import HubLink, HubSites
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import Limits
 from skyless.run.mqtt.link import Link
@@ -145,65 +142,3 @@ class LiveSites:
         """While no site is shown, no link states it."""
         if self._default is None:
             self._first.on_connection(connected)
-
-
-# The sites at a hub that pages look at: each is connected while somebody looks, and let go some time later.
-
-LET_GO_S: Final = 60.0
-"""Healths of all tags cross a site's line while it is connected, so not for longer after the last look."""
-_CHECK_S: Final = 1.0
-
-
-class _Shown(Struct):
-    live: LiveSite
-    work: asyncio.Task[None]
-    asked_s: float
-
-
-class ShownSites:
-    """Takes the place of ``LiveSites`` at a hub."""
-
-    def __init__(self, address: NatsAddress, name: str, make: Callable[[], LiveSite]) -> None:
-        """``name`` is shown at the hub; ``make`` returns the state of a site."""
-        self.known = HubSites(address, time.monotonic())
-        self._name, self._make = name, make
-        self._shown: dict[int, _Shown] = {}
-        self._tasks: asyncio.TaskGroup
-
-    @property
-    def all(self) -> list[LiveSite]:
-        """The sites that are connected."""
-        return [shown.live for shown in self._shown.values()]
-
-    def has(self, asked: str | None) -> bool:
-        """Whether this is the number of a site."""
-        return number_of(asked) in self.known.names()
-
-    def of(self, asked: str | None) -> LiveSite:
-        """The site of a number. Raises HTTPException."""
-        if not self.has(asked):
-            right = "the number of a site at this hub, as in /api/sites"
-            raise HTTPException(404, f"site is {(asked or '')[:20]!r}; it should be {right}")
-        number = number_of(asked)
-        if number not in self._shown:
-            link, live = HubLink(self.known.address, number, self._name), self._make()
-            live.attach(link, number)
-            link.on_state.append(live.on_connection)
-            work = self._tasks.create_task(connected(link, live))
-            self._shown[number] = _Shown(live, work, 0.0)
-        self._shown[number].asked_s = time.monotonic()
-        return self._shown[number].live
-
-    async def run(self) -> None:
-        """Stay connected until cancelled."""
-        async with asyncio.TaskGroup() as self._tasks:
-            self._tasks.create_task(self.known.run(self._name))
-            while True:
-                await asyncio.sleep(_CHECK_S)
-                now_s = time.monotonic()
-                for number, shown in list(self._shown.items()):
-                    if shown.live.pages or shown.live.streams:
-                        shown.asked_s = now_s
-                    elif now_s - shown.asked_s > LET_GO_S:
-                        shown.work.cancel()
-                        del self._shown[number]

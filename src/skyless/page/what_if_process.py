@@ -17,12 +17,13 @@ from skyless.core.estimator.state import State, covariances
 from skyless.core.fix import Fix
 from skyless.core.integrity import HPL
 from skyless.core.native.library import SOURCE, source_digest
-from skyless.core.native.records import Record, first, view
+from skyless.core.native.records import Record, first
+from skyless.core.native.views import view
 from skyless.core.tag.admission import Tag
 from skyless.core.tag.receiver import Receiver
 from skyless.page.tasks import WhatIfTask, serve_tasks
 from skyless.run.mqtt.messages import RawReception, SegmentStart
-from skyless.run.recordings.recorder import RefusedError, load
+from skyless.run.recordings.reception_log import RefusedError, load
 from skyless.run.recordings.recording import McapRecording
 
 _PAGE_BYTES: Final = 1024

@@ -27,7 +27,8 @@ from skyless.research.calibration.options import SurveyOptions
 from skyless.research.foreign.formats import format_of, open_recording
 from skyless.research.masterless.smoothing import OwnEstimator
 from skyless.research.replays.captures import CaptureReplay
-from skyless.research.replays.options import ReplayOptions, known_anchors, known_truth
+from skyless.research.replays.inputs import known_anchors, known_truth
+from skyless.research.replays.options import ReplayOptions
 from skyless.research.replays.site import SITE_FORMAT, SiteReplay
 from skyless.run.recordings.recording import McapRecording, is_mcap
 from skyless.sim.evaluation.figures import Figures, FixTable, Judged, figures_of, truth_at

@@ -23,7 +23,7 @@ from typing import Final, Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.integrity import Alert
+from skyless.core.alert import Alert
 from skyless.core.site import AlarmRule, RuleKind
 from skyless.run.mqtt.messages import AlarmMessage, Asset, FixMessage, TagHealth, Vector, WatchMessage, Zone, ZoneEvent
 from skyless.run.zones import TAG_TIMEOUT_S, ZoneMonitor

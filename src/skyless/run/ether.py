@@ -8,20 +8,16 @@ from typing import Final
 
 import msgspec
 
-from skyless.core.air.frame import MAX_FRAME_BYTES, Diagnostics, Reception, Transmission
+from skyless.core.air.frame import MAX_FRAME_BYTES, Transmission
 from skyless.core.site import Site
-from skyless.core.ticks import TICK_S, difference, from_seconds, wrap
+from skyless.core.ticks import TICK_S, wrap
 from skyless.radio import emulated as wire
-from skyless.radio.dw1000.radio import ChipError, Dw1000Radio
-from skyless.radio.emulated import EmulatedRadio
-from skyless.radio.interface import AntennaDelays, Gone, Late, RadioEvent, Restarted, Sent, ignore
+from skyless.radio.interface import ignore
 from skyless.run.fix_log import MAX_RECEPTION_AGE_S
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import EtherHealth, TrueMotion, TruthMessage, Vector
 from skyless.run.mqtt.topics import health_topic, truth_topic
 from skyless.run.process import HEALTH_S, Log, every, keep, link_of, most_files, together
-from skyless.sim.dw1000.chip import Chip, ModelBus
-from skyless.sim.dw1000.transceiver import PREAMBLE_TICKS
 from skyless.sim.impairments import Impairments
 from skyless.sim.listening import TagSpec
 from skyless.sim.medium import Delivery, Medium
@@ -373,71 +369,3 @@ class EtherNode:
     def _publish_health(self) -> None:
         if self._link is not None:
             self._link.publish(health_topic(self._site, "ether", "air"), self._ether.health(time.time()))
-
-
-# A model of a DW1000 on the emulated air, behind the same radio as a chip on SPI.
-
-ETHER_LEAD_TICKS: Final = PREAMBLE_TICKS + from_seconds(0.3e-3)
-"""How long before its RMARKER the emulated air, and the transfer to it, need a frame."""
-
-_SHORTEST_SLEEP_S: Final = 100e-6
-
-
-class ModelPort:
-    """A model of the chip at one node of ``skyless ether`` (``skyless.radio.dw1000.radio.Port``)."""
-
-    def __init__(self, node: EmulatedRadio, delays: AntennaDelays) -> None:
-        self._node = node
-        self.chip = Chip(self, delays.tx_ticks, delays.rx_ticks, time.monotonic)
-        self._radio: Dw1000Radio | None = None
-
-    async def run(self, radio: Dw1000Radio) -> None:
-        """Have a chip while there is an ether, until cancelled."""
-        self._radio = radio
-        await self._node.run(self._on_event)
-
-    def _on_event(self, event: RadioEvent) -> None:
-        radio, chip = self._radio, self.chip
-        assert radio is not None
-        if isinstance(event, Restarted):
-            chip.pull_reset()
-            try:
-                radio.begin(ModelBus(chip, _sleep))
-            except ChipError as error:
-                radio.end(str(error))
-        elif isinstance(event, Gone):
-            radio.end(event.reason)
-        elif isinstance(event, Reception):
-            measured, phase_cycles = event.diagnostics or Diagnostics(), event.carrier_phase_cycles
-            chip.receive(event.frame, event.rx_ticks, measured, carrier_phase_cycles=phase_cycles)
-        elif isinstance(event, Sent):
-            chip.transceiver.finish()
-        elif isinstance(event, Late):
-            chip.transceiver.fail()
-        if not isinstance(event, Gone) and chip.irq:
-            try:
-                radio.serve()
-            except ChipError as error:
-                radio.end(str(error))
-
-    # The chip's air
-
-    def now_ticks(self) -> int:
-        """The node's counter."""
-        return self._node.now_ticks() or 0
-
-    def transmit(self, frame: bytes, leaves_ticks: int) -> bool:
-        """Hand a frame to the ether, unless it would come too late there."""
-        if difference(leaves_ticks, self.now_ticks()) < ETHER_LEAD_TICKS:
-            return False
-        self._node.transmit(Transmission(frame, leaves_ticks))
-        return True
-
-    def withdraw(self) -> None:
-        """The ether cancels nothing: the frame is sent at its time."""
-
-
-def _sleep(seconds: float) -> None:
-    """Pauses of the driver; those of transfers are too short to sleep."""
-    if seconds >= _SHORTEST_SLEEP_S:
-        time.sleep(seconds)

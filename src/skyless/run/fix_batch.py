@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from skyless.core.integrity import Alert
+from skyless.core.alert import Alert
 from skyless.run.mqtt.messages import FixMessage
 
 MAGIC: Final = b"SKB2"

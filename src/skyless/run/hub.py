@@ -5,44 +5,30 @@ import contextlib
 import json
 import logging
 import re
-import secrets
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Final, Literal
 
 import msgspec
 from msgspec import Struct
-from msgspec.structs import replace
 from nats.errors import Error
 from nats.js.api import ExternalStream, StreamConfig, StreamSource
 from nats.js.errors import NotFoundError
 
-from skyless.core.errors import SkylessError, writing
-from skyless.files import replace_files
+from skyless.core.errors import SkylessError
 from skyless.run.broker import Broker
 from skyless.run.find_site import KnownSites
-from skyless.run.gather import streams
-from skyless.run.gather.node import PING_INTERVAL, Leaf, StuckLineError, Summary
-from skyless.run.gather.streams import (
-    DOMAIN,
-    EVENT_BYTES,
-    FIRST_PORT,
-    KEEP_EVENTS_S,
-    KEEP_S,
-    MAX_PAYLOAD,
-    NEWEST_OF_EACH,
-    SOURCED,
-    SUMMARY,
+from skyless.run.gather import subjects
+from skyless.run.gather.leaf import Leaf, StuckLineError
+from skyless.run.gather.node import Summary
+from skyless.run.gather.streams import EVENT_BYTES, KEEP_EVENTS_S, KEEP_S, NEWEST_OF_EACH, follow, make_stream
+from skyless.run.gather.subjects import (
     NatsAddress,
-    at,
     connect,
-    follow,
-    make_stream,
     rarely,
 )
-from skyless.run.mqtt.address import PASSWORD_VARIABLE, is_loopback
+from skyless.run.hub_files import Hub
 from skyless.run.mqtt.link import Handler, Subscriptions
 from skyless.run.process import Log, together
 
@@ -53,7 +39,7 @@ if TYPE_CHECKING:
 SILENT_S: Final = 5.0
 """The line to a site counts as cut when its gather has not been heard for so long."""
 _CHECK_S: Final = 0.5
-_KEPT: Final = (*streams.STATE, *streams.EVENTS, streams.JSON_FIXES)
+_KEPT: Final = (*subjects.STATE, *subjects.EVENTS, subjects.JSON_FIXES)
 """What comes from streams, fixes as batches."""
 
 _log = logging.getLogger("skyless.run.hub")
@@ -97,13 +83,13 @@ class HubLink:
         """Read until cancelled."""
         client = await connect(self.address, self._name, self._say, self.drops)
         try:
-            await client.subscribe(streams.at(streams.SUMMARY, self.site), cb=self._on_summary)
+            await client.subscribe(subjects.at(subjects.SUMMARY, self.site), cb=self._on_summary)
             for topic_filter in self._subscriptions.filters:
                 if self._is_live(topic_filter):
-                    await client.subscribe(streams.subject_of(topic_filter), cb=self._on_message)
+                    await client.subscribe(subjects.subject_of(topic_filter), cb=self._on_message)
             await together(
-                self._follow(client, streams.STATE_STREAM),
-                self._follow(client, streams.EVENT_STREAM),
+                self._follow(client, subjects.STATE_STREAM),
+                self._follow(client, subjects.EVENT_STREAM),
                 self._watch(client),
             )
         finally:
@@ -112,15 +98,15 @@ class HubLink:
 
     def _is_live(self, topic_filter: str) -> bool:
         """Whether the messages of a filter are in no stream."""
-        levels = streams.subject_of(topic_filter).split(".")
+        levels = subjects.subject_of(topic_filter).split(".")
         for subject in _KEPT:
-            kept = streams.at(subject, self.site).split(".")
+            kept = subjects.at(subject, self.site).split(".")
             if len(kept) == len(levels) and all(one in ("*", level) for one, level in zip(kept, levels, strict=True)):
                 return False
         return True
 
     async def _follow(self, client: "Client", pattern: str) -> None:
-        name, own = streams.at(pattern, self.site), f"skyless.v1.{self.site}.>"
+        name, own = subjects.at(pattern, self.site), f"skyless.v1.{self.site}.>"
         found = follow(client.jetstream(), name, own, self._say, newest_of_each=True)
         async for message in found:
             await self._on_message(message)
@@ -147,149 +133,7 @@ class HubLink:
         self._heard_s = time.monotonic()
 
     async def _on_message(self, message: "Msg") -> None:
-        self._subscriptions.receive(streams.topic_of(message.subject), message.data)
-
-
-# The files of a hub: one states what was asked and all passwords, and the others are made of it.
-#
-# Each tenant is an account of plain nats-server: one user that may do everything, and one for each site.
-
-CLUSTER_PORT: Final = 2000
-LEAF_PORT: Final = 3200
-MONITOR_PORT: Final = 4000
-"""What is added to a node's port for other servers of the hub, for sites, and for monitoring on the node itself."""
-PLAN: Final = "hub.json"
-
-_NODE: Final = re.compile(r"([A-Za-z0-9][A-Za-z0-9.-]*)(?::(\d{1,5}))?")
-_CLUSTER: Final = "hub.node"
-_ADMIN: Final = "hub.admin"
-_SITE: Final = "{}.site{}"
-"""Users; names of tenants have no dot."""
-
-
-class Node(Struct, frozen=True):
-    """A server of a hub."""
-
-    host: str
-    port: int
-
-    @property
-    def name(self) -> str:
-        """Name of the server and of its folder."""
-        return self.host if self.port == FIRST_PORT else f"{self.host}-{self.port}"
-
-
-def read_node(option: str, text: str) -> Node:
-    """HOST or HOST:PORT. Raises SkylessError."""
-    found = _NODE.fullmatch(text)
-    most = 0xFFFF - MONITOR_PORT
-    if found is None or not 1 <= int(found[2] or FIRST_PORT) <= most:
-        raise SkylessError(f"{option} is {text!r}; it should be HOST or HOST:PORT, the port at most {most}")
-    return Node(found[1], int(found[2] or FIRST_PORT))
-
-
-class Hub(Struct, frozen=True):
-    """What was asked of a hub, and all of its passwords."""
-
-    nodes: tuple[Node, ...]
-    fixes_gb: float = 50.0
-    """Fixes that each server keeps of each tenant."""
-    data: str = "/var/lib/skyless-hub"
-    certificates: str = "/etc/skyless-hub"
-    sites: dict[str, list[int]] = {}
-    """Of each tenant."""
-    passwords: dict[str, str] = {}
-    """By user."""
-
-    @property
-    def ca(self) -> str | None:
-        """Certificates that all machines trust; None without TLS, on one machine alone."""
-        return None if all(is_loopback(node.host) for node in self.nodes) else f"{self.certificates}/ca.pem"
-
-    def address(self, user: str, added: int = 0) -> NatsAddress:
-        """Where a user connects; what is ``added`` to the ports says for what."""
-        hosts = ",".join(f"{node.host}:{node.port + added}" for node in self.nodes)
-        url, ca = (f"nats://{hosts}", None) if self.ca is None else (f"tls://{hosts}", Path(self.ca))
-        return NatsAddress(url, user, self.passwords[user], ca)
-
-    def leaf(self, tenant: str, site: int) -> Leaf:
-        """What a site needs."""
-        user = _SITE.format(tenant, site)
-        urls = self.address(user, LEAF_PORT).servers
-        return Leaf(site=site, tenant=tenant, urls=urls, user=user, password=self.passwords[user], ca=self.ca)
-
-
-def with_sites(hub: Hub, tenant: str, sites: Iterable[int]) -> Hub:
-    """The hub with a tenant and its sites; passwords that are there stay."""
-    numbers = hub.sites | {tenant: sorted({*hub.sites.get(tenant, ()), *sites})}
-    users = [_CLUSTER, _ADMIN, *numbers, *(_SITE.format(name, site) for name in numbers for site in numbers[name])]
-    return replace(hub, sites=numbers, passwords={user: secrets.token_urlsafe(24) for user in users} | hub.passwords)
-
-
-def write_files(hub: Hub, folder: Path) -> list[Path]:
-    """Write what has changed, for the owner alone. The files' paths. Raises SkylessError."""
-    values: dict[Path, object] = {folder / node.name / "nats-server.conf": _server(hub, node) for node in hub.nodes}
-    for tenant, sites in hub.sites.items():
-        values |= {folder / "sites" / f"{tenant}-site{site}.json": hub.leaf(tenant, site) for site in sites}
-    values[folder / PLAN] = hub
-    files = {file: msgspec.json.format(msgspec.json.encode(value), indent=1) for file, value in values.items()}
-    trusted = "" if hub.ca is None else f"SKYLESS_MQTT_CA={hub.ca}\n"
-    for tenant in hub.sites:
-        text = f"SKYLESS_HUB={hub.address(tenant)}\n{PASSWORD_VARIABLE}={hub.passwords[tenant]}\n{trusted}"
-        files[folder / "tenants" / f"{tenant}.env"] = text.encode()
-    with writing(folder):
-        changed = {file: data for file, data in files.items() if not file.exists() or file.read_bytes() != data}
-        for file in changed:
-            file.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
-        replace_files(changed, secret=changed)
-    return list(changed)
-
-
-def _server(hub: Hub, node: Node) -> dict[str, Any]:
-    """The configuration of nats-server, whose format takes JSON."""
-    host, tls, folder = node.host, {}, hub.certificates
-    if hub.ca is not None:
-        files = {"cert_file": f"{folder}/cert.pem", "key_file": f"{folder}/key.pem", "ca_file": hub.ca}
-        host, tls = "0.0.0.0", {"tls": files}
-    accounts: dict[str, Any] = {"SYS": {"users": [_user(hub, _ADMIN)]}}
-    for tenant, sites in hub.sites.items():
-        users = [_user(hub, tenant), *(_user(hub, _SITE.format(tenant, site), _access(site)) for site in sites)]
-        accounts[tenant] = {"jetstream": "enabled", "users": users}
-    whole: dict[str, Any] = {
-        "server_name": node.name,
-        "listen": f"{host}:{node.port}",
-        "http": f"127.0.0.1:{node.port + MONITOR_PORT}",
-        "max_payload": MAX_PAYLOAD,
-        "ping_interval": PING_INTERVAL,
-        "jetstream": {"domain": "hub", "store_dir": f"{hub.data}/{node.name}"},
-        "leafnodes": {"listen": f"{host}:{node.port + LEAF_PORT}", "no_advertise": True, **tls},
-        "accounts": accounts,
-        "system_account": "SYS",
-        **tls,
-    }
-    if len(hub.nodes) > 1:
-        own, others = _user(hub, _CLUSTER), [other for other in hub.nodes if other != node]
-        whole["cluster"] = {
-            "name": "hub",
-            "listen": f"{host}:{node.port + CLUSTER_PORT}",
-            "no_advertise": True,
-            "authorization": own,
-            "routes": [f"nats://{':'.join(own.values())}@{one.host}:{one.port + CLUSTER_PORT}" for one in others],
-            **tls,
-        }
-    return whole
-
-
-def _user(hub: Hub, name: str, access: dict[str, Any] | None = None) -> dict[str, Any]:
-    return {"user": name, "password": hub.passwords[name], **(access or {})}
-
-
-def _access(site: int) -> dict[str, Any]:
-    """A site publishes what is its own, and takes what the hub's streams ask of it, but no command."""
-    publish = [f"skyless.v1.{site}.>", f"skyless.v2.{site}.>", f"{at(SOURCED, site)}.>", "$JSC.R.>", "$JS.R.>", "_R_.>"]
-    asked = f"$JS.{at(DOMAIN, site)}.API"
-    subscribe = {"allow": [f"{asked}.>", "$JS.ACK.>", "$JS.FC.>", at(SUMMARY, site)], "deny": [f"{asked}.STREAM.>"]}
-    return {"permissions": {"publish": {"allow": publish}, "subscribe": subscribe}}
+        self._subscriptions.receive(subjects.topic_of(message.subject), message.data)
 
 
 # A site's line to the hub: whether it is up, and whether another site has the same number there.
@@ -337,10 +181,10 @@ async def refuse_second(leaf: Leaf, address: NatsAddress, log: Log) -> None:
     """Watch that no other site with this number was at the hub before this one. Raises SkylessError."""
     own = ""
     async with await connect(address, "skyless broker", rarely(log), Counter()) as client:
-        heard = await client.subscribe(streams.at(streams.SUMMARY, leaf.site))
+        heard = await client.subscribe(subjects.at(subjects.SUMMARY, leaf.site))
         async for message in heard.messages:
             with contextlib.suppress(Error, msgspec.DecodeError):
-                stream = streams.at(streams.FIX_STREAM, leaf.site)
+                stream = subjects.at(subjects.FIX_STREAM, leaf.site)
                 own = own or str((await client.jetstream().stream_info(stream)).created)
                 other = msgspec.json.decode(message.data, type=Summary)
                 if other.since and other.since < own:
@@ -374,16 +218,16 @@ async def make_hub_streams(client: "Client", hub: Hub, tenant: str) -> None:
             await stream.delete_stream(name)
     share = 1.0 / max(1, len(sites))
     of_each: tuple[tuple[int, str, dict[str, Any]], ...] = (
-        (1, streams.STATE_STREAM, NEWEST_OF_EACH | {"max_bytes": _STATE_BYTES}),
-        (2, streams.NAMES_STREAM, NEWEST_OF_EACH | {"max_bytes": _NAMES_BYTES}),
-        (1, streams.EVENT_STREAM, {"max_age": KEEP_EVENTS_S, "max_bytes": round(4 * EVENT_BYTES * share)}),
-        (2, streams.FIX_STREAM, {"max_age": KEEP_S, "max_bytes": round(1e9 * hub.fixes_gb * share)}),
+        (1, subjects.STATE_STREAM, NEWEST_OF_EACH | {"max_bytes": _STATE_BYTES}),
+        (2, subjects.NAMES_STREAM, NEWEST_OF_EACH | {"max_bytes": _NAMES_BYTES}),
+        (1, subjects.EVENT_STREAM, {"max_age": KEEP_EVENTS_S, "max_bytes": round(4 * EVENT_BYTES * share)}),
+        (2, subjects.FIX_STREAM, {"max_age": KEEP_S, "max_bytes": round(1e9 * hub.fixes_gb * share)}),
     )
     there = await sites_at(client)
     for site in sorted(sites, key=lambda site: site not in there):  # those that are there make room first
-        api, deliver = f"$JS.{streams.at(streams.DOMAIN, site)}.API", streams.at(streams.SOURCED, site)
+        api, deliver = f"$JS.{subjects.at(subjects.DOMAIN, site)}.API", subjects.at(subjects.SOURCED, site)
         for version, pattern, limits in of_each:
-            name, own = streams.at(pattern, site), f"skyless.v{version}.{site}.>"
+            name, own = subjects.at(pattern, site), f"skyless.v{version}.{site}.>"
             source = StreamSource(name=name, filter_subject=own, external=ExternalStream(api=api, deliver=deliver))
             config = StreamConfig(name=name, num_replicas=len(hub.nodes), sources=[source], **limits)
             await make_stream(stream, config)
@@ -399,7 +243,7 @@ async def sites_at(client: "Client") -> set[int]:
         if not names:
             break
         found.update(names)
-    prefix = streams.at(streams.STATE_STREAM, "")
+    prefix = subjects.at(subjects.STATE_STREAM, "")
     return {int(name.removeprefix(prefix)) for name in found if re.fullmatch(rf"{prefix}\d{{1,5}}", name)}
 
 
@@ -422,13 +266,13 @@ async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary 
     except TimeoutError:
         raise SkylessError(f"the hub {address} is not ready, or has no room for --fixes-gb {hub.fixes_gb:g}") from None
     async with client:
-        heard = await client.subscribe(streams.at(streams.SUMMARY, streams.EVERY))
+        heard = await client.subscribe(subjects.at(subjects.SUMMARY, subjects.EVERY))
         await asyncio.sleep(_LISTEN_S)
         messages = [await heard.next_msg() for _ in range(heard.pending_msgs)]
     found = dict[int | None, Summary]()
     for one in messages:
         with contextlib.suppress(msgspec.MsgspecError):
-            found[streams.site_in(one.subject)] = msgspec.json.decode(one.data, type=Summary)
+            found[subjects.site_in(one.subject)] = msgspec.json.decode(one.data, type=Summary)
     return {site: found.get(site) for site in hub.sites[tenant]}
 
 
@@ -522,19 +366,19 @@ class HubSites:
         client = self._client = await connect(self.address, name, say, Counter())
 
         async def on_summary(message: "Msg") -> None:
-            if (number := streams.site_in(message.subject)) is not None:
+            if (number := subjects.site_in(message.subject)) is not None:
                 self.add_summary(number, message.data, time.monotonic(), time.time())
 
         try:
-            await client.subscribe(streams.at(streams.SUMMARY, streams.EVERY), cb=on_summary)
+            await client.subscribe(subjects.at(subjects.SUMMARY, subjects.EVERY), cb=on_summary)
             while True:
                 try:
                     for number in await sites_at(client) - {site for site, name in self.names().items() if name}:
-                        subject = streams.at(streams.SITES, number)
+                        subject = subjects.at(subjects.SITES, number)
                         with contextlib.suppress(NotFoundError):  # it has not come to the hub yet
-                            name = streams.at(streams.STATE_STREAM, number)
+                            name = subjects.at(subjects.STATE_STREAM, number)
                             found = await client.jetstream().get_last_msg(name, subject, direct=True)
-                            self.add_site(streams.topic_of(subject), found.data or b"")
+                            self.add_site(subjects.topic_of(subject), found.data or b"")
                 except Error as error:
                     say(f"the sites at the hub cannot be listed: {error or type(error).__name__}")
                 await asyncio.sleep(LIST_S)

@@ -40,7 +40,7 @@ from skyless.core.keys.chain import (
     public_key,
     root_of,
 )
-from skyless.core.keys.verifier import Fault
+from skyless.core.keys.fault import Fault
 from skyless.core.trusted_receiver import SiteTrust, TrustedReceiver
 from skyless.files import write_whole
 from skyless.run.process import Log

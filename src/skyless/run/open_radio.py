@@ -17,7 +17,7 @@ from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio, Uc
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Radio, Restarted
 from skyless.radio.serial.serial_port import check_path
 from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, SerialRadio
-from skyless.run.ether import ModelPort
+from skyless.run.dw1000_model import ModelPort
 from skyless.run.process import Log
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"

@@ -19,7 +19,8 @@ from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import ReceptionsMessage, RequestMessage, StatusMessage
 from skyless.run.mqtt.topics import request_topic, site_topic
 from skyless.run.process import Log, data_folder, every, locked
-from skyless.run.recordings.recorder import EVERY_TAG, McapFile, McapRecorder
+from skyless.run.recordings.reception_log import EVERY_TAG
+from skyless.run.recordings.recorder import McapFile, McapRecorder
 
 _LEASE_S: Final = 15.0
 _REQUEST_S: Final = 5.0  # each request for receptions is repeated at this interval, before its lease ends

@@ -27,7 +27,7 @@ from skyless.run.mqtt.messages import Counters, FixMessage, RequestMessage, TagH
 from skyless.run.mqtt.topics import fix_topic, health_topic, receptions_topic, request_topic
 from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import HEALTH_S, Log, Usage, data_folder, every, keep, reader, together
-from skyless.run.recordings.recorder import ReceptionLog, receiver_settings
+from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings
 
 RECEPTIONS_S: Final = 0.05
 """Interval of the messages with raw receptions."""

@@ -32,7 +32,7 @@ from skyless.core.arrays import Array
 # The first of these is used that can be written, or that cannot but holds kernels (an image): ``NUMBA_CACHE_DIR``,
 # next to the sources, the user's cache. Where there is none, every program compiles for itself.
 
-_PACKAGE: Final = Path(__file__).parents[2]
+_PACKAGE: Final = Path(__file__).parents[1]
 _IMPORT: Final = re.compile(rb"from (skyless[\w.]*) import (\([^)]*\)|.*)")
 _KEPT_S: Final = 7 * 86_400.0
 """Kernels of other sources are kept for a week after their last use: several versions may share a folder."""

@@ -97,7 +97,7 @@ class Fixes(Struct, frozen=True, eq=False):
     vpl_m: Vector
     """Shape (n,): vertical protection level."""
     alert: tuple[str, ...]
-    """n words: whether the levels can be relied on (``skyless.core.integrity.Alert``); empty without levels."""
+    """n words: whether the levels can be relied on (``skyless.core.alert.Alert``); empty without levels."""
     truth_m: Matrix
     """Shape (n, 3): where the tag truly was."""
     judged: Mask

@@ -18,7 +18,7 @@ from skyless.core.method_names import DEFAULT_METHOD, FILTERS
 from skyless.core.site import Site
 from skyless.research.verify import random_points, verify
 from skyless.site.channel import ChannelModel
-from skyless.site.file.check import anchors_needed
+from skyless.site.file.advice import anchors_needed
 from skyless.site.file.load import site_of
 from skyless.site.planning.links import (
     ANCHORS_IN_VIEW,

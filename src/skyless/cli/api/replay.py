@@ -88,7 +88,7 @@ class ReplayResult(Result, frozen=True, eq=False):
         Raises:
             SkylessError: there is no such tag.
         """
-        from skyless.research.replays.options import track_figure
+        from skyless.research.replays.plot import track_figure
 
         name = self.tags[0] if tag is None else tag
         if name not in self.reports:

@@ -33,7 +33,7 @@ from skyless.sim.evaluation.scenarios import (
     room_of,
     run_fleet,
 )
-from skyless.sim.world import ideal_lab_site, lab_site, paper_lab_site
+from skyless.sim.lab import ideal_lab_site, lab_site, paper_lab_site
 from skyless.site.file.load import site_of
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class SimulationResult(Result, frozen=True, eq=False):
         Raises:
             SkylessError: there is no such tag.
         """
-        from skyless.research.replays.options import track_figure
+        from skyless.research.replays.plot import track_figure
 
         rows = self.fixes.track(tag)
         return track_figure(rows, f"{self.site.name}, {tag or self.tags[0]}, simulated: {len(rows)} fixes")

@@ -19,15 +19,17 @@ from skyless.core.arrays import Integers, Vector
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site
 from skyless.research.calibration.biases import Biases, biases_of, known_tags, ranges_of, walks_of
-from skyless.research.calibration.options import SurveyOptions, facts_of
+from skyless.research.calibration.facts import facts_of
+from skyless.research.calibration.options import SurveyOptions
 from skyless.research.foreign.formats import format_of
-from skyless.research.replays.options import known_truth
+from skyless.research.replays.inputs import known_truth
 from skyless.run.recordings.recording import McapRecording, is_mcap
 from skyless.site.file.load import site_of
 from skyless.site.report import BLUE, GRID, INK, MUTED, ORANGE, RED, panel, report_style
 from skyless.site.survey.facts import Count, PairRanges, Survey, SurveyedAnchor, count
 from skyless.site.survey.pair_ranger import PairRanger
-from skyless.site.survey.solve import delay_differences_m, run_survey, surveyed_text, unchanged_anchors
+from skyless.site.survey.solve import run_survey
+from skyless.site.survey.surveyed_site import delay_differences_m, surveyed_text, unchanged_anchors
 from skyless.site.survey.watch import drop_moved, with_changes
 from skyless.site.tables import read_ranges
 

@@ -22,9 +22,9 @@ from skyless.arguments import Method, Picoseconds, Positive, Seed, TagCount, tag
 from skyless.cli.common import make_folder
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, site_named
 from skyless.cli.nodes.site_view import SiteView
+from skyless.core.alert import Alert
 from skyless.core.any_receiver import beacon_period_s
 from skyless.core.errors import SkylessError
-from skyless.core.integrity import Alert
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import AlarmRule, FloorPlanSite, GeoreferenceSite, Site
 from skyless.files import replace_files
@@ -75,7 +75,7 @@ from skyless.run.process import (
 )
 from skyless.sim.evaluation.figures import ErrorStatistics
 from skyless.sim.evaluation.request import ProtectionOptions
-from skyless.sim.world import lab_site
+from skyless.sim.lab import lab_site
 from skyless.site.file.template import rectangle, site_template
 from skyless.site.survey.facts import (
     PairRange,

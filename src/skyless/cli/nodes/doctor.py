@@ -14,7 +14,8 @@ from cyclopts import App
 from skyless.arguments import Options, Positive
 from skyless.cli.common import JsonOptions, check_folder, command, plain, print_json, progress_bar, write_file
 from skyless.cli.nodes.options import SiteOptions, log
-from skyless.cli.nodes.site_view import LINK_NAME, SiteProbe, SiteView, broker_failed, site_number
+from skyless.cli.nodes.site_probe import SiteProbe, broker_failed
+from skyless.cli.nodes.site_view import LINK_NAME, SiteView, site_number
 from skyless.core.errors import SkylessError
 from skyless.core.site import NoiseSite, Site
 from skyless.core.version import installed_version

@@ -15,7 +15,7 @@ from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import AccuracySite, Site
 from skyless.machine import extra_module
 from skyless.run.broker import running_broker
-from skyless.run.gather.streams import NatsAddress, nats_address
+from skyless.run.gather.subjects import NatsAddress, nats_address
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 
 _DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
@@ -89,7 +89,7 @@ def site_named(site: str) -> Site:
 
     With other noise than 100 ps as ``lab:PS``. Raises SkylessError.
     """
-    from skyless.sim.world import lab_site, paper_lab_site
+    from skyless.sim.lab import lab_site, paper_lab_site
     from skyless.site.file.load import load_site
 
     name, colon, noise_ps = site.partition(":")

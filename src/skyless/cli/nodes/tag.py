@@ -19,8 +19,8 @@ from skyless.bridges.program import TagBridge, heard_site
 from skyless.cli.common import JsonOptions, cm, command, print_json, to_json
 from skyless.cli.nodes.bridge import hub_of
 from skyless.cli.nodes.options import MqttOptions, SiteId, log, run_until_stopped, site_named
+from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
-from skyless.core.integrity import Alert
 from skyless.core.method_names import DEFAULT_METHOD, Dynamics
 from skyless.core.site import GeoreferenceSite
 from skyless.core.trusted_receiver import SiteTrust, Trust

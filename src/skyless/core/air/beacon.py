@@ -31,7 +31,8 @@ from skyless.core.air.frame import (
 from skyless.core.air.neighbours import StatedPlace
 from skyless.core.air.site_pages import PAGE_BYTES, decode_page, encode_page, is_possible_page
 from skyless.core.native.library import compiled
-from skyless.core.native.records import Array, Byte, Bytes, Record, Ticks, record, view
+from skyless.core.native.records import Array, Byte, Bytes, Record, Ticks, record
+from skyless.core.native.views import view
 
 # The beacon of protocol 2: each anchor states its own position and when it sends next (``docs/protocol2.md``).
 

@@ -35,7 +35,8 @@ from skyless.core.estimator.state import (
     new_state,
     set_layout,
 )
-from skyless.core.native.records import MAX_ANCHORS, MAX_RELAYS, records, view
+from skyless.core.native.records import MAX_ANCHORS, MAX_RELAYS
+from skyless.core.native.views import records, view
 from skyless.core.ticks import NEVER
 
 # The estimator's state as bytes of a version, and back.

@@ -45,10 +45,9 @@ from skyless.core.native.records import (
     Reals,
     Record,
     Ticks,
-    aligned,
     record,
-    view,
 )
+from skyless.core.native.views import aligned, view
 from skyless.core.ticks import NEVER
 
 LANES: Final = 1 if PACKED else 4

@@ -6,7 +6,6 @@ frame counts only if it was received before any anchor can have disclosed that k
 
 import math
 from collections import Counter, deque
-from enum import StrEnum
 from typing import TYPE_CHECKING, Final
 
 from msgspec import Struct
@@ -15,6 +14,7 @@ from skyless.core.air.almanac import KeyPage
 from skyless.core.air.beacon import INTERVAL_BITS, Authentication, Beacon, signed_bytes
 from skyless.core.air.frame import Reception
 from skyless.core.keys.chain import SECTION_BITS, SECTION_INTERVALS, ChainTiming, is_mac, section_of
+from skyless.core.keys.fault import Fault
 from skyless.core.keys.known_keys import Arrival, Arrivals, CertificateUse, KeyUse, KnownKeys, Stamps
 from skyless.core.ticks import TICK_S, Unwrapper, from_seconds, nearest
 
@@ -126,38 +126,6 @@ class SiteClock(Struct):
             return None
         offset_s = min(self.offsets_s)
         return offset_s if abs(offset_s) > self.bound_s else None
-
-
-# Why a beacon is not accepted, or an anchor sends without a code.
-
-
-class Fault(StrEnum):
-    """The values are what counters and reports show."""
-
-    NO_CODE = "no-code"
-    """The frame carries no authentication."""
-    BAD_CODE = "bad-code"
-    """The code is not that of these bytes: the frame was forged or altered, or its anchor has a wrong seed."""
-    REVOKED_CHAIN = "revoked-chain"
-    """Its anchor uses a key chain that the site has replaced."""
-    LATE = "late-frame"
-    """Keys of its interval may have been disclosed when it came: it was delayed or repeated, or a clock is wrong."""
-    EARLY = "early-frame"
-    """Its interval has not begun."""
-    REPEATED = "repeated-frame"
-    """The same frame was received before."""
-    FIRST = "first-frame"
-    """The first genuine frame of its anchor: another one has to agree with when it came."""
-    NO_KEY = "no-key"
-    """The key of its interval did not come in time."""
-    TOO_MANY = "too-many-frames"
-    """More frames wait for their keys than a radio can receive."""
-    NO_TIME = "no-time"
-    """The anchor's host has not stated the time yet."""
-    NO_CHAIN = "no-chain"
-    """The anchor has no key chain for the present: none has begun, or the last has ended."""
-    CLOCK_WRONG = "clock-wrong"
-    """The clock of the host is not that of the site's anchors."""
 
 
 MAX_UNDECIDED: Final = 8192

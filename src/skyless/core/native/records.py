@@ -35,9 +35,6 @@ from typing import (
 from zlib import compress, decompressobj
 from zlib import error as zlib_error
 
-import numpy as np
-from numpy.typing import NDArray
-
 Value = TypeVar("Value")
 Read_co = TypeVar("Read_co", covariant=True)
 Made = TypeVar("Made", bound="Record")
@@ -237,36 +234,3 @@ SHARES_MEMORY: Final = False
 """Whether the search for a start uses the memory of the state, which is not used meanwhile."""
 HAS_ORIGIN: Final = False
 """Whether positions are from whole metres near the first anchor, as far ones lose millimetres in single precision."""
-
-
-# Records and their arrays as NumPy sees them, in the same memory.
-
-_CACHE_LINE: Final = 64
-
-
-def view(array: Any) -> NDArray[Any]:  # noqa: ANN401 - ctypes' arrays have no common type
-    """A record, or an array of numbers or records, as NumPy sees the same memory."""
-    element: Any = type(array)
-    shape: list[int] = []
-    while issubclass(element, ctypes.Array):
-        shape.append(element._length_)
-        element = element._type_
-    return np.frombuffer(array, _dtype(element)).reshape(shape)
-
-
-@cache
-def _dtype(element: type) -> np.dtype[Any]:
-    """NumPy takes longer over the fields of a record than over its memory."""
-    return np.dtype(element)
-
-
-def records(made: type[Made], array: NDArray[np.void]) -> Array[Made]:
-    """The records of a NumPy array of their type, shape (n,), in the same memory."""
-    return (made * len(array)).from_buffer(array.data)
-
-
-def aligned(made: type[Made]) -> Made:
-    """A record of zeros that begins at a cache line. Pages of it that are never used take no memory."""
-    memory = np.zeros(ctypes.sizeof(made) + _CACHE_LINE, np.uint8)
-    begin = -memory.ctypes.data % _CACHE_LINE
-    return made.from_buffer(memory[begin : begin + ctypes.sizeof(made)].data)

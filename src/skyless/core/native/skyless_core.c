@@ -1503,8 +1503,6 @@ INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks)
 
 /* Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8). */
 
-/* What a fix states of its integrity; on its own, so that programs that only read fixes load no numeric library. */
-
 /* ``limits_of`` in the plane. */
 INTERNAL real horizontal_limit(real risk) {
     return MARGIN * SQRT(-REAL(2.0) * log_(risk));

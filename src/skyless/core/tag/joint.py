@@ -17,7 +17,8 @@ from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement, limits_of
 from skyless.core.native.arithmetic import square
 from skyless.core.native.library import compiled
-from skyless.core.native.records import MAX_ANCHORS, RELAYS_KEPT, Bytes, packed, unpacked, view
+from skyless.core.native.records import MAX_ANCHORS, RELAYS_KEPT, Bytes, packed, unpacked
+from skyless.core.native.views import view
 from skyless.core.observation import Observation
 from skyless.core.tag.acquisition import MAX_LINKS, Acquisition
 from skyless.core.tag.following import (

@@ -11,7 +11,8 @@ from skyless.core.arrays import Array, Integers
 from skyless.core.fix import NoFixReason
 from skyless.core.native.arithmetic import chi2_tail, factorise, mean_if_positive, sqrt
 from skyless.core.native.library import compiled
-from skyless.core.native.records import MAX_ANCHORS, Matrix, Reals, Record, record, view
+from skyless.core.native.records import MAX_ANCHORS, Matrix, Reals, Record, record
+from skyless.core.native.views import view
 from skyless.core.tag.search import (
     EXHAUSTED,
     LARGEST,

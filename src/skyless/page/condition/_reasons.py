@@ -6,7 +6,7 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
-from skyless.core.keys.verifier import Fault
+from skyless.core.keys.fault import Fault
 from skyless.page.condition.evidence import ALERT_WORDS, ALERTS, FRESH_S, GRACE_S, MAX_NAMES, Evidence, Node
 from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, TagHealth, WatchMessage
 

@@ -24,7 +24,7 @@ from skyless.research.calibration.options import First, Stay, SurveyOptions
 from skyless.research.foreign import datasets
 from skyless.research.foreign.formats import FORMATS, Recording, format_of, open_recording
 from skyless.research.masterless.pair_engine import PairEngine
-from skyless.research.replays.options import flight_height, known_anchors, known_truth
+from skyless.research.replays.inputs import flight_height, known_anchors, known_truth
 from skyless.research.replays.site import SITE_FORMAT, reception_of, recorded_site, recorded_truth
 from skyless.run.mqtt.messages import ReceptionsMessage, StampsMessage
 from skyless.run.recordings.recording import HostClock, McapRecording, Recorded, is_mcap, tags_to_replay

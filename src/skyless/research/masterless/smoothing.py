@@ -29,7 +29,7 @@ from skyless.core.estimator.kalman import is_stationary, range_error_decay
 from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import covariances
 from skyless.core.fix import POSITION, VELOCITY, Fix, NoFixReason
-from skyless.core.native.records import view
+from skyless.core.native.views import view
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_BITS, TICK_S
 from skyless.research.masterless.difference_tracking import DifferenceTracking

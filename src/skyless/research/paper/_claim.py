@@ -25,8 +25,8 @@ from skyless.research.paper.plan import (
 )
 from skyless.research.studies.runner import Cell
 from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.sim.world import paper_lab_site
 from skyless.site.report import GREEN, INK, METHOD_COLOURS, MUTED, panel
 
 _CLAIM_FIXES: Final = 30_000

@@ -10,7 +10,7 @@ from skyless.core.protocol1.snapshots import literal_covariance
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.paper.plan import P1, P2, RADIO_PS, Panel, Plan, Results, Section, Verdict
 from skyless.research.studies.runner import Cell
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.site.report import MAP, MAP_WHITE, draw_floor_plan, panel
 
 LAB_ANCHORS_M: Final = np.array([(anchor.x_m, anchor.y_m) for anchor in paper_lab_site().anchors])

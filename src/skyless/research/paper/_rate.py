@@ -14,8 +14,8 @@ from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section,
 from skyless.research.studies.runner import Cell
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.sim.world import paper_lab_site
 from skyless.site.report import INK, METHOD_COLOURS, panel
 
 _METHODS: Final = ("literal", "joint")

@@ -18,8 +18,8 @@ from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Sect
 from skyless.research.studies.runner import Cell
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.sim.world import paper_lab_site
 from skyless.site.report import BLUE, GREEN, INK, MUTED, ORANGE, panel
 
 _JUDGED_FROM_S: Final = 0.6

@@ -10,7 +10,7 @@ from skyless.research.paper._dop_map import LAB_ANCHORS_M
 from skyless.research.paper.plan import P1, P2, Panel, Plan, Results, Section, Verdict
 from skyless.research.studies.runner import Cell
 from skyless.sim.evaluation.scenarios import Request, fleet_of
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 from skyless.site.report import BLUE, GREEN, ORANGE, PAPER, RED, draw_floor_plan, panel
 
 _TAGS_M: Final = ((2.0, 2.4), (4.1, 5.9), (1.6, 5.6))

@@ -29,8 +29,8 @@ from skyless.research.paper.plan import (
 )
 from skyless.research.studies.runner import Cell
 from skyless.sim.impairments import DelayError, Impairments, lab_impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.sim.world import paper_lab_site
 from skyless.site.channel import ChannelModel, power_bias_m, received_power_dbm
 from skyless.site.report import INK, METHOD_COLOURS, MUTED, RED, panel
 

@@ -16,9 +16,10 @@ from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Verdict
 from skyless.research.studies.runner import Cell
 from skyless.sim.impairments import Outage, lab_impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
-from skyless.sim.world import Broadcast, World, paper_lab_site
+from skyless.sim.world import Broadcast, World
 from skyless.site.report import GREEN, GRID, INK, METHOD_COLOURS, MUTED, RED, panel
 
 _POSITIONS_M: Final = ((3.0, 4.0), (1.2, 1.6), (4.6, 6.3))

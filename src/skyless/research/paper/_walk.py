@@ -12,8 +12,8 @@ from skyless.research.paper._dop_map import EXPLAINING_CORRELATION, LAB_ANCHORS_
 from skyless.research.paper.plan import RADIO_PS, Panel, Plan, Results, Section, Track, Verdict, grouped, listen
 from skyless.research.studies.runner import Cell
 from skyless.sim.impairments import lab_impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Waypoints
-from skyless.sim.world import paper_lab_site
 from skyless.site.report import INK, METHOD_COLOURS, RED, draw_floor_plan, panel
 
 _METHODS: Final = ("literal", "joint")

@@ -23,17 +23,15 @@ from skyless.research.masterless.difference_tracking import DIFFERENCES, Differe
 from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.research.masterless.pair_engine import PairEngine
 from skyless.research.masterless.smoothing import Event, Height, OwnEstimator, heard, smoothed
-from skyless.research.replays.options import (
-    DIFFERENCES_MADE,
-    PACKETS,
+from skyless.research.replays.inputs import (
     YAML_SUFFIXES,
-    ReplayOptions,
     flight_height,
     height_to_hold,
     known_anchors,
     known_heights,
     known_truth,
 )
+from skyless.research.replays.options import DIFFERENCES_MADE, PACKETS, ReplayOptions
 from skyless.sim.evaluation.figures import (
     EvenSample,
     Figures,

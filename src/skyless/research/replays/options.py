@@ -1,16 +1,9 @@
 """What is asked of a replay: options of ``skyless replay``, and what a survey of a recording shares with it."""
 
-from collections import deque
-from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from runpy import run_path
 from typing import TYPE_CHECKING, Annotated, Any, Final
-
-import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from numpy.typing import ArrayLike
 
 from skyless.arguments import (
     ComputedOptions,
@@ -31,19 +24,11 @@ from skyless.arguments import (
     read_numbers,
     wrong,
 )
-from skyless.core.air.masterless_packets import Point
 from skyless.core.air.site_pages import MAX_COORDINATE_M
-from skyless.core.arrays import Matrix, Vector
-from skyless.core.errors import ConfigurationError, SkylessError
-from skyless.core.geometry import GUESSED_STD_M, plane_height_m
+from skyless.core.errors import SkylessError
 from skyless.core.method_names import Dynamics
 from skyless.core.site import Site
-from skyless.research.foreign.formats import format_of
-from skyless.research.masterless.smoothing import Height
-from skyless.sim.evaluation.figures import FLIGHT_M, antenna_truth, flies, shifted
 from skyless.sim.evaluation.request import IntegrityRisk, ProtectionOptions
-from skyless.site.file.load import site_of
-from skyless.site.tables import HEIGHT_STD_M, Truth, read_anchors, read_height_readings, read_truth
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -53,137 +38,7 @@ if TYPE_CHECKING:
     from skyless.core.integrity import IntegrityRequirement
     from skyless.core.site import Site
     from skyless.research.masterless.smoothing import OwnEstimator
-
-# What a replay or a survey is given with a recording: anchors, truth and heights, as values.
-
-Anchors = Mapping[int, tuple[float, float, float]] | str | Path
-"""Positions by identifier in metres, or the path of a table."""
-
-AnyTruth = ArrayLike | str | Path
-"""Rows of time and position, shape (n, 4), or the path of a table."""
-
-TOO_FLAT = "the anchors' mean: they lie too flat to determine the height"
-"""Where a height is from that nobody gave."""
-
-
-YAML_SUFFIXES: Final = frozenset({".yaml", ".yml"})
-
-
-def known_anchors(anchors: Anchors | None, site: Site | str | Path | None) -> tuple[dict[int, Point], float | None]:
-    """Positions of the anchors, and the tags' height where a site states it. Raises SkylessError."""
-    if anchors is not None and site is not None:
-        raise SkylessError("give either --anchors or --site, not both")
-    if site is not None:
-        known = site_of(site)[0]
-        return {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in known.anchors}, known.tags.height_m
-    if anchors is None:
-        return {}, None
-    if not isinstance(anchors, Mapping):
-        path = existing_file("--anchors", anchors)
-        return (_read_yaml(path) if path.suffix in YAML_SUFFIXES else read_anchors(path)), None
-    anchors_m: dict[int, Point] = {}
-    for identifier, position_m in anchors.items():
-        if not isinstance(identifier, int) or identifier < 0:
-            raise wrong("--anchors", identifier, "positions by identifiers, which are whole numbers")
-        x_m, y_m, z_m = check_point(f"--anchors[{identifier}]", position_m, (3,))
-        anchors_m[identifier] = (x_m, y_m, z_m)
-    return anchors_m, None
-
-
-def _read_yaml(path: Path) -> dict[int, Point]:
-    """Positions of anchors as Bitcraze's programs keep them, x, y and z by identifier. Raises ConfigurationError."""
-    import yaml  # noqa: PLC0415 - of the extra research
-
-    try:
-        known = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return {int(anchor): (float(one["x"]), float(one["y"]), float(one["z"])) for anchor, one in known.items()}
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError) as error:
-        raise ConfigurationError(path, "the file", type(error).__name__, "identifiers with x, y and z each") from None
-
-
-def known_truth(path: Path, asked: "RecordingOptions") -> Truth | None:
-    """Where the antenna was, by an array, a table, or the recording itself. Raises SkylessError."""
-    truth, arm_m = asked.truth, asked.lever_arm_m
-    own, known = format_of(path, asked.format).read_truth, None
-    if truth is None and own is not None:
-        known = own(path, asked.listener)
-    if truth is None and known is None:
-        asked.leave_out("lever_arm_m", "truth_offset_s", why="it moves the truth, which --truth must give")
-        return None
-    if isinstance(truth, str | Path):
-        known = read_truth(existing_file("--truth", truth), asked.listener)
-    elif truth is not None:
-        known = _truth_of(truth)
-    assert known is not None
-    if isinstance(asked.truth_offset_s, float | int):
-        known = shifted(known, asked.truth_offset_s)
-    return known if arm_m is None else antenna_truth(known, arm_m)
-
-
-def _truth_of(given: ArrayLike) -> Truth:
-    right = "an array of shape (n, 4), n at least 1: time in s, which does not decrease, x, y, z in metres, all finite"
-    try:
-        rows = np.array(given, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise wrong("--truth", given, right) from None
-    is_table = rows.ndim == 2 and rows.shape[1] == 4 and len(rows) > 0
-    if not (is_table and np.isfinite(rows).all() and (np.diff(rows[:, 0]) >= 0.0).all()):
-        raise SkylessError(f"--truth is an array of shape {rows.shape}; it should be {right}")
-    return Truth(rows[:, 0], rows[:, 1:], None)
-
-
-def known_heights(asked: "ReplayOptions") -> deque[Height]:
-    """Readings of the tag's height sensor by time, by an array or a table. Raises SkylessError."""
-    given = asked.heights
-    if given is None:
-        return deque()
-    if str(given) == RECORDED:
-        own = format_of(asked.file, asked.format).read_heights
-        found = None if own is None else own(asked.file, is_barometer=asked.height_kind == BAROMETER)
-        if found is None:
-            raise wrong("--heights", RECORDED, "a table: the recording holds none of this kind")
-        rows = found
-    elif isinstance(given, str | Path):
-        rows = read_height_readings(existing_file("--heights", given))
-    else:
-        rows = np.array(given, dtype=np.float64)
-        if rows.ndim == 2 and rows.shape[1] == 2:
-            rows = np.column_stack([rows, np.full(len(rows), HEIGHT_STD_M)])
-    right = rows.ndim == 2 and rows.shape[1] == 3 and np.isfinite(rows).all() and (rows[:, 2] > 0.0).all()
-    if not right or (np.diff(rows[:, 0]) < 0.0).any():
-        expected = "rows of time in s, which does not decrease, height in m and, above 0, its standard deviation in m"
-        raise wrong("--heights", given, expected)
-    return deque(Height(t_s, height_m, std_m, asked.height_kind == BAROMETER) for t_s, height_m, std_m in rows.tolist())
-
-
-def height_to_hold(
-    wish: float | str, anchors_m: dict[int, Point], site_m: float | None, truth: Truth | None, format_name: str
-) -> tuple[float | None, float, str]:
-    """Height to hold (None where it is estimated), its standard deviation, and where it is from.
-
-    ``wish``: metres, or one of ``HEIGHT_WORDS``. Raises SkylessError.
-    """
-    if not isinstance(wish, str):
-        return wish, 0.0, "given"
-    if wish == "free":
-        return None, 0.0, "estimated"
-    if wish == "truth" or (truth is not None and format_name == "miluv"):
-        if truth is None:
-            raise SkylessError("--tag-height truth takes the height from the truth, which --truth must give")
-        return float(np.median(truth.position_m[:, 2])), 0.0, "the truth's median"
-    if site_m is not None:
-        return site_m, 0.0, "from the site file"
-    plane_m = plane_height_m(anchors_m)
-    if plane_m is None:
-        return None, 0.0, "estimated"
-    return plane_m, GUESSED_STD_M, TOO_FLAT
-
-
-def flight_height(wish: float | None, truth: Truth | None) -> float | None:
-    """Height above which fixes are judged: the wish, or where the truth begins on the floor and rises well above it."""
-    if wish is not None or truth is None:
-        return wish
-    return FLIGHT_M if flies(truth) else None
+    from skyless.research.replays.inputs import Anchors, AnyTruth
 
 
 PACKETS, DIFFERENCES_MADE = "packets", "differences"
@@ -368,77 +223,3 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
         if not asked.protection_given and self.tag_height_std_m is None:
             return None
         return asked.requirement(self.method, self.tag_height_std_m)
-
-
-# The picture of a replay: track and height over truth, errors and stated σ over time, histograms of the errors.
-
-
-def track_figure(rows: Matrix, title: str) -> Figure:
-    """Draw rows of time, position, truth (NaN where unknown) and σ of each axis, shape (n, 10); of none, the title."""
-    figure = Figure(figsize=(15, 8), layout="constrained")
-    figure.suptitle(title)
-    if len(rows):
-        _fill(figure, rows)
-    return figure
-
-
-def _fill(figure: Figure, rows: Matrix) -> None:
-    axes = figure.subplots(2, 3)
-    judged = rows[np.isfinite(rows[:, 4])]
-    known = len(judged) > 0
-    drawn = judged if known else rows
-    errors = judged[:, 1:4] - judged[:, 4:7] if known else rows[:, 1:4] - np.median(rows[:, 1:4], axis=0)
-    time_s, std_m = drawn[:, 0] - drawn[:1, 0], drawn[:, 7:10]
-    _track(axes[0, 0], rows, judged)
-    _over_time(axes[0, 1], time_s, errors[:, :2], std_m[:, :2], known=known)
-    _over_time(axes[0, 2], time_s, errors[:, 2:], std_m[:, 2:], known=known)
-    _histogram(axes[1, 0], errors, known=known)
-    _distribution(axes[1, 1], np.linalg.norm(errors[:, :2], axis=1), known=known)
-    _height(axes[1, 2], rows, judged)
-
-
-def _track(axes: Axes, rows: Matrix, judged: Matrix) -> None:
-    if len(judged):
-        axes.plot(judged[:, 4], judged[:, 5], color="black", linewidth=0.8, label="truth")
-    axes.plot(rows[:, 1], rows[:, 2], ".", markersize=2, label="fixes")
-    axes.set(xlabel="x in m", ylabel="y in m", title="track", aspect="equal")
-    axes.legend()
-
-
-def _height(axes: Axes, rows: Matrix, judged: Matrix) -> None:
-    if len(judged):
-        axes.plot(judged[:, 0] - rows[0, 0], judged[:, 6], color="black", linewidth=0.8, label="truth")
-    axes.plot(rows[:, 0] - rows[0, 0], rows[:, 3], ".", markersize=2, label="fixes")
-    axes.set(xlabel="time in s", ylabel="z in m", title="height")
-    axes.legend()
-
-
-def _over_time(axes: Axes, time_s: Vector, errors: Matrix, std_m: Matrix, *, known: bool) -> None:
-    """Errors of x and y, or of z, and the largest σ of them."""
-    names = "xy" if errors.shape[1] == 2 else "z"
-    for axis, name in enumerate(names):
-        axes.plot(time_s, errors[:, axis], linewidth=0.7, label=name)
-    for sign in (1.0, -1.0):
-        axes.plot(
-            time_s, sign * std_m.max(axis=1), color="black", linewidth=0.8, label="± stated σ" if sign > 0 else None
-        )
-    axes.set(xlabel="time in s", ylabel=_label(known=known), title=f"{' and '.join(names)} over time")
-    axes.legend()
-
-
-def _histogram(axes: Axes, errors: Matrix, *, known: bool) -> None:
-    span = np.percentile(np.abs(errors), 99.5) if len(errors) else 1.0
-    for axis, name in enumerate("xyz"):
-        axes.hist(errors[:, axis], bins=80, range=(-span, span), histtype="step", label=name)
-    axes.set(xlabel=_label(known=known), ylabel="fixes", title="histogram")
-    axes.legend()
-
-
-def _distribution(axes: Axes, radial_m: Matrix, *, known: bool) -> None:
-    axes.plot(np.sort(radial_m), np.linspace(0.0, 100.0, len(radial_m)))
-    axes.set(xlabel=f"horizontal {_label(known=known)}", ylabel="per cent of the fixes below", title="distribution")
-    axes.grid(visible=True, linewidth=0.3)
-
-
-def _label(*, known: bool) -> str:
-    return "error in m" if known else "deviation from the median in m"

@@ -25,7 +25,7 @@ from skyless.core.ticks import WRAP_TICKS, wrap
 from skyless.files import Drops
 from skyless.research.replays.captures import ReplayReport, common_figures
 from skyless.run.mqtt.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart, fix_message
-from skyless.run.recordings.recorder import RefusedError, load
+from skyless.run.recordings.reception_log import RefusedError, load
 from skyless.run.recordings.recording import HostClock, McapRecording, Recorded, tags_to_replay
 from skyless.sim.evaluation.figures import FixSamples, Judged, figures_of
 from skyless.site.tables import Truth

@@ -20,7 +20,7 @@ from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.research.studies.runner import Cell, Plan, Row
 from skyless.research.uncertainty import BoundSettings, tracking_bound
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 # Episodes of one tag in the lab, simulated to the stamps alone: quick to draw, with just the noise of the bounds.
 #

@@ -31,7 +31,7 @@ from skyless.research.studies.efficiency import (
 )
 from skyless.research.studies.picture import clustered_interval
 from skyless.research.studies.runner import Cell, Plan, Row
-from skyless.sim.world import paper_lab_site
+from skyless.sim.lab import paper_lab_site
 
 _ONSETS: Final = (40, 67)
 """Superframes between which the fault begins; the filter has settled long before."""

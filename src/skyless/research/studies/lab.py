@@ -16,9 +16,9 @@ from skyless.research.studies.runner import Cell, Plan, Row, seed_of
 from skyless.research.studies.worlds import LAB_WARMUP_S, Run, anchor_of, box, large_lab_site, walking, worlds
 from skyless.research.uncertainty import BoundSettings, known_receptions, received_bound
 from skyless.sim.impairments import AnchorBias, AnchorOutage, Impairments, Outage
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.oscillator import Temperature
 from skyless.sim.trajectory import Piece, Static, Trajectory, Waypoints
-from skyless.sim.world import paper_lab_site
 
 _SHARES: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
 _QUICK_SHARES: Final = (0.3, 0.5, 0.7, 0.9)

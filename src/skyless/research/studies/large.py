@@ -28,11 +28,11 @@ from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, wit
 from skyless.research.studies.worlds import box, worlds
 from skyless.research.uncertainty import BoundSettings, Sendings, received_bound, relayed_receptions
 from skyless.sim.cells.world import CellWorld, TagReceptions, anchors_of
-from skyless.sim.evaluation.fleet import SiteBeacons, period_codes_of
+from skyless.sim.evaluation.cell_fleet import SiteBeacons, period_codes_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room
 from skyless.sim.impairments import Impairments, RangeErrorModel
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Roaming, Trajectory, Waypoints
-from skyless.sim.world import paper_lab_site
 from skyless.site.channel import ChannelModel
 from skyless.site.file.template import grid_site
 

@@ -18,8 +18,8 @@ from skyless.research.studies.runner import Limit, Plan, Row, with_limits
 from skyless.research.studies.worlds import box, walking, worlds
 from skyless.sim.evaluation.scenarios import Room, wanderer, wanderers
 from skyless.sim.impairments import Body, CarrierModel, Impairments, RangeErrorModel
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.trajectory import Trajectory
-from skyless.sim.world import lab_site, paper_lab_site
 
 _WARMUP_S: Final = 2.5
 _STAMPS: Final = ", stamps alone"

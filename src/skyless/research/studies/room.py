@@ -38,8 +38,9 @@ from skyless.sim.evaluation.figures import LevelCounts
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room, wanderer, wanderers
 from skyless.sim.impairments import AnchorBias, Body, RangeErrorModel, WarmUp
+from skyless.sim.lab import lab_site
 from skyless.sim.trajectory import Static, Trajectory, Waypoints
-from skyless.sim.world import Broadcast, lab_site
+from skyless.sim.world import Broadcast
 
 BASE: Final = "the room"
 AIR: Final = "unbiased air"

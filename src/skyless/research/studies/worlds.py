@@ -25,9 +25,9 @@ from skyless.sim.evaluation.figures import EvenSample, FirstFixes, LevelCounts, 
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import WALL_MARGIN_M, Request, impairments_of, trajectories_of
 from skyless.sim.impairments import Impairments
+from skyless.sim.lab import paper_lab_site
 from skyless.sim.streams import stream
 from skyless.sim.trajectory import Trajectory
-from skyless.sim.world import paper_lab_site
 
 LAB_WARMUP_S: Final = 4.0
 """No fix is judged before; cold starts of the lab take a tenth of a second, those with 90 % loss some seconds."""

@@ -30,13 +30,15 @@ from skyless.sim.impairments import (
     RangeErrorModel,
     lab_impairments,
 )
-from skyless.sim.world import World, lab_site
+from skyless.sim.lab import lab_site
+from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
 from skyless.site.survey.determined import aligned_covariance
 from skyless.site.survey.facts import Facts, PairRanges, Point, Survey, Tape
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.problem import Problem, jacobian, superimposed
-from skyless.site.survey.solve import run_survey, surveyed_site
+from skyless.site.survey.solve import run_survey
+from skyless.site.survey.surveyed_site import surveyed_site
 
 # Sites on which surveys of anchors are studied.
 

@@ -7,11 +7,10 @@ import time
 from collections import Counter, deque
 from collections.abc import Mapping
 from itertools import count
-from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Final, Literal
 
 import msgspec
-from msgspec import Meta, Struct
+from msgspec import Struct
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.aio.subscription import Subscription
@@ -19,11 +18,11 @@ from nats.errors import Error
 from nats.js import JetStreamContext
 from nats.js.errors import APIError
 
-from skyless.core.errors import SkylessError
 from skyless.core.version import installed_version
 from skyless.run.fix_batch import MAX_RECORDS, BadBatchError, Batch, Records, decode_batch, encode_batch, records_of
-from skyless.run.gather import streams
-from skyless.run.gather.streams import NEVER_WRITTEN, Names, NatsAddress, connect, make_streams, messages, rarely
+from skyless.run.gather import subjects
+from skyless.run.gather.streams import NEVER_WRITTEN, Names, make_streams, messages
+from skyless.run.gather.subjects import NatsAddress, connect, rarely
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import RefusedError, kept_messages, trouble_with
 from skyless.run.mqtt.messages import FixMessage, SiteMessage, StatusMessage, WrongMessageError, read_message
@@ -211,7 +210,7 @@ class Gather:
         self.site = site
         self._address, self._keep_bytes, self._log, self._broker = address, keep_bytes, log, broker
         self._say = rarely(log)
-        self._host = streams.own_host()
+        self._host = subjects.own_host()
         self._packer = Packer(secrets.randbits(32))
         self._client: Client | None = None
         self._names: Names | None = None
@@ -252,10 +251,10 @@ class Gather:
         stream = client.jetstream()
         try:
             site = self.site = await self._first_site(client) if self.site is None else self.site
-            fixes = await client.subscribe(streams.at(streams.JSON_FIXES, site), _QUEUE, self._on_fix)
-            await client.subscribe(streams.at(streams.FIXES, site), cb=self._on_batch)
-            for pattern in (streams.STATUSES, streams.SITES):
-                await client.subscribe(streams.at(pattern, site), cb=self._on_message)
+            fixes = await client.subscribe(subjects.at(subjects.JSON_FIXES, site), _QUEUE, self._on_fix)
+            await client.subscribe(subjects.at(subjects.FIXES, site), cb=self._on_batch)
+            for pattern in (subjects.STATUSES, subjects.SITES):
+                await client.subscribe(subjects.at(pattern, site), cb=self._on_message)
             try:
                 await together(self._send(stream, site), self._summarise(client, site))
             finally:
@@ -266,7 +265,7 @@ class Gather:
 
     async def _first_site(self, client: Client) -> int:
         heard = await client.subscribe("skyless.v1.*.>")
-        while (site := streams.site_in((await heard.next_msg(None)).subject)) is None:
+        while (site := subjects.site_in((await heard.next_msg(None)).subject)) is None:
             pass
         await heard.unsubscribe()
         self._log(f"gathers site {site}; --site-id names another")
@@ -275,7 +274,7 @@ class Gather:
     # Messages
 
     async def _on_fix(self, message: Msg) -> None:
-        self._packer.add(streams.tag_in(message.subject), message.data)
+        self._packer.add(subjects.tag_in(message.subject), message.data)
 
     async def _on_batch(self, message: Msg) -> None:
         with contextlib.suppress(BadBatchError):
@@ -294,7 +293,7 @@ class Gather:
         while True:
             try:
                 await make_streams(stream, site, self._keep_bytes)
-                self._since = str((await stream.stream_info(streams.at(streams.FIX_STREAM, site))).created)
+                self._since = str((await stream.stream_info(subjects.at(subjects.FIX_STREAM, site))).created)
                 await self._copy_state(stream, site)
                 names = Names(stream, site)
                 await names.read()
@@ -308,21 +307,21 @@ class Gather:
 
     async def _copy_state(self, stream: JetStreamContext, site: int) -> None:
         """Read the state that the stream has. What the broker has kept from before the stream was made is put there."""
-        state, known = streams.at(streams.STATE_STREAM, site), set[str]()
+        state, known = subjects.at(subjects.STATE_STREAM, site), set[str]()
         async for message in messages(stream, state):
             known.add(message.subject)
             if message.subject.endswith((".site", ".status")):
                 await self._on_message(message)
         if self._broker is None:
             return
-        filters = [streams.topic_of(streams.at(one, site)).replace("*", "+") for one in streams.STATE]
+        filters = [subjects.topic_of(subjects.at(one, site)).replace("*", "+") for one in subjects.STATE]
         try:
             kept = await kept_messages(self._broker, filters)
         except (OSError, RefusedError) as error:
             self._say(f"what the broker has kept is not copied: {trouble_with(self._broker, error)}")
             return
         for topic, payload in kept.items():
-            if (subject := streams.subject_of(topic)) not in known:
+            if (subject := subjects.subject_of(topic)) not in known:
                 with contextlib.suppress(APIError):  # it has come at this moment
                     await stream.publish(subject, payload, headers=dict(NEVER_WRITTEN))
 
@@ -331,7 +330,7 @@ class Gather:
 
         A batch that the stream refuses, as on a full disk, has reached those who read now, and is not sent again.
         """
-        subject = streams.at(streams.FIXES, site, self._host)
+        subject = subjects.at(subjects.FIXES, site, self._host)
         while self._ready is not None or (tags := self._packer.next_tags()):
             if self._ready is None:
                 await names.give(tags, self._host, time.time())  # first: every number in the stream has a name
@@ -353,48 +352,5 @@ class Gather:
 
     async def _summarise(self, client: Client, site: int) -> None:
         while True:
-            await client.publish(streams.at(streams.SUMMARY, site), msgspec.json.encode(self.summary))
+            await client.publish(subjects.at(subjects.SUMMARY, site), msgspec.json.encode(self.summary))
             await asyncio.sleep(SUMMARY_S)
-
-
-# The file of a site's line to a hub: ``skyless hub init`` writes it, ``skyless broker --hub`` reads it.
-
-Kind = TypeVar("Kind")
-
-
-PING_INTERVAL: Final = "10s"
-"""nats-server gives a connection up after two pings without an answer, of 2 minutes each without this."""
-
-
-class StuckLineError(Exception):
-    """nats-server does not try to reach the hub any more (nats-server #7615): it is to be started again."""
-
-
-class Leaf(Struct, frozen=True, kw_only=True):
-    """What nats-server of a site needs to reach the hub."""
-
-    version: Literal[1] = 1
-    site: Annotated[int, Meta(ge=0, le=0xFFFD)]
-    tenant: str
-    urls: Annotated[list[str], Meta(min_length=1)]
-    """The port for sites of each node, nats://HOST:PORT or tls://HOST:PORT."""
-    user: str
-    password: str
-    ca: str | None
-    """Certificates to trust, an absolute path; None without TLS."""
-
-    def configuration(self) -> dict[str, Any]:
-        """What nats-server needs. MQTT's own subjects stay at the site: sites of a tenant share its account."""
-        urls = [url.replace("://", f"://{self.user}:{self.password}@", 1) for url in self.urls]
-        remote: dict[str, Any] = {"urls": urls, "deny_imports": ["$MQTT.>"], "deny_exports": ["$MQTT.>"]}
-        if self.ca is not None:
-            remote["tls"] = {"ca_file": self.ca}
-        return {"no_advertise": True, "remotes": [remote]}
-
-
-def read_json(file: Path, kind: type[Kind], maker: str) -> Kind:
-    """A file of a hub. Raises SkylessError: it cannot be read, or ``maker`` has not made it."""
-    try:
-        return msgspec.json.decode(file.read_bytes(), type=kind)
-    except (OSError, msgspec.DecodeError, UnicodeError) as error:
-        raise SkylessError(f"{file} cannot be used: {getattr(error, 'strerror', error)}; {maker} makes it") from None

@@ -22,20 +22,11 @@ from numpy.typing import NDArray
 
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import MAX_RECORDS, BadBatchError, Batch, Records, decode_batch, records_of
-from skyless.run.gather import streams
-from skyless.run.gather.streams import Names, NatsAddress, connect, follow, rarely
-from skyless.run.history.layout import (
-    FIX_COLUMNS,
-    REMEMBERED_KINDS,
-    Event,
-    EventLog,
-    current_events,
-    current_files,
-    day_of,
-    read_events,
-    read_table,
-    unix_ms,
-)
+from skyless.run.gather import subjects
+from skyless.run.gather.streams import Names, follow
+from skyless.run.gather.subjects import NatsAddress, connect, rarely
+from skyless.run.history.layout import FIX_COLUMNS, current_events, current_files, day_of
+from skyless.run.history.tables import REMEMBERED_KINDS, Event, EventLog, read_events, read_table, unix_ms
 from skyless.run.history.writer import FILE_ROWS, Intake, Keep, Writer, tidy
 from skyless.run.hub import LIST_S, sites_at
 from skyless.run.mqtt import topics
@@ -160,7 +151,7 @@ async def take_batches(stream: "JetStreamContext", writer: Writer, say: Log) -> 
 
     The place in the stream is kept together with the rows, so that each batch is taken once.
     """
-    name, own = streams.at(streams.FIX_STREAM, writer.site), streams.at(streams.FIXES, writer.site)
+    name, own = subjects.at(subjects.FIX_STREAM, writer.site), subjects.at(subjects.FIXES, writer.site)
     taker = BatchTaker(Names(stream, writer.site), writer, say)
     async for message in follow(stream, name, own, say, await first_place(stream, name, writer.fixes, say)):
         await taker.take(message)
@@ -367,22 +358,22 @@ class _Site:
         await take_batches(self._stream, self.writer, self._say)
 
     async def _take_state(self) -> None:
-        async for message in self._follow(streams.STATE_STREAM, is_state=True):
+        async for message in self._follow(subjects.STATE_STREAM, is_state=True):
             self._receive(message)
 
     async def _take_events(self) -> None:
-        name, intake = streams.at(streams.EVENT_STREAM, self.writer.site), self.writer.events
+        name, intake = subjects.at(subjects.EVENT_STREAM, self.writer.site), self.writer.events
         after = await first_place(self._stream, name, intake, self._say)
-        async for message in self._follow(streams.EVENT_STREAM, after):
+        async for message in self._follow(subjects.EVENT_STREAM, after):
             self.history.event_place = message.metadata.sequence.stream
             self._receive(message)
 
     def _follow(self, pattern: str, after: int = 0, *, is_state: bool = False) -> "AsyncGenerator[Msg, None]":
-        name, own = streams.at(pattern, self.writer.site), f"skyless.v1.{self.writer.site}.>"
+        name, own = subjects.at(pattern, self.writer.site), f"skyless.v1.{self.writer.site}.>"
         return follow(self._stream, name, own, self._say, after, newest_of_each=is_state)
 
     def _receive(self, message: "Msg") -> None:
-        self._subscriptions.receive(streams.topic_of(message.subject), message.data)
+        self._subscriptions.receive(subjects.topic_of(message.subject), message.data)
 
 
 class HubHistory:

@@ -47,16 +47,14 @@ from skyless.run.history.layout import (
     ASSET_COLUMNS,
     FIX_COLUMNS,
     NAME_COLUMNS,
-    ROW_GROUP,
     THINNED,
     ZONE_COLUMNS,
     current_events,
     current_files,
     day_of,
-    read_table,
-    schema_of,
     site_folder,
 )
+from skyless.run.history.tables import ROW_GROUP, read_table, schema_of
 from skyless.run.web import HISTORY as LIMITS
 
 # Times in cells and near tags, which need all rows: PyArrow and NumPy take a third of DuckDB's processor time here.

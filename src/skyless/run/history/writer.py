@@ -32,18 +32,13 @@ from skyless.run.history.layout import (
     NAME_COLUMNS,
     THINNED,
     ZONE_COLUMNS,
-    Event,
     day_of,
-    event_table,
     file_name,
-    fix_table,
     largest_files,
-    read_table,
     rows_of,
-    schema_of,
     site_folder,
-    write_table,
 )
+from skyless.run.history.tables import Event, event_table, fix_table, read_table, schema_of, write_table
 from skyless.run.mqtt.messages import Asset, FixMessage, Zone
 from skyless.run.process import locked
 from skyless.run.web import HISTORY as LIMITS

@@ -101,7 +101,7 @@ class FixMessage(Struct, frozen=True):
     integrity_risk: float | None = None
     """Probability, for each fix, that the error exceeds its level."""
     alert: str | None = None
-    """A value of ``skyless.core.integrity.Alert``."""
+    """A value of ``skyless.core.alert.Alert``."""
     verified_until_s: float | None = None
     """Up to this time, on the scale of ``time_s``, all beacons that count are verified; None where none is."""
     unverified: float = 1.0
@@ -168,7 +168,7 @@ class TagHealth(Struct, frozen=True):
     """Whether beacons have been verified within the last seconds."""
     faults: dict[str, str] = {}
     """Anchors whose beacons, or beacons in whose name, were not accepted within the last seconds, and why
-    (``skyless.core.keys.verifier.Fault``)."""
+    (``skyless.core.keys.fault.Fault``)."""
     clock_error_s: float | None = None
     """How far the host's clock is ahead of the site's where that is more than the bound; None where all is well."""
     multipath_std_m: float | None = None
@@ -223,7 +223,7 @@ class AnchorHealth(Struct, frozen=True):
     chain_ends_unix_s: float | None = None
     """When the last of its key chains ends."""
     code_fault: str | None = None
-    """Why an anchor with keys sends without codes (``skyless.core.keys.verifier.Fault``); None where it has them."""
+    """Why an anchor with keys sends without codes (``skyless.core.keys.fault.Fault``); None where it has them."""
     faults: dict[str, str] = {}
     """Other anchors whose beacons, or beacons in whose name, were not accepted within the last seconds, and why."""
 

@@ -41,21 +41,20 @@ from skyless.run.mqtt.topics import (
 )
 from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import Log, every, keep, outlasting, reader, together
-from skyless.run.survey.live_survey import (
+from skyless.run.survey.files import (
     BadFactsError,
-    FactsOf,
     FloorImage,
-    LiveSurvey,
     Saved,
     check_facts,
     record_of,
     save_survey,
     saved_without_file,
 )
+from skyless.run.survey.live_survey import FactsOf, LiveSurvey
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, PairRanges, Survey
 from skyless.site.survey.legs import LegCollector
-from skyless.site.survey.solve import delay_differences_m
+from skyless.site.survey.surveyed_site import delay_differences_m
 from skyless.site.survey.watch import change_of
 
 NAME: Final = "survey"

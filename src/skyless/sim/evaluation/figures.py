@@ -13,10 +13,10 @@ from typing import Any, Final
 import numpy as np
 from msgspec import Struct
 
+from skyless.core.alert import Alert
 from skyless.core.any_receiver import superframe_s
 from skyless.core.arrays import Array, Mask, Matrix, Vector
 from skyless.core.fix import Fix
-from skyless.core.integrity import Alert
 from skyless.core.site import Site
 from skyless.site.tables import Truth
 

@@ -15,7 +15,8 @@ from skyless.core.errors import SkylessError
 from skyless.core.geometry import rectangle_of
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, SNAPSHOTS
 from skyless.core.site import FloorSite, Site
-from skyless.sim.evaluation.fleet import MAX_MACHINES, CellFleet, Fleet, FleetSettings, JudgedFix, TagFleet, TagReceiver
+from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet
+from skyless.sim.evaluation.fleet import Fleet, FleetSettings, JudgedFix, TagFleet, TagReceiver
 from skyless.sim.evaluation.request import Conditions
 from skyless.sim.impairments import AnchorDisplacement, Body, CarrierModel, Impairments, RangeErrorModel, WarmUp
 from skyless.sim.oscillator import OscillatorModel, Temperature

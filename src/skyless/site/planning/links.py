@@ -21,7 +21,8 @@ from skyless.site.channel import (
     delivery_probability,
     received_power_dbm,
 )
-from skyless.site.file.check import anchors_needed, image_size
+from skyless.site.file.advice import anchors_needed
+from skyless.site.file.check import image_size
 from skyless.site.kernels import kernel, threaded_kernel
 
 PLAN_COLUMNS: Final = (

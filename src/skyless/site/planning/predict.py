@@ -23,7 +23,8 @@ from skyless.core.estimator.state import State, at, new_state
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay, SteadyState
 from skyless.core.geometry import anchor_positions, inverses
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS
-from skyless.core.native.records import MAX_ANCHORS, MAX_ANCHORS_IN_USE, records, view
+from skyless.core.native.records import MAX_ANCHORS, MAX_ANCHORS_IN_USE
+from skyless.core.native.views import records, view
 from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.protocol1.snapshots import SnapshotMethod, bracketed_covariance, literal_covariance
 from skyless.core.site import Site

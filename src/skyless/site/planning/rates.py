@@ -24,7 +24,7 @@ from skyless.site.channel import (
     pack_walls,
     received_power_dbm,
 )
-from skyless.site.file.check import warnings_of
+from skyless.site.file.advice import warnings_of
 from skyless.site.kernels import threaded_kernel
 from skyless.site.planning.links import IN_VIEW, Floor, range_of
 from skyless.site.planning.maps import Grid, grid_of

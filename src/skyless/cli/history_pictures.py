@@ -1,0 +1,137 @@
+"""Pictures of the history's answers."""
+
+import time
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+from datetime import datetime
+from typing import TYPE_CHECKING, Any, Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from skyless.run.history.answers import THINNED_GAP_S
+from skyless.site.report import BLUE, MAP, MUTED, panel, report_style
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from skyless.run.history.program import HistoryNode, HubHistory
+
+    _History = HistoryNode | HubHistory
+
+
+_BARS: Final = 30
+
+
+_LINES: Final = 8
+
+
+_Zones = Mapping[str, tuple[str, tuple[tuple[float, float], ...]]]
+
+
+_Answer = Mapping[str, Any]
+"""An answer (``run/history/answers.py``) by its fields, with names beside identifiers."""
+
+
+def track_figure(track: _Answer, zones: _Zones, title: str) -> Figure:
+    """The way over the zones, interrupted at gaps."""
+    with report_style():
+        figure, axes = panel(f"{track['tag_name']}, {title}", 4.2)
+        rows = np.array([(point.unix_s, point.x_m, point.y_m) for point in track["points"]]).reshape(-1, 3)
+        usual_s = np.median(np.diff(rows[:, 0])) if len(rows) > 1 else 0.0
+        gaps = np.flatnonzero(np.diff(rows[:, 0]) > max(THINNED_GAP_S, 3.0 * usual_s)) + 1
+        for part in np.split(rows, gaps):
+            axes.plot(part[:, 1], part[:, 2], ".-", color=BLUE, markersize=1.5, linewidth=0.7)
+        _plan(axes, zones)
+        return figure
+
+
+def heatmap_figure(heatmap: _Answer, zones: _Zones, title: str) -> Figure:
+    """The time in each cell over the zones, in colours by its logarithm."""
+    with report_style():
+        figure, axes = panel(title, 4.2)
+        seconds = np.array(heatmap["seconds"]).reshape(heatmap["rows"], heatmap["columns"])
+        if (seconds > 0.0).any():
+            x0_m, y0_m, cell_m = (heatmap[name] for name in ("x0_m", "y0_m", "cell_m"))
+            extent = (x0_m, x0_m + cell_m * seconds.shape[1], y0_m, y0_m + cell_m * seconds.shape[0])
+            shown = np.ma.masked_equal(seconds, 0.0)
+            drawn = axes.imshow(shown, extent=extent, origin="lower", cmap=MAP, norm=LogNorm())
+            figure.colorbar(drawn, ax=axes, label="time in s")
+        _plan(axes, zones)
+        return figure
+
+
+def dwell_figure(dwell: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
+    """The longest times as bars."""
+    longest = sorted(dwell, key=lambda one: -one["seconds"])[:_BARS][::-1]
+    with report_style():
+        figure, axes = panel(title, 1.2 + 0.2 * max(len(longest), 3))
+        names = [f"{one['tag_name']}, {one['zone_name']}" for one in longest]
+        axes.barh(names, [one["seconds"] / 60.0 for one in longest], color=BLUE)
+        axes.set_xlabel("time in min")
+        return figure
+
+
+def occupancy_figure(occupancy: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
+    """The mean number of tags over time, of the fullest zones."""
+    zones: dict[str, list[_Answer]] = defaultdict(list)
+    for one in occupancy:
+        zones[one["zone"]].append(one)
+    fullest = sorted(zones.values(), key=lambda steps: -sum(step["mean"] for step in steps))[:_LINES]
+    with report_style():
+        figure, axes = panel(title)
+        for steps in fullest:
+            times: list[Any] = [datetime.fromtimestamp(step["unix_s"]) for step in steps]
+            axes.step(times, [step["mean"] for step in steps], where="post", label=steps[0]["zone_name"])
+        axes.set_ylabel("tags, mean of each step")
+        figure.autofmt_xdate()
+        if fullest:
+            axes.legend()
+        return figure
+
+
+def contacts_figure(contacts: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
+    """When each other tag was near."""
+    return _times_figure([(one["other_name"], one["begin_unix_s"], one["end_unix_s"]) for one in contacts], title)
+
+
+def alarms_figure(alarms: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
+    """From when to when each rule's alarms lasted; those that have not ended, until now."""
+    times = [(one["raised_unix_s"], one["ended_unix_s"] or time.time()) for one in alarms]
+    names = [f"{one['rule']}, {one['subject_name']}" for one in alarms]
+    return _times_figure([(name, *span) for name, span in zip(names, times, strict=True)], title)
+
+
+def _times_figure(times: Sequence[tuple[str, float, float]], title: str) -> Figure:
+    """A line of bars for each of the first names, from the one Unix time to the other."""
+    names = list(dict.fromkeys(name for name, _, _ in times))[:_BARS][::-1]
+    with report_style():
+        figure, axes = panel(title, 1.2 + 0.2 * max(len(names), 3))
+        for name, begin_s, end_s in times:
+            if name in names:
+                begin, end = datetime.fromtimestamp(begin_s), datetime.fromtimestamp(end_s)
+                axes.barh(name, end - begin, left=begin, color=BLUE)  # type: ignore[arg-type]
+        figure.autofmt_xdate()
+        return figure
+
+
+def _plan(axes: Axes, zones: _Zones) -> None:
+    for name, corners in zones.values():
+        if corners:
+            x_m, y_m = zip(*corners, corners[0], strict=True)
+            axes.plot(x_m, y_m, color=MUTED, linewidth=0.8)
+            axes.annotate(name, (sum(x_m[1:]) / len(corners), sum(y_m[1:]) / len(corners)), fontsize=7.0, ha="center")
+    axes.set(xlabel="x in m", ylabel="y in m", aspect="equal")
+
+
+FIGURES: Final[Mapping[str, Callable[[Any, _Zones, str], Figure]]] = {
+    "track": track_figure,
+    "heatmap": heatmap_figure,
+    "dwell": dwell_figure,
+    "occupancy": occupancy_figure,
+    "contacts": contacts_figure,
+    "alarms": alarms_figure,
+}
+"""What draws the answer to a question, by the question's name."""

@@ -1,0 +1,83 @@
+"""The picture of a replay: track and height over truth, errors and stated σ over time, histograms of the errors."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from skyless.core.arrays import Matrix, Vector
+
+if TYPE_CHECKING:
+    pass
+
+
+def track_figure(rows: Matrix, title: str) -> Figure:
+    """Draw rows of time, position, truth (NaN where unknown) and σ of each axis, shape (n, 10); of none, the title."""
+    figure = Figure(figsize=(15, 8), layout="constrained")
+    figure.suptitle(title)
+    if len(rows):
+        _fill(figure, rows)
+    return figure
+
+
+def _fill(figure: Figure, rows: Matrix) -> None:
+    axes = figure.subplots(2, 3)
+    judged = rows[np.isfinite(rows[:, 4])]
+    known = len(judged) > 0
+    drawn = judged if known else rows
+    errors = judged[:, 1:4] - judged[:, 4:7] if known else rows[:, 1:4] - np.median(rows[:, 1:4], axis=0)
+    time_s, std_m = drawn[:, 0] - drawn[:1, 0], drawn[:, 7:10]
+    _track(axes[0, 0], rows, judged)
+    _over_time(axes[0, 1], time_s, errors[:, :2], std_m[:, :2], known=known)
+    _over_time(axes[0, 2], time_s, errors[:, 2:], std_m[:, 2:], known=known)
+    _histogram(axes[1, 0], errors, known=known)
+    _distribution(axes[1, 1], np.linalg.norm(errors[:, :2], axis=1), known=known)
+    _height(axes[1, 2], rows, judged)
+
+
+def _track(axes: Axes, rows: Matrix, judged: Matrix) -> None:
+    if len(judged):
+        axes.plot(judged[:, 4], judged[:, 5], color="black", linewidth=0.8, label="truth")
+    axes.plot(rows[:, 1], rows[:, 2], ".", markersize=2, label="fixes")
+    axes.set(xlabel="x in m", ylabel="y in m", title="track", aspect="equal")
+    axes.legend()
+
+
+def _height(axes: Axes, rows: Matrix, judged: Matrix) -> None:
+    if len(judged):
+        axes.plot(judged[:, 0] - rows[0, 0], judged[:, 6], color="black", linewidth=0.8, label="truth")
+    axes.plot(rows[:, 0] - rows[0, 0], rows[:, 3], ".", markersize=2, label="fixes")
+    axes.set(xlabel="time in s", ylabel="z in m", title="height")
+    axes.legend()
+
+
+def _over_time(axes: Axes, time_s: Vector, errors: Matrix, std_m: Matrix, *, known: bool) -> None:
+    """Errors of x and y, or of z, and the largest σ of them."""
+    names = "xy" if errors.shape[1] == 2 else "z"
+    for axis, name in enumerate(names):
+        axes.plot(time_s, errors[:, axis], linewidth=0.7, label=name)
+    for sign in (1.0, -1.0):
+        axes.plot(
+            time_s, sign * std_m.max(axis=1), color="black", linewidth=0.8, label="± stated σ" if sign > 0 else None
+        )
+    axes.set(xlabel="time in s", ylabel=_label(known=known), title=f"{' and '.join(names)} over time")
+    axes.legend()
+
+
+def _histogram(axes: Axes, errors: Matrix, *, known: bool) -> None:
+    span = np.percentile(np.abs(errors), 99.5) if len(errors) else 1.0
+    for axis, name in enumerate("xyz"):
+        axes.hist(errors[:, axis], bins=80, range=(-span, span), histtype="step", label=name)
+    axes.set(xlabel=_label(known=known), ylabel="fixes", title="histogram")
+    axes.legend()
+
+
+def _distribution(axes: Axes, radial_m: Matrix, *, known: bool) -> None:
+    axes.plot(np.sort(radial_m), np.linspace(0.0, 100.0, len(radial_m)))
+    axes.set(xlabel=f"horizontal {_label(known=known)}", ylabel="per cent of the fixes below", title="distribution")
+    axes.grid(visible=True, linewidth=0.3)
+
+
+def _label(*, known: bool) -> str:
+    return "error in m" if known else "deviation from the median in m"

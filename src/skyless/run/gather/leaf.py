@@ -1,0 +1,49 @@
+"""The file of a site's line to a hub: ``skyless hub init`` writes it, ``skyless broker --hub`` reads it."""
+
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal, TypeVar
+
+import msgspec
+from msgspec import Meta, Struct
+
+from skyless.core.errors import SkylessError
+
+Kind = TypeVar("Kind")
+
+
+PING_INTERVAL: Final = "10s"
+"""nats-server gives a connection up after two pings without an answer, of 2 minutes each without this."""
+
+
+class StuckLineError(Exception):
+    """nats-server does not try to reach the hub any more (nats-server #7615): it is to be started again."""
+
+
+class Leaf(Struct, frozen=True, kw_only=True):
+    """What nats-server of a site needs to reach the hub."""
+
+    version: Literal[1] = 1
+    site: Annotated[int, Meta(ge=0, le=0xFFFD)]
+    tenant: str
+    urls: Annotated[list[str], Meta(min_length=1)]
+    """The port for sites of each node, nats://HOST:PORT or tls://HOST:PORT."""
+    user: str
+    password: str
+    ca: str | None
+    """Certificates to trust, an absolute path; None without TLS."""
+
+    def configuration(self) -> dict[str, Any]:
+        """What nats-server needs. MQTT's own subjects stay at the site: sites of a tenant share its account."""
+        urls = [url.replace("://", f"://{self.user}:{self.password}@", 1) for url in self.urls]
+        remote: dict[str, Any] = {"urls": urls, "deny_imports": ["$MQTT.>"], "deny_exports": ["$MQTT.>"]}
+        if self.ca is not None:
+            remote["tls"] = {"ca_file": self.ca}
+        return {"no_advertise": True, "remotes": [remote]}
+
+
+def read_json(file: Path, kind: type[Kind], maker: str) -> Kind:
+    """A file of a hub. Raises SkylessError: it cannot be read, or ``maker`` has not made it."""
+    try:
+        return msgspec.json.decode(file.read_bytes(), type=kind)
+    except (OSError, msgspec.DecodeError, UnicodeError) as error:
+        raise SkylessError(f"{file} cannot be used: {getattr(error, 'strerror', error)}; {maker} makes it") from None
