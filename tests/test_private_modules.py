@@ -14,4 +14,4 @@ def test_only_their_own_folder_imports_them():
         for owner in PRIVATE.findall(file.read_text(encoding="utf-8")):
             assert owner == folder, f"{file} imports a private module of {owner}"
             found += 1
-    assert found > 40
+    assert found

@@ -68,7 +68,7 @@ _MODULES: Final = {
     "Trust": "skyless.core.trusted_receiver",
     "TrustedReceiver": "skyless.core.trusted_receiver",
     "fleet_of": "skyless.sim.evaluation.scenarios",
-    "lab_site": "skyless.sim.world",
+    "lab_site": "skyless.sim.lab",
     "load_site": "skyless.site.file.load",
     "locate": "skyless.core.tag.position",
     "open_recording": "skyless.cli.api.replay",

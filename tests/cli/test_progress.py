@@ -11,7 +11,7 @@ import pytest
 pytestmark = pytest.mark.site
 
 WORK = """
-from skyless.cli.common import progress
+from skyless.cli import common as progress
 progress._HIDDEN_S = {patience}
 with progress.progress_bar("replaying", 3) as reach:
     for done in range(4):

@@ -145,10 +145,10 @@ def test_the_server_loads_nothing_heavy():
 BUSY = """
 import sys
 from skyless.cli.main import main
-from skyless.page.api import past
+from skyless.page.api import questions
 from skyless.page.tasks import TaskProcess
 
-past.TaskProcess = lambda module, fault: TaskProcess("never_answers", fault)
+questions.TaskProcess = lambda module, fault: TaskProcess("never_answers", fault)
 sys.exit(main(sys.argv[1:]))
 """
 NEVER_ANSWERS = "import sys\nsys.stdin.readline()\nprint('asked', file=sys.stderr, flush=True)\nsys.stdin.readline()"
