@@ -140,14 +140,12 @@ class TrustedReceiver:
         given = self._verify()
         if frame is not None:
             given += self._use(frame)
-        return [one for ticks, one in given if self._is_next(ticks)]
-
-    def _is_next(self, rx_ticks: int) -> bool:
-        """Whether a fix is later than those that were given."""
-        if self._given_ticks is not None and rx_ticks <= self._given_ticks:
-            return False
-        self._given_ticks = rx_ticks
-        return True
+        later = []
+        for rx_ticks, one in given:
+            if self._given_ticks is None or rx_ticks > self._given_ticks:
+                self._given_ticks = rx_ticks
+                later.append(one)
+        return later
 
     def _use(self, frame: ReceivedFrame) -> list[tuple[int, GivenFix]]:
         """Let the live receiver process a frame that is plausible and that it has not processed yet; its fix."""

@@ -35,6 +35,8 @@ from skyless.core.estimator.monitor import (
     is_of_clock,
     is_warm,
     learn_place,
+    note_innovation,
+    note_outlier,
     open_range_error,
     variance_scale,
 )
@@ -206,19 +208,22 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
     if is_warm(s) and abs(a.innovation) > tuning.common and is_common(s, a.innovation):
         status.walk_scale = tuning.max_walk_scale
         a.outliers_in_row = 0
-    elif is_warm(s) and has_jumped(s, anchor, innovation, innovation_variance):
-        if is_of_clock(s, anchor, innovation):
-            return CLOCK_JUMPED
-        # the outliers counted as late; a jump shows that none of them was
-        status.late_share = max(status.late_share - tuning.slow_forgetting * (a.outliers_in_row - 1), 0.0)
-        innovation = _jump(s, anchor, innovation, rx_variance)
-        innovation_variance = compute_ph(s) + rx_variance
-        if innovation < -settings.gate * sqrt(innovation_variance):
-            return CLOCK_JUMPED
-    scale = variance_scale(s, innovation, innovation_variance, False)
+    elif is_warm(s):
+        note_outlier(s, anchor, innovation, innovation_variance)
+        if has_jumped(s, anchor):
+            if is_of_clock(s, anchor, innovation):
+                return CLOCK_JUMPED
+            # the outliers counted as late; a jump shows that none of them was
+            status.late_share = max(status.late_share - tuning.slow_forgetting * (a.outliers_in_row - 1), 0.0)
+            innovation = _jump(s, anchor, innovation, rx_variance)
+            innovation_variance = compute_ph(s) + rx_variance
+            if innovation < -settings.gate * sqrt(innovation_variance):
+                return CLOCK_JUMPED
+    note_innovation(s, innovation, innovation_variance, False)
+    normalised = innovation / sqrt(innovation_variance)
+    scale = variance_scale(s, normalised, False)
     if scale > 0.0:
         end_small_obstruction(s, anchor)
-        normalised = innovation / sqrt(innovation_variance)
         if a.is_obstructed:
             adapt_change_noise(s, anchor, normalised)
         if is_warm(s):
@@ -553,11 +558,13 @@ def difference(s: State, a: int, b: int, rx_ticks: Ticks, difference_m: float) -
     expected_m = difference_terms(s, a, b)
     innovation = difference_m - expected_m - h_dot_x(s, 2 * direction_terms(s))
     innovation_variance = compute_ph(s) + square(settings.difference_std_m)
-    scale = variance_scale(s, innovation, innovation_variance, True)
+    note_innovation(s, innovation, innovation_variance, True)
+    normalised = innovation / sqrt(innovation_variance)
+    scale = variance_scale(s, normalised, True)
     if scale == 0.0:
         return UNUSED
     if is_warm(s):
-        adapt_process_noise(s, innovation / sqrt(innovation_variance) / scale)
+        adapt_process_noise(s, normalised / scale)
     compute_fault_input(s, b)
     subtract_fault_input(s, a)
     update_later(s, innovation, innovation_variance * scale)

@@ -33,8 +33,8 @@ def is_warm(s: State) -> bool:
     return s.status.packets > 2 * s.count
 
 
-def has_jumped(s: State, anchor: int, innovation: float, innovation_variance: float) -> bool:
-    """Whether this reception and those before it show that an anchor's range error has jumped."""
+def note_outlier(s: State, anchor: int, innovation: float, innovation_variance: float) -> None:
+    """Count the receptions of an anchor in a row that are off by the same amount."""
     a, tuning, settings = s.anchors[anchor], s.tuning, s.settings
     if innovation * innovation <= square(tuning.suspect) * innovation_variance:
         a.outliers_in_row = 0
@@ -45,7 +45,12 @@ def has_jumped(s: State, anchor: int, innovation: float, innovation_variance: fl
         agrees = agrees and both * both > square(tuning.together) * innovation_variance
         a.outliers_in_row = a.outliers_in_row + 1 if agrees else 1
         a.outlier_m = innovation
-    return a.outliers_in_row >= (tuning.in_row_where_late if is_late_often(s) else tuning.in_row)
+
+
+def has_jumped(s: State, anchor: int) -> bool:
+    """Whether so many receptions in a row are off that the anchor's range error has jumped."""
+    needed = s.tuning.in_row_where_late if is_late_often(s) else s.tuning.in_row
+    return s.anchors[anchor].outliers_in_row >= needed
 
 
 def is_common(s: State, normalised: float) -> bool:
@@ -111,16 +116,12 @@ def end_small_obstruction(s: State, anchor: int) -> None:
         s.status.ends_of_obstructions += 1
 
 
-def variance_scale(s: State, innovation: float, innovation_variance: float, is_difference: bool) -> float:
-    """Factor on an innovation's variance; 0 if the measurement is not to be used. Counts it.
-
-    Large innovations have less weight where receptions are late often, and always in time differences, of which
-    either anchor may be late.
-    """
-    status, tuning, settings = s.status, s.tuning, s.settings
+def note_innovation(s: State, innovation: float, innovation_variance: float, is_difference: bool) -> None:
+    """Count an innovation as rejected or accepted, and update the running means."""
+    status, tuning = s.status, s.tuning
     forgetting = tuning.forgetting
     normalised = innovation / sqrt(innovation_variance)
-    is_beyond = not -settings.gate <= normalised <= settings.gate
+    is_beyond = not is_within_gate(s, normalised)
     beyond = 1.0 if is_beyond else 0.0
     if not is_difference:
         status.late_share += tuning.slow_forgetting * (beyond - status.late_share)
@@ -128,11 +129,27 @@ def variance_scale(s: State, innovation: float, innovation_variance: float, is_d
     if is_beyond:
         status.rejected += 1
         status.rejected_in_row += 1
+    else:
+        status.accepted += 1
+        status.rejected_in_row = 0
+        status.mean_nis += forgetting * (normalised * normalised - status.mean_nis)
+        status.mean_square_m2 += forgetting * (innovation * innovation - status.mean_square_m2)
+
+
+def is_within_gate(s: State, normalised: float) -> bool:
+    """Whether a normalised innovation is small enough to be used; NaN is not."""
+    return -s.settings.gate <= normalised <= s.settings.gate
+
+
+def variance_scale(s: State, normalised: float, is_difference: bool) -> float:
+    """Factor on the variance of a measurement with this normalised innovation; 0 beyond the gate.
+
+    Large innovations have less weight where receptions are late often, and always in time differences, of which
+    either anchor may be late.
+    """
+    tuning = s.tuning
+    if not is_within_gate(s, normalised):
         return 0.0
-    status.accepted += 1
-    status.rejected_in_row = 0
-    status.mean_nis += forgetting * (normalised * normalised - status.mean_nis)
-    status.mean_square_m2 += forgetting * (innovation * innovation - status.mean_square_m2)
     if is_difference:
         return max(1.0, abs(normalised) / tuning.difference_huber)
     return max(1.0, abs(normalised) / tuning.reception_huber) if is_late_often(s) else 1.0

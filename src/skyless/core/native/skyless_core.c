@@ -213,7 +213,8 @@ INTERNAL bool relays_fit(State *s);
 INTERNAL real horizontal_variance_m2(State *s, real ahead_s);
 INTERNAL bool fits_settings(State *s);
 INTERNAL bool is_warm(State *s);
-INTERNAL bool has_jumped(State *s, int32_t anchor, real innovation, real innovation_variance);
+INTERNAL void note_outlier(State *s, int32_t anchor, real innovation, real innovation_variance);
+INTERNAL bool has_jumped(State *s, int32_t anchor);
 INTERNAL bool is_common(State *s, real normalised);
 INTERNAL bool is_of_clock(State *s, int32_t anchor, real innovation);
 INTERNAL void open_range_error(State *s, int32_t anchor, real innovation);
@@ -221,7 +222,9 @@ INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised);
 INTERNAL real adapted(State *s, real scale, bool is_too_small, real largest);
 INTERNAL bool is_off_zero(State *s, real mean);
 INTERNAL void end_small_obstruction(State *s, int32_t anchor);
-INTERNAL real variance_scale(State *s, real innovation, real innovation_variance, bool is_difference);
+INTERNAL void note_innovation(State *s, real innovation, real innovation_variance, bool is_difference);
+INTERNAL bool is_within_gate(State *s, real normalised);
+INTERNAL real variance_scale(State *s, real normalised, bool is_difference);
 INTERNAL void adapt_change_variance(State *s, int32_t anchor, real elapsed_s);
 INTERNAL void learn_place(State *s, int32_t anchor, real residual_m);
 INTERNAL void update_stationary(State *s, real dt);
@@ -370,12 +373,13 @@ INTERNAL void drop_impossible(Acquisition *q, int64_t now);
 INTERNAL int32_t solve_start(Acquisition *q, int32_t left_out, int64_t now, real residual_tail);
 INTERNAL int32_t locate(Acquisition *q, int32_t count, real residual_tail);
 INTERNAL bool is_wide(Acquisition *q);
+INTERNAL bool is_worth_waiting(Acquisition *q);
 INTERNAL int32_t solve_without_one(Acquisition *q, int64_t now);
 INTERNAL int32_t process_in_course(Course *c, State *s, FixTime *time, Packet *packet, Relays *relays, uint8_t *packed,
         int32_t packed_bytes);
 INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks);
 INTERNAL bool is_surely_in_reach(Course *c, int64_t rx_ticks);
-INTERNAL bool is_contradicted(Course *c, State *s, int64_t rx_ticks);
+INTERNAL bool judge_start(Course *c, State *s, int64_t rx_ticks);
 INTERNAL void use_anchor(Course *c, Place *place, int64_t rx_ticks);
 INTERNAL int32_t longest_silent(Course *c);
 INTERNAL void forget_silent(Course *c, int64_t rx_ticks);
@@ -411,7 +415,8 @@ INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame);
 INTERNAL int32_t join(Tag *t, State *s, Neighbour *n);
 INTERNAL void forget_moves(Tag *t);
 INTERNAL void separate_moved(Tag *t, State *s, Acquisition *q, Neighbour *n);
-INTERNAL bool is_kept_apart(Tag *t, Acquisition *q, Neighbour *n);
+INTERNAL void follow_moves(Tag *t, Acquisition *q, Neighbour *n);
+INTERNAL bool is_kept_apart(Tag *t, Neighbour *n);
 INTERNAL bool have_most_moved(Tag *t);
 INTERNAL int32_t hear_admitted(Tag *t, State *s, Acquisition *q, Neighbour *n, uint8_t *frame);
 INTERNAL bool confirm(Tag *t, State *s);
@@ -2854,8 +2859,8 @@ INTERNAL bool is_warm(State *s) {
     return s->status.packets > 2 * s->count;
 }
 
-/* Whether this reception and those before it show that an anchor's range error has jumped. */
-INTERNAL bool has_jumped(State *s, int32_t anchor, real innovation, real innovation_variance) {
+/* Count the receptions of an anchor in a row that are off by the same amount. */
+INTERNAL void note_outlier(State *s, int32_t anchor, real innovation, real innovation_variance) {
     Anchor *a = &s->anchors[anchor];
     Tuning *tuning = &s->tuning;
     EstimatorSettings *settings = &s->settings;
@@ -2870,7 +2875,12 @@ INTERNAL bool has_jumped(State *s, int32_t anchor, real innovation, real innovat
         a->outliers_in_row = agrees ? a->outliers_in_row + 1 : 1;
         a->outlier_m = innovation;
     }
-    return (real)a->outliers_in_row >= (is_late_often(s) ? tuning->in_row_where_late : tuning->in_row);
+}
+
+/* Whether so many receptions in a row are off that the anchor's range error has jumped. */
+INTERNAL bool has_jumped(State *s, int32_t anchor) {
+    real needed = is_late_often(s) ? s->tuning.in_row_where_late : s->tuning.in_row;
+    return (real)s->anchors[anchor].outliers_in_row >= needed;
 }
 
 /* Whether the newest innovations of all anchors but one, which may show nothing, lie on the side of this one.
@@ -2941,17 +2951,13 @@ INTERNAL void end_small_obstruction(State *s, int32_t anchor) {
     }
 }
 
-/* Factor on an innovation's variance; 0 if the measurement is not to be used. Counts it.
- *
- * Large innovations have less weight where receptions are late often, and always in time differences, of which
- * either anchor may be late. */
-INTERNAL real variance_scale(State *s, real innovation, real innovation_variance, bool is_difference) {
+/* Count an innovation as rejected or accepted, and update the running means. */
+INTERNAL void note_innovation(State *s, real innovation, real innovation_variance, bool is_difference) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
-    EstimatorSettings *settings = &s->settings;
     real forgetting = tuning->forgetting;
     real normalised = innovation / SQRT(innovation_variance);
-    bool is_beyond = !(-settings->gate <= normalised && normalised <= settings->gate);
+    bool is_beyond = !is_within_gate(s, normalised);
     real beyond = is_beyond ? REAL(1.0) : REAL(0.0);
     if (!is_difference) {
         status->late_share += tuning->slow_forgetting * (beyond - status->late_share);
@@ -2960,12 +2966,28 @@ INTERNAL real variance_scale(State *s, real innovation, real innovation_variance
     if (is_beyond) {
         status->rejected += 1;
         status->rejected_in_row += 1;
+    } else {
+        status->accepted += 1;
+        status->rejected_in_row = 0;
+        status->mean_nis += forgetting * (normalised * normalised - status->mean_nis);
+        status->mean_square_m2 += forgetting * (innovation * innovation - status->mean_square_m2);
+    }
+}
+
+/* Whether a normalised innovation is small enough to be used; NaN is not. */
+INTERNAL bool is_within_gate(State *s, real normalised) {
+    return -s->settings.gate <= normalised && normalised <= s->settings.gate;
+}
+
+/* Factor on the variance of a measurement with this normalised innovation; 0 beyond the gate.
+ *
+ * Large innovations have less weight where receptions are late often, and always in time differences, of which
+ * either anchor may be late. */
+INTERNAL real variance_scale(State *s, real normalised, bool is_difference) {
+    Tuning *tuning = &s->tuning;
+    if (!is_within_gate(s, normalised)) {
         return REAL(0.0);
     }
-    status->accepted += 1;
-    status->rejected_in_row = 0;
-    status->mean_nis += forgetting * (normalised * normalised - status->mean_nis);
-    status->mean_square_m2 += forgetting * (innovation * innovation - status->mean_square_m2);
     if (is_difference) {
         return max_real(REAL(1.0), abs_real(normalised) / tuning->difference_huber);
     }
@@ -3540,23 +3562,27 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
     if (is_warm(s) && abs_real(a->innovation) > tuning->common && is_common(s, a->innovation)) {
         status->walk_scale = tuning->max_walk_scale;
         a->outliers_in_row = 0;
-    } else if (is_warm(s) && has_jumped(s, anchor, innovation, innovation_variance)) {
-        if (is_of_clock(s, anchor, innovation)) {
-            return CLOCK_JUMPED;
-        }
-        /* the outliers counted as late; a jump shows that none of them was */
-        status->late_share = max_real(status->late_share - tuning->slow_forgetting * (real)(a->outliers_in_row - 1),
-                REAL(0.0));
-        innovation = jump(s, anchor, innovation, rx_variance);
-        innovation_variance = compute_ph(s) + rx_variance;
-        if (innovation < -settings->gate * SQRT(innovation_variance)) {
-            return CLOCK_JUMPED;
+    } else if (is_warm(s)) {
+        note_outlier(s, anchor, innovation, innovation_variance);
+        if (has_jumped(s, anchor)) {
+            if (is_of_clock(s, anchor, innovation)) {
+                return CLOCK_JUMPED;
+            }
+            /* the outliers counted as late; a jump shows that none of them was */
+            status->late_share = max_real(status->late_share - tuning->slow_forgetting * (real)(a->outliers_in_row - 1),
+                    REAL(0.0));
+            innovation = jump(s, anchor, innovation, rx_variance);
+            innovation_variance = compute_ph(s) + rx_variance;
+            if (innovation < -settings->gate * SQRT(innovation_variance)) {
+                return CLOCK_JUMPED;
+            }
         }
     }
-    real scale = variance_scale(s, innovation, innovation_variance, false);
+    note_innovation(s, innovation, innovation_variance, false);
+    real normalised = innovation / SQRT(innovation_variance);
+    real scale = variance_scale(s, normalised, false);
     if (scale > REAL(0.0)) {
         end_small_obstruction(s, anchor);
-        real normalised = innovation / SQRT(innovation_variance);
         if (a->is_obstructed) {
             adapt_change_noise(s, anchor, normalised);
         }
@@ -3936,12 +3962,14 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
     real expected_m = difference_terms(s, a, b);
     real innovation = difference_m - expected_m - h_dot_x(s, 2 * direction_terms(s));
     real innovation_variance = compute_ph(s) + square(settings->difference_std_m);
-    real scale = variance_scale(s, innovation, innovation_variance, true);
+    note_innovation(s, innovation, innovation_variance, true);
+    real normalised = innovation / SQRT(innovation_variance);
+    real scale = variance_scale(s, normalised, true);
     if (scale == REAL(0.0)) {
         return UNUSED;
     }
     if (is_warm(s)) {
-        adapt_process_noise(s, innovation / SQRT(innovation_variance) / scale);
+        adapt_process_noise(s, normalised / scale);
     }
     compute_fault_input(s, b);
     subtract_fault_input(s, a);
@@ -5703,7 +5731,14 @@ INTERNAL int32_t try_start(Acquisition *q, Packet *packet, Relays *relays) {
     int32_t reason = solve_start(q, -1, now, q->tuning.start_tail);
     q->rival_count = reason == MIRROR ? q->pair_count : 0;
     if (reason == FOUND) {
-        return !is_wide(q) ? FOUND : ACQUIRING;
+        if (!is_wide(q)) {
+            return FOUND;
+        }
+        if (!q->has_been_wide) {
+            q->has_been_wide = true;
+            q->wide_ticks = q->start.rx_ticks_tag;
+        }
+        return is_worth_waiting(q) ? ACQUIRING : FOUND;
     }
     if (reason == MIRROR || q->pair_count <= needed + 1 || !is_first) {
         return reason;
@@ -6087,10 +6122,9 @@ INTERNAL int32_t locate(Acquisition *q, int32_t count, real residual_tail) {
     return skyless_find_position(p, &q->found);
 }
 
-/* Whether a start is held back: ranges are curved within its standard deviation by more than their noise.
+/* Whether ranges are curved within a start's standard deviation by more than their noise.
  *
- * Updates would then make the filter sure of a wrong position. More anchors may come; if they do not, a start that
- * at least one anchor more than needed agrees with is used. */
+ * Updates would then make the filter sure of a wrong position. */
 INTERNAL bool is_wide(Acquisition *q) {
     Start *start = &q->start;
     int32_t dims = q->knows_height ? 2 : 3;
@@ -6104,13 +6138,13 @@ INTERNAL bool is_wide(Acquisition *q) {
         range_m += SQRT(total) / (real)start->count;
     }
     real curvature_m = REAL(0.5) * (start->covariance_m2[0][0] + start->covariance_m2[1][1]) / range_m;
-    if (square(curvature_m) < q->variance_m2 + q->error_variance_m2) {
-        return false;
-    }
-    if (!q->has_been_wide) {
-        q->has_been_wide = true;
-        q->wide_ticks = start->rx_ticks_tag;
-    }
+    return !(square(curvature_m) < q->variance_m2 + q->error_variance_m2);
+}
+
+/* Whether a wide start is held back: more anchors may come, or too few agree with it to use it as it is. */
+INTERNAL bool is_worth_waiting(Acquisition *q) {
+    Start *start = &q->start;
+    int32_t dims = q->knows_height ? 2 : 3;
     real waited_s = (real)(start->rx_ticks_tag - q->wide_ticks) * TICK_S;
     return start->count <= dims + 1 || waited_s <= q->tuning.start_patience_s;
 }
@@ -6161,7 +6195,7 @@ INTERNAL int32_t process_in_course(Course *c, State *s, FixTime *time, Packet *p
     if (outcome == REJECTED || outcome == STALE) {
         return is_lost(s) ? LOST : OUTLIER;
     }
-    if (is_contradicted(c, s, packet->rx_ticks)) {
+    if (judge_start(c, s, packet->rx_ticks)) {
         return START_CONTRADICTED;
     }
     use_anchor(c, &packet->place, packet->rx_ticks);
@@ -6182,8 +6216,10 @@ INTERNAL bool is_surely_in_reach(Course *c, int64_t rx_ticks) {
     return 0 <= rx_ticks - c->newest_ticks && rx_ticks - c->newest_ticks < SURELY_IN_REACH_TICKS;
 }
 
-/* Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect. */
-INTERNAL bool is_contradicted(Course *c, State *s, int64_t rx_ticks) {
+/* Record what relays and faults say of the start. Return True if they contradict it, so that a new one is needed.
+ *
+ * What the new start has to expect is then recorded as well. */
+INTERNAL bool judge_start(Course *c, State *s, int64_t rx_ticks) {
     Tuning *tuning = &s->tuning;
     if (c->start_was_contradicted && is_late_often(s)) {
         c->start_was_contradicted = false;  /* it was by single late packets */
@@ -6941,7 +6977,8 @@ INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame) 
     if (t->has_moved) {
         separate_moved(t, s, q, n);
     }
-    if (is_kept_apart(t, q, n)) {
+    follow_moves(t, q, n);
+    if (is_kept_apart(t, n)) {
         return MOVED_ANCHOR;
     }
     if (!n->has_place) {
@@ -7018,24 +7055,23 @@ INTERNAL void separate_moved(Tag *t, State *s, Acquisition *q, Neighbour *n) {
     }
 }
 
-/* Whether an anchor states its position before a move while the anchors in use have moved, or the reverse. */
-INTERNAL bool is_kept_apart(Tag *t, Acquisition *q, Neighbour *n) {
-    if (!t->is_moving) {
-        return false;
-    }
+/* End a move of anchors that is over; begin again with those that have moved once they are most. */
+INTERNAL void follow_moves(Tag *t, Acquisition *q, Neighbour *n) {
     int64_t calm_ticks = t->admission.rx_ticks - t->moved_ticks;
-    if (calm_ticks >= MOVE_TICKS) {
+    if (t->is_moving && calm_ticks >= MOVE_TICKS) {
         forget_moves(t);
-        return false;
-    }
-    if (!t->uses_moved && n->has_moved && calm_ticks >= MOVED_HOLD_TICKS && have_most_moved(t)) {
+    } else if (t->is_moving && !t->uses_moved && n->has_moved && calm_ticks >= MOVED_HOLD_TICKS && have_most_moved(t)) {
         t->uses_moved = true;
         forget_all(q);
         if (t->has_settings) {
             begin_with_pages(t, q);
         }
     }
-    return n->has_moved != t->uses_moved;
+}
+
+/* Whether an anchor states its position before a move while the anchors in use have moved, or the reverse. */
+INTERNAL bool is_kept_apart(Tag *t, Neighbour *n) {
+    return t->is_moving && n->has_moved != t->uses_moved;
 }
 
 /* Whether most of the anchors that are there, with a position, have moved. */

@@ -178,7 +178,11 @@ def try_start(q: Acquisition, packet: Packet, relays: Relays) -> int:
     reason = _solve_start(q, -1, now, q.tuning.start_tail)
     q.rival_count = q.pair_count if reason == MIRROR else 0
     if reason == FOUND:
-        return FOUND if not _is_wide(q) else ACQUIRING
+        if not _is_wide(q):
+            return FOUND
+        if not q.has_been_wide:
+            q.has_been_wide, q.wide_ticks = True, q.start.rx_ticks_tag
+        return ACQUIRING if _is_worth_waiting(q) else FOUND
     if reason == MIRROR or q.pair_count <= needed + 1 or not is_first:
         return reason
     return _solve_without_one(q, now)
@@ -478,10 +482,9 @@ def _locate(q: Acquisition, count: int, residual_tail: float) -> int:
 
 
 def _is_wide(q: Acquisition) -> bool:
-    """Whether a start is held back: ranges are curved within its standard deviation by more than their noise.
+    """Whether ranges are curved within a start's standard deviation by more than their noise.
 
-    Updates would then make the filter sure of a wrong position. More anchors may come; if they do not, a start that
-    at least one anchor more than needed agrees with is used.
+    Updates would then make the filter sure of a wrong position.
     """
     start, dims = q.start, 2 if q.knows_height else 3
     range_m = 0.0
@@ -491,10 +494,12 @@ def _is_wide(q: Acquisition) -> bool:
             total += square(q.heard[start.used[index]].newer.packet.place.position_m[axis] - start.position_m[axis])
         range_m += sqrt(total) / start.count
     curvature_m = 0.5 * (start.covariance_m2[0][0] + start.covariance_m2[1][1]) / range_m
-    if square(curvature_m) < q.variance_m2 + q.error_variance_m2:
-        return False
-    if not q.has_been_wide:
-        q.has_been_wide, q.wide_ticks = True, start.rx_ticks_tag
+    return not square(curvature_m) < q.variance_m2 + q.error_variance_m2
+
+
+def _is_worth_waiting(q: Acquisition) -> bool:
+    """Whether a wide start is held back: more anchors may come, or too few agree with it to use it as it is."""
+    start, dims = q.start, 2 if q.knows_height else 3
     waited_s = (start.rx_ticks_tag - q.wide_ticks) * TICK_S
     return start.count <= dims + 1 or waited_s <= q.tuning.start_patience_s
 

@@ -114,7 +114,7 @@ def process_in_course(
     c.newest_ticks = max(c.newest_ticks, packet.rx_ticks)
     if outcome in (REJECTED, STALE):
         return LOST if is_lost(s) else OUTLIER
-    if _is_contradicted(c, s, packet.rx_ticks):
+    if _judge_start(c, s, packet.rx_ticks):
         return START_CONTRADICTED
     use_anchor(c, packet.place, packet.rx_ticks)
     return settle(c, s, time, packet.rx_ticks)
@@ -133,8 +133,11 @@ def is_surely_in_reach(c: Course, rx_ticks: Ticks) -> bool:
     return 0 <= rx_ticks - c.newest_ticks < SURELY_IN_REACH_TICKS
 
 
-def _is_contradicted(c: Course, s: State, rx_ticks: Ticks) -> bool:
-    """Whether a new start is needed, as relays or faults contradict this one; decides what that has to expect."""
+def _judge_start(c: Course, s: State, rx_ticks: Ticks) -> bool:
+    """Record what relays and faults say of the start. Return True if they contradict it, so that a new one is needed.
+
+    What the new start has to expect is then recorded as well.
+    """
     tuning = s.tuning
     if c.start_was_contradicted and is_late_often(s):
         c.open_range_errors = c.start_was_contradicted = False  # it was by single late packets

@@ -201,7 +201,8 @@ def process_rare(t: Tag, s: State, q: Acquisition, frame: Bytes) -> int:
         _begin_with_pages(t, q)
     if t.has_moved:
         _separate_moved(t, s, q, n)
-    if _is_kept_apart(t, q, n):
+    _follow_moves(t, q, n)
+    if _is_kept_apart(t, n):
         return MOVED_ANCHOR
     if not n.has_place:
         return NO_POSITION
@@ -261,20 +262,21 @@ def _separate_moved(t: Tag, s: State, q: Acquisition, n: Neighbour) -> None:
             _begin_with_pages(t, q)
 
 
-def _is_kept_apart(t: Tag, q: Acquisition, n: Neighbour) -> bool:
-    """Whether an anchor states its position before a move while the anchors in use have moved, or the reverse."""
-    if not t.is_moving:
-        return False
+def _follow_moves(t: Tag, q: Acquisition, n: Neighbour) -> None:
+    """End a move of anchors that is over; begin again with those that have moved once they are most."""
     calm_ticks = t.admission.rx_ticks - t.moved_ticks
-    if calm_ticks >= MOVE_TICKS:
+    if t.is_moving and calm_ticks >= MOVE_TICKS:
         _forget_moves(t)
-        return False
-    if not t.uses_moved and n.has_moved and calm_ticks >= MOVED_HOLD_TICKS and _have_most_moved(t):
+    elif t.is_moving and not t.uses_moved and n.has_moved and calm_ticks >= MOVED_HOLD_TICKS and _have_most_moved(t):
         t.uses_moved = True
         forget_all(q)
         if t.has_settings:
             _begin_with_pages(t, q)
-    return n.has_moved != t.uses_moved
+
+
+def _is_kept_apart(t: Tag, n: Neighbour) -> bool:
+    """Whether an anchor states its position before a move while the anchors in use have moved, or the reverse."""
+    return t.is_moving and n.has_moved != t.uses_moved
 
 
 def _have_most_moved(t: Tag) -> bool:
