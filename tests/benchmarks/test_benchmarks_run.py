@@ -31,11 +31,6 @@ RUNS = {
         ["gather", "--seconds", "1", "--rate", "10000", "--json-rate", "500"],
         ("json: 500 fixes", "'read': 10000", "in the stream: 10500 of 10500 fixes, no gap"),
     ),
-    "large_site": (
-        ["--anchors", "100", "--tags", "2", "--seconds", "0.5", "--workers", "1"],
-        ("wall_s_per_s", "digest", "efficiency"),
-    ),
-    "open_doors": (["--tags", "20", "--anchors", "5"], ("0 subscriptions refused", "20 tags with a fix")),
     "page": (["--part", "page", "--quick", "--seconds", "1"], ("frames_per_s", "cpu_ms_per_frame")),
     "recorded_phases": ([str(MULOC)], ("channel 1, stamps alone:", "place at rest")),
     "running_site": (["--minutes", "0.05"], ("fixes_made_per_s", "cpu_share", "age_less_own_ms")),
