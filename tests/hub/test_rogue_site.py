@@ -107,8 +107,8 @@ async def _run(folder, hub, rogue_address, *, is_filtered):
             return set(found.state.subjects or ())
 
         async with asyncio.timeout(90):
-            await hub.make_hub_streams(tenant, hub, "plant")
-            assert await hub.sites_at(tenant) == {HONEST, ROGUE}
+            await hub_program.make_hub_streams(tenant, hub, "plant")
+            assert await hub_program.sites_at(tenant) == {HONEST, ROGUE}
             assert not any([await has_stream(tenant, old) for old in hub_program._OF_ALL_SITES])
             # A source that was made before the line was up asks again after half a minute at most.
             while history.state().fixes < 8 or not all(known.names().get(one) and seen[one] for one in seen):
