@@ -1,4 +1,4 @@
-"""What is sent to a vehicle and when, without I/O: fixes, heartbeat, origin, answers to its questions for the time."""
+"""MAVLink for autopilots, without I/O: its frames, what each profile sends of a fix, and answers to the vehicle."""
 
 import struct
 from collections import Counter

@@ -1,4 +1,4 @@
-"""The table of targets, and how one is opened by its address."""
+"""The table of targets, how one is opened by its address, and the senders that carry bytes to readers."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""What commands write: JSON for programs, text for people, files all at once."""
+"""What commands share: options, JSON and text on standard output, and progress on a terminal."""
 
 import inspect
 import os

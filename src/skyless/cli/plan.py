@@ -1,4 +1,4 @@
-"""``skyless plan``: what a site will give before anything is mounted, and where its anchors should hang."""
+"""``skyless plan``: a site's errors before it is mounted; ``skyless simulate``: a site in the simulated world."""
 
 import csv
 import os

@@ -1,4 +1,4 @@
-"""``skyless study``: how accurate the receiver is under which conditions, over many runs in the simulated world."""
+"""``skyless study``, ``skyless paper`` and ``skyless benchmark``: research from the command line."""
 
 import csv
 import io

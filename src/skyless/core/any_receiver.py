@@ -1,4 +1,4 @@
-"""``AnyReceiver``: a tag that finds out which protocol the anchors around it use."""
+"""Both protocols behind one door: what depends on which a site uses, and a tag that finds it out."""
 
 from collections import Counter
 from collections.abc import Callable

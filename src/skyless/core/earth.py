@@ -1,4 +1,4 @@
-"""From a site's frame to the Earth: longitude, latitude and height of a point, and east, north and up of a vector.
+"""Positions for the world outside: on the Earth, east, north and up, GeoJSON, and the ellipse of a covariance.
 
 Plain arithmetic on single values, for programs that must start quickly.
 """

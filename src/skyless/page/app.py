@@ -1,4 +1,4 @@
-"""The server's addresses: the page, its data, and the live stream."""
+"""The page's server: its addresses, and how it is started and stopped."""
 
 import asyncio
 import contextlib

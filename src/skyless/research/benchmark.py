@@ -1,4 +1,4 @@
-"""One recording by one method, judged; results that exist already are read instead."""
+"""``skyless benchmark``: every method on every recording below a folder, judged, as a table and a page."""
 
 import csv
 import hashlib

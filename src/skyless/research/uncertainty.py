@@ -1,4 +1,4 @@
-"""One DTDoA of the paper: what it depends on, the covariance of several, and its variances as printed and corrected.
+"""Uncertainty of positions: the covariance of the paper's DTDoA, and Cramér–Rao bounds.
 
 Names follow ``docs/maths.md`` section 1. Everything is in true seconds unless stated otherwise; the tag stands still.
 All formulas are arithmetic on the chain's fields alone and hold element by element for many anchors; the derivation in

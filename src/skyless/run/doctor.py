@@ -1,4 +1,4 @@
-"""What one check has found."""
+"""What ``skyless doctor`` checks of a host, its boards and their clocks."""
 
 import ctypes
 import getpass

@@ -1,4 +1,4 @@
-"""What a site publishes on MQTT, as a hub has it: for programs that only read."""
+"""A hub of several sites: its streams and sites, and the link by which programs read one site there."""
 
 import asyncio
 import contextlib

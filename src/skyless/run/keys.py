@@ -1,4 +1,4 @@
-"""Files of a site's keys: one folder with the site's key pair and, for each key chain, its seed and its public part.
+"""A site's keys on disk, and as an anchor's or tag's program follows them while they change.
 
 ``site.private`` (PEM) stays with the operator, who makes chains with it. ``site.public`` (TOML) goes to tags and to the
 hosts of anchors; ``chain-N.public`` and ``chain-N.seed`` go to the hosts of anchors. A seed may come from the

@@ -1,4 +1,4 @@
-"""Radios by their names in ``--radio``."""
+"""Radios by their names in ``--radio``, and what is said of each while it runs."""
 
 import os
 from collections import Counter

@@ -1,4 +1,4 @@
-"""Who may ask a server of this machine: not the pages of other sites that somebody opens in a browser.
+"""Servers of this machine: who may ask them, and their limits.
 
 A page of another site reaches a server on the same computer or network in two ways. It asks for its address, and the
 browser names that site as ``Origin``; or it lets its own name point to this address (DNS rebinding), and the browser

@@ -1,4 +1,4 @@
-"""When tags enter and leave zones.
+"""Zones: their list, and when tags enter and leave them.
 
 No I/O; the time is passed in. Noise at an edge causes no series of events: a tag has crossed the edge when its fix
 lies beyond it by the margin, or by half of the margin in every fix for a while. In between, it stays on its side.

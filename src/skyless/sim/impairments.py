@@ -1,4 +1,4 @@
-"""Everything that is not ideal in a world, as one value."""
+"""Everything that is not ideal in a world: crystals, channel, range errors, carrier phases, faults."""
 
 import math
 from typing import Any, Final

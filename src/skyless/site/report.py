@@ -1,4 +1,4 @@
-"""Reports as one HTML page that needs nothing else: pictures inline, no script, bright and dark, paper and phone."""
+"""Reports as one HTML page that needs nothing else, and the style of its pictures."""
 
 import base64
 import io

@@ -1,4 +1,4 @@
-"""``skyless.simulate``: a site in the simulated world, its tags judged against the truth."""
+"""``skyless.simulate`` and ``skyless.study``: tags in simulated worlds, judged against the truth."""
 
 import time
 from collections.abc import Callable, Iterator

@@ -1,4 +1,4 @@
-"""``skyless board``: an emulated board on a pseudo-terminal."""
+"""Commands for boards and the emulated air: ``skyless board``, ``skyless ether``, ``skyless flash-config``."""
 
 import asyncio
 import sys

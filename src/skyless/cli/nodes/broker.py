@@ -1,4 +1,4 @@
-"""``skyless broker``: the embedded MQTT broker on its own."""
+"""``skyless broker``, ``skyless gather`` and ``skyless hub``: the servers of a site and of several sites."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""``skyless record``: a running site into a file."""
+"""``skyless record``: a running site into a file; ``skyless export``: such a file as a bag of ROS 2."""
 
 import asyncio
 import contextlib

@@ -1,4 +1,4 @@
-"""What a running site publishes, gathered for ``skyless watch`` and ``skyless doctor``: the newest of each thing."""
+"""``skyless watch`` and ``skyless sites``: what a running site publishes, gathered and shown as text."""
 
 import asyncio
 import contextlib

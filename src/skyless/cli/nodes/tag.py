@@ -1,4 +1,4 @@
-"""``skyless tag``: tags as a program."""
+"""``skyless tag`` and ``skyless anchor``: the nodes of a site as programs."""
 
 import asyncio
 import os

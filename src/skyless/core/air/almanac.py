@@ -1,4 +1,4 @@
-"""The almanac: all that a tag must know about a site, sent as rotating pages of 17 bytes."""
+"""The almanac's pages, all that a tag must know about a site, and the published instants of beacons."""
 
 from typing import Final
 

@@ -1,4 +1,4 @@
-"""Faults that the state does not hold: what they do to it, what innovations show of them, and adding them to it.
+"""Faults of anchors: what they do to the state, what innovations show of them, and the verdicts.
 
 Where all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b, and the
 innovation of a measurement h holds s_j·b (Friedland 1969):

@@ -1,4 +1,4 @@
-"""Arithmetic of the functions that are also translated to C: the same bits on every processor, without a C library."""
+"""Arithmetic that is also translated to C, with the same bits on every processor: functions, small matrices, tails."""
 
 from math import floor as _floor
 from math import sqrt

@@ -1,4 +1,4 @@
-"""An anchor's own counter against the site's time: by the master's beacons, or, as the master, by its own counter."""
+"""The site's time in protocol 1: an anchor's own counter against it, the master's term, and its scale."""
 
 from collections import Counter
 from typing import Final

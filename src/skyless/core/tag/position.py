@@ -1,4 +1,4 @@
-"""The position of a set of TDoAs: its minima, unfolded from a plane, and decided between by the height's bounds."""
+"""The position of a set of TDoAs: by the search's minima, and ``locate``, its Python function."""
 
 from functools import cache
 from typing import Annotated, Final

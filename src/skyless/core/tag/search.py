@@ -1,4 +1,4 @@
-"""The minima of a set of TDoAs, and which of them are distinct."""
+"""The search for positions that explain a set of TDoAs: starts, descent, and the distinct minima."""
 
 from typing import Annotated, Final
 

@@ -1,4 +1,4 @@
-"""What the HTTP interface answers where no message of MQTT and no answer of the history is the same."""
+"""What requests and answers of the HTTP interface consist of: parameters, structs, and the OpenAPI document."""
 
 import re
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Answers about the site as it is now, and what changes it."""
+"""The questions of the HTTP interface: the site as it is now, its map as GeoJSON, and its history."""
 
 import asyncio
 import time

@@ -1,4 +1,4 @@
-"""All routes: what the server answers, and its OpenAPI document, come from it and the functions' signatures."""
+"""All routes of the HTTP interface, and its stream of fixes over a WebSocket."""
 
 import asyncio
 import inspect

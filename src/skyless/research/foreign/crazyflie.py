@@ -1,4 +1,4 @@
-"""Logs of a Crazyflie's SD card: events that the file itself describes, with a CRC-32 at its end.
+"""Recordings of Bitcraze's system: logs of a Crazyflie's SD card, and captures of a sniffer.
 
     0xBC, version u16 (1 or 2), number of kinds of events u16
     of each kind   number u16, name, number of fields u16, of each field "name(type)" with a type of Python's struct

@@ -1,4 +1,4 @@
-"""MULoc's recordings: four DW1000s that broadcast in turn and hear each other, and a tag that only listens.
+"""Published recordings in arrays and tables: MULoc, STARLoc, TDoA tables, and those of A-Value.
 
 An ``.npz`` of arrays over rounds k, senders p in the order in which they send, and observers o, the last of which is
 the tag. TX stamps were not recorded. A sender answers the packet before its own by a delayed transmission, so

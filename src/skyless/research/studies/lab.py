@@ -1,4 +1,4 @@
-"""The study ``loss``: how the error grows with the share of lost messages, at the tags or between anchors as well."""
+"""The studies of the lab: ``loss``, ``nlos``, ``sync`` and ``motion``."""
 
 import math
 from collections.abc import Callable, Sequence

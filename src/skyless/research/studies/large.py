@@ -1,4 +1,4 @@
-"""The study ``large``: tags that walk through a site of a thousand anchors without a master (protocol 2).
+"""The studies ``large`` and ``scale``: sites of a thousand anchors, and growing sites.
 
 What anchors send and receive is simulated on demand (``simulation/cells``); each tag gets the beacons that it receives,
 and nothing else. Nothing that keeps time for the site is on the air.

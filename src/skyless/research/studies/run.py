@@ -1,4 +1,4 @@
-"""All of ``skyless study`` but for what it writes."""
+"""The studies by name, and how one is run."""
 
 from collections.abc import Callable, Sequence
 from functools import partial

@@ -1,4 +1,4 @@
-"""Maps cells over all cores of this machine, or over a Dask cluster; the results are the same.
+"""How studies run: plans, cells over all cores or a Dask cluster, and finished parts that are kept.
 
 ``reached`` is called with the share of the work that is done, ``keep`` with number and result of each finished cell.
 """

@@ -1,4 +1,4 @@
-"""One room with errors that are drawn, and the site files that different people would write for it.
+"""Rooms for studies of surveys: drawn errors, layouts, the air between anchors, and the judge of a result.
 
 In the air are: antenna delays that are off, errors of the pairs of anchors, and the errors of the ranges at tags that
 the scenario ``room`` has. The truth of a room does not depend on who writes its file.

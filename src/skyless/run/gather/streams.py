@@ -1,4 +1,4 @@
-"""The streams of a site at its NATS server: what they keep, and how they are read."""
+"""The streams of a site at its NATS server, and the names of its tags there."""
 
 import asyncio
 import contextlib

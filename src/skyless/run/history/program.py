@@ -1,4 +1,4 @@
-"""What a site's programs publish, into its history."""
+"""``skyless history run``: messages of a site, batches of a large one, and recordings, into the history."""
 
 import asyncio
 import platform

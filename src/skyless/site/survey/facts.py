@@ -1,4 +1,4 @@
-"""What goes into a survey: ranges of pairs of anchors, what a user states, and how much of it checks the result."""
+"""What goes into a survey and what comes out, as values: ranges, facts of the user, positions and delays."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike

@@ -1,4 +1,4 @@
-"""A shape's frame: named anchors, known points, the sketch, or by default the first and the farthest anchor.
+"""A survey's rows, and the frame that its shape is moved to: named anchors, known points, a sketch or a default.
 
 Ranges leave a shape free to turn, to shift and to be mirrored.
 """

@@ -1,4 +1,4 @@
-"""What anchors receive of one another, as anyone who receives their beacons can know it.
+"""Legs: beacons between anchors as any listener can know them, from stamps and relays, and what they repeat.
 
 A beacon states its TX stamp, and relays when its sender received which frame of which other anchor. A listener that has
 received that frame, too, knows both stamps of the leg. An anchor's own receptions are legs as they are.

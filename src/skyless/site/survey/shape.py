@@ -1,4 +1,4 @@
-"""The shape of a site: the fit of all anchors that have enough ranges, held by known points, and its covariance."""
+"""The shape of a site, by a fit of all anchors with enough ranges; and what the measurements leave open."""
 
 import math
 import re
