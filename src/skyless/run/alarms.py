@@ -32,8 +32,9 @@ from skyless.site.alarm_rules import GROUP, read_hours
 # Which tags are near each other.
 
 STOREY_M: Final = 2.5
-"""Tags whose heights differ by more than this are on different storeys. Otherwise the horizontal distance counts:
-heights are known less well than the rest, and one tag may be on a helmet and the other on a fork."""
+"""Tags whose heights differ by more than this are on different storeys. Only the horizontal distance counts otherwise:
+heights are less accurate, and one tag may be on a helmet and the other on a fork.
+"""
 
 _FARTHEST_M: Final = 1e6
 _AROUND: Final = tuple(product((-1, 0, 1), repeat=2))
@@ -42,7 +43,7 @@ _AROUND: Final = tuple(product((-1, 0, 1), repeat=2))
 def near_tags(
     positions_m: Mapping[str, Vector], first: Container[str], others: Container[str], reach_m: float
 ) -> dict[tuple[str, str], float]:
-    """Distances of the pairs within ``reach_m``, one tag of ``first`` and one of ``others``, in the names' order."""
+    """Distances of the pairs within ``reach_m``, one tag from ``first`` and one from ``others``, by sorted names."""
     places = {
         name: (math.floor(x / reach_m), math.floor(y / reach_m))
         for name, (x, y, _) in positions_m.items()
@@ -69,22 +70,22 @@ def near_tags(
 EVALUATION_S: Final = 0.2
 
 CONFIRM_S: Final = 5.0
-"""A tag that has not been heard for this long after messages could be missing, or after the start, is not there."""
+"""A tag not heard for this long after a start, or after messages may have been lost, counts as absent."""
 
 SETTLE_S: Final = 0.5
-"""A tag is not outside a zone before two fixes and this long: it may be about to be found in it."""
+"""A tag counts as outside a zone only after two fixes and this time, because it may be about to be found inside."""
 
 FORGET_S: Final = 86_400.0
 """A tag that no rule names is forgotten after this long without a fix."""
 _FORGET_PERIOD_S: Final = 60.0
 
 MAX_KEPT: Final = 2_000
-"""Alarms that are kept. Beyond it the oldest that have ended go, and where none has, no more are raised."""
+"""Largest number of alarms kept. Beyond it the oldest ended ones are dropped; if none has ended, no more are raised."""
 
 _MAX_NAMED: Final = 20
 
 UPDATE_S: Final = 1.0
-"""Between updates of the sentences of active alarms."""
+"""Interval between updates of the sentences of active alarms."""
 
 _LONGER: Final = 1.1
 """A duration is updated when it has grown by this factor, so that a long stay is not a message each second."""
@@ -94,22 +95,21 @@ _LASTING: Final = frozenset({"inside", "outside", "silent", "anchor-offline"})
 
 What = Literal["raised", "updated", "ended", "acknowledged", "dropped"]
 Change = tuple[What, AlarmMessage]
-"""What has become of an alarm. An updated one says a worse value; a dropped one is not kept any longer, as there are
-too many."""
+"""What has happened to an alarm. "updated": the worst value is worse; "dropped": there are too many alarms."""
 Key = tuple[str, str]
 """Rule and subject."""
 
 
 class _Tag(Struct):
-    """What is known of a tag."""
+    """What is known about a tag."""
 
     first_s: float
-    """When the first fix without a gap came."""
+    """Time of the first fix since the last gap."""
     fixes: int = 0
-    """Since then."""
+    """Number of fixes since then."""
     fix: FixMessage | None = None
     seen_s: float = -math.inf
-    """When the newest fix came."""
+    """Time of the newest fix."""
     gone: bool = False
     """Whether its program has ended since."""
     battery: float | None = None
@@ -118,7 +118,7 @@ class _Tag(Struct):
         return not self.gone and now_s - self.seen_s < TAG_TIMEOUT_S
 
     def is_settled(self, now_s: float) -> bool:
-        """Whether it is known in which zones it is not."""
+        """Whether it is known which zones the tag is outside."""
         return self.fixes >= 2 and now_s - self.first_s >= SETTLE_S
 
 
@@ -132,26 +132,26 @@ class _Case(Struct):
     holds: bool
     since_s: float
     known_s: float
-    """When it was last known whether the condition holds."""
+    """When the condition was last evaluated with a known result."""
     begin_s: float | None = None
-    """When it first held; pauses that have not ended the alarm do not change it."""
+    """When the condition first held; pauses too short to end the alarm do not change it."""
     worst: float | None = None
     """As of ``AlarmMessage``."""
 
     def add(self, kind: RuleKind, value: float | None) -> None:
-        """The value while the condition holds; None where it is not known."""
+        """Include a value in the worst one; None where it is not known."""
         if value is not None:
             worse = min if kind in ("near", "battery") else max
             self.worst = value if self.worst is None else worse(self.worst, value)
 
 
 class Concerned:
-    """The tags that ``tags`` or ``others`` of a rule name; all where the list is empty."""
+    """The tags named in ``tags`` or ``others`` of a rule; all tags if the list is empty."""
 
     def __init__(self, names: Sequence[str], assets: Mapping[str, Asset]) -> None:
         self.named = {name for name in names if not name.startswith(GROUP)}
         self.named |= {tag for tag, asset in assets.items() if f"{GROUP}{asset.group}" in names}
-        """Tags that are expected even if nothing has been heard of them."""
+        """Tags that are expected even if they have never been heard."""
         self._all = not names
 
     def __contains__(self, tag: object) -> bool:
@@ -159,14 +159,14 @@ class Concerned:
 
 
 class _Rule:
-    """A rule, whom it concerns, and its cases by subject."""
+    """A rule, the tags it concerns, and its cases by subject."""
 
     def __init__(self, rule: AlarmRule, assets: Mapping[str, Asset], before: "_Rule | None") -> None:
-        """The cases of ``before`` go on where it is of the same kind and zone."""
+        """Take over the cases of ``before`` if it has the same kind and zone."""
         self.rule, self.hours = rule, read_hours(rule.hours)
         self.concerned, self.others = Concerned(rule.tags, assets), Concerned(rule.others, assets)
         self.distances_m: dict[str, float] = {}
-        """Of near pairs, by subject."""
+        """Distances of near pairs, by subject."""
         self.cases: dict[str, _Case] = {}
         self.is_on: bool | None = None  # not known before the first evaluation
         self.on_since_s = -math.inf
@@ -179,14 +179,14 @@ class _Rule:
 
 
 class AlarmEngine:
-    """The alarms of one site. What changes is returned by the next ``tick``."""
+    """The alarms of one site. ``tick`` returns the changes since the last call."""
 
     def __init__(self, monitor: ZoneMonitor, local_time: Callable[[float], time.struct_time] = time.localtime) -> None:
-        """``monitor`` is given the same fixes, and its events come here. ``local_time`` turns Unix time into hours."""
+        """``monitor`` gets the same fixes; its events are passed in. ``local_time`` converts from Unix time."""
         self.messages: dict[Key, AlarmMessage] = {}
         """The alarms that are kept; those of another engine while that one leads."""
         self.leading = False
-        """Whether it raises alarms: from ``resume`` on."""
+        """Whether this engine raises alarms; true from ``resume`` on."""
         self._monitor, self._local_time = monitor, local_time
         self._assets: Mapping[str, Asset] = {}
         self._zones: dict[str, Zone] = {}
@@ -196,7 +196,7 @@ class AlarmEngine:
         self._forget_due_s = 0.0
         self._changed: dict[str, None] = {}  # tags with something new since the last evaluation
         self._anchors: dict[RuleKind, dict[str, str]] = {}
-        """What is known of anchors, by kind of rule: subjects for which the condition holds, and a sentence."""
+        """Subjects for which a condition on anchors holds, each with a sentence, by kind of rule."""
         self._changes: list[Change] = []
         self._blind_s = self._evaluated_s = self._updated_s = -math.inf
         self._unix_offset_s = 0.0
@@ -220,7 +220,7 @@ class AlarmEngine:
             self.set_rules(self.rules)
 
     def set_zones(self, zones: Iterable[Zone], now_s: float) -> None:
-        """The monitor has these zones now. Its events of the change come first."""
+        """Take the zones that the monitor has now. Pass in the monitor's events of this change first."""
         self._zones = {zone.id: zone for zone in zones}
         for tag in self._tags.values():
             tag.first_s, tag.fixes = now_s, 0
@@ -233,7 +233,7 @@ class AlarmEngine:
     # What happens
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
-        """A fix of a tag; to be called before the events that the monitor finds with it."""
+        """Process a fix of a tag. Call this before ``on_zone_events`` with the events that the monitor finds for it."""
         tag = self._tags.setdefault(fix.tag, _Tag(now_s))
         if not tag.is_fresh(now_s):
             tag.first_s, tag.fixes = now_s, 0
@@ -242,12 +242,12 @@ class AlarmEngine:
         self._changed[fix.tag] = None
 
     def hear(self, name: str, now_s: float) -> None:
-        """A tag has had a fix that is not given to ``on_fix``."""
+        """Note that a tag has had a fix that is not passed to ``on_fix``."""
         if name in self._tags:
             self._tags[name].seen_s = now_s
 
     def on_zone_events(self, events: Iterable[ZoneEvent], now_s: float) -> None:
-        """Tags have entered or left zones."""
+        """Process events of tags that have entered or left zones."""
         for event in events:
             members = self._members[event.zone]
             (members.add if event.kind == "enter" else members.discard)(event.tag)
@@ -256,18 +256,18 @@ class AlarmEngine:
                     self._check(own, f"zone-{event.zone}" if own.rule.kind == "crowded" else event.tag, now_s)
 
     def on_tag_gone(self, name: str) -> None:
-        """A tag's program has ended; to be called before the monitor's events: nobody knows where the tag is."""
+        """Note that a tag's program has ended, so that its position is unknown. Call this before ``on_zone_events``."""
         if name in self._tags:
             self._tags[name].gone = True
 
     def on_health(self, health: TagHealth, now_s: float) -> None:
-        """A tag's health, with what is left in its battery."""
+        """Process a tag's health, which states the charge of its battery."""
         if health.battery_share is not None:
             self._tags.setdefault(health.tag, _Tag(now_s)).battery = health.battery_share
             self._changed[health.tag] = None
 
     def on_anchors(self, offline: Iterable[str] | None, watch: WatchMessage | None) -> None:
-        """The anchors that are offline, None where that is not known, and what their watch has found."""
+        """Take the anchors that are offline (None if unknown) and the findings of the watch."""
         if offline is not None:
             self._anchors["anchor-offline"] = {f"anchor-{name}": "" for name in sorted(offline)}
         if watch is not None and watch.state == "watching":
@@ -277,7 +277,7 @@ class AlarmEngine:
     # Leading, and what people do
 
     def resume(self, messages: Iterable[AlarmMessage], now_s: float, unix_s: float) -> None:
-        """Lead from now on, with the alarms that are kept."""
+        """Start to lead, continuing with the retained alarms."""
         self.messages = {(one.rule, one.subject): one for one in messages if not is_over(one)}
         self.leading, self._unix_offset_s = True, unix_s - now_s
         for message in self.messages.values():
@@ -295,11 +295,11 @@ class AlarmEngine:
 
     @property
     def has_changes(self) -> bool:
-        """Whether the next ``tick`` has something to say that has happened already."""
+        """Whether the next ``tick`` will return changes that have already happened."""
         return bool(self._changes)
 
     def acknowledge(self, rule: str, subject: str, occurrence: str, by: str, unix_s: float) -> bool:
-        """Somebody has seen an alarm. False where there is no such occurrence, or somebody has seen it before."""
+        """Acknowledge an alarm. Return False if there is no such occurrence or it has already been acknowledged."""
         message = self.messages.get((rule, subject))
         if message is None or message.id != occurrence or message.acknowledged_unix_s is not None:
             return False
@@ -307,7 +307,7 @@ class AlarmEngine:
         return True
 
     def tick(self, now_s: float, unix_s: float, *, blind: bool = False) -> list[Change]:
-        """Do what is due, several times a second. ``blind``: messages may be missing, so that silence means nothing."""
+        """Evaluate what is due, several times a second. ``blind``: messages may be missing, so silence is ignored."""
         self._unix_offset_s = unix_s - now_s
         if blind or self._blind_s == -math.inf:  # before the first tick it was blind
             self._blind_s = now_s
@@ -342,7 +342,7 @@ class AlarmEngine:
         self._forget(now_s)
 
     def _subjects(self, own: _Rule, changed: Iterable[str], now_s: float) -> Iterable[str]:
-        """For whom a condition may have begun to hold."""
+        """Subjects for which a condition may have begun to hold."""
         match own.rule.kind:
             case "near":
                 reach_m = (own.rule.limit or 0.0) + own.rule.hysteresis
@@ -363,7 +363,7 @@ class AlarmEngine:
     def _holds(  # noqa: PLR0911, PLR0912 - some for each kind
         self, own: _Rule, subject: str, now_s: float, *, held: bool
     ) -> bool | None:
-        """Whether the condition holds; None where that is not known, so that it stays as it was."""
+        """Whether the condition holds; None if that is unknown, so that the case stays as it was."""
         rule, tag, inside = own.rule, self._tag(subject), self._members[own.rule.zone or ""]
         limit, hysteresis = rule.limit or 0.0, rule.hysteresis if held else 0.0
         if rule.zone is not None and rule.zone not in self._zones:
@@ -405,7 +405,7 @@ class AlarmEngine:
         return now_s - self._blind_s < CONFIRM_S
 
     def _is_missed(self, name: str, now_s: float) -> bool:
-        """Whether a tag may be there though nothing has come from it."""
+        """Whether a tag may be present although nothing has been received from it."""
         return self._was_blind(now_s) and self._tag(name).seen_s <= self._blind_s
 
     def _crowd(self, own: _Rule) -> list[str]:
@@ -424,7 +424,7 @@ class AlarmEngine:
     # From conditions to alarms
 
     def _check(self, own: _Rule, subject: str, now_s: float) -> None:
-        """Find out whether a condition holds, and raise or end its alarm where its time has come."""
+        """Evaluate a condition, and raise or end its alarm when that is due."""
         rule, case = own.rule, own.cases.get(subject)
         holds = self._holds(own, subject, now_s, held=case is not None and case.holds)
         if case is None:
@@ -490,7 +490,7 @@ class AlarmEngine:
                 self._keep(replace(message, sentence=sentence, worst=worst), "updated")
 
     def _value(self, own: _Rule, subject: str, held_s: float) -> float | None:
-        """What an alarm is about in numbers, as in ``AlarmMessage.worst``; None where that is not known."""
+        """The value that an alarm reports, as in ``AlarmMessage.worst``; None if it is unknown."""
         match own.rule.kind:
             case "near":
                 return own.distances_m.get(subject)
@@ -539,7 +539,7 @@ class AlarmEngine:
         return ", ".join(names) or ("" if fix is None else "at x {:.1f}, y {:.1f} m".format(*fix.position_m))
 
     def _sentence(self, own: _Rule, subject: str, worst: float | None, what: What) -> str:
-        """Empty where nothing is known any more."""
+        """The sentence of an alarm; empty if nothing is known any more."""
         rule, limit, zone = own.rule, own.rule.limit or 0.0, self._zone_name(own.rule.zone)
         if worst is None and what != "raised" and rule.kind != "anchor-moved":
             return ""
@@ -567,12 +567,12 @@ class AlarmEngine:
 
 
 def is_over(message: AlarmMessage) -> bool:
-    """Whether an alarm has ended and somebody has acknowledged it, so that it is not kept any longer."""
+    """Whether an alarm has ended and been acknowledged, so that it is no longer kept."""
     return message.ended_unix_s is not None and message.acknowledged_unix_s is not None
 
 
 def _level_m(tag: _Tag) -> float | None:
-    """The horizontal protection level; infinite where none can be given, None of a method that has none."""
+    """Horizontal protection level; infinite if none can be given, None if the method has none."""
     fix = tag.fix
     if fix is None or fix.hpl_m is not None:
         return None if fix is None else fix.hpl_m

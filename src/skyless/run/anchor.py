@@ -39,27 +39,29 @@ from skyless.run.process import HEALTH_S, Log, SitePublisher, every, keep, link_
 from skyless.site.file.check import check_site
 
 MAX_MOVE_M: Final = 0.5
-"""How far a survey may move an anchor with keys from its place in the site file: its codes vouch for the new place."""
+"""How far a survey may move an anchor with keys from its place in the site file, as its codes vouch for the new place.
+"""
 
 MAX_LEAD_S: Final = 8e-3
 LEAD_GAIN: Final = 1.25
 LEAD_LOSS: Final = 0.998
-"""Frames are handed over as long before their RMARKERs as the radio asks for at first. A host that is late does so
-earlier: by the gain with each late one, up to the maximum, and back by the loss with each one sent. The cost of an
-earlier frame is relayed stamps that are older by as much."""
+"""Frames are first handed over as long before their RMARKERs as the radio asks for. The lead grows by the gain with
+each late frame, up to the maximum, and shrinks by this factor with each frame sent. A longer lead makes relayed stamps
+older.
+"""
 
 ASK_AGAIN_S: Final = 5e-3
 LOST_ANSWER_S: Final = 0.25
-"""A radio that has not reported the end of a frame within this time will not report it."""
+"""A radio that has not reported the end of a frame within this time never will."""
 
 STAMPS_S: Final = 0.05
-"""Interval at which stamps are looked through for a message that is due."""
+"""Interval at which stamps are checked for a message that is due."""
 
 STAMPS_INTERVAL_S: Final = 0.2
-"""Stamps of this time go into one message."""
+"""Length of time whose stamps go into one message."""
 
 MAX_PENDING_STAMPS: Final = 4096
-"""Where nobody collects stamps, the oldest are dropped and counted."""
+"""Largest number of uncollected stamps; the oldest are dropped and counted beyond it."""
 
 _ROLES: Final[dict[Role, Literal["master", "anchor", "listening"]]] = {
     Role.MASTER: "master",
@@ -69,7 +71,7 @@ _ROLES: Final[dict[Role, Literal["master", "anchor", "listening"]]] = {
 
 
 class AnchorNode:
-    """Runs the machine of an anchor on a radio."""
+    """Runs an anchor's state machine on a radio."""
 
     def __init__(
         self,
@@ -81,13 +83,13 @@ class AnchorNode:
         *,
         allow_placement: bool = False,
     ) -> None:
-        """``keys`` are None for an anchor that sends without codes, which a survey may move anywhere.
+        """``keys`` is None for an anchor without codes, which a survey may move anywhere.
 
-        ``allow_placement``: a survey may move one with keys anywhere, too.
+        ``allow_placement`` lets a survey move an anchor with keys anywhere, too.
         """
         self.site, self.id, self.radio = site, anchor_id, radio
         self._radio_site, self._log = site, log
-        """The radio is configured with the antenna delays of this site, and keeps them."""
+        """The radio is configured with this site's antenna delays, and keeps them."""
         self._may_move = keys is None or allow_placement
         self._keys, self._report = keys, AnchorReport(anchor_id, log)
         self.authentication: BeaconAuthentication | None = None
@@ -114,7 +116,7 @@ class AnchorNode:
         return machine
 
     def place(self, message: PlacementMessage) -> bool:
-        """Adopt a survey's positions and delays, unless they are for another site. Returns whether the site changed."""
+        """Adopt a survey's positions and delays, unless they are for another site. Returns whether it changed."""
         present, offered = site_digest(self.site), site_digest(message.site)
         if offered == present:
             return False
@@ -145,7 +147,7 @@ class AnchorNode:
         return True
 
     def on_request(self, message: RequestMessage) -> None:
-        """A subscriber requests stamps."""
+        """Process a subscriber's request for stamps."""
         self.stamps.request(message, time.monotonic())
 
     def refuse(self, reason: str) -> None:
@@ -187,19 +189,19 @@ class AnchorNode:
                 self._wait(None, self._schedule)
 
     def check_reception(self, now_s: float) -> None:
-        """Log where to look if it receives nothing usable. ``now_s`` is the host's monotonic clock."""
+        """Log likely causes if the anchor receives nothing usable. ``now_s`` is the host's monotonic clock."""
         counters = self.machine.counters
         drops = Counter({reason: count for reason, count in counters.items() if reason not in NOT_DROPS})
         self.monitor.check(now_s, self._received, counters["heard"], drops + self.radio.counters)
 
     def check_codes(self, unix_s: float, now_s: float) -> None:
-        """Log what has changed of codes. ``now_s`` is the host's monotonic clock."""
+        """Log changes in the state of codes. ``now_s`` is the host's monotonic clock."""
         if self._keys is not None and self.authentication is not None:
             accepted_s = max(self.heard_s.values(), default=self.started_s)
             self._report.update(self.authentication, self._keys.present(unix_s), accepted_s, unix_s, now_s)
 
     def with_codes(self, health: AnchorHealth) -> AnchorHealth:
-        """An anchor's state with what it knows of key chains and codes."""
+        """Add the state of key chains and codes to an anchor's health."""
         keys, authentication = self._keys, self.authentication
         if keys is None or authentication is None:
             return health
@@ -222,7 +224,7 @@ class AnchorNode:
         self.stamps.add(beacon.anchor, beacon.tx_ticks, reception.rx_ticks, reception.carrier_phase_cycles)
 
     def _wait(self, seconds: float | None, then: Callable[[], None]) -> None:
-        """Call a function later, instead of the one planned before. None plans nothing."""
+        """Call a function later, replacing any call that is planned. None only cancels."""
         if self._timer is not None:
             self._timer.cancel()
         self._timer = None if seconds is None else asyncio.get_running_loop().call_later(seconds, then)
@@ -241,15 +243,15 @@ class AnchorNode:
         self._wait(max(ahead_s, 0.0), lambda: self._transmit(tx_ticks))
 
     def _transmit(self, tx_ticks: int) -> None:
-        """Hand the frame to the radio, and ask again if it never reports the frame's end."""
+        """Hand the frame to the radio, and schedule again if it never reports the frame's end."""
         self._wait(LOST_ANSWER_S, self._schedule)
         self.radio.transmit(self.machine.transmission(tx_ticks))
 
 
 class StampLog:
-    """What an anchor has received of the others, kept for as long as somebody asks for it.
+    """What an anchor has received from the others, kept while somebody requests it.
 
-    No I/O and no clock: times are passed in, by any clock that does not go back.
+    No I/O and no clock: times are passed in, by any monotonic clock.
     """
 
     def __init__(self, anchor: int, run: str) -> None:
@@ -261,19 +263,19 @@ class StampLog:
         self._sent_s = 0.0
 
     def request(self, message: RequestMessage, now_s: float) -> None:
-        """Process a request. One without ``stamps`` ends the lease of its sender."""
+        """Process a request. One without ``stamps`` ends its sender's lease."""
         if message.stamps:
             self._leases.grant(message.by, message.lease_s, now_s)
         else:
             self._leases.end(message.by)
 
     def restart(self, run: str) -> None:
-        """The anchor's counter has restarted: what was not collected before is useless."""
+        """Discard what was not collected, because the anchor's counter has restarted."""
         self._run, self._missed = run, 0
         self._pending.clear()
 
     def add(self, anchor: int, tx_ticks: int, rx_ticks: int, phase_cycles: float | None = None) -> None:
-        """Add a reception of another anchor: its stated TX stamp and the own RX stamp, 40 bits each, and its phase."""
+        """Add a reception from another anchor: its stated TX stamp and the own RX stamp (40 bits), and the phase."""
         if not self._leases.are_held:
             return
         if len(self._pending) >= MAX_PENDING_STAMPS:
@@ -283,7 +285,7 @@ class StampLog:
         self._pending.append(Stamp(anchor, tx_ticks, rx_ticks, rounded))
 
     def collect(self, now_s: float, unix_s: float) -> StampsMessage | None:
-        """The next message if it is due, also one without stamps while an anchor that is asked receives nobody."""
+        """Return the next message if it is due. It may be empty, if an anchor that is asked receives nobody."""
         self._leases.expire(now_s)
         if not self._leases.are_held:
             self._pending.clear()
@@ -299,22 +301,22 @@ class StampLog:
 
 
 class TransmissionCount:
-    """Transmissions of an anchor that were sent and missed, including slots that were passed over."""
+    """Counts an anchor's transmissions that were sent and missed, including skipped slots."""
 
     def __init__(self, interval_ticks: float) -> None:
         self.sent = self.missed = 0
         self._interval_ticks = interval_ticks
-        """Ticks between two transmissions, or 0 where they are at random instants."""
+        """Ticks between two transmissions; 0 if they are at random instants."""
         self._planned_ticks: int | None = None
 
     def plan(self, tx_ticks: int | None) -> None:
-        """The next transmission is planned, or may not be planned yet. Slots that were passed over are missed."""
+        """Note the next planned transmission, which may not be known yet. Skipped slots count as missed."""
         before, self._planned_ticks = self._planned_ticks, tx_ticks
         if tx_ticks is not None and before is not None and self._interval_ticks:
             self.missed += max(0, round(difference(tx_ticks, before) / self._interval_ticks) - 1)
 
     def drain(self) -> float:
-        """Share of transmissions since the last call that were missed."""
+        """Return the share of transmissions missed since the last call."""
         share = self.missed / max(self.sent + self.missed, 1)
         self.sent = self.missed = 0
         return share
@@ -335,7 +337,7 @@ class Anchors:
         keys: AnchorKeys | None = None,
         allow_placement: bool = False,
     ) -> None:
-        """``simulated`` is asked again when a radio has restarted: its port may lead to another device."""
+        """``simulated`` is called again after each restart of a radio, as its port may lead to another device."""
         self._site, self._log, self._keys = site, log, keys
         self._site_publisher = SitePublisher(site, simulated, plans)
         self.nodes = tuple(
@@ -344,7 +346,7 @@ class Anchors:
         self._links = tuple(self._link(node, address) for node in self.nodes)
 
     def _link(self, node: AnchorNode, address: MqttAddress | None) -> Link | None:
-        """An anchor's connection to the broker."""
+        """Return an anchor's connection to the broker."""
         link = link_of(address, node.id, site=self._site.id, kind="anchor")
         if link is not None:
             site, placed = self._site.id, partial(self._place, node)
@@ -357,7 +359,7 @@ class Anchors:
         return link
 
     def _place(self, node: AnchorNode, message: PlacementMessage) -> None:
-        """Let an anchor adopt a placement, and publish the site that it has then."""
+        """Let an anchor adopt a placement, and publish the resulting site."""
         if node.place(message):
             self._site_publisher.place(node.site)
 
@@ -371,7 +373,7 @@ class Anchors:
         await together(*parts)
 
     def update_keys(self) -> None:
-        """Use other key chains where their files have changed."""
+        """Reload key chains whose files have changed."""
         if self._keys is not None:
             if self._keys.update():
                 for node in self.nodes:
@@ -386,14 +388,14 @@ class Anchors:
                 link.publish(stamps_topic(self._site.id, node.id), message, qos=1)
 
     def healths(self, unix_s: float, now_s: float) -> list[AnchorHealth]:
-        """State of all anchors since their last one. ``now_s`` is the host's monotonic clock."""
+        """Return the state of all anchors since the last call. ``now_s`` is the host's monotonic clock."""
         pairs = zip(self.nodes, self._links, strict=True)
         return [
             health_of(node, Counters(0, 0, 0) if link is None else link.counters, unix_s, now_s) for node, link in pairs
         ]
 
     def _publish_health(self) -> None:
-        """Health of all anchors, and the site by its master or root, or by the first anchor of each process."""
+        """Publish the health of all anchors, and the site where one of them is responsible for it (``leads``)."""
         unix_s, now_s = time.time(), time.monotonic()
         self._site_publisher.update(sum(node.monitor.restarts for node in self.nodes))
         for node, link in zip(self.nodes, self._links, strict=True):
@@ -409,7 +411,7 @@ class Anchors:
 
 
 def leads(machine: AnchorMachine, *, is_first: bool) -> bool:
-    """Whether an anchor publishes the site: the master; where there is none the first anchor of its process."""
+    """Whether an anchor publishes the site: the master, or the first anchor of its process if there is no master."""
     state = machine.clock(None)
     return is_first if state is None else state.role is Role.MASTER
 

@@ -1,4 +1,4 @@
-"""What tags are attached to: which lists are valid, and their form as CSV for spreadsheets."""
+"""What tags are attached to: validation of lists of assets, and their form as CSV for spreadsheets."""
 
 import csv
 import io
@@ -12,27 +12,27 @@ from skyless.run.mqtt.messages import Asset, AssetsMessage, WrongMessageError, r
 
 MAX_ASSETS: Final = 10_000
 MAX_BYTES: Final = 4_000_000
-"""Of a list in JSON or CSV; brokers take messages of 8 MB."""
+"""Size limit of a list in JSON or CSV; brokers take messages of 8 MB."""
 
 COLUMNS: Final = Asset.__struct_fields__
-"""Head of a table in CSV, as it is written."""
+"""Header of a CSV table as written."""
 
 _TAG: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _FORMULA: Final = ("=", "+", "-", "@", "'")
-"""How a cell begins that a spreadsheet may compute; and one of text there, which must stay distinct from it."""
+"""Beginnings of cells that a spreadsheet may compute, and the apostrophe, which marks escaped text."""
 _COLOUR: Final = re.compile(r"(#[0-9A-Fa-f]{6})?")
 _MAX_LENGTHS: Final = {"name": 100, "group": 64, "icon": 8, "owner": 100, "notes": 1000}
 
 
 def read_assets(payload: bytes) -> AssetsMessage:
-    """An ``AssetsMessage`` in JSON, all its assets checked. Raises WrongMessageError."""
+    """Read an ``AssetsMessage`` in JSON and check its assets. Raises WrongMessageError."""
     message = read_message(payload, AssetsMessage)
     check_assets(message.assets)
     return message
 
 
 def check_assets(assets: tuple[Asset, ...]) -> None:
-    """Check a list of assets. Raises WrongMessageError, which names asset, key, value and what would be right."""
+    """Check a list of assets. Raises WrongMessageError, naming asset, key, value and what is allowed."""
     if len(assets) > MAX_ASSETS:
         raise WrongMessageError(f"there are {len(assets)} assets; at most {MAX_ASSETS} are allowed")
     known: set[str] = set()
@@ -47,7 +47,7 @@ def check_assets(assets: tuple[Asset, ...]) -> None:
 
 
 def _fault(asset: Asset) -> str:
-    """What is wrong with an asset, empty where nothing is."""
+    """What is wrong with an asset; empty if nothing is."""
     if not _TAG.fullmatch(asset.tag):
         return f"tag is {asset.tag[:40]!r}; it should be 1 to 64 letters, digits, dots, dashes and underscores"
     for key, most in _MAX_LENGTHS.items():
@@ -62,7 +62,7 @@ def _fault(asset: Asset) -> str:
 
 
 def write_csv(assets: Iterable[Asset]) -> bytes:
-    """A table in CSV (RFC 4180), UTF-8. What a spreadsheet would take for a formula has an apostrophe before it."""
+    """Write a table in CSV (RFC 4180), UTF-8. Cells that look like a formula get an apostrophe in front."""
     out = io.StringIO()
     writer = csv.writer(out)
     writer.writerow(COLUMNS)
@@ -72,12 +72,12 @@ def write_csv(assets: Iterable[Asset]) -> bytes:
 
 
 def read_csv(data: bytes) -> tuple[Asset, ...]:
-    """The assets of a table, all checked; commas, or semicolons or tabs as spreadsheets of some languages write them.
+    """Read and check the assets in a table, separated by commas, semicolons or tabs, as spreadsheets write them.
 
-    The head names the columns: ``tag``, and any of the others in any order.
+    The header names the columns: ``tag``, and any of the others in any order.
 
     Raises:
-        WrongMessageError: it names the line.
+        WrongMessageError: naming the line.
     """
     if len(data) > MAX_BYTES:
         raise WrongMessageError(f"the table has {len(data)} bytes; it should have {MAX_BYTES} at most")
@@ -111,7 +111,7 @@ def read_csv(data: bytes) -> tuple[Asset, ...]:
 
 
 def _text(cell: str) -> str:
-    """A cell without the apostrophe that ``write_csv`` puts before it."""
+    """Remove the apostrophe that ``write_csv`` puts in front of a cell."""
     return cell[1:] if cell[:1] == "'" and cell[1:].startswith(_FORMULA) else cell
 
 
@@ -125,5 +125,5 @@ def _columns(head: list[str]) -> list[str]:
 
 
 def assets_at(message: AssetsMessage, site: str) -> dict[str, Asset]:
-    """The assets by tag at the site of this name; none where they are of another site of the same number."""
+    """Assets by tag at the site of this name; none if they belong to another site with the same number."""
     return {asset.tag: asset for asset in message.assets} if message.site in ("", site) else {}

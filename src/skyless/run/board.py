@@ -50,26 +50,24 @@ from skyless.radio.tag_reports import (
 from skyless.run.fix_log import Lateness
 from skyless.run.process import HEALTH_S, Log, RateLimit, every, together
 
-# What makes an emulated board a tag by itself: its settings, its own position, and what it says of them.
-#
-# It computes with ``Receiver``, whose C is the firmware's as well (``firmware/source/tag.c``), and has this
-# computer's clock. It says records only, and neither sleeps nor advertises.
+# A board that is a tag by itself. It computes with ``Receiver`` as the firmware does (``firmware/source/tag.c``), uses
+# this computer's clock, and neither sleeps nor advertises.
 
 _REPEAT_S: Final = 10.0
-"""How often places of anchors and the georeference are repeated."""
+"""Interval at which anchor positions and the georeference are repeated."""
 
 
 class BoardTag:
-    """The tag on a board; ``settings`` are those in use, ``flash`` those that it has after a start."""
+    """The tag on a board. ``settings`` are in use; ``flash`` holds those used after a restart."""
 
     def __init__(self, report: Callable[[int, bytes], None], clock_s: Callable[[], float] = time.monotonic) -> None:
-        """``report`` sends a record of a kind; ``clock_s()`` is the host's time, on the clock of receptions."""
+        """``report`` sends a record of a kind; ``clock_s()`` is the host's time, on the clock of the receptions."""
         self._report, self._clock_s = report, clock_s
         self.flash = BoardSettings()
         self.begin(self.flash)
 
     def begin(self, settings: BoardSettings) -> None:
-        """Work with these settings; nothing has been heard."""
+        """Start with these settings, and no receptions."""
         self._receiver = Receiver(
             site=None if settings.site == ANY_SITE else settings.site,
             qa=settings.qa_m2ps3,
@@ -81,15 +79,15 @@ class BoardTag:
         self._begun_s = self._clock_s()
         self._fixed_s = self._placed_s = -_REPEAT_S
         self._placed: tuple[int, ...] = ()
-        """Anchors whose places were said last."""
+        """Anchors whose positions were sent last."""
 
     @property
     def is_on(self) -> bool:
-        """Whether it computes; else the board is a radio for its host."""
+        """Whether the board computes its position; otherwise it is a radio for its host."""
         return MODES[self.settings.mode] == "tag"
 
     def execute(self, record: bytes) -> None:
-        """Execute a command about settings; the time is known already."""
+        """Execute a command about settings; the time must already be known."""
         if record[0] == link.SET_TAG_CONFIG:
             settings = unpack(record[link.SETTINGS_AT :])
             if settings is None or OUTPUTS[settings.output] != "records":
@@ -103,7 +101,7 @@ class BoardTag:
             self._report(link.TAG_CONFIG, bytes((in_flash,)) + pack(self.settings))
 
     def hear(self, reception: Reception) -> None:
-        """Process a frame; say where the tag is, if that is due."""
+        """Process a frame, and report the position if that is due."""
         now_s = self._clock_s()
         ended_s = now_s if reception.host_s is None else reception.host_s
         if not self._lateness.admits(ended_s, now_s) or (fix := self._receiver.hear(reception)) is None:
@@ -124,7 +122,7 @@ class BoardTag:
             self._report(link.GEOREFERENCE, georeference_body(heard.georeference))
 
     def each_second(self) -> None:
-        """Say what it has counted, and why there is no fix where there is none."""
+        """Report the counters, and the reason if there is no fix."""
         if self.is_on:
             receiver, counted, now_s = self._receiver, self._receiver.counters, self._clock_s()
             reason = receiver.reason if now_s - self._fixed_s > HEALTH_S else None
@@ -153,14 +151,14 @@ RADIO_OF: Final[dict[BoardFormat, str]] = {
     "uci": "uci",
     "uci-2": "uci",
 }
-"""The name in ``--radio`` of a board of each format."""
+"""Name of a board of each format in ``--radio``."""
 
 
 class BoardProtocol(Protocol):
-    """What a board sends and understands on its serial line."""
+    """What a board sends and accepts on its serial line."""
 
     def on_radio_event(self, event: RadioEvent) -> None:
-        """Send the host what happened on the air."""
+        """Report an event on the air to the host."""
 
     def on_host_data(self, data: bytes) -> None:
         """Process bytes from the host."""
@@ -172,14 +170,14 @@ class LinkProtocol:
     def __init__(
         self, radio: Radio, send: Send, *, can_transmit: bool, clock_s: Callable[[], float] = time.monotonic
     ) -> None:
-        """One that only listens can be a tag by itself, whose time of the host is ``clock_s()``."""
+        """A board that only listens can be a tag by itself; ``clock_s()`` is its host's time."""
         self._radio, self._send, self._can_transmit = radio, send, can_transmit
         self.tag = None if can_transmit else BoardTag(self.report, clock_s)
         self._reader, self._writer = link.Reader(), link.Writer()
         self._configured = self._receiving = self._wants_phases = False
         self._tx_delay_ticks = 0
         self._waiting: dict[int, int] = {}
-        """dx by TX stamp, of frames that have not left."""
+        """``dx`` of frames not sent yet, by TX stamp."""
         self.counts = dict.fromkeys(("received", "errors", "sent", "late", "garbled", "unsent"), 0)
 
     def on_radio_event(self, event: RadioEvent) -> None:
@@ -253,7 +251,7 @@ class LinkProtocol:
         self._write(self._writer.status(ticks or 0, state, list(counts.values())))
 
     def _configure(self, record: bytes) -> None:
-        """Set the antenna delays; the other settings must be those of the air."""
+        """Set the antenna delays; the other settings must match the air."""
         if len(record) < link.CONFIG_BYTES or record[2:8] != _CONFIG[2:8]:
             reason = link.REFUSED_MALFORMED if len(record) < link.CONFIG_BYTES else link.REFUSED_SETTING
             self.report(link.REFUSED, bytes((link.CONFIG, reason)))
@@ -292,7 +290,7 @@ class LinkProtocol:
 
 
 def _is_frame(psdu: bytes) -> bool:
-    """Whether a board sends these bytes: what the line has damaged is refused."""
+    """Whether a board would send these bytes; frames damaged on the line are refused."""
     return 3 <= len(psdu) <= link.MAX_FRAME_BYTES and is_intact(psdu)
 
 
@@ -303,7 +301,7 @@ class ListenerProtocol:
         self._send = send
 
     def on_radio_event(self, event: RadioEvent) -> None:
-        """One line for each frame."""
+        """Write one line for each frame."""
         if not isinstance(event, Reception):
             return
         measured, frame = event.diagnostics or Diagnostics(), event.frame
@@ -318,11 +316,11 @@ class ListenerProtocol:
         self._send(json.dumps(line, separators=(",", ":")).encode() + b"\r\n")
 
     def on_host_data(self, data: bytes) -> None:
-        """It takes no commands."""
+        """Ignore the data: this board takes no commands."""
 
 
 class _BeaconTranslator:
-    """What emulated boards of other systems have in common: they report beacons as messages of their system."""
+    """What emulated boards of other systems share: they report beacons as messages of their own system."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -332,7 +330,7 @@ class _BeaconTranslator:
         self.drops: Counter[str] = Counter()
 
     def _beacon(self, event: RadioEvent, greatest_anchor: int = 0xFFFF) -> SiteBeacon | None:
-        """The beacon of a reception; None for other events, and for frames that have no translation."""
+        """The beacon of a reception; None for other events and for frames without a translation."""
         if not isinstance(event, Reception):
             return None
         beacon = decode_any(event.frame)
@@ -349,7 +347,7 @@ class _BeaconTranslator:
         return self._anchors_m.get(anchor) or self._almanac.anchors_m.get(anchor)
 
     def _flight_ticks(self, one: int, other: int) -> int:
-        """As anchors would have ranged each other; 0 for more than the line has bits for, or unknown positions."""
+        """Time of flight between two anchors, as if they had ranged; 0 if it is unknown or exceeds the field."""
         one_m, other_m = self._position_m(one), self._position_m(other)
         if one_m is None or other_m is None:
             return 0
@@ -358,14 +356,14 @@ class _BeaconTranslator:
 
 
 class SnifferProtocol(_BeaconTranslator):
-    """A Bitcraze sniffer: beacons translated into packets of a TDoA3 system, as text until the host sends ``b``."""
+    """A Bitcraze sniffer: reports beacons as packets of a TDoA3 system, in text until the host sends ``b``."""
 
     def __init__(self, send: Send, *, knows_binary: bool) -> None:
         super().__init__(send)
         self._knows_binary, self._binary = knows_binary, False
 
     def on_radio_event(self, event: RadioEvent) -> None:
-        """One packet for each beacon."""
+        """Send one packet for each beacon."""
         beacon = self._beacon(event, _LAST_ID)
         if beacon is None or not isinstance(event, Reception):
             return
@@ -378,11 +376,11 @@ class SnifferProtocol(_BeaconTranslator):
             self._send(b"From %02x to ff @%010x: %s\r\n" % (beacon.anchor, event.rx_ticks, payload.hex().encode()))
 
     def on_host_data(self, data: bytes) -> None:
-        """``b`` asks for binary."""
+        """Switch to binary on ``b``."""
         self._binary = self._binary or (self._knows_binary and b"b" in data)
 
     def _payload(self, beacon: SiteBeacon) -> bytes:
-        """Type, sequence, TX time, when the anchor heard which other, and the times of flight that are known."""
+        """Payload of a packet: type, sequence, TX time, times of reception of other anchors, and times of flight."""
         heard = [entry for entry in beacon.relayed if entry.anchor <= _LAST_ID]
         payload = struct.pack("<BBIB", TDOA3, beacon.sequence & 0x7F, beacon.tx_ticks & 0xFFFFFFFF, len(heard))
         for entry in heard:
@@ -394,16 +392,15 @@ class SnifferProtocol(_BeaconTranslator):
 
 
 class UciProtocol(_BeaconTranslator):
-    """A FiRa board: a site's beacons as the rounds of a DL-TDoA session, in notifications of UCI.
+    """A FiRa board: reports a site's beacons as the rounds of a DL-TDoA session, in UCI notifications.
 
-    Only a site with a master has rounds. Every superframe is one. The master's beacon is the poll. Those of the other
-    anchors are the responses, as each holds when its sender received the master's. Where anchors have two frames in a
-    superframe, the master's second one is the final message, which holds when it received the responses; what comes
-    after it belongs to no round.
+    Only a site with a master has rounds, one per superframe. The master's beacon is the poll, and the other anchors'
+    are the responses, each stating when its sender received the master's. If anchors have two frames in a superframe,
+    the master's second one is the final message, stating when it received the responses; later frames belong to no
+    round.
 
-    The board sends a round as soon as it holds all messages that the one before had, or with the next poll.
-
-    What joins a round after that has a notification of its own.
+    A round is sent as soon as it has all messages of the one before, or with the next poll. Messages that come after
+    that are sent in notifications of their own.
     """
 
     def __init__(self, send: Send, version: Literal[1, 2]) -> None:
@@ -412,7 +409,7 @@ class UciProtocol(_BeaconTranslator):
         self._heard: set[tuple[int, DtMessageType]] = set()
         """Messages of this round."""
         self._usual: set[tuple[int, DtMessageType]] = set()
-        """Those of the round before."""
+        """Messages of the round before."""
         self._waiting: list[tuple[Beacon, DtMeasurement]] = []
         self._poll: Beacon | None = None
         self._sequence = 0
@@ -441,10 +438,10 @@ class UciProtocol(_BeaconTranslator):
             self._notify()
 
     def on_host_data(self, data: bytes) -> None:
-        """It takes no commands: its session goes on from the start."""
+        """Ignore the data: the session runs from the start."""
 
     def _measurement(self, beacon: Beacon, reception: Reception) -> DtMeasurement | None:
-        """What the board reports of a beacon; None for one that answers no poll of this round."""
+        """The measurement that the board reports for a beacon; None if it answers no poll of this round."""
         poll, heard = self._poll, beacon.master_heard
         if poll is None or (poll.anchor, DtMessageType.FINAL) in self._heard:
             return None
@@ -496,7 +493,7 @@ class UciProtocol(_BeaconTranslator):
 
 
 def _answered(one: DtMeasurement, sent: Beacon, final: Beacon) -> DtMeasurement:
-    """A response with the reply of the final message, where the initiator received it."""
+    """A response with the reply time of the final message, if the initiator received it."""
     heard = next((entry for entry in final.heard if entry.anchor == one.address), None)
     if one.message != DtMessageType.RESPONSE or heard is None or heard.sequence != sent.sequence:
         return one
@@ -505,7 +502,7 @@ def _answered(one: DtMeasurement, sent: Beacon, final: Beacon) -> DtMeasurement:
 
 
 class Board:
-    """A board from its radio to its serial port."""
+    """An emulated board, from its radio to its serial port."""
 
     def __init__(
         self, radio: Radio, kind: Literal["anchor", "tag"], board_format: BoardFormat, link: Path | None, log: Log
@@ -543,11 +540,8 @@ class Board:
         self.protocol.on_radio_event(event)
 
 
-# A tag whose board computes: its fixes, and what it says of itself and of the site, in place of a receiver.
-
-
 class BoardReceiver:
-    """One tag (``skyless.core.tag.receiver.SiteListener``)."""
+    """A tag whose board computes; stands in for a receiver (``skyless.core.tag.receiver.SiteListener``)."""
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
@@ -565,7 +559,7 @@ class BoardReceiver:
         return HeardSite(self._anchors_m, earth, is_complete=earth is not None) if self._anchors_m else None
 
     def take(self, report: TagReport) -> Fix | None:
-        """Process what the board says; a fix if it is one."""
+        """Process a report of the board; return the fix if it is one."""
         if isinstance(report, BoardFix):
             self._enter(report.site)
             known = all(anchor in self._anchors_m for anchor in report.fix.anchors)
@@ -582,7 +576,7 @@ class BoardReceiver:
         return None
 
     def _enter(self, site: int | None) -> None:
-        """Another site has other anchors."""
+        """Switch to another site, which has other anchors."""
         if self.site is not None and site not in (None, self.site):
             self._anchors_m, self._georeference = {}, None
         self.site = self.site if site is None else site

@@ -1,7 +1,7 @@
-"""``skyless broker``: nats-server, which speaks MQTT 3.1.1, started and stopped as a child process.
+"""``skyless broker``: runs nats-server, which speaks MQTT 3.1.1, as a child process.
 
-While it runs, a file in a folder of the user alone states its address for programs without ``--mqtt``. The file is
-locked as long, so that one that a killed program has left is recognised.
+While it runs, a file in a folder private to the user states its address for programs without ``--mqtt``. The file stays
+locked for that time, so that one left behind by a killed program is recognised.
 """
 
 import asyncio
@@ -52,52 +52,53 @@ _WAIT_S: Final = 0.01
 
 
 class BrokerLimits(Struct, frozen=True):
-    """Beyond them nats-server ends a connection, or refuses what is asked, and says so in its log."""
+    """Limits beyond which nats-server ends a connection or refuses a request, and logs it."""
 
     message_bytes: int = MAX_PAYLOAD
-    """A message, such as a floor plan."""
+    """Size of a message, such as a floor plan."""
     stored_bytes: int = 4 * 1024**3
-    """What is retained, and what waits for clients with sessions; a gather's streams come in addition."""
+    """Retained messages, and those waiting for clients with sessions; a gather's streams come in addition."""
     subscriptions: int = 100_000
-    """Subscriptions of QoS 1 of all clients: each is a consumer of a stream, and nats-server's default is 1,000."""
+    """Subscriptions of QoS 1 of all clients. Each is a consumer of a stream, for which nats-server's default is 1,000.
+    """
     session_idle_h: int = 24
-    """Hours after which subscriptions of a session that is away end, where strangers may read and could leave many."""
+    """Hours after which an absent client's subscriptions end, where strangers may read and could leave many behind."""
     log_bytes: int = 1_000_000
-    """A file of the log, of which there are two."""
+    """Size of a log file, of which there are two."""
 
 
 LIMITS: Final = BrokerLimits()
 
 
 class BrokerSettings(Struct, frozen=True):
-    """Where the embedded broker listens and stores its data. By default it serves this machine alone."""
+    """Where the embedded broker listens and stores its data. By default it serves only this machine."""
 
     port: int | None = None
-    """None: 1883, or the next one that is free."""
+    """None means 1883, or the next free port."""
     listen: str = "127.0.0.1"
     data: Path | None = None
-    """None means the user's data folder, or a temporary one where that cannot be used or another broker has it."""
+    """None means the user's data folder, or a temporary one if that cannot be used or another broker has it."""
     user: str | None = None
     password: str | None = None
     certificate: Path | None = None
     key: Path | None = None
     """Certificate and private key in PEM form, for TLS."""
     roles: Mapping[Role, str] | None = None
-    """The passwords of the roles, each of which may do what ``ACCESS`` says, instead of one user for everything."""
+    """Passwords of the roles, whose permissions ``ACCESS`` states, instead of a single user for everything."""
     strangers_read: bool = False
-    """Whether clients without user and password have the stranger's role. Otherwise they are refused."""
+    """Whether clients without user and password have the stranger's role; otherwise they are refused."""
     temporary: bool = False
-    """Whether its data end with it: they are in a temporary folder."""
+    """Whether the data are deleted at the end, being in a temporary folder."""
     gathered_bytes: int | None = None
-    """What the streams of a gather may take on disk; None without a gather, whose port of NATS nobody uses."""
+    """Disk limit of a gather's streams; None without a gather, for which the NATS port is unused."""
     hub: Leaf | None = None
-    """The site's line to a hub."""
+    """The site's connection to a hub."""
 
     def check(self) -> None:
         """Check the options for access.
 
         Raises:
-            SkylessError: saying which option is missing.
+            SkylessError: naming the missing option.
         """
         if (self.user is None) != (self.password is None):
             raise SkylessError(f"--user and a password in {PASSWORD_VARIABLE} belong together")
@@ -120,19 +121,19 @@ class BrokerSettings(Struct, frozen=True):
 
     @property
     def operator(self) -> tuple[str | None, str | None]:
-        """User and password that may do everything; None without access control."""
+        """User and password with all permissions; None without access control."""
         if self.roles is None:
             return self.user, self.password
         return str(Role.OPERATOR), self.roles[Role.OPERATOR]
 
     def address(self, port: int) -> MqttAddress:
-        """Its address for clients on this machine. Where there are roles, each puts its own user there."""
+        """Address for clients on this machine. With roles, each fills in its own user."""
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(self.listen, self.listen)
         return MqttAddress(host, port, self.certificate is not None, self.user, self.password)
 
 
 def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAddress | None = None) -> str:
-    """The file for nats-server, whose format takes JSON. ``nats`` is the address for a gather."""
+    """The configuration file of nats-server, whose format accepts JSON. ``nats`` is the address for a gather."""
     host = f"[{settings.listen}]" if ":" in settings.listen else settings.listen
     mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": _SEND_AGAIN}
     if settings.certificate is not None:
@@ -155,7 +156,7 @@ def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAd
     }
     if settings.hub is not None:
         site = at(DOMAIN, settings.hub.site)
-        # Of two servers with one name the hub keeps the newer only, so that nobody could say that there are two.
+        # The hub keeps only the newer of two servers with one name, so duplicate sites could not be detected.
         whole["server_name"] = f"{site}-{secrets.token_hex(4)}"
         whole["jetstream"]["domain"] = site
         whole |= {"leafnodes": settings.hub.configuration(), "ping_interval": PING_INTERVAL, "connect_error_reports": 1}
@@ -181,7 +182,7 @@ def _user(role: Role, password: str) -> dict[str, Any]:
 
 
 def _permission(filters: tuple[str, ...]) -> dict[str, list[str]]:
-    """Topic filters as subjects of NATS. An empty list of allowed subjects would allow all of them."""
+    """Convert topic filters to NATS subjects. An empty list of allowed subjects would allow all of them."""
     subjects = [name.replace("/", ".").replace("+", "*").replace("#", ">") for name in filters]
     # In MQTT "a/#" includes "a"; nats-server subscribes to both.
     subjects += [subject.removesuffix(".>") for subject in subjects if subject.endswith(".>")]
@@ -192,7 +193,7 @@ def _permission(filters: tuple[str, ...]) -> dict[str, list[str]]:
 
 
 def _locked_folder(settings: BrokerSettings) -> tuple[Path, IO[str]]:
-    """The private folder of the broker's data, locked. Without ``data`` a temporary one where the usual one fails."""
+    """Lock the private folder of the broker's data. Without ``data``, use a temporary one if the usual fails."""
     if settings.data is not None:
         try:
             return settings.data, _lock(settings.data)
@@ -210,7 +211,7 @@ def _locked_folder(settings: BrokerSettings) -> tuple[Path, IO[str]]:
 
 
 def _remove_abandoned() -> None:
-    """Delete the temporary folders of brokers that were killed together with the programs that had started them."""
+    """Delete the temporary folders of brokers that were killed together with their parents."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_TEMPORARY}*"):
         with contextlib.suppress(OSError):
             if time.time() - folder.stat().st_mtime > _ABANDONED_S:  # another may be about to lock its own
@@ -225,10 +226,10 @@ def _lock(folder: Path) -> IO[str]:
 
 
 def _reserved(host: str, port: int) -> socket.socket | None:
-    """A reservation against brokers that start at the same moment, or None where another program has the port.
+    """Reserve a port against brokers starting at the same moment; None if another program has it.
 
     Raises:
-        SkylessError: the host is no address of this machine, or only the system may use the port.
+        SkylessError: the host is not an address of this machine, or the port needs privileges.
     """
     held = reserve(host, port)
     if held is None:
@@ -248,11 +249,11 @@ def _reserved(host: str, port: int) -> socket.socket | None:
 
 
 class _PortTakenError(Exception):
-    """Another program listens there."""
+    """Another program listens on the port."""
 
 
 class Broker:
-    """A running broker. ``async with`` stops it at the end."""
+    """A running broker. ``async with`` stops it on exit."""
 
     def __init__(
         self,
@@ -271,15 +272,15 @@ class Broker:
 
     @property
     def pid(self) -> int:
-        """Process identifier of nats-server."""
+        """Process ID of nats-server."""
         return self._process.pid
 
     async def wait(self) -> int:
-        """Wait until it ends. Returns its exit code."""
+        """Wait until it ends, and return its exit code."""
         return await self._process.wait()
 
     async def stop(self, *, to_restart: bool = False) -> None:
-        """End it. Temporary data are deleted unless another broker is to continue with them (``to_restart``)."""
+        """Stop the broker. Temporary data are deleted unless another broker continues with them (``to_restart``)."""
         if self._stated is not None:
             self._stated.withdraw()
         await end(self._process)
@@ -298,7 +299,7 @@ class Broker:
 
 
 async def start_broker(settings: BrokerSettings | None = None) -> Broker:
-    """Start a broker, and return when it accepts MQTT. It ends with this process, however that ends.
+    """Start a broker, and return once it accepts MQTT. It ends with this process, however that ends.
 
     Raises:
         SkylessError: the port is taken, the folder cannot be used, or nats-server is missing or does not start.
@@ -343,7 +344,7 @@ async def _start(program: Path, settings: BrokerSettings, port: int, data: Path,
 async def _spawn(
     program: Path, settings: BrokerSettings, port: int, data: Path, lock: IO[str], nats: NatsAddress | None
 ) -> asyncio.subprocess.Process:
-    """nats-server, when it accepts MQTT."""
+    """Start nats-server, and return once it accepts MQTT."""
     file = data / "nats-server.conf"
     with writing(file):
         replace_files({file: _configuration(settings, port, data, nats).encode()}, secret=(file,))
@@ -384,7 +385,7 @@ async def _until_ready(process: asyncio.subprocess.Process, address: MqttAddress
 
 
 async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception:
-    """Why nats-server ended at its start, from its log."""
+    """Find out from its log why nats-server ended at its start."""
     lines = (await process.stderr.read()).decode(errors="replace").splitlines() if process.stderr else []
     with contextlib.suppress(OSError):
         log = (data / "nats-server.log").read_text(encoding="utf-8", errors="replace")
@@ -396,14 +397,14 @@ async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception
 
 
 def _release(data: Path, lock: IO[str], *, keep: bool = False) -> None:
-    """Unlock the folder for the next broker. A temporary one is deleted unless it is kept for that."""
+    """Unlock the folder for the next broker. Delete a temporary one unless it is to be kept."""
     if not keep and data.name.startswith(_TEMPORARY):
         shutil.rmtree(data, ignore_errors=True)
     lock.close()
 
 
 def _program() -> Path:
-    """nats-server of the wheel, which is installed with this Python, else the system's."""
+    """Path of nats-server: the wheel's, which is installed with this Python, or else the system's."""
     here = Path(sysconfig.get_path("scripts")) / "nats-server"
     found = str(here) if here.exists() else shutil.which("nats-server")
     if found is None:
@@ -412,7 +413,7 @@ def _program() -> Path:
 
 
 def _unverified() -> ssl.SSLContext:
-    """Checks no certificate: that of the child process is for its names on the network, not for loopback."""
+    """TLS settings without certificate checks: the child's certificate is for its network names, not for loopback."""
     context = ssl.create_default_context()
     context.check_hostname = False
     context.verify_mode = ssl.CERT_NONE
@@ -423,9 +424,9 @@ def _unverified() -> ssl.SSLContext:
 
 
 class StatedAddress:
-    """A broker's address, stated until ``withdraw``. Nothing is stated where no file can be written.
+    """A broker's address, published until ``withdraw``. Nothing is published if no file can be written.
 
-    The second line of the file is its address for NATS, where it has a gather.
+    The second line of the file is its NATS address, if it has a gather.
     """
 
     def __init__(self, address: MqttAddress, nats: NatsAddress | None = None) -> None:
@@ -440,7 +441,7 @@ class StatedAddress:
             self._file = file
 
     def withdraw(self) -> None:
-        """The broker has ended."""
+        """Withdraw the address, because the broker has ended."""
         if self._file is not None:
             self._file.unlink(missing_ok=True)
         if self._lock is not None:
@@ -448,7 +449,7 @@ class StatedAddress:
 
 
 def _locked(file: Path) -> IO[str]:
-    """The file, locked: a program that looks for a broker may have it for a moment, and the last broker may remove it.
+    """Lock the file. A program looking for a broker may hold it briefly, and the previous broker may remove it.
 
     Raises:
         OSError: it cannot be written, or another broker states its address there.
@@ -463,12 +464,12 @@ def _locked(file: Path) -> IO[str]:
 
 
 def running_broker() -> MqttAddress | None:
-    """The broker that was started last of those that run on this machine, or None without any."""
+    """The most recently started broker on this machine, or None."""
     return next((mqtt for mqtt, _ in _stated()), None)
 
 
 def nats_of(broker: MqttAddress) -> NatsAddress | None:
-    """The address for NATS of a broker that runs on this machine with a gather, with the broker's user."""
+    """NATS address, with the broker's user, of a broker on this machine with a gather."""
     for mqtt, nats in _stated():
         if nats and (mqtt.host, mqtt.port) == (broker.host, broker.port):
             return NatsAddress(nats, broker.user, broker.password)
@@ -476,7 +477,7 @@ def nats_of(broker: MqttAddress) -> NatsAddress | None:
 
 
 def _stated() -> Iterator[tuple[MqttAddress, str]]:
-    """The addresses in each broker's file, the newest first; that for NATS is empty where there is no gather."""
+    """Yield the addresses in each broker's file, newest first; the NATS address is empty without a gather."""
     with contextlib.suppress(OSError):
         files = sorted(_session_folder().glob("broker-*"), key=lambda file: file.stat().st_mtime, reverse=True)
         for file in files:
@@ -486,7 +487,7 @@ def _stated() -> Iterator[tuple[MqttAddress, str]]:
 
 
 def _addresses_in(file: Path) -> tuple[MqttAddress, str] | None:
-    """The addresses in a file, or None where its broker has ended. The file stays: a broker may be about to lock it."""
+    """The addresses in a file, or None if its broker has ended. The file stays, as a broker may be about to lock it."""
     try:
         with file.open(encoding="utf-8") as stated:
             try:
@@ -503,7 +504,7 @@ def _session_folder() -> Path:
     """The user's folder for files that last no longer than a session.
 
     Raises:
-        OSError: there is none that is the user's alone.
+        OSError: there is none private to the user.
     """
     shared = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(shared) / "skyless" if shared and Path(shared).is_absolute() else None

@@ -29,41 +29,41 @@ Result = Literal["failed", "warning", "not checked", "ok"]
 
 
 class Check(Struct, frozen=True):
-    """What was found of one thing."""
+    """The result of one check."""
 
     name: str
     result: Result
     finding: str
     """One sentence."""
     advice: str = ""
-    """What to do next; empty where nothing is to be done."""
+    """What to do next; empty if nothing is needed."""
 
 
 def sentence(words: str) -> str:
-    """Words that begin with a capital letter and end with a full stop."""
+    """Capitalise words and end them with a full stop."""
     return f"{words[0].upper()}{words[1:]}."
 
 
 def judged(name: str, value: float, warn: float, fail: float, finding: str, advice: str) -> Check:
-    """A check of a value that is better the smaller it is."""
+    """Judge a value that is better the smaller it is."""
     result: Result = "failed" if value > fail else "warning" if value > warn else "ok"
     return Check(name, result, finding, "" if result == "ok" else advice)
 
 
 def residuals_check(name: str, words: str, fixes: Collection[FixMessage]) -> Check:
-    """Whether the residuals of fixes are as large as the site's noise figures let expect. ``words`` come before."""
+    """Check that the residuals of fixes match the site's noise figures. ``words`` precede the finding."""
     ratio = sum(fix.chi2 for fix in fixes) / max(sum(fix.dof for fix in fixes), 1)
     finding = f"{words}; squared residuals are {ratio:.2f} of what the site's noise figures let expect."
     advice = "Survey the anchors again, and look for what stands in the way."
     return judged(name, ratio, 2.0, 10.0, finding, advice)
 
 
-# How steady counters are, from stamps of the same frames by two of them: a check of the site's noise figures.
+# Stability of counters, from stamps of the same frames by two of them: a check of the site's noise figures.
 
 _TIMES_S: Final = (0.5, 4.0)
 _MIN_SAMPLES: Final = 30
 _STEP_TICKS: Final = round(0.05 / TICK_S)
-"""Stamps of a pair that follow sooner are not needed."""
+"""Shortest interval between stamps of a pair that are used."""
 _MAX_PAIRS: Final = 1000
 _MAX_GAP_S: Final = 8.0  # half a turn of the counters
 _TOO_NOISY: Final = 1.5
@@ -71,14 +71,14 @@ _TOO_NOISY: Final = 1.5
 
 
 class CounterPairs:
-    """Stamps of frames by their sender's counter and by a receiver's, for each pair of them."""
+    """Stamps of frames by the counters of sender and receiver, for each pair."""
 
     def __init__(self) -> None:
         self._pairs: dict[tuple[str, int], list[tuple[int, int]]] = {}
         self._added_s: dict[tuple[str, int], float] = {}
 
     def add(self, receiver: str, sender: int, tx_ticks: int, rx_ticks: int, now_s: float) -> None:
-        """Add a frame, in order. After a restart of either counter, or a long gap, the pair begins again."""
+        """Add a frame, in order. A pair starts afresh after a restart of either counter or a long gap."""
         pair = receiver, sender
         if pair not in self._pairs and len(self._pairs) >= _MAX_PAIRS:
             return
@@ -99,7 +99,7 @@ class CounterPairs:
         stamps.append((tx_ticks, rx_ticks))
 
     def deviation(self, tau_s: float) -> tuple[float, int]:
-        """Allan deviation of the two counters of a pair against each other, of all pairs; and number of samples.
+        """Allan deviation of two counters against each other over all pairs, and the number of samples.
 
         From differences of mean frequencies over neighbouring times of at least ``tau_s``: σ² = ⟨(y₂ − y₁)²⟩ / 2.
         """
@@ -117,14 +117,14 @@ class CounterPairs:
 
 
 def assumed_deviation(noise: NoiseSite, tau_s: float) -> float:
-    """The same of two counters as the site's filters assume them, stamps included: 2·(w²/τ + r²·τ/3) + 3·s²/τ²."""
+    """The same for two counters as the site's filters assume them, including stamps: 2·(w²/τ + r²·τ/3) + 3·s²/τ²."""
     stamp2 = (noise.tx_stamp_ps**2 + noise.rx_stamp_ps**2) * 1e-24
     crystals = noise.white_fm**2 / tau_s + noise.random_walk_fm**2 * tau_s / 3.0
     return math.sqrt(2.0 * crystals + 3.0 * stamp2 / tau_s**2)
 
 
 def counters_check(pairs: CounterPairs, noise: NoiseSite, name: str) -> Check:
-    """Whether the counters are as steady as the filters assume, at a short and at a long time."""
+    """Check that the counters are as stable as the filters assume, over a short and a long time."""
     measured = [pairs.deviation(tau_s) for tau_s in _TIMES_S]
     samples = min(count for _, count in measured)
     if samples < _MIN_SAMPLES:
@@ -142,14 +142,14 @@ def counters_check(pairs: CounterPairs, noise: NoiseSite, name: str) -> Check:
     return Check(name, "warning", finding, f"{advice}, unless a board was moved or is warming up.")
 
 
-# Checks of a board on a serial port: it listens as a tag, and what it receives is judged.
+# Checks of a board on a serial port, which listens as a tag.
 
 
 class BoardProbe:
     """Listens with one board."""
 
     def __init__(self, radio: SerialRadio, site: int | None) -> None:
-        """``site`` is the number of the site that it is to hear; None for the first that is heard."""
+        """``site`` is the number of the site to listen to; None for the first that is heard."""
         self.radio = radio
         self._troubles: dict[str, None] = {}  # without those that have been before
         self._hello: Hello | None = None
@@ -175,7 +175,7 @@ class BoardProbe:
             self._pairs.add(self.radio.name, beacon.anchor, beacon.tx_ticks, reception.rx_ticks, time.monotonic())
 
     def checks(self, noise: NoiseSite) -> tuple[Check, ...]:
-        """What was found."""
+        """Evaluate what was received."""
         name, hello, troubles = f"board {self.radio.name}", self._hello, "; ".join(self._troubles)
         if hello is None:
             advice = (
@@ -200,17 +200,15 @@ class BoardProbe:
         return residuals_check(name, f"{finding}, {len(self._fixes)} fixes", self._fixes)
 
 
-# Checks of the computer: serial ports and their permissions, and whether its clock is synchronised.
-
 _PORTS: Final = ("ttyACM*", "ttyUSB*")
 _TIMEX: Final = "@Illl"
-"""The first fields of Linux's ``struct timex``: modes, offset, freq, maxerror."""
+"""First fields of Linux's ``struct timex``: modes, offset, freq, maxerror."""
 _TIMEX_BYTES: Final = 512  # more than it has
 _TIME_ERROR: Final = 5
 
 
 def port_checks(devices: Path = Path("/dev")) -> tuple[Check, ...]:
-    """Which serial ports there are, and whether this user may open them."""
+    """Check which serial ports exist, and whether this user may open them."""
     ports = [port for pattern in _PORTS for port in sorted(devices.glob(pattern))]
     if not ports:
         finding = "There is no serial port (ttyACM*, ttyUSB*) on this computer."
@@ -230,7 +228,7 @@ def _port(port: Path) -> Check:
 
 
 def clock_check() -> Check:
-    """Whether the system says that something synchronises its clock (``adjtimex``)."""
+    """Check whether the system reports that its clock is being synchronised (``adjtimex``)."""
     if not sys.platform.startswith("linux"):
         return Check("clock", "not checked", "This system does not say whether its clock is synchronised.")
     timex = ctypes.create_string_buffer(_TIMEX_BYTES)

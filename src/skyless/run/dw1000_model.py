@@ -1,4 +1,4 @@
-"""A model of a DW1000 on the emulated air, behind the same radio as a chip on SPI."""
+"""A model of a DW1000 on the emulated air, behind the same radio class as a real chip on SPI."""
 
 import time
 from typing import Final
@@ -12,7 +12,7 @@ from skyless.sim.dw1000.chip import Chip, ModelBus
 from skyless.sim.dw1000.transceiver import PREAMBLE_TICKS
 
 ETHER_LEAD_TICKS: Final = PREAMBLE_TICKS + from_seconds(0.3e-3)
-"""How long before its RMARKER the emulated air, and the transfer to it, need a frame."""
+"""How long before its RMARKER a frame must reach the emulated air, including the transfer to it."""
 
 
 _SHORTEST_SLEEP_S: Final = 100e-6
@@ -27,7 +27,7 @@ class ModelPort:
         self._radio: Dw1000Radio | None = None
 
     async def run(self, radio: Dw1000Radio) -> None:
-        """Have a chip while there is an ether, until cancelled."""
+        """Provide a chip while there is an ether, until cancelled."""
         self._radio = radio
         await self._node.run(self._on_event)
 
@@ -62,17 +62,17 @@ class ModelPort:
         return self._node.now_ticks() or 0
 
     def transmit(self, frame: bytes, leaves_ticks: int) -> bool:
-        """Hand a frame to the ether, unless it would come too late there."""
+        """Hand a frame to the ether; return False if it would arrive too late."""
         if difference(leaves_ticks, self.now_ticks()) < ETHER_LEAD_TICKS:
             return False
         self._node.transmit(Transmission(frame, leaves_ticks))
         return True
 
     def withdraw(self) -> None:
-        """The ether cancels nothing: the frame is sent at its time."""
+        """Do nothing: the ether cannot cancel a frame, which is sent at its time."""
 
 
 def _sleep(seconds: float) -> None:
-    """Pauses of the driver; those of transfers are too short to sleep."""
+    """Sleep for the driver's pauses, except those of transfers, which are too short."""
     if seconds >= _SHORTEST_SLEEP_S:
         time.sleep(seconds)

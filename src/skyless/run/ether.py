@@ -25,29 +25,29 @@ from skyless.sim.trajectory import Trajectory
 
 _CLOCKS_S: Final = 0.1
 _TRUTH_S: Final = 0.05
-"""Intervals of the nodes' counters to each process, and of the truth on MQTT."""
+"""Interval at which counters are sent to each process, and the truth to MQTT."""
 
 _SEND_BUFFER_BYTES: Final = 1 << 16
 _OVERRUN_BYTES: Final = 1 << 16
-"""Frames for a process that does not read are lost beyond this, as from a radio whose host is asleep."""
+"""Frames beyond this are lost if a process does not read them, as with a radio whose host is asleep."""
 
 
 _OTHER_FILES: Final = 192
-"""Files that are no connections of processes: the broker's, the libraries', and connections accepted in one turn."""
+"""Files other than connections of processes: the broker's, the libraries', and connections accepted in one turn."""
 
 
 class Session:
     """The nodes of one process that are on the air."""
 
     def __init__(self, client: "Client", nodes: tuple[int, ...], wrong_ticks: tuple[int, ...] = ()) -> None:
-        """``wrong_ticks``: by how much each radio's TX antenna delay is set larger than it is."""
+        """``wrong_ticks``: by how much each radio's TX antenna delay is set too large."""
         self._client = client
         self.nodes = nodes
         self.wrong_ticks = wrong_ticks or (0,) * len(nodes)
         self.index = {node: index for index, node in enumerate(nodes)}
 
     def send(self, message: msgspec.Struct) -> bool:
-        """Send the process a message; False if it was dropped because the process does not read."""
+        """Send a message to the process; return False if it was dropped because the process does not read."""
         return self._client.send(message)
 
 
@@ -62,7 +62,7 @@ class Client(asyncio.Protocol):
         self._is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Keep the buffers small, so that nothing old piles up in them."""
+        """Keep the buffers small, so that no old data pile up in them."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         endpoint = transport.get_extra_info("socket")
@@ -74,7 +74,7 @@ class Client(asyncio.Protocol):
             self._refuse(refusal)
 
     def send(self, message: msgspec.Struct) -> bool:
-        """Send a message; False if it was dropped because too much waits already."""
+        """Send a message; return False if it was dropped because too much is waiting."""
         transport = self._transport
         if transport is None or transport.is_closing() or transport.get_write_buffer_size() > _OVERRUN_BYTES:
             return False
@@ -82,7 +82,7 @@ class Client(asyncio.Protocol):
         return True
 
     def data_received(self, data: bytes) -> None:
-        """Process messages; a client that sends anything else is refused."""
+        """Process messages; refuse a client that sends anything else."""
         try:
             for body in self._unpacker.feed(data):
                 self._process(body)
@@ -115,7 +115,7 @@ class Client(asyncio.Protocol):
 
 
 class Ether:
-    """One site's air and who is on it. ``clock`` gives the host's monotonic time in s."""
+    """One site's air and the nodes on it. ``clock`` gives the host's monotonic time in s."""
 
     def __init__(
         self,
@@ -126,7 +126,7 @@ class Ether:
         clock: Callable[[], float] = time.monotonic,
         most_connections: int | None = None,
     ) -> None:
-        """``most_connections``: None for as many as the system lets this process have."""
+        """``most_connections`` is None for as many as the system allows."""
         self.site, self._tags, self._clock = site, tags, clock
         specs = [TagSpec(trajectory) for trajectory in tags.values()]
         faults = msgspec.structs.replace(impairments, diagnostics=True)
@@ -152,10 +152,10 @@ class Ether:
         self.machine = wire.this_machine()
 
     async def serve(self, host: str, port: int, log: Log = ignore) -> asyncio.Server:
-        """Listen; port 0 takes any free one. ``log`` gets a line when no further connections are accepted.
+        """Listen; port 0 takes any free one. ``log`` gets a line when no more connections are accepted.
 
         Raises:
-            OSError: the address cannot be listened to.
+            OSError: the address cannot be listened on.
         """
         loop = asyncio.get_running_loop()
         self._origin_s = self._clock()
@@ -167,9 +167,9 @@ class Ether:
     # Time
 
     def advance(self) -> None:
-        """Let true time catch up with the host's, and wake again at the next event.
+        """Advance true time to the host's, and schedule the next wake-up.
 
-        Frames that no tag could use any more are not sent: so a slow computer has gaps on the air, and no delay.
+        Frames too old for any tag are not sent, so that a slow computer causes gaps but no delay.
         """
         now_s = self._clock() - self._origin_s
         if now_s - self.medium.now_s > MAX_RECEPTION_AGE_S:
@@ -180,7 +180,7 @@ class Ether:
         self._arm()
 
     def _miss(self, until_s: float) -> None:
-        """Send none of the frames whose time has passed; their senders are notified."""
+        """Drop the frames whose time has passed, and notify their senders."""
         for node in self.medium.miss(until_s):
             self._missed += 1
             session, tx_ticks = self._owners.get(node), self._flying.pop(node, None)
@@ -205,7 +205,7 @@ class Ether:
 
     @property
     def now_host_s(self) -> float:
-        """The host's monotonic time of the medium's present."""
+        """The host's monotonic time at the medium's present."""
         return self._origin_s + self.medium.now_s
 
     def _counters(self, session: Session) -> tuple[int, ...]:
@@ -214,7 +214,7 @@ class Ether:
     # Clients
 
     def admit(self) -> str | None:
-        """Count another connection; or why there is no room for it."""
+        """Count a new connection; return the reason if there is no room for it."""
         most = self._most_connections
         if most is None or self.connections < most:
             self.connections += 1
@@ -226,7 +226,7 @@ class Ether:
         return f"all {most} connections of the ether are in use"
 
     def join(self, client: Client, message: wire.Join) -> Session | str:
-        """Put a process's nodes on the air; or why not."""
+        """Put a process's nodes on the air; return the reason if that is not possible."""
         nodes = [self._nodes.get((message.kind, name)) for name in message.names]
         for name, node in zip(message.names, nodes, strict=True):
             if node is None:
@@ -260,10 +260,10 @@ class Ether:
             self.medium.switch_off(node)
 
     def transmit(self, session: Session, message: wire.Send) -> None:
-        """Plan a transmission, unless it is too late or the node's radio has one waiting already.
+        """Plan a transmission, unless it is too late or the node's radio already has one waiting.
 
         Raises:
-            WireError: no radio of an anchor sends that.
+            WireError: no anchor's radio sends that.
         """
         node = session.nodes[message.node]
         if node >= len(self.site.anchors) or len(message.frame) > MAX_FRAME_BYTES:
@@ -279,7 +279,7 @@ class Ether:
             session.send(wire.Done(message.node, message.tx_ticks, late=True))
 
     def _deliver(self, delivery: Delivery) -> None:
-        """Send a frame that has ended to all processes with nodes that heard it, and its end to the sender."""
+        """Send a completed frame to all processes whose nodes heard it, and its end to the sender."""
         flight, host_s = delivery.flight, self.now_host_s
         rows: dict[Session, list[wire.HeardRow]] = {}
         for heard in (delivery.by_anchors, delivery.by_tags):
@@ -300,7 +300,7 @@ class Ether:
     # Truth and health
 
     def truth(self, unix_less_host_s: float) -> TruthMessage:
-        """True positions of the tags that are on the air; ``unix_less_host_s``: unix time less the host's."""
+        """True positions of the tags on the air; ``unix_less_host_s`` is Unix time less the host's."""
         now_s, unix_s = self.medium.now_s, self.now_host_s + unix_less_host_s
         motions = {}
         for name, trajectory in self._tags.items():
@@ -310,7 +310,7 @@ class Ether:
         return TruthMessage(unix_s, motions)
 
     def health(self, unix_s: float) -> EtherHealth:
-        """What the air has carried so far; to be called once a second."""
+        """What the air has carried so far; call this once a second."""
         tally = self.medium.tally
         missed = tally.late_transmissions + self._missed
         sent_before, missed_before = self._reported
@@ -347,7 +347,7 @@ class EtherNode:
         """Serve until cancelled.
 
         Raises:
-            OSError: the address cannot be listened to.
+            OSError: the address cannot be listened on.
         """
         server = await self._ether.serve(self._host, self._port, self._log)
         host, port = server.sockets[0].getsockname()[:2]

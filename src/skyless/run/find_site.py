@@ -1,7 +1,7 @@
-"""Which sites a broker carries, and how many of their programs are online: to choose one where none is named.
+"""The sites on a broker, and how many of their programs are online, for choosing one where none is named.
 
-A broker keeps the last state of every site that ever ran on it. A site counts as alive while a program of its own, an
-anchor, a tag or the emulated air, states that it is online. Programs that only observe a site do not count.
+A broker keeps the last state of every site that ever ran on it. A site counts as alive while an anchor, a tag or the
+emulated air of its own states that it is online. Programs that only observe a site do not count.
 """
 
 import asyncio
@@ -32,26 +32,26 @@ _log = logging.getLogger("skyless.run")
 
 
 class SiteOnBroker(Struct, frozen=True):
-    """A site that a broker carries."""
+    """A site on a broker."""
 
     number: int
     name: str
     online: int
-    """How many of its programs are online."""
+    """Number of its programs that are online."""
     versions: dict[str, int] = {}
-    """How many of them have each version."""
+    """Number of them of each version."""
 
 
 class KnownSites:
-    """The sites of a broker, gathered from its messages. No I/O."""
+    """The sites on a broker, collected from its messages. No I/O."""
 
     def __init__(self) -> None:
         self._names: dict[int, str] = {}
         self._online: dict[int, dict[str, str]] = {}
-        """By site the topics of programs that are online, with their versions."""
+        """Topics of programs that are online, with their versions, by site."""
 
     def add(self, topic: str, payload: bytes) -> None:
-        """Process a message of a site or of a program's status. One that cannot be read changes nothing."""
+        """Process a message of a site or a program's status. Unreadable ones are ignored."""
         levels = topic.split("/")
         if not levels[2].isdecimal():
             return
@@ -68,7 +68,7 @@ class KnownSites:
                 self._names.pop(number, None)
 
     def sites(self) -> list[SiteOnBroker]:
-        """The sites, by number."""
+        """Return the sites, by number."""
         found = []
         for number, name in sorted(self._names.items()):
             versions = Counter(self._online.get(number, {}).values())
@@ -89,10 +89,10 @@ class _SiteMessage(Struct):
 
 
 async def find_site(address: MqttAddress) -> int:
-    """Wait for a site that is alive.
+    """Wait for a site that is alive, and return its number.
 
     Raises:
-        SkylessError: several are; the message names them.
+        SkylessError: there are several; the message names them.
     """
     found: asyncio.Future[list[SiteOnBroker]] = asyncio.get_running_loop().create_future()
     logged = ""
@@ -134,10 +134,10 @@ async def watch_sites(
     on_sites: Callable[[list[SiteOnBroker]], None],
     on_state: Callable[[bool], None] = lambda _: None,
 ) -> None:
-    """Call ``on_sites`` with the sites whenever these have changed, until cancelled.
+    """Call ``on_sites`` with the sites whenever they change, until cancelled.
 
-    ``on_state`` is called with whether the broker is there. A link needs its site from the start, for its last will;
-    so this has a connection of its own.
+    ``on_state`` is called with whether the broker is connected. A ``Link`` needs its site from the start, for its last
+    will, so this function has a connection of its own.
     """
     logged = ""
     while True:
@@ -155,7 +155,7 @@ async def watch_sites(
 async def _watch_connected(
     address: MqttAddress, on_sites: Callable[[list[SiteOnBroker]], None], on_state: Callable[[bool], None]
 ) -> None:
-    """Until the connection is lost."""
+    """Watch until the connection is lost."""
     known = KnownSites()
     who, react = Introduction("", _KEEPALIVE_S), Reactions(message=known.add)
     connection = await open_connection(address, address.tls_context(), who, react)

@@ -1,7 +1,7 @@
-"""Many fixes in few bytes: the batches that gather, history and the page of a large site exchange.
+"""Batches of fixes in binary form, exchanged by gather, history and the page of a large site.
 
-A batch is a header of 32 bytes and records of 48 bytes, little-endian (``docs/batches.md``). Readers skip what they do
-not know of both, by the sizes that the header states.
+A batch is a header of 32 bytes and records of 48 bytes, little-endian (``docs/batches.md``). Readers skip unknown parts
+of both, by the sizes in the header.
 """
 
 import math
@@ -35,14 +35,15 @@ RECORD: Final = np.dtype(
     ]
 )
 """One fix: the tag's number, flags, anchors used, method (0: not stated), time, position, covariance xx, xy, yy,
-standard deviation of z, protection level and velocity."""
+standard deviation of z, protection level and velocity.
+"""
 
 FIELDS: Final = struct.Struct("<IHBBQiiifffHHhh")
 """The same as plain numbers."""
 
 MAX_RECORDS: Final = 1000
 NONE_U16: Final = 65535
-"""No standard deviation of z, or no protection level."""
+"""Marks a missing standard deviation of z or protection level."""
 
 ALERT_BITS: Final = 0b111
 HEIGHT_GIVEN: Final = 1 << 3
@@ -51,7 +52,7 @@ VELOCITY_KNOWN: Final = 1 << 5
 SIMULATED: Final = 1 << 6
 
 ALERTS: Final = tuple(Alert)
-"""The alert of a record is the number of its value here plus one; 0 for none."""
+"""A record's alert is its index here plus one; 0 for none."""
 
 _ALERT_NUMBERS: Final[dict[str | None, int]] = {None: 0} | {alert: number for number, alert in enumerate(ALERTS, 1)}
 
@@ -60,11 +61,11 @@ _MAX_I32: Final = 2**31 - 1
 _MAX_I16: Final = 2**15 - 1
 
 Records = NDArray[Any]
-"""Of dtype ``RECORD``."""
+"""Array of dtype ``RECORD``."""
 
 
 class BadBatchError(ValueError):
-    """Bytes that are no batch."""
+    """The bytes are not a batch."""
 
 
 class Batch(Struct, frozen=True):
@@ -76,17 +77,17 @@ class Batch(Struct, frozen=True):
     """Number of the batch in this run."""
     sent_unix_us: int
     names_issue: int
-    """Number of the table of names that the records' tags are in."""
+    """Number of the table of names to which the records' tag numbers refer."""
     records: Records
 
     @property
     def id(self) -> str:
-        """Streams drop a second message with the same id."""
+        """ID of the message; streams drop a second message with the same one."""
         return f"{self.run}-{self.sequence}"
 
 
 def encode_batch(batch: Batch) -> bytes:
-    """The bytes of a batch."""
+    """Encode a batch."""
     head = _HEADER.pack(
         *(MAGIC, HEADER_BYTES, RECORD.itemsize, batch.run, batch.sequence),
         *(batch.sent_unix_us, batch.names_issue, len(batch.records)),
@@ -95,7 +96,7 @@ def encode_batch(batch: Batch) -> bytes:
 
 
 def decode_batch(data: bytes) -> Batch:
-    """The batch of bytes. Raises BadBatchError."""
+    """Decode a batch. Raises BadBatchError."""
     if len(data) < HEADER_BYTES:
         raise BadBatchError(f"{len(data)} bytes are shorter than a header")
     magic, header_bytes, record_bytes, run, sequence, sent, issue, count = _HEADER.unpack_from(data)
@@ -110,7 +111,7 @@ def decode_batch(data: bytes) -> Batch:
 
 
 def records_of(fixes: Sequence[tuple[int, FixMessage]], *, simulated: bool) -> Records:
-    """Records of fixes, each with its tag's number. Values beyond a field's range are given as its limit."""
+    """Convert fixes to records, each with its tag's number. Values beyond a field's range are clipped to it."""
     rows = [_row(number, fix, simulated=simulated) for number, fix in fixes]
     with np.errstate(over="ignore"):  # a covariance beyond 32 bits becomes infinite
         return np.array(rows, RECORD)
@@ -135,7 +136,7 @@ def _row(number: int, fix: FixMessage, *, simulated: bool) -> tuple[Any, ...]:
 
 
 def fix_of(name: str, record: tuple[Any, ...]) -> FixMessage:
-    """The fix of a record that ``FIELDS`` has unpacked. What it does not hold is empty, 0 or not a number."""
+    """Convert a record unpacked by ``FIELDS`` to a fix. Missing fields are empty, 0 or NaN."""
     _, flags, _, _, unix_us, x_mm, y_mm, z_mm, xx, xy, yy, std_z_mm, hpl_cm, vx_cmps, vy_cmps = record
     zz = 0.0 if std_z_mm == NONE_U16 else (0.001 * std_z_mm) ** 2
     alert = min(flags & ALERT_BITS, len(ALERTS))
@@ -174,6 +175,6 @@ def _scaled(value: float, scale: float, most: int) -> int:
 
 
 def _counted(value: float, scale: float) -> int:
-    """A value that is not negative, below the mark for none."""
+    """Scale and clip a non-negative value to stay below the mark for none."""
     scaled = scale * value
     return min(max(round(scaled), 0), NONE_U16 - 1) if math.isfinite(scaled) else NONE_U16

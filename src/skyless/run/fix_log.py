@@ -1,8 +1,7 @@
-"""What a tag's program keeps of its fixes: numbers, latencies, Unix times, and which are too old to be given.
+"""Counts, latencies and Unix times of a tag's fixes, and the decision which receptions and fixes are too old.
 
-A fix is worth nothing when it is old, and what waits in front of a slow program makes everything behind it old as well.
-So a reception that is too old at its turn is dropped with all that wait at that moment: positioning goes on with what
-comes next, and the receptions that it gets follow one another without gaps between such pauses.
+Old fixes are worthless, and receptions waiting before a slow program delay all those behind them. So a reception that
+is too old at its turn is dropped with all that wait at that moment; positioning continues with the next ones.
 """
 
 import time
@@ -19,13 +18,15 @@ from skyless.run.process import HEALTH_S, RateLimit
 FixListener = Callable[[FixMessage], None]
 
 MAX_AGE_S: Final = 0.1
-"""No fix reaches a subscriber later than this after the end of its last frame, as far as its sender can see to it."""
+"""Largest age of a fix, after the end of its last frame, at which it may reach a subscriber, as far as the sender
+controls it.
+"""
 
 FIX_LEAVES_S: Final = 0.6 * MAX_AGE_S
-"""A fix that is older is not given: the broker and the subscriber need the rest where a computer is busy."""
+"""Largest age of a fix to be published; the rest is for the broker and the subscriber on a busy computer."""
 
 MAX_RECEPTION_AGE_S: Final = 0.5 * MAX_AGE_S
-"""A reception that is older at its turn is dropped, so that time is left for its fix."""
+"""Largest age of a reception at its turn; older ones are dropped, so that time is left for the fix."""
 
 _MAX_LATENCIES: Final = 4096
 _MAX_PHASES: Final = 64
@@ -37,7 +38,7 @@ class FixLog:
     def __init__(
         self, tag: str, publish: FixListener, publish_hz: float, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """``publish`` is called at most ``publish_hz`` times a second, and not with too old fixes. All are counted.
+        """``publish`` is called at most ``publish_hz`` times a second, never with old fixes. All are counted.
 
         ``clock`` gives the host's monotonic time in s.
         """
@@ -49,21 +50,22 @@ class FixLog:
         self.first_fix_s: float | None = None  # since the start
         self.last_fix_s: float | None = None  # when the last fix was made, by the host's monotonic clock
         self.due_s = 0.0
-        """When the last frame had ended without which the newest fix could not be made: its own, except for a verified
-        fix, which needs a key that comes later."""
+        """When the last frame needed for the newest fix ended: the fix's own, or for a verified fix the one with the
+        key, which comes later.
+        """
         self.latencies = Latencies()
         self.lateness = Lateness()  # which receptions and fixes are too old
         self._reported_serial = 0
         self._publish, self._rate = publish, RateLimit(publish_hz)
 
     def update_clock_offset(self) -> None:
-        """Measure again how far Unix time is from the host's monotonic clock: it is set now and then."""
+        """Measure the offset of Unix time from the host's monotonic clock again, as Unix time is set now and then."""
         self.unix_less_host_s = time.time() - self._clock()
 
     def add(self, fix: Fix, ended_s: float, done_s: float, due_s: float | None = None) -> None:
-        """Add a fix: when its last frame ended, and when it was made, by the host's monotonic clock.
+        """Add a fix, with the host's monotonic times of its last frame's end and of its computation.
 
-        ``due_s``: when it could be made, where that is not at its last frame; its age counts from then.
+        ``due_s``: when it could first be made, if that is after its last frame; its age counts from then.
         """
         self.serial += 1
         self.due_s = ended_s if due_s is None else due_s
@@ -129,7 +131,7 @@ class Lateness:
         self._present_s = float("-inf")  # when the newest backlog was noticed: what had ended by then is dropped
 
     def admits(self, ended_s: float, now_s: float) -> bool:
-        """Whether to process a reception whose frame ended at ``ended_s``. If not, it is counted."""
+        """Whether to process a reception whose frame ended at ``ended_s``; count it if not."""
         self._note(now_s - ended_s)
         if now_s - ended_s > MAX_RECEPTION_AGE_S:
             self._present_s = now_s
@@ -139,7 +141,7 @@ class Lateness:
         return True
 
     def gives(self, ended_s: float, now_s: float) -> bool:
-        """Whether to give a fix made now, whose last frame ended at ``ended_s``. If not, it is counted."""
+        """Whether to publish a fix made now, whose last frame ended at ``ended_s``; count it if not."""
         self._note(now_s - ended_s)
         if now_s - ended_s > FIX_LEAVES_S:
             self.withheld += 1
@@ -148,11 +150,11 @@ class Lateness:
 
     @property
     def drops(self) -> Counter[str]:
-        """Dropped receptions as a counter."""
+        """The dropped receptions and fixes, by reason."""
         return +Counter({"late-reception": self.dropped})
 
     def drain(self) -> float:
-        """The largest age since the last call, or 0 if there was nothing."""
+        """Return the largest age since the last call, or 0."""
         largest_s, self._largest_s = self._largest_s, 0.0
         return largest_s
 
@@ -161,17 +163,17 @@ class Lateness:
 
 
 class Latencies:
-    """Latencies since they were last read, in s."""
+    """Latencies since the last reading, in s."""
 
     def __init__(self) -> None:
         self._values: deque[float] = deque(maxlen=_MAX_LATENCIES)
 
     def add(self, latency_s: float) -> None:
-        """Count one fix."""
+        """Add one fix."""
         self._values.append(latency_s)
 
     def drain(self) -> tuple[float | None, float | None, int]:
-        """Median, 99th percentile and number of the latencies, which are then forgotten."""
+        """Return and reset the median, 99th percentile and number of the latencies."""
         ordered = sorted(self._values)
         self._values.clear()
         if not ordered:
@@ -180,7 +182,7 @@ class Latencies:
 
 
 class PhaseLog:
-    """When the frames of the present superframe and of the last whole one ended and were processed."""
+    """When the frames of the current superframe and of the last complete one ended and were processed."""
 
     def __init__(self) -> None:
         self._superframe: int | None = None
@@ -189,9 +191,9 @@ class PhaseLog:
         self.last: tuple[Phase, ...] = ()
 
     def add(self, frame: bytes, ended_s: float, done_s: float, *, made_fix: bool) -> None:
-        """Add one frame: when it ended, and when its processing did, by the host's monotonic clock.
+        """Add a frame: when it ended and when it had been processed, by the host's monotonic clock.
 
-        Frames without slots, of anchors that send at random instants, are left out.
+        Frames without slots, from anchors that send at random instants, are ignored.
         """
         beacon = decode_any(frame)
         if not isinstance(beacon, Protocol1Beacon):

@@ -1,4 +1,4 @@
-"""What Foxglove shows without configuration (poses, a scene, positions on the Earth), and the JSON schemas of messages.
+"""Messages that Foxglove shows without configuration (poses, a scene, positions on the Earth), and JSON schemas.
 
 Foxglove's own schemas are documented at https://docs.foxglove.dev/docs/sdk/schemas.
 """
@@ -67,7 +67,7 @@ PRIMITIVES: Final = {
     ),
     "models": _object("foxglove.ModelPrimitive"),
 }
-"""Shapes of a scene's entity, of which each must be there; those without fields are never used."""
+"""Shapes of a scene's entity. All of them must be present; those without fields are never used."""
 
 _ENTITY: Final = _object(
     "foxglove.SceneEntity",
@@ -115,10 +115,10 @@ def foxglove_schema(name: str) -> tuple[str, bytes]:
 
 @lru_cache(maxsize=64)
 def schema_of(payload: type[Struct]) -> tuple[str, bytes]:
-    """Name and JSON schema of a payload, as far as viewers of MCAP understand one.
+    """Name and JSON schema of a payload, reduced to what viewers of MCAP understand.
 
     Foxglove accepts objects, plain types and arrays of those, without references, alternatives or free keys; anything
-    else is left out, and a type that may be null is given without the null.
+    else is left out, and a nullable type is given without the null.
     """
     name = f"skyless.{payload.__name__.removesuffix('Message')}"
     schema = msgspec.json.schema(payload)
@@ -127,7 +127,7 @@ def schema_of(payload: type[Struct]) -> tuple[str, bytes]:
 
 
 def _viewable(schema: Schema, definitions: Schema) -> Schema | None:
-    """A schema without what viewers do not accept; None if nothing is left."""
+    """Reduce a schema to what viewers accept; None if nothing is left."""
     schema = _resolved(schema, definitions)
     match schema.get("type"):
         case "boolean" | "integer" | "number" as kind:
@@ -145,7 +145,7 @@ def _viewable(schema: Schema, definitions: Schema) -> Schema | None:
 
 
 def _resolved(schema: Schema, definitions: Schema) -> Schema:
-    """What a reference means, and what may be null otherwise is; empty if that is more than one thing."""
+    """Resolve a reference, and reduce a nullable type to the type; empty if several types remain."""
     if "$ref" in schema:
         return _resolved(definitions[schema["$ref"].rpartition("/")[2]], definitions)
     if "anyOf" in schema:
@@ -158,7 +158,7 @@ FRAME: Final = "site"
 SCENE_TOPIC: Final = "/site/scene"
 KNOWN_COVARIANCE: Final = 3
 ELLIPSE_SIGMAS: Final = 2.0
-"""How many standard deviations an ellipse shows."""
+"""Number of standard deviations that an ellipse shows."""
 
 WALL_HEIGHT_M: Final = 2.5
 _LINE_LOOP: Final = 1
@@ -166,7 +166,7 @@ _LINE_LOOP: Final = 1
 
 
 def pose_in_frame(fix: FixMessage, *, facing: bool) -> bytes:
-    """``foxglove.PoseInFrame``: where the tag is; ``facing``: turned to where it goes, which nobody has measured."""
+    """``foxglove.PoseInFrame``: the tag's position; ``facing`` turns it to its direction of travel."""
     yaw = math.atan2(fix.velocity_mps[1], fix.velocity_mps[0]) if facing and fix.velocity_mps is not None else 0.0
     return msgspec.json.encode({"timestamp": _time(fix.unix_s), "frame_id": FRAME, "pose": _pose(fix.position_m, yaw)})
 

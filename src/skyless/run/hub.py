@@ -37,20 +37,20 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
 
 SILENT_S: Final = 5.0
-"""The line to a site counts as cut when its gather has not been heard for so long."""
+"""A site counts as disconnected when its gather has not been heard for this long."""
 _CHECK_S: Final = 0.5
 _KEPT: Final = (*subjects.STATE, *subjects.EVENTS, subjects.JSON_FIXES)
-"""What comes from streams, fixes as batches."""
+"""What is read from streams; fixes as batches."""
 
 _log = logging.getLogger("skyless.run.hub")
 
 
 class HubLink:
-    """Takes the place of ``Link`` at a hub: handlers get the messages of one site by MQTT's topics.
+    """Stands in for ``Link`` at a hub: handlers get one site's messages by their MQTT topics.
 
-    Retained messages and events come from the hub's streams, so that they are complete after every cut; healths and
-    the like come while the line is up. Fixes come in batches only, not here. What is published is dropped: a site is
-    changed at the site.
+    Retained messages and events come from the hub's streams, and so are complete after every disconnection; healths and
+    the like come while the site is connected. Fixes come only in batches, not here. Published messages are dropped,
+    because a site can only be changed at the site.
     """
 
     def __init__(self, address: NatsAddress, site: int, name: str) -> None:
@@ -68,7 +68,7 @@ class HubLink:
         self._say = rarely(_log.warning)
 
     def subscribe(self, topic_filter: str, handler: Handler, qos: int = 0) -> None:
-        """Call ``handler`` with every message of a filter. All of a link's handlers stand before it runs."""
+        """Call ``handler`` with every message of a filter. All handlers must be set before ``run``."""
         self._subscriptions.add(topic_filter, handler, qos)
 
     def publish(
@@ -77,7 +77,7 @@ class HubLink:
         """Drop a message."""
 
     def forget(self, topic: str) -> None:
-        """Nothing is repeated."""
+        """Do nothing, as nothing is repeated."""
 
     async def run(self) -> None:
         """Read until cancelled."""
@@ -97,7 +97,7 @@ class HubLink:
             self._set_state("stopped")
 
     def _is_live(self, topic_filter: str) -> bool:
-        """Whether the messages of a filter are in no stream."""
+        """Whether a filter's messages are in no stream."""
         levels = subjects.subject_of(topic_filter).split(".")
         for subject in _KEPT:
             kept = subjects.at(subject, self.site).split(".")
@@ -112,7 +112,7 @@ class HubLink:
             await self._on_message(message)
 
     async def _watch(self, client: "Client") -> None:
-        """State whether the site is heard."""
+        """Update whether the site is heard."""
         while True:
             if not client.is_connected:
                 self._set_state(f"the hub {self.address} cannot be reached")
@@ -136,7 +136,7 @@ class HubLink:
         self._subscriptions.receive(subjects.topic_of(message.subject), message.data)
 
 
-# A site's line to the hub: whether it is up, and whether another site has the same number there.
+# A site's connection to the hub: whether it is up, and whether another site has the same number there.
 
 _LINE_CHECK_S: Final = 2.0
 _SILENT_CHECKS: Final = 3
@@ -145,10 +145,9 @@ _UP: Final = "Leafnode connection created"
 
 
 async def watch_line(leaf: Leaf, broker: Broker, log: Log) -> None:
-    """Log when the line is lost and when it is back, until cancelled. Raises StuckLineError.
+    """Log when the connection to the hub is lost or restored, until cancelled. Raises StuckLineError.
 
-    The log of nats-server names every try. A line that the hub refuses, or where it does not answer,
-    is up for a moment.
+    nats-server's log names every attempt. A connection that the hub refuses or does not answer is up only briefly.
     """
     newest, said, unsteady, tried_s = "", "", 0, time.monotonic()
     while True:
@@ -178,7 +177,7 @@ async def watch_line(leaf: Leaf, broker: Broker, log: Log) -> None:
 
 
 async def refuse_second(leaf: Leaf, address: NatsAddress, log: Log) -> None:
-    """Watch that no other site with this number was at the hub before this one. Raises SkylessError."""
+    """Check that no other site with this number was at the hub before this one. Raises SkylessError if one was."""
     own = ""
     async with await connect(address, "skyless broker", rarely(log), Counter()) as client:
         heard = await client.subscribe(subjects.at(subjects.SUMMARY, leaf.site))
@@ -194,24 +193,22 @@ async def refuse_second(leaf: Leaf, address: NatsAddress, log: Log) -> None:
                     )
 
 
-# The streams of a hub, which take what the sites' own streams have whenever their lines are up.
-#
-# Each site has its own, so that none can push out what another has sent. A source asks for the subjects of its site,
-# which the site's server may ignore: so readers ask the hub for those subjects again, and take the site from the
-# stream.
+# The streams of a hub, which copy the sites' own streams. Each site has its own, so that none can displace another's
+# messages. A source asks for its site's subjects, but the site's server may ignore that, so readers filter by those
+# subjects again.
 
 _READY_S: Final = 60.0
 _RETRY_S: Final = 1.0
 _LISTEN_S: Final = 2.5
 _NAMES_BYTES: Final = 30_000_000
 _STATE_BYTES: Final = 100_000_000
-"""What a site can store at most: names of 200,000 tags; floor plans, and statuses of as many programs."""
+"""Most that a site can store: names of 200,000 tags, floor plans, and statuses of as many programs."""
 _OF_ALL_SITES: Final = ("FIXES", "NAMES", "STATE", "EVENTS")
-"""Streams of earlier hubs, in which each site could write as another."""
+"""Streams of earlier hubs, in which each site could write under another's number."""
 
 
 async def make_hub_streams(client: "Client", hub: Hub, tenant: str) -> None:
-    """Make the streams of a tenant, or change those that are there. Raises nats.errors.Error."""
+    """Make the streams of a tenant, or update existing ones. Raises nats.errors.Error."""
     stream, sites = client.jetstream(), hub.sites[tenant]
     for name in _OF_ALL_SITES:
         with contextlib.suppress(NotFoundError):
@@ -234,7 +231,7 @@ async def make_hub_streams(client: "Client", hub: Hub, tenant: str) -> None:
 
 
 async def sites_at(client: "Client") -> set[int]:
-    """The sites of a tenant that have streams at its hub. Raises nats.errors.Error."""
+    """Numbers of a tenant's sites with streams at its hub. Raises nats.errors.Error."""
     found, total = set[str](), 1
     while len(found) < total:
         answer = await client.request("$JS.API.STREAM.NAMES", json.dumps({"offset": len(found)}).encode())
@@ -248,9 +245,9 @@ async def sites_at(client: "Client") -> set[int]:
 
 
 async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary | None]:
-    """Make the streams of a tenant, or extend them. Returns what each site says; None where it is not heard.
+    """Make or extend the streams of a tenant. Returns the summary of each site, None if it is not heard.
 
-    Raises SkylessError: the hub is not ready within a minute.
+    Raises SkylessError if the hub is not ready within a minute.
     """
     address, say = hub.address(tenant), rarely(lambda trouble: log(f"waits for the hub: {trouble}"))
     try:
@@ -276,30 +273,30 @@ async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary 
     return {site: found.get(site) for site in hub.sites[tenant]}
 
 
-# The sites at a hub: names from what they retain, conditions from what their gathers say every second.
+# Sites at a hub: names from retained messages, conditions from the summaries that gathers send every second.
 
 LISTEN_S: Final = 2.5
-"""After this time every site whose line is up has been heard."""
+"""By this time every connected site has been heard."""
 LIST_S: Final = 5.0
-"""Interval at which the hub is asked which sites it has."""
+"""Interval at which the hub is asked for its sites."""
 _ORDER: Final = ("bad", "cut", "degraded", "unknown", "good")
 
 
 class HubSite(Struct, frozen=True):
-    """How a site is, as a hub knows it. What is not known of one that is not heard is None."""
+    """State of a site as known at a hub. Unknown values of a site that is not heard are None."""
 
     number: int
     name: str
     condition: Literal["bad", "cut", "degraded", "unknown", "good"]
-    """``cut``: it is not heard. ``unknown``: it is not heard yet, or does not say."""
+    """``cut``: not heard. ``unknown``: not heard yet, or not stated."""
     reason: str
-    """The first one; empty where all is well."""
+    """The first reason; empty if all is well."""
     tags_heard: int | None = None
     anchors_online: int | None = None
     versions: dict[str, int] | None = None
     """Programs that are online, by version."""
     heard_unix_s: float | None = None
-    """When this program heard it last."""
+    """When this program last heard it."""
 
 
 class HubSites:
@@ -310,36 +307,36 @@ class HubSites:
         self._began_s = now_s
         self._known = KnownSites()
         self._heard: dict[int, tuple[float, float, Summary]] = {}
-        """The newest summary of each, and when it came, by both clocks."""
+        """Newest summary of each site, and when it came by both clocks."""
         self._client: Client | None = None
 
     @property
     def connected(self) -> bool:
-        """Whether the hub is."""
+        """Whether the hub is connected."""
         return self._client is not None and self._client.is_connected
 
     @property
     def has_answered(self) -> bool:
-        """Whether the hub has been connected."""
+        """Whether the hub has ever been connected."""
         return self._client is not None
 
     def add_site(self, topic: str, payload: bytes) -> None:
-        """A site has published itself."""
+        """Process the message with which a site publishes itself."""
         self._known.add(topic, payload)
 
     def add_summary(self, number: int, payload: bytes, now_s: float, unix_s: float) -> None:
-        """The gather of a site has said how it is. What cannot be read changes nothing."""
+        """Process a summary of a site's gather. Unreadable ones are ignored."""
         with contextlib.suppress(msgspec.MsgspecError):
             self._heard[number] = now_s, unix_s, msgspec.json.decode(payload, type=Summary)
 
     def names(self) -> dict[int, str]:
-        """The names of the sites by their numbers."""
+        """Return the sites' names by number."""
         heard = {number: summary.site for number, (_, _, summary) in self._heard.items()}
         known = {site.number: site.name for site in self._known.sites()}
         return heard | known | {number: name for number, name in heard.items() if name}
 
     def sites(self, now_s: float) -> list[HubSite]:
-        """The sites, those in trouble first."""
+        """Return the sites, those with problems first."""
         found = [self._site(number, name, now_s) for number, name in self.names().items()]
         return sorted(found, key=lambda site: (_ORDER.index(site.condition), site.number))
 
@@ -361,7 +358,7 @@ class HubSites:
         return HubSite(number, name, condition, reason, summary.tags_heard, anchors, summary.versions, unix_s)
 
     async def run(self, name: str) -> None:
-        """Listen until cancelled. ``name`` is shown at the hub."""
+        """Listen until cancelled. ``name`` identifies this program at the hub."""
         say = rarely(logging.getLogger("skyless.run.hub").warning)
         client = self._client = await connect(self.address, name, say, Counter())
 

@@ -1,6 +1,6 @@
-"""The files of a hub: one states what was asked and all passwords, and the others are made of it.
+"""Files of a hub: one states the settings and all passwords, and the others are generated from it.
 
-Each tenant is an account of plain nats-server: one user that may do everything, and one for each site.
+Each tenant is an account of plain nats-server, with one user for everything and one for each site.
 """
 
 import re
@@ -38,7 +38,7 @@ LEAF_PORT: Final = 3200
 
 
 MONITOR_PORT: Final = 4000
-"""What is added to a node's port for other servers of the hub, for sites, and for monitoring on the node itself."""
+"""Offsets from a node's port: for other servers of the hub, for sites, and for monitoring on the node itself."""
 
 
 PLAN: Final = "hub.json"
@@ -54,7 +54,7 @@ _ADMIN: Final = "hub.admin"
 
 
 _SITE: Final = "{}.site{}"
-"""Users; names of tenants have no dot."""
+"""User name of a site; names of tenants have no dot."""
 
 
 class Node(Struct, frozen=True):
@@ -70,7 +70,7 @@ class Node(Struct, frozen=True):
 
 
 def read_node(option: str, text: str) -> Node:
-    """HOST or HOST:PORT. Raises SkylessError."""
+    """Parse HOST or HOST:PORT. Raises SkylessError."""
     found = _NODE.fullmatch(text)
     most = 0xFFFF - MONITOR_PORT
     if found is None or not 1 <= int(found[2] or FIRST_PORT) <= most:
@@ -79,45 +79,45 @@ def read_node(option: str, text: str) -> Node:
 
 
 class Hub(Struct, frozen=True):
-    """What was asked of a hub, and all of its passwords."""
+    """Settings of a hub, with all of its passwords."""
 
     nodes: tuple[Node, ...]
     fixes_gb: float = 50.0
-    """Fixes that each server keeps of each tenant."""
+    """Size in GB of the fixes that each server keeps of each tenant."""
     data: str = "/var/lib/skyless-hub"
     certificates: str = "/etc/skyless-hub"
     sites: dict[str, list[int]] = {}
-    """Of each tenant."""
+    """Sites of each tenant."""
     passwords: dict[str, str] = {}
-    """By user."""
+    """Passwords by user."""
 
     @property
     def ca(self) -> str | None:
-        """Certificates that all machines trust; None without TLS, on one machine alone."""
+        """Certificates that all machines trust; None without TLS, on a single machine."""
         return None if all(is_loopback(node.host) for node in self.nodes) else f"{self.certificates}/ca.pem"
 
     def address(self, user: str, added: int = 0) -> NatsAddress:
-        """Where a user connects; what is ``added`` to the ports says for what."""
+        """Address for a user; the offset ``added`` to the ports selects the service."""
         hosts = ",".join(f"{node.host}:{node.port + added}" for node in self.nodes)
         url, ca = (f"nats://{hosts}", None) if self.ca is None else (f"tls://{hosts}", Path(self.ca))
         return NatsAddress(url, user, self.passwords[user], ca)
 
     def leaf(self, tenant: str, site: int) -> Leaf:
-        """What a site needs."""
+        """What a site needs to connect."""
         user = _SITE.format(tenant, site)
         urls = self.address(user, LEAF_PORT).servers
         return Leaf(site=site, tenant=tenant, urls=urls, user=user, password=self.passwords[user], ca=self.ca)
 
 
 def with_sites(hub: Hub, tenant: str, sites: Iterable[int]) -> Hub:
-    """The hub with a tenant and its sites; passwords that are there stay."""
+    """Add a tenant and its sites to the hub; existing passwords stay."""
     numbers = hub.sites | {tenant: sorted({*hub.sites.get(tenant, ()), *sites})}
     users = [_CLUSTER, _ADMIN, *numbers, *(_SITE.format(name, site) for name in numbers for site in numbers[name])]
     return replace(hub, sites=numbers, passwords={user: secrets.token_urlsafe(24) for user in users} | hub.passwords)
 
 
 def write_files(hub: Hub, folder: Path) -> list[Path]:
-    """Write what has changed, for the owner alone. The files' paths. Raises SkylessError."""
+    """Write the files that have changed, private to the owner, and return their paths. Raises SkylessError."""
     values: dict[Path, object] = {folder / node.name / "nats-server.conf": _server(hub, node) for node in hub.nodes}
     for tenant, sites in hub.sites.items():
         values |= {folder / "sites" / f"{tenant}-site{site}.json": hub.leaf(tenant, site) for site in sites}
@@ -136,7 +136,7 @@ def write_files(hub: Hub, folder: Path) -> list[Path]:
 
 
 def _server(hub: Hub, node: Node) -> dict[str, Any]:
-    """The configuration of nats-server, whose format takes JSON."""
+    """Configuration of nats-server, whose format accepts JSON."""
     host, tls, folder = node.host, {}, hub.certificates
     if hub.ca is not None:
         files = {"cert_file": f"{folder}/cert.pem", "key_file": f"{folder}/key.pem", "ca_file": hub.ca}
@@ -175,7 +175,7 @@ def _user(hub: Hub, name: str, access: dict[str, Any] | None = None) -> dict[str
 
 
 def _access(site: int) -> dict[str, Any]:
-    """A site publishes what is its own, and takes what the hub's streams ask of it, but no command."""
+    """Permissions of a site: it publishes its own messages and answers the hub's streams, but accepts no commands."""
     publish = [f"skyless.v1.{site}.>", f"skyless.v2.{site}.>", f"{at(SOURCED, site)}.>", "$JSC.R.>", "$JS.R.>", "_R_.>"]
     asked = f"$JS.{at(DOMAIN, site)}.API"
     subscribe = {"allow": [f"{asked}.>", "$JS.ACK.>", "$JS.FC.>", at(SUMMARY, site)], "deny": [f"{asked}.STREAM.>"]}

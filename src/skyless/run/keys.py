@@ -2,7 +2,7 @@
 
 ``site.private`` (PEM) stays with the operator, who makes chains with it. ``site.public`` (TOML) goes to tags and to the
 hosts of anchors; ``chain-N.public`` and ``chain-N.seed`` go to the hosts of anchors. A seed may come from the
-environment instead. Secret files are readable by their owner only, and their contents stand in no message.
+environment instead. Secret files are readable only by their owner, and no message shows their contents.
 """
 
 import contextlib
@@ -55,7 +55,7 @@ SEEDS_VARIABLE: Final = "SKYLESS_CHAIN_SEEDS"
 
 MAX_SERIAL: Final = 0xFFFF
 _MAX_BYTES: Final = 1 << 26
-"""Largest size of any of the files, as devices never end. Ten years take 25 MB."""
+"""Largest size of any of the files, because devices never end. Ten years take 25 MB."""
 
 _CHAIN_FILE: Final = re.compile(r"chain-([1-9]\d{0,4})\.public")
 _MAGIC: Final = b"skyless chain 1\n"
@@ -65,7 +65,7 @@ _ENTRY: Final = re.compile(rf"([1-9]\d{{0,4}}):([0-9a-fA-F]{{{2 * SEED_BYTES}}})
 
 
 class SitePublic(Struct, frozen=True):
-    """What everybody may know of a site's keys."""
+    """The public part of a site's keys."""
 
     site: int
     public: bytes
@@ -75,22 +75,22 @@ class SitePublic(Struct, frozen=True):
 
     @property
     def fingerprint(self) -> str:
-        """A few digits that two people can compare."""
+        """A few digits for comparison by two people."""
         digits = sha256(self.public).hexdigest()[:16]
         return " ".join(digits[at : at + 4] for at in range(0, 16, 4))
 
 
 class SiteKeys(Struct, frozen=True):
-    """What an anchor's host has."""
+    """Keys of an anchor's host."""
 
     public: SitePublic
     chains: tuple[Chain, ...]
     without_seed: tuple[int, ...] = ()
-    """Serial numbers of chains whose seed is not there."""
+    """Serial numbers of chains without a seed."""
 
 
 class _PublicDocument(Struct, frozen=True, forbid_unknown_fields=True):
-    """``site.public`` as it is written."""
+    """The contents of ``site.public``."""
 
     site: int
     public_key: str
@@ -101,17 +101,17 @@ class _PublicDocument(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def chain_public_file(folder: Path, serial: int) -> Path:
-    """Where the public part of a chain is."""
+    """Path of the public part of a chain."""
     return folder / f"chain-{serial}.public"
 
 
 def chain_seed_file(folder: Path, serial: int) -> Path:
-    """Where the seed of a chain is."""
+    """Path of the seed of a chain."""
     return folder / f"chain-{serial}.seed"
 
 
 def serials_in(folder: Path) -> tuple[int, ...]:
-    """Serial numbers of the chains in a folder, in their order. Raises OSError."""
+    """Sorted serial numbers of the chains in a folder. Raises OSError."""
     found = (_CHAIN_FILE.fullmatch(entry.name) for entry in folder.iterdir())
     return tuple(sorted(int(match[1]) for match in found if match is not None and int(match[1]) <= MAX_SERIAL))
 
@@ -156,7 +156,7 @@ def chain_public_bytes(chain: Chain) -> bytes:
 
 
 def read_site_public(file: Path) -> SitePublic:
-    """The public key in a file. Raises SkylessError."""
+    """Read the public key in a file. Raises SkylessError."""
     try:
         document = tomllib.loads(_read(file).decode())
         read = msgspec.convert(document, _PublicDocument)
@@ -174,7 +174,7 @@ def read_site_public(file: Path) -> SitePublic:
 
 
 def read_private(folder: Path, public: SitePublic) -> "Ed25519PrivateKey":
-    """The site's private key. Raises SkylessError, also where it does not belong to the public key."""
+    """Read the site's private key. Raises SkylessError, also if it does not belong to the public key."""
     from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 - loads OpenSSL
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey  # noqa: PLC0415
     from cryptography.hazmat.primitives.serialization import load_pem_private_key  # noqa: PLC0415
@@ -192,7 +192,7 @@ def read_private(folder: Path, public: SitePublic) -> "Ed25519PrivateKey":
 
 
 def read_chain_public(folder: Path, serial: int, site: int) -> Chain:
-    """A chain without its seed, which is empty. Raises SkylessError."""
+    """Read a chain without its seed, which is left empty. Raises SkylessError."""
     file = chain_public_file(folder, serial)
     data = _read(file)
     rest = len(data) - _HEADER.size - _DIGEST_BYTES
@@ -224,9 +224,9 @@ def read_chain_public(folder: Path, serial: int, site: int) -> Chain:
 
 
 def read_keys(folder: Path, site: int, seeds: Mapping[int, bytes]) -> SiteKeys:
-    """What an anchor's host needs: the chains with their seeds, which are in the folder or in ``seeds``.
+    """Read what an anchor's host needs: the chains with their seeds, from the folder or from ``seeds``.
 
-    That seed, signatures and public key belong together is verified with the first section of each chain.
+    The first section of each chain is used to verify that seed, signatures and public key belong together.
 
     Raises:
         SkylessError: something is missing, damaged, of another site, or a secret that others can read.
@@ -256,7 +256,7 @@ def read_keys(folder: Path, site: int, seeds: Mapping[int, bytes]) -> SiteKeys:
 
 
 def read_folder_public(folder: Path, site: int) -> SitePublic:
-    """The public key in a folder of keys of a site. Raises SkylessError."""
+    """Read the public key in a site's folder of keys. Raises SkylessError."""
     if not folder.is_dir():
         raise SkylessError(f"{folder} is no folder; it should be one with keys, which skyless site keys new makes")
     public = read_site_public(folder / SITE_PUBLIC)
@@ -266,7 +266,7 @@ def read_folder_public(folder: Path, site: int) -> SitePublic:
 
 
 def parse_seeds(text: str) -> dict[int, bytes]:
-    """Seeds in the environment, by serial number. Raises SkylessError, whose message does not show them."""
+    """Parse seeds from the environment, by serial number. Raises SkylessError, whose message does not show them."""
     seeds = {}
     for number, entry in enumerate(text.split(), start=1):
         match = _ENTRY.fullmatch(entry)
@@ -280,7 +280,7 @@ def parse_seeds(text: str) -> dict[int, bytes]:
 
 
 def _check_chain(folder: Path, chain: Chain, public: SitePublic) -> None:
-    """Whether seed, signatures and public key belong together. Raises SkylessError."""
+    """Check that seed, signatures and public key belong together. Raises SkylessError."""
     name = SectionName(chain.site, chain.serial, chain.first >> SECTION_BITS)
     certificate = Certificate(name, chain.timing, chain.first, root_of(chain.seed, name))
     if not is_signed(certificate, chain.signatures[:CERTIFICATE_SIGNATURE_BYTES], public_key(public.public)):
@@ -291,7 +291,7 @@ def _check_chain(folder: Path, chain: Chain, public: SitePublic) -> None:
 
 
 def _read_seed(file: Path) -> bytes | None:
-    """The seed in a file; None where there is no such file. Raises SkylessError."""
+    """Read the seed in a file; None if the file does not exist. Raises SkylessError."""
     if not file.exists():
         return None
     text = _read_secret(file).strip()
@@ -301,12 +301,12 @@ def _read_seed(file: Path) -> bytes | None:
 
 
 def _read_secret(file: Path) -> bytes:
-    """A file that nobody but its owner can read. Raises SkylessError."""
+    """Read a file that only its owner may read. Raises SkylessError."""
     return _read(file, is_secret=True)
 
 
 def _read(file: Path, *, is_secret: bool = False) -> bytes:
-    """The bytes of a file. Raises SkylessError."""
+    """Read a file. Raises SkylessError."""
     try:
         with open(file, "rb", opener=_open_at_once) as opened:
             status = os.fstat(opened.fileno())
@@ -325,29 +325,29 @@ def _read(file: Path, *, is_secret: bool = False) -> bytes:
 
 
 def _open_at_once(path: str, flags: int) -> int:
-    """Does not wait for a writer if the name belongs to a pipe."""
+    """Open without waiting for a writer if the name is that of a pipe."""
     return os.open(path, flags | os.O_NONBLOCK)
 
 
-# Keys in the programs: an anchor's chains from files, a tag's memory of them, and what both log of codes.
+# Keys in the programs: an anchor's chains, a tag's memory of them, and log lines about codes.
 
 KEYS_S: Final = 3.0
-"""Interval at which files are looked at."""
+"""Interval at which files are checked for changes."""
 
 RECENT_S: Final = 2.0
-"""Faults that are older do not count."""
+"""Older faults are ignored."""
 
 LASTING_S: Final = 4.0
-"""Faults that last for a shorter time, as a moment after a start, are not logged."""
+"""Faults shorter than this, as after a start, are not logged."""
 
 CALM_S: Final = 30.0
-"""An anchor is said to be accepted again after this time without a fault."""
+"""An anchor counts as accepted again after this time without a fault."""
 
 MAX_NAMED: Final = 8
-"""Anchors that are named at the same time: forged frames can name any."""
+"""Largest number of anchors named at a time, as forged frames can name any."""
 
 UNVERIFIED_S: Final = 10.0
-"""After this time without verified beacons the cause is logged: a certificate comes every second or so."""
+"""After this time without verified beacons the cause is logged; a certificate comes every second or so."""
 
 _DAY_S: Final = 86_400.0
 _LITTLE_LEFT_S: Final = 60.0 * _DAY_S
@@ -381,10 +381,10 @@ _NOT_VERIFIED: Final = {
 
 
 class AnchorKeys:
-    """Key chains of a site, shared by the anchors of a process and read again whenever their files change."""
+    """A site's key chains, shared by the anchors of a process and reloaded when their files change."""
 
     def __init__(self, folder: Path, site: int, log: Log, environment: Mapping[str, str] = os.environ) -> None:
-        """Read them. Raises SkylessError: they cannot be used."""
+        """Read the keys. Raises SkylessError if they cannot be used."""
         self._folder, self._site, self._log = folder, site, log
         self._seeds = parse_seeds(environment.get(SEEDS_VARIABLE, ""))
         self._seen = self._state()
@@ -393,9 +393,9 @@ class AnchorKeys:
         self._use(read_keys(folder, site, self._seeds))
 
     def update(self) -> bool:
-        """Read the files again if they have changed. Returns whether the chains have changed.
+        """Reload the files if they have changed. Returns whether the chains have changed.
 
-        Files that cannot be used, as while they are copied, are logged once, and what was read before stays in use.
+        Unusable files, as during copying, are logged once, and the previous chains stay in use.
         """
         state = self._state()
         if state == self._seen:
@@ -421,7 +421,7 @@ class AnchorKeys:
             self._log(f"keys: chain {waiting[-1]} has no seed in {self._folder}; chain {newest.serial} stays in use")
 
     def present(self, unix_s: float) -> int | None:
-        """Serial number of the chain in use at a Unix time."""
+        """Serial number of the chain in use at a Unix time; None if there is none."""
         timing = self._ring.timing
         keys = None if timing is None else self._ring.at(timing.interval_at(unix_s))
         return None if keys is None else keys.chain.serial
@@ -432,7 +432,7 @@ class AnchorKeys:
         return max(chain.timing.start_s(chain.end) for chain in self.chains)
 
     def warn(self, unix_s: float) -> None:
-        """Log once a day when little is left of the last chain."""
+        """Log once a day when the last chain ends soon."""
         left_s = self.ends_s - unix_s
         day = int(left_s // _DAY_S)
         if left_s > _LITTLE_LEFT_S or day == self._warned_day:
@@ -444,7 +444,7 @@ class AnchorKeys:
         self._log(f"keys: the last key chain {what}: skyless site keys rotate makes another one")
 
     def _state(self) -> tuple[tuple[str, int, int, int], ...]:
-        """What shows that a file has changed."""
+        """File attributes that reveal a change."""
         try:
             with os.scandir(self._folder) as entries:
                 known = [(entry.name, entry.stat()) for entry in entries if entry.name.endswith((".public", ".seed"))]
@@ -454,7 +454,7 @@ class AnchorKeys:
 
 
 class AnchorReport:
-    """Logs when an anchor's codes begin and end, and whose beacons are not accepted."""
+    """Logs when an anchor's codes start and stop, and whose beacons are not accepted."""
 
     def __init__(self, anchor: int, log: Log) -> None:
         self._name, self._log = f"anchor {anchor}", log
@@ -465,10 +465,10 @@ class AnchorReport:
     def update(
         self, authentication: BeaconAuthentication, serial: int | None, accepted_s: float, unix_s: float, now_s: float
     ) -> None:
-        """Log what has changed. Call it once a second.
+        """Log changes; call this once a second.
 
-        ``serial`` is the number of the chain in use, ``accepted_s`` when a beacon of another anchor was accepted last,
-        ``now_s`` the present, both by the host's monotonic clock.
+        ``serial`` is the chain in use, ``accepted_s`` when a beacon of another anchor was last accepted, ``now_s`` the
+        present, both by the host's monotonic clock.
         """
         self._on_own(authentication.fault(), serial)
         faults = recent_faults(authentication, unix_s)
@@ -509,7 +509,7 @@ class Remembered(Struct, frozen=True):
 
 
 class TagMemory:
-    """The file of one site and public key. One that is damaged, or cannot be written, is ignored."""
+    """The memory file for one site and public key. A damaged or unwritable one is ignored."""
 
     def __init__(self, trust: SiteTrust, folder: Path) -> None:
         """``folder``: the user's data folder of Skyless."""
@@ -518,7 +518,7 @@ class TagMemory:
         self.remembered = self._read()
 
     def keep(self, serial: int, certificates: Iterable[bytes]) -> None:
-        """Write what is known now, if it has changed. The serial number never decreases."""
+        """Store the present knowledge if it has changed. The serial number never decreases."""
         known = Remembered(serial, tuple(certificates))
         if known == self.remembered:
             return
@@ -541,7 +541,7 @@ class TagMemory:
 
 
 def trust_reason(trusted: TrustedReceiver) -> str | None:
-    """Why no beacon has been verified within the last second, or None where some have, or none has come at all."""
+    """Why no beacon was verified within the last second; None if some were, or none was received at all."""
     if trusted.is_verified:
         return None
     verifier, faults = trusted.verifier, set(trusted.faults().values())
@@ -566,7 +566,7 @@ class TagReport:
         self._logged = ""
 
     def update(self, trusted: TrustedReceiver, now_s: float, *, is_verified: bool) -> None:
-        """Log what has changed. Call it once a second. ``now_s`` is the host's monotonic clock."""
+        """Log changes; call this once a second. ``now_s`` is the host's monotonic clock."""
         self._on_clock(trusted)
         if is_verified:
             self._unverified_s, self._logged = None, ""
@@ -607,15 +607,15 @@ class _Known(Struct):
 
 
 class FaultLines:
-    """Logs whose beacons are not accepted: one line when that begins, one when it is over."""
+    """Logs whose beacons are not accepted: one line when that begins, one when it ends."""
 
     def __init__(self, name: str, log: Log) -> None:
-        """``name`` is that of the anchor or tag whose log this is."""
+        """``name`` is the name of the anchor or tag that logs."""
         self._name, self._log = name, log
         self._known: dict[int, _Known] = {}
 
     def update(self, faults: Mapping[int, Fault], now_s: float) -> None:
-        """Log what has changed. ``faults`` are those of the last seconds, ``now_s`` is the host's monotonic clock."""
+        """Log changes. ``faults`` are those of the last seconds; ``now_s`` is the host's monotonic clock."""
         for anchor, fault in sorted(faults.items()):
             known = self._known.get(anchor)
             if known is None and len(self._known) >= MAX_NAMED:

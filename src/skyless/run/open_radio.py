@@ -23,7 +23,7 @@ from skyless.run.process import Log
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
 _SERIAL_BAUD: Final = 1_000_000
 _FOREIGN_BAUD: Final = 115_200
-"""Of listeners and FiRa boards; any rate serves on a real sniffer's USB port."""
+"""Baud rate of listeners and FiRa boards; a real sniffer's USB port accepts any rate."""
 _EXPECTED: Final = (
     "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN], model:HOST[:PORT], "
     "listener:PATH[@BAUD], sniffer:PATH[@BAUD] or uci:PATH[@BAUD]"
@@ -33,7 +33,7 @@ _EXPECTED: Final = (
 def is_simulated(spec: str) -> bool:
     """Whether a radio of that name is simulated: emulated, a model, or behind a pseudo-terminal.
 
-    To be asked again when a radio has restarted: the path may lead to another device.
+    Check again after a radio has restarted: the path may lead to another device.
     """
     port = spec.partition(":")[2].partition(",")[0].partition("@")[0]
     return spec.split(":", 1)[0] in ("ether", "model") or os.path.realpath(port).startswith("/dev/pts/")
@@ -45,12 +45,12 @@ def is_ether(spec: str) -> bool:
 
 
 def receives_packets(spec: str) -> bool:
-    """Whether a radio of that name receives packets of another system, and not beacons."""
+    """Whether a radio of that name receives packets of another system instead of beacons."""
     return spec.split(":", 1)[0] in ("sniffer", "uci")
 
 
 def hears_positions(spec: str) -> bool:
-    """Whether what a radio of that name receives may state where anchors are."""
+    """Whether the receptions of a radio of that name may state anchor positions."""
     return spec.split(":", 1)[0] == "uci"
 
 
@@ -63,10 +63,10 @@ def open_radios(
     phases: bool | None = None,
     computes: bool = False,
 ) -> tuple[Radio, ...]:
-    """Radios for the nodes of one process, in the order of their names; nothing is connected yet.
+    """Create radios for the nodes of one process, in the order of their names, without connecting them.
 
-    ``delays`` are the nodes' antenna delays, which their radios are set to. ``phases``: whether receptions are to have
-    the phase of their carrier, where the radio can measure it; None for those of tags. ``computes``: whether boards on
+    ``delays`` are the nodes' antenna delays, which their radios are set to. ``phases``: whether receptions should
+    include the carrier phase, if the radio can measure it; None for radios of tags. ``computes``: whether boards on
     serial ports compute their own positions.
 
     Raises:
@@ -108,9 +108,9 @@ def open_radios(
 def open_sniffers(
     spec: str, names: tuple[str, ...], anchors_m: Mapping[int, Point] | None = None
 ) -> tuple[SnifferRadio | UciRadio, ...]:
-    """Sniffers or FiRa boards for the tags of one process, in the order of their names.
+    """Create sniffers or FiRa boards for the tags of one process, in the order of their names.
 
-    ``anchors_m``: positions of the system's anchors, as far as they are known. Raises SkylessError.
+    ``anchors_m``: known positions of the system's anchors. Raises SkylessError.
     """
     driver, _, where = spec.partition(":")
     ports = zip(_ports(spec, where, _FOREIGN_BAUD, names), names, strict=True)
@@ -121,7 +121,7 @@ def open_sniffers(
 
 
 def _ports(spec: str, where: str, usual_baud: int, names: tuple[str, ...]) -> list[tuple[str, int]]:
-    """Path and baud rate of each node's port, from PATH[@BAUD],PATH[@BAUD] and so on. Raises SkylessError."""
+    """Parse path and baud rate of each node's port, from PATH[@BAUD],PATH[@BAUD] and so on. Raises SkylessError."""
     parts = where.split(",")
     if len(parts) != len(names) or not all(parts):
         wanted = "one port" if len(names) == 1 else f"{len(names)} ports, one for each node, with commas"
@@ -135,7 +135,7 @@ def _ports(spec: str, where: str, usual_baud: int, names: tuple[str, ...]) -> li
 
 
 def spi_port(spec: str, where: str) -> SpiPort:
-    """The chip of BUS.DEVICE[,irq=PIN][,reset=PIN][,hz=RATE][,chip=PATH], if it could be there. Raises SkylessError."""
+    """Parse BUS.DEVICE[,irq=PIN][,reset=PIN][,hz=RATE][,chip=PATH], and check the device. Raises SkylessError."""
     wires, _, rest = where.partition(",")
     bus, dot, device = wires.partition(".")
     options = [part.partition("=")[::2] for part in rest.split(",") if part]
@@ -175,7 +175,7 @@ def _port(spec: str, part: str, usual_baud: int) -> tuple[str, int]:
 
 
 def host_and_port(spec: str, where: str, default_port: int) -> tuple[str, int]:
-    """HOST[:PORT] of a radio's name, the host 127.0.0.1 where none is given. Raises SkylessError."""
+    """Parse HOST[:PORT] of a radio's name; the host defaults to 127.0.0.1. Raises SkylessError."""
     host, colon, digits = where.rpartition(":") if where.count(":") != 0 else (where, "", "")
     port = int(digits) if digits.isdecimal() and len(digits) < 6 else 0
     if colon and not 0 < port < 65_536:
@@ -187,12 +187,12 @@ def host_and_port(spec: str, where: str, default_port: int) -> tuple[str, int]:
     return host.strip("[]") or "127.0.0.1", port or default_port
 
 
-# What a node logs about its radio: that it is ready or gone, and where to look when it receives nothing usable.
+# What a node logs about its radio: that it is ready or gone, and likely causes if it receives nothing usable.
 
 UNUSABLE_S: Final = 5.0
-"""A node that has received nothing usable for this time logs it."""
+"""A node that has received nothing usable for this long logs it."""
 REPEAT_S: Final = 60.0
-"""The same line is not logged again within this time, however often reception comes and goes."""
+"""The same line is not logged again within this time, however often reception changes."""
 
 _MEANING: Final = {
     "foreign-site": "those are of another site than asked for",
@@ -211,7 +211,7 @@ _MEANING: Final = {
 
 
 class _Counts(Struct, frozen=True):
-    """What had been counted at a moment."""
+    """Counts at one moment."""
 
     now_s: float
     received: int
@@ -220,7 +220,7 @@ class _Counts(Struct, frozen=True):
 
 
 class RadioMonitor:
-    """Watches the radio of one node. ``advice`` is asked of the radio when nothing at all has come from it."""
+    """Watches the radio of one node. ``advice`` gives the radio's hint for when nothing at all was received."""
 
     def __init__(self, name: str, ready: str, log: Log, advice: Callable[[], str]) -> None:
         """``ready`` says in words what the node does once its radio has started."""
@@ -244,10 +244,10 @@ class RadioMonitor:
             self._log(f"{self._name}: {event.text}")
 
     def check(self, now_s: float, received: int, used: int, drops: Mapping[str, int]) -> None:
-        """Log where to look if for ``UNUSABLE_S`` nothing was usable; to be called every second or so.
+        """Log likely causes if nothing was usable for ``UNUSABLE_S``; call this every second or so.
 
-        ``now_s`` is the host's monotonic clock; ``received`` and ``used`` count frames, ``drops`` what could not be
-        used, by reason; all since ``Restarted`` or before.
+        ``now_s`` is the host's monotonic clock; ``received`` and ``used`` count frames, ``drops`` unusable ones by
+        reason, all since ``Restarted`` or before.
         """
         if not self._present or (self._since is not None and now_s - self._since.now_s < UNUSABLE_S):
             return

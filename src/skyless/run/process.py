@@ -1,4 +1,4 @@
-"""What the programs of a running site share: event loop, tasks, links, folders, ports, use of the machine."""
+"""Shared parts of a site's programs: event loop, tasks, links, folders, ports, resource usage."""
 
 import asyncio
 import contextlib
@@ -39,13 +39,15 @@ Log = Callable[[str], None]
 _PR_SET_PDEATHSIG: Final = 1
 
 _RESERVED: Final = "\0skyless-{}:{}"
-"""Linux's abstract sockets have one owner each, in the same namespace as its ports, and end with their process."""
+"""Name of an abstract socket of Linux, which has one owner in the same namespace as its ports and ends with its
+process.
+"""
 
 _MAX_FILES: Final = 65_536
-"""More are not asked for: some systems allow billions, and some libraries go through all that could be open."""
+"""Upper limit of open files: some systems allow billions, and some libraries iterate over all possible ones."""
 
 _RADIO_NICE: Final = -10
-"""Priority of programs that serve a radio, where the system allows it (root, or a limit in limits.conf)."""
+"""Priority of programs that serve a radio, if the system allows it (root, or a limit in limits.conf)."""
 
 
 # The event loop
@@ -54,7 +56,7 @@ _RADIO_NICE: Final = -10
 def run(main: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
     """Run a program until it ends or is cancelled by SIGTERM, SIGHUP or Ctrl-C.
 
-    ``punctual``: ask the system for a higher priority, because a radio's slots do not wait.
+    ``punctual`` requests a higher priority, because a radio's slots do not wait.
 
     Raises:
         KeyboardInterrupt: it was Ctrl-C.
@@ -71,7 +73,7 @@ def run(main: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
 
 
 def _new_loop() -> asyncio.AbstractEventLoop:
-    """A loop for any number of connections, whose timers are exact to microseconds."""
+    """Create a loop for any number of connections, with timers exact to microseconds."""
     return asyncio.SelectorEventLoop(PunctualSelector() if hasattr(selectors, "EpollSelector") else None)
 
 
@@ -80,12 +82,12 @@ if hasattr(selectors, "EpollSelector"):
     class PunctualSelector(selectors.EpollSelector):
         """epoll(), whose own timeouts end up to a millisecond late, woken by select(), which is exact.
 
-        select() takes no file beyond number 1023. So it waits for one file alone, epoll()'s own, which can be read as
-        soon as any of the others is ready.
+        select() takes no file beyond number 1023, so it waits only for epoll()'s own, which becomes readable as soon as
+        any of the others is ready.
         """
 
         def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-            """The files that are ready. Waits for one at most ``timeout`` s, without limit where it is None."""
+            """Return the files that are ready, waiting for at most ``timeout`` s, or without limit if it is None."""
             if timeout is None:
                 return super().select()
             if timeout > 0.0:
@@ -108,7 +110,7 @@ def ending_signals() -> tuple[signal.Signals, ...]:
 
 
 def end_with_parent(number: signal.Signals = signal.SIGTERM) -> Callable[[], None] | None:
-    """The ``preexec_fn`` of a child process that is to end with its parent, however the parent ends. Linux only."""
+    """The ``preexec_fn`` of a child process that must end with its parent, however that ends; None except on Linux."""
     if not sys.platform.startswith("linux"):
         return None
     prctl = ctypes.CDLL(None).prctl
@@ -126,7 +128,7 @@ def end_with_parent(number: signal.Signals = signal.SIGTERM) -> Callable[[], Non
 
 
 async def together(*parts: Awaitable[None]) -> None:
-    """Run until one part fails or all are cancelled. A failure cancels the others and is raised as itself."""
+    """Run until one part fails or all are cancelled. A failure cancels the others and is raised unwrapped."""
     tasks = [asyncio.ensure_future(part) for part in parts]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_EXCEPTION)
@@ -146,7 +148,7 @@ async def every(seconds: float, act: Callable[[], None]) -> None:
 
 
 async def outlasting(lasting: Coroutine[Any, Any, None], others: Coroutine[Any, Any, None]) -> None:
-    """Run both until one ends or all is cancelled. ``lasting`` is cancelled when the others have ended."""
+    """Run both until one ends or all are cancelled. ``lasting`` is cancelled when the others have ended."""
     last, first = asyncio.ensure_future(lasting), asyncio.ensure_future(others)
     try:
         done, _ = await asyncio.wait((last, first), return_when=asyncio.FIRST_COMPLETED)
@@ -162,12 +164,12 @@ async def outlasting(lasting: Coroutine[Any, Any, None], others: Coroutine[Any, 
 
 
 def link_of(address: MqttAddress | None, name: int | str, *, site: int, kind: str) -> Link | None:
-    """The node's connection to the broker, or None without one."""
+    """Create the node's connection to the broker; None without a broker."""
     return None if address is None else Link(address, name, site=site, kind=kind, keepalive_s=NODE_KEEPALIVE_S)
 
 
 async def keep(link: Link, log: Log) -> None:
-    """Run a link until cancelled. A fault in it is logged, and costs neither a fix nor a beacon."""
+    """Run a link until cancelled. A fault in it is logged, and affects neither fixes nor beacons."""
     while True:
         try:
             await link.run()
@@ -182,9 +184,9 @@ def reader(
     on_wrong: Callable[[], None],
     withdrawn: Struct | None = None,
 ) -> Handler:
-    """A handler that decodes messages of a kind, or as a function does. ``on_wrong`` is called where that fails.
+    """Make a handler that decodes messages of a kind, or with a function. ``on_wrong`` is called if that fails.
 
-    An empty payload is a retained message that was withdrawn. It is skipped, or counts as the message ``withdrawn``.
+    An empty payload, a withdrawn retained message, is skipped or replaced by the message ``withdrawn``.
     """
 
     def read(_topic: str, payload: bytes) -> None:
@@ -202,15 +204,15 @@ def reader(
 
 
 class SitePublisher:
-    """Publishes a site, retained: again when its radios turn out to be simulated or not, and repeatedly.
+    """Publishes a site, retained: repeatedly, and when its radios turn out to be simulated or not.
 
-    A broker that others read may have missed it, or lost it.
+    A bridged broker may have missed or lost it.
     """
 
     def __init__(
         self, site: Site, is_simulated: Callable[[], bool], plans: Mapping[int | None, Path] | None = None
     ) -> None:
-        """``plans`` are the images of the floors by their numbers; None is that of the whole site."""
+        """``plans`` are the images of the floors by number; None is the key for that of the whole site."""
         self._site, self._is_simulated, self._plans = site, is_simulated, dict(plans or {})
         self._restarts: int | None = None
         self._simulated = False
@@ -218,12 +220,12 @@ class SitePublisher:
         self._repeat_s = 0.0  # when it is published again, by the host's monotonic clock
 
     def place(self, site: Site) -> None:
-        """Publish the site of a survey from now on."""
+        """Publish a survey's site from now on."""
         if site != self._site:
             self._site, self._published = site, None
 
     def update(self, restarts: int) -> None:
-        """Call ``is_simulated`` after each restart of a radio: its port may lead to another device."""
+        """Call ``is_simulated`` after each restart of a radio, as its port may lead to another device."""
         if restarts != self._restarts:
             self._restarts, self._simulated = restarts, self._is_simulated()
 
@@ -246,7 +248,7 @@ class SitePublisher:
 
 
 def data_folder() -> Path:
-    """``skyless`` in the user's data folder (XDG), or a temporary folder where that cannot be written."""
+    """``skyless`` in the user's data folder (XDG), or a temporary folder if that cannot be written."""
     shared = os.environ.get("XDG_DATA_HOME")
     try:
         home = Path(shared) if shared and Path(shared).is_absolute() else Path("~/.local/share").expanduser()
@@ -263,19 +265,19 @@ def data_folder() -> Path:
 
 
 def recordings_folder() -> Path:
-    """Folder of the recordings that the page shows. It is created if missing."""
+    """Folder of the recordings that the page shows, created if missing."""
     folder = data_folder() / "recordings"
     folder.mkdir(exist_ok=True)
     return folder
 
 
 def new_recording(folder: Path, kind: str) -> Path:
-    """File name for a recording that begins at this moment."""
+    """File name for a recording that begins now."""
     return folder / f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
 
 
 def locked(file: Path) -> IO[str]:
-    """The file, locked for this process until it is closed. Raises OSError."""
+    """Lock a file for this process until it is closed. Raises OSError."""
     lock = file.open("a", encoding="utf-8")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -289,10 +291,10 @@ def locked(file: Path) -> IO[str]:
 
 
 def is_free(host: str, port: int) -> bool:
-    """Whether a program could listen there.
+    """Whether a program could listen on the port.
 
     Raises:
-        OSError: none could: no address of this machine, or a port that only the system may use.
+        OSError: none could: not an address of this machine, or a privileged port.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -307,7 +309,7 @@ def is_free(host: str, port: int) -> bool:
 
 
 def reserve(host: str, port: int) -> socket.socket | None:
-    """A socket that reserves a port among the programs of Skyless while it is open, or None if one of them has it."""
+    """Reserve a port among Skyless's programs while the returned socket is open; None if one of them has it."""
     held = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     if sys.platform.startswith("linux"):
         try:
@@ -319,7 +321,7 @@ def reserve(host: str, port: int) -> socket.socket | None:
 
 
 def reserve_next(host: str, first: int) -> tuple[int, socket.socket]:
-    """The first free port from this one on that no program of Skyless has reserved, and the socket that holds it."""
+    """The first free, unreserved port from this one on, and the socket that reserves it."""
     port = first
     while True:
         held = reserve(host, port)
@@ -331,7 +333,7 @@ def reserve_next(host: str, first: int) -> tuple[int, socket.socket]:
 
 
 def hold_any(host: str) -> tuple[int, socket.socket]:
-    """A free port and its socket: while that is open, the system assigns the port to no program by itself."""
+    """A free port and its socket: while that is open, the system does not assign the port to other programs."""
     held = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     held.bind((host, 0))
@@ -342,7 +344,7 @@ def hold_any(host: str) -> tuple[int, socket.socket]:
 
 
 def most_files() -> int:
-    """How many files and connections this process may have open: as many as the system lets it have, from now on."""
+    """Raise the limit of open files of this process as far as the system allows, and return it."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == hard:
         return soft
@@ -360,7 +362,7 @@ class Usage:
         self._cpu_s = time.process_time()
 
     def sample(self) -> tuple[float, int]:
-        """Share of a core since the last call, and resident memory in bytes."""
+        """Return the share of a core since the last call, and the resident memory in bytes."""
         wall_s, cpu_s = time.monotonic(), time.process_time()
         share = (cpu_s - self._cpu_s) / max(wall_s - self._wall_s, 1e-9)
         self._wall_s, self._cpu_s = wall_s, cpu_s
@@ -377,13 +379,11 @@ def resident_bytes() -> int:
     return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-# A largest rate of events.
-
 _LATE_SHARE: Final = 0.5
-"""An event that comes late by up to this share of the interval does not lower the average rate."""
+"""An event that is late by up to this share of the interval does not lower the average rate."""
 
 _EARLY_SHARE: Final = 0.25
-"""An event that comes early by up to this share passes: else of events at just this rate some would not."""
+"""An event that is early by up to this share passes; otherwise some events at exactly this rate would not."""
 
 
 class RateLimit:
@@ -401,11 +401,11 @@ class RateLimit:
         return True
 
 
-# Programs that a program starts: watched, started again when they die, ended together.
+# Child programs: watched, restarted when they die, ended together.
 
 _RESTART_S: Final = 0.2
 _LONGEST_RESTART_S: Final = 5.0
-"""Pause before a program is started again. It doubles while the program ends soon after each start."""
+"""Longest pause before a program is restarted. The pause doubles while the program ends soon after each start."""
 _GOOD_RUN_S: Final = 10.0  # a program that has run for this time was not faulty from the start
 
 _STOP_S: Final = 5.0
@@ -420,12 +420,13 @@ class Program(Struct, frozen=True):
     name: str
     arguments: tuple[str, ...]
     new_file: int | None = None
-    """Index among the arguments of a file that must not exist: later starts get another name, and the program is not
-    started again when it has ended by itself (a full disk, its limit reached)."""
+    """Index among the arguments of a file that must not exist: later starts get another name. The program is not
+    restarted if it ends by itself (a full disk, its limit reached).
+    """
     start_after_s: float = 0.0
-    """Its first start is so much later."""
+    """Delay of its first start."""
     logs_lines: bool = False
-    """Whether its lines on standard error are logged as they come; otherwise the last one is, when it ends."""
+    """Whether lines on standard error are logged as they come; otherwise only the last one, at its end."""
     environment: Mapping[str, str] = {}
     """Variables in addition to those of this program."""
 
@@ -439,7 +440,7 @@ class Program(Struct, frozen=True):
 
 
 class Child:
-    """One program, started again whenever it ends."""
+    """One program, restarted whenever it ends."""
 
     def __init__(self, program: Program, log: Log) -> None:
         self.program = program
@@ -451,14 +452,14 @@ class Child:
         self._line = b""
 
     def restart(self) -> None:
-        """Start it again now, with no word about it: what it read at its start has changed."""
+        """Restart it now without logging, because what it read at its start has changed."""
         if self.pid is not None:
             self._is_asked = True
             with contextlib.suppress(ProcessLookupError):  # it has just ended by itself
                 os.kill(self.pid, signal.SIGTERM)
 
     async def run(self) -> None:
-        """Keep it alive until cancelled, or until it has ended for good."""
+        """Keep it running until cancelled, or until it has ended for good."""
         if self.program.start_after_s > 0.0:
             await asyncio.sleep(self.program.start_after_s)
         wait_s = _RESTART_S
@@ -483,7 +484,7 @@ class Child:
         self.starts += 1
         self._last_lines.clear()
         self._line = b""
-        # asyncio's own pipes report a program's end only when its children have closed them too
+        # asyncio's own pipes report a program's end only after its children have closed them, too
         read_end, write_end = os.pipe()
         os.set_blocking(read_end, False)
         loop = asyncio.get_running_loop()
@@ -503,7 +504,7 @@ class Child:
             os.close(read_end)
 
     async def _start(self, stderr: int) -> asyncio.subprocess.Process:
-        """Start the program. Standard error goes to a pipe, whose end on this side is closed."""
+        """Start the program. Standard error goes to a pipe, whose writing end is closed on this side."""
         try:
             return await asyncio.create_subprocess_exec(
                 *(*_COMMAND, *self.program.start(self.starts)),
@@ -530,7 +531,7 @@ class Child:
             asyncio.get_running_loop().remove_reader(pipe)
 
     def _last_message(self) -> str:
-        """What it wrote last, which need not be why it ended: a program that is killed cannot say so."""
+        """The last line that it wrote, which need not explain its end: a killed program cannot say so."""
         if begun := self._line.decode(errors="replace").strip():
             return f'its last message, unfinished: "{begun}"'
         line = next((line for line in reversed(self._last_lines) if line), None)
@@ -538,7 +539,7 @@ class Child:
 
 
 async def end(process: asyncio.subprocess.Process) -> None:
-    """Terminate a process. Kill it if it does not end."""
+    """Terminate a process, and kill it if it does not end."""
     if process.returncode is not None:
         return
     with contextlib.suppress(ProcessLookupError):

@@ -1,4 +1,4 @@
-"""``skyless record``: requests the receptions of a site's tags and writes all its messages into a file."""
+"""``skyless record``: requests receptions of a site's tags and writes all of the site's messages into a file."""
 
 import asyncio
 import contextlib
@@ -43,19 +43,19 @@ class RecorderState(Struct, frozen=True):
     lost: int
     drops: dict[str, int]
     trouble: str | None
-    """Why there is no broker, or None while there is one."""
+    """Why there is no connection to the broker; None while there is one."""
     ended: str | None
-    """Why the file is not written any more, or None while it is."""
+    """Why the file is no longer written; None while it is."""
 
 
 class RecorderNode:
-    """Records one site until cancelled, or until the file cannot be written any more."""
+    """Records one site until cancelled, or until the file can no longer be written."""
 
     def __init__(self, file: McapFile, address: MqttAddress, site: int, log: Log) -> None:
         self.file = file
         self.recorder = McapRecorder(file)
         self._name, self._lock = _own_name(site)
-        # the broker keeps what this name has subscribed to while it is away, so that its restart loses nothing
+        # the broker keeps this name's messages during its restart, so that nothing is lost
         self.link = Link(address, self._name, site=site, kind="recorder", persistent=True, client_key=_client_key())
         self.receptions = 0
         self._site = site
@@ -68,7 +68,7 @@ class RecorderNode:
         self.link.on_state.append(self._on_state)
 
     async def run(self, duration_s: float | None = None) -> None:
-        """Record. Finally the request is withdrawn and the file closed."""
+        """Record, then withdraw the request and close the file."""
         link = asyncio.ensure_future(self.link.run())
         work = [asyncio.ensure_future(every(_REQUEST_S, self._request)), asyncio.ensure_future(self._write())]
         try:
@@ -85,7 +85,7 @@ class RecorderNode:
             self._lock.close()
 
     def state(self) -> RecorderState:
-        """Progress so far."""
+        """Return the progress so far."""
         return RecorderState(
             seconds=time.monotonic() - self._started_s,
             messages=dict(self.recorder.kinds),
@@ -110,7 +110,7 @@ class RecorderNode:
             self._request()
 
     def _begin_new_run(self) -> None:
-        """After a loss: request under another name, so that the tags begin another run with its checkpoint."""
+        """Request under another name after a loss, so that the tags begin another run with its checkpoint."""
         now_s = time.monotonic()
         if now_s - self._new_run_s >= _NEW_RUN_S:
             self._new_run_s = now_s
@@ -140,7 +140,7 @@ class RecorderNode:
             self._begin_new_run()
 
     async def _write(self) -> None:
-        """Close a chunk at intervals and sync it to the disk, until nothing can be written any more."""
+        """Close chunks at intervals and sync them to the disk, until nothing more can be written."""
         while True:
             await asyncio.sleep(_FLUSH_S)
             self.file.flush()
@@ -152,10 +152,10 @@ class RecorderNode:
 
 
 def _own_name(site: int) -> tuple[str, IO[str]]:
-    """A name on MQTT that no other running recorder of this machine has. An earlier one may have had it.
+    """Choose and lock an MQTT name that no other running recorder of this machine has.
 
-    A recorder that was killed has left a session that the broker fills; the next one takes it over and ends it. A lock
-    that another user has made cannot be opened, and its name is skipped.
+    A killed recorder leaves a session that the broker fills; the next one takes it over and ends it. A lock of another
+    user cannot be opened, and its name is skipped.
 
     Raises:
         SkylessError: there is no folder for temporary files, or too many recorders run.
@@ -169,9 +169,9 @@ def _own_name(site: int) -> tuple[str, IO[str]]:
 
 
 def _client_key() -> str:
-    """Random, and the same for all recorders of this user on this machine, so that a later one has the same session.
+    """A random key shared by all of this user's recorders on this machine, so that a later one has the same session.
 
-    Where it cannot be kept it is new each time: then the session of a recorder that was killed stays at the broker.
+    If it cannot be stored, it is new each time, and the session of a killed recorder stays at the broker.
     """
     key = secrets.token_hex(16)
     with contextlib.suppress(OSError, UnicodeError):

@@ -33,7 +33,7 @@ RECEPTIONS_S: Final = 0.05
 """Interval of the messages with raw receptions."""
 
 VERIFIED_S: Final = 2.0
-"""Beacons that were received before this time do not count as verified any more."""
+"""Beacons received longer ago than this no longer count as verified."""
 
 HealthListener = Callable[[TagHealth, SiteListener], None]
 """Called with a tag's state, and with its receiver, which knows the site."""
@@ -45,18 +45,18 @@ class TagSettings(Struct, frozen=True):
     method: str = DEFAULT_METHOD
     qa: float = 0.3
     site: int | None = None
-    """The only site to listen to, or None for the first that is heard."""
+    """The only site to listen to; None for the first that is heard."""
     integrity: IntegrityRequirement = IntegrityRequirement()
     publish_hz: float = 50.0
-    """Largest rate of fixes on MQTT. All of them count."""
+    """Largest rate of fixes on MQTT; ``serial`` counts all fixes."""
     trust: SiteTrust | None = None
-    """Which beacons and fixes are accepted, or None for a tag that does not know the site's public key."""
+    """Which beacons and fixes are accepted; None without the site's public key."""
     from_board: bool = False
-    """The boards compute, with settings of their own; of the others only ``publish_hz`` counts."""
+    """Whether boards compute with settings of their own, so that only ``publish_hz`` is used here."""
 
 
 class TagNode:
-    """Runs a receiver on a radio. ``publish`` is called with the fixes that are to be published."""
+    """Runs a receiver on a radio. ``publish`` is called with the fixes to be published."""
 
     def __init__(
         self,
@@ -68,7 +68,7 @@ class TagNode:
         clock: Callable[[], float] | None = None,
         memory: TagMemory | None = None,
     ) -> None:
-        """``before`` is called before each reception that is processed: with receiver, reception and number of fixes.
+        """``before`` is called before each reception with receiver, reception and number of fixes.
 
         ``clock`` gives the host's monotonic time in s, as ``host_s`` of the receptions; None for ``time.monotonic``.
         ``memory``: what is known of the site's keys from earlier runs.
@@ -89,17 +89,17 @@ class TagNode:
         self.monitor = RadioMonitor(f"tag {self.name}", "listening", log, radio.advice)
 
     def new_receiver(self) -> AnyReceiver:
-        """A receiver that has heard nothing yet."""
+        """Create a receiver that has heard nothing yet."""
         asked = self.settings
         return AnyReceiver(asked.method, site=asked.site, qa=asked.qa, integrity=asked.integrity)
 
     def _new_verified_receiver(self) -> Receiver:
-        """A receiver for verified beacons, which only protocol 2 has."""
+        """Create a receiver for verified beacons, which only protocol 2 has."""
         asked = self.settings
         return Receiver(site=asked.site, qa=asked.qa, integrity=asked.integrity)
 
     def _new_trusted(self) -> TrustedReceiver | None:
-        """What verifies beacons, with all that is remembered of the site's keys, or None without a public key."""
+        """Create the verifier of beacons, with the remembered keys of the site; None without a public key."""
         trust = self.settings.trust
         if trust is None:
             return None
@@ -109,7 +109,7 @@ class TagNode:
 
     @property
     def receiver(self) -> SiteListener:
-        """The one whose fixes are given."""
+        """The receiver whose fixes are published."""
         return self._hearing if self._board is None else self._board
 
     @property
@@ -118,7 +118,7 @@ class TagNode:
 
     @property
     def drops(self) -> Counter[str]:
-        """What could not be used, by reason."""
+        """Unusable receptions, by reason."""
         counters = self.receiver.counters.items()
         dropped = Counter({reason: count for reason, count in counters if reason not in NOT_DROPS})
         refused = Counter[str]() if self._trusted is None else self._trusted.counters
@@ -126,13 +126,13 @@ class TagNode:
 
     @property
     def reason(self) -> str:
-        """Why there is no fix, where there is none."""
+        """Why there is no fix, if there is none."""
         trusted = self._trusted
         needs_trust = trusted is not None and trusted.trust.trust is not Trust.OPEN
         return (trust_reason(trusted) if trusted and needs_trust else None) or str(self.receiver.reason)
 
     def complete(self, health: TagHealth) -> TagHealth:
-        """A tag's state with what it knows of phases, of multipath and of verified beacons."""
+        """Add phases, multipath and verification to a tag's state."""
         trusted, phases = self._trusted, self.receiver.phase_anchors
         health = replace(health, carrier_phase_anchors=phases, on_board=self._board is not None)
         if (multipath := self.receiver.multipath_m) is not None:
@@ -148,7 +148,7 @@ class TagNode:
         )
 
     def check_trust(self) -> None:
-        """Log what has changed of verified beacons, and remember what is known of the site's keys."""
+        """Log changes in the verification of beacons, and remember the site's keys."""
         trusted = self._trusted
         if trusted is None or self._report is None:
             return
@@ -160,7 +160,7 @@ class TagNode:
         return trusted.is_verified and self._clock() - self._heard_s < VERIFIED_S
 
     def check_reception(self, now_s: float) -> None:
-        """Log where to look if nothing usable comes, and, once, ranges that change more than the site file states.
+        """Log likely causes if nothing usable comes and, once, ranges that vary more than the site file states.
 
         ``now_s`` is the host's monotonic clock.
         """
@@ -212,7 +212,7 @@ class TagNode:
             self.fix_log.add(fix, event.host_s - report.latency_s, event.host_s)
 
     def _fixes_of(self, reception: Reception) -> list[GivenFix]:
-        """The fixes that a reception makes possible."""
+        """Return the fixes that a reception makes possible."""
         if self._trusted is not None:
             host_s = reception.host_s
             unix_s = time.time() if host_s is None else host_s + self.fix_log.unix_less_host_s
@@ -285,7 +285,7 @@ class Tag:
         self.reception_log.counters["bad-request"] += 1
 
     def publish_receptions(self) -> None:
-        """Publish the raw receptions that were requested and are due."""
+        """Publish the requested raw receptions that are due."""
         if self.link is None:
             return
         unix_less_host_s = self.node.fix_log.unix_less_host_s

@@ -1,7 +1,7 @@
 """Servers of this machine: who may ask them, and their limits.
 
-A page of another site reaches a server on the same computer or network in two ways. It asks for its address, and the
-browser names that site as ``Origin``; or it lets its own name point to this address (DNS rebinding), and the browser
+A page of another site can reach a server on the same computer or network in two ways. It requests the server's address,
+and the browser sends that site as ``Origin``; or its own name resolves to this address (DNS rebinding), and the browser
 sends that name as ``Host``.
 """
 
@@ -20,7 +20,7 @@ _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[a-z0-9._-]+)(?::\d{1,5})?")
 def is_own_host(host: str, names: Collection[str] = (), *, remote: bool) -> bool:
     """Whether a ``Host`` is a name of this server: ``localhost``, one of ``names``, or an address.
 
-    ``remote``: whether other machines can reach it. Then it may be any IP address, otherwise a loopback one.
+    ``remote``: whether other machines can reach it. Then any IP address is allowed, otherwise only a loopback one.
     """
     match = _HOST.fullmatch(host.lower())
     if match is None:
@@ -36,13 +36,13 @@ def is_own_host(host: str, names: Collection[str] = (), *, remote: bool) -> bool
 
 
 def own_names(host: str) -> frozenset[str]:
-    """Names of a server that listens at this host: that one, and those of this computer."""
+    """Names of a server that listens on this host: the host itself, and the names of this computer."""
     node = platform.node().lower()
     return frozenset({host.lower(), node, f"{node.partition('.')[0]}.local"})
 
 
 def same_origin(origin: str, host: str) -> bool:
-    """Whether the page that asks comes from this server itself."""
+    """Whether the requesting page comes from this server itself."""
     try:
         parts = urlsplit(origin.lower())
     except ValueError:
@@ -51,7 +51,7 @@ def same_origin(origin: str, host: str) -> bool:
 
 
 def is_local_origin(origin: str) -> bool:
-    """Whether the page that asks comes from a server of this computer."""
+    """Whether the requesting page comes from a server on this computer."""
     try:
         parts = urlsplit(origin.lower())
         return parts.scheme in {"http", "https"} and is_own_host(parts.netloc, remote=False)

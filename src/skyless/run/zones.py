@@ -1,7 +1,7 @@
 """Zones: their list, and when tags enter and leave them.
 
-No I/O; the time is passed in. Noise at an edge causes no series of events: a tag has crossed the edge when its fix
-lies beyond it by the margin, or by half of the margin in every fix for a while. In between, it stays on its side.
+No I/O; the time is passed in. Noise at an edge must not cause a series of events: a tag has crossed the edge when its
+fix is beyond it by the margin, or by half of the margin in every fix for a while. Otherwise it stays on its side.
 """
 
 import math
@@ -25,9 +25,8 @@ from skyless.run.mqtt.messages import (
     read_message,
 )
 
-# Zones as polygons (corners in order, metres), and lists of them: which are valid, and which belong to a site.
-#
-# Plain arithmetic: bridges and the page's server start without NumPy.
+# Zones as polygons (corners in order, metres): validation, and which of them belong to a site. Plain arithmetic, as
+# bridges and the page's server start without NumPy.
 
 Point = tuple[float, float]
 Polygon = tuple[Point, ...]
@@ -37,7 +36,8 @@ _MAX_CORNERS: Final = 100
 _MAX_CORNER_M: Final = 1e5
 
 MAX_OTHER_SITES: Final = 20
-"""Other sites of one number whose zones are kept; the ones not seen for longest are dropped."""
+"""Largest number of other sites with the same number whose zones are kept; the ones not seen for longest are dropped.
+"""
 
 _ID: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _COLOUR: Final = re.compile(r"#[0-9A-Fa-f]{3,8}|[A-Za-z]{1,32}")
@@ -49,7 +49,7 @@ def area_m2(polygon: Polygon) -> float:
 
 
 def signed_area_m2(polygon: Polygon) -> float:
-    """The same, negative where the corners go clockwise."""
+    """Area, negative if the corners go clockwise."""
     return 0.5 * sum(x1 * y2 - x2 * y1 for (x1, y1), (x2, y2) in sides(polygon))
 
 
@@ -101,7 +101,7 @@ def _turn(a: Point, b: Point, c: Point) -> float:
 
 
 def read_zones(payload: bytes) -> ZonesMessage:
-    """A ``ZonesMessage`` in JSON, all its zones checked. Raises WrongMessageError."""
+    """Read a ``ZonesMessage`` in JSON and check its zones. Raises WrongMessageError."""
     message = read_message(payload, ZonesMessage)
     for zones in (message.zones, *(other.zones for other in message.others)):
         check_zones(zones)
@@ -109,9 +109,9 @@ def read_zones(payload: bytes) -> ZonesMessage:
 
 
 def zones_of(message: ZonesMessage, site: str) -> ZonesMessage:
-    """The same for the site of this name: its zones first, those of others kept.
+    """Select the zones of the site of this name, keeping those of other sites apart.
 
-    Zones of which no site is known become this one's; an empty name is a site that is not known yet.
+    Zones of an unknown site become this one's; an empty name is a site that is not known yet.
     """
     if message.site in ("", site) or not site:
         return ZonesMessage(message.zones, message.site or site, message.others)
@@ -154,27 +154,27 @@ def _faults(zone: Zone) -> Iterator[str]:
 MIN_MARGIN_M: Final = 0.05
 _MIN_FLOOR_MARGIN_M: Final = 0.1
 _MARGIN_SIGMAS: Final = 3.0
-"""Margins in standard deviations of the fix, for a zone in its worst direction; they are at least those above."""
+"""Margins in standard deviations of the fix in a zone's worst direction, at least those above."""
 
 CROSSING_S: Final = 0.3
 """Fixes beyond the edge by half of the margin must last this long."""
 
 TAG_TIMEOUT_S: Final = 3.0
-"""A tag without a fix for this long has left."""
+"""A tag without a fix for this long counts as having left."""
 
 
 class _MonitoredZone:
-    """A zone with figures that are computed once."""
+    """A zone with precomputed values."""
 
     def __init__(self, zone: Zone) -> None:
         self.zone = zone
         xs, ys = zip(*zone.polygon_m, strict=True)
         self.box: tuple[float, float, float, float] = (min(xs), min(ys), max(xs), max(ys))
-        # So that a zone smaller than the error can be entered; for a disc it is half of the radius.
+        # Lets a zone smaller than the error be entered; for a disc it is half of the radius.
         self.max_margin_m = area_m2(zone.polygon_m) / perimeter_m(zone.polygon_m)
 
     def beyond_m(self, tag: "_TagState") -> float:
-        """How far a tag has crossed the edge, from the side where it was; negative where it has not."""
+        """How far a tag is beyond the edge, seen from the side where it was; negative if it is not."""
         x1, y1, x2, y2 = self.box
         x, y, _ = tag.position_m
         was_inside = self.zone.id in tag.inside
@@ -194,9 +194,9 @@ class _TagState(Struct):
     position_m: Vector = (0.0, 0.0, 0.0)
     inside: set[str] = set()
     floor: int | None = None
-    """The number of its floor; None where its height or the floors are not known."""
+    """Number of its floor; None if its height or the floors are unknown."""
     beyond_since_s: dict[str, float] = {}
-    """By zone: start of the time in which every fix was beyond its edge by half of the margin."""
+    """Since when every fix was beyond the edge by half of the margin, by zone."""
 
 
 class ZoneMonitor:
@@ -205,12 +205,12 @@ class ZoneMonitor:
     def __init__(self) -> None:
         self.zones: tuple[Zone, ...] = ()
         self.floors: tuple[FloorSite, ...] = ()
-        """The site's; a tag whose height is known is in zones of its floor only, and in those over all floors."""
+        """The site's floors. A tag of known height is only in zones of its floor, and in those over all floors."""
         self._monitored: dict[str, _MonitoredZone] = {}
         self._tags: dict[str, _TagState] = {}
 
     def set_zones(self, zones: tuple[Zone, ...], unix_s: float) -> list[ZoneEvent]:
-        """Monitor other zones; tags in a removed zone leave it."""
+        """Replace the monitored zones; tags in a removed zone leave it."""
         old = self._monitored
         self.zones = zones
         self._monitored = {zone.id: _MonitoredZone(zone) for zone in zones}
@@ -223,7 +223,7 @@ class ZoneMonitor:
         return events
 
     def update(self, fix: FixMessage, now_s: float) -> list[ZoneEvent]:
-        """Process a fix; ``now_s`` is its time of arrival, by the clock of ``expire_tags``."""
+        """Process a fix; ``now_s`` is its time of arrival, on the clock of ``expire_tags``."""
         tag = self._tags.get(fix.tag) or self._tags.setdefault(fix.tag, _TagState())
         tag.updated_s, tag.position_m = now_s, fix.position_m
         std_z_m = math.sqrt(max(fix.covariance_m2[8], 0.0))
@@ -235,17 +235,17 @@ class ZoneMonitor:
         ]
 
     def hear(self, name: str, now_s: float) -> None:
-        """A tag has had a fix that is not given to ``update``."""
+        """Note that a tag has had a fix that is not passed to ``update``."""
         if name in self._tags:
             self._tags[name].updated_s = now_s
 
     def expire_tags(self, now_s: float, unix_s: float) -> list[ZoneEvent]:
-        """Remove tags that had no fix for ``TAG_TIMEOUT_S`` from their zones."""
+        """Remove tags without a fix for ``TAG_TIMEOUT_S`` from their zones."""
         expired = [name for name, tag in self._tags.items() if now_s - tag.updated_s >= TAG_TIMEOUT_S]
         return [event for name in expired for event in self.remove_tag(name, unix_s)]
 
     def zones_with(self, name: str) -> list[Zone]:
-        """The zones that a tag is in, the smallest first."""
+        """The zones that a tag is in, smallest first."""
         inside = self._tags[name].inside if name in self._tags else set()
         return sorted((self._monitored[zone].zone for zone in inside), key=lambda zone: area_m2(zone.polygon_m))
 
@@ -258,10 +258,10 @@ class ZoneMonitor:
 
 
 def floor_at(floors: tuple[FloorSite, ...], z_m: float, std_m: float, before: int | None) -> int | None:
-    """The number of the floor at a height, whose standard deviation is given; None at a site without floors.
+    """Number of the floor at a height with a standard deviation; None at a site without floors.
 
-    A tag stays on the floor where it was before until it is beyond the boundary by the margin, so that noise on a
-    ladder or a stair changes nothing. The margin is at most a third of the height between two floors.
+    A tag stays on its previous floor until it is beyond the boundary by the margin, so that noise on a ladder or a
+    stair changes nothing. The margin is at most a third of the height between two floors.
     """
     if not floors:
         return None

@@ -1,4 +1,4 @@
-"""The file of a site's line to a hub: ``skyless hub init`` writes it, ``skyless broker --hub`` reads it."""
+"""The file with a site's connection to a hub: ``skyless hub init`` writes it, ``skyless broker --hub`` reads it."""
 
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
@@ -12,11 +12,11 @@ Kind = TypeVar("Kind")
 
 
 PING_INTERVAL: Final = "10s"
-"""nats-server gives a connection up after two pings without an answer, of 2 minutes each without this."""
+"""nats-server gives up a connection after two unanswered pings, by default of 2 minutes each."""
 
 
 class StuckLineError(Exception):
-    """nats-server does not try to reach the hub any more (nats-server #7615): it is to be started again."""
+    """nats-server no longer tries to reach the hub (nats-server #7615) and must be restarted."""
 
 
 class Leaf(Struct, frozen=True, kw_only=True):
@@ -30,10 +30,10 @@ class Leaf(Struct, frozen=True, kw_only=True):
     user: str
     password: str
     ca: str | None
-    """Certificates to trust, an absolute path; None without TLS."""
+    """Path of the certificates to trust, absolute; None without TLS."""
 
     def configuration(self) -> dict[str, Any]:
-        """What nats-server needs. MQTT's own subjects stay at the site: sites of a tenant share its account."""
+        """Settings for nats-server. MQTT's own subjects stay at the site, as a tenant's sites share its account."""
         urls = [url.replace("://", f"://{self.user}:{self.password}@", 1) for url in self.urls]
         remote: dict[str, Any] = {"urls": urls, "deny_imports": ["$MQTT.>"], "deny_exports": ["$MQTT.>"]}
         if self.ca is not None:
@@ -42,7 +42,7 @@ class Leaf(Struct, frozen=True, kw_only=True):
 
 
 def read_json(file: Path, kind: type[Kind], maker: str) -> Kind:
-    """A file of a hub. Raises SkylessError: it cannot be read, or ``maker`` has not made it."""
+    """Read a file of a hub. Raises SkylessError if it cannot be read or was not made by ``maker``."""
     try:
         return msgspec.json.decode(file.read_bytes(), type=kind)
     except (OSError, msgspec.DecodeError, UnicodeError) as error:

@@ -1,4 +1,4 @@
-"""The gather of a site: takes fixes from the subjects of MQTT, and puts them into the stream of the site in batches."""
+"""The gather of a site: takes fixes from MQTT's subjects, and puts them into the site's stream in batches."""
 
 import asyncio
 import contextlib
@@ -28,14 +28,12 @@ from skyless.run.mqtt.connection import RefusedError, kept_messages, trouble_wit
 from skyless.run.mqtt.messages import FixMessage, SiteMessage, StatusMessage, WrongMessageError, read_message
 from skyless.run.process import Log, together
 
-# Fixes of one site from JSON to batches. No I/O: the caller passes in the time.
-
 MAX_WAITING: Final = 100_000
-"""Fixes that wait for the stream. The oldest are dropped beyond it, and counted."""
+"""Largest number of fixes waiting for the stream; the oldest are dropped and counted beyond it."""
 
 
 class Packer:
-    """Takes fixes one by one and gives them in batches. ``run`` is the random number of this start."""
+    """Packs single fixes into batches. No I/O: times are passed in. ``run`` is the random number of this start."""
 
     def __init__(self, run: int) -> None:
         self.fixes, self.simulated = 0, False
@@ -47,11 +45,11 @@ class Packer:
 
     @property
     def waiting(self) -> int:
-        """Fixes that are in no batch yet."""
+        """Number of fixes not in a batch yet."""
         return len(self._waiting) + len(self._next)
 
     def add(self, name: str, payload: bytes) -> None:
-        """Add a ``FixMessage`` in JSON that came under a tag's name. What cannot be used is counted in ``drops``."""
+        """Add a ``FixMessage`` in JSON received under a tag's name. Unusable ones are counted in ``drops``."""
         try:
             fix = self._decoder.decode(payload)
         except (msgspec.MsgspecError, ValueError, RecursionError):
@@ -66,13 +64,13 @@ class Packer:
         self._waiting.append(fix)
 
     def next_tags(self) -> list[str]:
-        """The tag of each fix of the next batch: of the oldest that wait. They need numbers first."""
+        """The tag of each fix of the next batch, oldest first. These tags need numbers first."""
         if not self._next:
             self._next = [self._waiting.popleft() for _ in range(min(len(self._waiting), MAX_RECORDS))]
         return [fix.tag for fix in self._next]
 
     def next_batch(self, numbers: Mapping[str, int], issue: int, now_unix_s: float) -> Batch | None:
-        """The fixes of ``next_tags``; None where none of these tags has a number."""
+        """Return the fixes of ``next_tags`` as a batch; None if none of these tags has a number."""
         fixes, self._next = self._next, []
         taken = [(numbers[fix.tag], fix) for fix in fixes if fix.tag in numbers]
         if len(taken) < len(fixes):
@@ -83,12 +81,11 @@ class Packer:
         return Batch(self._run, next(self._sequences), round(1e6 * now_unix_s), issue, records)
 
 
-# The condition of a site in one word with its reasons, from what passes a gather. No I/O.
-#
-# It is coarser than that of the site's page, which reads every health: it is for a list of many sites.
+# Condition of a site in one word with reasons, from what passes a gather. It is coarser than the page's, for lists of
+# sites.
 
 HEARD_S: Final = 10.0
-"""A tag without a fix for so long is not heard."""
+"""A tag without a fix for this long is not heard."""
 _DROPS_S: Final = 60.0
 _MAX_WAITING: Final = 5_000
 _MAX_NAMED: Final = 3
@@ -97,7 +94,7 @@ ConditionWord = Literal["good", "degraded", "bad"]
 
 
 class SiteCondition:
-    """What a gather knows of its site."""
+    """What a gather knows about its site. No I/O."""
 
     def __init__(self, now_s: float) -> None:
         self.site: SiteMessage | None = None
@@ -107,7 +104,7 @@ class SiteCondition:
         self._dropped: deque[tuple[float, int]] = deque()
 
     def on_message(self, kind: str, name: str, payload: bytes) -> None:
-        """Take the site, or a program's status. One that cannot be read changes nothing, or says that it is offline."""
+        """Process a site or a program's status. Unreadable ones are ignored, or count as offline."""
         with contextlib.suppress(WrongMessageError):
             if kind == "site":
                 self.site = read_message(payload, SiteMessage)
@@ -116,7 +113,7 @@ class SiteCondition:
                 self._programs[kind, name] = read_message(payload, StatusMessage)
 
     def on_batch(self, records: Records, now_s: float) -> None:
-        """Take the fixes of a batch of this gather or of another program."""
+        """Process the fixes of a batch of this gather or another program."""
         self._heard_s.update(dict.fromkeys(records["tag"].tolist(), now_s))
 
     def online(self) -> dict[str, int]:
@@ -152,7 +149,7 @@ class SiteCondition:
         return "bad" if bad else "degraded" if degraded else "good", bad + degraded
 
     def _offline_anchors(self) -> list[str]:
-        """Anchors of the site that have said that they are offline, or whose broker has said so."""
+        """Anchors of the site that are offline by their own status or the broker's last will."""
         names = [] if self.site is None else [str(anchor.id) for anchor in self.site.site.anchors]
         found = ((name, self._programs.get(("anchor", name))) for name in names)
         return [name for name, status in found if status is not None and not status.online]
@@ -206,7 +203,7 @@ class Gather:
     def __init__(
         self, address: NatsAddress, site: int | None, keep_bytes: int, log: Log, broker: MqttAddress | None = None
     ) -> None:
-        """``site`` None: the first site of which anything is heard. ``broker`` is the same server's for MQTT."""
+        """``site`` None: the first site that is heard. ``broker`` is the same server's MQTT address."""
         self.site = site
         self._address, self._keep_bytes, self._log, self._broker = address, keep_bytes, log, broker
         self._say = rarely(log)
@@ -246,7 +243,7 @@ class Gather:
         )
 
     async def run(self) -> None:
-        """Gather until cancelled. What waits is sent before the end."""
+        """Gather until cancelled, then send what is waiting."""
         client = self._client = await connect(self._address, "skyless gather", self._say, self._packer.drops)
         stream = client.jetstream()
         try:
@@ -289,7 +286,7 @@ class Gather:
     # Sending
 
     async def _send(self, stream: JetStreamContext, site: int) -> None:
-        """Send for ever. While the server cannot take fixes, they wait."""
+        """Send until cancelled. Fixes wait while the server cannot take them."""
         while True:
             try:
                 await make_streams(stream, site, self._keep_bytes)
@@ -306,7 +303,7 @@ class Gather:
                 await asyncio.sleep(_RETRY_S)
 
     async def _copy_state(self, stream: JetStreamContext, site: int) -> None:
-        """Read the state that the stream has. What the broker has kept from before the stream was made is put there."""
+        """Read the state from the stream, and copy there what the broker retained before the stream was made."""
         state, known = subjects.at(subjects.STATE_STREAM, site), set[str]()
         async for message in messages(stream, state):
             known.add(message.subject)
@@ -326,9 +323,9 @@ class Gather:
                     await stream.publish(subject, payload, headers=dict(NEVER_WRITTEN))
 
     async def _send_waiting(self, stream: JetStreamContext, site: int, names: Names) -> None:
-        """Send until nothing waits. A batch counts as sent when the stream has acknowledged it.
+        """Send until nothing waits. A batch counts as sent once the stream has acknowledged it.
 
-        A batch that the stream refuses, as on a full disk, has reached those who read now, and is not sent again.
+        A batch that the stream refuses, as on a full disk, has reached live readers and is not sent again.
         """
         subject = subjects.at(subjects.FIXES, site, self._host)
         while self._ready is not None or (tags := self._packer.next_tags()):
@@ -345,7 +342,7 @@ class Gather:
                 self._ready = None
 
     async def _leave(self, fixes: Subscription, stream: JetStreamContext, site: int) -> None:
-        """Take no more, and send what has come; another gather gets the rest at once."""
+        """Stop taking fixes, and send those that have come; another gather gets the rest at once."""
         await fixes.drain()  # type: ignore[no-untyped-call]
         if self._names is not None:
             await self._send_waiting(stream, site, self._names)

@@ -36,7 +36,7 @@ KEEP_S: Final = 24 * 3600.0
 KEEP_EVENTS_S: Final = 365 * 24 * 3600.0
 EVENT_BYTES: Final = 500_000_000
 NEWEST_OF_EACH: Final[dict[str, Any]] = {"max_msgs_per_subject": 1, "allow_direct": True}
-"""Limits of a stream that keeps the newest message of each subject, which can be asked for."""
+"""Limits of a stream that keeps the newest message of each subject for direct requests."""
 
 _NO_ROOM: Final = 10047  # JetStream's code of an error
 _DUPLICATES_S: Final = 120.0
@@ -47,7 +47,7 @@ _RETRY_S: Final = 1.0
 
 
 async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -> None:
-    """Make the streams of a site, or set the limits of those that are there: what a hub takes from there.
+    """Make the streams of a site, or update the limits of existing ones; a hub copies from them.
 
     Raises:
         SkylessError: the server has no room for these bytes.
@@ -70,7 +70,7 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
 
 
 async def make_stream(stream: "JetStreamContext", config: StreamConfig) -> None:
-    """Make a stream, or change the one that is there: to add it again would reserve its bytes twice."""
+    """Make a stream, or change an existing one, as adding it again would reserve its bytes twice."""
     try:
         await stream.update_stream(config)
     except NotFoundError:
@@ -86,10 +86,10 @@ async def make_stream(stream: "JetStreamContext", config: StreamConfig) -> None:
 async def messages(
     stream: "JetStreamContext", name: str, after: int = 0, subject: str = ">"
 ) -> AsyncGenerator["Msg", None]:
-    """The messages of a stream after the one with this number, in order, until the last one that it has now.
+    """Yield the messages of a stream after the one with this number, in order, up to the current last one.
 
-    ``subject`` is the pattern of those that are wanted; ``message.metadata.sequence.stream`` is a message's number.
-    Raises nats.errors.Error: the stream is not there.
+    ``subject`` is the pattern of those wanted; ``message.metadata.sequence.stream`` is a message's number. Raises
+    nats.errors.Error if the stream does not exist.
     """
     state = (await stream.stream_info(name)).state
     if state.messages == 0 or state.last_seq <= after:
@@ -110,10 +110,10 @@ async def messages(
 async def follow(
     stream: "JetStreamContext", name: str, subject: str, say: Log, after: int = 0, *, newest_of_each: bool = False
 ) -> AsyncGenerator["Msg", None]:
-    """The messages of a stream after the one with this number, in order and each once, until cancelled.
+    """Yield the messages of a stream after the one with this number, in order and each once, until cancelled.
 
-    It waits for a stream that is not there, and goes on at another server when one is lost. ``subject`` is a pattern.
-    With ``newest_of_each`` it begins with the newest message of each subject.
+    Waits for a stream that does not exist yet, and reconnects to another server when one is lost. ``subject`` is a
+    pattern. With ``newest_of_each``, starts with the newest message of each subject.
     """
     while True:
         first = DeliverPolicy.LAST_PER_SUBJECT if newest_of_each else DeliverPolicy.ALL
@@ -138,7 +138,7 @@ async def follow(
 
 
 async def _next(reading: "JetStreamContext.PushSubscription", place: int) -> "Msg":
-    """The next message. Raises nats.errors.Error: it was lost with a connection, or the server has lost the reader."""
+    """Return the next message. Raises nats.errors.Error if the connection or the server's consumer is lost."""
     while True:
         try:
             return await reading.next_msg(_IDLE_S)
@@ -156,16 +156,16 @@ NEVER_WRITTEN: Final = {"Nats-Expected-Last-Subject-Sequence": "0"}
 
 
 class TagName(Struct, frozen=True):
-    """The name of a tag's number. A number is given once and never again."""
+    """Name for a tag's number. A number is never reused."""
 
     name: str
     host: str
-    """Where its fixes are packed."""
+    """Host on which its fixes are packed."""
     since_unix_s: float
 
 
 async def name_of(stream: "JetStreamContext", site: int, number: int) -> str:
-    """The name of a tag's number, empty where it has none. Raises nats.errors.Error."""
+    """Look up the name for a tag's number; empty if there is none. Raises nats.errors.Error."""
     names, subject = at(NAMES_STREAM, site), at(NAMES, site, number)
     try:
         message = await stream.get_last_msg(names, subject, direct=True)
@@ -175,17 +175,17 @@ async def name_of(stream: "JetStreamContext", site: int, number: int) -> str:
 
 
 class Names:
-    """Numbers and names of a site's tags. Every program that packs fixes gives numbers in this way."""
+    """Numbers and names of a site's tags; every program that packs fixes assigns numbers in this way."""
 
     def __init__(self, stream: "JetStreamContext", site: int) -> None:
         self.tags: dict[int, TagName] = {}
         self.numbers: dict[str, int] = {}
         self.issue = 0
-        """The largest number that was given. Readers that know fewer read the names again."""
+        """Largest number assigned. Readers that know fewer read the names again."""
         self._stream, self._site, self._read = stream, site, 0
 
     async def read(self) -> None:
-        """Read what the stream has that is not known here yet. Raises nats.errors.Error."""
+        """Read the entries of the stream that are not known here yet. Raises nats.errors.Error."""
         name, of_site = at(NAMES_STREAM, self._site), at(NAMES, self._site)
         async for message in messages(self._stream, name, self._read, of_site):
             self._read = message.metadata.sequence.stream
@@ -195,10 +195,10 @@ class Names:
                 self._add(number, msgspec.json.decode(message.data, type=TagName))
 
     async def give(self, names: Iterable[str], host: str, now_unix_s: float) -> None:
-        """Give numbers to those names that have none; a full table gives none. Raises nats.errors.Error.
+        """Assign numbers to the names without one; none if the table is full. Raises nats.errors.Error.
 
-        Several programs may do so. The stream takes each number once, and a program gives a number only when it knows
-        the names of all smaller ones, so no name has two.
+        Several programs may do so. The stream takes each number once, and a program assigns a number only when it knows
+        the names of all smaller ones, so no name gets two.
         """
         for name in dict.fromkeys(names):
             while name not in self.numbers and len(self.numbers) < MAX_NAMES:

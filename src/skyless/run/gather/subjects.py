@@ -56,11 +56,11 @@ STATE: Final = (
     "skyless.v1.{}.survey.placement",
     "skyless.v1.{}.survey.watch",
 )
-"""Retained messages of MQTT of which the newest matters."""
+"""Retained messages of MQTT of which only the newest matters."""
 
 
 EVENTS: Final = ("skyless.v1.{}.zone.*.event", "skyless.v1.{}.alarm.*.*.state")
-"""Messages of MQTT of which each is an event."""
+"""Messages of MQTT each of which is an event."""
 
 
 FIX_STREAM: Final = "FIX_{}"
@@ -74,36 +74,36 @@ STATE_STREAM: Final = "STATE_{}"
 
 EVENT_STREAM: Final = "EVENTS_{}"
 
-"""Streams of a site at its own server; a hub's have the same names, and there a reader asks for the site's subjects."""
+"""Streams of a site at its own server. A hub's have the same names; readers there ask for the site's subjects."""
 
 
 SOURCED: Final = "sourced.{}"
-"""How the subjects begin under which a site's messages come to the streams of a hub."""
+"""Prefix of the subjects under which a site's messages reach a hub's streams."""
 
 
 DOMAIN: Final = "site{}"
-"""JetStream's domain of a site."""
+"""JetStream domain of a site."""
 
 
 NAME_REQUESTS: Final = "$JS.API.DIRECT.GET.*.skyless.v2.*.names.*"
-"""Where the server is asked for the name of one number."""
+"""Where to ask the server for the name for one number."""
 
 
 PAGE_INBOX: Final = "_INBOX_PAGE"
-"""How the subjects begin under which pages are answered."""
+"""Prefix of the subjects of answers to pages."""
 
 
 EVERY: Final = "*"
 
 
 def at(pattern: str, site: int | str, last: int | str = "") -> str:
-    """A subject or stream of a site, with its last level where the pattern leaves it open."""
+    """A subject or stream of a site, with its last level filled in if the pattern has one."""
     subject = pattern.format(site)
     return f"{subject[:-1]}{last}" if last else subject
 
 
 def own_host() -> str:
-    """Name of the own computer as one level of a subject."""
+    """Name of this computer as one level of a subject."""
     return re.sub(r"[^A-Za-z0-9_-]", "-", platform.node()) or "host"
 
 
@@ -113,18 +113,18 @@ def tag_in(subject: str) -> str:
 
 
 def subject_of(topic: str) -> str:
-    """The subject of a topic of MQTT, or the pattern of a topic filter."""
+    """Subject for an MQTT topic, or pattern for a topic filter."""
     levels = (level.replace(".", "//") for level in topic.split("/"))
     return ".".join("*" if level == "+" else level for level in levels)
 
 
 def topic_of(subject: str) -> str:
-    """The topic of MQTT of a subject."""
+    """MQTT topic for a subject."""
     return "/".join(level.replace("//", ".") for level in subject.split("."))
 
 
 def site_in(subject: str) -> int | None:
-    """Number of the site in a subject, or None where it has none."""
+    """Number of the site in a subject, or None."""
     level = subject.split(".")[2]
     return int(level) if level.isdecimal() and len(level) < 6 else None
 
@@ -133,7 +133,7 @@ FIRST_PORT: Final = 4222
 
 
 MAX_PAYLOAD: Final = 8 * 1024 * 1024
-"""Bytes of a message, such as a floor plan, that a site's server and a hub take."""
+"""Largest message in bytes, such as a floor plan, that a site's server and a hub take."""
 
 
 _FIND_AGAIN_S: Final = 0.5
@@ -143,14 +143,14 @@ _CONNECT_S: Final = 2
 
 
 _PING_S: Final = 5
-"""Two pings without an answer, and another server is tried."""
+"""After two unanswered pings another server is tried."""
 
 
 _SAME_TROUBLE_S: Final = 30.0
 
 
 class NatsAddress(Struct, frozen=True):
-    """A NATS server, or those of a hub; its ``str()`` never shows the password."""
+    """One NATS server, or those of a hub; ``str()`` never shows the password."""
 
     url: str
     """Without user and password, as nats://127.0.0.1:4222; of a hub as nats://a:4222,b:4222."""
@@ -166,7 +166,7 @@ class NatsAddress(Struct, frozen=True):
         return [f"{scheme}://{host}" for host in hosts.split(",")]
 
     def tls_context(self) -> ssl.SSLContext | None:
-        """The checks of the servers' certificates; None without TLS. Raises SkylessError: the file cannot be used."""
+        """TLS settings for the servers; None without TLS. Raises SkylessError if ``ca`` cannot be used."""
         return tls_context(self.ca) if self.url.startswith("tls:") else None
 
     def __str__(self) -> str:
@@ -177,12 +177,12 @@ class NatsAddress(Struct, frozen=True):
 
 
 def nats_address(url: str, option: str = "--nats", ca: Path | None = None) -> NatsAddress:
-    """The server of a URL, or the servers of a hub; the password may also be in ``SKYLESS_MQTT_PASSWORD``.
+    """Parse the URL of a server, or of a hub's servers; the password may also be in ``SKYLESS_MQTT_PASSWORD``.
 
     Several are separated by commas: ``tls://plant@a,b:4223,c``.
 
     Raises:
-        SkylessError: with what would be right; it never shows the password.
+        SkylessError: with what would be right, never showing the password.
     """
     right = f"nats://[USER@]HOST[:PORT] or tls://[USER@]HOST[:PORT], as nats://127.0.0.1:{FIRST_PORT}"
     fault = SkylessError(f"{option} is {hide_password(url)!r}; it should be {right}")
@@ -205,7 +205,7 @@ def nats_address(url: str, option: str = "--nats", ca: Path | None = None) -> Na
 
 
 def rarely(log: Log) -> Log:
-    """Log each trouble once, and again every half minute while it lasts."""
+    """Log each problem once, and again every half minute while it lasts."""
     said_s: dict[str, float] = {}
 
     def say(trouble: str) -> None:
@@ -218,9 +218,9 @@ def rarely(log: Log) -> Log:
 
 
 async def connect(address: NatsAddress, name: str, say: Log, drops: Counter[str], inbox: str = "_INBOX") -> "Client":
-    """A connection, made again whenever it is lost; waits for a server that is not there yet.
+    """Connect, reconnecting whenever the connection is lost; wait for a server that is not there yet.
 
-    ``inbox`` is how the subjects of answers begin. Messages that came faster than they were read are counted under
+    ``inbox`` is the prefix of the subjects of answers. Messages that arrive faster than they are read are counted under
     ``unread``. Raises SkylessError without nats-py.
     """
     nats = extra_module("nats", "NATS")

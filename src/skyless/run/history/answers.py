@@ -12,8 +12,7 @@ from skyless.core.errors import SkylessError
 
 GAP_S: Final = 5.0
 THINNED_GAP_S: Final = 65.0
-"""Where a tag is after its last fix is known for this long; in days that are thinned a fix may be the only one of a
-minute."""
+"""How long a tag's position counts after its last fix in days that are thinned, where there may be one fix a minute."""
 
 
 class Span(Struct, frozen=True):
@@ -106,25 +105,23 @@ class AlarmRow(Struct, frozen=True):
     acknowledged_by: str
 
 
-# Ranges of time as people type them: "yesterday", "14:00", "2 hours ago", ISO dates, seconds since 1970.
-
 _EXAMPLES: Final = "a time such as 14:00, yesterday 8:00, 2 hours ago, 2026-01-31 06:00, or seconds since 1970"
 _TIMES_OF_DAY: Final = ("%H:%M", "%H:%M:%S", "%I:%M%p", "%I:%M %p", "%I%p", "%I %p")
 _EARLIEST_S: Final = 1e8
-"""Smaller numbers than this, in the year 1973, are rather an hour or a year. 0 is allowed: from the beginning."""
+"""Smaller numbers (before 1973) probably mean an hour or a year. 0 is allowed: from the beginning."""
 _LATEST_S: Final = 1e11
 """Larger numbers are milliseconds."""
 _AT_AN_HOUR: Final = re.compile(r"\bat (\d{1,2})$")
 
 
 def span_of(from_text: str, to_text: str | None, now_unix_s: float) -> Span:
-    """The range between two times, in the time zone of this machine where they name none.
+    """Parse the range between two times, in this machine's time zone where they name none.
 
-    A time of day without a date is today's, at the end of the range that of the day on which the range begins. A day
-    without a time means its beginning. Without ``to_text`` the range ends now.
+    A time without a date is today's; at the end of the range it is on the day on which the range begins. A day without
+    a time means its beginning. Without ``to_text`` the range ends now.
 
     Raises:
-        SkylessError: a text that is no time, a range that begins in the future, or ends before it begins.
+        SkylessError: a text is not a time, or the range begins in the future or ends before it begins.
     """
     now = datetime.fromtimestamp(now_unix_s)
     begin_s = _unix_s("from", from_text, now, now.date())
@@ -155,7 +152,7 @@ def _unix_s(name: str, text: str, now: datetime, day: date) -> float:
 
 
 def _read(text: str, now: datetime, day: date) -> datetime:
-    """A time with a zone, or without one, which is this machine's then. Raises ValueError."""
+    """Parse a time, in this machine's time zone if it names none. Raises ValueError."""
     for form in _TIMES_OF_DAY:
         with contextlib.suppress(ValueError):
             return datetime.combine(day, datetime.strptime(text, form).time())

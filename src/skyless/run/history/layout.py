@@ -24,8 +24,9 @@ FIX_COLUMNS: Final = {
     "hpl_cm": "uint16",
     "flags": "uint16",
 }
-"""Sorted by tag and t. ``std_mm`` is the one-sigma radial error, ``hpl_cm`` 65535 for no level; ``flags`` are those of
-a record of a batch (``run/fix_batch.py``)."""
+"""Sorted by tag and t. ``std_mm`` is the one-sigma radial error; ``hpl_cm`` is 65535 for no level; ``flags`` are those
+of a record of a batch (``run/fix_batch.py``).
+"""
 
 EVENT_COLUMNS: Final = {
     "t": "timestamp[ms, tz=UTC]",
@@ -36,9 +37,10 @@ EVENT_COLUMNS: Final = {
     "alarm": "string",
     "text": "string",
 }
-"""``kind`` is an ``EventKind``. ``tag`` and ``zone`` are the tag's name and the zone's identifier, null where there is
-none; ``subject`` is ``anchor-<id>``, or what an alarm is about; ``alarm`` is the alarm's id; ``text`` is for people,
-and of an acknowledgement who made it."""
+"""``kind`` is an ``EventKind``. ``tag`` is the tag's name and ``zone`` the zone's identifier, null if there is none;
+``subject`` is ``anchor-<id>`` or what an alarm is about; ``alarm`` is the alarm's id; ``text`` is for people, and names
+the person who acknowledged an alarm.
+"""
 
 EventKind = Literal["enter", "leave", "alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online"]
 
@@ -48,21 +50,21 @@ ZONE_COLUMNS: Final = {"zone": "string", "name": "string", "corners_m": "string"
 """``corners_m`` is a list of pairs in JSON."""
 
 THINNED: Final = b"skyless_thinned"
-"""The key in the metadata of files of old fixes, of which one in ten seconds or in a minute is kept."""
+"""Metadata key of files with thinned fixes: one every ten seconds or every minute."""
 
 
 def site_folder(folder: Path, site: int) -> Path:
-    """Everything of one site."""
+    """Folder of one site."""
     return folder / f"site={site}"
 
 
 def file_name(first: int, last: int) -> str:
-    """The name of a file with these rows."""
+    """Name of the file with these rows."""
     return f"{first:012}-{last:012}.parquet"
 
 
 def rows_of(file: Path) -> tuple[int, int] | None:
-    """First and last number in a file's name; None for another file."""
+    """First and last row number from a file's name; None for other files."""
     first, dash, last = file.stem.partition("-")
     if not dash or not (first.isdecimal() and last.isdecimal()):
         return None
@@ -70,26 +72,25 @@ def rows_of(file: Path) -> tuple[int, int] | None:
 
 
 def day_of(file: Path) -> str:
-    """The day in the name of a file's folder."""
+    """Day from the name of a file's folder."""
     return file.parent.name.removeprefix("day=")
 
 
 def current_files(folder: Path, site: int) -> tuple[Path, ...]:
-    """The files that hold all fixes once, by number.
+    """Files that together hold each fix once, by number.
 
-    A file may be joined into a larger one and removed after that. A reader that finds it gone should take the list
-    again.
+    A file may be joined into a larger one and then removed. A reader that finds it gone should list the files again.
     """
     return largest_files(site_folder(folder, site))
 
 
 def current_events(folder: Path, site: int) -> tuple[Path, ...]:
-    """The same of events."""
+    """Files that together hold each event once, by number."""
     return largest_files(site_folder(folder, site) / "events")
 
 
 def largest_files(folder: Path) -> tuple[Path, ...]:
-    """Files in a folder's days whose numbers are not all in another file."""
+    """Files in a folder's days whose rows are not all in another file."""
     found = [(rows[0], -rows[1], file) for file in folder.glob("day=*/*.parquet") if (rows := rows_of(file))]
     kept: list[Path] = []
     end = -1

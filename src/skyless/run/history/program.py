@@ -53,29 +53,32 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
 
-# Fixes of a large site for its history: from the stream that a gather fills, instead of from MQTT.
+# Fixes of a large site, from the stream that a gather fills instead of from MQTT.
 
 _PERIOD_S: Final = 0.2
 _STREAM_RETRY_S: Final = 2.0
 _MAX_WAITING: Final = 100_000
-"""While more rows than this wait for the disk, others stay in the stream."""
+"""While more rows than this wait for the disk, further ones are left in the stream."""
 _NAMES_S: Final = 60.0
-"""How long the names of a batch may come later than itself: at a hub, streams catch up one after the other."""
+"""How much later than a batch its names may come: a hub's streams catch up one after the other."""
 _MAX_SENDERS: Final = 1000
 
 
 class BatchTaker:
-    """Gives the batches of a stream to a history, each once."""
+    """Passes the batches of a stream to a history, each once."""
 
     def __init__(self, names: Names, writer: Writer, log: Log) -> None:
         self._names, self._writer, self._say = names, writer, rarely(log)
         self._sequences: dict[int, int] = {}
-        """The last sequence of each run of a sender."""
+        """Last sequence number of each run of a sender."""
         self._given_up = 0
-        """Names with numbers up to this did not come in time."""
+        """Largest number whose name did not come in time."""
 
     async def take(self, message: "Msg") -> None:
-        """Take the batch of a message, unless it is known. Waits for the disk, and for the names of its tags."""
+        """Take the batch of a message, unless it is already known.
+
+        Waits for the disk, and for the names of its tags.
+        """
         while self._writer.fixes.waiting > _MAX_WAITING:
             await asyncio.sleep(_PERIOD_S)
         place = message.metadata.sequence.stream
@@ -93,7 +96,7 @@ class BatchTaker:
         self._writer.fixes.add(self._renumbered(batch.records, now_s), now_s, place)
 
     def _is_next(self, batch: Batch) -> bool:
-        """Whether a batch is new. Those before it that the stream does not have any more are counted."""
+        """Whether a batch is new. Earlier ones that the stream no longer has are counted as lost."""
         before = self._sequences.pop(batch.run, None)
         self._sequences[batch.run] = max(batch.sequence, before or 0)
         if len(self._sequences) > _MAX_SENDERS:
@@ -118,7 +121,7 @@ class BatchTaker:
                 await asyncio.sleep(_PERIOD_S)
 
     def _renumbered(self, records: Records, now_s: float) -> Records:
-        """Records that are kept, with the numbers that this history gives to their tags; the others are counted."""
+        """Return the records to keep, with this history's numbers for their tags; count the others."""
         writer = self._writer
         given, rows = np.unique(records["tag"], return_inverse=True)
         tags = (self._names.tags.get(int(number)) for number in given)
@@ -132,7 +135,7 @@ class BatchTaker:
 
 
 async def first_place(stream: "JetStreamContext", name: str, intake: Intake, say: Log) -> int:
-    """The place in a stream up to which an intake has all. Waits for the stream."""
+    """Return the place in a stream up to which an intake is complete. Waits for the stream."""
     while True:
         try:
             last = (await stream.stream_info(name)).state.last_seq
@@ -147,9 +150,9 @@ async def first_place(stream: "JetStreamContext", name: str, intake: Intake, say
 
 
 async def take_batches(stream: "JetStreamContext", writer: Writer, say: Log) -> None:
-    """Give the batches of a site's stream to a history until cancelled, from where it stopped the last time.
+    """Pass the batches of a site's stream to a history until cancelled, from where it last stopped.
 
-    The place in the stream is kept together with the rows, so that each batch is taken once.
+    The place in the stream is stored together with the rows, so that each batch is taken once.
     """
     name, own = subjects.at(subjects.FIX_STREAM, writer.site), subjects.at(subjects.FIXES, writer.site)
     taker = BatchTaker(Names(stream, writer.site), writer, say)
@@ -158,7 +161,7 @@ async def take_batches(stream: "JetStreamContext", writer: Writer, say: Log) -> 
 
 
 async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:
-    """The same with a connection of its own."""
+    """Take the batches over a connection of its own."""
     say = rarely(log)
     client = await connect(address, "skyless history", say, writer.drops)
     try:
@@ -171,7 +174,9 @@ _STORE_S: Final = 0.1
 _SYNC_S: Final = 1.0
 _FIRST_FILE_S: Final = 30.0
 FILE_S: Final = 600.0
-"""The first files come soon, so that a new history can be asked, later ones after twice the time, up to this."""
+"""Longest interval between files. The first files come early, so that a new history can be queried; the interval then
+doubles up to this.
+"""
 _RETRY_S: Final = 10.0  # after a file could not be written
 
 
@@ -183,26 +188,26 @@ class HistoryState(Struct, frozen=True):
     events: int
     tags: int
     waiting: int
-    """Rows that are in no Parquet file yet."""
+    """Rows not in a Parquet file yet."""
     lost: int
-    """Rows that the disk did not take in time."""
+    """Rows dropped because the disk was too slow."""
     drops: dict[str, int]
-    """Messages that are not kept, by reason."""
+    """Messages that were not kept, by reason."""
     trouble: str | None
-    """Why there is no broker; None while there is one."""
+    """Why there is no connection to the broker; None while there is one."""
     disk: str | None
-    """Why nothing can be written; None while it can."""
+    """Why nothing can be written; None while writing works."""
 
 
 class SiteHistory:
-    """Keeps the history of one site, from whatever gives its messages."""
+    """Keeps the history of one site, from any source of its messages."""
 
     def __init__(self, writer: Writer, keep: Keep, log: Log) -> None:
-        """Raises SkylessError: the events of the past cannot be read."""
+        """Raises SkylessError if the past events cannot be read."""
         self.trouble: str | None = None
         """Why there are no messages."""
         self.event_place = 0
-        """Place in its source of the event that is handled next, where the source has places."""
+        """Place in the source of the next event, if the source has places."""
         self._writer, self._keep, self._log = writer, keep, log
         self._trouble: dict[str, str] = {}
         self._try("files", writer.write)  # so that all events of the past are in files
@@ -213,7 +218,7 @@ class SiteHistory:
         self._started_s = time.monotonic()
 
     def attach(self, subscribe: Callable[[str, Handler, int], None], *, fixes: bool) -> None:
-        """Subscribe to what is kept, with topic filters of MQTT; ``fixes``: also to single fixes."""
+        """Subscribe to what is kept, with topic filters of MQTT. ``fixes`` includes single fixes."""
         site = self._writer.site
 
         def on_wrong() -> None:
@@ -234,7 +239,10 @@ class SiteHistory:
         subscribe(topics.zones_topic(site), zones, 1)
 
     async def run(self, *sources: Coroutine[Any, Any, None]) -> None:
-        """Keep what the sources give. Finally it becomes files; what cannot waits in the journal for the next start."""
+        """Keep what the sources deliver.
+
+        At the end write files; what cannot be written waits in the journal for the next start.
+        """
         try:
             await together(*sources, every(_STORE_S, self._store), self._work())
         finally:
@@ -242,7 +250,7 @@ class SiteHistory:
             self._try("files", self._writer.close)
 
     def state(self) -> HistoryState:
-        """Progress so far."""
+        """Return the progress so far."""
         intakes = (self._writer.fixes, self._writer.events)
         return HistoryState(
             seconds=time.monotonic() - self._started_s,
@@ -280,7 +288,7 @@ class SiteHistory:
         self._try("journal", self._writer.store)
 
     async def _work(self) -> None:
-        """What another thread does: sync the journal, write files, tidy."""
+        """Sync the journal, write files and tidy up; runs in another thread."""
         due_s, file_s, tidied = time.monotonic() + _FIRST_FILE_S, _FIRST_FILE_S, None
         while True:
             await asyncio.sleep(_SYNC_S)
@@ -296,7 +304,7 @@ class SiteHistory:
                 await asyncio.to_thread(self._try, "daily work", work)
 
     def _try(self, what: str, act: Callable[[], None]) -> None:
-        """Do something with the disk; when its trouble begins and ends, a line says so."""
+        """Run a disk operation, and log when errors begin and end."""
         try:
             act()
         except (OSError, SkylessError) as error:
@@ -310,14 +318,14 @@ class SiteHistory:
 
 
 class HistoryNode:
-    """Keeps the history of one site of a broker until cancelled."""
+    """Keeps the history of one site on a broker until cancelled."""
 
     def __init__(
         self, writer: Writer, address: MqttAddress, keep: Keep, log: Log, nats: NatsAddress | None = None
     ) -> None:
-        """``nats`` is the server of a site with a gather, whose stream then gives the fixes.
+        """``nats`` is the server of a site with a gather, whose stream then delivers the fixes.
 
-        Raises SkylessError: the events of the past cannot be read.
+        Raises SkylessError if the past events cannot be read.
         """
         host = re.sub(r"[^A-Za-z0-9_.-]", "-", platform.node())
         name = f"{host}-{zlib.crc32(str(writer.folder.resolve()).encode()):08x}"
@@ -327,7 +335,7 @@ class HistoryNode:
         self._history.attach(self.link.subscribe, fixes=nats is None)
 
     async def run(self) -> None:
-        """Keep it until cancelled."""
+        """Keep the history until cancelled."""
         sources = [keep(self.link, self._log)]
         if self._nats is not None:
             sources.append(take_stream(self._nats, self._writer, self._log))
@@ -338,11 +346,11 @@ class HistoryNode:
         return replace(self._history.state(), trouble=self.link.trouble)
 
 
-# The history of the sites of a hub: fixes, events and the rest from its streams.
+# The history of a hub's sites: fixes, events and the rest from its streams.
 
 
 class _Site:
-    """One site that is kept, from its own streams: what they have under another site's subjects is not read."""
+    """One site that is kept, from its own streams only; their messages under another site's subjects are ignored."""
 
     def __init__(self, stream: "JetStreamContext", writer: Writer, keep: Keep, log: Log) -> None:
         self.writer, self.history = writer, SiteHistory(writer, keep, log)
@@ -351,7 +359,7 @@ class _Site:
         self.history.attach(self._subscriptions.add, fixes=False)
 
     async def run(self) -> None:
-        """Keep it until cancelled."""
+        """Keep the site's history until cancelled."""
         await self.history.run(self._take_state(), self._take_events(), self._take_fixes())
 
     async def _take_fixes(self) -> None:
@@ -377,7 +385,7 @@ class _Site:
 
 
 class HubHistory:
-    """Keeps the history of all sites of a tenant at a hub, or of one, until cancelled."""
+    """Keeps the history of all sites of a tenant at a hub, or of one site, until cancelled."""
 
     def __init__(self, folder: Path, address: NatsAddress, site: int | None, keep: Keep, log: Log) -> None:
         self._folder, self._address, self._keep, self._log = folder, address, keep, log
@@ -391,7 +399,7 @@ class HubHistory:
         self._tasks: asyncio.TaskGroup
 
     def state(self) -> HistoryState:
-        """Progress so far, of all sites."""
+        """Return the progress of all sites so far."""
         states = [site.history.state() for site in self._sites.values()]
         client = self._client
         is_connected = client is not None and (client.is_connected or client.is_closed)  # it is closed at the end
@@ -408,7 +416,7 @@ class HubHistory:
         )
 
     async def run(self) -> None:
-        """Keep it. Raises SkylessError: a folder of a site cannot be written."""
+        """Keep the histories. Raises SkylessError if a site's folder cannot be written."""
         client = self._client = await connect(self._address, "skyless history", self._say, self._drops)
         self._stream = client.jetstream()
         try:
@@ -429,7 +437,7 @@ class HubHistory:
             self._tasks.create_task(site.run())
 
     async def _find_sites(self, client: "Client") -> None:
-        """Keep all sites that the hub has."""
+        """Follow the list of sites at the hub."""
         while True:
             try:
                 for number in sorted(await sites_at(client)):
@@ -439,31 +447,31 @@ class HubHistory:
             await asyncio.sleep(LIST_S)
 
 
-# Recordings become history, without what it has already, from the same file or from the running site.
+# Import of recordings, without what the history already has.
 
 _CHUNK: Final = 100_000
 _MARGIN: Final = timedelta(days=1)
-"""A message may have arrived a little earlier or later at the running history."""
+"""How much earlier or later a message may have reached the running history."""
 
 
 class Imported(Struct, frozen=True):
-    """What became of a recording."""
+    """The result of importing a recording."""
 
     fixes: int
     known_fixes: int
-    """Those that the history had."""
+    """Fixes that the history already had."""
     events: int
     drops: dict[str, int]
 
 
 def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[float], None]) -> Imported:
-    """Write its fixes, zone events and zones. ``reach`` is called with the time that has been read, Unix time in s.
+    """Write a recording's fixes, zone events and zones. ``reach`` is called with the Unix time in s reached so far.
 
-    A tag has one fix in a millisecond.
+    A tag has at most one fix per millisecond.
 
     Raises:
         SkylessError: the history cannot be read.
-        OSError: the disk does not take it; what it took is there, and a repetition adds the rest.
+        OSError: the disk fails; what was written stays, and importing again adds the rest.
     """
     writer.write()  # what an earlier import, or a run, has left in the journal
     writer.set_zones(() if recording.zones is None else recording.zones.zones)
@@ -507,7 +515,7 @@ def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[
 
 
 def _known(recording: McapRecording, writer: Writer) -> tuple[NDArray[np.int64], set[Event]]:
-    """Keys of the fixes, and the events, that the history has of the time of a recording."""
+    """Return the keys of the fixes, and the events, that the history has for the time of a recording."""
     summary = recording.summary()
     if summary.start_s is None or summary.end_s is None:
         return np.empty(0, np.int64), set()

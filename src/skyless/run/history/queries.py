@@ -1,7 +1,7 @@
-"""Questions to the history of a site: ways, times in cells and zones, contacts, alarms; and its fixes as a file.
+"""Queries on the history of a site: tracks, times in cells and zones, contacts, alarms, and export of fixes.
 
-DuckDB reads the files, and PyArrow where a question needs all rows. Rows that are in the journal only,
-those of the last ten minutes or so, are not known yet.
+DuckDB reads the files, or PyArrow where a query needs all rows. Rows that are only in the journal, from the last ten
+minutes or so, are not included.
 """
 
 import contextlib
@@ -57,27 +57,30 @@ from skyless.run.history.layout import (
 from skyless.run.history.tables import ROW_GROUP, read_table, schema_of
 from skyless.run.web import HISTORY as LIMITS
 
-# Times in cells and near tags, which need all rows: PyArrow and NumPy take a third of DuckDB's processor time here.
+# Times in cells and contacts need all rows: PyArrow and NumPy take a third of DuckDB's processor time here.
 
 _SIDE: Final = 2000
-"""Cells along each side of the grid, which lies around the first fixes; with a power of two, rows of the grid would
-share few lines of the processor's cache."""
+"""Cells along each side of the grid, which is placed around the first fixes. Not a power of two, as rows would then
+share few cache lines.
+"""
 _OUTSIDE: Final = _SIDE * _SIDE
 _WILD_SHARE: Final = 1e-3
-"""Of the time, this share may be outside the grid, which then are wild fixes."""
+"""Largest share of the time that wild fixes outside the grid may account for."""
 
 _ScanInts = NDArray[Any]
 
 
 def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collection[int] | None) -> Heatmap:
-    """The time of tags in cells; ``tags`` None means all. Raises SkylessError, OSError.
+    """Compute the time of tags in cells; ``tags`` None means all. Raises SkylessError, OSError.
 
-    A fix counts until the tag's next one in the range, for ``GAP_S`` at most, in a thinned file ``THINNED_GAP_S``. The
-    tag's last one counts nothing.
+    A fix counts until the tag's next one in the range, up to ``GAP_S``, or ``THINNED_GAP_S`` in a thinned file. The
+    tag's last fix does not count.
     """
     sums_ms = np.zeros(_OUTSIDE + 1, np.int64)
     edges = [np.empty((4, 0), np.int64)]
-    """Tag, time, the most that a row counts, which is 0 for a tag's first row of a batch, else its last, and cell."""
+    """Rows: tag, time, longest time that the fix may count (0 for a tag's first row of a batch, else its last), and
+    cell.
+    """
     corner: list[int] = []
     for (tag, t, x, y), gap_ms in read_rows(files, span, tags):
         places = x // cell_mm, y // cell_mm
@@ -113,10 +116,10 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
 def near(
     files: Sequence[Path], span: Span, own: Collection[int], bucket_ms: int, distance_mm: int, gap: int
 ) -> NDArray[np.int64]:
-    """When tags were near one with the numbers ``own``: tag, first and last bucket of time, least squared distance.
+    """Find when tags were near the one with the numbers ``own``.
 
-    The first fix of ``own`` in a bucket counts. ``gap`` is how many buckets may lie between those of one contact.
-    Raises OSError.
+    Returns tag, first and last bucket of time, and least squared distance. The first fix of ``own`` in a bucket counts.
+    ``gap`` is the largest number of buckets between those of one contact. Raises OSError.
     """
     firsts: list[tuple[_ScanInts, ...]] = []
     for (_, t, x, y), _ in read_rows(files, span, own):
@@ -144,9 +147,9 @@ def near(
 
 
 def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:
-    """Runs of buckets of tags, with the runs of a tag joined that have ``gap`` buckets or less between them.
+    """Join runs of buckets of the same tag with at most ``gap`` buckets between them.
 
-    Raises SkylessError: they are too many.
+    Raises SkylessError if there are too many.
     """
     runs = np.concatenate([np.empty((4, 0), np.int64), *parts], axis=1)
     if not runs.size:
@@ -164,7 +167,7 @@ def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:
 
 
 def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -> Iterator[tuple[list[_ScanInts], int]]:
-    """Tags, times in ms and coordinates of batches of rows, and for how many ms a fix counts there at most."""
+    """Yield tags, times in ms and coordinates of batches of rows, and the longest time in ms that a fix counts."""
     begin_ms, end_ms = (math.ceil(round(1000.0 * unix_s, 2)) for unix_s in (span.from_unix_s, span.to_unix_s))
     wanted = schema_of({name: FIX_COLUMNS[name] for name in ("tag", "t", "x_mm", "y_mm")})
     for file in files:
@@ -191,7 +194,7 @@ def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -
 
 
 def limits(metadata: parquet.FileMetaData, group: int, column: str) -> tuple[int, int]:
-    """The least and the largest value of a column in a row group; times are in ms. Raises ValueError."""
+    """Smallest and largest value of a column in a row group; times are in ms. Raises ValueError."""
     known = metadata.row_group(group).column(metadata.schema.names.index(column)).statistics
     if known is None or not isinstance(known.max_raw, int):
         raise ValueError(f"its column {column} has no whole numbers, or no statistics of them")
@@ -202,16 +205,17 @@ EXPORT_SUFFIXES: Final = (".csv", ".parquet", ".geojsonl")
 
 _EARLY: Final = timedelta(hours=1)
 _LATE: Final = timedelta(days=1)
-"""How much earlier and later than its time a fix may arrive: clocks differ, and sites keep what a cut line delays."""
+"""How much earlier or later than its own time a fix may arrive: clocks differ, and sites buffer while disconnected."""
 
 _UNREADABLE: Final = (OSError, ValueError, RecursionError, duckdb.Error, pyarrow.ArrowException, msgspec.MsgspecError)
 _TRIES: Final = 3
 _MOVE_M: Final = 0.25
 _MOVE_SIGMAS: Final = 3.0
-"""A shorter move, or one within this many standard deviations of the fix, may be noise and does not lengthen a way."""
+"""Shorter moves, in standard deviations of the fix, may be noise and do not lengthen a track."""
 _CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
-"""By whether days are thinned: the length in milliseconds of the intervals within which fixes are compared, and the
-longest interruption of a contact in such intervals."""
+"""Length in ms of the intervals in which fixes are compared, and longest interruption of a contact in such intervals,
+by whether days are thinned.
+"""
 _FETCHED: Final = 10_000
 _PART_S: Final = 28.0 * 86_400.0
 _NAMED: Final = 5
@@ -240,9 +244,10 @@ _STAYS: Final = """
         WINDOW of_tag AS (PARTITION BY hash(tag, zone) ORDER BY s, enters)
     )
 """
-"""The time from each crossing of a zone's border to the tag's next one. Tags that were in a zone at the beginning enter
-it there. Of two crossings at one instant the leaving is the first. Sorting by a hash of 64 bits costs two thirds of
-sorting by two texts."""
+"""The time from each crossing of a zone's border to the tag's next one. Tags in a zone at the beginning enter it then.
+Of two simultaneous crossings the leaving comes first. Sorting by a 64-bit hash costs two thirds of sorting by two
+texts.
+"""
 
 _DWELL: Final = f"""
     {_STAYS} SELECT tag, zone, count(*) FILTER (NOT was_inside), sum(until - since), min(since), max(until)
@@ -269,13 +274,13 @@ _Floats = NDArray[np.float64]
 
 
 def sites_in(folder: Path) -> tuple[int, ...]:
-    """Numbers of the sites whose history a folder holds."""
+    """Numbers of the sites whose history is in a folder."""
     found = (one.name.removeprefix("site=") for one in folder.glob("site=*"))
     return tuple(sorted(int(number) for number in found if number.isdecimal()))
 
 
 def _asked(question: Callable[_P, _R]) -> Callable[_P, _R]:
-    """A question that is asked again where a file has gone, as a larger one has replaced it meanwhile."""
+    """Repeat a query if a file has vanished, because it was replaced by a larger one meanwhile."""
 
     @wraps(question)
     def ask(*args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -292,7 +297,7 @@ def _asked(question: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _damaged(history: object) -> Path | None:
-    """The first file of a history that cannot be read, which not every error names."""
+    """Return the first unreadable file of a history, which not every error names."""
     if isinstance(history, History):
         for file in (*current_files(history.folder, history.site), *current_events(history.folder, history.site)):
             try:
@@ -305,10 +310,10 @@ def _damaged(history: object) -> Path | None:
 
 
 class History:
-    """The history of one site. May be asked from several threads."""
+    """The history of one site; thread-safe."""
 
     def __init__(self, folder: Path, site: int) -> None:
-        """Raises SkylessError: there is no history of the site."""
+        """Raises SkylessError if there is no history of the site."""
         self.folder, self.site = folder, site
         self._site_folder = site_folder(folder, site)
         if not self._site_folder.is_dir():
@@ -319,16 +324,16 @@ class History:
     # What there is
 
     def tags(self) -> tuple[str, ...]:
-        """Names of all tags."""
+        """Return the names of all tags."""
         return tuple(sorted(set(self._names().values())))
 
     def assets(self) -> dict[str, str]:
-        """Names of assets by the names of their tags, from the newest list that the history has received."""
+        """Return asset names by tag name, from the newest list that the history has received."""
         return {row["tag"]: row["name"] for row in self._table("assets.parquet", ASSET_COLUMNS) if row["name"]}
 
     @_asked
     def zones(self) -> dict[str, tuple[str, tuple[tuple[float, float], ...]]]:
-        """Names and corners of all zones by their identifiers."""
+        """Return names and corners of all zones by identifier."""
         kind = tuple[tuple[float, float], ...]
         return {
             row["zone"]: (row["name"] or row["zone"], msgspec.json.decode(row["corners_m"] or "[]", type=kind))
@@ -337,7 +342,7 @@ class History:
 
     @_asked
     def known_until_unix_s(self) -> float | None:
-        """The time of the newest row that is in a file; None without any."""
+        """Return the time of the newest row in a file; None if there is none."""
         files = (*current_files(self.folder, self.site), *current_events(self.folder, self.site))
         last_day = max(map(day_of, files), default="")
         newest = [parquet.read_metadata(file) for file in files if day_of(file) == last_day]
@@ -348,9 +353,9 @@ class History:
 
     @_asked
     def track(self, tag: str, span: Span, most_points: int = 2000) -> Track:
-        """The way of a tag, thinned to a number of points; what lies next to a gap stays, as long as that is possible.
+        """Return the track of a tag, thinned to ``most_points``; points next to gaps are kept if possible.
 
-        Raises SkylessError: there is no such tag.
+        Raises SkylessError if there is no such tag.
         """
         ((tag, numbers),) = self._tags((tag,)).items()
         check_number("the number of points", most_points, least=2, most=LIMITS.points)
@@ -370,17 +375,17 @@ class History:
 
     @_asked
     def heatmap(self, span: Span, cell_m: float = 0.25, tags: Sequence[str] = ()) -> Heatmap:
-        """How long tags, by default all, were in the cells of a grid. Raises SkylessError."""
+        """Return how long the tags (default: all) were in the cells of a grid. Raises SkylessError."""
         check_number("the cells' side", cell_m, least=0.01, most=1000.0)
         numbers = [*chain(*self._tags(tags).values())] if tags else None
         return time_in_cells(self._files(span), span, round(1000.0 * cell_m), numbers)
 
     @_asked
     def dwell(self, span: Span, tags: Sequence[str] = (), zone: str | None = None) -> tuple[Dwell, ...]:
-        """How long tags, by default all, were in zones, by default all. Raises SkylessError.
+        """Return how long the tags (default: all) were in the zones (default: all). Raises SkylessError.
 
-        A visit at an edge of the range counts with its part in it. One that has not ended goes on until the end of the
-        range, or of what is known.
+        A visit across an end of the range counts with its part inside. An unfinished one lasts until the end of the
+        range, or of the known data.
         """
         names = self._zone_names(zone)
         return tuple(
@@ -390,7 +395,7 @@ class History:
 
     @_asked
     def occupancy(self, span: Span, zone: str | None = None, step_s: float = 300.0) -> tuple[Occupancy, ...]:
-        """How many tags were in zones, by default all, in each step of time; the last step may be shorter.
+        """Return how many tags were in the zones (default: all) in each time step; the last step may be shorter.
 
         Raises SkylessError.
         """
@@ -413,9 +418,10 @@ class History:
 
     @_asked
     def contacts(self, tag: str, span: Span, distance_m: float = 2.0) -> tuple[Contact, ...]:
-        """When other tags were within a distance in the plane of this one's first fix of a second, within that second.
+        """Return when other tags were within a distance in the plane of this tag's first fix of a second.
 
-        In a range with thinned days it is the first fix of ten seconds. Raises SkylessError.
+        The others' fixes of the same second are compared; in a range with thinned days, of ten seconds. Raises
+        SkylessError.
         """
         check_number("the distance", distance_m, least=0.01, most=LIMITS.contact_m)
         ((tag, own),) = self._tags((tag,)).items()
@@ -436,12 +442,12 @@ class History:
 
     @_asked
     def alarms(self, span: Span) -> tuple[AlarmRow, ...]:
-        """Alarms that were raised before the range's end and had not ended at its beginning. Raises SkylessError."""
+        """Return the alarms raised before the range's end that had not ended at its beginning. Raises SkylessError."""
         return tuple(AlarmRow(*row) for row in _table(_stream(_ALARMS, current_events(self.folder, self.site), span)))
 
     @_asked
     def export(self, file: Path, span: Span, tags: Sequence[str] = (), origin: GeoreferenceSite | None = None) -> int:
-        """Write the fixes of tags, by default all, by name and time; return how many. The suffix is the format.
+        """Write the fixes of the tags (default: all), by name and time, in the suffix's format; return their number.
 
         GeoJSON, one feature a line, needs the site's georeference. Raises SkylessError, OSError.
         """
@@ -486,12 +492,12 @@ class History:
         return [row for row in rows if row[next(iter(columns))] is not None]
 
     def _names(self) -> dict[int, str]:
-        """The newest name of each number."""
+        """Newest name for each number."""
         rows = self._table("names.parquet", NAME_COLUMNS | {"since": "int64"})
         return {row["tag"]: row["name"] for row in sorted(rows, key=lambda row: row["since"] or 0) if row["name"]}
 
     def _tags(self, asked: Iterable[str]) -> dict[str, list[int]]:
-        """Tags by their names or those of their assets, and their numbers. Raises SkylessError."""
+        """Resolve names of tags or assets to tags and their numbers. Raises SkylessError."""
         numbers = defaultdict(list)
         for number, name in self._names().items():
             numbers[name].append(number)
@@ -507,7 +513,7 @@ class History:
         return found
 
     def _zone_names(self, zone: str | None) -> dict[str, str]:
-        """Names by identifier. Raises SkylessError where ``zone`` is not among them."""
+        """Zone names by identifier. Raises SkylessError if ``zone`` is not among them."""
         names = {one: name for one, (name, _) in self.zones().items()}
         if zone is not None and zone not in names:
             raise SkylessError(f"the history of site {self.site} has no zone {zone!r}; {_some(names, 'zones')}")
@@ -525,7 +531,7 @@ class History:
 
 
 def counts(begins: _Floats, ends: _Floats, edges: _Floats) -> tuple[list[float], list[int]]:
-    """How many are inside in each interval between edges: their mean and most."""
+    """Mean and largest number of visits present in each interval between edges."""
     begins, ends = np.sort(begins), np.sort(ends)
     mean = np.diff(_ramp(begins, edges) - _ramp(ends, edges)) / np.diff(edges)
     most = np.searchsorted(begins, edges[:-1], "right") - np.searchsorted(ends, edges[:-1], "right")
@@ -537,26 +543,26 @@ def counts(begins: _Floats, ends: _Floats, edges: _Floats) -> tuple[list[float],
 
 
 def _ramp(times: _Floats, at: _Floats) -> _Floats:
-    """The sum of how long each of the sorted times has passed at ``at``."""
+    """The sum, over the sorted times, of the time passed since each at ``at``."""
     passed = np.searchsorted(times, at)
     ramp: _Floats = passed * at - np.append(0.0, np.cumsum(times))[passed]
     return ramp
 
 
 class _Way:
-    """Fixes of a tag in the order of their times: their length, and which are kept of them."""
+    """Fixes of a tag in order of time: their length, and which of them to keep."""
 
     def __init__(self, count: int, most: int, gap_ms: int) -> None:
-        """``most`` are kept of ``count`` fixes."""
+        """Keep at most ``most`` of ``count`` fixes."""
         self.length_m = 0.0
-        """Of moves that are not within the noise, each from the end of the last."""
+        """Sum of moves beyond the noise, each measured from the end of the last."""
         self._most, self._gap_ms = most, gap_ms
         self._step, self._index = max(1.0, (count - 1) / (most - 1)), -1
         self._evenly, self._at_gaps = array("q"), list[float]()
         self._before_ms, self._x, self._y = -math.inf, 0.0, 0.0
 
     def add(self, now_ms: int, x: float, y: float, std_m: float) -> None:
-        """Go on to the next fix."""
+        """Add the next fix."""
         moved_m = math.hypot(x - self._x, y - self._y)
         is_new = now_ms - self._before_ms > self._gap_ms
         if is_new or moved_m >= max(_MOVE_M, _MOVE_SIGMAS * std_m):
@@ -570,7 +576,7 @@ class _Way:
         self._before_ms = now_ms
 
     def kept(self) -> list[int]:
-        """Times of fixes, evenly among them; those at gaps are kept if they are half of ``most`` or less."""
+        """Times of the fixes to keep, evenly spaced; those at gaps are kept if they are at most half of ``most``."""
         at_gaps = np.unique(np.array(self._at_gaps, np.int64))
         if len(at_gaps) > self._most // 2:
             at_gaps = at_gaps[:0]
@@ -585,17 +591,17 @@ class _Way:
 
 @contextlib.contextmanager
 def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
-    """DuckDB without files of its own but temporary ones, and without the network."""
+    """Open DuckDB with temporary files only, and without the network."""
     spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # made where it is needed
     options: dict[str, Any] = {"memory_limit": f"{LIMITS.memory_mb}MB", "temp_directory": spill}
-    # One thread takes less processor time in all, and leaves the other cores to the site.
+    # One thread takes less processor time in total, and leaves the other cores to the site.
     options |= {"autoinstall_known_extensions": "false", "threads": 1}
     with duckdb.connect(config=options) as duck:
         yield duck
 
 
 def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iterator[tuple[Any, ...]]:
-    """The rows of an answer, of which few are in memory at once."""
+    """Yield the rows of a result, with few of them in memory at once."""
     parameters = _parameters(files, span) | more
     if parameters["files"]:
         with _connection() as duck:
@@ -605,7 +611,7 @@ def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iter
 
 
 def _table(found: Iterator[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-    """The rows of an answer that is a table. Raises SkylessError."""
+    """Return the rows of a result that is a table. Raises SkylessError."""
     rows = list(islice(found, LIMITS.rows + 1))
     if len(rows) > LIMITS.rows:
         raise SkylessError(f"the answer has more than {LIMITS.rows} rows; choose a shorter range, a tag or a zone")
@@ -621,7 +627,7 @@ def _day(unix_s: float, later: timedelta) -> str:
 
 
 def _parts(files: Sequence[Path], span: Span) -> Iterator[tuple[list[Path], Span]]:
-    """A range in parts of four weeks, of which some have files."""
+    """Split a range into parts of four weeks, leaving out those without files."""
     begin_s = span.from_unix_s // _PART_S * _PART_S
     while begin_s < span.to_unix_s:
         part = Span(max(begin_s, span.from_unix_s), min(begin_s + _PART_S, span.to_unix_s))
@@ -631,13 +637,13 @@ def _parts(files: Sequence[Path], span: Span) -> Iterator[tuple[list[Path], Span
 
 
 def _of_days(files: Iterable[Path], span: Span) -> list[Path]:
-    """Files in which fixes of the range may be: they lie by the day of arrival."""
+    """Files that may contain fixes of the range; they are sorted by day of arrival."""
     begin, end = _day(span.from_unix_s, -_EARLY), _day(span.to_unix_s, _LATE)
     return [file for file in files if begin <= day_of(file) <= end]
 
 
 def _are_thinned(files: Iterable[Path]) -> bool:
-    """Whether any of the files is."""
+    """Whether any of the files is thinned."""
     return any(THINNED in (parquet.read_schema(file).metadata or {}) for file in files)
 
 

@@ -1,4 +1,4 @@
-"""The history's rows as tables, and its files, which are read and written as a whole."""
+"""The history's rows as tables, and reading and writing of complete files."""
 
 import contextlib
 import os
@@ -28,7 +28,7 @@ _TIME: Final = pa.timestamp("ms", tz="UTC")
 
 
 class Event(Struct, frozen=True):
-    """One row of the events, as ``EVENT_COLUMNS``."""
+    """One row of the events, with ``EVENT_COLUMNS``."""
 
     t: datetime
     kind: EventKind
@@ -40,16 +40,16 @@ class Event(Struct, frozen=True):
 
 
 def schema_of(columns: dict[str, str]) -> pa.Schema:
-    """The schema of columns as ``layout.py`` states them."""
+    """The schema of columns as defined in ``layout.py``."""
     return pa.schema(
         [(name, _TIME if kind.startswith("timestamp") else pa.type_for_alias(kind)) for name, kind in columns.items()]
     )
 
 
 def fix_table(records: Records) -> pa.Table:
-    """Columns of records (``run/fix_batch.py``), by tag and time.
+    """Convert records (``run/fix_batch.py``) to a table, by tag and time.
 
-    ``std_mm`` is the root of the covariance's trace, as ``FixMessage.std_m``; the correlation of x and y is not kept.
+    ``std_mm`` is the root of the covariance's trace, as ``FixMessage.std_m``; the correlation of x and y is dropped.
     """
     rows = records[np.lexsort((records["unix_us"], records["tag"]))]
     up_mm = np.where(rows["std_z_mm"] == NONE_U16, 0, rows["std_z_mm"]).astype(np.float64)
@@ -69,13 +69,13 @@ def unix_ms(records: Records) -> NDArray[np.int64]:
 
 
 def event_table(events: Sequence[Event]) -> pa.Table:
-    """Columns of events, by time."""
+    """Convert events to a table, by time."""
     rows = [msgspec.structs.asdict(event) for event in sorted(events, key=lambda event: event.t)]
     return pa.Table.from_pylist(rows, schema_of(EVENT_COLUMNS))
 
 
 def read_table(file: Path, columns: dict[str, str], wanted: pc.Expression | None = None) -> pa.Table:
-    """Columns of the wanted rows of a file. Raises SkylessError: it cannot be read, or lacks one."""
+    """Read columns of the wanted rows of a file. Raises SkylessError if it cannot be read, or lacks one."""
     try:
         table = parquet.ParquetFile(file).read(columns=list(columns)).cast(schema_of(columns))
         table.validate(full=True)  # texts are UTF-8
@@ -86,15 +86,15 @@ def read_table(file: Path, columns: dict[str, str], wanted: pc.Expression | None
 
 
 def read_events(files: Iterable[Path], wanted: pc.Expression) -> Iterator[Event]:
-    """The wanted events in files, in order. Raises SkylessError."""
+    """Yield the wanted events in files, in order. Raises SkylessError."""
     for file in files:
         yield from (Event(**row) for row in read_table(file, EVENT_COLUMNS, wanted).to_pylist())
 
 
 def write_table(table: pa.Table, file: Path) -> None:
-    """Write a file that readers find whole, on the disk and under its name, or not at all. Raises OSError.
+    """Write a file atomically and durably. Raises OSError.
 
-    A program that was killed meanwhile leaves a file of the same name with ``.tmp``.
+    A program that is killed meanwhile leaves a file of the same name with ``.tmp``.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     scratch = file.with_name(f"{file.name}.tmp")
@@ -120,22 +120,22 @@ def write_table(table: pa.Table, file: Path) -> None:
 
 
 REMEMBERED_KINDS: Final = ("alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online")
-"""Events that retained messages tell of: those of the past must be known."""
+"""Events derived from retained messages, for which the past ones must be known."""
 
 
 class EventLog:
-    """Tells new events from those that are known."""
+    """Distinguishes new events from known ones."""
 
     def __init__(self, past: Iterable[Event] = ()) -> None:
-        """``past``: the events that the history has, in order."""
+        """``past``: the events in the history, in order."""
         self._alarms: set[tuple[EventKind, str]] = set()
         self._last: dict[tuple[str | None, ...], tuple[EventKind, datetime | None]] = {}
-        """What was last heard of a node, or of a tag in a zone; of one that is offline, when it had come."""
+        """The last event of each node, or of a tag in a zone, with its time of arrival if it is offline."""
         for event in past:
             self._remember(event)
 
     def of(self, message: ZoneEvent | AlarmMessage | StatusMessage, now_unix_s: float) -> list[Event]:
-        """What is new: a tag entered or left a zone, an alarm came to something, a tag or an anchor came or went."""
+        """Return the new events in a message: of tags in zones, alarms, and tags and anchors that came or went."""
         if isinstance(message, ZoneEvent):
             text = f"{message.tag} {'entered' if message.kind == 'enter' else 'left'} {message.name}"
             return self._new(message.unix_s, message.kind, tag=message.tag, zone=message.zone, text=text)
@@ -159,7 +159,7 @@ class EventLog:
         return [event] if self._is_new(event) else []
 
     def _is_new(self, event: Event) -> bool:
-        """Remember an event, unless it is a copy; False also where it says what is known."""
+        """Remember an event. Return False for a copy, or for one that states what is known already."""
         if event.alarm:
             is_new = (event.kind, event.alarm) not in self._alarms
         else:

@@ -1,7 +1,7 @@
-"""The history of one site as it is written: rows wait in memory, then in a journal (SQLite), then are in Parquet.
+"""Writing of one site's history: rows wait in memory, then in a journal (SQLite), and end in Parquet.
 
-Rows are numbered. A row whose number is within a file's name is in Parquet, whatever the journal says: so no row is
-lost or written twice, wherever a program is killed. One process at a time writes a site.
+Rows are numbered. A row whose number is within a file's name is in Parquet, whatever the journal says, so no row is
+lost or written twice if a program is killed. Only one process at a time writes a site.
 """
 
 import contextlib
@@ -44,11 +44,11 @@ from skyless.run.process import locked
 from skyless.run.web import HISTORY as LIMITS
 
 FILE_ROWS: Final = 1_000_000
-"""Rows of a file, nearly: one more batch would be too many."""
+"""Approximate number of rows in a file, which ends before the batch that would exceed it."""
 
 
 class Intake:
-    """Rows of one kind. Another thread than the others' may call ``write``."""
+    """Rows of one kind. ``write`` may be called from another thread than the other methods."""
 
     def __init__(
         self,
@@ -60,14 +60,14 @@ class Intake:
         source: str,
     ) -> None:
         self.lost = 0
-        """Rows that were dropped, as the disk did not take them in time."""
+        """Rows dropped because the disk was too slow."""
         self.taken = 0
-        """Rows since the start."""
+        """Rows taken since the start."""
         self._journal, self._kind, self._folder, self._place = journal, kind, folder, source + kind
         self._encode, self._table = encode, table
         self._batches: list[tuple[Records | Sequence[Event], float]] = []
         self.position = 0
-        """Place in the source of the newest rows, where it has places."""
+        """Place in the source of the newest rows, if it has places."""
         files = [rows for file in largest_files(folder) if (rows := rows_of(file))]
         self.last = max((last for _, last in files), default=0)
         """Number of the last row in a file."""
@@ -79,10 +79,10 @@ class Intake:
             for (position,) in sql.execute("SELECT position FROM positions WHERE kind = ?", (self._place,)):
                 self.position = position
         self.next = max(self.last + 1, end or 1)
-        """Number of the next row that comes to the journal."""
+        """Number of the next row to enter the journal."""
 
     def add(self, rows: Records | Sequence[Event], arrived_unix_s: float, position: int = 0) -> None:
-        """Take rows, which are in the journal after ``store``, and with them their place in the source."""
+        """Take rows. ``store`` brings them into the journal, together with their place in the source."""
         if len(rows):
             self._batches.append((rows, arrived_unix_s))
         self.taken += len(rows)
@@ -90,11 +90,14 @@ class Intake:
 
     @property
     def waiting(self) -> int:
-        """Rows that are not in the journal yet."""
+        """Rows not in the journal yet."""
         return sum(len(rows) for rows, _ in self._batches)
 
     def store(self) -> None:
-        """Bring all rows into the journal. Raises OSError: none is, and the oldest that are too many are dropped."""
+        """Bring all rows into the journal.
+
+        Raises OSError: none is stored, and the oldest beyond the limit are dropped.
+        """
         number, values = self.next, []
         for rows, unix_s in self._batches:
             values.append((number, len(rows), unix_s, self._encode(rows)))
@@ -113,7 +116,7 @@ class Intake:
         self.next = number
 
     def write(self) -> None:
-        """Turn what is in the journal at the beginning of this call into files. Raises OSError: the rest stays."""
+        """Write the rows now in the journal to files. Raises OSError: the rest stays."""
         end = self.next
         while self.last + 1 < end:
             day, last, batches = self._next_file(end)
@@ -124,7 +127,7 @@ class Intake:
                 sql.execute(f"DELETE FROM {self._kind} WHERE first <= ?", (last,))
 
     def _next_file(self, end: int) -> tuple[str, int, list[bytes]]:
-        """Day, last row and rows of the next file: they came on one day."""
+        """Return day, last row and rows of the next file; its rows arrived on one day."""
         day, last, batches = "", self.last, list[bytes]()
         query = f"SELECT first, rows, unix_s, data FROM {self._kind} WHERE first > ? AND first < ? ORDER BY first"
         with self._journal.transaction() as sql:
@@ -138,7 +141,7 @@ class Intake:
 
 
 class Journal:
-    """An SQLite file. What is committed outlives the program, and after ``sync`` a power cut."""
+    """An SQLite file. Committed data survive the program, and after ``sync`` a power cut."""
 
     def __init__(self, file: Path) -> None:
         """Raises OSError."""
@@ -151,17 +154,17 @@ class Journal:
 
     @contextlib.contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """All of a block, or where it fails nothing. Raises OSError."""
+        """Commit a block, or roll it back if it fails. Raises OSError."""
         with self._lock, self._errors(), self._sql:
             yield self._sql
 
     def sync(self) -> None:
-        """Wait until all that is committed is on the disk. Raises OSError."""
+        """Wait until all committed data are on the disk. Raises OSError."""
         with self._lock, self._errors():
             self._sql.execute("PRAGMA wal_checkpoint").fetchall()
 
     def close(self) -> None:
-        """Let other programs open it."""
+        """Close the file, so that other programs can open it."""
         with self._lock:
             self._sql.close()
 
@@ -174,24 +177,24 @@ class Journal:
 
 
 class Table:
-    """A small table that is kept as a whole, such as the names of tags; a row that has been there stays."""
+    """A small table written as a whole, such as the names of tags; rows are never removed."""
 
     def __init__(self, file: Path, columns: dict[str, str], key: str) -> None:
-        """Raises SkylessError: the file is damaged."""
+        """Raises SkylessError if the file is damaged."""
         self.rows: dict[str, dict[str, Any]] = {}
-        """By the value of the column ``key``."""
+        """Rows by the value of the column ``key``."""
         self._file, self._columns, self._key, self._is_saved = file, columns, key, True
         if file.exists():
             self.rows = {row[key]: row for row in read_table(file, columns).to_pylist()}
 
     def set(self, *values: object) -> None:
-        """Add or replace a row; its values are in the order of the columns."""
+        """Add or replace a row; the values are in the order of the columns."""
         row: dict[str, Any] = dict(zip(self._columns, values, strict=True))
         self._is_saved = self._is_saved and self.rows.get(row[self._key]) == row
         self.rows[row[self._key]] = row
 
     def save(self) -> None:
-        """Write the table if it is not on the disk as it is now. Raises OSError."""
+        """Write the table if it has changed. Raises OSError."""
         if not self._is_saved:
             write_table(pa.Table.from_pylist([*self.rows.values()], schema_of(self._columns)), self._file)
             self._is_saved = True
@@ -201,13 +204,14 @@ class Writer:
     """Writes the history of one site."""
 
     def __init__(self, folder: Path, site: int, source: str = "") -> None:
-        """``source`` names streams whose places are kept, which no other's may continue.
+        """``source`` names streams whose places are stored; a history of another source is refused.
 
-        Raises SkylessError: it cannot be written, another program does so, it is damaged, or has rows from elsewhere.
+        Raises SkylessError: it cannot be written, another program is writing it, it is damaged, or has rows from
+        elsewhere.
         """
         self.root, self.site, self.folder = folder, site, site_folder(folder, site)
         self.drops: Counter[str] = Counter()
-        """Messages that are not kept, by reason."""
+        """Messages that were not kept, by reason."""
         self._writing = Lock()  # a thread may still be at work when the program ends
         names = self.folder / "names.parquet"
         try:
@@ -237,18 +241,18 @@ class Writer:
 
     @property
     def unwritten(self) -> int:
-        """Rows in the journal that are in no file yet."""
+        """Rows in the journal that are not in a file yet."""
         return sum(intake.next - 1 - intake.last for intake in (self.fixes, self.events))
 
     def number(self, fix: FixMessage, unix_s: float) -> int | None:
-        """The number of a fix's tag, which no other ever gets; None for a fix that is not kept, which is counted."""
+        """Return the unique number for a fix's tag; None for a fix that is not kept, which is counted."""
         if not LIMITS.first_unix_s <= fix.unix_s <= LIMITS.last_unix_s:
             self.drops["wrong-time"] += 1
             return None
         return self.tag_number(fix.tag, unix_s)
 
     def tag_number(self, name: str, unix_s: float) -> int | None:
-        """The number of a tag; None where too many have one, which is counted."""
+        """Return the number for a tag; None if there are too many tags, which is counted."""
         if name not in self.names.rows:
             if len(self.names.rows) >= LIMITS.tags:
                 self.drops["too-many-tags"] += 1
@@ -258,30 +262,30 @@ class Writer:
         return int(self.names.rows[name]["tag"])
 
     def set_zones(self, zones: Iterable[Zone]) -> None:
-        """Keep zones; those that were removed stay, as events name them."""
+        """Keep zones; removed ones stay, because events refer to them."""
         for zone in zones:
             self.zones.set(zone.id, zone.name, msgspec.json.encode(zone.polygon_m).decode())
 
     def set_assets(self, assets: Iterable[Asset]) -> None:
-        """Keep what people call tags; a tag that has no asset any more has an empty name."""
+        """Keep the asset names of tags; a tag that no longer has an asset gets an empty name."""
         for tag, name in (dict.fromkeys(self.assets.rows, "") | {one.tag: one.name for one in assets}).items():
             self.assets.set(tag, name)
 
     def store(self) -> None:
-        """Bring all that was added into the journal. Raises OSError: what is not there waits."""
+        """Bring everything added into the journal. Raises OSError: the rest waits."""
         for table in (self.names, self.assets, self.zones):  # the journal uses the numbers
             table.save()
         self.fixes.store()
         self.events.store()
 
     def write(self) -> None:
-        """Turn all rows of the journal into files. Raises OSError: the others stay in the journal."""
+        """Write all rows of the journal to files. Raises OSError: the rest stays in the journal."""
         with self._writing:
             self.fixes.write()
             self.events.write()
 
     def close(self) -> None:
-        """Turn all rows into files, and let other programs write. Raises OSError."""
+        """Write all rows to files, and unlock the history. Raises OSError."""
         with contextlib.ExitStack() as stack:  # in reverse order, each even if another fails
             stack.callback(self._lock.close)
             stack.callback(self.journal.close)
@@ -298,32 +302,29 @@ def _events_in(batches: Sequence[bytes]) -> pa.Table:
     return event_table(tuple(chain.from_iterable(found)))
 
 
-# What a history does once a day: join small files, thin what is old, remove what is too old.
-#
-# Readers take no row twice and miss none, whenever the program is killed: a joined file has a name that covers those
-# of the files that it replaces, so that these are no longer current (``layout.py``); a thinned file takes the place
-# of the whole one in one step.
+# Daily maintenance: join small files, thin old ones, remove those that are too old. It is safe against kills: a joined
+# file's name covers the files that it replaces (``layout.py``), and a thinned file replaces the original atomically.
 
 _JOINED_ROWS: Final = 2_000_000
-"""Rows of a joined file: what fits into memory several times."""
+"""Rows of a joined file: it must fit into memory several times."""
 
 _MOVING_MS: Final = 10_000
 _REST_MS: Final = 60_000
 _REST_MM: Final = 500
-"""A tag is at rest in a minute in which no coordinate changes by more."""
+"""A tag is at rest in a minute in which no coordinate changes by more than this."""
 
 
 class Keep(Struct, frozen=True):
-    """For how many days what is kept."""
+    """For how many days fixes and events are kept."""
 
     days: float = 400.0
     full_days: float = 7.0
-    """From then on, fixes are thinned."""
+    """Fixes older than this are thinned."""
     event_days: float = 365.0
 
 
 def tidy(root: Path, site: int, keep: Keep, unix_s: float) -> None:
-    """Do what is due in a site's folder. Raises OSError or SkylessError; what has been done by then stays so."""
+    """Do the maintenance that is due in a site's folder. Raises OSError or SkylessError; completed steps stay."""
     folder = site_folder(root, site)
     _tidy(folder, FIX_COLUMNS, ("tag", "t"), keep.days, keep.full_days, unix_s)
     _tidy(folder / "events", EVENT_COLUMNS, ("t",), keep.event_days, math.inf, unix_s)
@@ -353,7 +354,7 @@ def _tidy(
 
 
 def _groups(files: Iterable[Path]) -> Iterator[tuple[list[Path], int, int]]:
-    """Files with consecutive numbers, and their first and last number: those of one group are to be joined."""
+    """Group files with consecutive numbers that are to be joined, with their first and last number."""
     group, first, last = list[Path](), 0, 0
     for file in files:
         begin, end = rows_of(file) or (0, 0)
@@ -365,7 +366,10 @@ def _groups(files: Iterable[Path]) -> Iterator[tuple[list[Path], int, int]]:
 
 
 def thinned(table: pa.Table) -> pa.Table:
-    """Of a moving tag one fix in ten seconds, of one at rest one in a minute. The table is sorted by tag and time."""
+    """Keep one fix per ten seconds of a moving tag, one per minute of one at rest.
+
+    The table is sorted by tag and time.
+    """
     tag, ms = table["tag"].to_numpy(), table["t"].cast(pa.int64()).to_numpy()
     is_minute, is_step = (_begins(tag, ms // length_ms) for length_ms in (_REST_MS, _MOVING_MS))
     first = np.flatnonzero(is_minute)
@@ -377,7 +381,7 @@ def thinned(table: pa.Table) -> pa.Table:
 
 
 def _begins(tag: NDArray[Any], part: NDArray[Any]) -> NDArray[np.bool_]:
-    """Whether another tag or another part of its time begins at a row."""
+    """Mark rows at which another tag, or another part of its time, begins."""
     return np.append(True, (np.diff(tag) != 0) | (np.diff(part) != 0))
 
 

@@ -1,4 +1,4 @@
-"""Address of an MQTT broker, or of several of a cluster, with user, password and certificates."""
+"""Address of one or several MQTT brokers, with user, password and certificates."""
 
 import os
 import re
@@ -25,11 +25,11 @@ _LOOPBACK: Final = re.compile(r"localhost|127(\.\d{1,3}){3}|::1")
 _PASSWORD: Final = re.compile(
     r"^((?>(?:[^:/?#]*://)?)(?>\[[\da-fA-F:.]+\]|[^:/?#@]*)):(?!\d{1,5}(?:/[^?#@]*)?\?\w+(?:[=&]|$)).*@"
 )
-"""What comes after a colon behind user or host, up to the last ``@``; not a port and a query such as ``?to=a@b``."""
+"""The text after a colon behind user or host, up to the last ``@``; not a port and a query such as ``?to=a@b``."""
 
 
 class MqttAddress(Struct, frozen=True):
-    """A broker; its ``str()`` never shows the password."""
+    """One broker, or several of a cluster; ``str()`` never shows the password."""
 
     host: str
     port: int
@@ -51,12 +51,12 @@ class MqttAddress(Struct, frozen=True):
 
     @property
     def loopback(self) -> bool:
-        """Whether the broker, and each of several, is on this machine."""
+        """Whether all of the brokers are on this machine."""
         return all(is_loopback(host) for host, _ in self._hosts)
 
     @property
     def brokers(self) -> "tuple[MqttAddress, ...]":
-        """Each broker by itself."""
+        """Each broker as an address of its own."""
         return tuple(replace(self, host=host, port=port, others=()) for host, port in self._hosts)
 
     @property
@@ -64,7 +64,7 @@ class MqttAddress(Struct, frozen=True):
         return ((self.host, self.port), *self.others)
 
     def tls_context(self) -> ssl.SSLContext | None:
-        """The checks of the broker's certificate; None without TLS.
+        """TLS settings for the broker; None without TLS.
 
         Raises:
             SkylessError: the file of certificates cannot be used.
@@ -73,7 +73,7 @@ class MqttAddress(Struct, frozen=True):
 
 
 def tls_context(ca: Path | None) -> ssl.SSLContext:
-    """The checks of a server's certificate; ``ca`` has those to trust. Raises SkylessError: it cannot be used."""
+    """TLS settings that trust the certificates in ``ca``. Raises SkylessError if the file cannot be used."""
     try:
         return ssl.create_default_context(cafile=ca)
     except OSError as error:
@@ -82,12 +82,12 @@ def tls_context(ca: Path | None) -> ssl.SSLContext:
 
 
 def mqtt_address(url: str, ca: Path | None = None) -> MqttAddress:
-    """The broker of a URL, or the brokers; the password may also be in ``SKYLESS_MQTT_PASSWORD``.
+    """Parse the URL of one or several brokers; the password may also be in ``SKYLESS_MQTT_PASSWORD``.
 
     Several are separated by commas: ``mqtts://ann@a,b:8884,c``.
 
     Raises:
-        SkylessError: with what would be right; it never shows the password.
+        SkylessError: with what would be right, never showing the password.
     """
     several = re.fullmatch(r"([^:/?#]*://(?:[^/?#]*@)?)([^/?#@]*)(.*)", url, re.DOTALL)
     before, hosts, after = several.groups() if several else ("", url, "")
@@ -96,7 +96,7 @@ def mqtt_address(url: str, ca: Path | None = None) -> MqttAddress:
 
 
 def _broker(url: str, single: str, ca: Path | None) -> MqttAddress:
-    """The broker of a URL with one host; errors show the whole URL."""
+    """Parse a URL with one host; errors show the whole URL."""
     try:
         parts = urlsplit(single)
         port = parts.port
@@ -128,7 +128,7 @@ def _credentials(url: str, parts: SplitResult) -> tuple[str | None, str | None]:
 
 
 def _is_host(host: str | None) -> bool:
-    """Whether a resolver can be asked for it: labels of 1 … 63 characters, without blanks."""
+    """Whether a host can be resolved: labels of 1 … 63 characters, without blanks."""
     if not host or re.search(r"[\s\x00-\x1f]", host):
         return False
     return all(0 < len(label) <= 63 for label in host.removesuffix(".").split("."))
@@ -139,7 +139,7 @@ def _wrong(url: str, expected: str) -> SkylessError:
 
 
 def hide_password(url: str) -> str:
-    """The URL with asterisks in place of its password, however wrong the rest is."""
+    """Replace the password in a URL by asterisks, however malformed the rest is."""
     return _PASSWORD.sub(r"\1:***@", url)
 
 
@@ -148,27 +148,24 @@ def is_loopback(host: str) -> bool:
     return _LOOPBACK.fullmatch(host) is not None
 
 
-# Roles at the broker (``docs/mqtt.md``, Roles): which topics each may publish and subscribe to, and their passwords.
-#
-# Passwords are in a private folder with one file for each role, ``<role>.env``. A file sets the variables that a
-# program of the role reads, in the form of systemd, Docker and the shell: it is copied to the machines of that role
-# only.
+# Roles at the broker (``docs/mqtt.md``, Roles): permitted topics, and passwords. A private folder has one file for each
+# role, ``<role>.env``, in the form of systemd, Docker and the shell; each is copied only to the machines of its role.
 
 
 class Role(StrEnum):
-    """What a client is for; except for the stranger's, also its user name."""
+    """Purpose of a client; except for the stranger's, also its user name."""
 
     ANCHORS = "anchors"
     """Anchors, and the emulated air."""
     TAGS = "tags"
     PAGE = "page"
-    """What shows, records and passes on: dashboard, watch, doctor, record, bridge; also Home Assistant itself."""
+    """Programs that show, record and forward: dashboard, watch, doctor, record, bridge; also Home Assistant itself."""
     SURVEY = "survey"
-    """What moves anchors: survey, and a dashboard whose users set up the site."""
+    """Programs that move anchors: survey, and a dashboard whose users set up the site."""
     OPERATOR = "operator"
-    """A person, and programs that are all of a site in one: the demo, tags in a system without Skyless's anchors."""
+    """A person, and programs that are a whole site: the demo, tags in a system without Skyless's anchors."""
     STRANGER = "stranger"
-    """A client without user and password, where the operator admits it."""
+    """A client without user and password, if the operator admits it."""
 
 
 class Access(Struct, frozen=True):
@@ -201,7 +198,7 @@ _SHOWN: Final = (
     topics.alarm_topic(EVERY_SITE, "+", "+"),
     topics.acknowledge_topic(EVERY_SITE, "+", "+"),
 )
-"""What the page publishes, whether its users may set up the site or not."""
+"""What the page publishes, whether or not its users may set up the site."""
 
 ACCESS: Final = {
     Role.ANCHORS: Access(
@@ -256,7 +253,7 @@ ACCESS: Final = {
 
 
 def may_subscribe(user: str | None, topic_filter: str) -> bool | None:
-    """Whether the roles let a user subscribe to a filter; None where it is not known, as without roles."""
+    """Whether the roles let a user subscribe to a filter; None if unknown, as without roles."""
     if user is not None and user not in ACCESS:
         return None
     granted = any(topic_matches_sub(one, topic_filter) for one in ACCESS[Role(user or Role.STRANGER)].subscribe)
@@ -268,14 +265,14 @@ USERS: Final = tuple(role for role in Role if role is not Role.STRANGER)
 
 _PASSWORD_BYTES: Final = 24
 _PASSWORD_LINE: Final = re.compile(r"[A-Za-z0-9_-]{12,200}")
-"""Nothing that means something to a shell, systemd or nats-server."""
+"""Characters without a meaning to a shell, systemd or nats-server."""
 _PLAIN_ADDRESS: Final = re.compile(r"[\w.:@/\[\]-]+", re.ASCII)
 _MAX_BYTES: Final = 65_536
 _OTHERS: Final = 0o077
 
 
 def create_access(folder: Path, address: MqttAddress) -> tuple[Path, ...]:
-    """Make the files that a folder lacks, with random passwords; those that stand there stay. Their paths.
+    """Create a folder's missing files with random passwords, keeping existing ones; return their paths.
 
     Raises:
         SkylessError: none is missing, the address has a user, or the folder cannot be written.
@@ -301,10 +298,10 @@ def _text(role: Role, address: MqttAddress) -> str:
 
 
 def read_access(folder: Path) -> Mapping[Role, str]:
-    """The password of each role.
+    """Read the password of each role.
 
     Raises:
-        SkylessError: a file is missing, others than its owner may use it, or it has no usable password.
+        SkylessError: a file is missing, is accessible to others than its owner, or has no usable password.
     """
     return {role: _password(folder / f"{role}.env") for role in USERS}
 

@@ -1,4 +1,4 @@
-"""One connection to a broker, from its beginning until it breaks: paho's client, driven by our event loop."""
+"""A single connection to a broker until it breaks: paho's client, driven by our event loop."""
 
 import asyncio
 import contextlib
@@ -29,14 +29,15 @@ _KEPT_S: Final = 0.5
 _LONGEST_KEPT: Final = 20
 
 _SEND_BUFFER: Final = 262_144
-"""Bytes that wait in the kernel, and as many in the process: what is older than the newest fix should not be many."""
+"""Send buffer in the kernel, and as large a one in the process; small, so that few outdated fixes wait in them."""
 
 _MAX_PACKETS: Final = 100
-"""Read at once, before the event loop continues with other work."""
+"""Packets read at once, before the event loop continues with other work."""
 
 _QUICK_ACK: Final = getattr(socket, "TCP_QUICKACK", None)
-"""Linux resets it after each use. mosquitto holds a message back until the one before is acknowledged, which
-TCP otherwise delays by 40 ms."""
+"""Linux resets it after each use. Without it TCP delays acknowledgements by 40 ms, and mosquitto holds messages back
+until the one before is acknowledged.
+"""
 
 _REFUSALS: Final = {
     "Bad user name or password": "wrong user name or password",
@@ -47,7 +48,7 @@ _log = logging.getLogger("skyless.run.mqtt")
 
 
 class Will(Struct, frozen=True):
-    """What the broker publishes, retained and at QoS 1, when the client goes without disconnecting."""
+    """What the broker publishes, retained and at QoS 1, if the client vanishes without disconnecting."""
 
     topic: str
     payload: bytes
@@ -57,46 +58,45 @@ class Introduction(Struct, frozen=True):
     """What a client sends the broker about itself."""
 
     client: str
-    """Its name; a new one where it is empty."""
+    """Client name; a new one if it is empty."""
     keepalive_s: int
-    """The connection is given up when the broker has been silent for this time."""
+    """The connection is given up when the broker has been silent for this long."""
     persistent: bool = False
-    """The broker keeps subscriptions, and messages of QoS 1, for this name."""
+    """Whether the broker keeps subscriptions, and messages of QoS 1, for this name."""
     will: Will | None = None
 
 
 class Reactions(Struct, frozen=True):
-    """Functions that the event loop calls."""
+    """Callbacks from the event loop."""
 
     message: Callable[[str, bytes], None] = lambda _topic, _payload: None
     acknowledged: Callable[[int], None] = lambda _number: None
     """The broker has the message of QoS 1 that ``publish`` gave this number."""
     writable: Callable[[], None] = lambda: None
-    """The connection accepts more again."""
+    """The connection accepts more data again."""
     subscribed: Callable[[str, bool], None] = lambda _filter, _granted: None
     """The broker has granted a subscription, or has refused it."""
 
 
 class RefusedError(Exception):
-    """The broker refuses this client; the text says why."""
+    """The broker refuses this client; the message says why."""
 
 
 class Connection:
-    """A client of paho for one connection: a broken one is discarded, and nothing waits here for the next one.
+    """A paho client for one connection: a broken one is discarded, and nothing waits here for the next one.
 
-    paho writes at once (it would wait for a turn of the event loop if it had ``on_socket_register_write``). What the
-    socket does not accept waits in paho until the socket is writable, and what is published while paho reads, until it
-    has read.
+    paho writes at once, because it has no ``on_socket_register_write``. What the socket does not accept waits in paho
+    until the socket is writable, and what is published while paho reads, until it has read.
     """
 
     def __init__(self, address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions) -> None:
         self.writable = False
-        """Whether the connection accepts more; false while a slow broker has its buffers full, and once it is lost."""
+        """Whether the connection accepts more; false while a slow broker's buffers are full, and once it is lost."""
         self.lost = asyncio.Event()
         self.reason = "the broker has closed the connection"
-        """Why it was lost."""
+        """Why the connection was lost."""
         self.unread_since_s: float | None = None
-        """Since when messages of the broker have waited to be read, by the loop's clock; None while none do."""
+        """Since when messages of the broker have waited to be read, by the loop's clock; None if none do."""
         self._address = address
         self._keepalive_s = who.keepalive_s
         self._react = react
@@ -116,7 +116,7 @@ class Connection:
         """Connect, and wait until the broker accepts.
 
         Raises:
-            RefusedError: it does not.
+            RefusedError: the broker refuses the client.
             OSError: it cannot be reached, or does not answer (TimeoutError).
         """
         try:
@@ -134,7 +134,7 @@ class Connection:
         self._keep_alive()
 
     def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> int:
-        """Send a message, or let it wait for the socket; never blocks. Its number until it is acknowledged."""
+        """Send a message, or queue it for the socket; never blocks. Returns its number until it is acknowledged."""
         info = self._client.publish(topic, payload, qos, retain)
         while info.rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:  # its number is still in use, 65 535 messages later
             info = self._client.publish(topic, payload, qos, retain)
@@ -169,7 +169,7 @@ class Connection:
             sock.close()
 
     async def leave(self) -> None:
-        """Disconnect and close when all is sent, or after a second."""
+        """Disconnect, and close once all is sent, or after a second."""
         self.writable = False
         if not self.lost.is_set():
             self._client.disconnect()
@@ -182,7 +182,7 @@ class Connection:
     # What the event loop calls
 
     def _begin(self) -> None:
-        """Keep buffers small, so that nothing old piles up in them, and watch the socket."""
+        """Keep buffers small, so that no old data pile up in them, and watch the socket."""
         self._socket = cast(socket.socket | None, self._client.socket())
         if self._socket is None:
             raise ConnectionError(self.reason)
@@ -197,14 +197,14 @@ class Connection:
         self._await_socket()
 
     def _read(self) -> None:
-        """Read all that has come, packet by packet."""
+        """Read everything available, packet by packet."""
         self._has_answered = self._reading = True
         left = _MAX_PACKETS
         while self._socket is not None:
             seen = self._messages
             self._client.loop_read()
             left -= 1
-            # The socket does not announce what TLS has decrypted already.
+            # The socket does not signal data that TLS has already decrypted.
             if not _decrypted(self._socket) and (left <= 0 or self._messages == seen):
                 break
         self._reading = False
@@ -214,14 +214,14 @@ class Connection:
             self.unread_since_s = self._loop.time()
         if self._socket is not None and _QUICK_ACK is not None:
             self._socket.setsockopt(socket.IPPROTO_TCP, _QUICK_ACK, 1)
-        # paho's on_publish would also come for each message of QoS 0, whose number may be that of another in flight.
+        # paho's on_publish would also be called for QoS 0, whose number may equal that of another message in flight.
         for number in [number for number, info in self._flying.items() if info.is_published()]:
             del self._flying[number]
             self._react.acknowledged(number)
         self._write()
 
     def _write(self) -> None:
-        """Write what waits, and accept more when nothing waits."""
+        """Write waiting data, and accept more once nothing waits."""
         if self._client.want_write():
             self._client.loop_write()
         if not self._client.want_write():
@@ -232,7 +232,7 @@ class Connection:
         self._await_socket()
 
     def _await_socket(self) -> None:
-        """Watch whether the socket accepts more while paho has more for it."""
+        """Watch for the socket to become writable while paho has data for it."""
         wanted = self._client.want_write() and self._socket is not None
         if self._reading or self._socket is None or wanted == self._awaits_socket:
             return
@@ -302,17 +302,17 @@ class Connection:
 
 
 def _decrypted(sock: socket.socket) -> int:
-    """Bytes that wait in TLS."""
+    """Number of bytes waiting in TLS."""
     return sock.pending() if isinstance(sock, ssl.SSLSocket) else 0
 
 
 async def open_connection(
     address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions | None = None
 ) -> Connection:
-    """A connection that the broker has accepted; of several brokers, the first that does.
+    """Open a connection; of several brokers, to the first that accepts.
 
     Raises:
-        RefusedError: it, or the last of several, refuses this client.
+        RefusedError: the broker, or the last of several, refuses this client.
         OSError: it cannot be reached, or does not answer (TimeoutError).
     """
     *others, last = address.brokers
@@ -331,7 +331,7 @@ async def _open(
 
 
 async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) -> None:
-    """Check that a broker accepts this client; ``tls`` replaces the address's own checks of its certificate.
+    """Check that a broker accepts this client; ``tls`` replaces the address's own TLS settings.
 
     Raises:
         SkylessError: it does not; the message says why.
@@ -344,9 +344,9 @@ async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) 
 
 
 async def kept_messages(address: MqttAddress, filters: Iterable[str]) -> dict[str, bytes]:
-    """The messages of some filters that a broker has kept, by their topics, and what comes meanwhile.
+    """Return the retained messages of some filters by topic, including any that arrive meanwhile.
 
-    Nothing says that all have come: none has for half a second then. Raises OSError and RefusedError.
+    Nothing marks the last one; reading ends after half a second without any. Raises OSError and RefusedError.
     """
     found: dict[str, bytes] = {}
     react = Reactions(message=found.__setitem__)
@@ -365,7 +365,7 @@ async def kept_messages(address: MqttAddress, filters: Iterable[str]) -> dict[st
 
 
 def trouble_with(address: MqttAddress, error: OSError | RefusedError) -> str:
-    """One line for a person about a connection that cannot be made."""
+    """Describe in one line for a person why a connection cannot be made."""
     if isinstance(error, RefusedError):
         hint = ""
         if "user" in str(error):
@@ -382,7 +382,7 @@ def trouble_with(address: MqttAddress, error: OSError | RefusedError) -> str:
 
 
 def _make_client(address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, timeout_s: float) -> paho.Client:
-    """A client that neither bounds the messages in flight nor connects again; a link does both."""
+    """Make a client that neither bounds the messages in flight nor reconnects; a link does both."""
     client = paho.Client(
         CallbackAPIVersion.VERSION2,
         who.client or f"skyless-{secrets.token_hex(4)}",
@@ -401,10 +401,10 @@ def _make_client(address: MqttAddress, tls: ssl.SSLContext | None, who: Introduc
 
 
 async def _connect(client: paho.Client, address: MqttAddress, keepalive_s: int) -> None:
-    """Let paho connect, which blocks, in a thread that nothing waits for, not even the end of the program.
+    """Let paho connect, which blocks, in a daemon thread for which not even the program's end waits.
 
     Raises:
-        OSError: it cannot be reached.
+        OSError: the broker cannot be reached.
     """
     loop = asyncio.get_running_loop()
     done: asyncio.Future[None] = loop.create_future()
@@ -443,17 +443,17 @@ def _close(client: paho.Client) -> None:
         sock.close()
 
 
-# What waits to be sent to a broker: bounded, so that a slow or absent one costs memory only up to a limit.
+# Messages waiting for a broker: bounded, so that a slow or absent one costs limited memory.
 
 _TOPIC: Final = re.compile(r"[^\s+#\x00-\x1f\x7f]{1,250}")
-"""What every broker accepts; nats-server accepts no blanks."""
+"""Topics that every broker accepts; nats-server accepts no blanks."""
 
 
 class Limits(Struct, frozen=True):
-    """How much may wait. Payload bytes."""
+    """Limits on waiting messages. Payloads in bytes."""
 
     topics: int = 1000
-    """Topics of QoS 0, each with its newest message, and as many that are retained."""
+    """Topics of QoS 0, each with its newest message, and as many retained ones."""
     topic_bytes: int = 16_000_000
     messages: int = 20_000
     """Messages of QoS 1."""
@@ -465,22 +465,22 @@ class Limits(Struct, frozen=True):
 
 
 class Waiting(Struct, frozen=True, gc=False):
-    """One message on its way."""
+    """One message to be sent."""
 
     topic: str
     payload: bytes
     qos: int
     retain: bool
     until_s: float = math.inf
-    """One of QoS 0 is not sent after this, by the clock of its sender."""
+    """A message of QoS 0 is not sent after this time, by its sender's clock."""
 
 
 class Outbox:
     """Messages not yet sent, and those of QoS 1 not yet acknowledged.
 
-    Of QoS 0 the newest message of a topic stays, and the oldest topics go when there are too many. Of QoS 1 all stay in
-    their order, and the oldest that is not on its way goes when there are too many. Retained messages are a topic's
-    state: the newest one stays, to be sent again after each reconnect.
+    Of QoS 0 only the newest message of a topic is kept, and the oldest topics are dropped when there are too many. Of
+    QoS 1 all are kept in order, and the oldest that is not in flight is dropped when there are too many. Of retained
+    messages the newest of each topic is kept, to be sent again after each reconnect.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -496,14 +496,14 @@ class Outbox:
         self._to_retain: dict[str, Waiting] = {}
         self.dropped = 0
         self.late = 0
-        """Those of the dropped that had waited for too long."""
+        """Messages dropped because they had waited too long."""
         self.sent = 0
         """Messages of QoS 0 given to the connection, and messages of QoS 1 acknowledged."""
 
     def add(self, topic: str, payload: bytes, qos: int, *, retain: bool, until_s: float = math.inf) -> str | None:
-        """Add a message; returns the fault of one that no broker would accept.
+        """Add a message; return the fault of one that no broker would accept.
 
-        One of QoS 0 that has not been taken at ``until_s``, by the clock of ``next_message``, is dropped.
+        One of QoS 0 that has not been taken by ``until_s``, on the clock of ``next_message``, is dropped.
         """
         fault = self._fault(topic, payload)
         if fault is not None:
@@ -521,7 +521,7 @@ class Outbox:
         return None
 
     def next_message(self, now_s: float) -> Waiting | None:
-        """The next message to send; None when nothing is left, or the window is full."""
+        """Return the next message to send; None if nothing is left, or the window is full."""
         open_window = len(self._flying) < self._limits.window
         if self._again:
             return self._again.popleft()
@@ -539,14 +539,14 @@ class Outbox:
         return None
 
     def mark_sent(self, message: Waiting, number: int) -> None:
-        """The connection has the message, under this number."""
+        """Note that the connection has the message, under this number."""
         if message.qos:
             self._flying[number] = message
         else:
             self.sent += 1
 
     def acknowledge(self, number: int) -> None:
-        """The broker has the message of QoS 1 with this number."""
+        """Note that the broker has the message of QoS 1 with this number."""
         message = self._flying.pop(number, None)
         if message is None:
             return
@@ -555,20 +555,20 @@ class Outbox:
             self._queue_bytes -= len(message.payload)
 
     def restart(self) -> None:
-        """A new connection: send again what was not acknowledged, and what the broker should have retained."""
+        """Prepare for a new connection: resend what was not acknowledged, and what the broker should have retained."""
         self._again.extendleft(message for message in reversed(self._flying.values()) if not message.retain)
         self._flying.clear()
         self._to_retain = dict(self._retained)
 
     def forget(self, topic: str) -> None:
-        """Stop sending the retained message of a topic: another node has published a newer one."""
+        """Stop sending a topic's retained message, because another node has published a newer one."""
         self._to_retain.pop(topic, None)
         old = self._retained.pop(topic, None)
         self._retained_bytes -= len(old.payload) if old else 0
 
     @property
     def unacknowledged(self) -> int:
-        """Messages of QoS 1, and retained ones, that the broker does not have for certain."""
+        """Number of messages of QoS 1, and retained ones, that the broker may not have."""
         return len(self._flying) + len(self._again) + len(self._queue) + len(self._to_retain)
 
     def _fault(self, topic: str, payload: bytes) -> str | None:
@@ -598,7 +598,7 @@ class Outbox:
             self.dropped += 1
 
     def _retain(self, message: Waiting) -> None:
-        """Replace the state of a topic."""
+        """Replace the retained message of a topic."""
         self.forget(message.topic)
         more = len(self._retained) >= self._limits.topics
         if more or self._retained_bytes + len(message.payload) > self._limits.topic_bytes:

@@ -39,8 +39,9 @@ Handler = Callable[[str, bytes], None]
 
 READER_KEEPALIVE_S: Final = 20
 NODE_KEEPALIVE_S: Final = 10
-"""For how long a broker may be silent. A link sends a ping after half of that time, and the broker disconnects a client
-that has been silent for three quarters: a busy event loop may delay a ping by a quarter. With 10 s bridges lost it."""
+"""How long a broker may be silent. A link sends a ping after half of that time, and the broker disconnects a client
+that has been silent for three quarters; a busy event loop may delay a ping by a quarter. With 10 s bridges lost it.
+"""
 
 _MAX_TOPICS: Final = 10_000
 _FIRST_WAIT_S: Final = 0.1
@@ -49,20 +50,19 @@ _LONGEST_WAIT_LOOPBACK_S: Final = 0.5
 _LEAVE_S: Final = 1.0
 _SAME_TROUBLE_S: Final = 30.0
 _ECHO_S: Final = 5.0
-"""When a broker should have returned a link's own status."""
+"""Time within which the broker should have returned a link's own status."""
 RESEND_S: Final = 30.0
-"""The longest time between two repetitions of a status or a site: a broker elsewhere may have missed or lost it."""
+"""Longest time between repetitions of a status or a site, which a bridged broker may have missed or lost."""
 _QUICK_START_S: Final = 0.5
-"""A first connection that takes no longer is not logged."""
+"""A first connection that is made within this time is not logged."""
 
 
 class Link:
-    """One MQTT connection of a node, made again for as long as ``run`` runs.
+    """A node's MQTT connection, restored whenever it is lost while ``run`` runs.
 
-    Where a broker of its address refuses it or does not answer, it goes on to the next. It publishes the
-    node's status, retained and with a last will. Messages wait in an ``Outbox`` while the broker is slow or away. All
-    of it belongs to one event loop. Subscribers may get a message of QoS 1 twice, when a connection broke at the wrong
-    moment.
+    If a broker of its address refuses it or does not answer, it tries the next. It publishes the node's status,
+    retained and with a last will. Messages wait in an ``Outbox`` while the broker is slow or away. Everything runs in
+    one event loop. Subscribers may get a message of QoS 1 twice if a connection breaks.
     """
 
     def __init__(
@@ -77,10 +77,10 @@ class Link:
         keepalive_s: int = READER_KEEPALIVE_S,
         limits: Limits | None = None,
     ) -> None:
-        """``persistent`` lets the broker keep messages of QoS 1 for this name while it is away, until it is stopped.
+        """``persistent`` lets the broker keep messages of QoS 1 for this name until the link is stopped.
 
-        Two persistent links of one name would end each other's connection, and so would a stranger who knows it:
-        ``client_key``, which nobody else knows, is part of the client identifier then.
+        Two persistent links of one name would end each other's connection, and so could a stranger who knows it.
+        Therefore the secret ``client_key`` becomes part of the client identifier.
 
         Raises:
             SkylessError: the address names a file of certificates that cannot be used.
@@ -90,7 +90,7 @@ class Link:
         self.trouble: str | None = "not connected yet"
         """Why there is no connection; None while there is one."""
         self.refused: set[str] = set()
-        """Topic filters that the broker does not let it subscribe to, because of the user or for want of room."""
+        """Topic filters that the broker refuses, because of the user or for lack of room."""
         self.on_state: list[Callable[[bool], None]] = []
         """Called with ``connected`` whenever it changes."""
         self._tls = address.tls_context()
@@ -105,7 +105,7 @@ class Link:
         self._reactions = Reactions(self._subscriptions.receive, self._acknowledged, self._pump, self._subscribed)
         self._connection: Connection | None = None
         self._brokers = address.brokers
-        """Those of the address in turn, the present one first."""
+        """Brokers of the address, rotated so that the present one is first."""
         self._reconnects = -1
         self._reported_dropped = 0
         self._away_since_s = time.monotonic()
@@ -117,23 +117,23 @@ class Link:
 
     @property
     def counters(self) -> Counters:
-        """Messages sent and dropped, reconnects."""
+        """Messages sent and dropped, and reconnects."""
         return Counters(self._outbox.sent, self._outbox.dropped, max(0, self._reconnects))
 
     @property
     def late(self) -> int:
-        """Messages that were dropped because they could not be sent in time."""
+        """Messages dropped because they could not be sent in time."""
         return self._outbox.late
 
     @property
     def unread_s(self) -> float:
-        """For how long messages of the broker have waited without a break to be read; 0 while none do."""
+        """For how long messages of the broker have continuously waited to be read; 0 if none do."""
         since_s = None if self._connection is None else self._connection.unread_since_s
         return 0.0 if since_s is None else asyncio.get_running_loop().time() - since_s
 
     @property
     def unacknowledged(self) -> int:
-        """Messages of QoS 1, and retained ones, that the broker does not have for certain."""
+        """Number of messages of QoS 1, and retained ones, that the broker may not have."""
         return self._outbox.unacknowledged
 
     def publish(
@@ -145,9 +145,9 @@ class Link:
         retain: bool = False,
         until_s: float = math.inf,
     ) -> None:
-        """Hand over a message; returns at once, even if the broker does not answer. A struct becomes JSON.
+        """Queue a message; returns at once, even if the broker does not answer. A struct becomes JSON.
 
-        One of QoS 0 that cannot be sent before ``until_s``, of the host's monotonic clock, is dropped.
+        One of QoS 0 that cannot be sent before ``until_s``, by the host's monotonic clock, is dropped.
         """
         payload = message if isinstance(message, bytes) else _encode(message)
         fault = self._outbox.add(topic, payload, qos, retain=retain, until_s=until_s)
@@ -161,17 +161,17 @@ class Link:
         self._outbox.forget(topic)
 
     def subscribe(self, topic_filter: str, handler: Handler, qos: int = 0) -> None:
-        """Call ``handler`` with every message of a filter, also after every reconnect.
+        """Call ``handler`` with every message of a filter, also after reconnects.
 
-        A second handler of the same filter replaces the first. Where filters of one link overlap, some brokers send a
-        message once for each, and all its handlers get it as often.
+        A second handler for the same filter replaces the first. If filters of one link overlap, some brokers send a
+        message once for each, and all matching handlers are called as often.
         """
         self._subscriptions.add(topic_filter, handler, qos)
         if self._connection is not None:
             self._connection.subscribe({topic_filter: qos})
 
     async def run(self) -> None:
-        """Stay connected until cancelled; then send what waits, for a second at most, and disconnect."""
+        """Stay connected until cancelled; then send what waits, for at most a second, and disconnect."""
         failures = 0
         try:
             while True:
@@ -188,7 +188,7 @@ class Link:
                 _log.warning("stopped; the broker %s has not accepted %d messages", self.address, self.unacknowledged)
 
     async def _one_connection(self) -> bool:
-        """Whether it came about; returns when it is lost."""
+        """Connect once, and return when the connection is lost. Returns whether it was made."""
         broker = self._brokers[0]
         try:
             connection = await open_connection(broker, self._tls, self._introduction(), self._reactions)
@@ -248,7 +248,7 @@ class Link:
         self.publish(self._status_topic, self._online, qos=1, retain=True)
 
     def _repeat_later(self, connection: Connection) -> None:
-        """Repeat the status while a connection lasts, at random times: many links connect at the same moment."""
+        """Repeat the status during a connection, at random times because many links connect at the same moment."""
         wait_s = RESEND_S * random.uniform(0.5, 1.0)
         asyncio.get_running_loop().call_later(wait_s, self._repeat_status, connection)
 
@@ -261,7 +261,7 @@ class Link:
             self._repeat_later(connection)
 
     def _correct_status(self, _topic: str, payload: bytes) -> None:
-        """Publish the status again after a late last will, of a connection that the broker held open."""
+        """Publish the status again after a late last will from an older connection."""
         self._has_echo = self._has_echo or payload == self._online
         if not self._stopping and b'"online":false' in payload:
             self._publish_online()
@@ -321,7 +321,7 @@ class Link:
         return min(longest_s, _FIRST_WAIT_S * 2.0 ** min(failures, 10)) * random.uniform(0.6, 1.0)
 
     def _log_trouble(self, trouble: str) -> None:
-        """Log it once, and again every half minute while it lasts."""
+        """Log a problem once, and again every half minute while it lasts."""
         self.trouble = trouble
         now_s = time.monotonic()
         if trouble != self._logged[0] or now_s > self._logged[1] + _SAME_TROUBLE_S:
@@ -338,21 +338,21 @@ class Link:
 
 
 class Subscriptions:
-    """The handlers of one link: a tree of the levels of their filters, and those found for the newest topics."""
+    """The handlers of one link: a tree of the levels of their filters, and a cache for the newest topics."""
 
     def __init__(self) -> None:
         self.filters: dict[str, int] = {}
-        """Topic filters, each with its QoS."""
+        """Topic filters with their QoS."""
         self._handlers = MQTTMatcher()  # type: ignore[no-untyped-call]
         self._found: dict[str, tuple[Handler, ...]] = {}
 
     def add(self, topic_filter: str, handler: Handler, qos: int) -> None:
-        """Set the handler of a filter; it replaces the one before."""
+        """Set the handler of a filter, replacing any previous one."""
         self.filters[topic_filter], self._handlers[topic_filter] = qos, handler
         self._found.clear()
 
     def receive(self, topic: str, payload: bytes) -> None:
-        """Call all handlers whose filter matches."""
+        """Call all handlers whose filters match."""
         handlers = self._found.get(topic)
         if handlers is None:
             handlers = self._find(topic)

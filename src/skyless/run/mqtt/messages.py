@@ -48,7 +48,7 @@ class SiteMessage(Struct, frozen=True):
 
 
 def site_message(site: Site, *, simulated: bool, unix_s: float) -> SiteMessage:
-    """The message of a site: its outline, floors and rules of alarms stand beside it."""
+    """Make the message of a site, with its outline, floors and rules of alarms in fields of their own."""
     inner = replace(site, outline_m=UNSET, floors=UNSET, alarms=UNSET)
     alarms = () if site.alarms is UNSET else site.alarms
     return SiteMessage(inner, simulated, unix_s, site.outline_m, site.floors, alarms)
@@ -271,22 +271,22 @@ class RequestMessage(Struct, frozen=True):
 
 
 class Leases:
-    """Who has requested something that costs work or bandwidth, and until when. The caller passes in the time."""
+    """Who has requested something that costs work or bandwidth, and until when. Times are passed in."""
 
     def __init__(self) -> None:
         self._until_s: dict[str, float] = {}
 
     @property
     def are_held(self) -> bool:
-        """Whether anybody holds one, as of the last call with a time."""
+        """Whether any lease is held, as of the last call with a time."""
         return bool(self._until_s)
 
     def holds(self, by: str) -> bool:
-        """Whether this one does."""
+        """Whether this requester holds a lease."""
         return by in self._until_s
 
     def grant(self, by: str, lease_s: float, now_s: float) -> bool:
-        """Begin or extend a lease; False where too many hold one."""
+        """Begin or extend a lease; return False if too many are held."""
         self.expire(now_s)
         if by not in self._until_s and len(self._until_s) >= MAX_LEASES:
             return False
@@ -294,11 +294,11 @@ class Leases:
         return True
 
     def end(self, by: str) -> None:
-        """Its holder does not want it any more."""
+        """End a lease early."""
         self._until_s.pop(by, None)
 
     def expire(self, now_s: float) -> None:
-        """End those whose time is over."""
+        """End the leases whose time is over."""
         for by in [by for by, until_s in self._until_s.items() if until_s <= now_s]:
             del self._until_s[by]
 
@@ -604,11 +604,11 @@ class AcknowledgeMessage(Struct, frozen=True):
 
 
 class WrongMessageError(ValueError):
-    """A message that does not fit its topic: what is wrong with it."""
+    """A message does not fit its topic."""
 
 
 def read_message(payload: bytes, kind: type[_T]) -> _T:
-    """A message from JSON. Raises WrongMessageError."""
+    """Decode a message from JSON. Raises WrongMessageError."""
     try:
         return msgspec.json.decode(payload, type=kind)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
@@ -616,7 +616,7 @@ def read_message(payload: bytes, kind: type[_T]) -> _T:
 
 
 def fix_message(tag: str, serial: int, fix: "Fix", unix_s: float, latency_s: float) -> FixMessage:
-    """The message of a fix; ``unix_s`` is the end of its last frame."""
+    """Make the message of a fix; ``unix_s`` is the end of its last frame."""
     dops = fix.dops
     moving = fix.velocity_mps is not None and fix.velocity_covariance is not None
     return FixMessage(
@@ -660,7 +660,9 @@ def _matrix(values: list[float]) -> Matrix:
 
 
 REACH_S: Final = 0.25
-"""A message holds for this time before and after it, along a straight line; a turning tag leaves the line by then."""
+"""How long before and after its time a message is extrapolated along a straight line; a turning tag leaves the line by
+then.
+"""
 
 _MAX_MESSAGES: Final = 64
 
@@ -672,13 +674,13 @@ class TruthBuffer:
         self._truths: deque[TruthMessage] = deque(maxlen=_MAX_MESSAGES)
 
     def add(self, truth: TruthMessage) -> None:
-        """Add a message; one older than the last (a restarted ether) replaces all before it."""
+        """Add a message; one older than the last (after an ether's restart) replaces all before it."""
         if self._truths and truth.unix_s < self._truths[-1].unix_s:
             self._truths.clear()
         self._truths.append(truth)
 
     def at(self, tag: str, unix_s: float) -> Vector | None:
-        """True position of a tag: from the message nearest in time, along its velocity; None if none is near."""
+        """True position of a tag, extrapolated from the message nearest in time; None if none is near."""
         best, ahead_s = None, REACH_S
         for truth in reversed(self._truths):
             gap_s = unix_s - truth.unix_s

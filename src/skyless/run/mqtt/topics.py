@@ -18,7 +18,7 @@ def floor_plan_topic(site: int | str) -> str:
 
 
 def plan_of_floor_topic(site: int | str, floor: int | str) -> str:
-    """The same of one of several floors, by its number."""
+    """Retained image of one of several floors, by its number."""
     return f"{ROOT}/{site}/floor_plan/{floor}"
 
 

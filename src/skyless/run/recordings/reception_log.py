@@ -1,8 +1,8 @@
-"""What a tag keeps for those who record it: receptions in segments, each with the receiver's state at its beginning.
+"""A tag's receptions for recorders, in segments that begin with the receiver's state.
 
-A segment begins when somebody new asks, and whenever continuity was broken; within one, nothing is missing. The state
-lets a replay begin in the middle of a tag's life and go on with the same bits. No I/O and no clock: times are passed
-in, by any clock that does not go back.
+A segment begins when a new requester asks, and after every gap; within it nothing is missing. The state lets a replay
+start in the middle of a tag's life and continue bit for bit. No I/O and no clock: times are passed in, by any monotonic
+clock.
 """
 
 from collections import Counter, deque
@@ -30,11 +30,11 @@ _FORMAT: Final = 21
 
 
 _MAX_BYTES: Final = 1 << 23
-"""Enough for an estimator of a hundred anchors."""
+"""Size limit, enough for an estimator of a hundred anchors."""
 
 
 class _Header(Struct, frozen=True):
-    """What every checkpoint says first."""
+    """Header of every checkpoint."""
 
     format: int
     version: str
@@ -45,7 +45,7 @@ class _Checkpoint(_Header, frozen=True):
 
 
 class RefusedError(Exception):
-    """A checkpoint that cannot be used; ``reason`` is what it is counted by."""
+    """A checkpoint cannot be used; ``reason`` is the name under which it is counted."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -53,13 +53,13 @@ class RefusedError(Exception):
 
 
 def save(receiver: TagReceiver) -> bytes:
-    """The receiver's whole state."""
+    """Serialise the receiver's whole state."""
     checkpoint = _Checkpoint(_FORMAT, version("skyless"), receiver.state())  # type: ignore[arg-type]  # of these two
     return _ENCODER.encode(checkpoint)
 
 
 def load(state: bytes) -> AnyReceiver:
-    """The receiver as it was when ``state`` was made.
+    """Restore the receiver from ``state``.
 
     Raises:
         RefusedError: ``checkpoint-of-another-version``, ``checkpoint-damaged``.
@@ -76,7 +76,7 @@ def load(state: bytes) -> AnyReceiver:
 
 
 def _encode_array(value: object) -> bytes:
-    """A position, the only array in a state that is not bytes already."""
+    """Encode a position, the only array in a state that is not bytes already."""
     assert isinstance(value, np.ndarray)
     return value.tobytes()
 
@@ -97,21 +97,21 @@ EVERY_TAG: Final = "*"
 
 
 INTERVAL_S: Final = 0.1
-"""Receptions of this time go into one message."""
+"""Length of time whose receptions go into one message."""
 
 
 MAX_PENDING_RECEPTIONS: Final = 4096
-"""Receptions; where nobody collects them, the segment ends instead of taking memory."""
+"""Largest number of uncollected receptions; the segment ends beyond it."""
 
 
 Settings = dict[str, str | float | int | None]
 
 
 class ReceptionLog:
-    """The receptions of one tag, for as long as somebody asks for them."""
+    """The receptions of one tag, kept while somebody requests them."""
 
     def __init__(self, tag: str, settings: Settings, run: str) -> None:
-        """``settings``: how the receiver was made (``receiver_settings``); ``run`` names this start of the tag."""
+        """``settings``: the receiver's arguments (``receiver_settings``); ``run`` names this start of the tag."""
         self.counters: Counter[str] = Counter()
         self._tag = tag
         self._settings = settings
@@ -129,11 +129,11 @@ class ReceptionLog:
 
     @property
     def wanted(self) -> bool:
-        """Whether somebody holds a lease."""
+        """Whether any lease is held."""
         return self._leases.are_held
 
     def request(self, message: RequestMessage, now_s: float) -> None:
-        """Process a request; one who was not here before (or whose lease has ended) begins another segment."""
+        """Process a request; a new requester, or one whose lease has ended, begins another segment."""
         self._end_leases(now_s)
         if not {self._tag, EVERY_TAG} & set(message.receptions):
             self._leases.end(message.by)
@@ -145,7 +145,7 @@ class ReceptionLog:
             self.interrupt()
 
     def add(self, receiver: TagReceiver, reception: Reception, serial: int) -> None:
-        """Add a reception, before the receiver hears it; ``serial`` is the number of fixes made so far."""
+        """Add a reception before the receiver hears it; ``serial`` is the number of fixes made so far."""
         if not self._leases.are_held:
             return
         if len(self._pending) >= MAX_PENDING_RECEPTIONS:
@@ -160,9 +160,9 @@ class ReceptionLog:
         self._pending.append(raw(reception))
 
     def collect(self, now_s: float, unix_less_host_s: float) -> ReceptionsMessage | None:
-        """The next message that is due; to be called until it returns None, some twenty times a second.
+        """Return the next message that is due; call this until it returns None, some twenty times a second.
 
-        ``unix_less_host_s`` is what to add to the receptions' ``host_s`` to get Unix time.
+        ``unix_less_host_s`` is added to the receptions' ``host_s`` to get Unix time.
         """
         self._unix_less_host_s = unix_less_host_s
         self._end_leases(now_s)
@@ -172,7 +172,7 @@ class ReceptionLog:
         return self._ready.popleft() if self._ready else None
 
     def interrupt(self) -> None:
-        """A message was lost on its way, or somebody joined: what comes next is another segment."""
+        """End the segment, because a message was lost or a requester joined."""
         self._close_message()
         self._open = False
 
@@ -188,7 +188,7 @@ class ReceptionLog:
         self._start = SegmentStart(serial, self._settings, state)
 
     def _close_message(self) -> None:
-        """Make a message of what is pending."""
+        """Make a message from the pending receptions."""
         if not self._pending:
             return
         self._ready.append(
@@ -218,7 +218,7 @@ def receiver_settings(
     z_bounds_m: tuple[float, float] | None = None,
     integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
 ) -> Settings:
-    """How a receiver is made, as it stands in a segment."""
+    """The receiver's arguments as stated in a segment."""
     low_m, high_m = (None, None) if z_bounds_m is None else z_bounds_m
     asked = {
         "integrity_risk": integrity.risk,
@@ -230,7 +230,7 @@ def receiver_settings(
 
 
 def raw(reception: Reception) -> RawReception:
-    """A reception as it is published."""
+    """Convert a reception to its published form."""
     diagnostics = reception.diagnostics or Diagnostics()
     return RawReception(
         reception.frame,

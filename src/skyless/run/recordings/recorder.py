@@ -1,4 +1,4 @@
-"""Recordings of a running site as they are written: the file, and what of MQTT's messages goes into it."""
+"""Writing of recordings of a running site: the file, and which MQTT messages go into it."""
 
 import contextlib
 import os
@@ -32,52 +32,50 @@ from skyless.run.recordings.recording import (
     decoder_of,
 )
 
-# An MCAP file that is being written: whole after every flush.
-#
-# Chunks are compressed (zstd) and handed to the system at once; a program that is killed loses what came after the last
-# flush. A full disk ends the recording and is reported once; the file is cut back to its last whole chunk.
+# An MCAP file being written, valid after every flush. Chunks are compressed (zstd); a killed program loses what came
+# after the last flush. A full disk ends the recording: the file is cut back to its last complete chunk.
 
 _CHUNK_BYTES: Final = 1 << 22
-"""Chunks are closed by time; no second is expected to be longer."""
+"""Chunks are closed by time; no second is expected to need more."""
 
 
 class _Unwritten(IOBase):
-    """Gathers what the MCAP writer writes since the last flush; as much of a file as that writer uses."""
+    """A file object that collects what the MCAP writer has written since the last flush."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
         self._length = 0
 
     def write(self, data: bytes, /) -> int:
-        """Keep a piece."""
+        """Store a piece."""
         self._parts.append(bytes(data))
         self._length += len(data)
         return len(data)
 
     def seek(self, _offset: int, _whence: int = 0, /) -> int:
-        """Length of the file so far, as the writer asks for nothing else."""
+        """Length of the file so far; the writer asks for nothing else."""
         return self._length
 
     def drain(self) -> bytes:
-        """What was written since the last call."""
+        """Return what was written since the last call."""
         written = b"".join(self._parts)
         self._parts.clear()
         return written
 
 
 class McapFile:
-    """One recording on disk. Every method may be called after a failure, and then does nothing."""
+    """A recording on disk. After a failure every method does nothing."""
 
     def __init__(self, path: str | PathLike[str], limit_bytes: int | None = None) -> None:
-        """Make the file. Raises SkylessError: it exists already, or cannot be made."""
+        """Create the file. Raises SkylessError if it exists already, or cannot be created."""
         self.path = Path(path)
         self.limit_bytes = limit_bytes
         self.written_bytes = 0
         self.messages = 0
         self.lost = 0
-        """Messages that came after the recording had to end, or were not written any more."""
+        """Messages not written because the recording had ended."""
         self.ended: str | None = None
-        """Why nothing is written any more; None while all is well."""
+        """Why nothing more is written; None while all is well."""
         self.failed = False
         """Whether it ended because the disk is full or gone."""
         self._channels: dict[str, int] = {}
@@ -98,7 +96,7 @@ class McapFile:
     def add(
         self, topic: str, schema: tuple[str, bytes], payload: bytes, log_ns: int, publish_ns: int | None = None
     ) -> None:
-        """Write a JSON message at a Unix time; times never go back in the file."""
+        """Write a JSON message with a Unix time; times never decrease in the file."""
         if self.ended is not None:
             self.lost += 1
             return
@@ -125,7 +123,7 @@ class McapFile:
                 self.ended = f"its limit of {self.limit_bytes / 1e6:g} MB is reached"
 
     def sync(self) -> None:
-        """Wait until what was flushed is on the disk."""
+        """Wait until flushed data are on the disk."""
         handle = self._handle
         try:
             if handle >= 0:
@@ -135,7 +133,7 @@ class McapFile:
                 self._fail(error)
 
     def close(self) -> None:
-        """Write what is left and the index, and close the file."""
+        """Write the remaining data and the index, and close the file."""
         self.flush()
         if self.ended is None:
             self._finish()
@@ -157,7 +155,7 @@ class McapFile:
         return channel
 
     def _write(self, data: bytes) -> bool:
-        """Write all of it or, as far as the disk allows, nothing."""
+        """Write all of the data, or if the disk fails, as far as possible none."""
         view = memoryview(data)
         try:
             while view:
@@ -177,16 +175,16 @@ class McapFile:
             os.ftruncate(self._handle, self.written_bytes)
 
 
-# From MQTT's messages to a recording: what is kept, and what is added so that Foxglove shows it.
+# From MQTT messages to a recording: what is kept, and what is added so that Foxglove shows it.
 
 SHOWN_HZ: Final = 20.0
-"""How many poses of a tag are added for Foxglove in a second; the fixes themselves are all kept."""
+"""Largest rate of poses of a tag added for Foxglove; the fixes themselves are all kept."""
 
 MAX_TOPICS: Final = 10_000
 
 
 class McapRecorder:
-    """Writes what it is given into a recording."""
+    """Writes messages into a recording."""
 
     def __init__(self, file: McapFile) -> None:
         self.file = file
@@ -199,7 +197,7 @@ class McapRecorder:
         self._georeference: GeoreferenceSite | None = None
 
     def add(self, topic: str, payload: bytes, unix_s: float) -> Struct | None:
-        """Add a message that came at a time, and return it; what is not of this version is counted and dropped."""
+        """Add a message that arrived at a time, and return it; those of other versions are counted and dropped."""
         channel = channel_of(topic)
         if channel is None:
             self.drops["unknown-topic"] += 1
@@ -241,7 +239,7 @@ class McapRecorder:
             self._add(SCENE_TOPIC, "foxglove.SceneUpdate", shown, log_ns)
 
     def _show(self, fix: FixMessage, log_ns: int) -> None:
-        """Add what Foxglove shows, not more often than a person sees."""
+        """Add Foxglove's messages, no more often than a person can see."""
         if abs(fix.unix_s - self._shown_s.get(fix.tag, -1.0)) < 1.0 / SHOWN_HZ:
             return
         self._shown_s[fix.tag] = fix.unix_s

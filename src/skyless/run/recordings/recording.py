@@ -1,6 +1,6 @@
-"""Recordings of a running site as they are read, also while they are written or where they were cut off.
+"""Reading of recordings of a running site, including unfinished and truncated ones.
 
-A recording holds MQTT's topics and payloads, with their schemas.
+A recording holds MQTT topics and payloads, with their schemas.
 """
 
 import math
@@ -57,14 +57,14 @@ _OF_A_NODE: Final[dict[str, type[Struct]]] = {
     "event": messages.ZoneEvent,
 }
 FLOOR_PLAN: Final = "floor_plan"
-"""An image, which has no schema; it is kept as an attachment."""
+"""An image, which has no schema and is kept as an attachment."""
 
 RETAINED_KINDS: Final = frozenset({"site", "zones", "status", "watch", FLOOR_PLAN})
 """Kinds that are retained: a repetition adds nothing."""
 
 
 class Channel(Struct, frozen=True):
-    """What a topic means."""
+    """Meaning of a topic."""
 
     site: str
     kind: str
@@ -76,7 +76,7 @@ class Channel(Struct, frozen=True):
 
 @lru_cache(maxsize=10_000)
 def channel_of(topic: str) -> Channel | None:
-    """What a topic means; None for one that is not of version 1."""
+    """Meaning of a topic; None if it is not of version 1."""
     if not topic.startswith(f"{ROOT}/"):
         return None
     site, _, rest = topic.removeprefix(f"{ROOT}/").partition("/")
@@ -94,18 +94,16 @@ def channel_of(topic: str) -> Channel | None:
 
 @lru_cache(maxsize=64)
 def decoder_of(payload: type[Struct]) -> msgspec.json.Decoder[Struct]:
-    """What reads a payload."""
+    """Decoder of a payload."""
     return msgspec.json.Decoder(payload)
 
 
-# The chunks of an MCAP file, found by walking over its records: it need not have an index, nor an end.
-#
-# Reading goes as far as whole records reach, so a file that was cut off, or is being written now, gives all its whole
-# chunks (https://mcap.dev/spec).
+# Chunks of an MCAP file (https://mcap.dev/spec), found by walking over its records, without needing an index or an end.
+# Files that were cut off, or are being written, give all of their complete chunks.
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_CHUNK_BYTES: Final = 1 << 28
-"""Decompressed; more is taken for damage."""
+"""Decompressed size limit; larger chunks count as damaged."""
 
 MAX_ATTACHMENT_BYTES: Final = 1 << 26
 
@@ -119,7 +117,7 @@ _INDEX_ENTRY_BYTES: Final = 16
 
 
 def is_mcap(path: str | PathLike[str]) -> bool:
-    """Whether a file's content is an MCAP; one that cannot be opened, or would lose what is read here, is none."""
+    """Whether a file's content is MCAP; False if it cannot be opened, or if reading would consume it."""
     try:
         file = Path(path)
         if file.is_fifo():
@@ -131,7 +129,7 @@ def is_mcap(path: str | PathLike[str]) -> bool:
 
 
 class ChunkIndex(Struct):
-    """Where a chunk is in the file, and its index."""
+    """Position of a chunk in the file, and its index."""
 
     offset: int
     """Offset of its content in the file."""
@@ -141,19 +139,19 @@ class ChunkIndex(Struct):
     counts: dict[int, int]
     """Messages of each channel, as far as its index was found."""
     indexed: bool = False
-    """Whether that is all of it."""
+    """Whether the counts are complete."""
 
 
 class McapScan:
-    """Walks over a file; ``walk`` goes on where it stopped, for files that grow."""
+    """Walks over a file; ``walk`` continues where it stopped, for files that grow."""
 
     def __init__(self, path: str | PathLike[str]) -> None:
-        """Open the file. Raises ConfigurationError: it cannot be opened, or is no MCAP."""
+        """Open the file. Raises ConfigurationError if it cannot be opened, or is not MCAP."""
         self.path = Path(path)
         self.drops: Drops = Counter()
         self.chunks: list[ChunkIndex] = []
         self.attachments: dict[str, tuple[int, int]] = {}
-        """Where each one's record lies: offset and length."""
+        """Offset and length of each attachment's record."""
         self.topics: dict[int, str] = {}
         """Topics of channels, by number."""
         self.finished = False
@@ -171,7 +169,7 @@ class McapScan:
         self.walk()
 
     def walk(self) -> None:
-        """Read what has been written since."""
+        """Read what has been written since the last call."""
         size = self._file.seek(0, 2)
         while not self.finished and self._next + _RECORD.size <= size:
             self._file.seek(self._next)
@@ -184,7 +182,7 @@ class McapScan:
 
     @property
     def unread_bytes(self) -> int:
-        """What the file has beyond the last whole record."""
+        """Bytes beyond the last complete record."""
         return 0 if self.finished else self._file.seek(0, 2) - self._next
 
     def close(self) -> None:
@@ -209,7 +207,7 @@ class McapScan:
             self.finished = True
 
     def _complete_index(self, chunk: ChunkIndex) -> None:
-        """The chunk's index is complete; read the chunk if that names a channel that is not known yet."""
+        """Complete a chunk's index; read the chunk if the index names an unknown channel."""
         if not chunk.indexed and chunk.counts:
             chunk.indexed = True
             if not chunk.counts.keys() <= self.topics.keys():
@@ -242,7 +240,7 @@ class McapScan:
         return data
 
     def messages(self, chunk: ChunkIndex) -> Iterator[tuple[int, int, bytes]]:
-        """Channel, log time and payload of each message of a chunk, as written; none of a damaged chunk."""
+        """Yield channel, log time and payload of each message of a chunk, as written; none of a damaged chunk."""
         data = self._content(chunk)
         if data is None:
             self.drops["damaged-chunk"] += 1
@@ -282,7 +280,7 @@ class McapScan:
 
 
 def _decompressed(name: bytes, data: bytes, size: int) -> bytes | None:
-    """The content, of which no more is made than it should have; None if it is damaged or of another compression."""
+    """Decompress up to the expected size; None if the data are damaged or use another compression."""
     try:
         if name == b"zstd":
             return zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
@@ -293,13 +291,13 @@ def _decompressed(name: bytes, data: bytes, size: int) -> bytes | None:
     return None if name else data
 
 
-# ``McapRecording``: what was recorded of a running site, by kind and time; also while it is being recorded.
+# ``McapRecording``: a recording by kind and time, also while it is being written.
 
 NS: Final = 1_000_000_000
 
 
 class RecordingSummary(Struct, frozen=True):
-    """What a recording holds. Times are Unix seconds by the recorder's clock, None while nothing is in it."""
+    """Contents of a recording. Times are Unix seconds by the recorder's clock, None while nothing is in it."""
 
     path: str
     site: int | None
@@ -321,7 +319,7 @@ class RecordingSummary(Struct, frozen=True):
 
 
 def tags_to_replay(summary: RecordingSummary) -> tuple[str, ...]:
-    """Tags whose receptions a recording holds. Raises ConfigurationError where there is none."""
+    """Tags whose receptions a recording holds. Raises ConfigurationError if there are none."""
     if summary.start_s is None:
         beyond = f", and {summary.unread_bytes} bytes that are not whole" if summary.unread_bytes else ""
         held = f"empty: no message in it{beyond}"
@@ -344,7 +342,7 @@ class McapRecording:
     """A recording; ``refresh`` reads what has been written since it was opened."""
 
     def __init__(self, path: str | PathLike[str]) -> None:
-        """Open it and read where its chunks are. Raises ConfigurationError: it cannot be opened, or is no MCAP."""
+        """Open a recording and index its chunks. Raises ConfigurationError if it cannot be opened, or is not MCAP."""
         self._scan = McapScan(path)
         self._lasting: dict[str, Struct] = {}
         self._lasting_chunks = 0
@@ -361,17 +359,17 @@ class McapRecording:
         self._scan.close()
 
     def refresh(self) -> None:
-        """Read what has been written since."""
+        """Read what has been written since the last call."""
         self._scan.walk()
 
     @property
     def site(self) -> SiteMessage | None:
-        """The site, as recorded last."""
+        """The site as last recorded."""
         return cast("SiteMessage | None", self._last("site"))
 
     @property
     def zones(self) -> ZonesMessage | None:
-        """The site's zones, as recorded last."""
+        """The site's zones as last recorded."""
         return cast("ZonesMessage | None", self._last("zones"))
 
     @property
@@ -380,7 +378,7 @@ class McapRecording:
         return self._scan.attachment(FLOOR_PLAN)
 
     def summary(self) -> RecordingSummary:
-        """What it holds; quick, as only indexes are read."""
+        """Summarise the contents; quick, as only indexes are read."""
         counts: Counter[str] = Counter()
         tags: set[str] = set()
         raw_tags: set[str] = set()
@@ -413,32 +411,32 @@ class McapRecording:
     def fixes(
         self, from_s: float = -math.inf, to_s: float = math.inf, tags: Iterable[str] | None = None
     ) -> Iterator[FixMessage]:
-        """Fixes recorded from ``from_s`` on and before ``to_s`` (Unix time), in the order of recording."""
+        """Yield fixes recorded from ``from_s`` to before ``to_s`` (Unix time), in the order of recording."""
         wanted = None if tags is None else frozenset(tags)
         for found in self.messages({"fix"}, from_s, to_s):
             if wanted is None or found.channel.name in wanted:
                 yield cast("FixMessage", found.message)
 
     def truth(self, from_s: float = -math.inf, to_s: float = math.inf) -> Iterator[TruthMessage]:
-        """Where the tags truly were."""
+        """Yield the true positions of the tags."""
         return (cast("TruthMessage", found.message) for found in self.messages({"truth"}, from_s, to_s))
 
     def receptions(self, tag: str | None = None) -> Iterator[ReceptionsMessage]:
-        """Raw receptions of one tag, or of all."""
+        """Yield the raw receptions of one tag, or of all."""
         for found in self.messages({"receptions"}):
             if tag is None or found.channel.name == tag:
                 yield cast("ReceptionsMessage", found.message)
 
     def messages(self, kinds: set[str], from_s: float = -math.inf, to_s: float = math.inf) -> Iterator[Recorded]:
-        """Messages of these kinds by time of recording; chunks without any are not even read."""
+        """Yield messages of these kinds by time of recording; chunks without any are not read."""
         for chunk in list(self._scan.chunks):
             if chunk.end_ns / NS >= from_s and chunk.start_ns / NS < to_s and self._may_hold(chunk, kinds):
                 yield from self._of(chunk, kinds, from_s, to_s)
 
     def spans(self, kinds: set[str], gap_s: float) -> list[tuple[float, float]]:
-        """When there are messages of these kinds: begins and ends in Unix time, in order, by the times of chunks.
+        """Periods with messages of these kinds: sorted begins and ends in Unix time, by the times of chunks.
 
-        Gaps of up to ``gap_s`` are no gaps. Only indexes are read, so a span may begin and end a chunk too wide.
+        Gaps of up to ``gap_s`` are bridged. Only indexes are read, so a period may be a chunk too long at each end.
         """
         found: list[tuple[float, float]] = []
         for chunk in self._scan.chunks:
@@ -451,7 +449,7 @@ class McapRecording:
         return found
 
     def _holds(self, chunk: ChunkIndex, kinds: set[str]) -> bool:
-        """Whether a chunk holds messages of these kinds; one without a whole index is read."""
+        """Whether a chunk holds messages of these kinds; one without a complete index is read."""
         if chunk.indexed:
             return self._may_hold(chunk, kinds)
         return any(True for _ in self._of(chunk, kinds, -math.inf, math.inf))
@@ -471,14 +469,14 @@ class McapRecording:
             yield Recorded(time_s, channel, topic, message)
 
     def _may_hold(self, chunk: ChunkIndex, kinds: set[str]) -> bool:
-        """Whether the index does not rule it out."""
+        """Whether the index does not rule such messages out."""
         if not chunk.indexed:
             return True
         channels = (channel_of(self._scan.topics.get(number, "")) for number in chunk.counts)
         return any(channel is not None and channel.kind in kinds for channel in channels)
 
     def _last(self, kind: str) -> Struct | None:
-        """The newest message of a kind that lasts."""
+        """The newest message of a retained kind."""
         chunks = self._scan.chunks
         kinds = {"site", "zones"}
         for chunk in chunks[self._lasting_chunks :]:
@@ -489,7 +487,7 @@ class McapRecording:
         return self._lasting.get(kind)
 
     def _counts(self) -> Counter[str]:
-        """Messages by topic; a chunk without a whole index is read."""
+        """Messages by topic; a chunk without a complete index is read."""
         counts: Counter[str] = Counter()
         for chunk in self._scan.chunks:
             found = chunk.counts if chunk.indexed else Counter(channel for channel, _, _ in self._scan.messages(chunk))
@@ -497,41 +495,39 @@ class McapRecording:
         return counts
 
 
-# Unix time of recorded receptions: by the tag's counter, which the least delayed of them tie to its host's clock.
-#
-# A host sees frames late, by changing amounts, so the times that it gives them are too coarse to be compared with the
-# truth. But now and then the two clocks move against each other: the emulated air stood still, a clock was set, a
-# radio was started again. Then they are tied again. When receptions suddenly come late, it may also be that the host
-# was busy and receives what had waited. Which of the two it is shows within a second; until then they are held back.
+# Unix time of receptions by the tag's counter, tied to its host's clock by the least delayed ones, as hosts see frames
+# with varying delays. The clocks jump against each other when the emulated air stalls, a clock is set or a radio
+# restarts. Receptions that are suddenly late are held back for a second, until it is clear whether the host was merely
+# busy.
 
 _HOST_DRIFT: Final = 1e-4
-"""By how much a host's clock and a tag's may differ in rate."""
+"""Largest relative rate difference between a host's clock and a tag's."""
 
 _SUDDEN_S: Final = 0.1
 """Receptions that are later than this are held back until it is clear why."""
 
 _STEADY_S: Final = 1.0
-"""A host that is late for so long without a break has another clock, or the tag's counter stood still."""
+"""A host that is continuously late for this long has another clock, or the tag's counter stood still."""
 
 _MAX_HELD: Final = 10_000
-"""A forged recording could hold back any number."""
+"""Limit against forged recordings, which could hold back any number."""
 
 _T = TypeVar("_T")
 
 
 class HostClock(Generic[_T]):
-    """Unix times of one tag's receptions, and of what each of them carries through here."""
+    """Unix times of one tag's receptions, and of what is carried with each."""
 
     def __init__(self) -> None:
         self._ticks = Unwrapper()
         self._less_counter_s = math.inf
-        """Unix time less the counter, as the least delayed reception has it."""
+        """Unix time less the counter, by the least delayed reception."""
         self._last_s = 0.0
         self._held: list[tuple[_T, float, float, float]] = []
-        """What is carried, its counter, its host's time less that, and its host's time."""
+        """Carried object, counter, host time less counter, and host time."""
 
     def add(self, reception: Reception, unix_less_host_s: float, carried: _T) -> list[tuple[_T, float]]:
-        """Add a reception; what is carried by those whose Unix time is known now, in order, with that time."""
+        """Add a reception. Returns what is carried by those whose Unix time is known now, in order, with that time."""
         counter_s = self._ticks.unwrap(reception.rx_ticks, reception.host_s) * TICK_S
         least_s = self._less_counter_s + _HOST_DRIFT * max(counter_s - self._last_s, 0.0)
         self._last_s = counter_s
@@ -549,7 +545,7 @@ class HostClock(Generic[_T]):
         return self._released()
 
     def rest(self) -> list[tuple[_T, float]]:
-        """What is still held back at the end."""
+        """Return what is still held back at the end."""
         if len(self._held) > 1:
             (_, first_s, _, begun_s), (_, last_s, _, ended_s) = self._held[0], self._held[-1]
             if ended_s - begun_s >= 0.5 * (last_s - first_s):  # no backlog, which is processed at once

@@ -1,4 +1,4 @@
-"""A survey into the files of a site: the site's own, the record next to it, and the image of the floor."""
+"""Writing of a survey to the files of a site: the site file, the record next to it, and the image of the floor."""
 
 from collections.abc import Iterator
 from math import dist
@@ -38,7 +38,7 @@ _ENDINGS: Final = {b"\x89PNG": ".png"}
 
 
 class FloorImage(Struct, frozen=True):
-    """Where the image of the floor lies, and its bytes, or None for that of the site file."""
+    """Placement of the image of the floor, and its bytes; None for the image of the site file."""
 
     plan: FloorPlanSite
     image: bytes | None
@@ -53,10 +53,10 @@ class Saved(Struct, frozen=True):
 
 
 def saved_without_file(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> Saved:
-    """The site after a survey, where there is no file to write.
+    """The site after a survey if there is no file to write.
 
     Raises:
-        SkylessError: the result is no valid site.
+        SkylessError: the result is not a valid site.
     """
     placed = surveyed_site(site, survey)
     check_site(placed, Path("the survey's result"))
@@ -64,7 +64,7 @@ def saved_without_file(site: Site, survey: Survey, ranges: PairRanges, unix_s: f
 
 
 def record_of(file: Path | None, site: Site, log: Log) -> SurveyRecord | None:
-    """The record of the survey that a site file comes from. Without one the watch learns what is usual."""
+    """Read the record of the survey that made a site file. Without one the watch learns the usual ranges."""
     if file is None or not record_path(file).exists():
         return None
     try:
@@ -95,10 +95,10 @@ def is_record_of(record: SurveyRecord, site: Site) -> bool:
 def save_survey(
     file: Path, survey: Survey, ranges: PairRanges, unix_s: float, floor: FloorImage | None = None
 ) -> Saved:
-    """Write a result into a site's file, and its record next to it. The file before is kept under another name.
+    """Write a result into a site's file, and its record next to it; keep the previous file under another name.
 
     Raises:
-        SkylessError: a file cannot be read or written, or the result is no valid site.
+        SkylessError: a file cannot be read or written, or the result is not a valid site.
     """
     site = load_site(file)
     record, kept = _record(site, survey, ranges, unix_s), kept_path(file)
@@ -120,7 +120,7 @@ def _record(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> Su
 
 
 def kept_path(file: Path) -> Path:
-    """Where the file before a survey is kept: ``NAME.before-survey-1.toml``, or the next number that is free."""
+    """Path for the file before a survey: ``NAME.before-survey-1.toml``, or with the next free number."""
     number = 1
     while (kept := file.with_name(f"{file.stem}.before-survey-{number}{file.suffix}")).exists():
         number += 1
@@ -128,7 +128,7 @@ def kept_path(file: Path) -> Path:
 
 
 def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None, dict[Path, bytes]]:
-    """Name of the image in the site file, or None without one, and the file to write if the image is new."""
+    """Name of the image in the site file, None without one, and the file to write if the image is new."""
     present = None if site.floor_plan is None else site.floor_plan.image
     if floor.image is None or image_size(floor.image) is None:
         return present, {}
@@ -141,7 +141,7 @@ def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None,
 
 
 MAX_FACTS: Final = 10_000
-"""Heights, tapes, points and the like, each."""
+"""Limit for each of heights, tapes, points and so on."""
 
 
 _COORDINATE: Final = Limits(-MAX_COORDINATE_M, MAX_COORDINATE_M, "metres")
@@ -157,11 +157,11 @@ _POSITIVE_STD: Final = Limits(0, 100, "metres", above=True)
 
 
 class BadFactsError(ValueError):
-    """What is wrong with the facts that somebody has sent, or with a request to save."""
+    """The facts sent, or a request to save, are wrong."""
 
 
 def check_facts(message: SurveyFactsMessage) -> None:
-    """Check that facts can be computed with. Raises BadFactsError, which names field, value and what would be right."""
+    """Check that facts can be used. Raises BadFactsError, which names field, value and what would be right."""
     facts = message.facts
     if facts.tags:
         raise BadFactsError(f"facts.tags has {len(facts.tags)} entries; what tags received comes from recordings only")
@@ -183,7 +183,7 @@ def check_facts(message: SurveyFactsMessage) -> None:
 
 
 def _limited(message: SurveyFactsMessage) -> Iterator[tuple[str, float, Limits]]:
-    """Every number of metres: its path, itself, and what is allowed."""
+    """Yield every number of metres: its path, its value, and its limits."""
     facts, plan = message.facts, message.floor_plan
     for anchor, height_m in facts.heights_m.items():
         yield f"facts.heights_m of anchor {anchor}", height_m, _COORDINATE

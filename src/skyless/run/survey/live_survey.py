@@ -1,6 +1,6 @@
 """A survey while stamps come in: what is known so far, its newest results, and the watch once the site is surveyed.
 
-No I/O and no clock: times are passed in, ``now_s`` by one clock that does not go back.
+No I/O and no clock: times are passed in, ``now_s`` by one monotonic clock.
 """
 
 from collections import deque
@@ -32,29 +32,29 @@ from skyless.site.survey.pair_ranger import PairRanger, StepTable
 from skyless.site.survey.watch import AnchorWatch, Change, with_changes
 
 NO_DATA_S: Final = 5.0
-"""Without stamps for this time a result is out of date."""
+"""Time without stamps after which a result is outdated."""
 
 PRESENT_S: Final = 10.0
-"""An anchor of which nothing came for longer is missing."""
+"""An anchor that has not been received for longer is missing."""
 
 ADOPTION_S: Final = 2.0
-"""Stamps of this time after a placement are not used: anchors adopt it one after the other."""
+"""Stamps within this time after a placement are ignored, as anchors adopt it one after the other."""
 
 _RESULTS_KEPT: Final = 64  # a user saves the result that is on the page, while newer ones are made
 
 _MAX_BACKLOG_S: Final = 60.0
-"""A message that is later than this against others of its sender shows that a clock was set, not that it waited."""
+"""A message that seems later than this against others of its sender shows that a clock was set, not that it waited."""
 
 _SHOWN_PAIRS_PER_S: Final = 200
 
 _LAG_S: Final = 30.0
-"""For up to twice this time the quickest message counts: a host's clock that was set back is noticed after it."""
+"""The quickest message counts for up to twice this time, after which a host's clock that was set back is noticed."""
 
 _MAX_WAITING_BLOCKS: Final = 100_000  # a minute of a site with 50 anchors
 _MAX_WAITING_LEGS: Final = 100_000
 
 FactsOf = Callable[[Site], Facts]
-"""What is known of a site without a user's help."""
+"""Gives what is known of a site without a user's help."""
 
 State = Literal["collecting", "surveyed", "no data"]
 
@@ -86,7 +86,7 @@ class LiveSurvey:
     # What comes in
 
     def add_stamps(self, message: StampsMessage, now_s: float) -> None:
-        """Process what an anchor has received of others. Stamps of anchors that the site has not are dropped."""
+        """Process what an anchor has received from others. Stamps of anchors not in the site are dropped."""
         if message.anchor not in self._known or now_s < self._pause_until_s:
             return
         self.missed += message.missed
@@ -100,12 +100,12 @@ class LiveSurvey:
                 self._add(AnchorLeg(stamp.anchor, message.anchor, *ticks, t_s, phase_cycles), now_s)
 
     def add_leg(self, leg: AnchorLeg, now_s: float) -> None:
-        """Process a reception that was relayed."""
+        """Process a relayed reception."""
         if leg.sender in self._known and leg.receiver in self._known and not now_s < self._pause_until_s:
             self._add(leg, now_s)
 
     def set_facts(self, facts: Facts) -> None:
-        """Replace what is known. Facts of anchors that the site has not are dropped."""
+        """Replace the known facts. Those about anchors not in the site are dropped."""
         known = self._known
         gauge = facts.gauge
         named = set() if gauge is None else {gauge.origin, gauge.x_axis, gauge.left} - {None}
@@ -122,28 +122,28 @@ class LiveSurvey:
     # Results
 
     def ranges(self) -> PairRanges:
-        """All ranges so far, with all anchors of the site."""
+        """Return all ranges so far, with all anchors of the site."""
         found = self._ranger.ranges()
         return replace(found, anchors=tuple(sorted(self._known)))
 
     def finish(self) -> PairRanger:
-        """Nothing more comes: what has come since the last full second counts as well. What makes the ranges."""
+        """Finish the ranges, including those since the last full second, and return their ranger."""
         self._ranger.finish()
         return self._ranger
 
     def steps(self) -> StepTable:
-        """The ranges in the order of time, for ``change_of``."""
+        """Return the ranges in order of time, for ``change_of``."""
         return self._ranger.steps.table()
 
     def use_since(self, change: Change) -> None:
-        """Drop the ranges from before a change, and the results computed from them."""
+        """Drop the ranges before a change, and the results computed from them."""
         self._ranger.drop_before(change.since_s)
         self._changes += (change,)
         self._shown = None
         self._results.clear()
 
     def add_result(self, survey: Survey, ranges: PairRanges) -> None:
-        """Keep a result of the present ranges. The oldest of many is dropped."""
+        """Keep a result of the present ranges, dropping the oldest of many."""
         self.serial += 1
         self._results[self.serial] = (with_changes(survey, self._changes, ranges.duration_s), ranges)
         if len(self._results) > _RESULTS_KEPT:
@@ -172,7 +172,7 @@ class LiveSurvey:
         return "surveyed" if self._results else "collecting"
 
     def message(self, now_s: float, unix_s: float, file: str | None) -> SurveyMessage:
-        """All of it for those who watch."""
+        """Make the message that states all of this."""
         newest, state = self._results.get(self.serial), self.state(now_s)
         present = {anchor for anchor, heard_s in self._heard_s.items() if now_s - heard_s <= PRESENT_S}
         ranges = self._shown_ranges(now_s)
@@ -197,7 +197,7 @@ class LiveSurvey:
         )
 
     def watch_message(self, now_s: float, unix_s: float) -> WatchMessage | None:
-        """What the watch saw when it was last advanced, or None if too few anchors have positions for a watch."""
+        """What the watch saw when it last advanced; None if too few anchors have positions for a watch."""
         watched = self._watch
         if watched is None:
             return None
@@ -210,15 +210,15 @@ class LiveSurvey:
         return WatchMessage(unix_s, state if has_data else "no data", findings, pairs)
 
     def advance_watch(self, now_s: float) -> None:
-        """Let the watch look at the ranges that have come. A striking window of a large site takes it a second.
+        """Let the watch process new ranges. A conspicuous window of a large site takes a second.
 
-        It may run in a thread while all else is called, but not twice at once.
+        It may run in a thread parallel to everything else, but not twice at once.
         """
         if self._watch is not None:
             self._watch.advance(now_s)
 
     def restart_ranges(self) -> None:
-        """Forget all ranges and results: an anchor is where it was not before, or antenna delays are others."""
+        """Forget all ranges and results, because an anchor or antenna delays have changed."""
         self.begun += 1
         self._known = {anchor.id for anchor in self.site.all_anchors}
         self._ranger = PairRanger(on_block=self._on_block)
@@ -229,7 +229,7 @@ class LiveSurvey:
     # Within
 
     def _shown_ranges(self, now_s: float) -> PairRanges:
-        """Ranges for a message: those of 1225 pairs take half a second, and are made again every six."""
+        """Ranges for a message. Those of 1225 pairs take half a second, so they are made only every six."""
         if self._shown is None or not 0.0 <= now_s - self._shown[1] < len(self._shown[0].pairs) / _SHOWN_PAIRS_PER_S:
             self._shown = self._ranger.ranges(), now_s
         return self._shown[0]
@@ -241,9 +241,9 @@ class LiveSurvey:
             self._watch.waiting_legs.append(leg)
 
     def _sent_s(self, anchor: int, unix_s: float, now_s: float) -> float:
-        """When a message was sent: by its sender's clock, less what the quickest of its messages shows that to be off.
+        """When a message was sent by its sender's clock, corrected for that clock's offset.
 
-        A message may have waited behind others, and hosts' clocks differ.
+        The offset is that of the sender's quickest message: messages may wait, and hosts' clocks differ.
         """
         lag_s = now_s - unix_s
         lag = self._lags.get(anchor)
@@ -255,7 +255,7 @@ class LiveSurvey:
         return now_s - (lag_s - min(lag.least_s, lag.newest_s))
 
     def _begin_watch(self, record: SurveyRecord | None) -> None:
-        """Watch the anchors that have positions, if these are enough to say anything."""
+        """Watch the anchors that have positions, if these are enough."""
         placed = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in self.site.anchors}
         self._watch = None
         if len(placed) > 2:
@@ -272,13 +272,13 @@ class _Lag(Struct):
 
     begun_s: float
     newest_s: float
-    """Since then."""
+    """Least difference since then."""
     least_s: float
-    """In the time before."""
+    """Least difference in the time before."""
 
 
 class _Watched:
-    """A watch, the ranges that it has not looked at yet, and what it saw last."""
+    """A watch, its unprocessed ranges, and its last result."""
 
     def __init__(self, watch: AnchorWatch) -> None:
         self.waiting: deque[PairBlock] = deque(maxlen=_MAX_WAITING_BLOCKS)
@@ -287,7 +287,7 @@ class _Watched:
         self._watch, self._phases = watch, PhaseWatch()
 
     def advance(self, now_s: float) -> None:
-        """Look at what is waiting."""
+        """Process the waiting ranges."""
         watch = self._watch
         while self.waiting:
             watch.add(self.waiting.popleft())

@@ -1,4 +1,4 @@
-"""``skyless survey`` at a running site: gathers anchors' stamps, publishes results, saves them, watches the anchors."""
+"""``skyless survey`` at a running site: collects anchors' stamps, publishes and saves results, watches the anchors."""
 
 import asyncio
 import secrets
@@ -76,7 +76,7 @@ _EARLIER_KEPT: Final = 32  # sites before the present one that a placement names
 _MAX_LOGGED: Final = 100
 
 QUIET_S: Final = 10.0
-"""A program that serves publishes a survey at least this often."""
+"""A serving program publishes a survey at least this often."""
 
 _ENDED_S: Final = 3.0 * QUIET_S  # an earlier program without a message for this time has ended
 
@@ -86,19 +86,21 @@ Solve = Callable[[PairRanges, Facts], Survey]
 
 
 class SurveySettings(Struct, frozen=True):
-    """What a survey program serves."""
+    """Settings of a survey program."""
 
     site_id: int
     site: Site | None = None
-    """None: that on MQTT."""
+    """None means the site on MQTT."""
     file: Path | None = None
     """The site's file, which is written on request."""
     serves: bool = True
-    """False for a program that only gathers beside one that serves: it computes, publishes and saves nothing."""
+    """Whether it serves the site; otherwise it only collects beside one that does, and computes, publishes and saves
+    nothing.
+    """
 
 
 class SurveyNode:
-    """The survey program of one site, with stamps by MQTT or from what a radio of its own receives."""
+    """The survey program of one site, with stamps from MQTT or from its own radio."""
 
     def __init__(
         self,
@@ -109,7 +111,7 @@ class SurveyNode:
         log: Log,
         radio: Radio | None = None,
     ) -> None:
-        """``facts_of``: what is known of a site before anybody gives facts. ``solve``: ``survey.solve.run_survey``."""
+        """``facts_of``: what is known of a site without a user's help. ``solve``: ``survey.solve.run_survey``."""
         self.live: LiveSurvey | None = None  # None before the site is known
         self.problems = 0  # messages that could not be read
         self.saved: Saved | None = None
@@ -158,7 +160,7 @@ class SurveyNode:
             self._withdraw()
 
     def _withdraw(self) -> None:
-        """End the lease, and clear what is retained for as long as this runs."""
+        """End the lease, and clear what is retained only while this program runs."""
         link, site_id = self.link, self._settings.site_id
         if link is None:
             return
@@ -246,7 +248,7 @@ class SurveyNode:
             self._forget(survey_topic, watch_topic)
 
     def _waits(self) -> bool:
-        """Whether another program serves the site: then this one only gathers."""
+        """Whether another program serves the site, so that this one only collects."""
         return self._precedence.waits(time.monotonic())
 
     def _on_image(self, _topic: str, payload: bytes) -> None:
@@ -258,13 +260,13 @@ class SurveyNode:
         self._placement = message
 
     def _forget(self, *topics: Callable[[int], str]) -> None:
-        """Stop repeating what another program publishes now."""
+        """Stop repeating what another program now publishes."""
         if self.link is not None:
             for topic in topics:
                 self.link.forget(topic(self._settings.site_id))
 
     def _begin(self, site: Site) -> None:
-        """Survey a site from now on."""
+        """Start to survey a site."""
         record = record_of(self._settings.file, site, self._log)
         try:
             facts = self._facts_of(site) if self._given is None else self._given.facts
@@ -278,9 +280,9 @@ class SurveyNode:
     # Results
 
     def final_ranges(self) -> PairRanges:
-        """The ranges when nothing more comes, as the antenna delays of the site to be surveyed would give them.
+        """The final ranges, computed with the antenna delays of the site to be surveyed.
 
-        The anchors may run with others. Only once the site is known.
+        The anchors may run with other delays. Call this only once the site is known.
         """
         assert self.live is not None
         self.live.finish()
@@ -290,7 +292,7 @@ class SurveyNode:
         return ranges.without_delays(delay_differences_m(self._running, self.live.site))
 
     def update(self) -> None:
-        """Begin another result if it is time, and publish what is due."""
+        """Start to compute another result if it is time, and publish what is due."""
         live, now_s, unix_s = self.live, time.monotonic(), time.time()
         if self._monitor is not None and self._radio is not None:
             self._monitor.check(now_s, self._received, self._legs.counters["legs"], self._legs.counters)
@@ -309,7 +311,7 @@ class SurveyNode:
             self._publish(self.link, live, now_s, unix_s, watch)
 
     async def _make_result(self, live: LiveSurvey) -> None:
-        """One result, made in a thread so that the loop goes on."""
+        """Compute one result, in a thread so that the loop goes on."""
         self._facts_changed = False
         ranges, facts, begun = live.ranges(), live.facts, live.begun
         if not ranges.pairs:
@@ -339,7 +341,7 @@ class SurveyNode:
             live.add_result(survey, ranges)
 
     async def _advance_watch(self, live: LiveSurvey) -> None:
-        """Let the watch look at new ranges, in a thread so that the loop goes on."""
+        """Let the watch process new ranges, in a thread so that the loop goes on."""
         try:
             await asyncio.to_thread(live.advance_watch, time.monotonic())
         except Exception as error:  # noqa: BLE001 - whatever it is, the survey goes on
@@ -370,7 +372,7 @@ class SurveyNode:
             self._logged_state = state
 
     def _log_findings(self, live: LiveSurvey, watch: WatchMessage) -> None:
-        """Log what is new. An anchor that has moved makes the earlier ranges useless for another survey."""
+        """Log new findings. An anchor that has moved makes the earlier ranges useless for another survey."""
         lines, has_moved = self._findings_log.update(watch.findings)
         for line in lines:
             self._log(f"watch: {line}")
@@ -397,7 +399,7 @@ class SurveyNode:
         self.update()
 
     def save(self, serial: int | None = None) -> Saved:
-        """Use a result, by default the newest: write the site's file, and let the anchors adopt it.
+        """Use a result, by default the newest: write the site file, and let the anchors adopt it.
 
         Raises:
             SkylessError: there is no such result, or it cannot be used.
@@ -429,7 +431,7 @@ class SurveyNode:
         return saved
 
     def _place(self, live: LiveSurvey, before: Site, saved: Saved, serial: int) -> None:
-        """Publish the new site for the anchors, and survey and watch that from now on."""
+        """Publish the new site for the anchors, then survey and watch it."""
         earlier: tuple[str, ...] = ()
         old = self._placement
         if old is not None and site_digest(old.site) == site_digest(before):
@@ -450,7 +452,7 @@ class SurveyNode:
 
 
 class Precedence:
-    """Decides which of two survey programs at one site waits, so that only one saves what the page asks for. No I/O."""
+    """Decides which of two survey programs at one site waits, so that only one saves on the page's request. No I/O."""
 
     def __init__(self, unix_s: float) -> None:
         """``unix_s``: when this program started."""
@@ -460,10 +462,9 @@ class Precedence:
         self._heard_s: float | None = None  # when an earlier program was last seen to run
 
     def add(self, message: SurveyMessage, now_s: float) -> bool:
-        """Process a survey on MQTT. True if it is the first to show that this program has to wait.
+        """Add a survey message from MQTT. Returns True if it is the first to show that this program has to wait.
 
-        One message shows nothing: the broker may have kept it of a program that has ended. A second, different
-        message does.
+        One message proves nothing, as the broker may have retained it; a second, different one does.
         """
         if message.by == "" or message.by >= self.name:
             return False
@@ -480,13 +481,13 @@ class Precedence:
 
 
 class FindingsLog:
-    """The findings that have been logged and are not over."""
+    """Findings that were logged and still hold."""
 
     def __init__(self) -> None:
         self._logged: dict[tuple[str, tuple[int, ...]], WatchFinding] = {}
 
     def update(self, findings: Iterable[WatchFinding]) -> tuple[list[str], bool]:
-        """Lines for what is new or over, and whether an anchor has newly moved or changed its delay."""
+        """Return lines for what is new or over, and whether an anchor has newly moved or changed its delay."""
         lines: list[str] = []
         present = {(str(one.kind), one.anchors): one for one in findings}
         for key, one in present.items():
@@ -502,6 +503,6 @@ class FindingsLog:
 
 
 def _content(message: WatchMessage) -> object:
-    """A message of the watch without its times."""
+    """Contents of a watch message without its times."""
     findings = [(one.kind, one.anchors, one.sentence) for one in message.findings]
     return message.state, message.pairs, findings
