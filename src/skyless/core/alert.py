@@ -1,10 +1,10 @@
-"""What a fix states of its integrity; on its own, so that programs that only read fixes load no numeric library."""
+"""``Alert``, in a module of its own so that programs that only read fixes load no numeric library."""
 
 from enum import StrEnum
 
 
 class Alert(StrEnum):
-    """What a fix states of its integrity."""
+    """Integrity statement of a fix."""
 
     NONE = "none"
     EXCLUDED = "detected-excluded"

@@ -10,7 +10,7 @@ from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ
 
 
 class AnchorPage(Struct, frozen=True, gc=False, tag="anchor"):
-    """Position of one anchor (antenna phase centre), to the millimetre."""
+    """Position of one anchor's antenna phase centre, to the millimetre."""
 
     anchor: int
     x_m: float
@@ -30,7 +30,7 @@ class SchedulePage(Struct, frozen=True, gc=False, tag="schedule"):
     anchors: int
     """Number of anchors of the site, so that a tag knows when its almanac is complete."""
     tag_height_m: float | None
-    """Height at which every tag of the site moves (2-D positioning); None where height is to be estimated."""
+    """Height of every tag of the site (2-D positioning); None if the height is to be estimated."""
 
 
 class NoisePage(Struct, frozen=True, gc=False, tag="noise"):
@@ -66,16 +66,16 @@ class GeoreferencePage(Struct, frozen=True, gc=False, tag="georeference"):
 
 
 class SitePage(Struct, frozen=True, gc=False, tag="site"):
-    """What is common to a site of protocol 2, other than noise, accuracy and georeference."""
+    """Data common to a protocol 2 site, other than noise, accuracy and georeference."""
 
     pages: int
     """Number of pages, this one included, so that a tag knows when it has them all."""
     tag_height_m: float | None
-    """Height at which every tag of the site moves (2-D positioning); None where height is to be estimated."""
+    """Height of every tag of the site (2-D positioning); None if the height is to be estimated."""
 
 
 class KeyPage(Struct, frozen=True, gc=False, tag="key"):
-    """A disclosed key of the site's chain: that of the interval of its frame less the lag of the chain."""
+    """A disclosed key of the site's chain: the key of the frame's interval minus the lag of the chain."""
 
     key: bytes
     """16 bytes."""
@@ -84,13 +84,9 @@ class KeyPage(Struct, frozen=True, gc=False, tag="key"):
 Page = AnchorPage | SchedulePage | NoisePage | AccuracyPage | GeoreferencePage | SitePage | KeyPage
 
 
-# When an anchor of protocol 2 sends: at random instants that everybody can predict (``docs/protocol2.md``).
-#
-# The gap between two beacons of an anchor is a function of its identifier, of the first one's sequence number and of
-# the mean period that this one states. So a receiver of one beacon knows when the next ones leave, by the anchor's
-# counter, however many of them get lost; and two anchors whose beacons collided hardly collide again the next time.
-#
-# A period is stated as a code of 8 bits, as floating-point numbers are: 16 steps for each doubling, from 4 ms on.
+# When an anchor of protocol 2 sends: at pseudo-random instants that any receiver can predict (``docs/protocol2.md``).
+# The gap between two beacons follows from the anchor's identifier, the sequence number and the stated mean period.
+# Periods are coded in 8 bits like floating-point numbers: 16 steps per doubling, from 4 ms on.
 
 PERIOD_CHANGES: Final = 16
 """An anchor changes its period only before a beacon whose sequence number is a multiple of this."""
@@ -99,51 +95,51 @@ LONGEST_PERIOD_CODE: Final = 0x9F
 """4 s: a gap of one and a half periods is shorter than half a wrap of a counter."""
 
 OFFERED_HZ: Final = 3.0 / (20.0 * air_time_s(MAX_FRAME_BYTES))
-"""Beacons per second that the anchors in reach of a tag should send in all: 476.
+"""Total beacons per second that the anchors in reach of a tag should send: 476.
 
-In free space a frame of length tau is lost to others within sqrt(10) times its sender's distance, so a tag gets
-1 / (20 tau) * (1 - exp(-20 tau * offered)) beacons a second, which 3 / (20 tau) brings to 95 % of its most.
+In free space a frame of length tau is lost to others within sqrt(10) times its sender's distance, so a tag receives
+1 / (20 tau) * (1 - exp(-20 tau * offered)) beacons a second; 3 / (20 tau) gives 95 % of the maximum.
 """
 
 SHORTEST_PERIOD_S: Final = 0.015
-"""No anchor sends more often, 67 times a second, however few there are."""
+"""Shortest mean period: no anchor sends more than 67 times a second."""
 
 _UNIT_STEPS: Final = round(0.25e-3 * TICK_RATE_HZ) // DELAYED_TX_GRANULARITY_TICKS
-"""31,200 steps of the delayed transmission: a quarter of a millisecond, the unit of periods."""
+"""Unit of periods: 31,200 steps of the delayed transmission, a quarter of a millisecond."""
 
 _STEPS: Final = 16
 _LOW: Final = 0xFFFFFFFF
 
 
 def period_ticks(code: int) -> Ticks:
-    """Mean time between two beacons of an anchor that states this code."""
+    """Return the mean time between two beacons of an anchor that states this code."""
     unit: Ticks = _UNIT_STEPS * DELAYED_TX_GRANULARITY_TICKS
     return int(unit * ((_STEPS + (code & 15)) << (code >> 4)))
 
 
 def period_code(period_s: float) -> int:
-    """Code of the shortest period that is not shorter than this, or of the longest one."""
+    """Return the code of the shortest period not shorter than this, or of the longest period."""
     wanted_ticks = period_s * TICK_RATE_HZ
     codes = range(LONGEST_PERIOD_CODE)
     return next((code for code in codes if period_ticks(code) >= wanted_ticks), LONGEST_PERIOD_CODE)
 
 
 def suitable_period_s(anchors: float, rate_hz: float | None) -> float:
-    """Mean period of an anchor that has this number in reach, itself included; ``rate_hz``: what the site file says."""
+    """Return an anchor's mean period from the number in reach, itself included; ``rate_hz``: the site file's rate."""
     return max(SHORTEST_PERIOD_S, anchors / OFFERED_HZ) if rate_hz is None else 1.0 / rate_hz
 
 
 def mixed(value: int) -> int:
-    """32 bits that depend on all bits of 32 (Wellons' lowbias32); the same from Python's integers and from int64."""
+    """Hash 32 bits (Wellons' lowbias32); the result is the same for Python integers and int64."""
     value = ((value >> 16) ^ value) * 0x7FEB352D & _LOW
     value = ((value >> 15) ^ value) * 0x846CA68B & _LOW
     return (value >> 16) ^ value
 
 
 def gap_ticks(anchor_id: int, sequence: int, code: int) -> int:
-    """Time from the beacon with this sequence number (8 bits) to the next one, by the anchor's counter.
+    """Return the ticks from the beacon with this sequence number (8 bits) to the next, in the anchor's counter.
 
-    Uniform from half a period to one and a half; whole steps of the delayed transmission.
+    Uniform between half a period and one and a half, in whole steps of the delayed transmission.
     """
     drawn = mixed(mixed(anchor_id) ^ (sequence & 0xFF))
     steps = ((_STEPS + (code & 15)) << (code >> 4)) * _UNIT_STEPS
@@ -151,7 +147,7 @@ def gap_ticks(anchor_id: int, sequence: int, code: int) -> int:
 
 
 def ticks_ahead(anchor_id: int, sequence: int, code: int, beacons: int) -> int:
-    """Time from the beacon with this sequence number to the one that follows as the given number after it."""
+    """Return the ticks from the beacon with this sequence number to the one that is ``beacons`` later."""
     ahead = 0
     for number in range(beacons):
         ahead += gap_ticks(anchor_id, sequence + number, code)

@@ -34,14 +34,12 @@ from skyless.core.native.library import compiled
 from skyless.core.native.records import Array, Byte, Bytes, Record, Ticks, record
 from skyless.core.native.views import view
 
-# The beacon of protocol 2: each anchor states its own position and when it sends next (``docs/protocol2.md``).
-
 MAX_HEARD: Final = 12
-"""Entries that the number and the flags of ``heard`` have space for."""
+"""Largest number of entries that the count and the flags of ``heard`` can hold."""
 
 
 class StatedPosition(Struct, frozen=True, gc=False):
-    """Where the sender is (antenna phase centre), to the millimetre, up to 8388 m from the origin along each axis."""
+    """Sender's antenna phase centre, to the millimetre, up to 8388 m from the origin along each axis."""
 
     x_m: float
     y_m: float
@@ -55,12 +53,12 @@ class StatedPosition(Struct, frozen=True, gc=False):
 
 
 class Authentication(Struct, frozen=True, gc=False):
-    """What shows that a frame is of an anchor of the site, once the key of its interval is known."""
+    """Proof that a frame comes from an anchor of the site, checked once the key of its interval is known."""
 
     interval: int
-    """Number of the interval, its lowest 16 bits."""
+    """Lowest 16 bits of the interval's number."""
     mac: bytes
-    """Message authentication code of all bytes before it, 8 bytes."""
+    """Message authentication code (8 bytes) of all bytes before it."""
 
 
 class Beacon(Struct, frozen=True, gc=False):
@@ -81,35 +79,35 @@ class Beacon(Struct, frozen=True, gc=False):
     position: StatedPosition | None
     """None while the sender's position is unknown."""
     heard: tuple[Heard, ...] | PackedHeard
-    """Receptions of other anchors, the most recent first; as many as fit."""
+    """Receptions of other anchors, most recent first; as many as fit."""
     weak: int
-    """Bit k is set where the first path of entry k of ``heard`` was weak: it may be late."""
+    """Bit k is set if the first path of entry k of ``heard`` was weak, so that its stamp may be late."""
     page: Page | None
-    """One page of what is common to the site."""
+    """One of the site's common pages."""
     certificate: bytes | None = None
-    """Signed statement about the site's key chain (``skyless.core.keys.chain``); then the beacon has
-    neither position, receptions nor page."""
+    """Signed statement about the site's key chain (``skyless.core.keys.chain``). A beacon with a certificate has no
+    position, receptions or page."""
     authentication: Authentication | None = None
-    """None of anchors without keys."""
+    """None for anchors without keys."""
     has_phases: bool = False
-    """Whether ``heard`` has phases; a frame then has only the lowest 32 bits of its stamps."""
+    """Whether ``heard`` has phases; such a frame carries only the lowest 32 bits of its stamps."""
 
     @property
     def relayed(self) -> tuple[Heard, ...]:
-        """All receptions of other anchors."""
+        """Return all receptions of other anchors."""
         return tuple(self.heard)
 
 
-# A beacon of protocol 2 as it is read from a frame (``docs/protocol2.md``); little endian throughout.
+# Reading a beacon of protocol 2 from a frame (``docs/protocol2.md``).
 
 INTACT: Final = 0
 TOO_SHORT, TOO_LONG, BAD_FCS, NOT_A_BEACON, UNKNOWN_VERSION, BAD_FLAGS, BAD_LENGTH, BAD_HEARD, BAD_PAGE, BAD_PERIOD = (
     range(1, 11)
 )
-"""Why bytes are no beacon, in the order of ``Malformed``."""
+"""Reasons why bytes are not a beacon, in the order of ``Malformed``."""
 
 HEADER_BYTES: Final = 11
-"""Up to the magic number."""
+"""Length of the frame up to the magic number."""
 VERSION_2: Final = BEACON_MAGIC | 0x0200
 
 HAS_POSITION: Final = 0x01
@@ -117,16 +115,16 @@ HAS_PAGE: Final = 0x02
 HAS_AUTHENTICATION: Final = 0x04
 HAS_CERTIFICATE: Final = 0x08
 ALONGSIDE_CERTIFICATE: Final = HAS_CERTIFICATE | HAS_AUTHENTICATION
-"""All flags that a frame with a certificate may have."""
+"""All flags allowed in a frame with a certificate."""
 HAS_PHASES: Final = 0x40
-"""The receptions have a phase each and stamps of 32 bits, instead of stamps of 40."""
+"""Set if receptions carry a phase each and stamps of 32 bits instead of 40."""
 RESERVED_FLAGS: Final = 0xB0
 FLAGS_AT: Final = 11
 FIXED_BYTES: Final = 20
-"""The fields that every beacon has."""
+"""Length of the fields that every beacon has."""
 POSITION_BYTES: Final = 12
 COUNT_BYTES: Final = 2
-"""Number of receptions, and which of them are weak."""
+"""Number of receptions, and the mask of weak ones."""
 COUNT_BITS: Final = 4
 COUNT_MASK: Final = 15
 CERTIFICATE_BYTES: Final = 94
@@ -137,35 +135,35 @@ AUTHENTICATION_BYTES: Final = 10
 
 @record
 class BeaconFields(Record):
-    """All that a frame says, and where it has the parts that are only passed on."""
+    """Contents of a frame, and the offsets of the parts that are passed on unread."""
 
     site: int
     anchor: int
     sequence: int
     tx_ticks: Ticks
-    """In the sender's clock, 40 bits."""
+    """TX stamp in the sender's clock, 40 bits."""
     almanac_issue: int
     period_code: int
     has_place: bool
     place: StatedPlace
     heard_at: int
-    """Where the receptions of other anchors stand."""
+    """Offset of the receptions of other anchors."""
     heard_count: int
     weak: int
-    """Bit k is set where the first path of reception k was weak: it may be late."""
+    """Bit k is set if the first path of reception k was weak, so that its stamp may be late."""
     has_phases: bool
     """Whether the receptions have phases (``SHORT_BITS``)."""
     page_at: int
-    """Where the page stands; 0 where there is none, as in the next two."""
+    """Offset of the page; 0 if there is none, as for the next two."""
     certificate_at: int
     authentication_at: int
     relay_bytes: int
     relays: Annotated[Array[Byte], MAX_HEARD * HEARD_BYTES]
-    """The receptions without the weak ones, as in the frame."""
+    """Receptions without the weak ones, encoded as in the frame."""
 
 
 def read_frame(frame: Bytes, length: int, b: BeaconFields) -> int:
-    """Read a whole frame, FCS included; why it is no beacon of version 2, ``INTACT`` if it is one."""
+    """Read a whole frame, FCS included. Return ``INTACT``, or why it is not a beacon of version 2."""
     fault = _header_fault(frame, length)
     if fault != INTACT:
         return fault
@@ -197,7 +195,7 @@ def read_frame(frame: Bytes, length: int, b: BeaconFields) -> int:
 
 
 def _header_fault(frame: Bytes, length: int) -> int:  # noqa: PLR0911 - one for each fault
-    """Why bytes are no beacon of version 2, as far as length, check sequence, header and flags show it."""
+    """Return why bytes are not a beacon of version 2, judging by length, check sequence, header and flags."""
     if length > MAX_FRAME_BYTES:
         return TOO_LONG
     if length <= FCS_BYTES:
@@ -230,7 +228,7 @@ def _length_fault(frame: Bytes, length: int) -> int:
 
 
 def bare_bytes(flags: int) -> int:
-    """Length of a frame with these flags that relays no receptions."""
+    """Return the length of a frame with these flags and no relayed receptions."""
     size = FIXED_BYTES + FCS_BYTES + (CERTIFICATE_BYTES if flags & HAS_CERTIFICATE != 0 else COUNT_BYTES)
     size += POSITION_BYTES if flags & HAS_POSITION != 0 else 0
     size += PAGE_BYTES if flags & HAS_PAGE != 0 else 0
@@ -246,7 +244,7 @@ def _read_place(frame: Bytes, at: int, place: StatedPlace) -> None:
 
 
 def _read_relays(frame: Bytes, b: BeaconFields) -> bool:
-    """Copy the receptions that are not weak; False where one is of the sender, or two of the same anchor."""
+    """Copy the receptions that are not weak. Return False if one is of the sender, or two are of the same anchor."""
     for one in range(b.heard_count):
         at = b.heard_at + one * HEARD_BYTES
         anchor = two_bytes(frame, at)
@@ -263,10 +261,9 @@ def _read_relays(frame: Bytes, b: BeaconFields) -> bool:
 
 
 def checksum(data: Bytes, length: int) -> int:
-    """CRC-16 of x¹⁶ + x¹² + x⁵ + 1, initially 0, bit 0 of each byte first (clause 7.2.10); 0 with a frame's FCS.
+    """Return CRC-16 x¹⁶ + x¹² + x⁵ + 1, initially 0, bit 0 of each byte first (clause 7.2.10); 0 with the frame's FCS.
 
-    A byte's four low and four high bits each shift the polynomial in once, so no table is needed. Python's own frames
-    have theirs from ``ieee802154.fcs``, which is faster there.
+    The polynomial is applied to four bits at a time, so no table is needed. Python uses the faster ``ieee802154.fcs``.
     """
     crc = 0
     for at in range(length):
@@ -277,15 +274,15 @@ def checksum(data: Bytes, length: int) -> int:
 
 
 FAULTS: Final = tuple(Malformed)
-"""In the order of the numbers that ``read_frame`` returns."""
+"""Reasons in the order of the numbers that ``read_frame`` returns."""
 
 MAC_BYTES: Final = AUTHENTICATION_BYTES - 2
 """Length of a message authentication code: the first 64 bits of an HMAC-SHA-256."""
 INTERVAL_BITS: Final = 16
-"""How many bits of an interval's number a frame states."""
+"""Number of bits of an interval's number that a frame states."""
 
 MAX_STATED_COORDINATE_M: Final = ((1 << 23) - 1) / 1000.0
-"""8388.6 m, along each axis from the origin."""
+"""Largest coordinate along each axis from the origin, 8388.6 m."""
 
 _FIXED: Final = struct.Struct("<HBHHHHBIBHB")
 _POSITION: Final = struct.Struct("<HbHbHbBbB")
@@ -305,15 +302,16 @@ _HEARD_ANCHORS: Final = tuple(struct.Struct("<" + count * "H6x") for count in ra
 
 
 def heard_capacity(*, position: bool = False, page: bool = True, certificate: bool = False) -> int:
-    """How many ``heard`` entries a frame with these parts may carry, with space for authentication: 0, or 8 to 12."""
+    """Return how many ``heard`` entries fit a frame with these parts and authentication: 0, or 8 to 12."""
     return _CAPACITY[position * HAS_POSITION | page * HAS_PAGE | certificate * HAS_CERTIFICATE]
 
 
 def encode(beacon: Beacon) -> bytes:
-    """Return the whole frame, FCS included. Standard deviations are rounded up, so that they are never too optimistic.
+    """Encode a beacon as a whole frame, FCS included. Standard deviations are rounded up, never too optimistic.
 
     Raises:
-        ValueError: a field is out of its range, there are more ``heard`` than fit, or one is impossible; the message
+        ValueError: a field is out of range, or ``heard`` has too many or impossible entries; the message
+            names the field.
             names it.
     """
     flags = _flags(beacon)
@@ -343,9 +341,9 @@ def encode(beacon: Beacon) -> bytes:
 
 
 def with_authentication(frame: bytes, interval: int, mac_of: Callable[[bytes], bytes]) -> bytes:
-    """Return a frame of ``encode`` without authentication as one with it.
+    """Add authentication to a frame made by ``encode``.
 
-    ``interval``: its lowest 16 bits; ``mac_of`` gives the code of the bytes from the first to the interval.
+    ``interval``: its lowest 16 bits; ``mac_of`` returns the code of the bytes from the first to the interval.
     """
     signed = bytearray(frame[:-FCS_BYTES])
     signed[FLAGS_AT] |= HAS_AUTHENTICATION
@@ -355,19 +353,19 @@ def with_authentication(frame: bytes, interval: int, mac_of: Callable[[bytes], b
 
 
 def signed_bytes(frame: bytes) -> bytes:
-    """The bytes of an authenticated frame that its code is made of: all before the code."""
+    """Return the bytes of an authenticated frame that its code covers: all before the code."""
     return frame[: -FCS_BYTES - MAC_BYTES]
 
 
 def decode(frame: bytes) -> Beacon | Malformed:
-    """Return the beacon in a whole frame of version 2 (FCS included), or why there is none; never raises."""
+    """Decode a whole frame of version 2 (FCS included). Return the beacon, or why it is not one; never raises."""
     fields = BeaconFields()
     fault = _read_frame(frame, len(frame), fields)
     return beacon_of(fields, frame) if fault == INTACT else FAULTS[fault - 1]
 
 
 def beacon_of(b: BeaconFields, frame: bytes) -> Beacon:
-    """The beacon that was read from a frame."""
+    """Build a ``Beacon`` from the fields read from a frame."""
     stated, place, certificate, authentication = b.place, None, None, None
     if b.has_place:
         x_m, y_m, z_m = (one_mm / 1000 for one_mm in stated.position_mm)
@@ -387,14 +385,14 @@ _read_frame: Final = compiled(read_frame)
 
 
 def page_of(frame: bytes, b: BeaconFields) -> Page | None:
-    """The page in a frame that has been read; None where there is none, or its type is not known here."""
+    """Return the page in a frame that has been read; None if there is none or its type is unknown."""
     page = decode_page(frame[b.page_at : b.page_at + PAGE_BYTES]) if b.page_at else None
     assert page is not Malformed.BAD_PAGE, "read_frame refuses such frames"
     return page
 
 
 def fields_of(beacon: Beacon) -> BeaconFields:
-    """What ``read_frame`` makes of the frame of a beacon, but for what is only passed on."""
+    """Return the fields that ``read_frame`` reads from a beacon's frame, without the parts that are only passed on."""
     place, relays = beacon.position, packed_relays(beacon)
     fields = BeaconFields(
         site=beacon.site,
@@ -416,7 +414,7 @@ def fields_of(beacon: Beacon) -> BeaconFields:
 
 
 decode_cached = lru_cache(maxsize=256)(decode)
-"""``decode`` that remembers the last 256 frames: for a program that runs many tags which receive the same bytes."""
+"""``decode`` with a cache of the last 256 frames, for programs that run many tags which receive the same bytes."""
 
 
 def _packed(beacon: Beacon) -> bytes:
@@ -432,12 +430,12 @@ def _packed(beacon: Beacon) -> bytes:
 
 
 def _phase_code(entry: Heard) -> int:
-    """A phase as frames carry it, in the nearest step; 0 where there is none."""
+    """Return the code of a phase in a frame, rounded to the nearest step; 0 without a phase."""
     return 0 if entry.phase_cycles is None else PHASE_STEPS + round(entry.phase_cycles * PHASE_STEPS) % PHASE_STEPS
 
 
 def packed_relays(beacon: Beacon) -> bytes:
-    """The receptions that a beacon relays, ``HEARD`` after ``HEARD``, without those of a weak first path."""
+    """Encode the receptions that a beacon relays, one ``HEARD`` each, without those of a weak first path."""
     packed = _packed(beacon)
     if not beacon.weak:
         return packed
@@ -471,18 +469,18 @@ def _authentication_fault(beacon: Beacon, flags: int) -> str | None:
 
 
 def _std_steps(std_m: float) -> int:
-    """A standard deviation in the steps of a frame, rounded up."""
+    """Convert a standard deviation to the frame's steps, rounded up."""
     return min(math.ceil(round(std_m * _STD_STEPS_PER_M, 6)), _MAX_STD_STEPS)
 
 
 def _millimetres(value_m: float) -> tuple[int, int]:
-    """Low half-word and signed high byte of a coordinate."""
+    """Return the low half-word and the signed high byte of a coordinate."""
     value = round(value_m * 1000)
     return value & 0xFFFF, value >> 16
 
 
 def _fault(beacon: Beacon, capacity: int) -> str | None:
-    """The first field that is impossible or does not fit its bits, None where there is none."""
+    """Describe the first field that is impossible or does not fit its bits; None if all do."""
     if len(beacon.heard) > capacity:
         return f"heard has {len(beacon.heard)} entries; {capacity} fit"
     if isinstance(beacon.heard, PackedHeard) and beacon.heard.has_phases is not beacon.has_phases:

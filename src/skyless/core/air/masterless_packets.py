@@ -1,7 +1,7 @@
-"""What a tag receives in a system without a master, and the time differences that result from it.
+"""Packets that a tag receives in a system without a master, and the time differences derived from them.
 
-Anchors of such a system report when they sent and when they heard each other, each in its own clock. How many bits
-their counters have is a property of the whole stream, so it is kept with the stream and not in each value.
+Anchors of such a system report when they sent and when they received each other, each in its own clock. The number
+of bits of their counters is a property of the whole stream, so it is kept with the stream, not with each value.
 """
 
 from msgspec import Struct
@@ -11,18 +11,18 @@ Point = tuple[float, float, float]
 
 
 class Relay(Struct, frozen=True, gc=False):
-    """The sender of a packet heard another anchor."""
+    """One reception of another anchor, as the sender of a packet reports it."""
 
     anchor: int
     """Identifier of the anchor that was heard."""
     sequence: int
     """Sequence number of the packet that was heard."""
     rx_ticks: int
-    """When it was heard, in the clock of the sender of this relay; as many bits as its TX stamps."""
+    """RX stamp in the relaying sender's clock; as many bits as its TX stamps."""
     tof_ticks: float | None
-    """Time of flight between the two anchors, antenna delays included where the stamps include them."""
+    """Time of flight between the two anchors, including antenna delays if the stamps include them."""
     carrier_phase_cycles: float | None = None
-    """Phase of the carrier as it was heard (``Reception.carrier_phase_cycles``)."""
+    """Carrier phase at this reception (``Reception.carrier_phase_cycles``)."""
 
 
 class Packet(Struct, frozen=True, gc=False):
@@ -34,25 +34,25 @@ class Packet(Struct, frozen=True, gc=False):
     """Identifier of the sender."""
     sequence: int
     tx_ticks: int
-    """When it was sent, in the sender's clock."""
+    """TX stamp in the sender's clock."""
     rx_ticks: int
-    """When the tag received it, in the tag's own clock."""
+    """RX stamp in the tag's clock."""
     relays: tuple[Relay, ...]
     position_m: Point | None = None
-    """The sender's position, as it reports it."""
+    """Sender's position as it reports it."""
     carrier_phase_cycles: float | None = None
-    """Phase of the carrier as the tag received it (``Reception.carrier_phase_cycles``)."""
+    """Carrier phase as the tag received it (``Reception.carrier_phase_cycles``)."""
 
 
 class PairTdoa(Struct, frozen=True, gc=False):
     """One time difference of arrival between two anchors, in metres."""
 
     time_s: float
-    """In the tag's clock, since its first packet, or in the time of the recording that it comes from."""
+    """Time in the tag's clock since its first packet, or in the time of the recording it comes from."""
     anchor_a: int
     anchor_b: int
     tdoa_m: float
-    """Range to b less range to a."""
+    """Range to b minus range to a."""
     a_m: Point | None = None
-    """Position of a, if it moves and the recording has it; otherwise the site's coordinates hold."""
+    """Position of a, if it moves and is recorded; otherwise the site's coordinates apply."""
     b_m: Point | None = None

@@ -1,4 +1,4 @@
-"""What is kept of each anchor that is received, or that others relay: one table with a row for each."""
+"""Table of the anchors that are received, or that others relay: one row each."""
 
 from typing import Annotated, Final
 
@@ -6,12 +6,12 @@ from skyless.core.native.records import MAX_NEIGHBOURS, Array, Integers, Record,
 from skyless.core.ticks import NEVER, NOISE_TICKS, TICK_MASK, from_seconds, may_elapse, nearest
 
 RELAYED_TICKS: Final = from_seconds(2.0)
-"""A reception by an anchor in use, or by one that is confirmed itself, confirms its sender for this time."""
+"""How long a reception confirms its sender, if received by an anchor in use or by one that is confirmed itself."""
 
 
 @record
 class StatedPlace(Record):
-    """Where an anchor says that it is, as frames carry it."""
+    """Position that an anchor states, as frames carry it."""
 
     position_mm: Annotated[Integers, 3]
     std_mm: int
@@ -26,20 +26,19 @@ class Neighbour(Record):
     anchor: int
     """Its identifier."""
     changed_ticks: Ticks
-    """The receiver's reading when anything was last learnt of it."""
-    # Its stamps
+    """Receiver's reading when anything was last learnt about it."""
     frames: int
-    """Whose stamps have fitted since its counter began: 0, 1, or 2 for more."""
+    """Frames whose stamps have fitted since its counter began: 0, 1, or 2 for more."""
     sequence: int
-    """Of the newest one."""
+    """Sequence number of the newest frame."""
     rx_ticks: Ticks
-    """The receiver's own stamp of it."""
+    """Receiver's stamp of the newest frame."""
     tx_ticks: Ticks
-    """The anchor's, unwrapped."""
+    """Anchor's stamp of the newest frame, unwrapped."""
     impossible: int
-    """Stamps in a row that do not fit."""
+    """Number of impossible stamps in a row."""
     has_rival: bool
-    """Whether one of those may be right, as only one frame stands against it."""
+    """Whether an impossible stamp may be the right one, as only one frame stands against it."""
     rival_rx_ticks: Ticks
     rival_tx_ticks: Ticks
     # What it states of itself
@@ -47,21 +46,21 @@ class Neighbour(Record):
     period_code: int
     has_place: bool
     place: StatedPlace
-    """The one that is used."""
+    """Position in use."""
     has_other: bool
     other: StatedPlace
-    """Another one, stated once; used when it is stated twice in a row."""
+    """Another position, stated once; used when it is stated twice in a row."""
     has_moved: bool
-    """Whether it has stated another position than before, until all anchors are used together again."""
+    """Whether it has stated a different position, until all anchors are used together again."""
     # What others state of it
     was_relayed: bool
-    """Whether others had received it at its newest frame."""
+    """Whether others had received it by its newest frame."""
     relayed_ticks: Ticks
-    """The receiver's reading when another anchor last relayed that it had received this one."""
+    """Receiver's reading when another anchor last relayed a reception of this one."""
     own_relays_ticks: Ticks
-    """The receiver's reading when the anchor's own relays last fitted, where no other has relayed it since."""
+    """Receiver's reading when the anchor's own relays last fitted, if no other has relayed it since."""
     used_ticks: Ticks
-    """The receiver's reading when the filter, where it has the anchor, last got a packet of it."""
+    """Receiver's reading when the filter last got a packet of this anchor, if it has the anchor."""
     has_power: bool
     power_dbm: float
     """Running mean of the received power."""
@@ -71,19 +70,19 @@ class Neighbour(Record):
 
 @record
 class Neighbours(Record):
-    """All of them."""
+    """All rows of the table."""
 
     count: int
     row: int
-    """Of the anchor whose frame is processed, which is not forgotten meanwhile; −1 while that is not known."""
+    """Row of the anchor whose frame is being processed, which is then not forgotten; −1 if not known yet."""
     has_newest: bool
     newest_rx_ticks: Ticks
-    """RX stamp of the newest accepted frame: one impossible stamp must not make others late."""
+    """RX stamp of the newest accepted frame, so that one impossible stamp does not make others late."""
     rows: Annotated[Array[Neighbour], MAX_NEIGHBOURS]
 
 
 def find_neighbour(t: Neighbours, anchor: int) -> int:
-    """The row of an anchor, −1 where there is none."""
+    """Return the row of an anchor, −1 if there is none."""
     for row in range(t.count):
         if t.rows[row].anchor == anchor:
             return row
@@ -91,7 +90,7 @@ def find_neighbour(t: Neighbours, anchor: int) -> int:
 
 
 def neighbour_of(t: Neighbours, anchor: int, rx_ticks: Ticks) -> int:
-    """The row of an anchor of which something is learnt; a new one may take that of the least important."""
+    """Return the row of an anchor about which something is learnt; a new one may replace the least important."""
     row = find_neighbour(t, anchor)
     if row < 0:
         row = t.count if t.count < MAX_NEIGHBOURS else _least_important(t, rx_ticks)
@@ -105,9 +104,9 @@ def neighbour_of(t: Neighbours, anchor: int, rx_ticks: Ticks) -> int:
 
 
 def _least_important(t: Neighbours, rx_ticks: Ticks) -> int:
-    """The row to be forgotten: that of the lowest rank, and of several the longest silent.
+    """Return the row to forget: the one of lowest rank and, among equals, the longest silent.
 
-    Anchors in use rank highest, then those that others confirm, then strangers of several frames.
+    Anchors in use rank highest, then confirmed ones, then strangers with several frames.
     """
     least = -1
     least_rank = 0
@@ -136,14 +135,14 @@ def is_relayed(n: Neighbour, rx_ticks: Ticks) -> bool:
 
 
 def forget_times(t: Neighbours) -> None:
-    """The receiver's counter has restarted: who was received when is not known any more."""
+    """Forget when each anchor was received, after a restart of the receiver's counter."""
     t.has_newest = False
     for row in range(t.count):
         _forget_row(t.rows[row])
 
 
 def wake_times(t: Neighbours, rx_ticks: Ticks, rx_counter: Ticks) -> None:
-    """The same after a sleep from ``rx_ticks`` on: who was confirmed then counts as confirmed at ``rx_counter``."""
+    """Reset times after a sleep from ``rx_ticks`` on: anchors confirmed then count as confirmed at ``rx_counter``."""
     t.has_newest = False
     for row in range(t.count):
         was_confirmed = is_confirmed(t.rows[row], rx_ticks)
@@ -157,7 +156,7 @@ def _forget_row(n: Neighbour) -> None:
     n.relayed_ticks = n.own_relays_ticks = n.used_ticks = n.changed_ticks = NEVER
 
 
-# Every anchor's counter, unwrapped along the receiver's own.
+# Unwrapping of every anchor's counter along the receiver's own.
 
 # A counter has restarted once this number of stamps in a row were impossible and none has fitted for both of these
 # times: forged frames in between do not replace an anchor that still sends.
@@ -166,7 +165,7 @@ RESTART_SILENCE_TICKS: Final = from_seconds(0.2)
 RESTART_SILENCE_PERIODS: Final = 4
 
 STAMP_FITS, DUPLICATE, OUT_OF_ORDER, IMPOSSIBLE_STAMP, ANCHOR_RESTART = range(5)
-"""What a stamp is. After the last, which is impossible as well, the anchor's next one is a beginning."""
+"""Kinds of stamps. ``ANCHOR_RESTART`` is impossible as well, and the anchor's next stamp begins its counter anew."""
 STAMP_COUNTERS: Final = (
     (),
     ("duplicate",),
@@ -174,16 +173,16 @@ STAMP_COUNTERS: Final = (
     ("impossible-stamp",),
     ("impossible-stamp", "anchor-restart"),
 )
-"""By what each is counted."""
+"""Counters of each kind."""
 
 
 def unwrap_stamp(
     t: Neighbours, anchor: int, sequence: int, tx_counter: Ticks, rx_ticks: Ticks, period_ticks: Ticks
 ) -> int:
-    """Unwrap the TX stamp of a frame along the anchor's own counter; what the stamp is.
+    """Unwrap the TX stamp of a frame along the anchor's own counter. Return the kind of the stamp.
 
     ``rx_ticks`` is the receiver's own reading, unwrapped; ``period_ticks`` the time between two frames of an anchor,
-    as far as it is known. Where the stamp fits, ``row`` is the anchor's, and holds it; a first one keeps its own value.
+    if known. If the stamp fits, ``row`` is the anchor's and holds the result; a first stamp keeps its own value.
     """
     t.row = -1
     known = find_neighbour(t, anchor)
@@ -215,9 +214,9 @@ def _keep(n: Neighbour, sequence: int, tx_ticks: Ticks, rx_ticks: Ticks, frames:
 
 
 def _reject(n: Neighbour, sequence: int, tx_counter: Ticks, rx_ticks: Ticks, is_silent: bool) -> int:
-    """After a few stamps that are impossible the next one of a silent anchor is a beginning.
+    """Count an impossible stamp. After a few of them the next stamp of a silent anchor is a beginning.
 
-    Where only the first stamp stands against it, which may have been a false one, two that fit each other are.
+    If only the first stamp, which may be false, stands against it, two stamps that fit each other are one.
     """
     n.impossible += 1
     if n.frames == 1 and n.has_rival:

@@ -1,4 +1,4 @@
-"""Which site a tag uses, of those that it receives."""
+"""Choice of the site that a tag uses, among those it receives."""
 
 from typing import Annotated, Final
 
@@ -7,24 +7,24 @@ from skyless.core.native.records import MAX_COUNTED, MAX_SITES, Array, Integers,
 from skyless.core.ticks import from_seconds
 
 SITE_SILENCE_TICKS: Final = from_seconds(2.0)
-"""A tag that may choose its site leaves one that has been silent, or has given no fix, for this time."""
+"""A tag that may choose its site leaves one that has been silent, or has given no fix, for this long."""
 
 TRIAL_TICKS: Final = from_seconds(5.0)
-"""A site that has given no fix for this time is left for another one: none holds a tag by its number of anchors."""
+"""A site that has given no fix for this long is left for another, whatever its number of anchors."""
 
 PRESENT_TICKS: Final = from_seconds(1.0)
 """Anchors received within this time count."""
 
 
 FOREIGN, USED, CHANGED = range(3)
-"""What a beacon's site is to the tag; after the last it is used from this beacon on."""
+"""What a beacon's site is to the tag; with the last value it is in use from this beacon on."""
 
 NO_SITE: Final = -1
 
 
 @record
 class CountedAnchor(Record):
-    """An anchor of a site."""
+    """An anchor of a counted site."""
 
     anchor: int
     rx_ticks: Ticks
@@ -44,32 +44,32 @@ class CountedSite(Record):
 
 @record
 class SiteChoice(Record):
-    """The site in use and, where the tag may choose, how many anchors of others it receives.
+    """The site in use and, if the tag may choose, how many anchors of other sites it receives.
 
-    It uses the first site that it receives, but until there are fixes one with more anchors, so that a single foreign
-    anchor cannot hold it. One that gives no fix makes way for others, and returns only after those have failed.
+    The tag uses the first site that it receives, but until there are fixes one with more anchors, so that a single
+    foreign anchor cannot hold it. A site without fixes gives way to others and returns only after those have failed.
     """
 
     only_site: int = NO_SITE
-    """The site that was configured; ``NO_SITE`` where the tag may choose."""
+    """Configured site; ``NO_SITE`` if the tag may choose."""
     site: int = NO_SITE
-    """The site in use, by its PAN identifier."""
+    """PAN identifier of the site in use."""
     heard_ticks: Ticks
-    """RX stamp of the last beacon of it that was accepted."""
+    """RX stamp of its last accepted beacon."""
     since_ticks: Ticks
-    """RX stamp of the beacon with which it was chosen."""
+    """RX stamp of the beacon at which it was chosen."""
     has_fix: bool
     fix_ticks: Ticks
     """RX stamp of the last fix."""
     failed_count: int
     failed: Annotated[Integers, MAX_SITES]
-    """Sites that were left since the last fix as they gave none, the newest last."""
+    """Sites left since the last fix because they gave none, newest last."""
     count: int
     sites: Annotated[Array[CountedSite], MAX_SITES]
 
 
 def choose_site(choice: SiteChoice, site: int, anchor: int, rx_ticks: Ticks) -> int:
-    """Count an anchor of a site; whether its beacon is to be used."""
+    """Count an anchor of a site. Return whether its beacon is to be used."""
     if choice.only_site not in (NO_SITE, site):
         return FOREIGN
     counted = _index_of(choice, site)
@@ -88,12 +88,12 @@ def choose_site(choice: SiteChoice, site: int, anchor: int, rx_ticks: Ticks) -> 
 
 
 def note_fix(choice: SiteChoice, rx_ticks: Ticks) -> None:
-    """The site in use has given a fix."""
+    """Note that the site in use has given a fix."""
     choice.has_fix, choice.fix_ticks, choice.failed_count = True, rx_ticks, 0
 
 
 def restart_choice(choice: SiteChoice, rx_ticks: Ticks) -> None:
-    """The tag's counter has restarted, and reads this."""
+    """Restart all times after the tag's counter has restarted at this reading."""
     choice.heard_ticks = choice.since_ticks = rx_ticks
     choice.has_fix, choice.count = False, 0
 
@@ -106,7 +106,7 @@ def _find_site(choice: SiteChoice, site: int) -> int:
 
 
 def _index_of(choice: SiteChoice, site: int) -> int:
-    """Where a site is counted; a new one may take the place of that received longest ago, but not of the one in use."""
+    """Return a site's index; a new site may replace the one received longest ago, except the one in use."""
     found = _find_site(choice, site)
     if found < 0:
         found = choice.count
@@ -122,7 +122,7 @@ def _index_of(choice: SiteChoice, site: int) -> int:
 
 
 def _count_anchor(counted: CountedSite, anchor: int, rx_ticks: Ticks) -> None:
-    """Note when an anchor was received; where there are too many, that received longest ago is forgotten."""
+    """Note when an anchor was received; if there are too many, forget the one received longest ago."""
     place, oldest = -1, 0
     for one in range(counted.count):
         if counted.anchors[one].anchor == anchor:
@@ -152,12 +152,12 @@ def _prefers(choice: SiteChoice, other: int, rx_ticks: Ticks) -> bool:
 
 
 def _has_failed(choice: SiteChoice, rx_ticks: Ticks) -> bool:
-    """Whether the site in use has given no fix for long."""
+    """Whether the site in use has given no fix for too long."""
     return rx_ticks - (choice.fix_ticks if choice.has_fix else choice.since_ticks) >= TRIAL_TICKS
 
 
 def _note_failed(choice: SiteChoice) -> None:
-    """The site in use has failed; with too many of them the first is forgotten."""
+    """Note that the site in use has failed; if there are too many, forget the first."""
     if choice.failed_count == MAX_SITES:
         for one in range(1, MAX_SITES):
             choice.failed[one - 1] = choice.failed[one]
@@ -167,7 +167,7 @@ def _note_failed(choice: SiteChoice) -> None:
 
 
 def _received(choice: SiteChoice, counted: int, rx_ticks: Ticks) -> int:
-    """How many anchors of a site are received."""
+    """Return how many anchors of a site are being received."""
     one, present = choice.sites[counted], 0
     for index in range(one.count):
         if 0 <= rx_ticks - one.anchors[index].rx_ticks < PRESENT_TICKS:

@@ -1,4 +1,4 @@
-"""Protocol 2: which pages of those that beacons carry count, as the majority of the anchors states."""
+"""Choice of the pages in use, among those that beacons carry, by a majority of the anchors."""
 
 import struct
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from skyless.core.air.neighbours import Neighbours
 from skyless.core.native.records import MAX_PAGES, MAX_SENDERS, Array, Byte, Bytes, Integers, Record, Ticks, record
 from skyless.core.ticks import from_seconds
 
-# Which contents of a page are possible (``docs/protocol.md``, "Pages"); what frames carry may be anything.
+# Checks of page contents (``docs/protocol.md``, "Pages"): frames may carry any values.
 
 PAGE_BYTES: Final = 17
 """A type, then 16 bytes of contents."""
@@ -35,26 +35,26 @@ KEY_PAGE: Final = 7
 MAX_COORDINATE_MM: Final = 1_000_000_000
 """Coordinates and heights beyond 1000 km from the origin are errors; a page has 32-bit millimetres, ±2147 km."""
 MAX_SUPERFRAME_TICKS: Final = (1 << 39) - 1
-"""A superframe is shorter than half a wrap of the counter (8.6 s), else stamps become ambiguous."""
+"""Longest superframe: under half a wrap of the counter (8.6 s), as stamps would become ambiguous."""
 CIRCLE: Final = 3_600_000_000
 """A whole turn in steps of 1e-7 degree."""
 
 STD_STEPS_PER_M: Final = 10_000
 STEPS_PER_M: Final = 100
 STEPS_PER_S: Final = 10
-"""Units of an accuracy page: of standard deviations, of its distance and of its time."""
+"""Units of an accuracy page: standard deviations, distance, time."""
 
 HEIGHT_GIVEN: Final = 0x01
-"""The flag of a site or schedule page with the height of the tags."""
+"""Flag of a site or schedule page that states the height of the tags."""
 HEIGHT_FLAG_AT: Final = 8
-"""Where it stands in a site page; the height follows."""
+"""Offset of the flags in a site page; the height follows."""
 
 _MAX_NOISE_BITS: Final = 0x36000000
-"""2⁻¹⁹ as a float32: those from 0 on are in the order of their bits."""
+"""2⁻¹⁹ as a float32; non-negative float32 values are ordered by their bits."""
 
 
 def is_possible_page(data: Bytes, at: int) -> bool:  # noqa: PLR0911 - one for each type
-    """Whether the page in these bytes, from ``at`` on, can be; one of a type that is not known here can."""
+    """Whether the page at ``at`` has possible values; pages of unknown types count as possible."""
     kind = data[at]
     if kind == ANCHOR_PAGE:
         return _is_coordinate(data, at + 3) and _is_coordinate(data, at + 7) and _is_coordinate(data, at + 11)
@@ -91,29 +91,29 @@ PRESENT_TICKS: Final = from_seconds(1.0)
 """Anchors received within this time take part in the majority."""
 
 MIN_ANCHORS: Final = 3
-"""With fewer no majority counts, unless that is all that a tag receives for ``PRESENT_TICKS``."""
+"""With fewer anchors no majority counts, unless the tag receives no more for ``PRESENT_TICKS``."""
 
 NOISE_KIND, EARTH_KIND, ACCURACY_KIND, SITE_KIND = range(4)
-"""The types of these pages on the air, from ``NOISE_PAGE`` on; that of the georeference may be missing."""
+"""Number of page types on the air, from ``NOISE_PAGE`` on; the georeference may be missing."""
 PAGE_KINDS: Final = 4
 NO_ISSUE: Final = -1
 NO_PAGE: Final = -1
 
 SAME_PAGES, OTHER_PAGES, OTHER_SETTINGS = range(3)
-"""What a beacon has changed; the last is a page that the filters' settings depend on."""
+"""What a beacon has changed; the last is a page on which the filters' settings depend."""
 
 _MAX_TRIALS: Final = 256
 _CRC_32: Final = 0xEDB88320
-"""The polynomial of Ethernet's check sequence, its bits in reverse order."""
+"""Polynomial of Ethernet's check sequence, bits reversed."""
 _ONES: Final = 0xFFFFFFFF
 
 
 @record
 class UsedPage(Record):
-    """A page that is in use."""
+    """A page in use."""
 
     contents: Annotated[Array[Byte], PAGE_BYTES]
-    """All zeros where there is none."""
+    """All zeros if there is none."""
 
 
 @record
@@ -122,7 +122,7 @@ class CollectedPage(Record):
 
     issue: int
     support: int
-    """How many of the anchors that have sent it others have received."""
+    """How many of the anchors that sent it are received by others."""
     contents: Annotated[Array[Byte], PAGE_BYTES]
     sender_count: int
     senders: Annotated[Integers, MAX_SENDERS]
@@ -130,24 +130,24 @@ class CollectedPage(Record):
 
 @record
 class Choices(Record):
-    """What there is for each page of an issue."""
+    """Candidates for each page of an issue."""
 
     counts: Annotated[Integers, PAGE_KINDS]
     places: Annotated[Array[Integers], PAGE_KINDS, MAX_PAGES]
-    """Where they stand in the table, those of most anchors first."""
+    """Their rows in the table, those of most anchors first."""
     chosen: Annotated[Integers, PAGE_KINDS]
 
 
 @record
 class SitePages(Record):
-    """What a tag has learned of what is common to a site.
+    """What a tag has learnt of the site's common pages.
 
-    The pages count once a majority of the anchors received recently states their issue, and they fit it; those in use
+    Pages count once a majority of the recently received anchors states their issue and they match it; those in use
     stay until all pages of another such issue are there.
     """
 
     issue: int = NO_ISSUE
-    """Of the pages in use."""
+    """Issue of the pages in use."""
     used: Annotated[Array[UsedPage], PAGE_KINDS]
     has_first: bool
     first_ticks: Ticks
@@ -157,7 +157,7 @@ class SitePages(Record):
 
 
 def note_page(p: SitePages, t: Neighbours, frame: Bytes, page_at: int, rx_ticks: Ticks) -> int:
-    """Process the page at this place of the newest anchor's beacon, if it is not 0; whether others are in use then."""
+    """Process the page at ``page_at`` (0: none) of the newest anchor's beacon. Return what this changed."""
     n = t.rows[t.row]
     if not p.has_first:
         p.has_first, p.first_ticks = True, rx_ticks
@@ -169,7 +169,7 @@ def note_page(p: SitePages, t: Neighbours, frame: Bytes, page_at: int, rx_ticks:
 
 
 def _collect(p: SitePages, t: Neighbours, frame: Bytes, page_at: int) -> None:
-    """Note that the newest anchor has sent a page; where there are too many, one takes the place of the worst."""
+    """Note that the newest anchor has sent a page; if there is no space, replace the worst page."""
     n, place = t.rows[t.row], 0
     while place < p.count and not (p.collected[place].issue == n.almanac_issue and _is_page(p, place, frame, page_at)):
         place += 1
@@ -197,9 +197,9 @@ def _is_page(p: SitePages, place: int, frame: Bytes, page_at: int) -> bool:
 
 
 def _worst(p: SitePages, t: Neighbours) -> int:
-    """The page of the issue, and then with the senders, that fewest anchors support which others have received.
+    """Return the page to replace: of the issue, then of the senders, with the fewest supporters that others receive.
 
-    Strangers are any number.
+    The number of strangers does not matter.
     """
     worst, least_issue, least = 0, 0, 0
     for place in range(p.count):
@@ -223,7 +223,7 @@ def _supporters(one: CollectedPage, t: Neighbours) -> int:
 
 
 def _is_majority(p: SitePages, t: Neighbours, issue: int, rx_ticks: Ticks) -> bool:
-    """Whether most of the anchors that are there state this issue."""
+    """Whether most of the anchors present state this issue."""
     oldest, present, stating = rx_ticks - PRESENT_TICKS, 0, 0
     for row in range(t.count):
         n = t.rows[row]
@@ -235,7 +235,7 @@ def _is_majority(p: SitePages, t: Neighbours, issue: int, rx_ticks: Ticks) -> bo
 
 
 def _complete(p: SitePages, t: Neighbours, issue: int) -> int:
-    """Use the pages of an issue if they are all there; of several contents those of most anchors that fit it."""
+    """Use the pages of an issue if all are there; among several contents, those of most anchors that match it."""
     c, trials = Choices(), 1
     for place in range(p.count):
         if p.collected[place].issue == issue:
@@ -256,12 +256,12 @@ def _complete(p: SitePages, t: Neighbours, issue: int) -> int:
 
 
 def _options(c: Choices, kind: int) -> int:
-    """How many there are for a page; a site may have no georeference."""
+    """Return the number of candidates for a page; a site may have no georeference."""
     return c.counts[kind] + (1 if kind == EARTH_KIND else 0)
 
 
 def _add_choice(c: Choices, p: SitePages, place: int) -> None:
-    """Add a page to those of its type, behind those that more anchors support."""
+    """Add a page to those of its type, after those that more anchors support."""
     kind = p.collected[place].contents[0] - NOISE_PAGE
     index = c.counts[kind]
     while index > 0 and p.collected[c.places[kind][index - 1]].support < p.collected[place].support:
@@ -272,7 +272,7 @@ def _add_choice(c: Choices, p: SitePages, place: int) -> None:
 
 
 def _issue_of(p: SitePages, c: Choices) -> int:
-    """``site_issue`` of the pages that are chosen."""
+    """Return ``site_issue`` of the chosen pages."""
     crc: Ticks = _ONES
     for kind in range(PAGE_KINDS):
         if c.chosen[kind] != NO_PAGE:
@@ -285,7 +285,7 @@ def _issue_of(p: SitePages, c: Choices) -> int:
 
 
 def _use_chosen(p: SitePages, c: Choices, issue: int) -> int:
-    """Use the pages that are chosen."""
+    """Use the chosen pages."""
     outcome = OTHER_PAGES
     for kind in range(PAGE_KINDS):
         for byte in range(PAGE_BYTES):
@@ -315,11 +315,11 @@ _SITE: Final = struct.Struct("<BB6xBi4x")
 
 @lru_cache(maxsize=1024)
 def encode_page(page: Page) -> bytes:
-    """Return the 17 bytes of a page.
+    """Encode a page as 17 bytes.
 
     Coordinates are rounded to 1 mm, angles to 1e-7 degree (at most 5.6 mm on the ground), noise to float32.
-    In an accuracy page standard deviations are rounded to 0.1 mm, the distance to 1 cm and the time to 0.1 s; neither
-    of the latter two to 0.
+    An accuracy page rounds standard deviations to 0.1 mm, the distance to 1 cm and the time to 0.1 s, the latter two
+    never to 0.
 
     Raises:
         ValueError: a field is out of its range; the message names it.
@@ -329,7 +329,7 @@ def encode_page(page: Page) -> bytes:
 
 @lru_cache(maxsize=1024)
 def decode_page(data: bytes) -> Page | Literal[Malformed.BAD_PAGE] | None:
-    """Return the page in 17 bytes, ``BAD_PAGE`` where a value is impossible, None for a type not known here."""
+    """Decode 17 bytes to a page; ``BAD_PAGE`` if a value is impossible, None for an unknown type."""
     decode = _DECODERS.get(data[0])
     if decode is None:
         return None
@@ -450,7 +450,7 @@ def _decode_noise(data: bytes) -> NoisePage:
 
 def _decode_georeference(data: bytes) -> GeoreferencePage:
     _, latitude, longitude, height_mm, heading = _GEOREFERENCE.unpack(data)
-    # Division by 1e7 gives back the very float of a configured angle of up to seven decimals.
+    # Division by 1e7 restores the exact float of a configured angle of up to seven decimals.
     return GeoreferencePage(latitude / 1e7, longitude / 1e7, height_mm / 1000, heading / 1e7)
 
 
