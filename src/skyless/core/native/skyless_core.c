@@ -425,7 +425,7 @@ INTERNAL bool keep_place(Neighbour *n, StatedPlace *place);
 INTERNAL bool is_same(StatedPlace *one, StatedPlace *other);
 INTERNAL void fill_packet(Tag *t, Neighbour *n, real factor);
 
-/* Arithmetic of the functions that are also translated to C: the same bits on every processor, without a C library. */
+/* Arithmetic that is also translated to C, with the same bits on every processor: functions, small matrices, tails. */
 
 /* The exponential of a number up to 0, to four units in the last place.
  *
@@ -756,14 +756,14 @@ INTERNAL int64_t fix_time_ticks(FixTime *time, int64_t ticks_master, int64_t rx_
     return ticks_master - time->first_ticks_master;
 }
 
-/* What the frames of both protocols have in common: the header, relayed receptions, and why bytes are no beacon.
+/* What the frames of both protocols share: the header, relayed receptions, and reasons why bytes are not a beacon.
  *
  * A beacon is an IEEE 802.15.4 data frame of at most 127 bytes, little endian throughout. 40-bit stamps travel as a low
  * word of 32 bits and a high byte. */
 
-/* Whole numbers in frames, the lowest byte first. */
+/* Whole numbers in frames, lowest byte first. */
 
-/* That in this number of bytes. */
+/* Read an unsigned integer of this many bytes. */
 INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size) {
     int64_t number = 0;
     for (int32_t byte = size - 1; byte > -1; byte--) {
@@ -772,22 +772,22 @@ INTERNAL int64_t unsigned_(uint8_t *data, int32_t at, int32_t size) {
     return number;
 }
 
-/* That in two bytes, which needs no 64 bits. */
+/* Read an unsigned integer of two bytes, in an ``int``. */
 INTERNAL int32_t two_bytes(uint8_t *data, int32_t at) {
     return data[at] | (int32_t)((uint32_t)data[at + 1] << 8);
 }
 
-/* That in four bytes, which may be negative. */
+/* Read a signed integer of four bytes. */
 INTERNAL int64_t signed_(uint8_t *data, int32_t at) {
     int64_t number = unsigned_(data, at, 4);
     return number < SIGN ? number : number - 2 * SIGN;
 }
 
-/* Receptions whose first path is weak: they may be late, and count for less. */
+/* Receptions with a weak first path: they may be late, so they get less weight. */
 
-/* Factor on the variance of a reception, from 1 to ``MAX_VARIANCE_FACTOR``; it grows with the powers' difference.
+/* Return the factor on a reception's variance, 1 to ``MAX_VARIANCE_FACTOR``, growing with the powers' difference.
  *
- * Where a power is missing (NaN), not finite or impossible (a first path above the total) the factor is 1. */
+ * The factor is 1 if a power is missing (NaN), not finite or impossible (a first path above the total). */
 INTERNAL real variance_factor(real rx_power_dbm, real first_path_power_dbm) {
     real difference_db = rx_power_dbm - first_path_power_dbm;
     if (!(CLEAR_DB < difference_db && difference_db <= MAX_DIFFERENCE_DB)) {
@@ -797,19 +797,19 @@ INTERNAL real variance_factor(real rx_power_dbm, real first_path_power_dbm) {
     return MAX_VARIANCE_FACTOR * exp_((part * part * (REAL(3.0) - REAL(2.0) * part) - REAL(1.0)) * LOG_FACTOR);
 }
 
-/* The almanac: all that a tag must know about a site, sent as rotating pages of 17 bytes. */
+/* The almanac's pages, all that a tag must know about a site, and the published instants of beacons. */
 
-/* A period is stated as a code of 8 bits, as floating-point numbers are: 16 steps for each doubling, from 4 ms on. */
+/* Periods are coded in 8 bits like floating-point numbers: 16 steps per doubling, from 4 ms on. */
 
-/* Mean time between two beacons of an anchor that states this code. */
+/* Return the mean time between two beacons of an anchor that states this code. */
 INTERNAL int64_t period_ticks(int32_t code) {
     int64_t unit = UNIT_STEPS * DELAYED_TX_GRANULARITY_TICKS;
     return unit * (int32_t)((uint32_t)(STEPS + (code & 15)) << (code >> 4));
 }
 
-/* What is kept of each anchor that is received, or that others relay: one table with a row for each. */
+/* Table of the anchors that are received, or that others relay: one row each. */
 
-/* The row of an anchor, −1 where there is none. */
+/* Return the row of an anchor, −1 if there is none. */
 INTERNAL int32_t find_neighbour(Neighbours *t, int32_t anchor) {
     for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
         if (t->rows[row].anchor == anchor) {
@@ -819,7 +819,7 @@ INTERNAL int32_t find_neighbour(Neighbours *t, int32_t anchor) {
     return -1;
 }
 
-/* The row of an anchor of which something is learnt; a new one may take that of the least important. */
+/* Return the row of an anchor about which something is learnt; a new one may replace the least important. */
 INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks) {
     Neighbour fresh;
     int32_t row = find_neighbour(t, anchor);
@@ -837,9 +837,9 @@ INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks) {
     return row;
 }
 
-/* The row to be forgotten: that of the lowest rank, and of several the longest silent.
+/* Return the row to forget: the one of lowest rank and, among equals, the longest silent.
  *
- * Anchors in use rank highest, then those that others confirm, then strangers of several frames. */
+ * Anchors in use rank highest, then confirmed ones, then strangers with several frames. */
 INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks) {
     int32_t least = -1;
     int32_t least_rank = 0;
@@ -872,7 +872,7 @@ INTERNAL bool is_relayed(Neighbour *n, int64_t rx_ticks) {
     return rx_ticks - n->relayed_ticks < RELAYED_TICKS;
 }
 
-/* The receiver's counter has restarted: who was received when is not known any more. */
+/* Forget when each anchor was received, after a restart of the receiver's counter. */
 INTERNAL void forget_times(Neighbours *t) {
     t->has_newest = false;
     for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
@@ -880,7 +880,7 @@ INTERNAL void forget_times(Neighbours *t) {
     }
 }
 
-/* The same after a sleep from ``rx_ticks`` on: who was confirmed then counts as confirmed at ``rx_counter``. */
+/* Reset times after a sleep from ``rx_ticks`` on: anchors confirmed then count as confirmed at ``rx_counter``. */
 INTERNAL void wake_times(Neighbours *t, int64_t rx_ticks, int64_t rx_counter) {
     t->has_newest = false;
     for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
@@ -905,10 +905,10 @@ INTERNAL void forget_row(Neighbour *n) {
 
 /* times: forged frames in between do not replace an anchor that still sends. */
 
-/* Unwrap the TX stamp of a frame along the anchor's own counter; what the stamp is.
+/* Unwrap the TX stamp of a frame along the anchor's own counter. Return the kind of the stamp.
  *
  * ``rx_ticks`` is the receiver's own reading, unwrapped; ``period_ticks`` the time between two frames of an anchor,
- * as far as it is known. Where the stamp fits, ``row`` is the anchor's, and holds it; a first one keeps its own value. */
+ * if known. If the stamp fits, ``row`` is the anchor's and holds the result; a first stamp keeps its own value. */
 SKYLESS_EXPORT int32_t skyless_unwrap_stamp(Neighbours *t, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
         rx_ticks, int64_t period_ticks) {
     t->row = -1;
@@ -948,9 +948,9 @@ INTERNAL void keep(Neighbour *n, int32_t sequence, int64_t tx_ticks, int64_t rx_
     n->rx_ticks = rx_ticks;
 }
 
-/* After a few stamps that are impossible the next one of a silent anchor is a beginning.
+/* Count an impossible stamp. After a few of them the next stamp of a silent anchor is a beginning.
  *
- * Where only the first stamp stands against it, which may have been a false one, two that fit each other are. */
+ * If only the first stamp, which may be false, stands against it, two stamps that fit each other are one. */
 INTERNAL int32_t reject(Neighbour *n, int32_t sequence, int64_t tx_counter, int64_t rx_ticks, bool is_silent) {
     n->impossible += 1;
     if (n->frames == 1 && n->has_rival) {
@@ -971,11 +971,11 @@ INTERNAL int32_t reject(Neighbour *n, int32_t sequence, int64_t tx_counter, int6
     return IMPOSSIBLE_STAMP;
 }
 
-/* Protocol 2: which pages of those that beacons carry count, as the majority of the anchors states. */
+/* Choice of the pages in use, among those that beacons carry, by a majority of the anchors. */
 
-/* Which contents of a page are possible (``docs/protocol.md``, "Pages"); what frames carry may be anything. */
+/* Checks of page contents (``docs/protocol.md``, "Pages"): frames may carry any values. */
 
-/* Whether the page in these bytes, from ``at`` on, can be; one of a type that is not known here can. */
+/* Whether the page at ``at`` has possible values; pages of unknown types count as possible. */
 INTERNAL bool is_possible_page(uint8_t *data, int32_t at) {
     int32_t kind = data[at];
     if (kind == ANCHOR_PAGE) {
@@ -1017,7 +1017,7 @@ INTERNAL bool is_noise(uint8_t *data, int32_t at) {
     return bits <= MAX_NOISE_BITS || bits == SIGN;
 }
 
-/* Process the page at this place of the newest anchor's beacon, if it is not 0; whether others are in use then. */
+/* Process the page at ``page_at`` (0: none) of the newest anchor's beacon. Return what this changed. */
 INTERNAL int32_t note_page(SitePages *p, Neighbours *t, uint8_t *frame, int32_t page_at, int64_t rx_ticks) {
     Neighbour *n = &t->rows[t->row];
     if (!p->has_first) {
@@ -1033,7 +1033,7 @@ INTERNAL int32_t note_page(SitePages *p, Neighbours *t, uint8_t *frame, int32_t 
     return is_majority(p, t, n->almanac_issue, rx_ticks) ? complete(p, t, n->almanac_issue) : SAME_PAGES;
 }
 
-/* Note that the newest anchor has sent a page; where there are too many, one takes the place of the worst. */
+/* Note that the newest anchor has sent a page; if there is no space, replace the worst page. */
 INTERNAL void collect(SitePages *p, Neighbours *t, uint8_t *frame, int32_t page_at) {
     Neighbour *n = &t->rows[t->row];
     int32_t place = 0;
@@ -1071,9 +1071,9 @@ INTERNAL bool is_page(SitePages *p, int32_t place, uint8_t *frame, int32_t page_
     return same == PAGE_BYTES;
 }
 
-/* The page of the issue, and then with the senders, that fewest anchors support which others have received.
+/* Return the page to replace: of the issue, then of the senders, with the fewest supporters that others receive.
  *
- * Strangers are any number. */
+ * The number of strangers does not matter. */
 INTERNAL int32_t worst(SitePages *p, Neighbours *t) {
     int32_t worst = 0;
     int32_t least_issue = 0;
@@ -1108,7 +1108,7 @@ INTERNAL int32_t supporters(CollectedPage *one, Neighbours *t) {
     return support;
 }
 
-/* Whether most of the anchors that are there state this issue. */
+/* Whether most of the anchors present state this issue. */
 INTERNAL bool is_majority(SitePages *p, Neighbours *t, int32_t issue, int64_t rx_ticks) {
     int64_t oldest = rx_ticks - PRESENT_TICKS;
     int32_t present = 0;
@@ -1124,7 +1124,7 @@ INTERNAL bool is_majority(SitePages *p, Neighbours *t, int32_t issue, int64_t rx
     return is_enough && 2 * stating > present;
 }
 
-/* Use the pages of an issue if they are all there; of several contents those of most anchors that fit it. */
+/* Use the pages of an issue if all are there; among several contents, those of most anchors that match it. */
 INTERNAL int32_t complete(SitePages *p, Neighbours *t, int32_t issue) {
     Choices c = {0};
     int32_t trials = 1;
@@ -1153,12 +1153,12 @@ INTERNAL int32_t complete(SitePages *p, Neighbours *t, int32_t issue) {
     return SAME_PAGES;
 }
 
-/* How many there are for a page; a site may have no georeference. */
+/* Return the number of candidates for a page; a site may have no georeference. */
 INTERNAL int32_t options(Choices *c, int32_t kind) {
     return c->counts[kind] + (kind == EARTH_KIND ? 1 : 0);
 }
 
-/* Add a page to those of its type, behind those that more anchors support. */
+/* Add a page to those of its type, after those that more anchors support. */
 INTERNAL void add_choice(Choices *c, SitePages *p, int32_t place) {
     int32_t kind = p->collected[place].contents[0] - NOISE_PAGE;
     int32_t index_ = c->counts[kind];
@@ -1170,7 +1170,7 @@ INTERNAL void add_choice(Choices *c, SitePages *p, int32_t place) {
     c->counts[kind] += 1;
 }
 
-/* ``site_issue`` of the pages that are chosen. */
+/* Return ``site_issue`` of the chosen pages. */
 INTERNAL int32_t issue_of(SitePages *p, Choices *c) {
     int64_t crc = ONES;
     for (int32_t kind = 0; kind < PAGE_KINDS; kind++) {
@@ -1187,7 +1187,7 @@ INTERNAL int32_t issue_of(SitePages *p, Choices *c) {
     return (crc ^ (crc >> 16)) & 65535;
 }
 
-/* Use the pages that are chosen. */
+/* Use the chosen pages. */
 INTERNAL int32_t use_chosen(SitePages *p, Choices *c, int32_t issue) {
     int32_t outcome = OTHER_PAGES;
     for (int32_t kind = 0; kind < PAGE_KINDS; kind++) {
@@ -1208,9 +1208,9 @@ INTERNAL int32_t use_chosen(SitePages *p, Choices *c, int32_t issue) {
 
 /* Beacons of protocol 2 and their bytes (``docs/protocol2.md``); little endian throughout, 127 bytes at most. */
 
-/* A beacon of protocol 2 as it is read from a frame (``docs/protocol2.md``); little endian throughout. */
+/* Reading a beacon of protocol 2 from a frame (``docs/protocol2.md``). */
 
-/* Read a whole frame, FCS included; why it is no beacon of version 2, ``INTACT`` if it is one. */
+/* Read a whole frame, FCS included. Return ``INTACT``, or why it is not a beacon of version 2. */
 SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, BeaconFields *b) {
     int32_t fault = header_fault(frame, length);
     if (fault != INTACT) {
@@ -1263,7 +1263,7 @@ SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, Beacon
     return b->page_at > 0 && !is_possible_page(frame, b->page_at) ? BAD_PAGE : INTACT;
 }
 
-/* Why bytes are no beacon of version 2, as far as length, check sequence, header and flags show it. */
+/* Return why bytes are not a beacon of version 2, judging by length, check sequence, header and flags. */
 INTERNAL int32_t header_fault(uint8_t *frame, int32_t length) {
     if (length > MAX_FRAME_BYTES) {
         return TOO_LONG;
@@ -1306,7 +1306,7 @@ INTERNAL int32_t length_fault(uint8_t *frame, int32_t length) {
     return length == bare ? INTACT : BAD_LENGTH;
 }
 
-/* Length of a frame with these flags that relays no receptions. */
+/* Return the length of a frame with these flags and no relayed receptions. */
 INTERNAL int32_t bare_bytes(int32_t flags) {
     int32_t size = FIXED_BYTES + FCS_BYTES + ((flags & HAS_CERTIFICATE) != 0 ? CERTIFICATE_BYTES : COUNT_BYTES);
     size += (flags & HAS_POSITION) != 0 ? POSITION_BYTES : 0;
@@ -1326,7 +1326,7 @@ INTERNAL void read_place(uint8_t *frame, int32_t at, StatedPlace *place) {
     place->zone = frame[at + 11];
 }
 
-/* Copy the receptions that are not weak; False where one is of the sender, or two of the same anchor. */
+/* Copy the receptions that are not weak. Return False if one is of the sender, or two are of the same anchor. */
 INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b) {
     for (int32_t one = 0, one_end = b->heard_count; one < one_end; one++) {
         int32_t at = b->heard_at + one * HEARD_BYTES;
@@ -1349,10 +1349,9 @@ INTERNAL bool read_relays(uint8_t *frame, BeaconFields *b) {
     return true;
 }
 
-/* CRC-16 of x¹⁶ + x¹² + x⁵ + 1, initially 0, bit 0 of each byte first (clause 7.2.10); 0 with a frame's FCS.
+/* Return CRC-16 x¹⁶ + x¹² + x⁵ + 1, initially 0, bit 0 of each byte first (clause 7.2.10); 0 with the frame's FCS.
  *
- * A byte's four low and four high bits each shift the polynomial in once, so no table is needed. Python's own frames
- * have theirs from ``ieee802154.fcs``, which is faster there. */
+ * The polynomial is applied to four bits at a time, so no table is needed. Python uses the faster ``ieee802154.fcs``. */
 INTERNAL int32_t checksum(uint8_t *data, int32_t length) {
     int32_t crc = 0;
     for (int32_t at = 0; at < length; at++) {
@@ -1363,9 +1362,9 @@ INTERNAL int32_t checksum(uint8_t *data, int32_t length) {
     return crc;
 }
 
-/* Which site a tag uses, of those that it receives. */
+/* Choice of the site that a tag uses, among those it receives. */
 
-/* Count an anchor of a site; whether its beacon is to be used. */
+/* Count an anchor of a site. Return whether its beacon is to be used. */
 INTERNAL int32_t choose_site(SiteChoice *choice, int32_t site, int32_t anchor, int64_t rx_ticks) {
     if (choice->only_site != NO_SITE && choice->only_site != site) {
         return FOREIGN;
@@ -1391,14 +1390,14 @@ INTERNAL int32_t choose_site(SiteChoice *choice, int32_t site, int32_t anchor, i
     return CHANGED;
 }
 
-/* The site in use has given a fix. */
+/* Note that the site in use has given a fix. */
 INTERNAL void note_fix(SiteChoice *choice, int64_t rx_ticks) {
     choice->has_fix = true;
     choice->fix_ticks = rx_ticks;
     choice->failed_count = 0;
 }
 
-/* The tag's counter has restarted, and reads this. */
+/* Restart all times after the tag's counter has restarted at this reading. */
 INTERNAL void restart_choice(SiteChoice *choice, int64_t rx_ticks) {
     choice->since_ticks = rx_ticks;
     choice->heard_ticks = rx_ticks;
@@ -1415,7 +1414,7 @@ INTERNAL int32_t find_site(SiteChoice *choice, int32_t site) {
     return -1;
 }
 
-/* Where a site is counted; a new one may take the place of that received longest ago, but not of the one in use. */
+/* Return a site's index; a new site may replace the one received longest ago, except the one in use. */
 INTERNAL int32_t index_of(SiteChoice *choice, int32_t site) {
     int32_t found = find_site(choice, site);
     if (found < 0) {
@@ -1436,7 +1435,7 @@ INTERNAL int32_t index_of(SiteChoice *choice, int32_t site) {
     return found;
 }
 
-/* Note when an anchor was received; where there are too many, that received longest ago is forgotten. */
+/* Note when an anchor was received; if there are too many, forget the one received longest ago. */
 INTERNAL void count_anchor(CountedSite *counted, int32_t anchor, int64_t rx_ticks) {
     int32_t place = -1;
     int32_t oldest = 0;
@@ -1477,12 +1476,12 @@ INTERNAL bool prefers(SiteChoice *choice, int32_t other, int64_t rx_ticks) {
     return present > (used >= 0 ? received(choice, used, rx_ticks) : 0);
 }
 
-/* Whether the site in use has given no fix for long. */
+/* Whether the site in use has given no fix for too long. */
 INTERNAL bool has_failed(SiteChoice *choice, int64_t rx_ticks) {
     return rx_ticks - (choice->has_fix ? choice->fix_ticks : choice->since_ticks) >= TRIAL_TICKS;
 }
 
-/* The site in use has failed; with too many of them the first is forgotten. */
+/* Note that the site in use has failed; if there are too many, forget the first. */
 INTERNAL void note_failed(SiteChoice *choice) {
     if (choice->failed_count == MAX_SITES) {
         for (int32_t one = 1; one < MAX_SITES; one++) {
@@ -1494,7 +1493,7 @@ INTERNAL void note_failed(SiteChoice *choice) {
     choice->failed_count += 1;
 }
 
-/* How many anchors of a site are received. */
+/* Return how many anchors of a site are being received. */
 INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks) {
     CountedSite *one = &choice->sites[counted];
     int32_t present = 0;
@@ -2444,7 +2443,7 @@ INTERNAL void apply_four(State *s, int32_t k) {
     }
 }
 
-/* Faults that the state does not hold: what they do to it, what innovations show of them, and adding them to it.
+/* Faults of anchors: what they do to the state, what innovations show of them, and the verdicts.
  *
  * Where all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b, and the
  * innovation of a measurement h holds s_j·b (Friedland 1969):
@@ -4976,7 +4975,7 @@ SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_t
     }
 }
 
-/* The minima of a set of TDoAs, and which of them are distinct. */
+/* The search for positions that explain a set of TDoAs: starts, descent, and the distinct minima. */
 
 /* Anchors are in one plane if they leave it by less than this part of the smallest TDoA sigma. */
 
@@ -5499,7 +5498,7 @@ INTERNAL bool is_outside(LocateProblem *p, Minimum *minimum, real *state) {
     return !(chi2 <= DISTINCT_MINIMA_CHI2);
 }
 
-/* The position of a set of TDoAs: its minima, unfolded from a plane, and decided between by the height's bounds. */
+/* The position of a set of TDoAs: by the search's minima, and ``locate``, its Python function. */
 
 /* Mirror images have merged while the square of their distance from the plane is within these sigmas of zero. */
 

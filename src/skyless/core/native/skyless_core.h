@@ -52,7 +52,7 @@ typedef double real;
 #define ADMITTED 0
 #define AFTER_ALL_TICKS INT64_C(4611686018427387904)
 #define ALL_RANGE_ERRORS 2
-/* All flags that a frame with a certificate may have. */
+/* All flags allowed in a frame with a certificate. */
 #define ALONGSIDE_CERTIFICATE 12
 #define ANCHOR_PAGE 1
 #define ANCHOR_RESTART 4
@@ -66,12 +66,12 @@ typedef double real;
 #define BAD_LENGTH 7
 #define BAD_PAGE 9
 #define BAD_PERIOD 10
-/* The bytes 53 B0; the low half of the second is the version. */
+/* Bytes 53 B0; the low half of the second is the version. */
 #define BEACON_MAGIC 45139
 /* By which another anchor must be stronger to replace the weakest. */
 #define BETTER_DB REAL(3.0)
-/* Up to the former nothing changes, from the latter on all that can: the maker's 6 and 10, and 1 dB. Lines of sight of
- * the UTIL data set have up to 8.4 dB, paths through metal, the only ones that are much later, from 11.3. */
+/* Difference of powers in dB at which the factor starts to rise and at which it is greatest: the maker's 6 and 10, plus
+ * 1 dB. Lines of sight of the UTIL data set reach 8.4 dB; paths through metal, the only ones much later, start at 11.3. */
 #define BLOCKED_DB REAL(11.0)
 #define BOUND_SIGMAS REAL(3.0)
 #define BROADCAST 65535
@@ -95,11 +95,11 @@ typedef double real;
  * restarted; a single one is damaged. */
 #define COUNTER_JUMP_TICKS INT64_C(63897600000)
 #define COUNT_BITS 4
-/* Number of receptions, and which of them are weak. */
+/* Number of receptions, and the mask of weak ones. */
 #define COUNT_BYTES 2
 #define COUNT_MASK 15
 #define COVARIANCES (PACKED ? STATES * (STATES + 1) / 2 : STATES * STATES)
-/* The polynomial of Ethernet's check sequence, its bits in reverse order. */
+/* Polynomial of Ethernet's check sequence, bits reversed. */
 #define CRC_32 INT64_C(3988292384)
 #define CREEPING 2
 /* Whole cycles of each channel's carrier fit into this number of ticks: ``EstimatorSettings.carrier_cycles``. */
@@ -124,7 +124,7 @@ typedef double real;
 /* Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``. */
 #define FIRST_TEST 2
 #define FIX 20
-/* The fields that every beacon has. */
+/* Length of the fields that every beacon has. */
 #define FIXED_BYTES 20
 #define FLAGS_AT 11
 #define FLAT REAL(1e-09)
@@ -145,17 +145,17 @@ typedef double real;
 #define HAS_ORIGIN false
 #endif
 #define HAS_PAGE 2
-/* The receptions have a phase each and stamps of 32 bits, instead of stamps of 40. */
+/* Set if receptions carry a phase each and stamps of 32 bits instead of 40. */
 #define HAS_PHASES 64
 #define HAS_POSITION 1
 #define HAS_TOO_FEW 27
-/* Up to the magic number. */
+/* Length of the frame up to the magic number. */
 #define HEADER_BYTES 11
 #define HEARD_BYTES 8
 #define HEIGHT 1
-/* Where it stands in a site page; the height follows. */
+/* Offset of the flags in a site page; the height follows. */
 #define HEIGHT_FLAG_AT 8
-/* The flag of a site or schedule page with the height of the tags. */
+/* Flag of a site or schedule page that states the height of the tags. */
 #define HEIGHT_GIVEN 1
 #define HOST_JUMPED 2
 #define HPL 0
@@ -212,14 +212,14 @@ typedef double real;
 #ifndef MAX_COUNTED
 #define MAX_COUNTED 32
 #endif
-/* Larger ones are no powers. */
+/* Magnitude above which a value is not a valid power. */
 #define MAX_DIFFERENCE_DB REAL(1000.0)
 /* Two clocks cannot drift apart faster: each within 20 ppm (IEEE 802.15.4-2015, 16.4.9), and room for motion. */
 #define MAX_DRIFT REAL(5e-05)
 #define MAX_FAULTS 2
 /* Longest PSDU (IEEE 802.15.4-2015, aMaxPhyPacketSize). */
 #define MAX_FRAME_BYTES 127
-/* Entries that the number and the flags of ``heard`` have space for. */
+/* Largest number of entries that the count and the flags of ``heard`` can hold. */
 #define MAX_HEARD 12
 #define MAX_ITERATIONS 200
 #define MAX_LINKS (MAX_ANCHORS * (MAX_ANCHORS - 1))
@@ -227,7 +227,7 @@ typedef double real;
 #ifndef MAX_NEIGHBOURS
 #define MAX_NEIGHBOURS 256
 #endif
-/* 2⁻¹⁹ as a float32: those from 0 on are in the order of their bits. */
+/* 2⁻¹⁹ as a float32; non-negative float32 values are ordered by their bits. */
 #define MAX_NOISE_BITS 905969664
 /* Pages of issues that are not complete. */
 #ifndef MAX_PAGES
@@ -250,15 +250,15 @@ typedef double real;
 #define MAX_SITES 8
 #endif
 #define MAX_STARTS 9
-/* A superframe is shorter than half a wrap of the counter (8.6 s), else stamps become ambiguous. */
+/* Longest superframe: under half a wrap of the counter (8.6 s), as stamps would become ambiguous. */
 #define MAX_SUPERFRAME_TICKS INT64_C(549755813887)
 /* Rotations of all pairs of columns; they converge quadratically, with four columns after about six. */
 #define MAX_SWEEPS 12
 #define MAX_TRIALS 256
-/* Factor on the variance of a blocked path: metal made messages 0.2 to 0.4 m late, 4 to 8 times what noise does. */
+/* Factor on the variance of a blocked path: metal delayed messages by 0.2 to 0.4 m, 4 to 8 times the noise. */
 #define MAX_VARIANCE_FACTOR REAL(36.0)
 #define MERGED_SIGMAS REAL(2.0)
-/* With fewer no majority counts, unless that is all that a tag receives for ``PRESENT_TICKS``. */
+/* With fewer anchors no majority counts, unless the tag receives no more for ``PRESENT_TICKS``. */
 #define MIN_ANCHORS 3
 #define MIN_DAMPING REAL(0.0001)
 /* An anchor that relays this number of receptions of anchors in use, and they fit, is there. */
@@ -325,7 +325,7 @@ typedef double real;
 #ifndef PHASE_STATES
 #define PHASE_STATES 3
 #endif
-/* In a cycle; also the bit that shows that there is a phase. */
+/* Phase steps in a cycle; also the bit that marks the presence of a phase. */
 #define PHASE_STEPS 128
 #define PHASE_USED 2
 /* A comparison of range errors counts as this many times their mean at most, as jumps are not multipath. */
@@ -350,7 +350,7 @@ typedef double real;
 #define QUALITY 4
 #define RECENT 1
 #define REJECTED 0
-/* A reception by an anchor in use, or by one that is confirmed itself, confirms its sender for this time. */
+/* How long a reception confirms its sender, if received by an anchor in use or by one that is confirmed itself. */
 #define RELAYED_TICKS INT64_C(127795200000)
 /* Relays of each packet that are kept for the filter which begins. */
 #ifndef RELAYS_KEPT
@@ -380,9 +380,9 @@ typedef double real;
 #endif
 /* Time between two packets of an anchor at least: a frame takes longer. */
 #define SHORTEST_S REAL(5e-05)
-/* Of the stamp of such an entry. */
+/* Bits of the stamp of such an entry. */
 #define SHORT_BITS 32
-/* The highest bit of four bytes; as a float32 alone it is −0. */
+/* The highest bit of four bytes; as a float32 on its own it is −0. */
 #define SIGN INT64_C(2147483648)
 #define SINGULAR 5
 /* A pivot below this part of its diagonal element is rounding noise: the matrix is singular. */
@@ -390,7 +390,7 @@ typedef double real;
 #define SITE_CHANGED 4
 #define SITE_KIND 3
 #define SITE_PAGE 6
-/* A tag that may choose its site leaves one that has been silent, or has given no fix, for this time. */
+/* A tag that may choose its site leaves one that has been silent, or has given no fix, for this long. */
 #define SITE_SILENCE_TICKS INT64_C(127795200000)
 #define SOUND 0
 /* Speed of light in vacuum, exact (SI). Air slows it by 0.03 %, 1.6 mm over 6 m, and a calibration absorbs it. */
@@ -407,7 +407,7 @@ typedef double real;
 #define STD_STEPS_PER_M 10000
 #define STEPS 16
 #define STEPS_PER_M 100
-/* Units of an accuracy page: of standard deviations, of its distance and of its time. */
+/* Units of an accuracy page: standard deviations, distance, time. */
 #define STEPS_PER_S 10
 #define STEP_TOLERANCE REAL(1e-10)
 /* Parts of a tick; the air's unit of the site's time, of which beacons carry 48 bits. */
@@ -431,7 +431,7 @@ typedef double real;
 #define TOO_FEW_ANCHORS 21
 #define TOO_LONG 2
 #define TOO_SHORT 1
-/* A site that has given no fix for this time is left for another one: none holds a tag by its number of anchors. */
+/* A site that has given no fix for this long is left for another, whatever its number of anchors. */
 #define TRIAL_TICKS INT64_C(319488000000)
 #define TRIANGLE (MAX_ANCHORS * (MAX_ANCHORS - 1) / 2)
 #define TWO_PI REAL(6.283185307179586)
@@ -439,7 +439,7 @@ typedef double real;
 #define UNCERTAIN 8
 #define UNCONFIRMED_ANCHOR 33
 #define UNDETERMINED 1
-/* 31,200 steps of the delayed transmission: a quarter of a millisecond, the unit of periods. */
+/* Unit of periods: 31,200 steps of the delayed transmission, a quarter of a millisecond. */
 #define UNIT_STEPS 31200
 #define UNKNOWN_VERSION 5
 #define UNSETTLED 4
@@ -453,7 +453,7 @@ typedef double real;
 #define WEAKER_ANCHOR 34
 #define WORK_ROWS (MAX_ANCHORS + 1 + 2 * AXES)
 
-/* Where an anchor says that it is, as frames carry it. */
+/* Position that an anchor states, as frames carry it. */
 typedef struct StatedPlace {
     int32_t position_mm[3];
     int32_t std_mm;
@@ -461,64 +461,64 @@ typedef struct StatedPlace {
     int32_t zone;
 } StatedPlace;
 
-/* All that a frame says, and where it has the parts that are only passed on. */
+/* Contents of a frame, and the offsets of the parts that are passed on unread. */
 typedef struct BeaconFields {
     int32_t site;
     int32_t anchor;
     int32_t sequence;
-    int64_t tx_ticks;  /* In the sender's clock, 40 bits. */
+    int64_t tx_ticks;  /* TX stamp in the sender's clock, 40 bits. */
     int32_t almanac_issue;
     int32_t period_code;
     bool has_place;
     StatedPlace place;
-    int32_t heard_at;  /* Where the receptions of other anchors stand. */
+    int32_t heard_at;  /* Offset of the receptions of other anchors. */
     int32_t heard_count;
-    int32_t weak;  /* Bit k is set where the first path of reception k was weak: it may be late. */
+    int32_t weak;  /* Bit k is set if the first path of reception k was weak, so that its stamp may be late. */
     bool has_phases;  /* Whether the receptions have phases (``SHORT_BITS``). */
-    int32_t page_at;  /* Where the page stands; 0 where there is none, as in the next two. */
+    int32_t page_at;  /* Offset of the page; 0 if there is none, as for the next two. */
     int32_t certificate_at;
     int32_t authentication_at;
     int32_t relay_bytes;
-    uint8_t relays[96];  /* The receptions without the weak ones, as in the frame. */
+    uint8_t relays[96];  /* Receptions without the weak ones, encoded as in the frame. */
 } BeaconFields;
 
 /* One anchor. */
 typedef struct Neighbour {
     int32_t anchor;  /* Its identifier. */
-    int64_t changed_ticks;  /* The receiver's reading when anything was last learnt of it. */
-    int32_t frames;  /* Whose stamps have fitted since its counter began: 0, 1, or 2 for more. */
-    int32_t sequence;  /* Of the newest one. */
-    int64_t rx_ticks;  /* The receiver's own stamp of it. */
-    int64_t tx_ticks;  /* The anchor's, unwrapped. */
-    int32_t impossible;  /* Stamps in a row that do not fit. */
-    bool has_rival;  /* Whether one of those may be right, as only one frame stands against it. */
+    int64_t changed_ticks;  /* Receiver's reading when anything was last learnt about it. */
+    int32_t frames;  /* Frames whose stamps have fitted since its counter began: 0, 1, or 2 for more. */
+    int32_t sequence;  /* Sequence number of the newest frame. */
+    int64_t rx_ticks;  /* Receiver's stamp of the newest frame. */
+    int64_t tx_ticks;  /* Anchor's stamp of the newest frame, unwrapped. */
+    int32_t impossible;  /* Number of impossible stamps in a row. */
+    bool has_rival;  /* Whether an impossible stamp may be the right one, as only one frame stands against it. */
     int64_t rival_rx_ticks;
     int64_t rival_tx_ticks;
     int32_t almanac_issue;
     int32_t period_code;
     bool has_place;
-    StatedPlace place;  /* The one that is used. */
+    StatedPlace place;  /* Position in use. */
     bool has_other;
-    StatedPlace other;  /* Another one, stated once; used when it is stated twice in a row. */
-    /* Whether it has stated another position than before, until all anchors are used together again. */
-    bool has_moved;
-    bool was_relayed;  /* Whether others had received it at its newest frame. */
-    int64_t relayed_ticks;  /* The receiver's reading when another anchor last relayed that it had received this one. */
-    /* The receiver's reading when the anchor's own relays last fitted, where no other has relayed it since. */
+    StatedPlace other;  /* Another position, stated once; used when it is stated twice in a row. */
+    bool has_moved;  /* Whether it has stated a different position, until all anchors are used together again. */
+    bool was_relayed;  /* Whether others had received it by its newest frame. */
+    int64_t relayed_ticks;  /* Receiver's reading when another anchor last relayed a reception of this one. */
+    /* Receiver's reading when the anchor's own relays last fitted, if no other has relayed it since. */
     int64_t own_relays_ticks;
-    int64_t used_ticks;  /* The receiver's reading when the filter, where it has the anchor, last got a packet of it. */
+    /* Receiver's reading when the filter last got a packet of this anchor, if it has the anchor. */
+    int64_t used_ticks;
     bool has_power;
     real power_dbm;  /* Running mean of the received power. */
     bool is_misfit;  /* Whether it contradicted the others at the start. */
 } Neighbour;
 
-/* All of them. */
+/* All rows of the table. */
 typedef struct Neighbours {
     int32_t count;
-    /* Of the anchor whose frame is processed, which is not forgotten meanwhile; −1 while that is not known. */
+    /* Row of the anchor whose frame is being processed, which is then not forgotten; −1 if not known yet. */
     int32_t row;
     bool has_newest;
-    /* RX stamp of the newest accepted frame: one impossible stamp must not make others late. */
+    /* RX stamp of the newest accepted frame, so that one impossible stamp does not make others late. */
     int64_t newest_rx_ticks;
     Neighbour rows[MAX_NEIGHBOURS];
 } Neighbours;
@@ -531,7 +531,7 @@ typedef struct Unwrapper {
     real last_host_s;  /* NaN where no stamp has had a host time. */
 } Unwrapper;
 
-/* An anchor of a site. */
+/* An anchor of a counted site. */
 typedef struct CountedAnchor {
     int32_t anchor;
     int64_t rx_ticks;  /* RX stamp of its last beacon. */
@@ -545,19 +545,19 @@ typedef struct CountedSite {
     CountedAnchor anchors[MAX_COUNTED];
 } CountedSite;
 
-/* The site in use and, where the tag may choose, how many anchors of others it receives.
+/* The site in use and, if the tag may choose, how many anchors of other sites it receives.
  *
- * It uses the first site that it receives, but until there are fixes one with more anchors, so that a single foreign
- * anchor cannot hold it. One that gives no fix makes way for others, and returns only after those have failed. */
+ * The tag uses the first site that it receives, but until there are fixes one with more anchors, so that a single
+ * foreign anchor cannot hold it. A site without fixes gives way to others and returns only after those have failed. */
 typedef struct SiteChoice {
-    int32_t only_site;  /* The site that was configured; ``NO_SITE`` where the tag may choose. */
-    int32_t site;  /* The site in use, by its PAN identifier. */
-    int64_t heard_ticks;  /* RX stamp of the last beacon of it that was accepted. */
-    int64_t since_ticks;  /* RX stamp of the beacon with which it was chosen. */
+    int32_t only_site;  /* Configured site; ``NO_SITE`` if the tag may choose. */
+    int32_t site;  /* PAN identifier of the site in use. */
+    int64_t heard_ticks;  /* RX stamp of its last accepted beacon. */
+    int64_t since_ticks;  /* RX stamp of the beacon at which it was chosen. */
     bool has_fix;
     int64_t fix_ticks;  /* RX stamp of the last fix. */
     int32_t failed_count;
-    int32_t failed[MAX_SITES];  /* Sites that were left since the last fix as they gave none, the newest last. */
+    int32_t failed[MAX_SITES];  /* Sites left since the last fix because they gave none, newest last. */
     int32_t count;
     CountedSite sites[MAX_SITES];
 } SiteChoice;
@@ -627,26 +627,26 @@ typedef struct EstimatorSettings {
     real alert_limit_m;  /* Fixes with a higher horizontal protection level have an alert; NaN for none. */
 } EstimatorSettings;
 
-/* A page that is in use. */
+/* A page in use. */
 typedef struct UsedPage {
-    uint8_t contents[17];  /* All zeros where there is none. */
+    uint8_t contents[17];  /* All zeros if there is none. */
 } UsedPage;
 
 /* A page of an issue that is not complete yet. */
 typedef struct CollectedPage {
     int32_t issue;
-    int32_t support;  /* How many of the anchors that have sent it others have received. */
+    int32_t support;  /* How many of the anchors that sent it are received by others. */
     uint8_t contents[17];
     int32_t sender_count;
     int32_t senders[MAX_SENDERS];
 } CollectedPage;
 
-/* What a tag has learned of what is common to a site.
+/* What a tag has learnt of the site's common pages.
  *
- * The pages count once a majority of the anchors received recently states their issue, and they fit it; those in use
+ * Pages count once a majority of the recently received anchors states their issue and they match it; those in use
  * stay until all pages of another such issue are there. */
 typedef struct SitePages {
-    int32_t issue;  /* Of the pages in use. */
+    int32_t issue;  /* Issue of the pages in use. */
     UsedPage used[4];
     bool has_first;
     int64_t first_ticks;  /* When the first beacon was received. */
@@ -1241,10 +1241,10 @@ typedef struct State {
     real fix[10][3];  /* What a fix carries (``POSITION`` and the following). */
 } State;
 
-/* What there is for each page of an issue. */
+/* Candidates for each page of an issue. */
 typedef struct Choices {
     int32_t counts[4];
-    int32_t places[4][MAX_PAGES];  /* Where they stand in the table, those of most anchors first. */
+    int32_t places[4][MAX_PAGES];  /* Their rows in the table, those of most anchors first. */
     int32_t chosen[4];
 } Choices;
 
