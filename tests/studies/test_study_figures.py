@@ -113,18 +113,21 @@ def test_messages_lost_at_tags_are_heard_by_anchors():
     assert results[0].squared_m2 / results[0].fixes < results[1].squared_m2 / results[1].fixes
 
 
+OF_THE_LAB = (lab.loss_cases, lab.motion_cases, lab.nlos_cases, lab.sync_cases)
+
+
 def test_worlds_of_one_number_are_the_same_in_all_cases():
-    for module in (lab, lab, lab, lab):
-        seeds = {tuple(run.seed for run in case.runs) for case in module.cases(SMALL)}
+    for cases in OF_THE_LAB:
+        seeds = {tuple(run.seed for run in case.runs) for case in cases(SMALL)}
         assert len(seeds) == 1
     assert len({seed_of(seed, number) for seed in range(20) for number in range(20)}) == 400
 
 
 @pytest.mark.parametrize("quick", [False, True])
-@pytest.mark.parametrize("module", [lab, lab, lab, lab, room, large])
-def test_cases_can_be_told_apart_and_compared(module, quick):
+@pytest.mark.parametrize("cases_of", [*OF_THE_LAB, room.cases, large.scale_cases])
+def test_cases_can_be_told_apart_and_compared(cases_of, quick):
     plan = plan_of("joint", 1, quick=quick, worlds=2)
-    cases = module.cases(plan)
+    cases = cases_of(plan)
     names = [case.name for case in cases]
     assert len(set(names)) == len(names)
     assert all(case.of is None or case.of in names for case in cases)
