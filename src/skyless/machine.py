@@ -55,9 +55,6 @@ def extra_module(name: str, what: str) -> ModuleType:
         raise SkylessError(what_to_install(error, what)) from None
 
 
-# How many processors there are to compute with.
-
-
 def cores() -> int:
     """Processors that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

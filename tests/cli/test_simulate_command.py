@@ -15,7 +15,7 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.cli.nodes.options import check_live
-from skyless.cli.plan import FIXES_CSV_COLUMNS
+from skyless.cli.simulate import FIXES_CSV_COLUMNS
 from skyless.sim.lab import lab_site
 from skyless.site.file.load import load_site
 

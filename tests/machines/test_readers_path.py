@@ -17,11 +17,7 @@ DOCUMENT = (Path(__file__).parents[2] / "docs" / "architecture.md").read_text(en
 LISTED = [
     name for row in re.findall(r"^\| \d \|.*", DOCUMENT, re.MULTILINE) for name in re.findall(r"`(core/[\w/.]+)`", row)
 ]
-SMALL = {
-    "core/air/frame.py",
-    "core/air/site_choice.py",
-    "core/ticks.py",
-}
+SMALL = {"core/air/frame.py", "core/air/site_choice.py", "core/ticks.py"}
 """Checksum, kind of frame, weak first path and phase, which of several sites, wrapping counters: a line of each."""
 WARM_S = 3.0
 

@@ -27,7 +27,7 @@ _GROUPS: Final = {
     "Start here": (
         # name, module below skyless.cli (imported only when it is called) and its App (:app), what it does
         ("demo", "nodes.demo", "Show a site and walking tags in real time: no radio and no site file needed."),
-        ("simulate", "plan:simulate_app", "Run a site in the simulated world and judge it against the truth."),
+        ("simulate", "simulate", "Run a site in the simulated world and judge it against the truth."),
     ),
     "Set up and check a site": (
         ("site", "site", "Write and check site files."),
@@ -40,7 +40,7 @@ _GROUPS: Final = {
         ("broker", "nodes.broker", "Run the MQTT broker that comes with Skyless."),
         ("hub", "nodes.broker:hub_app", "Set up the servers where several sites meet."),
         ("gather", "nodes.broker:gather_app", "Pack the fixes of a site with thousands of tags into a stream of NATS."),
-        ("anchor", "nodes.tag:anchor_app", "Run anchors of a site."),
+        ("anchor", "nodes.anchor", "Run anchors of a site."),
         ("tag", "nodes.tag", "Run listening tags; with --print, --csv or --json their positions on standard output."),
         ("dashboard", "dashboard", "Show a site live in the browser."),
         ("watch", "nodes.site_view:watch_app", "Show a running site as text, for a terminal."),

@@ -278,8 +278,6 @@ _NAMES: Final = {
 """How the table names figures that missed their limits, where not by the field's own name."""
 
 
-# ``skyless paper``: the paper's figures and claims, simulated and judged, as one report.
-
 paper_app = App(name="paper", help_epilogue="Example: skyless paper --out report --seed 1")
 
 
@@ -317,8 +315,6 @@ def paper(*, out: Path, seed: Seed = 1, quick: bool = False, output: JsonOptions
     print_table("the paper, reproduced and corrected", ("", "figure", "verdict"), rows)
     console().print(f"{report.report}: {len(report.figures)} pictures and numbers.json next to it")
 
-
-# ``skyless benchmark``: every recording below a folder by every method.
 
 _QUICK_S: Final = 12.0
 

@@ -113,9 +113,6 @@ def horizontal_ellipse(covariance_m2: Sequence[float]) -> tuple[float, float, fl
     return sqrt(max(middle + half, 0.0)), sqrt(max(middle - half, 0.0)), atan2(2.0 * xy, xx - yy) / 2.0
 
 
-# Features of GeoJSON (RFC 7946).
-
-
 def coordinates(position_m: tuple[float, float, float], origin: GeoreferenceSite) -> list[float]:
     """Longitude, latitude (WGS 84) and height above the ellipsoid of a point of the site."""
     latitude_deg, longitude_deg, height_m = geodetic(position_m, origin)

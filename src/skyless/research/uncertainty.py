@@ -262,7 +262,7 @@ PRINTED: Final = PrintedVariances()
 # With Gaussian noise the (posterior) bound is the covariance of a filter that is linearised at the truth: the
 # estimator's own steps with the tag at its true position and innovations of zero. Relayed receptions count without
 # age, and with what they say of the survey, both of which the estimator approximates. Phases of the carrier count
-# without doubt of their cycles; the ambiguity of each anchor is a real number, of which nothing is known before.
+# with their cycles known; the ambiguity of each anchor is a real number, of which nothing is known before.
 # Equations: ``docs/maths.md`` section 7.
 
 # What is known before the first frame, almost nothing: 30 m, 33 µs, ±10 ppm.

@@ -29,8 +29,6 @@ from skyless.run.mqtt.messages import AlarmMessage, Asset, FixMessage, TagHealth
 from skyless.run.zones import TAG_TIMEOUT_S, ZoneMonitor
 from skyless.site.alarm_rules import GROUP, read_hours
 
-# Which tags are near each other.
-
 STOREY_M: Final = 2.5
 """Tags whose heights differ by more than this are on different storeys. Only the horizontal distance counts otherwise:
 heights are less accurate, and one tag may be on a helmet and the other on a fork.

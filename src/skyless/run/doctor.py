@@ -78,7 +78,7 @@ class CounterPairs:
         self._added_s: dict[tuple[str, int], float] = {}
 
     def add(self, receiver: str, sender: int, tx_ticks: int, rx_ticks: int, now_s: float) -> None:
-        """Add a frame, in order. A pair starts afresh after a restart of either counter or a long gap."""
+        """Add a frame, in order. A pair starts again after a restart of either counter or a long gap."""
         pair = receiver, sender
         if pair not in self._pairs and len(self._pairs) >= _MAX_PAIRS:
             return
@@ -140,9 +140,6 @@ def counters_check(pairs: CounterPairs, noise: NoiseSite, name: str) -> Check:
     else:
         advice = f"Set tx_stamp_ps and rx_stamp_ps in [noise] of the site file {short:.1f} times as large"
     return Check(name, "warning", finding, f"{advice}, unless a board was moved or is warming up.")
-
-
-# Checks of a board on a serial port, which listens as a tag.
 
 
 class BoardProbe:

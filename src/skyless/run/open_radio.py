@@ -187,8 +187,6 @@ def host_and_port(spec: str, where: str, default_port: int) -> tuple[str, int]:
     return host.strip("[]") or "127.0.0.1", port or default_port
 
 
-# What a node logs about its radio: that it is ready or gone, and likely causes if it receives nothing usable.
-
 UNUSABLE_S: Final = 5.0
 """A node that has received nothing usable for this long logs it."""
 REPEAT_S: Final = 60.0

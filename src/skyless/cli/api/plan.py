@@ -76,10 +76,10 @@ class RatePlanResult(FloorResult[RateMap], frozen=True, eq=False):
 
     def facts(self) -> Iterator[tuple[str, str]]:
         """The figures that matter, each with its name and unit."""
-        found, told = self.map.reception, self.summary
+        found, summary = self.map.reception, self.summary
         yield "anchors", f"{len(self.site.all_anchors)}"
-        yield "range in the open", f"{told['range_m']:.0f} m (path loss exponent {told['exponent']:g})"
-        yield "each anchor sends", f"{told['beacons_per_s_of_each_anchor']:.1f} beacons/s"
+        yield "range in the open", f"{summary['range_m']:.0f} m (path loss exponent {summary['exponent']:g})"
+        yield "each anchor sends", f"{summary['beacons_per_s_of_each_anchor']:.1f} beacons/s"
         yield "median beacons/s at a tag", f"{found.beacons_per_s.median:.0f}"
         yield "beacons/s at the worst 5 %", f"{found.beacons_per_s.worst_5_percent:.0f}"
         yield "anchors received at the worst 5 %", f"{found.anchors_received.worst_5_percent:.0f}"

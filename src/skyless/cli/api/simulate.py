@@ -181,9 +181,6 @@ def run_simulate(asked: SimulateOptions) -> SimulationResult:
 simulate = python_function(SimulateOptions, run_simulate)
 
 
-# ``skyless.study``: how accurate the receiver is under which conditions, over many runs in the simulated world.
-
-
 class StudyResult(Result, frozen=True, eq=False):
     """Rows of a study, one a case; all is simulated."""
 

@@ -96,8 +96,6 @@ def board(asked: BoardOptions, output: JsonOptions) -> None:
     run_until_stopped(emulated.run(), punctual=True)
 
 
-# ``skyless ether``: the emulated air.
-
 _Share = Annotated[float, number(least=0.0, below=1.0)]
 
 ether_app = App(name="ether", help_epilogue="Example: skyless ether --site lab --tags 3")
@@ -187,8 +185,6 @@ def _move(text: str, anchors: Iterable[int]) -> "AnchorDisplacement":
         raise SkylessError(f"--move is {text!r}; the time after @ should be more than 0 s")
     return AnchorDisplacement(known[name], x_m, y_m, z_m, from_s)
 
-
-# ``skyless flash-config``: settings of a board that is a tag by itself.
 
 _BAUDS: Final = (1_000_000, 115_200, 230_400, 460_800, 921_600)
 

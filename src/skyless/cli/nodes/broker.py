@@ -198,8 +198,6 @@ async def _keep_history(address: MqttAddress, folder: Path, nats: NatsAddress | 
         await asyncio.gather(*running.values(), return_exceptions=True)
 
 
-# ``skyless gather``: the fixes of a large site in batches.
-
 gather_app = App(name="gather", help_epilogue="Example: skyless gather --nats nats://127.0.0.1:4222 --site-id 7")
 
 
@@ -241,8 +239,6 @@ def gather(
             f"site {node.site}: {summary.fixes} fixes, {summary.batches} batches in the stream, dropped {summary.drops}"
         )
 
-
-# ``skyless hub``: the servers where the sites of a company meet.
 
 hub_app = App(
     name="hub", help_epilogue="Example: skyless hub init hub --node a.example --node b.example --node c.example"

@@ -127,8 +127,6 @@ def _report(path: Path, state: "RecorderState | None", *, json: bool) -> None:
             print(f"  not written at the end: {state.lost} messages; {state.ended}")
 
 
-# ``skyless export``: a recording in another program's format.
-
 export_app = App(name="export", help_epilogue="Example: skyless export walk.mcap --to walk_bag")
 
 

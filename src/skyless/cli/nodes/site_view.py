@@ -400,8 +400,6 @@ def _anchor(row: AnchorRow) -> list[Text]:
     ]  # fmt: skip
 
 
-# ``skyless watch``: a running site as text.
-
 _FIND_S: Final = 5.0
 _PICTURE_S: Final = 3.0
 """One picture is made after this time: tags and anchors report every second."""
@@ -441,8 +439,6 @@ async def _watch(address: MqttAddress, site_id: int | None, pictures: list[Pictu
     with Live(console=out, screen=True, auto_refresh=False) as live:
         await view.run(None, lambda: live.update(drawn(view.picture(), out.height), refresh=True))
 
-
-# ``skyless sites``: the sites of a broker or at a hub.
 
 _LISTEN_S: Final = 2.5
 _DASH: Final = "–"

@@ -98,8 +98,6 @@ class Beacon(Struct, frozen=True, gc=False):
         return tuple(self.heard)
 
 
-# Reading a beacon of protocol 2 from a frame (``docs/protocol2.md``).
-
 INTACT: Final = 0
 TOO_SHORT, TOO_LONG, BAD_FCS, NOT_A_BEACON, UNKNOWN_VERSION, BAD_FLAGS, BAD_LENGTH, BAD_HEARD, BAD_PAGE, BAD_PERIOD = (
     range(1, 11)

@@ -165,7 +165,7 @@ RESTART_SILENCE_TICKS: Final = from_seconds(0.2)
 RESTART_SILENCE_PERIODS: Final = 4
 
 STAMP_FITS, DUPLICATE, OUT_OF_ORDER, IMPOSSIBLE_STAMP, ANCHOR_RESTART = range(5)
-"""Kinds of stamps. ``ANCHOR_RESTART`` is impossible as well, and the anchor's next stamp begins its counter anew."""
+"""Kinds of stamps. ``ANCHOR_RESTART`` is impossible as well, and the anchor's next stamp restarts its counter."""
 STAMP_COUNTERS: Final = (
     (),
     ("duplicate",),

@@ -48,7 +48,7 @@ def note_outlier(s: State, anchor: int, innovation: float, innovation_variance: 
 
 
 def has_jumped(s: State, anchor: int) -> bool:
-    """Whether so many receptions in a row are off that the anchor's range error has jumped."""
+    """Whether enough receptions in a row are off to show that the anchor's range error has jumped."""
     needed = s.tuning.in_row_where_late if is_late_often(s) else s.tuning.in_row
     return s.anchors[anchor].outliers_in_row >= needed
 

@@ -1208,8 +1208,6 @@ INTERNAL int32_t use_chosen(SitePages *p, Choices *c, int32_t issue) {
 
 /* Beacons of protocol 2 and their bytes (``docs/protocol2.md``); little endian throughout, 127 bytes at most. */
 
-/* Reading a beacon of protocol 2 from a frame (``docs/protocol2.md``). */
-
 /* Read a whole frame, FCS included. Return ``INTACT``, or why it is not a beacon of version 2. */
 SKYLESS_EXPORT int32_t skyless_read_frame(uint8_t *frame, int32_t length, BeaconFields *b) {
     int32_t fault = header_fault(frame, length);
@@ -2876,7 +2874,7 @@ INTERNAL void note_outlier(State *s, int32_t anchor, real innovation, real innov
     }
 }
 
-/* Whether so many receptions in a row are off that the anchor's range error has jumped. */
+/* Whether enough receptions in a row are off to show that the anchor's range error has jumped. */
 INTERNAL bool has_jumped(State *s, int32_t anchor) {
     real needed = is_late_often(s) ? s->tuning.in_row_where_late : s->tuning.in_row;
     return (real)s->anchors[anchor].outliers_in_row >= needed;
@@ -6184,7 +6182,7 @@ INTERNAL int32_t solve_without_one(Acquisition *q, int64_t now) {
  * The filter's state and the search for a start are not used at the same time, so that a board may keep both in the same
  * memory (``SHARES_MEMORY``): a filter begins with copies of what was found. */
 
-/* A tag that knows where it is: what becomes of a packet, and when it has to begin again (``following.py``). */
+/* A tag that knows where it is: what becomes of a packet, and when it has to begin again. */
 
 /* Process a packet of a tag that knows where it is, as ``process_frame``; what becomes of it. */
 INTERNAL int32_t process_in_course(Course *c, State *s, FixTime *time, Packet *packet, Relays *relays, uint8_t *packed,

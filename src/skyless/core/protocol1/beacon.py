@@ -31,8 +31,6 @@ from skyless.core.air.site_pages import PAGE_BYTES, decode_page, encode_page
 from skyless.core.site import Site
 from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ
 
-# The beacon of protocol 1: what every anchor broadcasts in its slots (``docs/protocol.md``).
-
 
 class MasterTime(Struct, frozen=True, gc=False):
     """The frame's TX time on the master's scale, as the sending anchor's clock filter knows it."""

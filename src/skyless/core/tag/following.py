@@ -35,7 +35,7 @@ from skyless.core.tag.position import FOUND, IMPOSSIBLE, MIRROR, RESIDUALS, UNSE
 from skyless.core.tag.search import LARGEST
 from skyless.core.ticks import TICK_S, FixTime, fix_time_ticks, from_seconds
 
-# A tag that knows where it is: what becomes of a packet, and when it has to begin again (``following.py``).
+# A tag that knows where it is: what becomes of a packet, and when it has to begin again.
 
 FIX, OUTLIER, LOST, START_CONTRADICTED, BAD_GEOMETRY = range(20, 25)
 """What becomes of a packet. After ``LOST`` and ``START_CONTRADICTED`` the tag has to begin again."""

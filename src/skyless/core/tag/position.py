@@ -203,8 +203,8 @@ def _fill_residuals(p: LocateProblem, found: Found, minimum: Minimum) -> None:
 
 # Positions from one set of TDoAs, without an initial guess and without hiding an ambiguity.
 #
-# Closed forms give starts (``starts``), from which damped Gauss–Newton steps (``descent``) lead to the minima; these
-# are distinguished (``minima``), unfolded from a plane, and decided between by the height's bounds (``position``).
+# ``search.py`` finds the minima: starts in closed form, then damped Gauss–Newton steps. They are unfolded from a plane
+# and decided between by the height's bounds.
 
 _find_position = compiled(find_position)
 

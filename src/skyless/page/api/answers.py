@@ -186,8 +186,6 @@ def names(text: str) -> tuple[str, ...]:
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
-# The OpenAPI document (version 3.1) of the table of routes.
-
 ROOT: Final = "/api/v1"
 GEOJSON: Final = "application/geo+json"
 CSV: Final = "text/csv"

@@ -171,8 +171,6 @@ def muloc_truth(path: str | PathLike[str], _listener: str | None) -> Truth | Non
     return Truth(table[:, 0], table[:, 1:], None)
 
 
-# Tables whose rows are time differences of two anchors: ready ones, and MILUV's stamps of exchanges.
-
 # Tables of TDoAs with tdoa_m = |p − b| − |p − a|: by the names of ``PairTdoa``, or those of the UTIL flights and logs.
 
 TDOA_COLUMNS: Final = ("t_s", "anchor_a", "anchor_b", "tdoa_m")

@@ -173,8 +173,6 @@ def _late(plan: Plan, bias_m: float, burst_s: float | None, number: int) -> tupl
     return (AnchorBias(anchor_of(paper_lab_site(plan.noise_ps), number).id, bias_m, burst_s),)
 
 
-# The study ``sync``: synchronisation when masters die, with long superframes, bad crystals and temperature.
-
 _STEADY: Final = "steady"
 _SUPERFRAMES_MS: Final = (15.0, 30.0, 60.0, 120.0, 300.0, 1000.0)
 _LONGEST_SLOT_S: Final = 0.06

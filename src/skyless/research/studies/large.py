@@ -404,8 +404,6 @@ def row_of(plan: Plan, case: LargeCase, each: list[LargeResult]) -> Row:
     return replace(row, bound_m=math.sqrt(whole.bound_m2 / whole.fixes), ratio=ratio, ratio_error=ratio_error)
 
 
-# The study ``scale``: what a tag costs and how accurate it is: one to ten thousand tags, four to sixty anchors.
-
 _FLEET_WARMUP_S: Final = 1.0
 _FLEET_S: Final = 0.5
 """Fleets of all sizes are judged in the same stretch of time, short enough for ten thousand tags."""
