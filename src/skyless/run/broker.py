@@ -52,19 +52,18 @@ _WAIT_S: Final = 0.01
 
 
 class BrokerLimits(Struct, frozen=True):
-    """Limits beyond which nats-server ends a connection or refuses a request, and logs it."""
+    """Beyond them nats-server ends a connection, or refuses what is asked, and says so in its log."""
 
     message_bytes: int = MAX_PAYLOAD
-    """Size of a message, such as a floor plan."""
+    """A message, such as a floor plan."""
     stored_bytes: int = 4 * 1024**3
-    """Retained messages, and those waiting for clients with sessions; a gather's streams come in addition."""
+    """What is retained, and what waits for clients with sessions; a gather's streams come in addition."""
     subscriptions: int = 100_000
-    """Subscriptions of QoS 1 of all clients. Each is a consumer of a stream, for which nats-server's default is 1,000.
-    """
+    """Subscriptions of QoS 1 of all clients: each is a consumer of a stream, and nats-server's default is 1,000."""
     session_idle_h: int = 24
-    """Hours after which an absent client's subscriptions end, where strangers may read and could leave many behind."""
+    """Hours after which subscriptions of a session that is away end, where strangers may read and could leave many."""
     log_bytes: int = 1_000_000
-    """Size of a log file, of which there are two."""
+    """A file of the log, of which there are two."""
 
 
 LIMITS: Final = BrokerLimits()
