@@ -26,7 +26,7 @@ def test_anchors_of_a_site_that_relays_phases_ask_their_radios_for_them(key, pha
         asked.append(options["phases"])
         raise SkylessError("enough")
 
-    monkeypatch.setattr("skyless.cli.nodes.tag.open_radios", open_radios)
+    monkeypatch.setattr("skyless.cli.nodes.anchor.open_radios", open_radios)
     site.write_text(f'name = "x"\nid = 1\n[schedule]\nmode = "free"\n{key}[[anchors]]\nid = 1\nx_m = 0\ny_m = 0\n')
     assert main(["anchor", "1", "--site", str(site)]) == 2
     assert asked == [phases]
