@@ -1,10 +1,10 @@
 """``Anchor``: the protocol machine of one anchor. Bytes and ticks in, frames and ticks out; no I/O, no clock.
 
-A driver (simulator, program) hands it every reception, asks when its next frame is due, and fetches that frame as late
+A driver (simulator, program) passes it every reception, asks when its next frame is due, and fetches that frame as late
 as its radio allows, so that it carries the latest receptions.
 
 An anchor knows no time other than its own counter. It sends at the instants of ``skyless.core.air.almanac``. The more
-anchors it receives, the less often it sends, so that together they offer what the air carries best.
+anchors it receives, the less often it sends, so that together they make the best use of the air.
 """
 
 import math
@@ -63,14 +63,14 @@ from skyless.core.ticks import (
 
 
 def site_pages_of(site: Site) -> tuple[Page, ...]:
-    """Return the pages of a validated site of protocol 2, in the order of their types on the air."""
+    """The pages of a validated site of protocol 2, in the order of their types on the air."""
     filters, earth = filter_pages_of(site), georeference_page_of(site)
     others: list[Page] = [filters[0], *([] if earth is None else [earth]), filters[1]]
     return (*others, SitePage(len(others) + 1, site.tags.height_m))
 
 
 def filter_pages_of(site: Site) -> tuple[NoisePage, AccuracyPage]:
-    """The pages for the filters of the site's tags."""
+    """The pages for the filters of tags."""
     noise = site.noise
     return (
         NoisePage(noise.tx_stamp_ps * 1e-12, noise.rx_stamp_ps * 1e-12, noise.white_fm, noise.random_walk_fm),
@@ -79,7 +79,7 @@ def filter_pages_of(site: Site) -> tuple[NoisePage, AccuracyPage]:
 
 
 def georeference_page_of(site: Site) -> GeoreferencePage | None:
-    """The page with the site's position on the Earth, None where that is not known."""
+    """The page with the site's position on the Earth; None if unknown."""
     earth = site.georeference
     if earth is None:
         return None
@@ -87,24 +87,24 @@ def georeference_page_of(site: Site) -> GeoreferencePage | None:
 
 
 def stated_position(site: Site, anchor: AnchorSite) -> StatedPosition:
-    """What an anchor of a site states of its position."""
+    """The position that an anchor of a site states."""
     std_m = site.accuracy.survey_std_m if anchor.std_m is None else anchor.std_m
     return StatedPosition(anchor.x_m, anchor.y_m, anchor.z_m, std_m, anchor.floor, anchor.zone)
 
 
 def site_page_for(pages: tuple[Page, ...], sequence: int, anchor: int) -> Page:
-    """Return the page that a frame carries: an anchor's successive frames carry one after the other."""
+    """The page that a frame carries: an anchor's successive frames cycle through them."""
     return pages[(sequence + anchor) % len(pages)]
 
 
 def site_issue(pages: Iterable[Page]) -> int:
-    """Return 16 bits that depend on the contents of all pages and on nothing else."""
+    """A 16-bit checksum of the contents of all pages."""
     checksum = crc32(b"".join(sorted(map(encode_page, pages))))
     return (checksum ^ checksum >> 16) & 0xFFFF
 
 
 class CommonPages(Struct, frozen=True):
-    """The pages of a site, complete."""
+    """The complete pages of a site."""
 
     site: SitePage
     noise: NoisePage
@@ -113,10 +113,10 @@ class CommonPages(Struct, frozen=True):
 
 
 class LocalAlmanac:
-    """What a tag has learned of a site of protocol 2."""
+    """What a tag has learnt about a site of protocol 2."""
 
     def __init__(self, site_pages: SitePages, neighbours: Neighbours) -> None:
-        """The site's pages, and the anchors with what each states of itself, which go on changing."""
+        """The site's pages and the anchors' statements, both of which keep changing."""
         self._site_pages, self._neighbours = site_pages, neighbours
 
     @property
@@ -126,7 +126,7 @@ class LocalAlmanac:
 
     @property
     def pages(self) -> CommonPages | None:
-        """The pages in use, None until they are complete."""
+        """The pages in use; None until they are complete."""
         if self._site_pages.issue == NO_ISSUE:
             return None
         noise, earth, accuracy, site = (decode_page(bytes(one.contents)) for one in self._site_pages.used)
@@ -148,43 +148,43 @@ def _point_m(place: StatedPlace) -> tuple[float, float, float]:
 
 CERTIFICATE_S: Final = 0.5
 CERTIFICATE_EVERY: Final = (8, 16, 32)
-"""An anchor sends a certificate about twice a second, in one of 8, 16 or 32 frames: such a frame has no relays. Every
-fourth certificate is that of what comes next."""
+"""An anchor sends a certificate about twice a second, in one of 8, 16 or 32 frames, which then has no relays. Every
+fourth certificate is that of the next section or chain."""
 _SUCCESSOR_EVERY: Final = 4
 
 FAR_S: Final = 10.0
 """Codes of intervals farther from the present are not checked: anybody can state any, and their keys take long."""
 
 NO_KEYS_S: Final = 2.0
-"""No key is disclosed for this time after a start and after a step of the host's clock: others may find it wrong."""
+"""Time without disclosing keys after a start and after a step of the host's clock: others may find it wrong."""
 
 RECENT_S: Final = 2.0
 SPACINGS: Final = 3.0
-"""An anchor's first frame in an interval comes within this number of its mean times between two frames."""
+"""An anchor's first frame in an interval comes within this many of its mean times between frames."""
 MIN_OTHERS: Final = 2
-"""Own clock against this number of others: with one it is not known which of the two is wrong."""
+"""Number of other clocks that prove the own one wrong: with a single one, either may be."""
 
 
 class Contents(Struct, frozen=True, gc=False):
-    """What authentication puts in the next frame."""
+    """What authentication adds to the next frame."""
 
     interval: int | None = None
-    """Under whose key the frame is; None without authentication."""
+    """The interval whose key authenticates the frame; None without authentication."""
     certificate: bytes | None = None
     key: KeyPage | None = None
 
     def page(self, pages: tuple[Page, ...], sequence: int, anchor: int) -> Page | None:
-        """The page of the frame: a key, else one of the site's; none with a certificate."""
+        """The page of the frame: a key, otherwise one of the site's; none with a certificate."""
         if self.certificate is not None:
             return None
         return self.key or site_page_for(pages, sequence if self.interval is None else sequence >> 1, anchor)
 
 
 class _Offset(Struct):
-    """How far another anchor's clock is behind the own one, by its frames of the present second and the one before.
+    """By how much another anchor's clock is behind the own one, from its frames of this second and the last.
 
-    A frame shows what it is after the beginning of its interval, and the least of many is hardly more than the clocks'
-    difference. Repeated old frames show more, so they do no harm.
+    A frame gives the time since the beginning of its interval, and the smallest of many is hardly more than the clocks'
+    difference. Repeated old frames give larger values, so they do no harm.
     """
 
     since_s: float
@@ -201,30 +201,30 @@ class _Offset(Struct):
         self.frames += 1
 
     def is_far(self, timing: ChainTiming) -> bool:
-        """Whether the clocks are too far apart for any instants at which that anchor may send."""
+        """Whether the clocks are too far apart, whenever the anchor sends within its interval."""
         least_s = min(self.present_s, self.before_s)
         latest_s = min(SPACINGS / self.frames_before, timing.interval_s) if self.frames_before else timing.interval_s
         return least_s < -timing.anchors_apart_s or least_s > timing.anchors_apart_s + latest_s
 
 
 class BeaconAuthentication:
-    """Keys, time and neighbours of one anchor, as far as authentication needs them. No I/O, no clock of its own."""
+    """Keys, time and neighbours of one anchor, as needed for authentication. No I/O, no clock of its own."""
 
     def __init__(self, chains: Iterable[Chain], no_keys_s: float = NO_KEYS_S) -> None:
-        """``no_keys_s``: how long no key is disclosed after a start; 0 for an anchor that has been on before."""
+        """``no_keys_s``: time without disclosing keys after a start; 0 for an anchor that was on before."""
         self.faults: dict[int, tuple[Fault, float]] = {}
-        """The last fault of each other anchor, or of frames in its name, and when it was, in Unix seconds."""
+        """The last fault of each other anchor, or of frames in its name, with its Unix time in seconds."""
         self._ring = ChainRing(chains)
         self._now: tuple[int, float] | None = None
         self._offsets: dict[int, _Offset] = {}
         self._no_keys_s, self._no_keys_until_s = no_keys_s, 0.0
 
     def set_chains(self, chains: Iterable[Chain]) -> None:
-        """Use these chains from now on: a successor, or one instead of a revoked one."""
+        """Use these chains from now on: a successor, or a replacement of a revoked one."""
         self._ring = ChainRing(chains)
 
     def set_time(self, now_ticks: int, unix_s: float) -> None:
-        """The own counter (40 bits) and the host's clock at the same moment; needed every few seconds."""
+        """Set the own counter (40 bits) and the host's clock at the same moment; needed every few seconds."""
         timing = self._ring.timing
         step_s = math.inf if self._now is None else abs(unix_s - self._unix_s(now_ticks))
         if timing is not None and step_s > timing.anchors_apart_s:
@@ -232,7 +232,7 @@ class BeaconAuthentication:
         self._now = (now_ticks, unix_s)
 
     def fault(self) -> Fault | None:
-        """Why own frames are sent without a code; None where they have one."""
+        """Why own frames are sent without a code; None if they have one."""
         timing = self._ring.timing
         if self._now is None or timing is None:
             return Fault.NO_TIME if self._now is None else Fault.NO_CHAIN
@@ -242,7 +242,7 @@ class BeaconAuthentication:
         return None if self._ring.at(timing.interval_at(self._now[1])) is not None else Fault.NO_CHAIN
 
     def contents(self, tx_ticks: int, sequence: int, anchor: int, period_s: float) -> Contents:
-        """What the frame with this TX stamp (40 bits) is to hold; ``period_s``: mean time between two frames."""
+        """What to put into the frame with this TX stamp (40 bits); ``period_s``: mean time between two frames."""
         timing = self._ring.timing
         if timing is None or self.fault() is not None:
             return Contents()
@@ -264,7 +264,7 @@ class BeaconAuthentication:
         return Contents(interval, key=KeyPage(disclosing.key(disclosed)))
 
     def seal(self, frame: bytes, interval: int | None) -> bytes:
-        """The frame with its code."""
+        """The frame with its code filled in."""
         keys = None if interval is None else self._ring.at(interval)
         if keys is None or interval is None:
             return frame
@@ -272,7 +272,7 @@ class BeaconAuthentication:
         return with_authentication(frame, interval & (1 << INTERVAL_BITS) - 1, lambda signed: mac_of(signed, key))
 
     def fault_of(self, beacon: Beacon, reception: Reception) -> Fault | None:
-        """Why a beacon of another anchor is not used; None where it is genuine, or the own chains do not hold now."""
+        """Why a beacon of another anchor is refused; None if it is genuine, or if own chains do not hold now."""
         timing = self._ring.timing
         if self._now is None or timing is None:
             return Fault.NO_TIME if self._now is None else None
@@ -314,15 +314,15 @@ class BeaconAuthentication:
         known.add(unix_s, offset_s)
 
     def _clocks(self, timing: ChainTiming, unix_s: float) -> tuple[int, int]:
-        """How many of the other anchors' clocks are far from the own one, and how many near."""
+        """Number of other anchors' clocks far from the own one, and near it."""
         recent = [one for one in self._offsets.values() if abs(unix_s - one.since_s) <= RECENT_S]
         far = sum(one.is_far(timing) for one in recent)
         return far, len(recent) - far
 
     def _may_disclose(self, timing: ChainTiming) -> bool:
-        """Whether other anchors confirm the own clock: a key that is disclosed too early lets anybody make codes.
+        """Whether other anchors confirm the own clock: a key disclosed too early lets anybody make codes.
 
-        Without keys of this anchor nobody lacks any, as others disclose the same ones.
+        Nobody misses this anchor's keys, as others disclose the same ones.
         """
         assert self._now is not None
         unix_s = self._now[1]
@@ -335,14 +335,14 @@ class BeaconAuthentication:
 
 
 MAX_RELAY_AGE_TICKS: Final = from_seconds(1.0)
-"""Older stamps are not relayed: sequence numbers come around after 256 frames, and then name another frame."""
+"""Older stamps are not relayed: sequence numbers wrap after 256 frames, and then name another frame."""
 
 PRESENT_PERIODS: Final = 8
 PRESENT_TICKS: Final = from_seconds(1.0)
-"""An anchor that was received within both the last second and this number of own periods is in reach."""
+"""An anchor is in reach if it was received within the last second and within this number of own periods."""
 
 MIN_CODE_STEPS: Final = 2
-"""A period that is off by less than this, 9 to 12 %, stays, so that beacons can be predicted for long."""
+"""Smaller changes of the period, up to 9 to 12 %, are not made, so that beacons stay predictable for long."""
 
 
 class Anchor:
@@ -351,10 +351,10 @@ class Anchor:
     def __init__(
         self, site: Site, anchor_id: int, lead_s: float = 1e-3, authentication: BeaconAuthentication | None = None
     ) -> None:
-        """``lead_s``: how long before its RMARKER a frame must be in the driver's hands.
+        """``lead_s``: how long before its RMARKER the driver needs a frame.
 
         ``authentication``: the keys; None for an anchor that sends without codes and accepts all frames. The radio is
-        configured with the antenna delays of ``site``, and keeps them.
+        configured with the antenna delays of ``site`` and keeps them.
 
         Raises:
             KeyError: the site has no such anchor.
@@ -367,12 +367,12 @@ class Anchor:
         self._known = frozenset(anchor.id for anchor in site.all_anchors) - {anchor_id}
         self._delay_ticks = anchor_of(site, anchor_id).tx_antenna_delay_ticks
         self._correction_ticks = 0
-        """What frames state of their TX stamps beyond the radio's, as another site corrects its delays."""
+        """Correction of the radio's TX stamps in frames, if another site corrects its delays."""
         self._lead_ticks = from_seconds(lead_s) + DELAYED_TX_GRANULARITY_TICKS
         self._own_ticks = Unwrapper()
         self._neighbours = Neighbours()
         self._heard: dict[int, tuple[Heard, int, bool]] = {}
-        """Last reception of each, its unwrapped stamp, and whether its first path was weak; the newest last."""
+        """Last reception of each anchor, its unwrapped stamp, and whether its first path was weak; the newest last."""
         self._sequence = 0
         self._next_ticks: int | None = None
         """Instant of the frame with that sequence number, own unwrapped counter."""
@@ -381,9 +381,9 @@ class Anchor:
         self.place(site)
 
     def place(self, site: Site) -> None:
-        """Use other positions and antenna delays of the same anchors, and go on.
+        """Continue with other positions and antenna delays of the same anchors.
 
-        Own stamps stay as the radio makes them; frames state them corrected.
+        The radio's own stamps do not change; frames state them corrected.
         """
         anchor = anchor_of(site, self.id)
         self._position: StatedPosition | None = (
@@ -395,15 +395,15 @@ class Anchor:
 
     @property
     def interval_ticks(self) -> float:
-        """0: its frames are at random instants."""
+        """0, because frames are at random instants."""
         return 0.0
 
     def clock(self, _now_ticks: int | None) -> None:
-        """None: it knows of no other time than its own counter."""
+        """None, because it knows only its own counter."""
         return
 
     def hear(self, reception: Reception) -> None:
-        """Process a frame from the air; one that does not belong here is counted and dropped."""
+        """Process a frame from the air. Frames of others are counted and dropped."""
         beacon = decode_cached(reception.frame)
         if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
@@ -432,9 +432,9 @@ class Anchor:
         self._heard[beacon.anchor] = (heard, rx_ticks, weak)
 
     def next_transmission_ticks(self, now_ticks: int) -> int:
-        """TX stamp (40-bit, own counter) of the next frame that can still be made.
+        """TX stamp (40-bit, own counter) of the next frame that can still be prepared.
 
-        Frames that would have been due before have their sequence numbers, so that the later ones can be predicted.
+        Frames that would have been due earlier use up their sequence numbers, so that later ones stay predictable.
         """
         earliest_ticks = self._own_ticks.unwrap(now_ticks) + self._lead_ticks
         if self._next_ticks is None:
@@ -445,7 +445,7 @@ class Anchor:
         return wrap(self._next_ticks)
 
     def transmission(self, tx_ticks: int) -> Transmission:
-        """The frame for the time that ``next_transmission_ticks`` gave last."""
+        """The frame for the time last returned by ``next_transmission_ticks``."""
         assert self._next_ticks is not None
         keys, period_s = self.authentication, to_seconds(period_ticks(self._period_code))
         added = Contents() if keys is None else keys.contents(tx_ticks, self._sequence, self.id, period_s)
@@ -463,7 +463,7 @@ class Anchor:
         return Transmission(frame if keys is None else keys.seal(frame, added.interval), tx_ticks)
 
     def _advance(self) -> None:
-        """Go on to the next frame, with another period where the number of anchors in reach requires it."""
+        """Advance to the next frame, and adapt the period to the number of anchors in reach."""
         assert self._next_ticks is not None
         self._next_ticks += gap_ticks(self.id, self._sequence, self._period_code)
         self._sequence = (self._sequence + 1) & 0xFF
@@ -474,12 +474,12 @@ class Anchor:
                 self._period_code = code
 
     def _in_reach(self, now_ticks: int) -> int:
-        """How many other anchors it receives."""
+        """Number of other anchors that it receives."""
         oldest_ticks = now_ticks - max(PRESENT_TICKS, PRESENT_PERIODS * period_ticks(self._period_code))
         return sum(rx_ticks > oldest_ticks for _, rx_ticks, _ in self._heard.values())
 
     def _relayed(self, tx_ticks: int, capacity: int) -> tuple[tuple[Heard, ...], int]:
-        """Receptions for a frame at that own time, the most recent first, and the bit mask of the weak ones."""
+        """Receptions for a frame at this own time, the most recent first, and the bit mask of the weak ones."""
         oldest_ticks = tx_ticks - MAX_RELAY_AGE_TICKS
         recent = [(heard, weak) for heard, rx_ticks, weak in reversed(self._heard.values()) if rx_ticks > oldest_ticks]
         recent = recent[:capacity]
@@ -487,7 +487,7 @@ class Anchor:
 
 
 def anchor_of(site: Site, anchor_id: int) -> AnchorSite | UnplacedAnchor:
-    """An anchor of a site by its identifier. Raises KeyError where the site has none of it."""
+    """An anchor of a site by identifier. Raises KeyError if there is none."""
     for anchor in site.all_anchors:
         if anchor.id == anchor_id:
             return anchor
@@ -497,8 +497,8 @@ def anchor_of(site: Site, anchor_id: int) -> AnchorSite | UnplacedAnchor:
 def delay_change_ticks(before: Site, after: Site, anchor_id: int) -> int:
     """By how much later an anchor's frames leave than its radio states, if the delays of ``after`` are right.
 
-    The radio uses those of ``before``. Only TX and RX delay together can be observed, so a change of the latter counts
-    as a change of the TX delay. Raises KeyError if the site has no such anchor.
+    The radio uses those of ``before``. Only the sum of TX and RX delay is observable, so a change of the latter counts
+    as one of the TX delay. Raises KeyError if the site has no such anchor.
     """
     old, new = anchor_of(before, anchor_id), anchor_of(after, anchor_id)
     change_ticks = new.tx_antenna_delay_ticks - old.tx_antenna_delay_ticks
@@ -506,7 +506,7 @@ def delay_change_ticks(before: Site, after: Site, anchor_id: int) -> int:
 
 
 def on_radio_grid(ticks_own: int, tx_antenna_delay_ticks: int) -> int:
-    """The radio starts on multiples of 512 of its raw counter; the antenna's delay comes on top."""
+    """Round down to the radio's grid: it starts at multiples of 512 raw ticks, the antenna delay comes on top."""
     raw = ticks_own - tx_antenna_delay_ticks
     return raw - raw % DELAYED_TX_GRANULARITY_TICKS + tx_antenna_delay_ticks
 

@@ -1,4 +1,4 @@
-"""Both protocols behind one door: what depends on which a site uses, and a tag that finds it out."""
+"""Both protocols behind one interface: what depends on the protocol of a site, and a tag that detects it."""
 
 from collections import Counter
 from collections.abc import Callable
@@ -32,9 +32,9 @@ SiteBeacon = Beacon | Protocol1Beacon
 
 
 def decode_any(frame: bytes) -> SiteBeacon | Malformed:
-    """Return the beacon of either protocol in a whole frame (FCS included), or why there is none; never raises.
+    """Decode a whole frame (FCS included) of either protocol, or return why it is no beacon; never raises.
 
-    The last 256 frames of each are remembered, for a program that runs many tags which receive the same bytes.
+    The last 256 frames of each protocol are cached, for programs that run many tags which receive the same bytes.
     """
     if has_version(frame, protocol1_codec.VERSION_1):
         return protocol1_codec.decode_cached(frame)
@@ -42,44 +42,44 @@ def decode_any(frame: bytes) -> SiteBeacon | Malformed:
 
 
 class BeaconSender(Protocol):
-    """An anchor as its radio uses it: bytes and ticks in, frames and ticks out; no I/O, no clock."""
+    """An anchor as its radio sees it: bytes and ticks in, frames and ticks out; no I/O, no clock."""
 
     @property
     def id(self) -> int:
         """Identifier of the anchor."""
 
     def hear(self, reception: Reception) -> None:
-        """Process a frame from the air; one that does not belong here is counted and dropped."""
+        """Process a frame from the air. Frames of others are counted and dropped."""
 
     def next_transmission_ticks(self, now_ticks: int) -> int | None:
-        """TX stamp (40-bit, own counter) of the next frame that can still be made; None while that is not known."""
+        """TX stamp (40-bit, own counter) of the next frame that can still be prepared; None if unknown so far."""
 
     def transmission(self, tx_ticks: int) -> Transmission:
-        """The frame for the time that ``next_transmission_ticks`` gave last."""
+        """The frame for the time last returned by ``next_transmission_ticks``."""
 
 
 class AnchorMachine(BeaconSender, Protocol):
-    """The protocol machine of an anchor, as its program uses it."""
+    """The protocol machine of an anchor as its program sees it."""
 
     counters: Counter[str]
 
     @property
     def interval_ticks(self) -> float:
-        """Time between two frames; 0 where they are at random instants."""
+        """Time between two frames; 0 if they are at random instants."""
 
     def clock(self, now_ticks: int | None) -> protocol1_anchor.SiteTimeState | None:
-        """What it knows of the site's time at its counter (40 bits); None where a site has no common time."""
+        """Its estimate of the site time at its 40-bit counter; None if the site has no common time."""
 
     def place(self, site: Site) -> None:
-        """Use other positions and antenna delays of the same anchors, and go on."""
+        """Continue with other positions and antenna delays of the same anchors."""
 
 
 def new_anchor(
     site: Site, anchor_id: int, lead_s: float = 1e-3, authentication: BeaconAuthentication | None = None
 ) -> AnchorMachine:
-    """Return the machine of an anchor of a validated site; ``lead_s``: how early its driver needs a frame.
+    """Create the machine of an anchor of a validated site; ``lead_s``: how early its driver needs a frame.
 
-    ``authentication``: its keys; protocol 1 knows none.
+    ``authentication``: the anchor's keys; protocol 1 has none.
 
     Raises:
         KeyError: the site has no such anchor.
@@ -90,9 +90,9 @@ def new_anchor(
 
 
 def beacon_period_s(site: Site) -> float:
-    """Return the mean time between two beacons of one anchor of a validated site, in seconds (median over anchors).
+    """Mean time between two beacons of one anchor of a validated site, in seconds (median over anchors).
 
-    Anchors of protocol 2 are supposed to receive the others within the range in the open.
+    Assumes that anchors of protocol 2 receive all others within the open-air range.
     """
     if site.schedule.needs_master:
         schedule = schedule_of(site)
@@ -102,25 +102,25 @@ def beacon_period_s(site: Site) -> float:
 
 
 def superframe_s(site: Site) -> float:
-    """Return the seconds in which each anchor sends once: the superframe, or the mean time between two beacons."""
+    """Time in which each anchor sends once, in seconds: the superframe, or the mean time between two beacons."""
     return 1.0 / schedule_of(site).superframe_rate_hz if site.schedule.needs_master else beacon_period_s(site)
 
 
 class AnyReceiverState(Struct, frozen=True, tag="any"):
-    """All that an ``AnyReceiver`` keeps."""
+    """The saved state of an ``AnyReceiver``."""
 
     receiver: ReceiverState | protocol1.ReceiverState
     others: int
 
 
 MAX_OTHERS: Final = 200
-"""Beacons of the other protocol, without a fix meanwhile, after which a tag listens to that one."""
+"""A tag changes to the other protocol after this many beacons of it without a fix in between."""
 
 
 class AnyReceiver:
-    """One listening tag, at a site of either protocol. Bytes and ticks in, fixes out; no I/O, no clock.
+    """A listening tag at a site of either protocol. Bytes and ticks in, fixes out; no I/O, no clock.
 
-    It listens to the protocol of its first beacon, and to the other one once it receives that and has no fixes.
+    It uses the protocol of its first beacon, and changes to the other one if it receives that and has no fixes.
     """
 
     def __init__(
@@ -132,7 +132,7 @@ class AnyReceiver:
         z_bounds_m: tuple[float, float] | None = None,
         integrity: IntegrityRequirement | None = None,
     ) -> None:
-        """Make a tag that knows nothing yet, with the options of ``skyless.Receiver``.
+        """Create a tag that has heard nothing, with the options of ``skyless.Receiver``.
 
         ``method`` is one of ``METHODS``; all but ``joint`` are methods of protocol 1.
 
@@ -148,15 +148,15 @@ class AnyReceiver:
         """Beacons of the other protocol since the last fix."""
 
     def state(self) -> AnyReceiverState:
-        """All that it keeps, as it is now; to be used or encoded before its next frame, as parts are shared."""
+        """The present state. Shares memory with the receiver: use or encode it before its next frame."""
         return AnyReceiverState(self._receiver.state(), self._others)
 
     @classmethod
     def from_state(cls, state: AnyReceiverState | ReceiverState) -> "AnyReceiver":
-        """A receiver that continues with the same bits as the one with this state, which may be a ``Receiver``.
+        """Restore a receiver that continues bit by bit as the saved one would; also from a ``Receiver``'s state.
 
         Raises:
-            ValueError: no receiver has such a state.
+            ValueError: the state is invalid.
         """
         state = AnyReceiverState(state, 0) if isinstance(state, ReceiverState) else state
         admission = state.receiver.admission
@@ -183,39 +183,39 @@ class AnyReceiver:
 
     @property
     def counters(self) -> Counter[str]:
-        """Frames by what became of them."""
+        """Frames by outcome."""
         return self._receiver.counters
 
     @property
     def reason(self) -> NoFixReason:
-        """Why the last frame has made no fix."""
+        """Why the last frame made no fix."""
         if not self._may_change and self.counters["other-version"] and not self.counters["heard"]:
             return NoFixReason.NO_MASTER
         return self._receiver.reason
 
     @property
     def site(self) -> int | None:
-        """Identifier of the site that it receives, None before the first beacon."""
+        """Identifier of the site in use; None before the first beacon."""
         return self._receiver.site
 
     @property
     def method(self) -> Estimation | Snapshots | None:
-        """The positioning method in use, None before the almanac is known."""
+        """The positioning method in use; None before the almanac is known."""
         return self._receiver.method
 
     @property
     def multipath_m(self) -> tuple[float, float] | None:
-        """Standard deviation by which ranges change, and over which distance, where it exceeds what the site states."""
+        """Standard deviation and distance of changing range errors, if it exceeds the stated one."""
         return self._receiver.multipath_m
 
     @property
     def phase_anchors(self) -> tuple[int, ...]:
-        """Identifiers of the anchors the phases of whose carriers are in use."""
+        """Anchors whose carrier phases are in use."""
         return self._receiver.phase_anchors
 
     @property
     def heard_site(self) -> HeardSite | None:
-        """Anchors and georeference of the site, None before they are known."""
+        """Anchors and georeference of the site; None before they are known."""
         return self._receiver.heard_site
 
     def hear_height(self, height_m: float, std_m: float) -> bool:
@@ -223,9 +223,9 @@ class AnyReceiver:
         return self._receiver.hear_height(height_m, std_m)
 
     def hear(self, reception: Reception) -> Fix | None:
-        """Process a frame from the air; a fix if it made one, else ``reason`` is set.
+        """Process a frame from the air. Returns a fix if it made one, otherwise sets ``reason``.
 
-        What does not belong here is counted in ``counters`` and dropped; nothing on the air raises.
+        Unusable frames are counted in ``counters`` and dropped; no frame raises.
         """
         receiver, frame = self._receiver, reception.frame
         if isinstance(receiver, Receiver) and has_version(frame, VERSION_2):
@@ -240,7 +240,7 @@ class AnyReceiver:
         return self.hear_beacon(beacon, reception)
 
     def hear_beacon(self, beacon: SiteBeacon, reception: Reception) -> Fix | None:
-        """Process a beacon that is decoded already, as ``hear`` does; of protocol 2 the frame itself may be empty."""
+        """Process a decoded beacon as ``hear`` does; for protocol 2, ``reception.frame`` may be empty."""
         if isinstance(beacon, Beacon) is not isinstance(self._receiver, Receiver) and not self._change():
             self.counters["other-version"] += 1
             return None
@@ -250,7 +250,7 @@ class AnyReceiver:
         return fix
 
     def _change(self) -> bool:
-        """Listen to the other protocol, unless the present one gives fixes, or may still."""
+        """Change to the other protocol, unless the present one gives fixes or still may. Returns True if changed."""
         if not self._may_change:
             return False
         self._others += 1

@@ -15,7 +15,7 @@ Matrix = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 Indices = NDArray[np.uint32]
-"""Indices that cannot count from an array's end, which kernels would have to check for each."""
+"""Indices that cannot be negative, so that kernels need not check for them."""
 
 Mask = NDArray[np.bool_]
 

@@ -1,9 +1,9 @@
-"""The clock filter of two states: an anchor's offset and rate against the master (``docs/maths.md`` section 6).
+"""The two-state clock filter: an anchor's offset and rate against the master (``docs/maths.md`` section 6).
 
-The offset is kept in two parts, whole ticks in an integer and a remainder below one tick in metres of light, so that
-nothing is lost however long the filter runs. One update processes one master beacon.
+The offset is kept as whole ticks in an integer and a remainder below one tick in metres of light, so that no precision
+is lost however long the filter runs. One update processes one master beacon.
 
-Plain Python: so little arithmetic takes no longer than a call of compiled code.
+Plain Python: with so little arithmetic, calling compiled code would not be faster.
 """
 
 import math
@@ -25,7 +25,7 @@ TwoState = tuple[float, float, float]
 
 
 def predicted_value_variance(P: TwoState, dt: float, white: float, walk: float) -> float:
-    """Variance of the value ``dt`` later, or earlier: the process noise grows both ways."""
+    """Variance of the value ``dt`` later or earlier; process noise grows in both directions."""
     variance, covariance, rate_variance = P
     span = abs(dt)
     variance += dt * (2.0 * covariance + dt * rate_variance)
@@ -33,7 +33,7 @@ def predicted_value_variance(P: TwoState, dt: float, white: float, walk: float) 
 
 
 def predict(P: TwoState, dt: float, white: float, walk: float) -> TwoState:
-    """Time update F·P·Fᵀ + Q over ``dt``, 0 or later."""
+    """Time update F·P·Fᵀ + Q over ``dt`` ≥ 0."""
     variance, covariance, rate_variance = P
     variance += dt * (2.0 * covariance + dt * rate_variance)
     variance += dt * (white + walk * dt * dt / 3.0)
@@ -111,9 +111,9 @@ class ClockFilter:
         return math.sqrt(self.covariance[0])
 
     def update(self, tx_ticks_master: int, rx_ticks_own: int, range_m: float) -> float:
-        """Process a master beacon, both stamps unwrapped; return the normalised innovation squared (0 at the start).
+        """Process a master beacon with unwrapped stamps. Returns the normalised innovation squared (0 at the start).
 
-        The state is at the time at which the beacon arrives, so the rate acts on the flight time as it should
+        The state is at the time of the beacon's arrival, so that the rate also acts during the time of flight
         (``docs/maths.md`` section 4). An innovation beyond the gate changes nothing but the time.
         """
         if self.updates == 0:
@@ -145,9 +145,9 @@ class ClockFilter:
         rate: float = 0.0,
         rate_std: float = MAX_RELATIVE_RATE,
     ) -> None:
-        """Forget all and begin with this beacon: offset known to the stamps' noise, rate to the crystals' tolerance.
+        """Restart with this beacon: the offset known to the stamps' noise, the rate to the crystals' tolerance.
 
-        A rate that is known better is given with its standard deviation, both fractional.
+        A rate known better is passed with its standard deviation, both fractional.
         """
         self._whole_offset, self._epoch_master = rx_ticks_own - tx_ticks_master, tx_ticks_master
         self._offset_m, self._rate_mps = -range_m, rate * SPEED_OF_LIGHT_MPS
@@ -156,17 +156,17 @@ class ClockFilter:
         self.updates, self.rejected = 1, 0
 
     def inflate_covariance(self, factor: float) -> None:
-        """Multiply the covariance: the clock that is tracked from now on may differ from the one before."""
+        """Scale the covariance, because the tracked clock may have been replaced by another one."""
         variance, covariance, rate_variance = self.covariance
         self.covariance = (variance * factor, covariance * factor, rate_variance * factor)
 
     def add_offset_variance(self, variance_m2: float) -> None:
-        """Let the offset alone be uncertain: range or antenna delays have changed, the clocks have not."""
+        """Add variance to the offset alone: range or antenna delays have changed, the clocks have not."""
         variance, covariance, rate_variance = self.covariance
         self.covariance = (variance + variance_m2, covariance, rate_variance)
 
     def to_master(self, ticks_own: int) -> tuple[int, float, float]:
-        """Own time on the master's scale: whole ticks, the fraction of a tick in [0, 1), and the variance in m²."""
+        """Convert own time to the master's scale: whole ticks, fraction of a tick in [0, 1), and variance in m²."""
         elapsed_own = (ticks_own - self._whole_offset - self._epoch_master) - self._offset_m / TICK_M
         elapsed = elapsed_own / (1.0 + self._rate_mps / SPEED_OF_LIGHT_MPS)
         whole = math.floor(elapsed)
@@ -174,6 +174,6 @@ class ClockFilter:
         return self._epoch_master + whole, elapsed - whole, variance
 
     def from_master(self, ticks_master: int) -> int:
-        """Nearest own tick of a time on the master's scale."""
+        """Own tick nearest to a time on the master's scale."""
         offset_m = self._offset_m + self._rate_mps * ((ticks_master - self._epoch_master) * TICK_S)
         return ticks_master + self._whole_offset + round(offset_m / TICK_M)

@@ -26,7 +26,7 @@ def east_north_up(vector: Vector, heading_deg: float) -> Vector:
 
 
 def rotated(covariance: Matrix, heading_deg: float) -> Matrix:
-    """R C Rᵀ: a covariance of the site's axes as one of east, north, up."""
+    """R C Rᵀ: a covariance in site axes converted to east, north, up."""
     heading = radians(heading_deg)
     c, s = cos(heading), sin(heading)
     xx, xy, xz, yx, yy, yz, zx, zy, zz = covariance
@@ -43,8 +43,8 @@ def rotated(covariance: Matrix, heading_deg: float) -> Matrix:
 def geodetic(point_m: Vector, origin: GeoreferenceSite) -> Vector:
     """Latitude, longitude (degrees, WGS 84) and height (m) of a point of the site.
 
-    The plane of x and y touches the Earth at the origin. A height is always the sum of the origin's and z: a
-    survey levels its anchors, so that z follows the Earth's curvature (8 cm at a distance of 1 km).
+    The x-y plane touches the Earth at the origin. A height is always the origin's plus z: a survey levels its anchors,
+    so that z follows the Earth's curvature (8 cm at a distance of 1 km).
     """
     east, north, up = east_north_up(point_m, origin.heading_deg)
     latitude = radians(origin.latitude_deg)
@@ -60,9 +60,9 @@ def geodetic(point_m: Vector, origin: GeoreferenceSite) -> Vector:
 
 
 def east_north_up_of(latitude_deg: float, longitude_deg: float, height_m: float, origin: GeoreferenceSite) -> Vector:
-    """East, north and up (m) of a point on the Earth from the site's origin: what ``geodetic`` turns back.
+    """East, north and up (m) of a point on the Earth from the site's origin: the inverse of ``geodetic``.
 
-    Right to 0.05 mm within 1 km.
+    Accurate to 0.05 mm within 1 km.
     """
     latitude, from_latitude = radians(latitude_deg), radians(origin.latitude_deg)
     longitude = radians(longitude_deg - origin.longitude_deg)
@@ -104,7 +104,7 @@ def _latitude(radius_m: float, axis_m: float) -> float:
 
 
 def horizontal_ellipse(covariance_m2: Sequence[float]) -> tuple[float, float, float]:
-    """Semi-axes of one standard deviation in m, the longer first, and the longer one's direction from x to y in rad.
+    """Semi-axes of the 1σ ellipse in m, the longer first, and the longer one's direction from x to y in rad.
 
     ``covariance_m2`` is 3 × 3, row by row.
     """
@@ -120,5 +120,5 @@ def coordinates(position_m: tuple[float, float, float], origin: GeoreferenceSite
 
 
 def feature(kind: str, at: object, properties: dict[str, Any], **members: object) -> dict[str, Any]:
-    """A feature with this kind of geometry at these coordinates."""
+    """A GeoJSON feature with a geometry of this kind and these coordinates."""
     return {"type": "Feature", **members, "geometry": {"type": kind, "coordinates": at}, "properties": properties}

@@ -14,7 +14,7 @@ class SkylessError(Exception):
 
 @contextmanager
 def writing(path: str | PathLike[str]) -> Iterator[None]:
-    """Where files are written: an OSError becomes a SkylessError that names this file or folder."""
+    """Convert an OSError while writing to a SkylessError that names the file or folder."""
     try:
         yield
     except OSError as error:
@@ -22,10 +22,10 @@ def writing(path: str | PathLike[str]) -> Iterator[None]:
 
 
 class ConfigurationError(SkylessError):
-    """A configuration that cannot be used: which file, which key, its value, what would be right."""
+    """An unusable configuration: file, key, value, and what would be right."""
 
     def __init__(self, file: str | PathLike[str], key: str, value: object, expected: str) -> None:
-        """``key`` is empty when the file as a whole is meant; ``value`` is None when the key is missing."""
+        """``key`` is empty for the file as a whole; ``value`` is None if the key is missing."""
         self.file = fspath(file)
         self.key = key
         self.value = value
@@ -41,7 +41,7 @@ class ConfigurationError(SkylessError):
 
 
 def _shown(value: object) -> str:
-    """Write the value as a configuration file would, shortened."""
+    """The value as a configuration file would show it, shortened."""
     try:
         text = json.dumps(value, ensure_ascii=False) if isinstance(value, str | bool) else str(value)
     except RecursionError:

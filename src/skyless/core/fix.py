@@ -1,4 +1,4 @@
-"""What every positioning method returns."""
+"""``Fix``: the result of every positioning method."""
 
 from enum import StrEnum
 from math import sqrt
@@ -20,19 +20,19 @@ POSITION: Final = 0
 """The position, then three rows of its covariance."""
 
 QUALITY: Final = 4
-"""Chi-square and mean squared residual in m²."""
+"""Row of chi-square and mean squared residual in m²."""
 
 VELOCITY: Final = 5
-"""The velocity, then three rows of its covariance, for methods that know it."""
+"""The velocity, then three rows of its covariance; only of methods that estimate it."""
 
 PROTECTION: Final = 9
-"""The first three of the levels (``estimator/levels.py``), for methods that know some."""
+"""The first three levels (``estimator/levels.py``); only of methods that compute them."""
 
 PROTECTED_ROWS: Final = 10
 
 
 class NoFixReason(StrEnum):
-    """Why there is no position; the values are what reports and counters show."""
+    """Why there is no position; the values appear in reports and counters."""
 
     NO_BEACONS = "no-beacons"
     NO_ALMANAC = "no-almanac"
@@ -47,15 +47,15 @@ class NoFixReason(StrEnum):
 
 
 class Fix(Struct, frozen=True, gc=False):
-    """One position with all that is known of its quality. SI units, site frame.
+    """A position and its quality. SI units, site frame.
 
-    It keeps the rows as the method wrote them; arrays are read-only views, made when they are read.
+    Keeps the rows as the method wrote them; arrays are read-only views created on access.
     """
 
     time_s: float
-    """Master time at which the position holds, since the receiver's first fix; without a master the tag's own."""
+    """Master time of validity since the receiver's first fix; without a master, on the tag's own clock."""
     rows: bytes
-    """Rows of float64 (``POSITION`` and the following), as far as the method knows them."""
+    """Rows of float64 (``POSITION`` and the following), as many as the method provides."""
     anchors: tuple[int, ...]
     """Identifiers of the anchors in use, the reference first."""
     anchors_m: Array
@@ -66,11 +66,11 @@ class Fix(Struct, frozen=True, gc=False):
     dof: int = 1
     """Degrees of freedom of ``chi2``; 1 for the running mean of a filter."""
     requirement: IntegrityRequirement | None = None
-    """What the protection levels answer; None for methods that know none."""
+    """The requirement that the protection levels meet; None for methods without levels."""
     verified_until_s: float | None = None
-    """Up to this time, on the scale of ``time_s``, every beacon that counts is verified; None where none is."""
+    """All beacons in use up to this time, on the scale of ``time_s``, are verified; None if none is."""
     unverified: float = 1.0
-    """Share of the beacons of the last second that are not verified, or not yet."""
+    """Share of the last second's beacons that are not verified, or not yet."""
 
     @classmethod
     def of(
@@ -82,10 +82,10 @@ class Fix(Struct, frozen=True, gc=False):
         anchors: tuple[int, ...] = (),
         method: str = "own",
     ) -> "Fix":
-        """A fix of one's own estimator: shapes (3,) and (3, 3); without a covariance it claims nothing.
+        """A fix of another estimator: shapes (3,) and (3, 3); without a covariance it states no accuracy.
 
         Raises:
-            ValueError: the shapes are others, or the time or the position is not finite.
+            ValueError: the shapes are wrong, or the time or the position is not finite.
         """
         rows = np.full((VELOCITY, 3), np.nan)
         rows[POSITION] = position_m
@@ -108,12 +108,12 @@ class Fix(Struct, frozen=True, gc=False):
 
     @property
     def covariance_m2(self) -> Array:
-        """Covariance of the position, shape (3, 3). A given coordinate (2-D, known height) has zeros."""
+        """Covariance of the position, shape (3, 3); zeros for a given coordinate (2-D, known height)."""
         return _matrix(self.rows, POSITION + 1)
 
     @property
     def velocity_mps(self) -> Array | None:
-        """Shape (3,), None where the method knows none."""
+        """Shape (3,); None if the method does not estimate it."""
         return _vector(self.rows, VELOCITY) if len(self.rows) > VELOCITY * ROW_BYTES else None
 
     @property
@@ -128,12 +128,12 @@ class Fix(Struct, frozen=True, gc=False):
 
     @property
     def residual_rms_m(self) -> float:
-        """Root of the mean (filters: running mean) squared residual."""
+        """Root of the mean squared residual (filters: running mean)."""
         return sqrt(_row(self.rows, QUALITY)[1])
 
     @property
     def integrity(self) -> Integrity | None:
-        """Protection levels, and whether they can be relied on; None for methods that know none."""
+        """Protection levels and whether they are reliable; None for methods without levels."""
         requirement = self.requirement
         if requirement is None:
             return None
@@ -141,24 +141,24 @@ class Fix(Struct, frozen=True, gc=False):
 
     @property
     def hpl_m(self) -> float | None:
-        """Horizontal protection level: the error is larger with a probability of at most ``integrity_risk``."""
+        """Horizontal protection level: the error exceeds it with a probability of at most ``integrity_risk``."""
         integrity = self.integrity
         return None if integrity is None else integrity.hpl_m
 
     @property
     def vpl_m(self) -> float | None:
-        """Vertical protection level; None where the height is given."""
+        """Vertical protection level; None if the height is given."""
         integrity = self.integrity
         return None if integrity is None else integrity.vpl_m
 
     @property
     def integrity_risk(self) -> float | None:
-        """None for methods that know no protection levels."""
+        """The risk of the levels; None for methods without levels."""
         return None if self.requirement is None else self.requirement.risk
 
     @property
     def alert(self) -> Alert | None:
-        """Whether the levels can be relied on; None for methods without any."""
+        """Whether the levels are reliable; None for methods without levels."""
         integrity = self.integrity
         return None if integrity is None else integrity.alert
 

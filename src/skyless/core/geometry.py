@@ -13,22 +13,22 @@ from skyless.core.native.arithmetic import SINGULAR_PIVOT
 from skyless.core.site import Site
 
 _DIRECTION: Final = np.array([0.8164, 0.5211, 0.2489])
-"""Length just below one, along no street of a grid, so that few points share a projection."""
+"""Slightly shorter than one, and along no street of a grid, so that few points share a projection."""
 
 
 RADIO_REACH_M: Final = 31.0
-"""Range in the open that the planner's and the simulation's link budget give; half of the frames arrive there."""
+"""Open-air range of the planner's and the simulation's link budget, at which half of the frames arrive."""
 
 
 def anchor_positions(site: Site) -> Matrix:
-    """Return the positions of a site's placed anchors in the order of the file, shape (n, 3)."""
+    """Positions of a site's placed anchors in the order of the file, shape (n, 3)."""
     return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]).reshape(-1, 3)
 
 
 def pairs_within(points_m: Matrix, distance_m: float) -> Iterator[tuple[Integers, Integers, Vector]]:
-    """Pairs of points, shape (n, 3), that are closer than a distance: rows of both and their distances, in batches.
+    """Pairs of points, shape (n, 3), closer than a distance: rows of both and their distances, in batches.
 
-    The rows of a pair ascend; every pair comes once, in no order. The points are sorted along a direction; a point is
+    The rows of a pair ascend; each pair appears once, in no order. The points are sorted along a direction; a point is
     compared with its first follower, its second and so on, until none is near along that direction.
     """
     along_m = points_m @ _DIRECTION
@@ -47,13 +47,13 @@ def pairs_within(points_m: Matrix, distance_m: float) -> Iterator[tuple[Integers
 
 
 def anchors_in_reach(site: Site) -> Integers:
-    """Number of placed anchors within the range in the open of each placed anchor, itself included; shape (n,)."""
+    """Number of placed anchors within open-air range of each placed anchor, itself included; shape (n,)."""
     ones, others = links_in_reach(site)
     return np.bincount(np.concatenate([ones, others]), minlength=len(site.anchors)) + 1
 
 
 def links_in_reach(site: Site) -> tuple[Integers, Integers]:
-    """Return the links between anchors within radio reach of each other: the indices of their two ends."""
+    """Links between anchors within radio reach of each other: the indices of both ends."""
     pairs = [(one, other) for one, other, _ in pairs_within(anchor_positions(site), RADIO_REACH_M)]
     nothing = np.empty(0, np.int64)
     ones, others = zip(*pairs, strict=True) if pairs else ((nothing,), (nothing,))
@@ -64,16 +64,16 @@ Box = tuple[float, float, float, float]
 """x1, y1, x2, y2."""
 
 OUTSIDE_M: Final = 0.5
-"""Anchors hang on walls, whose thickness an outline may leave out: this far outside they count as inside."""
+"""Anchors this far outside an outline count as inside: it may leave out the walls that they hang on."""
 
 
 def outline_of(site: Site) -> Matrix | None:
-    """The corners of the site's room, shape (k, 2); None where the site has no outline."""
+    """Corners of the site's room, shape (k, 2); None without an outline."""
     return None if site.outline_m is UNSET else np.array(site.outline_m, dtype=np.float64)
 
 
 def rectangle_of(site: Site) -> Box | None:
-    """The site's room where it is a rectangle along the axes, otherwise None."""
+    """The site's room if it is a rectangle along the axes, otherwise None."""
     outline_m = outline_of(site)
     if outline_m is None:
         return None
@@ -89,7 +89,7 @@ def area(outline_m: Matrix) -> float:
 
 
 def sides_that_meet(outline_m: Matrix) -> tuple[int, int] | None:
-    """Two sides of a polygon, by their first corners, that meet though they are not neighbours; None without such."""
+    """Two sides of a polygon, by their first corners, that meet without being neighbours; None if there are none."""
     starts, ends = outline_m, np.roll(outline_m, -1, axis=0)
     lows, highs = np.minimum(starts, ends), np.maximum(starts, ends)
     count = len(outline_m)
@@ -105,7 +105,7 @@ def sides_that_meet(outline_m: Matrix) -> tuple[int, int] | None:
 
 
 def _left(start_m: Vector, end_m: Vector, point_m: Vector) -> Vector:
-    """The sign says on which side of a line a point lies; over the last axis."""
+    """Sign of the side of a line on which a point lies; over the last axis."""
     along, to = end_m - start_m, point_m - start_m
     return np.sign(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
 
@@ -121,7 +121,7 @@ def inside(points_m: Matrix, outline_m: Matrix) -> Mask:
 
 
 def distance_outside(point_m: Vector, outline_m: Matrix) -> float:
-    """How far a point, shape (2,), lies outside a polygon; 0 inside."""
+    """Distance of a point, shape (2,), from a polygon; 0 inside."""
     if inside(point_m[None], outline_m)[0]:
         return 0.0
     starts, ends = outline_m, np.roll(outline_m, -1, axis=0)
@@ -134,10 +134,10 @@ def distance_outside(point_m: Vector, outline_m: Matrix) -> float:
 # Dilutions of precision: how the anchors' geometry turns range noise into position noise.
 
 MAX_VDOP: Final = 4.0
-"""With a larger vertical dilution in the middle of the anchors, the height is not worth estimating."""
+"""With a larger vertical dilution in the middle of the anchors, estimating the height is not worthwhile."""
 
 GUESSED_STD_M: Final = 0.5
-"""Standard deviation of a tag's height from the anchors', where that is used instead."""
+"""Standard deviation of a tag's height about the anchors', if that is used instead."""
 
 _POINTS_AT_ONCE: Final = 4096
 
@@ -166,7 +166,7 @@ def dilution_of_precision(anchors_m: ArrayLike, position_m: ArrayLike, *, height
 
 
 def plane_height_m(anchors_m: Mapping[int, tuple[float, float, float]]) -> float | None:
-    """Mean height of anchors that lie too flat to resolve the height; None where they resolve it, or are too few."""
+    """Mean height of anchors too flat to resolve the height; None if they resolve it or are too few."""
     positions_m = np.array(list(anchors_m.values()), dtype=np.float64).reshape(-1, 3)
     if len(positions_m) < 3:
         return None
@@ -178,7 +178,7 @@ def plane_height_m(anchors_m: Mapping[int, tuple[float, float, float]]) -> float
 def dops_at(anchors_m: ArrayLike, positions_m: ArrayLike, *, height_known: bool, weights: ArrayLike = 1.0) -> Array:
     """DOPs at many positions, shape (m, 3): an array (m, 5) with columns in the order of ``Dops``.
 
-    ``weights``: how much each anchor counts at each position, shape (m, n); zero leaves it out.
+    ``weights`` of each anchor at each position, shape (m, n); zero leaves it out.
     """
     anchors = np.array(anchors_m, np.float64).reshape(-1, 3)
     positions = np.array(positions_m, np.float64).reshape(-1, 3)
@@ -198,7 +198,7 @@ def dops_at(anchors_m: ArrayLike, positions_m: ArrayLike, *, height_known: bool,
 
 
 def _normal_matrices(anchors: Array, positions: Array, weights: Array, size: int) -> Array:
-    """HᵀWH of rows [1, unit vector], shape (m, size, size); NaN where an anchor that counts has no direction.
+    """HᵀWH of rows [1, unit vector], shape (m, size, size); NaN if an anchor with a weight has no direction.
 
     The clock comes first, so that a factorisation removes the mean direction before anything else.
     """

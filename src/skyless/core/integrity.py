@@ -12,37 +12,36 @@ from skyless.core.native.arithmetic import log, normal_quantile, sqrt
 RISK: Final = 1e-4
 
 MARGIN: Final = 1.05
-"""Factor on all standard deviations, as errors are not quite Gaussian and figures not quite the filter's."""
+"""Factor on all standard deviations, as errors are not quite Gaussian and noise figures not quite right."""
 
 
 HPL, VPL, STATE = range(3)
-"""Rows of what a fix carries of its levels."""
+"""Elements of a fix's row of levels."""
 
 SOUND, OBSTRUCTED, CONTRADICTED, UNAVAILABLE = range(4)
-"""States: a position without known faults, with anchors whose range error has jumped or was wrong from the start, with
-a fault that the levels may not cover, and without levels."""
+"""States of a position: no known faults; anchors whose range error has jumped or was wrong from the start; a fault that
+the levels may not cover; no levels."""
 
 _ALERTS: Final = (Alert.NONE, Alert.EXCLUDED, Alert.NOT_EXCLUDED, Alert.UNAVAILABLE)
 
 
 class Integrity(Struct, frozen=True, gc=False):
-    """How wrong a fix may be."""
+    """The error bounds of a fix."""
 
     hpl_m: float | None
-    """The horizontal error is larger with a probability of at most ``risk``; None if there is no level."""
+    """The horizontal error exceeds it with a probability of at most ``risk``; None if there is no level."""
     vpl_m: float | None
-    """The same for the vertical error. None also if the height is given."""
+    """The same for the vertical error; None also if the height is given."""
     risk: float
     """For each fix and each of the two levels."""
     alert: Alert
 
 
 class IntegrityRequirement(Struct, frozen=True):
-    """What an application requires of the levels.
+    """An application's requirements for the levels.
 
     Raises:
-        ValueError: the risk is not between 0 and 0.1, the limit or the height's is not a length, or the acceleration
-            none.
+        ValueError: a field is out of range.
     """
 
     risk: float = RISK
@@ -50,9 +49,9 @@ class IntegrityRequirement(Struct, frozen=True):
     alert_limit_m: float | None = None
     """Fixes with a higher horizontal protection level have an alert."""
     max_acceleration_mps2: float = 0.0
-    """The tag's largest acceleration, which the levels then cover beyond the process noise; 0 where it is not known."""
+    """The tag's largest acceleration, covered by the levels beyond the process noise; 0 if unknown."""
     height_std_m: float = 0.0
-    """Standard deviation of the tag's height from the one that is given, which fixes then count."""
+    """Standard deviation of the tag's true height from the given one, which fixes then include."""
 
     def __post_init__(self) -> None:
         limits_of(self.risk)
@@ -77,7 +76,7 @@ def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert
 
 
 def limits_of(risk: float = RISK) -> tuple[float, float]:
-    """Multiples of the standard deviation, horizontal and vertical, that errors exceed with this risk, in a fix.
+    """Multiples of the standard deviation, horizontal and vertical, that errors of a fix exceed with this risk.
 
     Raises:
         ValueError: the probability is not between 0 and 0.1.
@@ -88,10 +87,10 @@ def limits_of(risk: float = RISK) -> tuple[float, float]:
 
 
 def horizontal_limit(risk: float) -> float:
-    """``limits_of`` in the plane."""
+    """``limits_of`` for the horizontal plane."""
     return MARGIN * sqrt(-2.0 * log(risk))
 
 
 def vertical_limit(risk: float) -> float:
-    """``limits_of`` along one axis."""
+    """``limits_of`` for one axis."""
     return MARGIN * normal_quantile(0.5 * risk)

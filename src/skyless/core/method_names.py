@@ -1,4 +1,4 @@
-"""Names of the positioning methods, and of how tags move."""
+"""Names of the positioning methods, and of kinds of motion."""
 
 from typing import Final, Literal
 
@@ -7,12 +7,12 @@ FILTERS: Final = ("joint",)
 METHODS: Final = (*SNAPSHOTS, *FILTERS)
 
 WEIGHTED: Final = "weighted"
-"""The one that is always there and needs no estimator."""
+"""The method that is always available and needs no estimator."""
 DEFAULT_METHOD: Final = "joint"
 PROTECTED: Final = "joint"
-"""The one whose fixes have protection levels."""
+"""The method whose fixes have protection levels."""
 
 Dynamics = Literal["walk", "robot", "drone"]
 """How tags move: as people, as robots at some 5 m/s, as drones at some 10 m/s."""
 DYNAMICS_QA_M2PS3: Final[dict[str, float]] = {"walk": 0.3, "robot": 1.0, "drone": 3.0}
-"""Process noise that filters assume of each."""
+"""Process noise assumed for each kind of motion."""

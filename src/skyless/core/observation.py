@@ -28,15 +28,15 @@ class Observation(Struct, frozen=True, gc=False):
     tx_variance_m2: float
     """Variance of the TX time on the master's scale, from the anchor's clock filter."""
     relays: tuple[tuple[int, int, int], ...] = ()
-    """When the anchor received others: (anchor, sequence number, own RX stamp, unwrapped); for ``joint`` only."""
+    """The anchor's receptions of others: (anchor, sequence number, own RX stamp, unwrapped); for ``joint`` only."""
     report: tuple[int, int] | None = None
-    """What the anchor knows of its clock: the master, and its own reading less the master's at its TX stamp, in
-    subticks modulo 2⁴⁸, with the variance ``tx_variance_m2``; for ``joint`` only."""
+    """The anchor's report of its clock: the master, and its own reading minus the master's at its TX stamp in subticks
+    modulo 2⁴⁸, with the variance ``tx_variance_m2``; for ``joint`` only."""
     rx_variance_factor: float = 1.0
-    """On the variance of this reception, at least 1: from the radio's diagnostics (``variance_factor``)."""
+    """Factor on the variance of this reception, at least 1, from the radio's diagnostics (``variance_factor``)."""
     packed_relays: bytes = b""
-    """More relays, as frames carry them (``codec.packed_relays``)."""
+    """More relays, encoded as in frames (``beacon.packed_relays``)."""
     phase_cycles: float = -1.0
-    """Phase of the carrier as the tag received it, below 0 where it is not known; for ``joint`` only."""
+    """Carrier phase as the tag received it, negative if unknown; for ``joint`` only."""
     relay_phases: tuple[float, ...] = ()
-    """The same of ``relays``, as anchors received each other."""
+    """Phases of ``relays``, as anchors received each other."""

@@ -1,4 +1,4 @@
-"""The values of a site file, already validated (``skyless.site.file.load`` makes them), and how two sites differ."""
+"""The values of a validated site file (``skyless.site.file.load`` creates them), and how two sites differ."""
 
 import math
 from hashlib import sha256
@@ -27,25 +27,25 @@ class AlarmRule(Struct, frozen=True, forbid_unknown_fields=True):
     """1 to 32 letters, digits, dashes and underscores; unique at the site."""
     kind: RuleKind
     name: str = ""
-    """What people read; by default the identifier."""
+    """Display name; by default the identifier."""
     zone: str | None = None
     """Identifier of the zone; kinds ``inside``, ``outside`` and ``crowded``."""
     tags: tuple[str, ...] = ()
     """Names of tags, and of groups of assets as ``group:NAME``; empty means all."""
     others: tuple[str, ...] = ()
-    """Kind ``near``: whom a tag of ``tags`` must not come near to; empty means any other tag."""
+    """Kind ``near``: tags that those of ``tags`` must not come near; empty means any other tag."""
     limit: float | None = None
     """``near``: distance in metres; ``crowded``: the most tags allowed; ``protection-level``: metres; ``battery``:
     share from 0 to 1."""
     hysteresis: float = 0.0
     """By how much the value must be back within the limit before the alarm ends, in the limit's unit."""
     after_s: float = 0.0
-    """For how long the condition must have held."""
+    """How long the condition must have held."""
     clear_after_s: float = 1.0
-    """For how long it must not have held before the alarm ends."""
+    """How long the condition must not have held before the alarm ends."""
     severity: Severity = "warning"
     hours: str = ""
-    """When the rule holds, in the local time of the page's server, as ``mon-fri 06:00-18:00, sat 08:00-12:00``; empty
+    """When the rule applies, in the local time of the page's server, as ``mon-fri 06:00-18:00, sat 08:00-12:00``; empty
     means always."""
 
 
@@ -65,19 +65,19 @@ class AnchorSite(Struct, frozen=True, forbid_unknown_fields=True):
     y_m: float
     z_m: float = 0.0
     slot: int | None = None
-    """Its first slot; by default in the order of the file, the master first."""
+    """First slot; by default in the order of the file, the master first."""
     tx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
     rx_antenna_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
     floor: int = 0
-    """Storey on which it hangs; sent with its position in protocol 2, as are the next two."""
+    """Storey; sent with the position in protocol 2, as are the next two."""
     zone: int = 0
-    """Zone of the site in which it hangs; 0 for none."""
+    """Zone of the site; 0 for none."""
     std_m: float | None = None
-    """How well this position is known, per axis; by default ``AccuracySite.survey_std_m``."""
+    """Standard deviation of the position per axis; by default ``AccuracySite.survey_std_m``."""
 
 
 class UnplacedAnchor(Struct, frozen=True, forbid_unknown_fields=True):
-    """An anchor of protocol 2 whose position is not known yet; it sends and relays."""
+    """An anchor of protocol 2 with an unknown position; it sends and relays."""
 
     id: int
     slot: int | None = None
@@ -99,10 +99,10 @@ class ScheduleSite(Struct, frozen=True, forbid_unknown_fields=True):
     guard_s: float = 0.5e-3
     """Time at the end of each slot in which no frame may be on the air."""
     rate_hz: float | None = None
-    """Mode free: beacons per second of each anchor; by default it follows from the number of anchors in reach."""
+    """Mode free: beacons per second of each anchor; by default derived from the number of anchors in reach."""
     carrier_phase: bool | UnsetType = UNSET
-    """Mode free: whether anchors relay the phases of carriers, too. Left out where it is not given: earlier versions
-    refuse a site with it, and drop such beacons."""
+    """Mode free: whether anchors relay carrier phases too. Omitted if unset: earlier versions refuse a site with it and
+    drop such beacons."""
 
     @property
     def needs_master(self) -> bool:
@@ -111,7 +111,7 @@ class ScheduleSite(Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def sends_phases(self) -> bool:
-        """Whether beacons carry the phases of the receptions that they relay."""
+        """Whether beacons carry the phases of the relayed receptions."""
         return self.carrier_phase is True and not self.needs_master
 
 
@@ -128,12 +128,12 @@ class AccuracySite(Struct, frozen=True, forbid_unknown_fields=True):
     """Accuracy of the survey and of a tag's ranges, beyond the noise of single stamps; each std is one sigma."""
 
     survey_std_m: float = 0.02
-    """How well each anchor's position was measured, per axis."""
+    """Standard deviation of each anchor's measured position, per axis."""
     range_std_m: float = 0.03
-    """Constant error of a tag's ranges, a different one for each anchor."""
+    """Constant error of a tag's ranges, different for each anchor."""
     slope_std_m: float = 0.05
-    """Range error that depends on the received power: it is a constant times clip((d - 4 m) / 4 m, -1, 1) at a
-    distance d, and this is the constant's standard deviation."""
+    """Range error that depends on received power: a constant times clip((d - 4 m) / 4 m, -1, 1) at distance d;
+    this is the constant's standard deviation."""
     place_std_m: float = 0.005
     """Part of a range's error that changes as the tag moves (reflections)."""
     place_distance_m: float = 1.0
@@ -148,11 +148,11 @@ class AccuracySite(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 EXACT: Final = AccuracySite(survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0)
-"""Survey and ranges without error, as in the simulated world without errors."""
+"""Survey and ranges without error, as in the ideal simulated world."""
 
 
 class TagsSite(Struct, frozen=True, forbid_unknown_fields=True):
-    """What is known about the tags."""
+    """What is known of the tags."""
 
     height_m: float | None = None
     """All tags move at this height (2-D positioning); leave out to estimate the height."""
@@ -164,34 +164,34 @@ class FloorPlanSite(Struct, frozen=True, forbid_unknown_fields=True):
     image: str
     """Path of a PNG or JPEG, relative to the site file."""
     width_m: float
-    """Width on the floor that the image covers."""
+    """Width of the floor that the image covers."""
     x_m: float = 0.0
     y_m: float = 0.0
     """Site coordinates of the image's lower left corner."""
 
 
 class FloorSite(Struct, frozen=True, forbid_unknown_fields=True):
-    """One storey of a building, and the image of its plan where it has one of its own."""
+    """One storey of a building, with the image of its plan if it has its own."""
 
     number: int
-    """As of its anchors."""
+    """As used by its anchors."""
     low_m: float
-    """Height of its ground: a tag above it, and below the next floor's, is on it."""
+    """Height of its ground: a tag between it and the next floor's is on this floor."""
     name: str = ""
     image: str | None = None
-    """As of ``FloorPlanSite``, as are the next three."""
+    """As in ``FloorPlanSite``, like the next three."""
     width_m: float | None = None
     x_m: float = 0.0
     y_m: float = 0.0
     slab_loss_db: float | UnsetType = UNSET
-    """What its ground takes from a signal that crosses it; 25 dB where it is not given (reinforced concrete, assumed).
-    That of the lowest floor is not used. Left out where it is not given, as earlier versions refuse it."""
+    """Loss of a signal that crosses its ground; 25 dB by default (reinforced concrete, assumed).
+    Not used for the lowest floor. Omitted if unset, as earlier versions refuse it."""
     slab_delay_m: float | UnsetType = UNSET
-    """By how much its ground delays such a signal; 0.4 m where it is not given (assumed)."""
+    """Delay of such a signal; 0.4 m by default (assumed)."""
 
     @property
     def slab(self) -> tuple[float, float]:
-        """Loss in dB and delay in metres of its ground."""
+        """Loss in dB and delay in metres of a signal that crosses its ground."""
         loss_db = 25.0 if isinstance(self.slab_loss_db, UnsetType) else self.slab_loss_db
         return loss_db, 0.4 if isinstance(self.slab_delay_m, UnsetType) else self.slab_delay_m
 
@@ -207,7 +207,7 @@ class GeoreferenceSite(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class WallSite(Struct, frozen=True, forbid_unknown_fields=True):
-    """A wall on the floor plan, full height, and what it does to a signal that crosses it."""
+    """A wall on the floor plan, full height, with its loss and delay for a crossing signal."""
 
     x1_m: float
     y1_m: float
@@ -224,11 +224,12 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     id: int
     """Identifier on the air, 16 bits."""
     master: int
-    """The anchor that starts the site's time; when it fails the others take over in the order of the file.
+    """The anchor that starts the site's time; if it fails, the others take over in the order of the file.
 
-    In protocol 2 it means nothing, and is the first anchor where the file has none."""
+    Without meaning in protocol 2, where it is the first anchor if the file has none.
+    """
     anchors: tuple[AnchorSite, ...]
-    """Those whose positions are known; in protocol 1 all."""
+    """The placed anchors; in protocol 1 all."""
     schedule: ScheduleSite = ScheduleSite()
     noise: NoiseSite = NoiseSite()
     tags: TagsSite = TagsSite()
@@ -237,17 +238,17 @@ class Site(Struct, frozen=True, forbid_unknown_fields=True):
     floor_plan: FloorPlanSite | None = None
     georeference: GeoreferenceSite | None = None
     unplaced: tuple[UnplacedAnchor, ...] = ()
-    """Those whose positions are not known yet, in protocol 2."""
+    """Anchors without known positions, in protocol 2."""
     outline_m: Outline | UnsetType = UNSET
-    """The room, where the file has it. Messages carry it beside the site: earlier versions refuse a site with it."""
+    """The room, if the file has it. Sent beside the site in messages: earlier versions refuse a site with it."""
     floors: tuple[FloorSite, ...] | UnsetType = UNSET
-    """The storeys, the lowest first, where the file has them. Messages carry them beside the site as well."""
+    """The storeys, lowest first, if the file has them. Sent beside the site too."""
     alarms: tuple[AlarmRule, ...] | UnsetType = UNSET
-    """The rules of alarms, where the file has any. Beside the site in messages, as its outline is."""
+    """The alarm rules, if the file has any. Sent beside the site too."""
 
     @property
     def storeys(self) -> tuple[FloorSite, ...]:
-        """The floors, none where the file has none."""
+        """The floors; empty if the file has none."""
         return () if isinstance(self.floors, UnsetType) else self.floors
 
     @property
@@ -281,16 +282,16 @@ def site_digest(site: Site) -> str:
 
 
 def is_same_but_placed(one: Site, other: Site) -> bool:
-    """Whether two sites have the same number, anchors, slots and schedule, so that only positions and delays differ."""
+    """Whether two sites differ only in positions and delays: same number, anchors, slots and schedule."""
     return _frame_of(one) == _frame_of(other)
 
 
 def largest_change_m(one: Site, other: Site) -> float:
-    """The largest error that one site instead of the other can make in a range to an anchor.
+    """The largest range error that using one site instead of the other can cause.
 
-    It is the anchor's displacement and the change of its delays together: both delays are in the time between a beacon
-    that it receives and its own. Both sites have the same anchors. One that has a position in the second site alone has
-    an infinite change.
+    It is the anchor's displacement plus the change of its delays: both delays are in the time between a received beacon
+    and its own. Both sites have the same anchors. An anchor with a position only in the second site has an infinite
+    change.
     """
     others = {anchor.id: anchor for anchor in other.all_anchors}
     return max(_change_m(anchor, others[anchor.id]) for anchor in one.all_anchors)

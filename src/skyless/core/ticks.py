@@ -25,13 +25,13 @@ TICK_S: Final = 1.0 / TICK_RATE_HZ
 """One tick of the timestamp counter, 15.650040064 ps."""
 
 TICK_M: Final = SPEED_OF_LIGHT_MPS * TICK_S
-"""What light travels in one tick, 4.692 mm."""
+"""Distance that light travels in one tick, 4.692 mm."""
 
 TICK_BITS: Final = 40
 """Width of the timestamp counter (DW1000 User Manual v2.12, 7.2.8); it wraps every 17.2074 s."""
 
 SUBTICKS: Final = 256
-"""Parts of a tick; the air's unit of the site's time, of which beacons carry 48 bits."""
+"""Subdivisions of a tick: the unit of the site's time on the air, of which beacons carry 48 bits."""
 
 DELAYED_TX_GRANULARITY_TICKS: Final = 512
 """DX_TIME ignores its low nine bits: transmissions start on 8.013 ns boundaries (DW1000 User Manual, p. 26)."""
@@ -40,7 +40,7 @@ DEFAULT_ANTENNA_DELAY_TICKS: Final = 16_436
 """Common default of TX_ANTD and LDE_RXANTD at 64 MHz PRF (DW1000 User Manual v2.12, 7.2.25)."""
 
 MAX_DRIFT: Final = 50e-6
-"""Two clocks cannot drift apart faster: each within 20 ppm (IEEE 802.15.4-2015, 16.4.9), and room for motion."""
+"""Largest relative drift of two clocks: 20 ppm each (IEEE 802.15.4-2015, 16.4.9), and room for motion."""
 
 CARRIER_CYCLES: Final = {1: 7, 2: 8, 3: 9, 4: 8, 5: 13, 7: 13}
 """Cycles of each channel's carrier in 128 ticks: the centre frequencies over half the chipping rate (table 16-3)."""
@@ -53,38 +53,38 @@ WRAP_TICKS: Final = 1 << TICK_BITS
 TICK_MASK: Final = WRAP_TICKS - 1
 
 LAST_TICKS: Final = 1 << 61
-"""A year of ticks, whose differences fit 64 bits; a host's clock that jumps by more was set."""
+"""A year of ticks, so that differences fit into 64 bits; a host's clock that jumps by more was set."""
 
 NEVER: Final = -(1 << 62)
-"""Earlier than any reading."""
+"""Earlier than any time."""
 
 _LONGEST_JUMP_S: Final = 1e8
-"""No jump of a host's clock counts as a longer one: the ticks of three years fit 64 bits."""
+"""Longer jumps of a host's clock are limited to this: the ticks of three years fit into 64 bits."""
 
 
 def wrap(ticks: int, bits: int = TICK_BITS) -> int:
-    """Return an unwrapped time as the counter of that many bits shows it, in [0, 2**bits)."""
+    """An unwrapped time as a counter of this many bits shows it, in [0, 2**bits)."""
     return ticks & ((1 << bits) - 1)
 
 
 def difference(later: int, earlier: int, bits: int = TICK_BITS) -> int:
     """Signed ``later - earlier`` of two counter values, in [-2**(bits-1), 2**(bits-1)).
 
-    Right whenever the true difference is shorter than half a wrap, 8.6 s for 40 bits.
+    Correct if the true difference is shorter than half a wrap, 8.6 s for 40 bits.
     """
     half = 1 << (bits - 1)
     return ((later - earlier + half) & ((half << 1) - 1)) - half
 
 
 def nearest(counter: Ticks, expected_ticks: Ticks, bits: int = TICK_BITS) -> Ticks:
-    """The unwrapped time that the counter shows and that lies nearest to the expected one."""
+    """The unwrapped time nearest to the expected one that agrees with the counter."""
     half: Ticks = 1
     half = half << (bits - 1)
     return expected_ticks - half + ((counter - expected_ticks + half) & (2 * half - 1))
 
 
 def to_seconds(ticks: int) -> float:
-    """Seconds of a tick difference; of an epoch far from zero the result keeps only 53 bits."""
+    """Seconds of a tick difference; far from zero the result keeps only 53 bits."""
     return ticks * TICK_S
 
 
@@ -94,40 +94,40 @@ def from_seconds(seconds: float) -> int:
 
 
 FLIGHT_SLACK_TICKS: Final = round(1e-6 * TICK_RATE_HZ)
-"""Flight times differ between anchors by less than this (300 m)."""
+"""Largest difference of flight times between anchors (300 m)."""
 
 NOISE_TICKS: Final = 64
-"""0.3 m allow for the noise of two stamps of one anchor."""
+"""Allowance of 0.3 m for the noise of two stamps of one anchor."""
 
 
 def may_elapse(counter_ticks: Ticks, elapsed_ticks: Ticks, slack_ticks: float) -> bool:
-    """Whether one crystal's counter may go by ``counter_ticks`` while another's goes by ``elapsed_ticks``."""
+    """Whether one crystal's counter may advance by ``counter_ticks`` while another's advances by ``elapsed_ticks``."""
     return abs(counter_ticks - elapsed_ticks) <= MAX_DRIFT * elapsed_ticks + slack_ticks
 
 
 def continued(counter: int, last_ticks: int, elapsed_ticks: int, bits: int = TICK_BITS) -> int | None:
-    """Unwrapped stamp of a counter ``elapsed_ticks`` after its last one; None if no crystal went from that to this."""
+    """Unwrapped stamp of a counter ``elapsed_ticks`` after its last one; None if no crystal can have got there."""
     ticks = nearest(counter, last_ticks + elapsed_ticks, bits)
     return ticks if may_elapse(ticks - last_ticks, elapsed_ticks, NOISE_TICKS) else None
 
 
 @record
 class Unwrapper(Record):
-    """Turns one counter's wrapped stamps into int64 ticks that never wrap (``unwrap``)."""
+    """Converts one counter's wrapped stamps to int64 ticks that never wrap (``unwrap``)."""
 
     bits: int = TICK_BITS
-    """Width of the counter, 62 at most."""
+    """Width of the counter, at most 62."""
     has_stamp: bool
     last_ticks: Ticks
     last_host_s: float = nan
-    """NaN where no stamp has had a host time."""
+    """NaN if no stamp has had a host time."""
 
     def unwrap(self, counter: int, host_s: float | None = None) -> int:
-        """Unwrapped ticks of a counter value, as ``unwrap``."""
+        """Unwrapped ticks of a counter value, by ``unwrap``."""
         return unwrap(self, counter, nan if host_s is None else host_s)
 
     def expect(self, counter: int) -> int:
-        """Unwrapped ticks of a counter value near the last stamp; it does not count as a stamp."""
+        """Unwrapped ticks of a counter value near the last stamp, without counting it as a stamp."""
         return nearest(counter, self.last_ticks, self.bits) if self.has_stamp else counter
 
 
@@ -154,7 +154,7 @@ def unwrap(u: Unwrapper, counter: Ticks, host_s: float) -> Ticks:
 
 @record
 class FixTime(Record):
-    """Counts from the first fix of a receiver and never goes back, even if the master or the method changes."""
+    """Time of fixes, counted from a receiver's first one; it never goes back, even if master or method change."""
 
     has_fix: bool
     first_ticks_master: Ticks
@@ -168,7 +168,7 @@ def fix_time_s(time: FixTime, ticks_master: int, rx_ticks_tag: int) -> float:
 
 
 def fix_time_ticks(time: FixTime, ticks_master: Ticks, rx_ticks_tag: Ticks) -> Ticks:
-    """Time of a fix that holds at this master time, given the tag's reading for it, both unwrapped."""
+    """Time of a fix at this master time, given the tag's time of it, both unwrapped."""
     if not time.has_fix:
         time.has_fix, time.first_ticks_master = True, ticks_master
     else:

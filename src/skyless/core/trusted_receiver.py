@@ -1,9 +1,9 @@
 """``TrustedReceiver``: a tag that verifies beacons with its site's public key. Like ``Receiver`` it does no I/O.
 
-It runs a ``Receiver`` on verified frames, which is 0.4 to 0.6 s behind. With trust ``verified``, the fixes are those of
-this receiver. With trust ``open``, a second, live receiver processes each plausible frame at once and gives the fixes.
-When a frame that it used turns out to be forged, it continues from the state of the first receiver: at once if forged
-frames are few, else once they have become few. Until then the fixes are those of verified frames.
+It runs a ``Receiver`` on verified frames, 0.4 to 0.6 s behind. With trust ``verified``, the fixes are those of this
+receiver. With trust ``open``, a second, live receiver processes each plausible frame at once and gives the fixes. If a
+frame that it used turns out to be forged, it continues from the state of the first receiver: at once if forged frames
+are few, otherwise once they have become few. Until then the fixes are those of verified frames.
 """
 
 import copy
@@ -29,14 +29,14 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
 SHARE_TICKS: Final = from_seconds(1.0)
-"""Shares are of the beacons received within this time."""
+"""Shares refer to the beacons of this time."""
 
 MAX_IN_SHARE: Final = 4096
 """More frames than a radio receives in that time."""
 
 MAX_FORGED: Final = 0.1
-"""Plausible frames that turned out to be forged, for each genuine one of the same time: where there are more, fixes are
-those of verified frames. Fewer are what gates and consistency checks of the estimator are for."""
+"""Largest ratio of forged to genuine plausible frames at which live fixes are given. So few are left to the gates and
+consistency checks of the estimator; with more, only verified frames give fixes."""
 
 _NOT_FORGED: Final = (Fault.NO_KEY, Fault.FIRST)
 
@@ -45,7 +45,7 @@ class Trust(StrEnum):
     """Which fixes a tag gives."""
 
     OPEN = "open"
-    """Each at once, unless frames are forged; it states how far it is verified."""
+    """Each one at once, unless frames are forged; each states how far it is verified."""
     VERIFIED = "verified"
     """Only those of verified beacons, 0.4 to 0.6 s later."""
 
@@ -57,29 +57,29 @@ class SiteTrust(Struct, frozen=True):
     public: bytes
     """The site's public key, 32 bytes."""
     least_serial: int = 0
-    """Key chains with lower serial numbers have been revoked."""
+    """Key chains with lower serial numbers are revoked."""
     trust: Trust = Trust.OPEN
     clock_bound_s: float = 0.1
-    """How far the tag's clock may be from those of the anchors."""
+    """Largest difference between the tag's clock and those of the anchors."""
 
 
 class GivenFix(Struct, frozen=True, gc=False):
-    """A fix, and the reception that made it: the last one that it contains."""
+    """A fix and the reception that made it, the last one used."""
 
     fix: Fix
     reception: Reception
 
 
 class TrustedReceiver:
-    """One listening tag that knows its site's public key."""
+    """A listening tag with its site's public key."""
 
     def __init__(
         self, trust: SiteTrust, new_receiver: "Callable[[], Receiver]", certificates: Iterable[bytes] = ()
     ) -> None:
-        """``new_receiver`` makes a receiver that has heard nothing; ``certificates``: those of an earlier run.
+        """``new_receiver`` creates a receiver that has heard nothing; ``certificates``: those of an earlier run.
 
         Raises:
-            ValueError: the public key has not 32 bytes.
+            ValueError: the public key is not 32 bytes long.
         """
         self.trust = trust
         self.counters: Counter[str] = Counter()
@@ -96,38 +96,38 @@ class TrustedReceiver:
         self._live = new_receiver() if trust.trust is Trust.OPEN else None
         """None with trust ``verified``, and after forged frames."""
         self._forged_ticks: deque[int] = deque(maxlen=MAX_IN_SHARE)
-        """When plausible frames of the last seconds were received that turned out to be forged."""
+        """Reception times of the last seconds' plausible frames that turned out to be forged."""
         self._genuine_ticks: deque[int] = deque(maxlen=MAX_IN_SHARE)
-        """When the verified frames of the last second were received."""
+        """Reception times of the last second's verified frames."""
         self._verified_ticks: int | None = None
-        """When the newest verified frame was received."""
+        """Reception time of the newest verified frame."""
         self._used = 0
-        """Number of the frames that wait and that the live receiver has used."""
+        """Number of waiting frames that the live receiver has used."""
         self._live_ticks: int | None = None
-        """When the last one of these was received."""
+        """Reception time of the last of these."""
         self._given_ticks: int | None = None
         self._first_time: FixTime | None = None
-        """From where times of fixes count."""
+        """Origin of the times of fixes."""
 
     @property
     def receiver(self) -> Receiver:
-        """The one whose fixes are given."""
+        """The receiver whose fixes are given."""
         return self._verified if self._live is None else self._live
 
     @property
     def is_verified(self) -> bool:
-        """Whether any beacon of the last seconds has been verified."""
+        """Whether any beacon of the last seconds is verified."""
         until_ticks = self._verified_ticks
         return until_ticks is not None and self.verifier.newest_ticks - until_ticks < LONGEST_WAIT_TICKS
 
     def faults(self) -> dict[int, Fault]:
-        """Anchors whose beacons, or beacons in whose name, were not accepted within the last seconds."""
+        """Anchors whose beacons, or beacons in whose name, were refused within the last seconds."""
         return self.verifier.faults()
 
     def hear(self, reception: Reception, unix_s: float) -> list[GivenFix]:
-        """Process a frame from the air, received at that time of the host's clock; the fixes that it makes possible.
+        """Process a frame from the air, received at this time of the host's clock. Returns new fixes in order of time.
 
-        They are in the order of their times. Nothing on the air raises.
+        No frame raises.
         """
         beacon = decode_any(reception.frame)
         if isinstance(beacon, Malformed):
@@ -148,7 +148,7 @@ class TrustedReceiver:
         return later
 
     def _use(self, frame: ReceivedFrame) -> list[tuple[int, GivenFix]]:
-        """Let the live receiver process a frame that is plausible and that it has not processed yet; its fix."""
+        """Pass a plausible frame that the live receiver has not processed yet to it. Returns its fix."""
         if self._live is None or not frame.is_plausible or frame.rx_ticks == self._live_ticks:
             return []
         self._used += 1
@@ -160,7 +160,7 @@ class TrustedReceiver:
         return [(frame.rx_ticks, GivenFix(self._with_trust(fix, frame.rx_ticks), frame.reception))]
 
     def _verify(self) -> list[tuple[int, GivenFix]]:
-        """Process the frames that are decided; fixes of the genuine ones, and those of a live receiver that returns."""
+        """Process the decided frames. Returns the fixes of genuine ones, and of a live receiver that returns."""
         given, is_other = [], False
         for one, fault in self.verifier.decided():
             if self._live is not None and one.is_plausible:
@@ -185,31 +185,31 @@ class TrustedReceiver:
         return given
 
     def _begin_verified(self) -> None:
-        """Let the verified receiver count time from the first fix of the live one."""
+        """Let the verified receiver count time from the live one's first fix."""
         if self._live is None or self._first_time is None or self._verified.counters["fixes"]:
             return
         self._verified.continue_time_of(self._live, self._first_time)
 
     def _is_attacked(self) -> bool:
-        """Whether many of the plausible frames of the last seconds have turned out to be forged."""
+        """Whether many of the last seconds' plausible frames have turned out to be forged."""
         oldest_ticks = self.verifier.newest_ticks - SHARE_TICKS
         return _since(oldest_ticks, self._forged_ticks) > MAX_FORGED * _since(oldest_ticks, self._genuine_ticks)
 
     def _leave_live(self) -> None:
-        """Give fixes of verified frames only: the live receiver has used forged ones, or would have."""
+        """Give fixes of verified frames only, because the live receiver has used forged ones or would have."""
         if self._live is not None:
             self._begin_verified()
             self._verified.counters |= self._live.counters  # what is reported must not go back
         self._live, self._used = None, 0
 
     def _return_live(self) -> list[tuple[int, GivenFix]]:
-        """Let the live receiver continue from the verified one with the plausible frames that wait; its fixes."""
+        """Continue the live receiver from the verified one with the plausible frames that wait. Returns its fixes."""
         self._live = Receiver.from_state(copy.deepcopy(self._verified.state()))
         self._used, self._live_ticks = 0, None
         return [given for one in self.verifier.waiting() for given in self._use(one)]
 
     def _with_trust(self, fix: Fix, rx_ticks: int) -> Fix:
-        """The fix with how far it is verified."""
+        """The fix with the extent of its verification filled in."""
         until_ticks = self._verified_ticks
         if until_ticks is None:
             return fix
@@ -219,7 +219,7 @@ class TrustedReceiver:
 
 
 def _since(oldest_ticks: int, ticks: deque[int]) -> int:
-    """Number of receptions since a time; earlier ones are forgotten."""
+    """Number of receptions since a time; drops earlier ones."""
     while ticks and ticks[0] < oldest_ticks:
         ticks.popleft()
     return len(ticks)

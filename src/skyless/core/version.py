@@ -1,10 +1,10 @@
-"""The version of the installed package, and what tells its source from all others."""
+"""The version of the installed package, and a digest of its source."""
 
 from functools import cache
 
 
 def installed_version() -> str:
-    """Version that pip shows for ``skyless``; read on demand, because ``importlib.metadata`` is slow to import."""
+    """Version of the installed package; read on demand, because ``importlib.metadata`` is slow to import."""
     from importlib.metadata import version  # noqa: PLC0415
 
     return version("skyless")
@@ -12,7 +12,7 @@ def installed_version() -> str:
 
 @cache
 def program_digest() -> str:
-    """Digest of the package's own source: checkouts of one version may compute different things."""
+    """Digest of the package's own source: checkouts of the same version may compute different results."""
     from hashlib import sha256  # noqa: PLC0415
     from pathlib import Path  # noqa: PLC0415
 

@@ -308,9 +308,7 @@ def encode(beacon: Beacon) -> bytes:
     """Encode a beacon as a whole frame, FCS included. Standard deviations are rounded up, never too optimistic.
 
     Raises:
-        ValueError: a field is out of range, or ``heard`` has too many or impossible entries; the message
-            names the field.
-            names it.
+        ValueError: a field is out of range, or ``heard`` has too many or impossible entries; the message names it.
     """
     flags = _flags(beacon)
     fault = _fault(beacon, _CAPACITY[flags & ~HAS_PHASES]) or _authentication_fault(beacon, flags)

@@ -1,4 +1,4 @@
-"""The estimator's functions as the library has them."""
+"""The estimator's functions as compiled in the library."""
 
 from skyless.core.estimator import levels, process, state, steady_state
 from skyless.core.native.library import compiled

@@ -1,4 +1,4 @@
-"""The estimator of one tag as Python uses it: packet by packet, or many in one compiled loop, with the same bits."""
+"""The estimator of one tag for Python: packet by packet, or many in one compiled loop, with the same bits."""
 
 from collections.abc import Sequence
 from math import sqrt
@@ -42,25 +42,25 @@ from skyless.core.ticks import NEVER
 # The estimator's state as bytes of a version, and back.
 
 VERSION: Final = 4
-"""Changes with the fields of ``State`` and of the records in it."""
+"""Changes with the fields of ``State`` and of its records."""
 _HEAD: Final = Format("<HBBB")
-"""Version, dimensions, anchors, and whether there are ambiguities."""
+"""Version, dimensions, number of anchors, and whether there are ambiguities."""
 
 
 def packed_state(s: State) -> bytes:
-    """A state as bytes: a head, then what is in use of each array."""
+    """Encode a state: a head, then the part of each array that is in use."""
     return _HEAD.pack(VERSION, s.dim, s.count, s.status.has_phases) + b"".join(
         _packed(part).tobytes() for part in _parts(s)
     )
 
 
 def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
-    """The state that ``packed_state`` has turned into bytes, which may come from anywhere.
+    """Decode a state from ``packed_state``, or from any other source.
 
-    What the estimator uses as an index is checked or computed again. Any other numbers will do.
+    Everything that the estimator uses as an index is checked or recomputed; other numbers are not.
 
     Raises:
-        ValueError: the bytes are of another version, other settings or another length, or hold an anchor twice.
+        ValueError: the bytes have another version, settings or length, or contain an anchor twice.
     """
     if len(packed) < _HEAD.size or _HEAD.unpack_from(packed)[:2] != (VERSION, settings.dim):
         raise ValueError("the estimator's state is of another version or of other settings")
@@ -88,18 +88,18 @@ def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
 
 
 def _flags(part: NDArray[Any]) -> list[NDArray[Any]]:
-    """All fields of records, and of records in these, that are true or false."""
+    """All boolean fields of records and of nested records."""
     fields = [part[name] for name in part.dtype.names or ()]
     return [one for one in fields if one.dtype == np.bool_] + [flags for one in fields for flags in _flags(one)]
 
 
 def _packed(part: NDArray[Any]) -> NDArray[Any]:
-    """Without what lies between the fields of records."""
+    """The records without padding between fields."""
     return repack_fields(part, recurse=True) if part.dtype.names else part
 
 
 def _parts(s: State) -> list[NDArray[Any]]:
-    """What is in use of the arrays of a state, and its counters."""
+    """The counters of a state and the parts of its arrays that are in use."""
     n, count, faults = s.layout.end, s.count, FAULT_KINDS * s.count
     return [
         view(s.status),
@@ -117,16 +117,16 @@ def _parts(s: State) -> list[NDArray[Any]]:
 
 
 MAX_ANCHORS_KNOWN: Final = 256
-"""With more, one that is not in the state is forgotten for each new one."""
+"""Beyond this number, each new anchor replaces one that is not in the state."""
 
 
 class Report(Struct, frozen=True, gc=False):
-    """What an anchor reports of its clock."""
+    """An anchor's report of its clock."""
 
     master: int
-    """The master's identifier; −1 where nothing is reported."""
+    """The master's identifier; −1 for no report."""
     subticks: int
-    """The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸."""
+    """The anchor's reading minus the master's at the packet's TX stamp, modulo 2⁴⁸."""
     variance_m2: float
 
 
@@ -134,7 +134,7 @@ NO_REPORT: Final = Report(-1, 0, 0.0)
 
 
 class Packets(Struct, frozen=True):
-    """Packets in the order in which the tag received them, all stamps unwrapped."""
+    """Packets in order of reception, with unwrapped stamps."""
 
     anchors: Integers
     """Identifier of each packet's anchor, shape (n,)."""
@@ -142,17 +142,17 @@ class Packets(Struct, frozen=True):
     rx_ticks: Integers
     """The tag's stamps."""
     tx_ticks: Integers
-    """The anchors' own."""
+    """The anchors' own stamps."""
     relays: Integers
     """[listener, sender, sequence number, RX stamp of the listener], shape (relays, 4)."""
     ends: Integers
-    """Where the relays of each packet end."""
+    """End of each packet's relays."""
     phases_cycles: Vector | None = None
-    """Phases of the carrier as the tag received it, shape (n,); below 0 where one is not known."""
+    """Carrier phases as the tag received them, shape (n,); negative if unknown."""
 
 
 class SavedEstimator(Struct, frozen=True):
-    """An ``Estimator`` in plain values: the anchors that it knows, and its state as bytes."""
+    """The saved state of an ``Estimator``: its known anchors, and the encoded state."""
 
     anchors: Annotated[tuple[tuple[int, float, float, float], ...], Meta(max_length=MAX_ANCHORS_KNOWN)]
     """Identifier and position of each anchor."""
@@ -165,14 +165,14 @@ class Estimator:
     def __init__(self, settings: EstimatorSettings, anchors_m: Matrix | None = None) -> None:
         """``anchors_m``: positions of anchors with identifiers 0, 1, …, shape (n, 3); ``know_anchor`` adds others."""
         self._known: dict[int, tuple[Vector, Place]] = {}
-        """The position of each anchor as it was given, and with what the filter needs besides."""
+        """Each anchor's position as given, and its place for the filter."""
         self._packet, self._relays = Packet(), Relays()
         self._state = new_state(settings)
         for anchor, position_m in enumerate([] if anchors_m is None else anchors_m):
             self.know_anchor(anchor, position_m)
 
     def save(self, has_state: bool) -> SavedEstimator:
-        """All that ``restore`` needs to continue with the same bits; ``has_state``: whether it has started."""
+        """Everything that ``restore`` needs to continue with the same bits; ``has_state``: whether it has started."""
         places = (place for _, place in self._known.values())
         anchors = tuple((one.anchor, *one.position_m) for one in places)
         return SavedEstimator(anchors, packed_state(self._state) if has_state else None)
@@ -181,7 +181,7 @@ class Estimator:
         """Continue from what an estimator with these settings has saved.
 
         Raises:
-            ValueError: it is no state of an estimator.
+            ValueError: the saved state is invalid.
         """
         for anchor, *position_m in saved.anchors:
             self.know_anchor(anchor, np.array(position_m))
@@ -192,12 +192,12 @@ class Estimator:
 
     @property
     def state(self) -> State:
-        """All states and counters; others after ``restore``."""
+        """The state; another object after ``restore``."""
         return self._state
 
     @property
     def settings(self) -> EstimatorSettings:
-        """What it assumes."""
+        """The settings in use."""
         return self._state.settings
 
     @property
@@ -207,16 +207,16 @@ class Estimator:
 
     @property
     def rows(self) -> bytes:
-        """What a fix carries (``POSITION`` and the following), as of the newest packet."""
+        """The rows of a fix (``POSITION`` and the following) at the newest packet."""
         fix: Any = self._state.fix
         return bytes(fix)
 
     # Anchors
 
     def know_anchor(self, anchor: int, position_m: Vector) -> None:
-        """Note where an anchor stands, which may have moved, before it is used.
+        """Set an anchor's position before it is used, or after it has moved.
 
-        ``position_m``, shape (3,), counts as unchanged as long as it is the same array.
+        ``position_m``, shape (3,), counts as unchanged while it is the same array object.
         """
         known = self._known.get(anchor)
         if known is not None and known[0] is position_m:
@@ -229,7 +229,7 @@ class Estimator:
 
     @property
     def known_anchors(self) -> tuple[int, ...]:
-        """Identifiers of all anchors that it knows."""
+        """Identifiers of all anchors whose position is known."""
         return tuple(self._known)
 
     def has_anchor(self, anchor: int) -> bool:
@@ -242,13 +242,13 @@ class Estimator:
         return tuple(self._state.anchors[index].identifier for index in range(self._state.count))
 
     def remove_anchor(self, anchor: int) -> None:
-        """Let an anchor leave the state, if it is there."""
+        """Remove an anchor from the state, if it is there."""
         compiled.leave(self._state, anchor)
 
     # Starts
 
     def expect_late(self, anchor: int, late_m: float, variance_m2: float, may_stay: bool) -> None:
-        """Expect that an anchor is late by so much at the start, with this variance; ``may_stay``: perhaps for good."""
+        """Expect an anchor to be ``late_m`` late at the start, with this variance; ``may_stay``: for good, perhaps."""
         s, index = self._state, find_anchor(self._state, anchor)
         if index < 0:
             place = self._known[anchor][1]
@@ -262,7 +262,7 @@ class Estimator:
         make_uncertain(s, ALL_RANGE_ERRORS)
 
     def withhold_levels(self, are_withheld: bool = True) -> None:
-        """State no levels: it is not sure yet where the tag is, or the anchors' positions are known to be wrong."""
+        """Withhold the levels, because the position is not certain yet or anchors are known to be misplaced."""
         self._state.status.withholds_levels = are_withheld
 
     def start(
@@ -272,7 +272,7 @@ class Estimator:
         covariance_m2: Matrix,
         speed_variance: float,
     ) -> None:
-        """Start at a position, shapes (dim,) and (dim, dim), without any anchor; the share of late packets is kept."""
+        """Start without anchors at a position, shapes (dim,) and (dim, dim); the share of late packets is kept."""
         s, dim = self._state, self.dim
         restart(s, rx_ticks, s.status.late_share, TUNING.lasting_std_m, False)
         view(s.x)[:dim] = position_m
@@ -297,11 +297,11 @@ class Estimator:
         variance_factor: float = 1.0,
         phase_cycles: float = -1.0,
     ) -> int:
-        """Process one packet of a known anchor; returns what became of it (``ACCEPTED`` …) and leaves ``rows``.
+        """Process one packet of a known anchor. Returns the outcome (``ACCEPTED`` …) and leaves ``rows``.
 
-        ``relays``: identifier, sequence number and RX stamp; ``packed``: relays as frames carry them
-        (``codec.packed_relays``); ``variance_factor``: on the variance of the tag's reception; ``phase_cycles``:
-        of the carrier as the tag received it, in [0, 1), below 0 where it is not known.
+        ``relays``: identifier, sequence number and RX stamp; ``packed``: relays encoded as in frames
+        (``beacon.packed_relays``); ``variance_factor``: on the variance of the tag's reception; ``phase_cycles``:
+        carrier phase as the tag received it, in [0, 1), negative if unknown.
         """
         given = self.packet_of(anchor, sequence, rx_ticks, tx_ticks, relays, report, variance_factor, phase_cycles)
         return compiled.process_frame(self._state, *given, packed, len(packed))
@@ -318,7 +318,7 @@ class Estimator:
         phase_cycles: float = -1.0,
         relay_phases: Sequence[float] = (),
     ) -> tuple[Packet, Relays]:
-        """A packet of a known anchor as compiled functions take it, in the same memory each time; see ``process``."""
+        """A packet of a known anchor for compiled functions, in the same memory each time; see ``process``."""
         packet, taken = self._packet, self._relays
         packet.place = self._known[anchor][1]
         packet.sequence, packet.rx_ticks, packet.tx_ticks = sequence, rx_ticks, tx_ticks
@@ -335,20 +335,20 @@ class Estimator:
         return packet, taken
 
     def process_difference(self, a: int, b: int, rx_ticks: int, difference_m: float) -> int:
-        """Process a ready-made difference of ranges, to anchor b less to anchor a; as ``process``."""
+        """Process a ready-made difference of ranges, to anchor b minus to anchor a, as ``process`` does."""
         if not np.isfinite(difference_m):
             return REJECTED
         return compiled.process_difference(self._state, self._known[a][1], self._known[b][1], rx_ticks, difference_m)
 
     def process_height(self, height_m: float, std_m: float, is_barometer: bool = False) -> int:
-        """Process the tag's height at the newest packet, as a sensor measures it; ``ACCEPTED`` or ``REJECTED``.
+        """Process a height sensor's reading at the newest packet: ``ACCEPTED`` or ``REJECTED``.
 
-        A barometer's zero, which is unknown and moves slowly, is estimated; in three dimensions only.
+        A barometer's zero, which is unknown and drifts, is estimated; only in three dimensions.
         """
         return compiled.process_height(self._state, height_m, std_m, is_barometer)
 
     def track(self, packets: Packets, *, has_levels: bool = False) -> NDArray[np.void]:
-        """Process many packets in one loop; the state after each, an array of ``BatchRow``, shape (n,)."""
+        """Process many packets in one loop. Returns the state after each, an array of ``BatchRow``, shape (n,)."""
         count = len(packets.anchors)
         identifiers, indices = np.unique(packets.anchors, return_inverse=True)
         places = (Place * len(identifiers))(*(self._known[int(anchor)][1] for anchor in identifiers))
@@ -369,7 +369,7 @@ class Estimator:
 
     @property
     def multipath_m(self) -> tuple[float, float] | None:
-        """How far range errors change, and over which distance walked, where that is more than the settings state."""
+        """Standard deviation and distance of changing range errors, if more than the settings state."""
         status = self._state.status
         variance_m2 = status.place_variance_m2
         return (sqrt(variance_m2), status.place_distance_m) if variance_m2 > 0.0 else None
@@ -381,18 +381,18 @@ class Estimator:
 
     @property
     def rejects_most(self) -> bool:
-        """Whether most measurements lie beyond the gate."""
+        """Whether most measurements are beyond the gate."""
         return rejects_most(self._state)
 
     @property
     def obstructed(self) -> tuple[int, ...]:
-        """Identifiers of the anchors whose range error has jumped and stayed, or has a lasting fault."""
+        """Anchors whose range error has jumped and stayed, or that have a lasting fault."""
         anchors = (self._state.anchors[index] for index in range(self._state.count))
         return tuple(one.identifier for one in anchors if one.is_obstructed or one.has_fault)
 
     @property
     def phase_anchors(self) -> tuple[int, ...]:
-        """Identifiers of the anchors the phases of whose carriers are in use."""
+        """Anchors whose carrier phases are in use."""
         s = self._state
         return tuple(sorted(s.anchors[index].identifier for index in range(s.count) if has_phase(s, index)))
 
@@ -407,11 +407,11 @@ class Estimator:
         return view(self._state.x)[states], covariances(self._state)[np.ix_(states, states)]
 
     def horizontal_variance_m2(self, ahead_s: float) -> float:
-        """Sum of the variances of x and y ``ahead_s`` later, if nothing is received until then."""
+        """Sum of the variances of x and y after ``ahead_s`` without receptions."""
         return horizontal_variance_m2(self._state, ahead_s)
 
     def clock(self, anchor: int) -> tuple[int, float, float] | None:
-        """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""
+        """Tag's clock minus an anchor's: whole ticks, the rest in m, rate in m/s. None if it is not in the state."""
         s, index = self._state, find_anchor(self._state, anchor)
         if index < 0 or s.anchors[index].rx_ticks == NEVER:
             return None

@@ -1,15 +1,15 @@
-"""Faults of anchors: what they do to the state, what innovations show of them, and the verdicts.
+"""Faults of anchors: their effect on the state, the evidence for them in innovations, and the tests.
 
-Where all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b, and the
-innovation of a measurement h holds s_j·b (Friedland 1969):
+If all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b, and the innovation of a
+measurement h contains s_j·b (Friedland 1969):
 
     s = [own reception of j] − h·V        V ← F·V  (time)        V ← V + K·s  (update)
 
-With y = Σ s·ν/S and M = Σ s·sᵀ/S over the innovations ν of variance S, and σ_f²·I the faults' variance beforehand, all
-anchors' faults are b̂ = (M + I/σ_f²)⁻¹·y with the covariance (M + I/σ_f²)⁻¹, and yᵀ·(M + I/σ_f²)⁻¹·y tests whether there
-are any. Where V, y and M forget, b is the present size of a fault that has grown as fast as they forget: within packets
-(recent) or seconds (creeping). A fault that is sure is added to the anchor's range error, which gives the state that
-the filter would have, had that error been open from the beginning.
+With y = Σ s·ν/S and M = Σ s·sᵀ/S over the innovations ν of variance S, and the prior variances σ_f²·I of the faults,
+the estimate of all anchors' faults is b̂ = (M + I/σ_f²)⁻¹·y with the covariance (M + I/σ_f²)⁻¹, and
+yᵀ·(M + I/σ_f²)⁻¹·y tests whether there are any. Where V, y and M are faded, b is the present size of a fault that
+has grown as fast as they fade: within packets (recent) or seconds (creeping). A fault beyond doubt is added to the
+anchor's range error, which gives the state that the filter would have if that error had been open from the beginning.
 """
 
 from typing import Final
@@ -40,13 +40,13 @@ MAX_FAULTS: Final = 2  # largest number of anchors that are selected
 
 
 def subtract_fault_input(s: State, anchor: int) -> None:
-    """Subtract the reception of the first anchor of a difference: its faults count with the opposite sign."""
+    """Subtract the input of the first anchor of a difference, whose faults have the opposite sign."""
     for kind in range(FAULT_KINDS):
         s.G[s.waiting][kind * s.count + anchor] -= 1.0
 
 
 def fade_faults(s: State) -> None:
-    """Forget, once in a round of packets, a share of what has not lasted has done, and of the evidence for it."""
+    """Fade the effect of, and the evidence for, recent and creeping faults; once a round of packets."""
     status, tuning, count = s.status, s.tuning, s.count
     if status.packets % count != 0:
         return
@@ -72,7 +72,7 @@ def fade_faults(s: State) -> None:
 def whiten(s: State, count: int, vectors: int) -> None:
     """Compute L⁻¹·r of the vectors r in the rows behind a symmetric matrix M = L·Lᵀ in ``work``, by Cholesky's method.
 
-    So r·M⁻¹·q is the product of what becomes of r and of q. Rows of vectors are treated as rows of the matrix.
+    The scalar product of two results is r·M⁻¹·q. Rows of vectors are treated like rows of the matrix.
     """
     for column in range(count):
         pivot, total = s.work[column], s.work[column][column]
@@ -88,13 +88,13 @@ def whiten(s: State, count: int, vectors: int) -> None:
 
 
 def fault_chi2(s: State, kind: int, axes: int) -> float:
-    """The test of all faults of a kind; leaves what they do to that number of axes, as factors, in rows of ``work``.
+    """Test all faults of a kind. Leaves their effect on the first ``axes`` states, as factors, in rows of ``work``.
 
-    In row ``count`` f, in those behind it A: A·f is how far the estimate of the faults moves a position. With L·Lᵀ =
-    M + I/σ_f² these are L⁻¹·y and L⁻¹·V, and A·Aᵀ is the covariance of that; for lasting faults A·Bᵀ, with B behind A.
+    Row ``count`` is f, those behind it are A: the estimated faults move a position by A·f. With L·Lᵀ = M + I/σ_f² these
+    are L⁻¹·y and L⁻¹·V, and A·Aᵀ is the covariance of that shift; for lasting faults it is A·Bᵀ, with B behind A.
     """
     count, begin, first, total = s.count, kind * s.count, s.count + 1, 0.0
-    if kind == LASTING:  # their covariance is known as it is
+    if kind == LASTING:  # whose covariance is kept explicitly
         for axis in range(axes):
             a, b = s.work[first + axis], s.work[first + AXES + axis]
             for one in range(count):
@@ -124,7 +124,7 @@ def fault_chi2(s: State, kind: int, axes: int) -> float:
 def explained_chi2(s: State, one: int, other: int) -> float:
     """How much of the test of all lasting faults one anchor or two explain.
 
-    ``other`` is not above ``one``, and the same for one anchor.
+    ``other`` is not above ``one``; equal for one anchor.
     """
     weight, y_one, y_other = 1.0 / square(s.tuning.late_std_m), s.evidence[one], s.evidence[other]
     a, b, both = s.information[one][one] + weight, s.information[other][other] + weight, s.information[one][other]
@@ -134,14 +134,14 @@ def explained_chi2(s: State, one: int, other: int) -> float:
 
 
 def _explained_alone(s: State, kind: int, anchor: int) -> float:
-    """How much the fault of an anchor explains; that it is early is less likely, and counts less."""
+    """How much an anchor's fault explains. An early one is less likely, and weighted less."""
     fault = kind * s.count + anchor
     y, information = s.evidence[fault], s.information[fault][fault]
     return (1.0 if y > 0.0 else s.tuning.early_weight) * y * y / (information + 1.0 / square(s.tuning.late_std_m))
 
 
 def _largest(s: State, kind: int) -> float:
-    """How much the fault of a single anchor explains at most."""
+    """The most that the fault of a single anchor explains."""
     most = 0.0
     for anchor in range(s.count):
         most = max(most, _explained_alone(s, kind, anchor))
@@ -152,10 +152,10 @@ def _largest(s: State, kind: int) -> float:
 
 
 def open_faults(s: State) -> None:
-    """Add faults to the state where the test of all of a kind is sure, of the kind that explains most.
+    """If the test of all faults of a kind is beyond doubt, add faults of the kind that explains most to the state.
 
-    After a start that was contradicted, none are selected: any number of anchors may be late then, and those that
-    explain the test are now and then the wrong ones.
+    None are selected after a start that was contradicted: any number of anchors may be late then, and those that
+    explain the test best are sometimes the wrong ones.
     """
     sure_chi2 = s.tuning.sure_chi2
     if s.status.fault_std_m[LASTING] > s.tuning.lasting_std_m:
@@ -171,10 +171,10 @@ def open_faults(s: State) -> None:
 
 
 def _open_new_faults(s: State, kind: int) -> None:
-    """Open the range errors of the anchors whose faults explain the innovations about as well as any other's.
+    """Open the range errors of the anchors whose faults explain the innovations about as well as the best one.
 
-    A single one opens by itself; where it is open which of several it is, the position uses none of them,
-    as long as enough anchors are left. None opens where there are too few anchors to contradict it afterwards.
+    If several explain them, all of these are opened, as long as enough anchors are left; none if too few anchors remain
+    to contradict the choice later.
     """
     spare, explained = s.count - s.dim - 1, s.work[0]
     for anchor in range(s.count):
@@ -196,7 +196,7 @@ def _open_new_faults(s: State, kind: int) -> None:
 
 
 def begin_obstruction(s: State, anchor: int) -> None:
-    """Note that an anchor's range error has jumped; it may still be changing."""
+    """Mark that an anchor's range error has jumped and may still be changing."""
     a = s.anchors[anchor]
     a.outliers_in_row = 0
     a.is_obstructed = True
@@ -206,12 +206,12 @@ def begin_obstruction(s: State, anchor: int) -> None:
 
 
 def _note_jump(s: State) -> None:
-    """Range errors jump at present."""
+    """Raise the estimated rate of jumps of range errors."""
     s.status.obstruction = min(s.status.obstruction + s.tuning.jump_rise, 2.0)
 
 
 def _open_lasting_faults(s: State, chi2: float) -> None:
-    """Add the lasting faults of one or two anchors to the state, where no others explain the test as well."""
+    """Add the lasting faults of one or two anchors to the state, if no others explain the test as well."""
     apart_chi2 = s.tuning.apart_chi2
     for faults in range(1, min(MAX_FAULTS, s.count - s.dim - 2) + 1):
         first, second, most, rival = -1, -1, 0.0, 0.0
@@ -231,10 +231,10 @@ def _open_lasting_faults(s: State, chi2: float) -> None:
 
 
 def _open_lasting_fault(s: State, anchor: int) -> None:
-    """Add a lasting fault to the state, and note that the anchor has one.
+    """Add a lasting fault to the state and to the anchor's record.
 
-    Nothing makes ranges much shorter. Where single packets are often late, the first packet was, from which the
-    anchor's clock was taken: it leaves the state instead, to join again with its next packet.
+    Nothing makes ranges much shorter. If single packets are often late, the first packet was, which initialised the
+    anchor's clock: the anchor leaves the state instead, and joins again with its next packet.
     """
     if s.status.late_share > s.tuning.late_often_share and s.lasting_m[anchor] < -s.tuning.lasting_std_m:
         remove_anchor(s, anchor)
@@ -244,20 +244,20 @@ def _open_lasting_fault(s: State, anchor: int) -> None:
 
 
 def end_lasting_fault(s: State, anchor: int) -> None:
-    """End a fault: an anchor's packets have been late since it joined, and are not any more."""
+    """End a fault: the anchor's packets had been late since it joined, and no longer are."""
     _open_fault(s, LASTING, anchor)
     reset_state(s, s.layout.constant + anchor, square(s.settings.range_std_m))
     _note_jump(s)
 
 
 def _open_fault(s: State, kind: int, anchor: int) -> None:
-    """Add a fault to its anchor's range error; all other hypotheses are conditioned on it (Schur's complement)."""
+    """Add a fault to its anchor's range error, and condition all other hypotheses on it (Schur's complement)."""
     is_lasting, chosen, faults = kind == LASTING, kind * s.count + anchor, FAULT_KINDS * s.count
     make_uncertain(s, ALL_RANGE_ERRORS if is_lasting else CHANGING_RANGE_ERRORS)
     gain = 1.0 / (s.information[chosen][chosen] + 1.0 / square(s.tuning.late_std_m))
     fault_m = gain * s.evidence[chosen]
     variance = gain if is_lasting else gain + fault_m * fault_m
-    opened, shared = s.U[0], s.G[0]  # what it adds to each state: 1 − V for the range error, −V for all others
+    opened, shared = s.U[0], s.G[0]  # change of each state per metre: 1 − V for the range error, −V for the others
     for state in range(s.n):
         opened[state] = -s.V[state][chosen]
     opened[(s.layout.constant if is_lasting else s.layout.change) + anchor] += 1.0
@@ -282,49 +282,49 @@ def _open_fault(s: State, kind: int, anchor: int) -> None:
     s.status.faults_opened += 1
 
 
-# What the estimator's counters say of its state: whether a new start is needed, and what that has to expect.
+# Verdicts on the state: whether a new start is needed, and what it has to expect
 
 _MOST_LATE: Final = 0.45
-"""A larger share of late packets counts as this."""
+"""Upper limit of the share of late packets in ``is_lost``."""
 
 
 def is_late_often(s: State) -> bool:
-    """Whether single packets are late often."""
+    """Whether single packets are often late."""
     return s.status.late_share > s.tuning.late_often_share
 
 
 def rejects_most(s: State) -> bool:
-    """Whether most measurements lie beyond the gate."""
+    """Whether most measurements are beyond the gate."""
     return s.status.rejected_share > s.tuning.lost_share
 
 
 def is_lost(s: State) -> bool:
-    """Whether more packets are rejected than a right state would reject."""
+    """Whether more packets are rejected than a correct state would reject."""
     in_row = s.status.rejected_in_row + s.status.stale_in_row
     late = min(s.status.late_share, _MOST_LATE)
     return rejects_most(s) or in_row * (1.0 - 2.0 * late) >= s.tuning.lost_in_row
 
 
 def relays_contradict(s: State) -> bool:
-    """Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks."""
+    """Whether most relays do not fit: a wrong position shifts all clocks."""
     status = s.status
     return status.relays_lately_rejected > max(s.tuning.max_relays_rejected, status.relays_lately_accepted)
 
 
 def relays_fit(s: State) -> bool:
-    """Whether most of what anchors received of each other fits, and that is more than a few receptions."""
+    """Whether most relays fit, and enough of them for a judgement."""
     status = s.status
     return status.relays_lately_accepted > max(s.tuning.max_relays_rejected, 4.0 * status.relays_lately_rejected)
 
 
 def has_phase(s: State, anchor: int) -> bool:
-    """Whether phases of an anchor are in use: one has confirmed its ambiguity, and they are not refused."""
+    """Whether an anchor's phases are in use: its ambiguity is confirmed, and phases are not being rejected."""
     own = s.anchors[anchor].own
     return own.is_known and own.refused_in_row < int(s.tuning.phases_in_row) - 1
 
 
 def horizontal_variance_m2(s: State, ahead_s: float) -> float:
-    """Sum of the variances of x and y ``ahead_s`` later, if nothing is received until then."""
+    """Sum of the variances of x and y after ``ahead_s`` without receptions."""
     total = 2.0 * s.settings.qa * s.status.q_scale * ahead_s * ahead_s * ahead_s / 3.0
     for axis in range(2):
         speed = s.layout.velocity + axis
@@ -333,7 +333,7 @@ def horizontal_variance_m2(s: State, ahead_s: float) -> float:
 
 
 def fits_settings(s: State) -> bool:
-    """Whether the constants of the ranges are as small as the settings state, as far as they are known."""
+    """Whether the range constants are as small as the settings state, as far as they are known."""
     first, count = s.layout.constant, s.count
     for one in range(count):
         for other in range(one + 1):

@@ -21,15 +21,15 @@ from skyless.core.native.records import MOST_WAITING, PACKED, Reals, Ticks
 from skyless.core.ticks import TICK_S
 
 LONGEST_S: Final = 1000.0
-"""The longest time update: of more, squares of variances are no numbers in single precision."""
+"""Longest time update: beyond it, squares of variances overflow in single precision."""
 
 # Time update
 
 
 def predict(s: State, rx_ticks: Ticks) -> None:
-    """Time update to a reading of the tag: F·P·Fᵀ + Q for constant velocity and constant clock rates.
+    """Time update to a tag time: F·P·Fᵀ + Q for constant velocity and constant clock rates.
 
-    The tag's oscillator is in all offsets, so its noise is common to them.
+    All offsets contain the tag's oscillator, so its noise is common to them.
     """
     status, settings, where = s.status, s.settings, s.layout
     dt = min((rx_ticks - status.epoch_ticks) * TICK_S, LONGEST_S)
@@ -48,7 +48,7 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     square_s, cube_s = dt * dt / 2.0, dt * dt * dt / 3.0
     for axis in range(s.dim):
         _add_noise(s, axis, axis, motion * cube_s, motion * square_s, motion * dt)
-        unknown = FAULT_KINDS * s.count + axis  # an acceleration that the filter does not know of
+        unknown = FAULT_KINDS * s.count + axis  # acceleration unknown to the filter
         s.V[axis][unknown] -= 0.5 * dt * dt
         s.V[where.velocity + axis][unknown] -= dt
     for anchor in range(s.count):
@@ -65,13 +65,13 @@ def predict(s: State, rx_ticks: Ticks) -> None:
 def is_stationary(s: State) -> bool:
     """Whether the tag has shown no motion for long enough to count as stationary.
 
-    Phases show that it rests by themselves, and what it then begins to do: ambiguities would take that up first.
+    Never while phases are in use: they show rest by themselves, and ambiguities would absorb the onset of motion.
     """
     return 0.0 < s.settings.stationary_s < s.status.stationary_s and not s.status.has_phases
 
 
 def _advance(s: State, dt: float) -> None:
-    """The values, which are the first states, gain dt·(their rates), which follow in the same order: F·P·Fᵀ."""
+    """Add dt·(rates) to the values; the values are the first states, their rates follow in the same order. F·P·Fᵀ."""
     values = s.layout.velocity
     for value in range(values):
         s.x[value] += dt * s.x[values + value]
@@ -95,7 +95,7 @@ def _advance(s: State, dt: float) -> None:
 
 
 def _advance_packed(s: State, values: int, dt: float) -> None:
-    """The same for the lower triangle: of values among each other in two steps, between which their rates change."""
+    """``_advance`` for a lower triangle: values among each other in two steps, between which their rates change."""
     for value in range(values):
         row, rates = row_of(value), row_of(values + value)
         for other in range(value + 1):
@@ -112,7 +112,7 @@ def _advance_packed(s: State, values: int, dt: float) -> None:
 
 
 def _add_noise(s: State, value: int, other: int, of_values: float, of_both: float, of_rates: float) -> None:
-    """Q of a value and its rate, or what two such pairs have in common: white noise of values, walk of rates."""
+    """Add Q of a value and its rate, or of two such pairs with common noise: white for values, a walk for rates."""
     rate, other_rate = s.layout.velocity + value, s.layout.velocity + other
     set_covariance(s, value, other, s.P[at(value, other)] + of_values)
     set_covariance(s, rate, other, s.P[at(rate, other)] + of_both)
@@ -125,16 +125,16 @@ def _add_noise(s: State, value: int, other: int, of_values: float, of_both: floa
 
 
 def jump_share(s: State) -> float:
-    """1 where range errors have jumped recently, 0 where none has."""
+    """1 if range errors have jumped recently, 0 if none has."""
     return min(s.status.obstruction, 1.0)
 
 
 def range_error_decay(s: State, anchor: int, dt: float, walked_m: float) -> tuple[float, float, float]:
-    """What an anchor's range errors keep over what has passed and was walked since its newest packet.
+    """Decay of an anchor's range errors over the time and the walked distance since its newest packet.
 
-    Of the changing part: the share that is kept and its variance in the long run; then the share of the constant part.
-    The changing part is a Gauss–Markov process of walked distance and of time. Where range errors jump, both parts
-    forget within seconds; one that has jumped itself wanders and returns to zero.
+    Returns the kept share of the changing part, its long-term variance, and the kept share of the constant part. The
+    changing part is a Gauss–Markov process of walked distance and time. Where range errors jump, both parts are
+    forgotten within seconds; one that has jumped itself wanders and returns to zero.
     """
     status, tuning, settings, a = s.status, s.tuning, s.settings, s.anchors[anchor]
     share = jump_share(s)
@@ -154,9 +154,9 @@ def range_error_decay(s: State, anchor: int, dt: float, walked_m: float) -> tupl
 
 
 def relax_range_error(s: State, anchor: int, dt: float, walked_m: float) -> None:
-    """Time update of an anchor's range errors since its newest packet, by what ``range_error_decay`` says."""
+    """Time update of an anchor's range errors since its newest packet, by ``range_error_decay``."""
     kept, variance, kept_constant = range_error_decay(s, anchor, dt, walked_m)
-    if variance > 0.0:  # also where the site calls ranges exact: multipath is learnt there as well
+    if variance > 0.0:  # also if the site states exact ranges: multipath is learnt there too
         make_uncertain(s, CHANGING_RANGE_ERRORS)
         _decay(s, s.layout.change + anchor, kept, variance)
     if kept_constant < 1.0:
@@ -164,7 +164,7 @@ def relax_range_error(s: State, anchor: int, dt: float, walked_m: float) -> None
 
 
 def _decay(s: State, state: int, kept: float, variance: float) -> None:
-    """A state decays towards zero and keeps, in the long run, that variance: Gauss–Markov."""
+    """Decay a state towards zero with the given long-term variance (Gauss–Markov)."""
     s.x[state] *= kept
     for other in range(s.used):
         set_covariance(s, state, other, s.P[at(state, other)] * kept)
@@ -174,7 +174,7 @@ def _decay(s: State, state: int, kept: float, variance: float) -> None:
 
 
 def reset_state(s: State, state: int, variance: float) -> None:
-    """Forget a state: zero, uncorrelated, with that variance."""
+    """Reset a state to zero, uncorrelated, with the given variance."""
     s.x[state] = 0.0
     for other in range(s.used):
         set_covariance(s, state, other, 0.0)
@@ -184,7 +184,7 @@ def reset_state(s: State, state: int, variance: float) -> None:
 
 
 def open_direction(s: State, variance: float, faults: int) -> None:
-    """Let what was taken for known err along the first of ``U``, which holds so much of each fault as ``G`` says."""
+    """Add uncertainty along the first of ``U``, which depends on each fault by the first of ``G``."""
     opened, shared = s.U[0], s.G[0]
     for one in range(s.used):
         row = row_of(one)
@@ -198,7 +198,7 @@ def open_direction(s: State, variance: float, faults: int) -> None:
 
 
 def compute_ph(s: State) -> float:
-    """Write P·h of the measurement in ``h`` into the next of ``U``; returns hᵀ·P·h. Counts updates that wait."""
+    """Write P·h of the measurement in ``h`` into the next of ``U``, including queued updates. Returns hᵀ·P·h."""
     if s.waiting == MOST_WAITING:
         finish_updates(s)
     ph = s.U[s.waiting]
@@ -220,7 +220,7 @@ def compute_ph(s: State) -> float:
 
 
 def _h_dot(s: State, states: Reals) -> float:
-    """The measurement in ``h`` times what stands in the order of states."""
+    """The scalar product of ``h`` and a vector over the states."""
     total = 0.0
     for term in range(s.terms):
         if s.h_index[term] < s.n:
@@ -247,20 +247,20 @@ def compute_fault_input(s: State, own: int) -> None:
 
 
 def update(s: State, innovation: float, innovation_variance: float, gain_scale: float = 1.0) -> None:
-    """Scalar update by a measurement whose P·h and shares of faults are the next of ``U`` and ``G``.
+    """Scalar update by the measurement whose P·h and fault inputs are the next of ``U`` and ``G``.
 
-    K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
-    follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit. No update may wait.
+    K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; an inflated variance is in S, with a scale of 1. P changes by
+    −u·uᵀ with u = P·h/√S, which is symmetric to the bit. No updates may be queued.
     """
     _note_update(s, innovation, innovation_variance, gain_scale)
     _apply_updates(s)
 
 
 def update_later(s: State, innovation: float, innovation_variance: float) -> None:
-    """The same for a measurement that shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
+    """Queue an update by a measurement that also shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
 
-    P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V.
-    What is known of lasting faults does not wait.
+    P, V and M follow in ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and
+    V. Lasting faults are updated at once.
     """
     g = s.G[s.waiting]
     normalised = innovation / sqrt(innovation_variance)
@@ -271,7 +271,7 @@ def update_later(s: State, innovation: float, innovation_variance: float) -> Non
 
 
 def _note_update(s: State, innovation: float, innovation_variance: float, gain_scale: float) -> None:
-    """Update x, and make u = P·h/√S and g = s/√S of what stands in ``U`` and ``G``, for P and V."""
+    """Update x, and scale the next of ``U`` and ``G`` to u = P·h/√S and g = s/√S for P and V."""
     inverse = 1.0 / sqrt(innovation_variance)
     step, u, g = gain_scale * inverse, s.U[s.waiting], s.G[s.waiting]
     for state in range(s.n):
@@ -285,14 +285,14 @@ def _note_update(s: State, innovation: float, innovation_variance: float, gain_s
 
 
 def finish_updates(s: State) -> None:
-    """Let P, V and M follow the updates that wait."""
+    """Apply the queued updates to P, V and M."""
     if s.waiting > 0:
         _inform(s)
         _apply_updates(s)
 
 
 def _inform(s: State) -> None:
-    """M ← M + Σ s·sᵀ/S over the updates that wait, of which ``G`` has s/√S."""
+    """M ← M + Σ s·sᵀ/S over the queued updates, whose s/√S are in ``G``."""
     faults = FAULT_KINDS * s.count
     for group in range(_fill_groups(s)):
         k = 4 * group
@@ -305,7 +305,7 @@ def _inform(s: State) -> None:
 
 
 def _fill_groups(s: State) -> int:
-    """Fill the updates that wait with zeros up to a multiple of four; returns a quarter of their number."""
+    """Pad the queued updates with zeros to a multiple of four. Returns the number of groups of four."""
     groups = (s.waiting + 3) // 4
     for one in range(s.waiting, 4 * groups):
         for state in range(s.n):
@@ -316,7 +316,7 @@ def _fill_groups(s: State) -> int:
 
 
 def _apply_updates(s: State) -> None:
-    """P ← P − Σ u·uᵀ and V ← V + Σ u·gᵀ over the updates that wait, four at a time: P is read and written once."""
+    """P ← P − Σ u·uᵀ and V ← V + Σ u·gᵀ over the queued updates, four at a time: P is read and written once."""
     if s.waiting <= 2:
         for one in range(s.waiting):
             _apply_one(s, one)

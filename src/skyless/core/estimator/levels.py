@@ -1,13 +1,13 @@
-"""Protection levels: how wrong a position may be, even if receptions are late (``docs/maths.md`` section 8).
+"""Protection levels: bounds on the position error even if receptions are late (``docs/maths.md`` section 8).
 
 Hypothesis: the tag's receptions of every anchor are late (or early) by a constant of its own, all at once. With the
 faults b̂ and their sensitivities V (``faults``) the estimate under the hypothesis and its covariance are
 
     x + V·b̂        P + V·(M + I/σ_f²)⁻¹·Vᵀ
 
-so the error exceeds |V·b̂| + k·σ with the stated risk only, whichever anchors are at fault. Three kinds are considered:
-constants since an anchor joined, what has begun recently, and what grows for seconds. What is larger than σ_f shows, as
-a jump or in yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then there is no number.
+so the error exceeds |V·b̂| + k·σ only with the stated risk, whichever anchors are at fault. Three kinds are considered:
+constants since an anchor joined, recent changes, and growth over seconds. A fault larger than σ_f is detected as a
+jump or by yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then no level is stated.
 """
 
 from typing import Final
@@ -20,15 +20,15 @@ from skyless.core.native.arithmetic import hypot, sqrt, square
 from skyless.core.ticks import TICK_S
 
 FIRST_TEST: Final = 2
-"""Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``."""
+"""Index of the tests of faults in ``levels``, after ``HPL`` and ``VPL``."""
 
 
 _SWEEPS: Final = 8
-"""Of Jacobi's rotations: each squares what is left off the diagonal."""
+"""Sweeps of Jacobi rotations; each squares what is left off the diagonal."""
 
 
 def protect(s: State) -> None:
-    """Write the levels in metres and the tests of faults."""
+    """Compute the levels in metres and the tests of faults."""
     settings, levels, scale = s.settings, s.levels, covariance_scale(s)
     levels[HPL] = levels[VPL] = 0.0
     for kind in range(FAULT_KINDS):
@@ -61,18 +61,18 @@ def protect(s: State) -> None:
 
 
 def largest_test(s: State) -> float:
-    """The largest test of faults, χ² with as many degrees of freedom as there are anchors if there are none."""
+    """The largest test of faults; without faults χ² with one degree of freedom for each anchor."""
     largest = 0.0
     for kind in range(FAULT_KINDS):
         largest = max(largest, s.levels[FIRST_TEST + kind])
     return largest
 
 
-# Whether the anchors determine on which side of them the tag is
+# Whether the anchors determine on which side of their plane the tag is
 
 
 def fit_plane(s: State) -> None:
-    """Find the plane of least squares through the anchors; where the height is given, the line on the floor plan."""
+    """Fit the least-squares plane through the anchors; with a given height, the line on the floor plan."""
     status = s.status
     for axis in range(AXES):
         status.plane_normal[axis] = 0.0
@@ -96,7 +96,10 @@ def fit_plane(s: State) -> None:
 
 
 def _find_least_axis(s: State, dim: int) -> None:
-    """Write the axis along which the symmetric matrix in ``work`` is smallest into the plane's normal (Jacobi 1846)."""
+    """Write the eigenvector of the matrix in ``work`` with the smallest eigenvalue into the plane's normal.
+
+    By Jacobi's method (1846).
+    """
     M, axes = s.work, AXES
     for one in range(dim):
         for other in range(dim):
@@ -115,13 +118,13 @@ def _find_least_axis(s: State, dim: int) -> None:
 
 
 def _rotate(s: State, dim: int, one: int, other: int) -> None:
-    """Rotate two axes of the matrix in ``work`` so that their common element becomes zero."""
+    """Rotate two axes of the matrix in ``work`` so that their off-diagonal element becomes zero."""
     M = s.work
     half = 0.5 * (M[other][other] - M[one][one]) / M[one][other]
     tangent = (1.0 if half >= 0.0 else -1.0) / (abs(half) + sqrt(half * half + 1.0))
     cosine = 1.0 / sqrt(tangent * tangent + 1.0)
     sine = tangent * cosine
-    for row in range(AXES + dim):  # columns, and of the axes behind the matrix as well
+    for row in range(AXES + dim):  # columns, including those of the axes behind the matrix
         if row < dim or row >= AXES:
             kept = M[row][one]
             M[row][one] = cosine * kept - sine * M[row][other]
@@ -134,10 +137,10 @@ def _rotate(s: State, dim: int, one: int, other: int) -> None:
 
 
 def is_side_open(s: State) -> bool:
-    """Whether the tag and its mirror image behind the anchors' plane, or in 2-D their line, explain the ranges alike.
+    """Whether the tag and its mirror image in the anchors' plane (2-D: line) explain the ranges about equally well.
 
-    Range errors make up for what the tag's clock and a shift of the image, by least squares, leave of the difference.
-    Not where the image lies where the tag cannot be, nor while a sensor measures the height.
+    The tag's clock and a shift of the image absorb the difference by least squares; range errors must explain the rest.
+    Not if the tag cannot be where the image is, nor while a sensor measures the height.
     """
     status, tuning, settings, dim = s.status, s.tuning, s.settings, s.dim
     if (status.epoch_ticks - status.height_ticks) * TICK_S < tuning.sensor_valid_s:
@@ -154,9 +157,9 @@ def is_side_open(s: State) -> bool:
 
 
 def _left_by_image(s: State, off_m: float, variance: float) -> float:
-    """What the tag's clock and a shift of the image leave of the ranges' difference: the sum of squares [m²].
+    """Sum of squares [m²] of the ranges' difference that the tag's clock and a shift of the image leave.
 
-    ``off_m``: from the plane to the tag; ``variance``: of a range.
+    ``off_m``: signed distance of the tag from the plane; ``variance``: of a range.
     """
     settings, dim, normal, left = s.settings, s.dim, s.status.plane_normal, 0.0
     if s.count <= dim:
@@ -196,16 +199,18 @@ def _left_by_image(s: State, off_m: float, variance: float) -> float:
 
 
 def integrity_state(s: State) -> int:
-    """Whether a position's levels can be relied on: ``SOUND``, ``OBSTRUCTED``, ``CONTRADICTED`` or ``UNAVAILABLE``."""
+    """Whether the position's levels are reliable: ``SOUND``, ``OBSTRUCTED``, ``CONTRADICTED`` or ``UNAVAILABLE``."""
     status, tuning = s.status, s.tuning
     state, range_m = SOUND, 0.0
     for anchor in range(s.count):
         range_m += s.anchors[anchor].range_m / s.count
         if s.anchors[anchor].is_obstructed or s.anchors[anchor].has_fault:
             state = OBSTRUCTED
-    was_contradicted = status.fault_std_m[LASTING] > tuning.lasting_std_m  # then none are selected
+    was_contradicted = status.fault_std_m[LASTING] > tuning.lasting_std_m  # then no anchor is selected
     limit = tuning.sure_chi2 if was_contradicted else tuning.uncovered_chi2
-    share = sqrt(s.P[at(0, 0)] + s.P[at(1, 1)]) / max(range_m, 1e-6)  # levels are of first order in it
+    share = sqrt(s.P[at(0, 0)] + s.P[at(1, 1)]) / max(
+        range_m, 1e-6
+    )  # levels are a first-order approximation in this share
     if status.withholds_levels or largest_test(s) > limit:
         state = CONTRADICTED
     if was_contradicted and (status.epoch_ticks - status.start_ticks) * TICK_S < tuning.contradicted_start_s:

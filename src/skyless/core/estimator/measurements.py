@@ -57,24 +57,24 @@ from skyless.core.ticks import SPEED_OF_LIGHT_MPS, SUBTICKS, TICK_M, TICK_MASK, 
 SUBTICK_MASK: Final = SUBTICKS * (TICK_MASK + 1) - 1
 
 SHORTEST_S: Final = 50e-6
-"""Time between two packets of an anchor at least: a frame takes longer."""
+"""Shortest time between two packets of an anchor: a frame takes longer."""
 
 UNUSED, USED, CLOCK_JUMPED = range(3)
-"""What became of a reception; after a jump of its clock the anchor has to join again."""
+"""Outcomes of a reception. After a jump of its clock an anchor has to join again."""
 
 
-# The terms of a measurement
+# Terms of a measurement
 
 
 def add_term(s: State, state: int, weight: float) -> None:
-    """The measurement holds so much of a state."""
+    """Add a term: weight × state."""
     s.h[s.terms] = weight
     s.h_index[s.terms] = state
     s.terms += 1
 
 
 def h_dot_x(s: State, begin: int) -> float:
-    """h·x of the terms from ``begin`` on."""
+    """Sum of h·x over the terms from ``begin`` on."""
     total = 0.0
     for term in range(begin, s.terms):
         total += s.h[term] * s.x[s.h_index[term]]
@@ -82,16 +82,16 @@ def h_dot_x(s: State, begin: int) -> float:
 
 
 def direction_terms(s: State) -> int:
-    """Terms of a distance: the position, the anchor's survey error and, in two dimensions, the height's error."""
+    """Number of terms of a distance: position, survey error and, in 2-D, the height's error."""
     return s.dim + 3
 
 
 def add_direction(s: State, anchor: int, sign: float) -> float:
-    """The measurement holds the distance to an anchor, by the unit vector from there; returns the distance.
+    """Add the distance to an anchor, linearised with the unit vector away from it. Returns the distance.
 
-    The anchor's survey error follows with the opposite sign, and the height's: ``direction_terms`` in all. The vector
-    is that of the held point, of the surveyed anchor and of the given height: were it that of the newest estimate, its
-    noise would seem to give information on what the ranges leave open.
+    The anchor's survey error follows with the opposite sign, and in 2-D the height's error: ``direction_terms`` in all.
+    The vector belongs to the held point, the surveyed anchor and the given height. If it followed the newest estimate,
+    that estimate's noise would seem to carry information on what the ranges leave open.
     """
     a = s.anchors[anchor]
     _hold_direction(s, anchor)
@@ -99,7 +99,7 @@ def add_direction(s: State, anchor: int, sign: float) -> float:
 
 
 def add_direction_from(s: State, anchor: int, sign: float, point_m: Reals, point_range_m: float) -> float:
-    """The same with the direction from a point at a distance from the anchor."""
+    """Like ``add_direction``, with the direction from the anchor to a given point at that range."""
     where, a = s.layout, s.anchors[anchor]
     survey, squared, up_m = where.survey + s.dim * anchor, 0.0, 0.0
     if s.dim == 2:
@@ -116,7 +116,7 @@ def add_direction_from(s: State, anchor: int, sign: float, point_m: Reals, point
 
 
 def _hold_direction(s: State, anchor: int) -> None:
-    """Move the point at which ranges to an anchor are linearised onto the estimate, once that is far enough away."""
+    """Move the point at which ranges to an anchor are linearised to the estimate, once that is far enough away."""
     tuning, a = s.tuning, s.anchors[anchor]
     moved_m2, squared, variance = 0.0, 0.0, 0.0
     if s.dim == 2:
@@ -135,7 +135,7 @@ def _hold_direction(s: State, anchor: int) -> None:
 
 
 def _add_range_errors(s: State, anchor: int, sign: float) -> None:
-    """The measurement holds an anchor's range errors: the part that changes, the part that stays, and the slope."""
+    """Add an anchor's range errors: changing part, constant part and slope."""
     where, from_m = s.layout, s.tuning.slope_from_m
     add_term(s, where.change + anchor, sign)
     add_term(s, where.constant + anchor, sign)
@@ -144,10 +144,10 @@ def _add_range_errors(s: State, anchor: int, sign: float) -> None:
 
 
 def _find_curvature_m(s: State, range_m: float, variance: float) -> float:
-    """Half the position's variance across the direction, over the range: what the range is longer by on average.
+    """Mean excess of the range over its linearisation: half the variance across the direction, over the range.
 
-    The second term of its Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 where that is
-    small compared with that of the stamps. The direction stands in the first terms of the measurement.
+    The second term of the Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 if negligible
+    against the variance of the stamps. The direction is in the first terms of ``h``.
     """
     across = 0.0
     for axis in range(s.dim):
@@ -164,7 +164,7 @@ def _find_curvature_m(s: State, range_m: float, variance: float) -> float:
 
 
 def reception_terms(s: State, anchor: int, has_tx_noise: bool) -> float:
-    """Write the tag's reception of an anchor into ``h``; returns their distance."""
+    """Write the tag's reception of an anchor into ``h``. Returns the distance."""
     s.terms = 0
     range_m = add_direction(s, anchor, 1.0)
     add_term(s, s.layout.offset + anchor, 1.0)
@@ -177,8 +177,8 @@ def reception_terms(s: State, anchor: int, has_tx_noise: bool) -> float:
 def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, variance_factor: float) -> int:
     """Process the tag's reception of an anchor's packet: ``USED``, ``UNUSED`` or ``CLOCK_JUMPED``.
 
-    R − T = |p − a − δa| + b + w + change + constant + slope·far + noise. A reception whose path looks blocked has
-    its variance multiplied; it is gated as any other, as it is late rather than noisy.
+    R − T = |p − a − δa| + b + w + change + constant + slope·far + noise. ``variance_factor`` is above 1 for a reception
+    whose path looks blocked; such a reception is late rather than noisy, so it is gated without the factor.
     """
     tuning, settings, status, where, a = s.tuning, s.settings, s.status, s.layout, s.anchors[anchor]
     elapsed_s = (rx_ticks - a.rx_ticks) * TICK_S
@@ -237,7 +237,7 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
 
 
 def _carry_ticks(s: State, anchor: int) -> None:
-    """Carry whole ticks of an offset to where they stand."""
+    """Move whole ticks of an offset state into ``offset_ticks``."""
     offset = s.layout.offset + anchor
     steps = floor(s.x[offset] / TICK_M)
     s.anchors[anchor].offset_ticks += steps
@@ -245,13 +245,13 @@ def _carry_ticks(s: State, anchor: int) -> None:
 
 
 def _jump(s: State, anchor: int, innovation: float, rx_variance: float) -> float:
-    """An anchor's range error has jumped: back to what it was before it was obstructed, or to something new.
+    """Handle a jump of an anchor's range error: back to the value before an obstruction, or to a new one.
 
-    Obstacles make packets late: an early jump of an anchor that is not known to be obstructed ends an obstruction that
-    has been there since it joined, and all its earlier receptions are considered again.
+    Obstacles make packets late. So an early jump of an anchor not known to be obstructed ends an obstruction that
+    existed since it joined, and all its earlier receptions are reconsidered.
 
-    Returns the innovation that is left. If that is early by more than antennas explain and packets are late often, the
-    range error stays as it is: the first packet, from which the anchor's clock was taken, was late.
+    Returns the remaining innovation. If that is earlier than antennas explain and packets are often late, the range
+    error is not opened: the first packet, which initialised the anchor's clock, was late.
     """
     a, tuning = s.anchors[anchor], s.tuning
     if innovation < 0.0:
@@ -273,10 +273,10 @@ def _jump(s: State, anchor: int, innovation: float, rx_variance: float) -> float
 
 
 def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, variance_factor: float) -> None:
-    """Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
+    """Initialise an anchor's clock: the limit of an update of an unknown offset.
 
-    All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``). Where packets
-    are often late, this one may be, which its variance then counts.
+    The offset then contains all errors of position and range. Its rate follows (``find_rate``). If packets are often
+    late, the variance covers that this one may be.
     """
     settings, where, a = s.settings, s.layout, s.anchors[anchor]
     offset, noise = where.offset + anchor, where.tx_noise + anchor
@@ -302,10 +302,10 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, var
 
 
 def open_state(s: State, state: int, own: int, variance: float) -> None:
-    """Initialise the covariance of a state by a measurement: the limit of an update when nothing was known of it.
+    """Initialise the covariance of a state from a measurement: the limit of an update of an unknown state.
 
-    All errors of the measurement, of that variance, are in it then. ``h`` holds all but the state, which has been
-    reset; P·h of that is the first of ``U``. ``own``: the anchor whose reception by the tag it is, or −1.
+    The state then contains all errors of the measurement, of this variance. ``h`` holds every term but this state,
+    which has been reset; their P·h is the first of ``U``. ``own``: the anchor if the tag received it, or −1.
     """
     compute_fault_input(s, own)
     for other in range(s.n):
@@ -316,11 +316,11 @@ def open_state(s: State, state: int, own: int, variance: float) -> None:
 
 
 def find_rate(s: State, anchor: int, innovation: float, innovation_variance: float, elapsed_s: float) -> None:
-    """Initialise the rate of an anchor's clock by the first measurement of its offset after that of its first packet.
+    """Initialise the rate of an anchor's clock from the first measurement of its offset after its first packet.
 
-    The limit of an update of a rate of which nothing was known: the offset takes all of the innovation. With a variance
-    of the rate in P instead, what is left of it were the difference of large numbers. P·h of the measurement and its
-    shares of faults are the first of ``U`` and ``G``.
+    The limit of an update of an unknown rate, in which the offset takes the whole innovation. With a large variance of
+    the rate in P instead, the result would be a difference of large numbers. The measurement's P·h and fault inputs are
+    the first of ``U`` and ``G``.
     """
     offset, rate, opened = s.layout.offset + anchor, s.layout.rate + anchor, s.U[0]
     update(s, 0.0, innovation_variance)
@@ -338,7 +338,7 @@ def find_rate(s: State, anchor: int, innovation: float, innovation_variance: flo
 
 
 def relay_terms(s: State, listener: int, sender: int, age_s: float, has_tx_noise: bool) -> None:
-    """Write an anchor's reception of another, ``age_s`` ago, into ``h``."""
+    """Write an anchor's reception of another anchor, ``age_s`` ago, into ``h``."""
     where = s.layout
     s.terms = 0
     add_term(s, where.offset + sender, 1.0)
@@ -350,27 +350,25 @@ def relay_terms(s: State, listener: int, sender: int, age_s: float, has_tx_noise
 
 
 def relay_variance(s: State, listener: int, sender: int, age_s: float) -> float:
-    """Variance of such a reception: of its RX stamp, and of what two oscillators have done since."""
+    """Variance of a relay: its RX stamp and the noise of two oscillators since."""
     settings = s.settings
     walk = settings.walk * max(s.anchors[listener].walk_scale, s.anchors[sender].walk_scale)
     return settings.rx_variance_m2 + 2.0 * age_s * (settings.white + walk * age_s * age_s / 3.0)
 
 
 def relay_age_s(s: State, listener: int, sender: int, packet_rx_ticks: Ticks) -> float:
-    """How long ago an anchor received a packet of another, which the tag received as well."""
+    """Time since an anchor received a packet that the tag received too."""
     flown_m = s.anchors[sender].range_m - find_distance_m(s, listener, sender)
     return (s.status.epoch_ticks - packet_rx_ticks) * TICK_S + flown_m / SPEED_OF_LIGHT_MPS
 
 
 def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks: Ticks, rx_ticks: Ticks) -> bool:
-    """Process the reception, by the anchor ``listener``, of a packet of ``sender`` that the tag has received as well.
+    """Process the reception, by ``listener``, of a packet of ``sender`` that the tag received too. True if used.
 
-    Whether it was used.
-
-    S − T = |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + constant of the pair + noise, when the packet reached anchor i. Both offsets go
-    back to that moment by their rates; what their oscillators have done since counts as noise. The pair's constant,
-    in which the survey is, is estimated outside the filter: as both directions of a pair hold it with the same sign
-    and the offsets with opposite ones, neither depends on the other.
+    S − T = |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + constant of the pair + noise, when the packet reached anchor i. Both offsets are
+    extrapolated back to that moment by their rates; the noise of their oscillators since then is added. The pair's
+    constant, which contains the survey error, is estimated outside the filter: both directions of a pair contain it
+    with the same sign and the offsets with opposite signs, so neither depends on the other.
     """
     tuning, settings, status = s.tuning, s.settings, s.status
     i, j, link = s.anchors[listener], s.anchors[sender], _pair(s, listener, sender)
@@ -414,12 +412,12 @@ def relay(s: State, listener: int, sender: int, tx_ticks: Ticks, packet_rx_ticks
 
 
 def _pair(s: State, one: int, other: int) -> Link:
-    """What is kept of two anchors in common, in the row of the lower index."""
+    """The link of two anchors, kept in the row of the lower index."""
     return s.links[min(one, other)][max(one, other)]
 
 
 def find_distance_m(s: State, one: int, other: int) -> float:
-    """How far two anchors are apart in the almanac."""
+    """Distance between two anchors in the almanac."""
     squared = 0.0
     for axis in range(AXES):
         squared += square(s.anchors[one].position_m[axis] - s.anchors[other].position_m[axis])
@@ -427,13 +425,13 @@ def find_distance_m(s: State, one: int, other: int) -> float:
 
 
 def _use(s: State, innovation: float, innovation_variance: float) -> None:
-    """Update by the measurement in ``h``, which is no reception of the tag's, and by what it shows of faults; later."""
+    """Queue an update, and its evidence of faults, by the measurement in ``h``, which is no reception of the tag's."""
     compute_fault_input(s, -1)
     update_later(s, innovation, innovation_variance)
 
 
 def _survey_pair(s: State, one: int, other: int) -> None:
-    """Use the range between two anchors for their survey; anchors that contradict most of theirs are misplaced."""
+    """Use the measured range between two anchors for their survey; an anchor that contradicts most is misplaced."""
     _pair_range(s, one, other)
     contradicted, rival = 0, 0
     for anchor in range(s.count):
@@ -469,7 +467,7 @@ def _pair_range(s: State, one: int, other: int) -> None:
 
 
 def add_pair_survey(s: State, one: int, other: int) -> None:
-    """The measurement holds what survey errors change in the distance of two anchors."""
+    """Add the effect of survey errors on the distance of two anchors."""
     a, b, distance_m = s.anchors[one], s.anchors[other], find_distance_m(s, one, other)
     for axis in range(s.dim):
         towards = (a.position_m[axis] - b.position_m[axis]) / distance_m
@@ -477,16 +475,16 @@ def add_pair_survey(s: State, one: int, other: int) -> None:
         add_term(s, s.layout.survey + s.dim * other + axis, -towards)
 
 
-# An anchor reports what its clock reads against the master's
+# An anchor's report of its clock against the master's
 
 
 def report(s: State, anchor: int, master: int, subticks: Ticks, variance_m2: float) -> None:
-    """Let what an anchor knows of its clock against the master's replace what the filter knows, where that is worse.
+    """Replace the filter's estimate of an anchor's clock against the master's by the anchor's own, if that is better.
 
-    The anchor has received all packets of the master that were relayed to the tag, and more, so its error is
-    uncorrelated with the difference of both estimates, of variance P − q (P: the filter's, q: the anchor's), and the
-    other states change by P_xd/P times that difference. ``subticks``: the anchor's reading less the master's at the
-    packet's TX stamp, modulo 2⁴⁸.
+    The anchor has received all packets of the master that were relayed to the tag, and more. Its error is therefore
+    uncorrelated with the difference of the two estimates, which has the variance P − q (P: the filter's, q: the
+    anchor's), and the other states change by P_xd/P times that difference. ``subticks``: the anchor's reading minus the
+    master's at the packet's TX stamp, modulo 2⁴⁸.
     """
     a, status = s.anchors[anchor], s.status
     finish_updates(s)
@@ -526,9 +524,9 @@ def report(s: State, anchor: int, master: int, subticks: Ticks, variance_m2: flo
 
 
 def difference_terms(s: State, a: int, b: int) -> float:
-    """Write a difference of ranges, to anchor b less to anchor a, into ``h``; returns the difference.
+    """Write a difference of ranges, to anchor b minus to anchor a, into ``h``. Returns the difference.
 
-    Its gradient stands in the first terms, as the other kinds' directions do.
+    Its gradient is in the first terms, like the direction of the other kinds.
     """
     s.terms = 0
     far_m = add_direction(s, b, 1.0)
@@ -545,10 +543,10 @@ def difference_terms(s: State, a: int, b: int) -> float:
 
 
 def difference(s: State, a: int, b: int, rx_ticks: Ticks, difference_m: float) -> int:
-    """Process a ready-made difference of ranges, to anchor b less to anchor a: ``USED`` or ``UNUSED``.
+    """Process a ready-made difference of ranges, to anchor b minus to anchor a: ``USED`` or ``UNUSED``.
 
-    d = |p − b| − |p − a| + range errors of b − those of a + noise. Nothing is estimated of clocks, which whoever made
-    the difference has removed.
+    d = |p − b| − |p − a| + range errors of b − those of a + noise. No clocks are estimated: whoever made the
+    difference has removed them.
     """
     settings, walked_m = s.settings, s.status.walked_m
     a_elapsed_s = (rx_ticks - s.anchors[a].rx_ticks) * TICK_S if s.anchors[a].packets > 0 else 0.0
@@ -578,7 +576,7 @@ def difference(s: State, a: int, b: int, rx_ticks: Ticks, difference_m: float) -
 
 
 def _bound_changes(s: State) -> None:
-    """Move changing parts that are below their bound onto it: the likeliest state of all where nothing is earlier."""
+    """Raise changing parts below their bound to it: the likeliest state if nothing can be earlier."""
     for change in range(s.layout.change, s.layout.constant):
         missing_m = s.settings.earliest_m - s.x[change]
         if missing_m > 0.0:
@@ -590,9 +588,9 @@ def _bound_changes(s: State) -> None:
 
 
 def height(s: State, height_m: float, std_m: float, is_barometer: bool) -> int:
-    """Process the tag's height as a sensor measures it: ``USED`` or ``UNUSED``.
+    """Process the reading of a height sensor: ``USED`` or ``UNUSED``.
 
-    Where a height is given, it corrects that. A barometer's zero is estimated as well, from its first reading on.
+    A given height is corrected by it. A barometer's zero is estimated too, from its first reading on.
     """
     settings, status, where = s.settings, s.status, s.layout
     innovation = height_m - s.x[where.height]
@@ -623,7 +621,7 @@ def height(s: State, height_m: float, std_m: float, is_barometer: bool) -> int:
 
 
 def zero_velocity(s: State) -> None:
-    """Process the knowledge that a stationary tag has no velocity, one axis after the other."""
+    """Process a velocity of zero for a stationary tag, axis by axis."""
     for axis in range(s.dim):
         speed = s.layout.velocity + axis
         s.terms = 0

@@ -1,19 +1,19 @@
-"""Which measurements are used, and how process noise is adapted to innovations.
+"""Which measurements are used, and how process noise adapts to innovations.
 
-It must handle
+Covered are
 
 1. single late receptions, as paths are blocked for a moment: the gate;
-2. an anchor behind an obstacle from now on, and its return: its range error jumps, and is estimated again;
+2. an anchor behind a new obstacle, and its return: its range error jumps and is estimated again;
 3. a person or a wall that obstructs several anchors in turn: a jump raises the process noise of all range errors;
-4. reflections that change as the tag walks: learnt from what range errors differ by from step to step;
-5. a tag that moves more than assumed: innovations stay on one side along an axis;
-6. the tag's oscillator that warms up, at once or slowly: innovations of all anchors are on one side;
-7. an anchor's oscillator that warms up, or its counter that jumps: relays show it;
-8. a tag that stands still, so that noise does not move it;
-9. all that does not fit any of these: covariances grow with the mean NIS.
+4. reflections that change as the tag walks: learnt from the differences of range errors from step to step;
+5. a tag that moves more than assumed: innovations along an axis stay on one side;
+6. the tag's oscillator warming up, suddenly or slowly: innovations of all anchors are on one side;
+7. an anchor's oscillator warming up, or its counter jumping: relays show it;
+8. a tag at rest, which noise must not move;
+9. everything else: covariances grow with the mean NIS.
 
-Anchors that are late from the start, or ever more, without a jump are found by ``faults``. ``docs/estimator_table.md``
-says what each of these buys.
+Anchors that are late from the start, or increasingly late without a jump, are found by ``faults``.
+``docs/estimator_table.md`` shows what each mechanism buys.
 """
 
 from typing import Final
@@ -24,8 +24,8 @@ from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, at, make_
 from skyless.core.native.arithmetic import log, sqrt, square
 
 _PLACE_LIMIT: Final = 2.0
-"""A comparison of range errors counts as this many times their mean at most, as jumps are not multipath."""
-_PLACE_LIMITED_MEAN: Final = 0.7421917  # of χ² with one degree of freedom where no value counts as more than that
+"""Squared differences of range errors are limited to this multiple of their mean, as jumps are not multipath."""
+_PLACE_LIMITED_MEAN: Final = 0.7421917  # mean of χ² with one degree of freedom, limited to that
 
 
 def is_warm(s: State) -> bool:
@@ -34,7 +34,7 @@ def is_warm(s: State) -> bool:
 
 
 def note_outlier(s: State, anchor: int, innovation: float, innovation_variance: float) -> None:
-    """Count the receptions of an anchor in a row that are off by the same amount."""
+    """Count consecutive receptions of an anchor that are off by the same amount."""
     a, tuning, settings = s.anchors[anchor], s.tuning, s.settings
     if innovation * innovation <= square(tuning.suspect) * innovation_variance:
         a.outliers_in_row = 0
@@ -48,15 +48,15 @@ def note_outlier(s: State, anchor: int, innovation: float, innovation_variance: 
 
 
 def has_jumped(s: State, anchor: int) -> bool:
-    """Whether enough receptions in a row are off to show that the anchor's range error has jumped."""
+    """Whether enough consecutive receptions are off to show that the anchor's range error has jumped."""
     needed = s.tuning.in_row_where_late if is_late_often(s) else s.tuning.in_row
     return s.anchors[anchor].outliers_in_row >= needed
 
 
 def is_common(s: State, normalised: float) -> bool:
-    """Whether the newest innovations of all anchors but one, which may show nothing, lie on the side of this one.
+    """Whether the newest innovations of all anchors but at most one small one are on the side of this innovation.
 
-    The tag's clock it is then. A faulty anchor draws the others to the opposite side of its own.
+    The tag's clock is the cause then. A faulty anchor draws the others to the opposite side of its own.
     """
     others = 0
     for anchor in range(s.count):
@@ -69,17 +69,17 @@ def is_common(s: State, normalised: float) -> bool:
 
 
 def is_of_clock(s: State, anchor: int, innovation: float) -> bool:
-    """Whether it is an anchor's clock that has jumped, and not its range error.
+    """Whether the anchor's clock has jumped rather than its range error.
 
-    Then the mean of its relays' innovations is off zero with the sign of its reception's. After a jump of the range
-    error it has the opposite sign: the receptions have pulled the clock's estimate away from what relays show.
+    The mean of its relays' innovations is then off zero with the sign of its reception's. After a jump of the range
+    error the sign is opposite: the receptions have pulled the clock's estimate away from what relays show.
     """
     relay_mean = s.anchors[anchor].relay_mean
     return _is_off_zero(s, relay_mean) and relay_mean * innovation > 0.0
 
 
 def open_range_error(s: State, anchor: int, innovation: float) -> None:
-    """Let an anchor's range error be estimated again from a jump on."""
+    """Estimate an anchor's range error again after a jump."""
     change = s.layout.change + anchor
     s.status.obstructions += 1
     begin_obstruction(s, anchor)
@@ -95,19 +95,19 @@ def adapt_change_noise(s: State, anchor: int, normalised: float) -> None:
 
 
 def _adapted(s: State, scale: float, is_too_small: bool, largest: float) -> float:
-    """Factor on process noise after an innovation, which says whether that is too small."""
+    """Factor on process noise after an innovation, which shows whether the noise is too small."""
     scale *= s.tuning.noise_growth if is_too_small else s.tuning.noise_loss
     return min(max(scale, 1.0), largest)
 
 
 def _is_off_zero(s: State, mean: float) -> bool:
-    """Whether a running mean of normalised innovations is further off zero than chance makes it."""
+    """Whether a running mean of normalised innovations is farther from zero than chance explains."""
     gain = s.tuning.mean_gain
     return mean * mean * (2.0 - gain) / gain > square(s.tuning.suspect)
 
 
 def end_small_obstruction(s: State, anchor: int) -> None:
-    """End an obstruction that has gone without a jump back: the range error is known, and is hardly there."""
+    """End an obstruction that has disappeared without a jump: the range error is known and close to zero."""
     tuning, a, change = s.tuning, s.anchors[anchor], s.layout.change + anchor
     error_m, variance, usual = s.x[change], s.P[at(change, change)], s.status.place_variance_m2
     settled = a.is_obstructed and variance < square(tuning.ended_std_m) + usual
@@ -137,15 +137,15 @@ def note_innovation(s: State, innovation: float, innovation_variance: float, is_
 
 
 def is_within_gate(s: State, normalised: float) -> bool:
-    """Whether a normalised innovation is small enough to be used; NaN is not."""
+    """Whether a normalised innovation is within the gate; False for NaN."""
     return -s.settings.gate <= normalised <= s.settings.gate
 
 
 def variance_scale(s: State, normalised: float, is_difference: bool) -> float:
     """Factor on the variance of a measurement with this normalised innovation; 0 beyond the gate.
 
-    Large innovations have less weight where receptions are late often, and always in time differences, of which
-    either anchor may be late.
+    Large innovations are down-weighted if receptions are often late, and always in time differences, of which either
+    anchor may be late.
     """
     tuning = s.tuning
     if not is_within_gate(s, normalised):
@@ -156,9 +156,9 @@ def variance_scale(s: State, normalised: float, is_difference: bool) -> float:
 
 
 def adapt_change_variance(s: State, anchor: int, elapsed_s: float) -> None:
-    """Let the variance of an anchor's changing range error track its estimate: the mean of its square.
+    """Track the variance of an anchor's changing range error: the mean square of its estimate.
 
-    The maximisation step of expectation maximisation (Shumway and Stoffer 1982) with a memory that fades.
+    The maximisation step of expectation maximisation (Shumway and Stoffer 1982) with fading memory.
     """
     tuning, settings, a = s.tuning, s.settings, s.anchors[anchor]
     memory_s = settings.change_memory_s
@@ -172,10 +172,10 @@ def adapt_change_variance(s: State, anchor: int, elapsed_s: float) -> None:
 
 
 def learn_place(s: State, anchor: int, residual_m: float) -> None:
-    """Learn how range errors change with the distance walked, from what they differ by after one and two steps.
+    """Learn how range errors change with walked distance, from their differences after one and after two steps.
 
-    Half the mean square of the differences is noise + σ²·(1 − c) after one step and noise + σ²·(1 − c²) after two, for
-    a Gauss–Markov process of variance σ² with the correlation c over a step (a semivariogram, Matheron 1963).
+    For a Gauss–Markov process of variance σ² with correlation c over a step, half the mean square difference is noise +
+    σ²·(1 − c) after one step and noise + σ²·(1 − c²) after two (a semivariogram, Matheron 1963).
     """
     tuning, settings, status, a = s.tuning, s.settings, s.status, s.anchors[anchor]
     step_m = status.walked_m - a.place_walked_m
@@ -204,7 +204,7 @@ def learn_place(s: State, anchor: int, residual_m: float) -> None:
 
 
 def update_stationary(s: State, dt: float) -> None:
-    """Count for how long the tag has shown no motion: neither its position, nor innovations that stay on one side."""
+    """Update the time without motion, shown by the position or by innovations that stay on one side."""
     status, tuning, chi2 = s.status, s.tuning, 0.0
     for axis in range(s.dim):
         chi2 += square(s.x[axis] - status.stationary_m[axis]) / s.P[at(axis, axis)]
@@ -212,7 +212,7 @@ def update_stationary(s: State, dt: float) -> None:
     moved = chi2 > s.dim or status.lag_square > tuning.lag_limit or status.rejected_in_row > 1
     if moved:
         status.stationary_s = 0.0
-    for axis in range(s.dim):  # a place that has become known better moves as well
+    for axis in range(s.dim):  # also if the position has become better known
         if moved or s.P[at(axis, axis)] < tuning.better_known * status.stationary_m2[axis]:
             status.stationary_m[axis] = s.x[axis]
             status.stationary_m2[axis] = s.P[at(axis, axis)]
@@ -221,7 +221,7 @@ def update_stationary(s: State, dt: float) -> None:
 def adapt_process_noise(s: State, normalised: float) -> None:
     """Adapt the process noise of the tag's motion and clock to an innovation.
 
-    The direction to the anchor stands in ``h``, the first of the measurement's terms.
+    The direction to the anchor is in the first terms of ``h``.
     """
     tuning, status = s.tuning, s.status
     gain, lag_square = tuning.mean_gain, 0.0
@@ -237,14 +237,14 @@ def adapt_process_noise(s: State, normalised: float) -> None:
 
 
 def adapt_clock_noise(s: State, anchor: int, normalised: float) -> None:
-    """Adapt the process noise of an anchor's clock to what a relay shows of it."""
+    """Adapt the process noise of an anchor's clock to a relay's innovation."""
     a = s.anchors[anchor]
     a.relay_mean += s.tuning.mean_gain * (normalised - a.relay_mean)
     a.walk_scale = _adapted(s, a.walk_scale, _is_off_zero(s, a.relay_mean), s.tuning.max_walk_scale)
 
 
 def covariance_scale(s: State) -> float:
-    """Factor on the position's covariance while innovations are larger than the filter expects.
+    """Factor on the position's covariance while innovations are larger than expected.
 
     Most of an innovation is the stamps' noise, so the state errs by more than the innovations show.
     """

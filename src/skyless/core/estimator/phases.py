@@ -1,16 +1,16 @@
-"""The phase of the carrier: what a reception shows besides its stamp, 20 times as fine but modulo a wavelength.
+"""Carrier phase: 20 times as precise as a stamp, but known only modulo a wavelength.
 
     R − X  =  |p − a| + b + ambiguity + noise                 (mod λ)      (the tag receives an anchor)
     S − X  =  |aᵢ − aⱼ| + bⱼ − bᵢ + ambiguity + noise         (mod λ)      (anchor i receives its partner j)
 
-X is when the sender's counter says that the frame left: carriers start at a phase that the counter gives, so the noise
-of its TX stamp is not in it. An ambiguity holds what is constant as long as both radios keep their supply, and what
-reflections add, which changes as the tag walks. It stays a real number: as the tag walks, directions to the anchors
-turn, and ranges that are known to millimetres but for a constant tell where it is. ``docs/maths.md`` section 6.7.
+X is the sender's counter when the frame leaves: the carrier starts at a phase given by the counter, so the noise of the
+TX stamp is not in it. An ambiguity contains what is constant while both radios keep their supply, and the effect of
+reflections, which changes as the tag walks. It is estimated as a real number: as the tag walks, directions to the
+anchors turn, and ranges known to millimetres up to a constant determine the position. ``docs/maths.md`` section 6.7.
 
-A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase counts only with a stamp that
-was used, where it is predicted to a tenth of a wavelength; else its ambiguity begins again, from which nothing is
-learnt. Where stamps contradict, all begin again.
+A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase is used only together with a
+stamp that was used, and only if it is predicted to a tenth of a wavelength; otherwise its ambiguity starts again, which
+provides no information. If stamps contradict the state, all ambiguities start again.
 """
 
 from typing import Final
@@ -32,15 +32,15 @@ from skyless.core.native.records import Reals, Ticks
 from skyless.core.ticks import TICK_M, TICK_S
 
 CYCLE_TICKS: Final = 128
-"""Whole cycles of each channel's carrier fit into this number of ticks: ``EstimatorSettings.carrier_cycles``."""
+"""Number of ticks with a whole number of carrier cycles in every channel: ``EstimatorSettings.carrier_cycles``."""
 _TWO_PI: Final = 6.283185307179586
 
 PHASE_BEGINS, PHASE_REFUSED, PHASE_USED = range(3)
-"""What became of a phase."""
+"""Outcomes of a phase."""
 
 
 def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
-    """Process the phase of a reception of the tag's whose stamp was used; it is in [0, 1) and falls as stamps grow."""
+    """Process the phase, in [0, 1), of a reception of the tag's whose stamp was used. It falls as stamps grow."""
     status, tuning, a = s.status, s.tuning, s.anchors[anchor]
     use_phases(s)
     finish_updates(s)
@@ -71,9 +71,9 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
 
 
 def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, phase_cycles: float) -> None:
-    """Process the phase of an anchor's reception of its partner, whose stamp was used; of others' it does nothing.
+    """Process the phase of an anchor's reception of its partner, whose stamp was used; ignore other senders.
 
-    The partner is the anchor of lowest identifier that it relays, so that all clocks are tied to one.
+    The partner is the relayed anchor of lowest identifier, so that all clocks are tied to one.
     """
     i, j, settings, where = s.anchors[listener], s.anchors[sender], s.settings, s.layout
     finish_updates(s)
@@ -94,7 +94,7 @@ def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, ph
 
 
 def _whole_cycles(s: State, ticks: Ticks) -> float:
-    """Cycles in whole ticks, in [0, 1)."""
+    """Fractional cycles, in [0, 1), of a number of ticks."""
     return ((ticks & (CYCLE_TICKS - 1)) * s.settings.carrier_cycles) % CYCLE_TICKS / CYCLE_TICKS
 
 
@@ -103,12 +103,12 @@ def _wavelength_m(s: State) -> float:
 
 
 def _certain_m2(s: State) -> float:
-    """Variance of a prediction up to which there is no doubt of the cycle."""
+    """Largest variance of a prediction that leaves no doubt of the cycle."""
     return square(s.tuning.phase_share * _wavelength_m(s))
 
 
 def _innovation_m(s: State, cycles: float, expected_m: float) -> float:
-    """By how much a phase is off what is expected, without whole cycles."""
+    """Difference between a phase and its prediction, to the nearest cycle."""
     off = cycles - expected_m / _wavelength_m(s)
     return (off - floor(off + 0.5)) * _wavelength_m(s)
 
@@ -135,7 +135,7 @@ def _use_phase(s: State, state: int, one: Ambiguity, innovation: float, variance
 
 
 def _limit_m2(s: State, variance: float) -> float:
-    """Square of the innovation beyond which a phase is more likely random than noisy, or could be a cycle off."""
+    """Squared innovation beyond which a phase is more likely random than noisy, or may be off by a cycle."""
     gate_squared = square(s.settings.gate)
     odds = min(s.status.wild_share, 0.5) * sqrt(_TWO_PI * variance) / _wavelength_m(s)
     if odds > 1e-6:
@@ -144,7 +144,7 @@ def _limit_m2(s: State, variance: float) -> float:
 
 
 def _learn_noise(s: State, shown_m2: float) -> None:
-    """Let the variance of phases follow what innovations show beyond their prediction: reflections differ in size."""
+    """Adapt the variance of phases to innovations beyond their prediction: reflections differ in size."""
     tuning, status = s.tuning, s.status
     status.phase_variance_m2 += tuning.slow_forgetting * (shown_m2 - status.phase_variance_m2)
     status.phase_variance_m2 = min(
@@ -154,7 +154,7 @@ def _learn_noise(s: State, shown_m2: float) -> None:
 
 
 def _may_count(s: State) -> bool:
-    """Whether the tag's phases may count: neither just after the start nor where stamps contradict the state."""
+    """Whether the tag's phases may be used: neither just after the start nor while stamps contradict the state."""
     status, tuning = s.status, s.tuning
     if status.mean_nis > tuning.wrong_nis:
         close_phases(s)
@@ -163,13 +163,13 @@ def _may_count(s: State) -> bool:
 
 
 def close_phases(s: State) -> None:
-    """Let all ambiguities of the tag's phases begin again: what they were taken for may be wrong by cycles."""
+    """Restart all ambiguities of the tag's receptions, which may be wrong by cycles."""
     for anchor in range(s.count):
         s.anchors[anchor].own.is_known = s.anchors[anchor].has_former = False
 
 
 def _measure_way(s: State) -> None:
-    """Add a step to the tag's way where it has gone so far."""
+    """Add a step to the tag's way once it has moved by its length."""
     squared = 0.0
     for axis in range(s.dim):
         squared += square(s.x[axis] - s.status.step_m[axis])
@@ -180,10 +180,10 @@ def _measure_way(s: State) -> None:
 
 
 def _follow_line(s: State) -> None:
-    """See that the point at which phases are linearised is near the tag.
+    """Keep the point at which phases are linearised near the tag.
 
-    It moves as the tag does, but not as estimates of its place are corrected. Were it the newest estimate, corrections
-    would turn the directions to the anchors, and phases would seem to show where the tag is.
+    The point moves as the tag does, but not with corrections of the estimate. At the newest estimate, corrections would
+    turn the directions to the anchors, and phases would seem to measure the position.
     """
     away_m2, is_in_use = 0.0, False
     for axis in range(s.dim):
@@ -204,9 +204,9 @@ def _follow_line(s: State) -> None:
 
 
 def _turn(s: State, anchor: int, ambiguity: int) -> None:
-    """Let an ambiguity's error hold that of the place by the direction from the estimate instead of that from the line.
+    """Change the direction to which an ambiguity's error refers, from that of the line to that of the estimate.
 
-    a ← a − (h' − h)·(p − δa): what is known of the place by itself does not change.
+    a ← a − (h' − h)·(p − δa): the information on the position itself does not change.
     """
     a, survey = s.anchors[anchor], s.layout.survey + s.dim * anchor
     old_m, new_m = _line_range_m(s, anchor, s.status.line_m), _line_range_m(s, anchor, s.x)
@@ -217,7 +217,7 @@ def _turn(s: State, anchor: int, ambiguity: int) -> None:
 
 
 def _subtract(s: State, state: int, other: int, weight: float) -> None:
-    """A state's error loses so much of that of another."""
+    """Subtract ``weight`` times another state's error from a state's error."""
     s.P[at(state, state)] -= weight * s.P[at(other, state)]
     for one in range(s.n):
         if one != state:
@@ -228,7 +228,7 @@ def _subtract(s: State, state: int, other: int, weight: float) -> None:
 
 
 def _line_range_m(s: State, anchor: int, point_m: Reals) -> float:
-    """Distance of a point, at the given height, from an anchor."""
+    """Distance of a point, at the given height in 2-D, from an anchor."""
     a, squared = s.anchors[anchor], 0.0
     if s.dim == 2:
         squared += square(s.settings.height_m - a.position_m[2])
@@ -238,7 +238,7 @@ def _line_range_m(s: State, anchor: int, point_m: Reals) -> float:
 
 
 def _phase_terms(s: State, anchor: int) -> float:
-    """Write a phase of the tag's into ``h``; returns what is expected of it but for whole ticks of the offset."""
+    """Write a phase of the tag's into ``h``. Returns its prediction without whole ticks of the offset."""
     s.terms = 0
     line_m = s.status.line_m
     range_m = add_direction_from(s, anchor, 1.0, line_m, _line_range_m(s, anchor, line_m))
@@ -249,10 +249,10 @@ def _phase_terms(s: State, anchor: int) -> float:
 
 
 def _open(s: State, state: int, one: Ambiguity, innovation: float, variance: float) -> None:
-    """Let an ambiguity, the last term of ``h``, begin, so that this phase is as expected."""
+    """Start an ambiguity, the last term of ``h``, so that this phase agrees with it."""
     s.status.phases_opened += 1
     one.is_known = True
-    one.refused_in_row = int(s.tuning.phases_in_row) - 1  # one that the next does not confirm was wrong
+    one.refused_in_row = int(s.tuning.phases_in_row) - 1  # if the next phase does not confirm this one, it was wrong
     ambiguity_m = s.x[state] + innovation
     reset_state(s, state, 0.0)
     s.terms -= 1
@@ -260,11 +260,11 @@ def _open(s: State, state: int, one: Ambiguity, innovation: float, variance: flo
     s.x[state] = ambiguity_m
 
 
-# By how many cycles an ambiguity has changed over a gap
+# Resolving the cycles lost in a gap
 
 
 def _keep_former(s: State, anchor: int) -> None:
-    """Keep an ambiguity that ends, unless there is one already that has not been kept for long."""
+    """Keep an ambiguity that ends, unless a recent one is kept already."""
     a, former, ambiguity = s.anchors[anchor], s.layout.former + anchor, s.layout.ambiguity + anchor
     if a.has_former and _former_age_s(s, anchor) < s.tuning.phase_former_s:
         return
@@ -282,9 +282,9 @@ def _former_age_s(s: State, anchor: int) -> float:
 
 
 def _rejoin(s: State, anchor: int) -> None:
-    """Let an ambiguity and its former one be the same but for whole cycles, once their number is beyond doubt.
+    """Equate an ambiguity and its former one up to whole cycles, once their number is beyond doubt.
 
-    What was received after a gap shows how clocks and tag have moved within it.
+    Receptions after a gap show how clocks and tag have moved within it.
     """
     a = s.anchors[anchor]
     if _former_age_s(s, anchor) > s.tuning.phase_former_s:
@@ -308,9 +308,9 @@ def _rejoin(s: State, anchor: int) -> None:
 
 
 def known_phase(s: State, anchor: int, walked_m: float) -> None:
-    """Process a phase at the tag's true position, with an innovation of zero, for a bound: there are no cycles.
+    """Process a phase at the tag's true position with an innovation of zero, for a bound without cycles.
 
-    ``walked_m``: since the phase before of this anchor. Noise and wander are as stated.
+    ``walked_m``: since this anchor's last phase. Noise and wander are as stated.
     """
     ambiguity = s.layout.ambiguity + anchor
     for axis in range(s.dim):
@@ -321,6 +321,6 @@ def known_phase(s: State, anchor: int, walked_m: float) -> None:
 
 
 def expected_phase(s: State, anchor: int) -> float:
-    """The phase that is expected of a reception, in cycles: ``own_phase`` then has an innovation of zero."""
+    """The predicted phase of a reception in cycles, for which ``own_phase`` has an innovation of zero."""
     expected_m = _phase_terms(s, anchor)
     return -(expected_m / _wavelength_m(s) + _whole_cycles(s, s.anchors[anchor].offset_ticks))

@@ -1,4 +1,4 @@
-"""What the estimator does with a packet, a ready-made difference or a height; and with many packets in one loop."""
+"""Processing a packet, a ready-made difference or a height; and a batch of packets in one loop."""
 
 from typing import Annotated, Final
 
@@ -47,44 +47,44 @@ from skyless.core.native.records import (
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S, nearest
 
 REJECTED, ACCEPTED, JOINED, STALE, RESTARTED_CLOCK = range(5)
-"""What became of a packet; after the last its anchor joins again, and the packet is processed again."""
+"""Outcomes of a packet. After the last one its anchor joins again and the packet is processed again."""
 
 MAX_RATE_MPS: Final = 100e-6 * SPEED_OF_LIGHT_MPS  # between two clocks that are still crystals
 
 
 @record
 class Place(Record):
-    """An anchor and where it stands."""
+    """An anchor and its position."""
 
     anchor: int
     """Identifier."""
     position_m: Annotated[Reals, AXES]
     std_m: float
-    """Standard deviation of each coordinate; below 0 for that of the settings."""
+    """Standard deviation of each coordinate; if negative, that of the settings."""
     is_open: bool
     """Whether it joins with range errors beyond those of the settings."""
 
 
 @record
 class Relay(Record):
-    """When an anchor, that of the packet as a rule, received a packet of another."""
+    """One anchor's reception of another's packet. The listener is usually the sender of the packet with the relay."""
 
     listener: int
-    """Identifier of the one that received it."""
+    """Identifier of the receiving anchor."""
     anchor: int
-    """Identifier of the other."""
+    """Identifier of the received anchor."""
     sequence: int
     rx_ticks: Ticks
-    """The listener's stamp, unwrapped; where it is short its lowest bits (``relay_rx_ticks``)."""
+    """The listener's stamp: unwrapped, or only the lowest bits if it is short (``relay_rx_ticks``)."""
     is_short: bool
     has_phase: bool
     phase_cycles: float
-    """Phase of the carrier as the listener received it, in [0, 1)."""
+    """Carrier phase as the listener received it, in [0, 1)."""
 
 
 @record
 class ScaledTime(Record):
-    """A TX time on a scale that packets of several anchors have in common."""
+    """A TX time on a scale common to packets of several anchors."""
 
     ticks: Ticks
     fraction_ticks: float
@@ -93,42 +93,42 @@ class ScaledTime(Record):
 
 @record
 class Packet(Record):
-    """A packet that the tag received; all stamps are unwrapped."""
+    """A packet received by the tag, with unwrapped stamps."""
 
     place: Place
     sequence: int
     rx_ticks: Ticks
-    """The tag's stamp."""
+    """RX time on the tag's clock."""
     tx_ticks: Ticks
-    """The anchor's own."""
+    """TX time on the anchor's own clock."""
     variance_factor: float
-    """On the variance of the tag's reception."""
+    """Factor on the variance of the tag's reception."""
     has_phase: bool
     phase_cycles: float
-    """Phase of the carrier as the tag received it, in [0, 1)."""
+    """Carrier phase as the tag received it, in [0, 1)."""
     master: int
-    """Identifier of the anchor against whose clock this one reports its own; −1 where it reports nothing."""
+    """Identifier of the anchor against whose clock this one reports its own; −1 without a report."""
     subticks: Ticks
-    """The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸."""
+    """The anchor's reading minus the master's at the packet's TX stamp, modulo 2⁴⁸."""
     report_variance_m2: float
     is_stated: bool
     """Whether the anchor states its TX time on the master's scale …"""
     stated: ScaledTime
     """… and that time, which only starts use."""
     relays_have_phases: bool
-    """Whether its frame carries phases of its relays, and short stamps."""
+    """Whether its frame carries phases in its relays, and therefore short stamps."""
 
 
 @record
 class Relays(Record):
-    """What came with a packet."""
+    """The relays of a packet."""
 
     count: int
     rows: Annotated[Array[Relay], MAX_RELAYS]
 
 
 def leave(s: State, identifier: int) -> None:
-    """Let an anchor leave the state, if it is there."""
+    """Remove an anchor from the state, if it is there."""
     anchor = find_anchor(s, identifier)
     if anchor >= 0:
         remove_anchor(s, anchor)
@@ -139,20 +139,20 @@ def leave(s: State, identifier: int) -> None:
 
 
 def process(s: State, packet: Packet, relays: Relays) -> int:
-    """Process a packet and what it relays; returns what became of it, and leaves ``levels`` and ``fix``."""
+    """Process a packet and its relays. Returns the outcome and fills ``levels`` and ``fix``."""
     outcome = _process_packet(s, packet, relays)
     fill_fix(s)
     return outcome
 
 
 def process_frame(s: State, packet: Packet, relays: Relays, packed: Bytes, packed_bytes: int) -> int:
-    """``process`` with more relays, as frames carry them."""
+    """``process`` with further relays, encoded as in a frame."""
     take_relays(packet, relays, packed, packed_bytes)
     return process(s, packet, relays)
 
 
 def take_relays(packet: Packet, relays: Relays, packed: Bytes, packed_bytes: int) -> None:
-    """Add relays as frames carry them to those of a packet, as far as there is space."""
+    """Append encoded relays to those of a packet, as far as there is space."""
     for begin in range(0, packed_bytes, HEARD_BYTES):
         if relays.count < MAX_RELAYS:
             relayed = relays.rows[relays.count]
@@ -172,13 +172,13 @@ def take_relays(packet: Packet, relays: Relays, packed: Bytes, packed_bytes: int
 def relay_rx_ticks(relayed: Relay, tx_ticks: Ticks, elapsed: Ticks) -> Ticks:
     """The unwrapped stamp of a relay.
 
-    ``tx_ticks`` is the listener's stamp of a packet that the tag received ``elapsed`` later than the relayed one.
+    ``tx_ticks`` is the listener's stamp of a packet that the tag received ``elapsed`` after the relayed one.
     """
     return nearest(relayed.rx_ticks, tx_ticks - elapsed, SHORT_BITS) if relayed.is_short else relayed.rx_ticks
 
 
 def _process_packet(s: State, packet: Packet, relays: Relays) -> int:
-    """Process a packet; its anchor joins where it is not in the state."""
+    """Process a packet. Its anchor joins if it is not in the state."""
     status, place = s.status, packet.place
     if status.packets > 0 and packet.rx_ticks < status.epoch_ticks:
         status.stale += 1
@@ -198,7 +198,7 @@ def _process_packet(s: State, packet: Packet, relays: Relays) -> int:
 
 
 def _present(s: State, place: Place) -> int:
-    """The index of an anchor, which joins where it is not in the state, or has moved; −1 where there is no room."""
+    """The index of an anchor, which is added or moved if needed; −1 if there is no room."""
     anchor, is_new = find_anchor(s, place.anchor), False
     if anchor < 0 and s.count < MAX_ANCHORS:
         anchor, is_new = add_anchor(s, place.anchor, place.position_m, place.std_m, place.is_open), True
@@ -212,7 +212,7 @@ def _present(s: State, place: Place) -> int:
 
 
 def _remove_silent(s: State, rx_ticks: Ticks) -> None:
-    """Let anchors leave that have been silent for too long."""
+    """Remove anchors that have been silent for too long."""
     for anchor in range(s.count - 1, -1, -1):
         a = s.anchors[anchor]
         if a.packets > 0 and (rx_ticks - a.rx_ticks) * TICK_S > s.settings.drop_s:
@@ -260,7 +260,7 @@ def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
 
 
 def _admit(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> int:
-    """``JOINED`` or ``ACCEPTED`` for a packet that can be processed; for others what becomes of them, counted."""
+    """Return ``JOINED`` or ``ACCEPTED`` for a packet that can be processed; otherwise count and return its outcome."""
     a, status = s.anchors[anchor], s.status
     if a.packets == 0:
         return JOINED
@@ -278,7 +278,7 @@ def _admit(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> int:
 
 
 def _is_impossible(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> bool:
-    """Whether no clock can have gone from an anchor's newest packet to this one."""
+    """Whether no clock can have got from the anchor's newest packet to this one."""
     a = s.anchors[anchor]
     elapsed = rx_ticks - a.rx_ticks
     change_m = abs(elapsed - (tx_ticks - a.tx_ticks)) * TICK_M
@@ -286,7 +286,7 @@ def _is_impossible(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> b
 
 
 def _keep_packet(s: State, anchor: int, packet: Packet) -> None:
-    """Keep what later packets and relays of this one need."""
+    """Keep what later packets of the anchor, and relays of this one, need."""
     a, kept = s.anchors[anchor], s.packets[anchor][packet.sequence % PACKETS_KEPT]
     a.packets += 1
     a.tx_ticks = packet.tx_ticks
@@ -298,7 +298,7 @@ def _keep_packet(s: State, anchor: int, packet: Packet) -> None:
 
 
 def _process_relay(s: State, relayed: Relay) -> None:
-    """Process a relayed reception once, if the tag has received that very packet."""
+    """Process a relay once, if the tag has received that packet."""
     listener, sender = find_anchor(s, relayed.listener), find_anchor(s, relayed.anchor)
     if listener < 0 or sender < 0 or sender == listener or not s.anchors[listener].has_rate:
         return
@@ -314,7 +314,7 @@ def _process_relay(s: State, relayed: Relay) -> None:
 
 
 def _check_motion_and_faults(s: State, elapsed_s: float) -> None:
-    """Check whether the tag stands still and, once in a round of packets, for faults.
+    """Check whether the tag is stationary and, once a round of packets, whether there are faults.
 
     An anchor whose clock is wrong leaves the state, to join again with its next packet.
     """
@@ -333,7 +333,7 @@ def _check_motion_and_faults(s: State, elapsed_s: float) -> None:
 
 
 def fill_fix(s: State) -> None:
-    """Write all that a fix carries."""
+    """Fill the rows of a fix."""
     velocity, scale = s.layout.velocity, covariance_scale(s)
     for one in range(s.dim):
         s.fix[POSITION][one] = s.x[one]
@@ -356,7 +356,7 @@ def fill_fix(s: State) -> None:
 
 
 def process_difference(s: State, a: Place, b: Place, rx_ticks: Ticks, difference_m: float) -> int:
-    """Process a ready-made difference of ranges, to anchor b less to anchor a, and leave all that a fix carries."""
+    """Process a ready-made difference of ranges, to anchor b minus to anchor a, and fill the rows of a fix."""
     status = s.status
     if rx_ticks < status.epoch_ticks:
         status.stale += 1
@@ -380,7 +380,7 @@ def process_difference(s: State, a: Place, b: Place, rx_ticks: Ticks, difference
 
 
 def _note_difference(s: State, anchor: int, rx_ticks: Ticks) -> None:
-    """An anchor was used in a difference."""
+    """Record the use of an anchor in a difference."""
     a = s.anchors[anchor]
     a.packets += 1
     a.rx_ticks = rx_ticks
@@ -388,7 +388,7 @@ def _note_difference(s: State, anchor: int, rx_ticks: Ticks) -> None:
 
 
 def process_height(s: State, height_m: float, std_m: float, is_barometer: bool) -> int:
-    """Process a sensor's height of the tag, and leave all that a fix carries."""
+    """Process a height sensor's reading, and fill the rows of a fix."""
     outcome = ACCEPTED if height(s, height_m, std_m, is_barometer) == USED else REJECTED
     fill_fix(s)
     return outcome
@@ -402,7 +402,7 @@ class BatchPacket(Record):
     """A packet of a batch."""
 
     place: int
-    """Row of its anchor in the table of places."""
+    """Index of its anchor in the table of places."""
     sequence: int
     rx_ticks: Ticks
     tx_ticks: Ticks
@@ -410,7 +410,7 @@ class BatchPacket(Record):
     has_phase: bool
     phase_cycles: float
     end: int
-    """Where its relays end in their table; they begin where those of the packet before end."""
+    """End of its relays in their table; they begin at the end of the previous packet's."""
 
 
 @record
@@ -421,7 +421,7 @@ class BatchRow(Record):
     velocity_mps: Annotated[Reals, AXES]
     covariance_m2: Annotated[Matrix, AXES, AXES]
     levels: Annotated[Reals, LEVELS]
-    """As ``protect`` writes them, where they are asked for."""
+    """As written by ``protect``, if requested."""
     integrity: int
     outcome: int
 
@@ -435,7 +435,7 @@ def track(
     count: int,
     has_levels: bool,
 ) -> None:
-    """Process many packets, and write a row for each."""
+    """Process a batch of packets, and write a row for each."""
     packet, taken = Packet(), Relays()
     packet.master = -1
     begin = 0

@@ -1,23 +1,23 @@
-"""The estimator's state: one record of fixed capacity, and how anchors join and leave by moving blocks in it.
+"""The estimator's state: one record of fixed capacity, in which anchors join and leave by moving blocks.
 
 The state vector, all clocks against the tag's own counter, in metres and m/s:
 
-    values      position (dim), then for each anchor the offset of its clock: tag's reading − anchor's reading (its
-                whole ticks stand in ``Anchor``)
+    values      position (dim), then for each anchor its clock's offset: tag's reading − anchor's reading (whole ticks
+                are in ``Anchor``)
     rates       velocity (dim), then the rate of each offset
-    tx noises   of each anchor's newest TX stamp, which all who received it share
-    ambiguities for each anchor what its carrier's phase shows beyond range and offset, once phases are used
+    tx noises   of each anchor's newest TX stamp, common to all who received it
+    ambiguities for each anchor what its carrier phase shows beyond range and offset, once phases are in use
     meshes      for each anchor the ambiguity of its own receptions of its partner, another anchor
-    formers     for each anchor its ambiguity up to a gap, while it is not known by how many cycles it has changed since
-    changes     for each anchor the part of the tag's range error to it that changes as the tag moves
+    formers     for each anchor its ambiguity before a gap, while the number of cycles lost in it is unknown
+    changes     for each anchor the part of the range error that changes as the tag moves
     constants   the part that stays
-    slope       how ranges lengthen with distance
-    height      the tag's true height − the one that is given, in two dimensions
-    zero        what a barometer reads − the tag's true height, in three dimensions
+    slope       growth of ranges with distance
+    height      true − given height of the tag, in 2-D
+    zero        barometer reading − true height of the tag, in 3-D
     surveys     for each anchor (dim) its true position − its position in the almanac
 
-Range errors and surveys stand last because many a site calls them exact. What is exact has no variance and no
-covariance, so it is left out of all arithmetic (``State.n``), until a jump or a fault shows otherwise. All that stands
+Range errors and surveys are last because many sites state that they are exact. Exact states have no variance and no
+covariance and are left out of all arithmetic (``State.n``), until a jump or a fault proves otherwise. Everything
 behind the states in use is zero.
 """
 
@@ -51,7 +51,7 @@ from skyless.core.native.views import aligned, view
 from skyless.core.ticks import NEVER
 
 LANES: Final = 1 if PACKED else 4
-"""Numbers in a vector of 256 bits, where rows of P begin at one."""
+"""Numbers in a 256-bit vector; rows of P start at vector boundaries."""
 
 AXES: Final = 3
 STATES: Final = 2 * (AXES + MAX_ANCHORS) + (3 + PHASE_STATES + AXES) * MAX_ANCHORS + 2
@@ -61,10 +61,10 @@ MOST_TERMS: Final = 2 * (AXES + 3) + 8
 """Most terms of a measurement: a difference of two distances has the most."""
 
 ROUNDING_M2: Final = 1e-7
-"""What rounding in single precision may make of a variance of lasting faults that is smaller."""
+"""Smaller variances of lasting faults may be rounding errors of single precision."""
 
 LASTING, RECENT, CREEPING = range(3)
-"""Kinds of faults: there since an anchor joined, begun within its last packets, or growing for seconds."""
+"""Kinds of faults: since the anchor joined, since its last few packets, or growing for seconds."""
 FAULT_KINDS: Final = 3
 FAULTS: Final = FAULT_KINDS * MAX_ANCHORS
 SENSITIVITIES: Final = FAULTS + AXES + PLANNED_FAULTS
@@ -73,91 +73,91 @@ WORK_ROWS: Final = MAX_ANCHORS + 1 + 2 * AXES
 
 
 NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS, ALL_RANGE_ERRORS = range(3)
-"""Which range errors are not known to be zero: none, those that change, or all of them, and surveys."""
+"""Which range errors are uncertain: none, the changing ones, or all of them and the surveys."""
 
 LEVELS: Final = 2 + FAULT_KINDS
-"""Numbers that ``levels.protect`` writes: ``HPL``, ``VPL``, and the tests of all kinds of faults."""
+"""Numbers written by ``levels.protect``: ``HPL``, ``VPL``, and the test of each kind of faults."""
 
 
 @record
 class Ambiguity(Record):
-    """What is kept of an ambiguity in addition to its state."""
+    """Record of an ambiguity beside its state."""
 
     is_known: bool
     refused_in_row: int
-    """Phases beyond the gate."""
+    """Consecutive phases beyond the gate."""
     ticks: Ticks
-    """The tag's reading at its newest phase."""
+    """Tag time of its newest phase."""
 
 
 @record
 class Anchor(Record):
-    """What is kept of an anchor in addition to its states."""
+    """Record of an anchor beside its states."""
 
     identifier: int
     position_m: Annotated[Reals, AXES]
     tx_ticks: Ticks
-    """Newest packet, by its own clock."""
+    """Its newest packet's TX time, on its own clock."""
     rx_ticks: Ticks
-    """Newest packet, by the tag's clock."""
+    """Its newest packet's RX time, on the tag's clock."""
     offset_ticks: Ticks
     """Whole ticks of the offset."""
     range_m: float
-    """At its newest packet."""
+    """Range at its newest packet."""
     held_m: Annotated[Reals, AXES]
-    """The tag's position at which ranges to it are linearised."""
+    """Position at which ranges to it are linearised."""
     held_range_m: float
-    """Distance of that point."""
+    """Range from there."""
     walked_m: float
     """The tag's walked distance at its newest packet."""
     is_relayed: bool
     """Whether others relay its packets."""
     has_rate: bool
-    """Whether its clock's rate is known: more than its first packet has shown its offset."""
+    """Whether its clock's rate is known: the offset has been measured more than once."""
     has_tx_noise: bool
     """Whether its newest packet's TX noise is a state."""
     packets: Count
     innovation: float
-    """Its newest one, normalised."""
+    """Its newest innovation, normalised."""
     outliers_in_row: int
     outlier_m: float
-    """The newest of them."""
+    """Innovation of the newest outlier."""
     is_obstructed: bool
-    """Whether its range error has jumped and not come back."""
+    """Whether its range error has jumped and not returned."""
     change_mean: float
-    """Running mean of its innovations since then, normalised."""
+    """Running mean of its normalised innovations since then."""
     change_scale: float
     """Factor on the process noise of a range error that has jumped."""
     has_fault: bool
-    """Whether a lasting fault of it was added to the state."""
+    """Whether a lasting fault of it has been added to the state."""
     relay_mean: float
-    """Running mean of what relays show of its clock, normalised."""
+    """Running mean of its clock's normalised innovations in relays."""
     walk_scale: float
     """Factor on its oscillator's random walk."""
     change_variance_m2: float
-    """Of the part of its range error that changes as the tag moves."""
+    """Variance of the changing part of its range error."""
     place_steps: int
-    """Steps of the tag after which its range error was compared, in a row."""
+    """Consecutive steps of the tag after which its range error was compared."""
     place_walked_m: float
-    """The tag's walked distance at the newest of them."""
+    """The tag's walked distance at the newest step."""
     place_residual_m: Annotated[Reals, 2]
-    """What its reception left after the last two."""
+    """Residuals of its receptions after the last two steps."""
     own: Ambiguity
-    """Of the tag's receptions of it."""
+    """Ambiguity of the tag's receptions of it."""
     mesh: Ambiguity
-    """Of its receptions of its partner."""
+    """Ambiguity of its receptions of its partner."""
     partner: int
-    """Identifier of that, −1 for none."""
+    """Identifier of the partner, −1 if none."""
     has_former: bool
     former_ticks: Ticks
-    """The tag's reading when its former ambiguity ended."""
+    """Tag time of the end of its former ambiguity."""
     phase_way_m: float
-    """The tag's way at its newest phase."""
+    """``Status.way_m`` at its newest phase."""
 
 
 @record
 class KeptPacket(Record):
-    """A packet that others may relay."""
+    """A packet that other anchors may relay."""
 
     sequence: int
     tx_ticks: Ticks
@@ -166,16 +166,16 @@ class KeptPacket(Record):
 
 @record
 class Link(Record):
-    """A pair of anchors, listener and sender."""
+    """An ordered pair of anchors: listener and sender."""
 
     tx_ticks: Ticks
     """Newest packet of the sender whose reception by the listener was processed."""
     relays: Count
-    """Used in this direction."""
+    """Relays used in this direction."""
     constant_m: float
-    """Estimated constant of the pair, in the row of the lower index."""
+    """Estimated constant of the pair, in the row of the lower index …"""
     variance_m2: float
-    """Variance of that."""
+    """… and its variance."""
     outliers_in_row: int
     contradicts: bool
     """Whether its range contradicts the survey."""
@@ -183,14 +183,14 @@ class Link(Record):
 
 @record
 class Status(Record):
-    """The estimator's counters and running means."""
+    """Counters and running means of the estimator."""
 
     epoch_ticks: Ticks
-    """The tag's reading at the newest packet."""
+    """Tag time of the newest packet."""
     start_ticks: Ticks
-    """The tag's reading at the start."""
+    """Tag time of the start."""
     faded_ticks: Ticks
-    """The tag's reading when faults that are not lasting last faded."""
+    """Tag time when faults that are not lasting were last faded."""
     packets: Count
     accepted: Count
     rejected: Count
@@ -208,7 +208,7 @@ class Status(Record):
     faults_opened: Count
     mean_nis: float
     mean_square_m2: float
-    """Of innovations."""
+    """Mean square of innovations."""
     rejected_share: float
     late_share: float
     relays_lately_accepted: float
@@ -220,80 +220,80 @@ class Status(Record):
     q_scale: float
     """Factor on qa."""
     common_mean: float
-    """Running mean of all innovations: the tag's own clock."""
+    """Running mean of all innovations, which shows the tag's own clock."""
     walk_scale: float
     """Factor on its random walk."""
     place_samples: int
-    """Comparisons of range errors at places a step apart."""
+    """Number of comparisons of range errors one step apart."""
     place_square_m2: Annotated[Reals, 2]
-    """Half their mean square after one and two steps."""
+    """Half the mean square of their differences after one and after two steps."""
     place_variance_m2: float
-    """Of what multipath changes in them, 0 where not more than stated."""
+    """Variance of range errors by multipath; 0 if no larger than stated."""
     place_distance_m: float
     """Distance over which multipath changes."""
     obstruction: float
-    """1 where range errors have jumped recently, 0 where they do not."""
+    """1 if range errors have jumped recently, 0 if not."""
     walked_m: float
     stationary_s: float
-    """Since the tag last showed motion."""
+    """Time since the tag last showed motion."""
     stationary_m: Annotated[Reals, AXES]
-    """Where it was then."""
+    """Its position then …"""
     stationary_m2: Annotated[Reals, AXES]
-    """Variance of that on each axis."""
+    """… and the variance along each axis."""
     withholds_levels: bool
     """Whether the anchors' positions are known to be wrong."""
     height_ticks: Ticks
-    """The tag's reading when a sensor's height was used last."""
+    """Tag time of the last height used from a sensor."""
     plane_m: Annotated[Reals, AXES]
-    """A point of the plane that lies closest to the anchors."""
+    """A point of the plane that fits the anchors best."""
     plane_normal: Annotated[Reals, AXES]
     """Normal of that plane."""
     has_phases: bool
-    """Whether phases are used, so that there are ambiguities."""
+    """Whether phases are in use, so that there are ambiguities."""
     line_m: Annotated[Reals, AXES]
-    """Where phases are linearised: a place of the tag, from there on moved by its velocity alone."""
+    """Point at which phases are linearised: a position of the tag, moved from then on by its velocity alone."""
     step_m: Annotated[Reals, AXES]
-    """The tag's place after its last step …"""
+    """The tag's position after its last step …"""
     way_m: float
-    """… and the sum of all steps: unlike ``walked_m`` it does not grow at rest."""
+    """… and the length of all steps: unlike ``walked_m`` it does not grow at rest."""
     phase_variance_m2: float
-    """Of a phase, as innovations show it."""
+    """Variance of a phase, learnt from innovations."""
     wild_share: float
     """Running share of phases beyond the gate."""
     phases_used: Count
     phases_refused: Count
     phases_opened: Count
-    """Ambiguities that began, or began again …"""
+    """Ambiguities that began or restarted …"""
     phases_rejoined: Count
-    """… and of these the ones of which it was then found by how many cycles they differ from the former."""
+    """… and those of them whose number of lost cycles was resolved afterwards."""
     has_open_ranges: bool
     """Whether anchors join with range errors beyond those of the settings."""
     range_errors: int
-    """NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS."""
+    """``NO_RANGE_ERRORS``, ``CHANGING_RANGE_ERRORS`` or ``ALL_RANGE_ERRORS``."""
     fault_std_m: Annotated[Reals, FAULT_KINDS]
-    """Of each kind of faults, beforehand."""
+    """Prior standard deviation of each kind of faults."""
 
 
 @record
 class Layout(Record):
-    """Where the states stand: the index of the first of each block."""
+    """Index of the first state of each block."""
 
     offset: int
-    """Of the first anchor; the others' follow, as in all blocks."""
+    """That of the first anchor; the others follow, as in all blocks."""
     velocity: int
     rate: int
     tx_noise: int
     ambiguity: int
     mesh: int
     former: int
-    """All where phases are used; else they are the change's place, and not used."""
+    """The last three exist only with phases; without, they equal ``change`` and are not used."""
     change: int
     constant: int
     slope: int
     height: int
-    """In two dimensions; in three it is one of the position."""
+    """In 2-D; in 3-D it is the position's third element."""
     zero: int
-    """In three dimensions; in two it is the slope's place, and not used."""
+    """In 3-D; in 2-D it equals ``slope`` and is not used."""
     survey: int
     """``dim`` states for each anchor."""
     end: int
@@ -301,88 +301,88 @@ class Layout(Record):
 
 @record
 class State(Record):
-    """Everything that the estimator keeps of one tag. What loops run over stands first: its rows fill cache lines."""
+    """The estimator's state of one tag. What loops run over comes first, so that its rows fill cache lines."""
 
     x: Annotated[Reals, STATES]
     P: Annotated[Reals, COVARIANCES]
     """Row by row, symmetric to the bit; see ``at``."""
     V: Annotated[Matrix, STATES, SENSITIVITIES]
-    """What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
-    acceleration along an axis, then what planning adds."""
+    """Sensitivity of x to faults: for each kind to each metre by which an anchor is received late, then to each m/s² of
+    acceleration along an axis, then to faults added by planning."""
     settings: EstimatorSettings
     tuning: Tuning
     horizontal_k: float
-    """How many standard deviations the risk of levels allows."""
+    """Standard deviations that cover the risk of the levels."""
     vertical_k: float
     dim: int
-    """Dimensions of the position: 2 where the height is given, else 3."""
+    """Dimensions of the position: 2 if the height is given, otherwise 3."""
     count: int
-    """Anchors in the state."""
+    """Number of anchors."""
     used: int
-    """States that are not known to be exact; covariances with all others are zero."""
+    """Number of uncertain states; all covariances with others are zero."""
     n: int
-    """The same up to a multiple of ``LANES``: what loops along rows of P go to."""
+    """The same rounded up to a multiple of ``LANES``: the end of loops along rows of P."""
     rows: int
     """Columns of V in use."""
     layout: Layout
     status: Status
     information: Annotated[Matrix, FAULTS, FAULTS]
-    """Information of the innovations on all faults; the lower half."""
+    """Information of the innovations on all faults, M; lower triangle."""
     evidence: Annotated[Reals, FAULTS]
-    """What innovations show of them."""
+    """Evidence of the innovations for all faults, y."""
     lasting_covariance: Annotated[Matrix, MAX_ANCHORS, MAX_ANCHORS]
-    """Of the lasting faults: (M + I/σ_f²)⁻¹. Their M grows without end, next to which 1/σ_f² would be lost."""
+    """Covariance of the lasting faults, (M + I/σ_f²)⁻¹, as M grows without limit and 1/σ_f² would be lost in it."""
     lasting_m: Annotated[Reals, MAX_ANCHORS]
-    """Their estimate: that times y."""
+    """Estimate of the lasting faults: that times y."""
     anchors: Annotated[Array[Anchor], MAX_ANCHORS]
     packets: Annotated[Array[Array[KeptPacket]], MAX_ANCHORS, PACKETS_KEPT]
     links: Annotated[Array[Array[Link]], MAX_ANCHORS, MAX_ANCHORS]
-    """Of listener and sender."""
+    """By listener and sender."""
     terms: int
-    """Terms of the measurement at hand, which stand in ``h``."""
+    """Terms of the current measurement, in ``h``."""
     h: Annotated[Reals, MOST_TERMS]
-    """The measurement where it is not zero, at the indices in ``h_index``."""
+    """Nonzero elements of the current measurement, at the indices in ``h_index``."""
     h_index: Annotated[Integers, MOST_TERMS]
     waiting: int
-    """Updates that are not in P and V yet: those of a packet's relays go there together."""
+    """Queued updates, not yet in P and V: a packet's relays are applied together."""
     U: Annotated[Matrix, MOST_WAITING, STATES]
-    """Of each its u = P·h/√S; then P·h of the measurement at hand."""
+    """u = P·h/√S of each queued update, then P·h of the current measurement."""
     G: Annotated[Matrix, MOST_WAITING, SENSITIVITIES]
-    """Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand."""
+    """Fault inputs over √S of each queued update, then those of the current measurement."""
     work: Annotated[Matrix, WORK_ROWS, MAX_ANCHORS]
     """Scratch for systems of equations of all faults of one kind."""
     levels: Annotated[Reals, LEVELS]
     fix: Annotated[Matrix, PROTECTED_ROWS, AXES]
-    """What a fix carries (``POSITION`` and the following)."""
+    """Rows of a fix (``POSITION`` and the following)."""
 
 
-# Where the covariances stand
+# Indices of the covariances
 
 
 def row_of(state: int) -> int:
-    """Where a state's row of P begins."""
+    """Index in P of a state's row."""
     return state * (state + 1) >> 1 if PACKED else state * STATES
 
 
 def row_end(state: int, end: int) -> int:
-    """How many of the first elements of a row of P there are: all, or those up to the diagonal."""
+    """Length of a row of P up to ``end``: the whole row, or up to the diagonal."""
     return min(state + 1, end) if PACKED else end
 
 
 def at(one: int, other: int) -> int:
-    """Where the covariance of two states stands in P."""
+    """Index in P of the covariance of two states."""
     return row_of(other) + one if PACKED and other > one else row_of(one) + other
 
 
 def set_covariance(s: State, one: int, other: int, value: float) -> None:
-    """Write the covariance of two states, in both places where P has two."""
+    """Write the covariance of two states; if P is square, in both places."""
     s.P[at(one, other)] = value
     if not PACKED:
         s.P[at(other, one)] = value
 
 
 def covariances(s: State) -> NDArray[Any]:
-    """P as NumPy sees it, square: a copy where it is packed."""
+    """P as a square NumPy array; a copy if it is packed."""
     P = view(s.P)
     states = np.arange(STATES)
     return P[np.vectorize(at)(*np.ix_(states, states))] if PACKED else P.reshape(STATES, STATES)
@@ -399,10 +399,10 @@ def new_state(settings: EstimatorSettings) -> State:
 
 
 def restart(s: State, rx_ticks: Ticks, late_share: float, fault_std_m: float, has_open_ranges: bool) -> None:
-    """Begin again without anchors at the origin, with the same settings.
+    """Start again without anchors at the origin, with the same settings.
 
-    ``fault_std_m``: of range errors of all anchors that the levels are to cover; ``has_open_ranges``: expect ranges to
-    be wrong by half a metre and anchors to be misplaced, since what the settings assume of them has been contradicted.
+    ``fault_std_m``: range errors of all anchors that the levels have to cover. ``has_open_ranges``: expect range errors
+    of half a metre and misplaced anchors, because the settings have been contradicted.
     """
     status = Status()
     _clear(s)
@@ -414,7 +414,7 @@ def restart(s: State, rx_ticks: Ticks, late_share: float, fault_std_m: float, ha
 
 
 def _clear(s: State) -> None:
-    """Forget all states and anchors. What is not in use is zero already, unless a search has used the memory."""
+    """Clear all states and anchors. Unused memory is zero already unless a search has used it."""
     states, rows, count = s.layout.end, s.rows, s.count
     if SHARES_MEMORY:
         states, rows, count = STATES, SENSITIVITIES, MAX_ANCHORS
@@ -439,7 +439,7 @@ def _clear(s: State) -> None:
 
 
 def prepare(s: State) -> None:
-    """Initialise a state that is all zeros but for its settings and dimensions."""
+    """Initialise a state that is zero except for its settings and dimensions."""
     status, settings, tuning = s.status, s.settings, s.tuning
     stamps_m2 = settings.tx_variance_m2 + settings.rx_variance_m2
     status.q_scale = status.mean_nis = 1.0
@@ -463,7 +463,7 @@ def prepare(s: State) -> None:
 
 
 def set_layout(s: State) -> None:
-    """Find where the states stand with the present number of anchors."""
+    """Compute the layout for the present number of anchors."""
     where, count, dim = s.layout, s.count, s.dim
     where.offset = dim
     where.velocity = dim + count
@@ -485,7 +485,7 @@ def set_layout(s: State) -> None:
 
 
 def make_uncertain(s: State, range_errors: int) -> None:
-    """From now on at least these range errors are not known to be zero; finds the number of uncertain states."""
+    """Treat at least these range errors as uncertain, and update the number of uncertain states."""
     s.status.range_errors = max(s.status.range_errors, range_errors)
     end = s.layout.change
     if s.status.range_errors == CHANGING_RANGE_ERRORS:
@@ -508,15 +508,15 @@ def find_anchor(s: State, identifier: int) -> int:
 
 
 def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_open: bool) -> int:
-    """Let an anchor join, of whose clock and, if it is open, range error nothing is known; its index.
+    """Add an anchor with an unknown clock and, if ``is_open``, an unknown range error. Returns its index.
 
-    ``std_m``: of each coordinate of this anchor; below 0 for that of the settings. There must be room.
+    ``std_m``: survey standard deviation of each coordinate; the settings' if negative. There must be room.
     """
     settings, tuning, dim, anchor = s.settings, s.tuning, s.dim, s.count
     where, a = s.layout, s.anchors[anchor]
     for _ in range(dim):
         _insert_state(s, where.end)
-    _insert_state(s, where.slope)  # behind the block of constants, and so on: from the last to the first
+    _insert_state(s, where.slope)  # from the last block to the first, as each index is behind those inserted before
     _insert_state(s, where.constant)
     if s.status.has_phases:
         _insert_state(s, where.change)
@@ -560,7 +560,7 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
 
 
 def use_phases(s: State) -> None:
-    """From now on there are ambiguities, all of which are still to begin."""
+    """Add ambiguities for all anchors, none of them known yet."""
     if not s.status.has_phases:
         for _ in range(3 * s.count):
             _insert_state(s, s.layout.change)
@@ -569,7 +569,7 @@ def use_phases(s: State) -> None:
 
 
 def _clear_link(link: Link, variance_m2: float) -> None:
-    """Nothing has been relayed from one anchor to another yet."""
+    """Reset a link to no relays."""
     link.tx_ticks = NEVER
     link.constant_m = 0.0
     link.variance_m2 = variance_m2
@@ -579,7 +579,7 @@ def _clear_link(link: Link, variance_m2: float) -> None:
 
 
 def remove_anchor(s: State, anchor: int) -> None:
-    """Let an anchor leave the state."""
+    """Remove an anchor from the state."""
     where, dim, last = s.layout, s.dim, s.count - 1
     for _ in range(dim):
         _remove_state(s, where.survey + dim * anchor)
@@ -609,7 +609,7 @@ def remove_anchor(s: State, anchor: int) -> None:
 
 
 def _insert_state(s: State, index: int) -> None:
-    """Move all states from an index on one place back; the one that is there then is zero."""
+    """Move all states from an index on back by one, and set the state at the index to zero."""
     end = s.layout.end
     for state in range(end, index, -1):
         s.x[state] = s.x[state - 1]
@@ -628,7 +628,7 @@ def _insert_state(s: State, index: int) -> None:
 
 
 def _remove_state(s: State, index: int) -> None:
-    """Move all states behind an index one place forward."""
+    """Move all states behind an index forward by one."""
     end = s.layout.end
     for state in range(index, end - 1):
         s.x[state] = s.x[state + 1]
@@ -647,7 +647,7 @@ def _remove_state(s: State, index: int) -> None:
 
 
 def _insert_fault(s: State, index: int, faults: int) -> None:
-    """Move all faults from an index on one place back; the one that is there then is zero."""
+    """Move all faults from an index on back by one, and set the fault at the index to zero."""
     for state in range(s.layout.end):
         _insert(s.V[state], index, s.rows)
     s.rows += 1
@@ -662,7 +662,7 @@ def _insert_fault(s: State, index: int, faults: int) -> None:
 
 
 def _remove_fault(s: State, index: int, faults: int) -> None:
-    """Move all faults behind an index one place forward."""
+    """Move all faults behind an index forward by one."""
     for state in range(s.layout.end):
         _remove(s.V[state], index, s.rows)
     s.rows -= 1
@@ -677,7 +677,7 @@ def _remove_fault(s: State, index: int, faults: int) -> None:
 
 
 def _remove_lasting(s: State, anchor: int) -> None:
-    """The same of what is known of lasting faults, given that this anchor has none."""
+    """Remove an anchor from the lasting faults, given that it has none."""
     covariance, end = s.lasting_covariance, s.count
     _weigh_zero(s, anchor, 1.0 / ROUNDING_M2)
     for row in range(anchor, end - 1):
@@ -691,24 +691,24 @@ def _remove_lasting(s: State, anchor: int) -> None:
 
 
 def _insert(numbers: Reals, index: int, end: int) -> None:
-    """Move numbers from an index up to an end one place back."""
+    """Move numbers from an index up to an end back by one, and set the number at the index to zero."""
     for place in range(end, index, -1):
         numbers[place] = numbers[place - 1]
     numbers[index] = 0.0
 
 
 def _remove(numbers: Reals, index: int, end: int) -> None:
-    """Move numbers behind an index one place forward."""
+    """Move numbers behind an index forward by one."""
     for place in range(index, end - 1):
         numbers[place] = numbers[place + 1]
     numbers[end - 1] = 0.0
 
 
-# What is known of lasting faults
+# Lasting faults
 
 
 def learn_lasting(s: State, m: Reals, weight: float, shown: float) -> None:
-    """M of the lasting faults gains weight·m·mᵀ, and y weight·m·shown (Sherman and Morrison 1950)."""
+    """Add weight·m·mᵀ to M of the lasting faults and weight·m·shown to y (Sherman and Morrison 1950)."""
     c, variance, innovation = s.work[1], 1.0, shown
     for one in range(s.count):
         total, row = 0.0, s.lasting_covariance[one]
@@ -726,7 +726,7 @@ def learn_lasting(s: State, m: Reals, weight: float, shown: float) -> None:
 
 
 def forget_lasting(s: State, anchor: int) -> None:
-    """The lasting fault of an anchor becomes a state, with its own variance beforehand; another one may follow."""
+    """Reset a lasting fault to its prior, because it has become a state of its own."""
     variance = square(s.status.fault_std_m[LASTING])
     _weigh_zero(s, anchor, 1.0 / square(s.tuning.late_std_m) - 1.0 / variance)
     for other in range(s.count):
@@ -736,7 +736,7 @@ def forget_lasting(s: State, anchor: int) -> None:
 
 
 def _weigh_zero(s: State, anchor: int, weight: float) -> None:
-    """It is known with this weight besides that the lasting fault of an anchor is zero."""
+    """Add the information, with this weight, that an anchor's lasting fault is zero."""
     m = s.work[2]
     for one in range(s.count):
         m[one] = 1.0 if one == anchor else 0.0

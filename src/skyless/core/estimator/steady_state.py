@@ -1,13 +1,13 @@
-"""Covariance analysis: the filter's own steps without measurements, for planning and for Cramér–Rao bounds.
+"""Covariance analysis: the filter's own steps without measurements, for planning and Cramér–Rao bounds.
 
-What the filter will claim of a tag at rest at some place of a site: a superframe of messages is processed with
-innovations of zero until the position's variance repeats. That holds what the filter allows for accelerations, which
-such a tag does not have. Their part follows from sensitivities: rows of V begin, at moments of a superframe, as a
-velocity that the filter does not know of, and the squares of what they do to the position, integrated over the time
-after that, are what accelerations add to P. Another row of V holds the walls' delays.
+Computes what the filter will claim for a tag at rest at some place of a site: a superframe of messages is processed
+with innovations of zero until the position's variance repeats. That variance includes the accelerations that the
+filter allows for and that such a tag does not have. Their part follows from sensitivities: rows of V start, at moments
+of a superframe, as a velocity unknown to the filter; the squares of their effect on the position, integrated over the
+time after, are what accelerations add to P. Another row of V is the effect of the walls' delays.
 
-Where only a share of an anchor's packets arrives, the stamps of all count for as much less: their variances are divided
-by the share, and those of relayed receptions by the share of all three that they take.
+If only a share of an anchor's packets arrives, all its stamps carry correspondingly less information: their variances
+are divided by the share, and those of relays by the share of all three packets involved.
 """
 
 from typing import Annotated, Final
@@ -47,40 +47,40 @@ class PlannedMessage(Record):
     """A message of a superframe."""
 
     anchor: int
-    """Index of its anchor in the state; −1 where the tag does not receive it."""
+    """Index of its anchor in the state; −1 if the tag does not receive it."""
     gap_ticks: Ticks
-    """Time since the message before."""
+    """Time since the previous message."""
     share: float
     """Share of its anchor's messages that arrive."""
     late_m: float
-    """By how much walls delay them."""
+    """Delay by walls."""
     end: int
-    """Where its relays end in their table; they begin where those of the message before end."""
+    """End of its relays in their table; they begin at the end of the previous message's."""
 
 
 @record
 class PlannedRelay(Record):
-    """A reception that is relayed with a message."""
+    """A relay carried by a message."""
 
     sender: int
-    """Index of the anchor that was received; −1 where the tag does not receive it itself."""
+    """Index of the received anchor; −1 if the tag does not receive it itself."""
     age_s: float
     share: float
-    """Share of its receptions of which the tag gets to know."""
+    """Share of these receptions that reach the tag."""
     late_m: float
 
 
 @record
 class SteadyState(Record):
-    """What a superframe's fixes sum up to, each by how often its message arrives."""
+    """Sums over the fixes of a superframe, each weighted by the share of its message that arrives."""
 
     fixes: float
     variance_m2: Annotated[Reals, AXES]
-    """Of each axis as the filter claims it."""
+    """Variance of each axis as the filter claims it."""
     square_bias_m2: float
-    """Of the error that walls leave."""
+    """Squared error caused by walls."""
     motion_m2: Annotated[Reals, AXES]
-    """What accelerations have of each axis' variance, for one fix."""
+    """Contribution of accelerations to the variance of each axis, for one fix."""
 
 
 def find_steady_state(
@@ -94,7 +94,7 @@ def find_steady_state(
 ) -> None:
     """Find the steady state of a tag at the state's position.
 
-    After ``most`` of the superframes it counts as steady in any case; sums are compared every ``step`` of them.
+    Ends after ``most`` superframes in any case; the sums are compared every ``step`` superframes.
     """
     s.rows = _walls(s) + 1 + IMPULSES * s.dim
     superframe: Ticks = 0
@@ -136,10 +136,10 @@ def find_walked(
     walked: int,
     found: SteadyState,
 ) -> None:
-    """Find what the filter claims of a tag that has rested for superframes and then walked for others.
+    """Find what the filter claims for a tag that rests for some superframes and then walks for others.
 
-    ``found`` has the fixes and variances of the last of them. A state with phases has them of each message of which at
-    least half arrive; what they show is as expected, so that cycles are in doubt where they are for the filter.
+    ``found`` holds the fixes and variances of the last superframe. A state with phases gets one for each message of
+    which at least half arrive; the phases are as predicted, so cycles are in doubt wherever they are for the filter.
     """
     s.rows = _walls(s) + 1
     superframe: Ticks = 0
@@ -153,7 +153,7 @@ def find_walked(
 
 
 def _walls(s: State) -> int:
-    """The row of V for the walls' delays; those of the impulses follow."""
+    """The row of V for the walls' delays; the rows of the impulses follow."""
     return FAULT_KINDS * s.count + s.dim
 
 
@@ -167,7 +167,7 @@ def _process_superframe(
     superframe: Ticks,
     found: SteadyState,
 ) -> None:
-    """Process the messages of a superframe from now on; impulses act in the one that begins at ``impulses_ticks``."""
+    """Process a superframe from ``now`` on; impulses act in the one that begins at ``impulses_ticks``."""
     begin = 0
     found.fixes = found.square_bias_m2 = 0.0
     for axis in range(AXES):
@@ -197,7 +197,7 @@ def _add_fix(s: State, share: float, found: SteadyState) -> None:
 
 
 def _predict_with_impulses(s: State, now: Ticks, impulses_ticks: Ticks, superframe: Ticks) -> None:
-    """Time update, with a velocity of 1 m/s that the filter does not know of from each impulse on."""
+    """Time update; from each impulse on the tag has a velocity of 1 m/s that the filter does not know of."""
     before = s.status.epoch_ticks
     predict(s, now)
     for impulse in range(IMPULSES):
@@ -210,7 +210,7 @@ def _predict_with_impulses(s: State, now: Ticks, impulses_ticks: Ticks, superfra
 
 
 def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
-    """The tag's reception of a message."""
+    """Process the tag's reception of a message."""
     a, where = s.anchors[message.anchor], s.layout
     if a.packets == 0:
         first_reception(s, message.anchor, rx_ticks, rx_ticks, 1.0)
@@ -234,7 +234,7 @@ def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
 
 
 def _receive_relay(s: State, message: PlannedMessage, relayed: PlannedRelay) -> None:
-    """A relayed reception."""
+    """Process a relay."""
     relay_terms(s, message.anchor, relayed.sender, relayed.age_s, True)
     variance = relay_variance(s, message.anchor, relayed.sender, relayed.age_s) / relayed.share
     variance += compute_ph(s)
@@ -259,8 +259,8 @@ def process_known(
 ) -> None:
     """Process a frame at the tag's true position, with innovations of zero.
 
-    ``known``: which receptions of it are known, of each anchor and then of the tag; those of anchors before ``first``
-    are left out. ``elapsed_s``, ``walked_m``: since the frame before of this anchor that the tag received.
+    ``known``: whether each anchor's reception of it, and then the tag's, is known; anchors before ``first`` are left
+    out. ``elapsed_s``, ``walked_m``: since this anchor's previous frame that the tag received.
     """
     predict(s, rx_ticks)
     for axis in range(s.dim):

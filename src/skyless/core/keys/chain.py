@@ -1,4 +1,4 @@
-"""The key chain as the site's anchors have it: with the seed, from which every key follows, and how it is made."""
+"""A site's key chain as its anchors hold it: with the seed, from which every key follows."""
 
 import hmac
 import struct
@@ -24,7 +24,7 @@ KEY_BYTES: Final = 16
 SEED_BYTES: Final = 32
 SECTION_BITS: Final = 13
 SECTION_INTERVALS: Final = 1 << SECTION_BITS
-"""Steps that a listener hashes at most to come from a root to a key; 14 minutes with intervals of 100 ms."""
+"""Most steps that a listener hashes from a root to a key; 14 minutes with intervals of 100 ms."""
 
 _SECTION: Final = struct.Struct("<HHI")
 _KEY_LABEL: Final = b"skyless key"
@@ -33,12 +33,12 @@ _SEED_LABEL: Final = b"skyless seed"
 
 
 class SectionName(Struct, frozen=True, gc=False):
-    """Which section of which chain of which site."""
+    """Identifies a section: site, chain and first interval."""
 
     site: int
     """16 bits."""
     serial: int
-    """Number of the chain, 16 bits: a later chain of a site has a higher one."""
+    """Number of the chain, 16 bits; later chains of a site have higher ones."""
     section: int
     """Number of its first interval divided by ``SECTION_INTERVALS``, 32 bits."""
 
@@ -59,7 +59,7 @@ def last_key(seed: bytes, name: SectionName) -> bytes:
 
 
 def earlier_key(key: bytes, name: SectionName, steps: int = 1) -> bytes:
-    """The key of an interval that many intervals before that of ``key``."""
+    """The key ``steps`` intervals before that of ``key``."""
     label = _KEY_LABEL + name.packed
     for _ in range(steps):
         key = sha256(label + key).digest()[:KEY_BYTES]
@@ -72,22 +72,22 @@ def root_of(seed: bytes, name: SectionName) -> bytes:
 
 
 def mac_key(key: bytes, name: SectionName) -> bytes:
-    """What codes of an interval are made with: not the chain's key itself, so that each serves one purpose."""
+    """The key for codes of an interval: derived from the chain's key, so that each serves one purpose."""
     return sha256(_MAC_LABEL + name.packed + key).digest()[:KEY_BYTES]
 
 
 def mac_of(signed: bytes, key_of_macs: bytes) -> bytes:
-    """Code of a frame's bytes; ``key_of_macs`` as ``mac_key`` gives it."""
+    """Authentication code of a frame's bytes; ``key_of_macs`` comes from ``mac_key``."""
     return hmac.digest(key_of_macs, signed, "sha256")[:MAC_BYTES]
 
 
 def is_mac(signed: bytes, mac: bytes, key_of_macs: bytes) -> bool:
-    """Whether a code is that of these bytes, in constant time."""
+    """Whether the code matches these bytes; in constant time."""
     return hmac.compare_digest(mac, mac_of(signed, key_of_macs))
 
 
 MIN_LAG: Final = 4
-"""With shorter lags nothing is left for the clocks of tags."""
+"""Shorter lags leave no tolerance for the clocks of tags."""
 
 CERTIFICATE_SIGNATURE_BYTES: Final = 64
 PUBLIC_KEY_BYTES: Final = 32
@@ -99,17 +99,17 @@ assert _STATEMENT.size + CERTIFICATE_SIGNATURE_BYTES == CERTIFICATE_BYTES
 
 
 class ChainTiming(Struct, frozen=True, gc=False):
-    """When keys hold and are disclosed, and the budget of clock errors that follows from it.
+    """When keys are valid and when disclosed, and the budget of clock errors that follows.
 
     A frame is sent up to the end of its interval, T, by a clock that may be behind by ``anchors_apart_s``. A tag must
-    have received it before any anchor discloses its key, whose clock may be ahead by ``anchor_lead_s``, and knows the
-    time to ± B. So every genuine frame is accepted, and no other, where lag · T >= T + apart + lead + 2 B.
+    have received it before any anchor, whose clock may be ahead by ``anchor_lead_s``, discloses its key, and knows the
+    time to ± B. So every genuine frame is accepted, and no other, if lag · T >= T + apart + lead + 2 B.
     """
 
     interval_ms: int = 100
     """Length of an interval, 10 to 10000."""
     lag: int = 5
-    """A key is disclosed this number of intervals after its own, 4 to 255."""
+    """Intervals from a key's own to its disclosure, 4 to 255."""
 
     @property
     def interval_s(self) -> float:
@@ -118,14 +118,14 @@ class ChainTiming(Struct, frozen=True, gc=False):
 
     @property
     def anchors_apart_s(self) -> float:
-        """How far two anchors' clocks may be apart. Beyond it the one that is ahead is reported and left out."""
+        """Largest difference of two anchors' clocks. An anchor further ahead is reported and left out."""
         return 0.5 * self.interval_s
 
     @property
     def anchor_lead_s(self) -> float:
         """How far an anchor may be ahead of others and still disclose keys.
 
-        It finds that out beyond ``anchors_apart_s``, and knows to an interval only when the others sent their frames.
+        It notices leads beyond ``anchors_apart_s``, and knows the others' sending times only to an interval.
         """
         return self.anchors_apart_s + self.interval_s
 
@@ -138,26 +138,26 @@ class ChainTiming(Struct, frozen=True, gc=False):
         return interval * self.interval_ms * 1e-3
 
     def is_possible(self) -> bool:
-        """Whether a chain may have this timing."""
+        """Whether the values are within their limits."""
         return 10 <= self.interval_ms <= 10_000 and MIN_LAG <= self.lag <= 255
 
 
 USUAL_TIMING: Final = ChainTiming()
-"""A key is known 0.4 to 0.6 s after a frame. Clocks of tags may be off by 0.1 s, those of anchors by 25 ms."""
+"""A key is known 0.4 to 0.6 s after its frame. Clocks of tags may be off by 0.1 s, those of anchors by 25 ms."""
 
 
 class Certificate(Struct, frozen=True, gc=False):
-    """What is stated of a section."""
+    """The signed statement about one section of a chain."""
 
     name: SectionName
     timing: ChainTiming
     first: int
-    """The first interval in which this chain counts, instead of those with lower serial numbers; 40 bits."""
+    """The first interval in which this chain replaces those with lower serial numbers; 40 bits."""
     root: bytes
     """16 bytes."""
 
     def signed_bytes(self) -> bytes:
-        """What is signed: a label, the site, and all that is sent but the signature."""
+        """The signed bytes: a label, the site, and everything that is sent but the signature."""
         return _LABEL + _SITE.pack(self.name.site) + self._statement()
 
     def _statement(self) -> bytes:
@@ -173,7 +173,7 @@ class Certificate(Struct, frozen=True, gc=False):
 
 
 def read_certificate(site: int, sent: bytes) -> tuple[Certificate, bytes] | None:
-    """The certificate in a frame of a site, and its signature, not yet verified; None where a value is impossible."""
+    """Decode a certificate in a frame of a site and its unverified signature; None if a value is impossible."""
     if len(sent) != CERTIFICATE_BYTES:
         return None
     serial, low, high, section, interval_ms, lag, root = _STATEMENT.unpack_from(sent)
@@ -185,25 +185,25 @@ def read_certificate(site: int, sent: bytes) -> tuple[Certificate, bytes] | None
 
 
 def section_of(sent: bytes) -> int:
-    """The section that a certificate in a frame names."""
+    """The section number in an encoded certificate."""
     section: int = _STATEMENT.unpack_from(sent)[3]
     return section
 
 
 def sign(certificate: Certificate, private: "Ed25519PrivateKey") -> bytes:
-    """The signature of the site."""
+    """Sign a certificate with the site's private key."""
     return private.sign(certificate.signed_bytes())
 
 
 def public_key(data: bytes) -> "Ed25519PublicKey":
-    """The key in 32 bytes. Raises ValueError: there are not as many."""
+    """A public key from 32 bytes. Raises ValueError for any other number."""
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey  # noqa: PLC0415 - loads OpenSSL
 
     return Ed25519PublicKey.from_public_bytes(data)
 
 
 def is_signed(certificate: Certificate, signature: bytes, public: "Ed25519PublicKey") -> bool:
-    """Whether the owner of the key has signed it."""
+    """Whether the signature is valid for this public key."""
     from cryptography.exceptions import InvalidSignature  # noqa: PLC0415 - loads OpenSSL
 
     try:
@@ -214,19 +214,19 @@ def is_signed(certificate: Certificate, signature: bytes, public: "Ed25519Public
 
 
 STEPS_AHEAD: Final = 256
-"""Keys of the next section that are made with each frame: 0.2 ms, so that no frame waits for the whole section."""
+"""Keys of the next section made with each frame: 0.2 ms, so that no frame waits for the whole section."""
 
 _MAX_SECTIONS: Final = 3
 
 
 class Chain(Struct, frozen=True, repr_omit_defaults=True):
-    """A key chain and its signatures; its ``repr`` does not show the seed."""
+    """A key chain with its signatures; its ``repr`` hides the seed."""
 
     site: int
     serial: int
     timing: ChainTiming
     first: int
-    """The first interval in which it counts."""
+    """The first interval in which it is valid."""
     signatures: bytes
     """Signatures of its sections in order, from the section of ``first`` on, 64 bytes each."""
     seed: bytes
@@ -242,11 +242,11 @@ class Chain(Struct, frozen=True, repr_omit_defaults=True):
 
     @property
     def end(self) -> int:
-        """The first interval after its last."""
+        """The first interval after its last section."""
         return (self.first >> SECTION_BITS) + self.sections << SECTION_BITS
 
     def holds(self, interval: int) -> bool:
-        """Whether it has a key for an interval."""
+        """Whether the chain has a key for an interval."""
         return self.first <= interval < self.end
 
     def name(self, interval: int) -> SectionName:
@@ -257,30 +257,30 @@ class Chain(Struct, frozen=True, repr_omit_defaults=True):
 def section_signatures(
     seed: bytes, site: int, serial: int, timing: ChainTiming, first: int, sections: range, private: "Ed25519PrivateKey"
 ) -> bytes:
-    """Signatures of some sections of a chain: 5 to 20 ms for each."""
+    """Signatures of some sections of a chain: 5 to 20 ms each."""
     names = (SectionName(site, serial, section) for section in sections)
     return b"".join(sign(Certificate(name, timing, first, root_of(seed, name)), private) for name in names)
 
 
 class ChainKeys:
-    """Keys and certificates of one chain, made as they are needed."""
+    """Keys and certificates of one chain, computed on demand."""
 
     def __init__(self, chain: Chain) -> None:
         self.chain = chain
         self._sections: dict[int, list[bytes]] = {}
-        """Keys of sections, that of the last interval first, the root at the end."""
+        """Keys of each section, that of the last interval first, the root last."""
 
     def key(self, interval: int) -> bytes:
-        """The key of an interval that the chain holds."""
+        """The key of an interval of the chain."""
         keys = self._section(interval >> SECTION_BITS)
         return keys[SECTION_INTERVALS - 1 - (interval & SECTION_INTERVALS - 1)]
 
     def mac_key(self, interval: int) -> bytes:
-        """What codes of that interval are made with."""
+        """The key for codes of that interval."""
         return mac_key(self.key(interval), self.chain.name(interval))
 
     def certificate(self, interval: int) -> bytes:
-        """The certificate of the section of an interval, as it is sent."""
+        """The encoded certificate of an interval's section."""
         chain, section = self.chain, interval >> SECTION_BITS
         at = (section - (chain.first >> SECTION_BITS)) * CERTIFICATE_SIGNATURE_BYTES
         root = self._section(section)[-1]
@@ -288,7 +288,7 @@ class ChainKeys:
         return certificate.sent_bytes(chain.signatures[at : at + CERTIFICATE_SIGNATURE_BYTES])
 
     def prepare(self, interval: int) -> None:
-        """Make a few keys of the section of an interval that is soon needed."""
+        """Compute a few keys of the section of an interval that is needed soon."""
         if self.chain.holds(interval):
             self._extend(interval >> SECTION_BITS, STEPS_AHEAD)
 
@@ -296,7 +296,7 @@ class ChainKeys:
         return self._extend(section, SECTION_INTERVALS)
 
     def _extend(self, section: int, steps: int) -> list[bytes]:
-        """Keys of a section, up to that number of them made now."""
+        """Keys of a section, after computing at most ``steps`` of them now."""
         name = SectionName(self.chain.site, self.chain.serial, section)
         keys = self._sections.get(section)
         if keys is None:
@@ -309,29 +309,29 @@ class ChainKeys:
 
 
 class ChainRing:
-    """The chains of one site that an anchor has."""
+    """An anchor's chains of one site."""
 
     def __init__(self, chains: Iterable[Chain]) -> None:
         ordered = sorted(chains, key=lambda chain: -chain.serial)
         self._chains = tuple(ChainKeys(chain) for chain in ordered)
 
     def at(self, interval: int) -> ChainKeys | None:
-        """The chain that counts in an interval: of those that have begun the last one made; None where it has ended."""
+        """The chain valid in an interval: the newest of those that have begun; None if that one has ended."""
         begun = next((keys for keys in self._chains if keys.chain.first <= interval), None)
         return begun if begun is not None and begun.chain.holds(interval) else None
 
     def revoked(self, interval: int) -> tuple[ChainKeys, ...]:
-        """Chains that hold a key for an interval, but do not count any more."""
+        """Chains with a key for an interval in which they are no longer valid."""
         present = self.at(interval)
         return tuple(keys for keys in self._chains if keys is not present and keys.chain.holds(interval))
 
     @property
     def timing(self) -> ChainTiming | None:
-        """Timing of the newest chain; None without any."""
+        """Timing of the newest chain; None without chains."""
         return self._chains[0].chain.timing if self._chains else None
 
     def successor(self, interval: int) -> bytes | None:
-        """The certificate of what comes after the section of an interval: another chain, or the next section."""
+        """The certificate of what follows an interval's section: another chain, or the next section."""
         present = self.at(interval)
         later = [keys for keys in self._chains if keys.chain.first > interval]
         next_interval = (interval >> SECTION_BITS) + 1 << SECTION_BITS
@@ -342,7 +342,7 @@ class ChainRing:
         return later[-1].certificate(later[-1].chain.first) if later else None
 
     def prepare(self, interval: int) -> None:
-        """Make keys that are needed soon."""
+        """Compute keys that are needed soon."""
         present = self.at(interval)
         if present is not None:
             present.prepare((interval >> SECTION_BITS) + 1 << SECTION_BITS)

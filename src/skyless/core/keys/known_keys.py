@@ -1,4 +1,4 @@
-"""Certificates and keys of a site, as far as a listener knows them."""
+"""A listener's knowledge of a site's certificates and keys, and of when its anchors' frames are due."""
 
 from collections.abc import Iterable, Sequence
 from enum import Enum, auto
@@ -24,17 +24,17 @@ if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
 
 KEPT_KEYS: Final = 256
-"""Keys kept of one section. Frames wait for their key for seconds only."""
+"""Keys kept per section. Frames wait only seconds for their key."""
 MAX_CERTIFICATES: Final = 6
 
 NEAR_STEPS: Final = 16
-"""Keys that follow within this number of intervals on a verified one are hashed at once, others as far as an allowance
-for long ones goes: somebody who sends forged keys must not keep the processor busy. Keys that two anchors sent have an
-allowance of their own, so that many different forged ones do not keep the right one waiting."""
+"""Keys within this number of intervals after a verified one are checked at once, others within an allowance of hashes:
+forged keys must not keep the processor busy. Keys sent by two anchors have an allowance of their own, so that many
+different forged ones cannot block the genuine one."""
 STEPS_PER_S: Final = 50_000.0
 MAX_STEPS: Final = 40_000.0
 MAX_SENDERS: Final = 4096
-"""Far keys whose first sender is remembered."""
+"""Most far keys whose first sender is remembered."""
 
 CHECKS_PER_S: Final = 100.0
 MAX_CHECKS: Final = 100.0
@@ -42,71 +42,71 @@ MAX_CHECKS: Final = 100.0
 
 
 class CertificateUse(Enum):
-    """What became of a certificate."""
+    """Outcomes of a certificate."""
 
     KNOWN = auto()
     NEW = auto()
     FORGED = auto()
     IGNORED = auto()
-    """There was no time to check it."""
+    """The allowance for checks was used up."""
     REVOKED = auto()
-    """Signed by the site, but a later chain counts instead."""
+    """Signed by the site, but replaced by a later chain."""
 
 
 class KeyUse(Enum):
-    """What became of a disclosed key."""
+    """Outcomes of a disclosed key."""
 
     KNOWN = auto()
-    """It was known, or nothing shows yet whether it is right."""
+    """It was known already, or cannot be checked yet."""
     NEW = auto()
     FORGED = auto()
 
 
 class _Section(Struct):
-    """What is known of one section."""
+    """A known section."""
 
     certificate: Certificate
     sent: bytes
     newest: int
-    """The newest interval whose key is known; that before the section's first for its root."""
+    """The newest interval with a known key; that before the section's first for its root."""
     keys: dict[int, bytes]
-    """Keys of the last intervals; the newest is the last entry."""
+    """Keys of the last intervals, the newest last."""
 
 
 class KnownKeys:
-    """All that is known of the chains of a site. Nothing that is forged stays in it."""
+    """The known chains of a site. Nothing forged is kept."""
 
     def __init__(self, site: int, public: "Ed25519PublicKey", least_serial: int = 0) -> None:
-        """``least_serial``: chains with lower serial numbers have been revoked."""
+        """``least_serial``: chains with lower serial numbers are revoked."""
         self._site, self._public = site, public
         self.serial = least_serial
-        """The highest serial number of a chain that has been seen to count."""
+        """The highest serial number of a chain known to be valid."""
         self.timing: ChainTiming | None = None
-        """When keys hold; None before the first certificate."""
+        """Timing of the keys; None before the first certificate."""
         self.newest = -1
-        """The newest interval whose key is known."""
+        """The newest interval with a known key."""
         self._sections: dict[SectionName, _Section] = {}
         self._present = 0
         self._steps = {False: MAX_STEPS, True: MAX_STEPS}
-        """Allowances, by whether two anchors sent a key."""
+        """Allowances of hashes, by whether two anchors sent the key."""
         self._checks, self._refilled_s = MAX_CHECKS, 0.0
         self._senders: dict[bytes, int] = {}
-        """By far key, the anchor that sent it first."""
+        """The anchor that first sent each far key."""
 
     @property
     def certificates(self) -> tuple[bytes, ...]:
-        """As they are sent: what lets a listener start at once the next time."""
+        """Encoded certificates, with which a listener can start at once the next time."""
         return tuple(section.sent for section in self._sections.values())
 
     def restore(self, certificates: Iterable[bytes]) -> None:
-        """Add certificates of an earlier run; signatures are checked again."""
+        """Add certificates of an earlier run, after checking their signatures again."""
         for sent in certificates:
             read = read_certificate(self._site, sent)
             if read is not None and is_signed(*read, self._public):
                 self._add(read[0], sent)
 
     def on_certificate(self, sent: bytes, now_s: float) -> CertificateUse:
-        """Process a certificate at a time, as far as that is known."""
+        """Process a certificate received at ``now_s``, as far as the time is known."""
         if any(section.sent == sent for section in self._sections.values()):
             return CertificateUse.REVOKED if self._is_revoked(sent, now_s) else CertificateUse.KNOWN
         read = read_certificate(self._site, sent)
@@ -126,9 +126,9 @@ class KnownKeys:
         return CertificateUse.NEW
 
     def on_key(self, key: bytes, interval: int, now_s: float, anchor: int, *, is_expected: bool = True) -> KeyUse:
-        """Process the key of an interval, as somebody disclosed it in an anchor's name at a time.
+        """Process the key of an interval that somebody disclosed in an anchor's name.
 
-        ``is_expected``: whether it is disclosed at about that time.
+        ``is_expected``: whether this is about the time of its disclosure.
         """
         section = self._section_of(interval)
         if section is None:
@@ -163,19 +163,19 @@ class KnownKeys:
         return KeyUse.NEW
 
     def mac_key(self, interval: int) -> bytes | None:
-        """What codes of an interval are made with; None while its key is not known."""
+        """The key for codes of an interval; None while unknown."""
         section = self._section_of(interval)
         key = None if section is None else section.keys.get(interval)
         return None if section is None or key is None else mac_key(key, section.certificate.name)
 
     def _section_of(self, interval: int) -> _Section | None:
-        """The section of the chain that counts in an interval; None where its certificate is not known."""
+        """The section of the chain valid in an interval; None if its certificate is unknown."""
         serials = [one.certificate.name.serial for one in self._sections.values() if one.certificate.first <= interval]
         serial = max(serials, default=0)
         return self._sections.get(SectionName(self._site, serial, interval >> SECTION_BITS))
 
     def _is_revoked(self, sent: bytes, now_s: float) -> bool:
-        """Whether a later chain counts at this time instead of that of a known certificate."""
+        """Whether a later chain has replaced that of a known certificate at this time."""
         own = next(one.certificate for one in self._sections.values() if one.sent == sent)
         later = [one.certificate for one in self._sections.values() if one.certificate.name.serial > own.name.serial]
         return any(one.first <= own.timing.interval_at(now_s) - own.timing.lag for one in later)
@@ -195,7 +195,7 @@ class KnownKeys:
         self.newest = max(counting, default=-1)  # keys of a chain that was revoked show nothing any more
 
     def _refill(self, now_s: float) -> None:
-        """Renew the allowances by the time that has passed."""
+        """Refill the allowances for the time that has passed."""
         elapsed_s = min(max(now_s - self._refilled_s, 0.0), 1.0)
         self._refilled_s = now_s
         for by_two, steps in self._steps.items():
@@ -206,10 +206,10 @@ class KnownKeys:
 # When frames arrive by the counters of both ends: a genuine frame that somebody sends again comes too late.
 
 SLACK_TICKS: Final = from_seconds(1e-6)
-"""A frame cannot be received whole and sent again in less than 100 times that."""
+"""Receiving a whole frame and sending it again takes at least 100 times this."""
 
 SILENCE_TICKS: Final = from_seconds(1.0)
-"""An anchor none of whose frames has fitted for this time may have a counter that has restarted."""
+"""An anchor without a fitting frame for this time may have a restarted counter."""
 
 
 class Stamps(Struct, frozen=True, gc=False):
@@ -223,33 +223,33 @@ class Stamps(Struct, frozen=True, gc=False):
 
 
 class Arrival(Enum):
-    """How a frame came."""
+    """How a frame's time of arrival compares with others."""
 
     IN_TIME = auto()
     FIRST = auto()
-    """Nothing shows it yet: no other frame of its anchor agrees with it."""
+    """Unconfirmed: no other frame of its anchor agrees with it."""
     LATE = auto()
 
 
 class _Reference(Struct):
-    """The last frame of an anchor that agrees with the earliest one, by both counters."""
+    """An anchor's last frame that agrees with its earliest one by both counters."""
 
     rx_ticks: int
     tx_ticks: int
     frames: int
-    """Number of frames that agree."""
+    """Number of agreeing frames."""
 
 
 class Arrivals:
-    """What a listener knows of when frames of each anchor are due."""
+    """When frames of each anchor are due."""
 
     def __init__(self) -> None:
         self._references: dict[int, _Reference] = {}
 
     def is_plausible(self, one: Stamps) -> bool:
-        """Whether a frame that is not verified yet arrived when a frame of its anchor with this stamp would.
+        """Whether an unverified frame arrived when a frame of its anchor with this stamp is due.
 
-        So is any before the first genuine frame of all.
+        Before the first genuine frame of any anchor, every frame is plausible.
         """
         last = self._references.get(one.anchor)
         if last is None:
@@ -257,9 +257,9 @@ class Arrivals:
         return not _delay_ticks(last, one)
 
     def of(self, frames: Sequence[Stamps]) -> list[Arrival]:
-        """How genuine frames came that are known together, in the order of their reception.
+        """Judge the arrival of genuine frames that become known together, in order of reception.
 
-        Nobody can send a frame before its anchor does. So where two of an anchor do not agree the later one is late.
+        Nobody can send a frame before its anchor does. So if two of an anchor disagree, the later one is late.
         """
         references, late = self._references, set[int]()
         for number, one in enumerate(frames):
@@ -283,7 +283,7 @@ class Arrivals:
 
 
 def _delay_ticks(last: _Reference, one: Stamps) -> int:
-    """How much later than due a frame has come; 0 where crystals and noise explain it."""
+    """How much later than due a frame arrived; 0 if crystals and noise explain it."""
     elapsed = one.rx_ticks - last.rx_ticks
     delay_ticks = difference(last.tx_ticks + elapsed, one.tx_ticks)
     return 0 if abs(delay_ticks) <= SLACK_TICKS + MAX_DRIFT * abs(elapsed) else delay_ticks

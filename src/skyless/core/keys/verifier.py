@@ -1,7 +1,8 @@
-"""``Verifier``: what a listener with the site's public key does with beacons. Frames in, decisions about them out.
+"""``Verifier``: verification of beacons with the site's public key. Frames in, decisions about them out.
 
-A frame waits until the key of its interval is disclosed; then its code shows whether an anchor of the site made it. A
-frame counts only if it was received before any anchor can have disclosed that key: else anybody could have made it.
+A frame waits until the key of its interval is disclosed; its code then shows whether an anchor of the site made it. A
+frame is accepted only if it was received before any anchor can have disclosed that key: afterwards anybody could have
+made it.
 """
 
 import math
@@ -26,47 +27,46 @@ if TYPE_CHECKING:
 # What a listener knows of the site's time: how late it may be, and whether its own clock is right.
 
 DRIFT: Final = 50e-6
-"""How much the own counter's rate may be off."""
+"""Largest relative error of the own counter's rate."""
 
 KEY_WAIT_INTERVALS: Final = 2
-"""The newest key is known to have been disclosed within this number of intervals, by the quickest of those before."""
+"""The newest key was disclosed within this number of intervals, judged by the fastest recent one."""
 
 RECENT_KEYS: Final = 10
-"""Number of recent keys. The quickest of them after its disclosure shows how far the host's clock is off."""
+"""Number of recent keys. The one received soonest after its disclosure shows the error of the host's clock."""
 
 AHEAD_S: Final = 1.0
-"""A host's clock that is farther ahead of the lower bound has been set; without keys that bound loses 0.2 s an hour."""
+"""A host's clock further ahead of the lower bound has been set; without keys that bound loses 0.2 s an hour."""
 
 RESTART_S: Final = 1.0
-"""A counter that goes back farther has restarted."""
+"""A counter that goes back further has restarted."""
 
 
 class SiteClock(Struct):
-    """Bounds of the site's time, which is that of the anchor whose clock is furthest ahead, in Unix seconds.
+    """Bounds of the site's time, that of the anchor whose clock is furthest ahead, in Unix seconds.
 
-    Only keys prove a lower bound, which the own counter carries on. The upper bound comes from the host's clock and
-    its stated bound. A host's clock that is set or dragged back lowers it no farther than to shortly after the lower
-    bound. One that is ahead raises it for as long as it is ahead: then frames are refused as late, and nothing of that
-    remains afterwards.
+    Only keys prove a lower bound, which the own counter continues. The upper bound comes from the host's clock and its
+    stated error. A host's clock that is set or dragged back lowers it no further than to shortly after the lower bound.
+    One that is ahead raises it only while it is ahead: frames are refused as late then, with no effect afterwards.
     """
 
     bound_s: float
-    """How far the host's clock may be off."""
+    """Largest error of the host's clock."""
     lower_s: float = -math.inf
     """Lower bound; none before the first key, and after a restart of the counter."""
     rx_ticks: int | None = None
-    """Own counter, unwrapped, to which the lower bound refers."""
+    """Own counter, unwrapped, at the lower bound."""
     is_late: bool = False
-    """Whether a verified key showed that the site's time is beyond the upper bound: nothing can be verified then."""
+    """Whether a verified key proved the site's time to be beyond the upper bound: nothing can be verified then."""
     host_s: float = 0.0
     """The host's clock at the last frame."""
     section_offset_s: float = 0.0
-    """The host's clock less the beginning of the section of the last certificate, where it is not near that."""
+    """Host's clock minus the beginning of the last certificate's section, if far from it."""
     offsets_s: deque[float] = deque()
-    """The host's clock less the disclosure of recent keys, at their first reception."""
+    """Host's clock minus the disclosure of recent keys, at their first reception."""
 
     def advance(self, rx_ticks: int, unix_s: float) -> None:
-        """A frame was received: own counter, unwrapped, and the host's clock."""
+        """Advance to the reception of a frame: own counter, unwrapped, and host's clock."""
         self.host_s = unix_s
         elapsed_s = 0.0 if self.rx_ticks is None else (rx_ticks - self.rx_ticks) * TICK_S
         if elapsed_s < -RESTART_S:
@@ -81,11 +81,11 @@ class SiteClock(Struct):
         return max(self.upper_at(self.host_s, timing), self.lower_s + KEY_WAIT_INTERVALS * timing.interval_s)
 
     def upper_at(self, unix_s: float, timing: ChainTiming) -> float:
-        """Upper bound that follows from the host's clock alone, when it showed this."""
+        """Upper bound from the host's clock alone, at the time when it showed ``unix_s``."""
         return unix_s + self.bound_s + timing.anchor_lead_s
 
     def on_key(self, interval: int, timing: ChainTiming) -> None:
-        """A key was verified for the first time: the site's time is at least that of its disclosure."""
+        """A key was verified for the first time: the site's time is not before its disclosure."""
         disclosed_s = timing.start_s(interval + timing.lag)
         self.offsets_s.append(self.host_s - disclosed_s)
         if len(self.offsets_s) > RECENT_KEYS:
@@ -95,7 +95,7 @@ class SiteClock(Struct):
             self.lower_s = max(self.lower_s, disclosed_s)
 
     def on_section(self, section: int, timing: ChainTiming) -> None:
-        """A certificate was received that anchors send during this section or the one before it."""
+        """A certificate was received, which anchors send during its section or the one before."""
         offset_s = self.host_s - timing.start_s(section << SECTION_BITS)
         length_s = SECTION_INTERVALS * timing.interval_s
         self.section_offset_s = 0.0 if -length_s - self.bound_s <= offset_s <= length_s + self.bound_s else offset_s
@@ -107,15 +107,14 @@ class SiteClock(Struct):
 
     @property
     def present_s(self) -> float:
-        """The host's clock, but no earlier than the lower bound."""
+        """The host's clock, but not before the lower bound."""
         return max(self.host_s, self.lower_s)
 
     @property
     def error_s(self) -> float | None:
-        """How far the host's clock is from the site's time where that is more than the bound: positive if it is ahead.
+        """Error of the host's clock if it exceeds the bound: positive if ahead; None if within it or unknown.
 
-        Where it is ahead frames may be late as well: somebody may have delayed them. None where all is well, or nothing
-        is known.
+        If it is ahead, frames may also be late because somebody has delayed them.
         """
         if not self.is_verified and self.section_offset_s:
             return self.section_offset_s
@@ -129,25 +128,25 @@ class SiteClock(Struct):
 
 
 MAX_UNDECIDED: Final = 8192
-"""Frames that wait: more than a radio can receive before their keys come, one after the other, 0.1 ms each."""
+"""Most waiting frames: more than a radio can receive before their keys come, one after the other, 0.1 ms each."""
 
 LONGEST_WAIT_TICKS: Final = from_seconds(2.0)
-"""A frame whose key has not come by then is dropped, so that fixes go on with later ones."""
+"""A frame without a key after this time is dropped, so that fixes continue with later ones."""
 
 FAULT_TICKS: Final = from_seconds(2.0)
-"""A fault is reported for this time after it was seen last."""
+"""A fault is reported for this time after its last occurrence."""
 
 CODES_KEPT: Final = 2048
-"""So many codes at least are remembered: more than there are in the intervals whose frames are still accepted."""
+"""Codes remembered, at least: more than in all intervals whose frames are still accepted."""
 
 MAX_FAULTY_ANCHORS: Final = 64
-"""Anchors with faults that are remembered: forged frames can name any."""
+"""Most anchors with remembered faults: forged frames can name any."""
 
 _ARRIVAL_FAULTS: Final = {Arrival.IN_TIME: None, Arrival.FIRST: Fault.FIRST, Arrival.LATE: Fault.LATE}
 
 
 class ReceivedFrame(Struct, frozen=True, gc=False):
-    """A frame with a code, which waits for its key or is decided."""
+    """A frame with a code, waiting for its key or decided."""
 
     beacon: Beacon
     authentication: Authentication
@@ -155,11 +154,11 @@ class ReceivedFrame(Struct, frozen=True, gc=False):
     rx_ticks: int
     """Own counter, unwrapped."""
     unix_s: float
-    """The host's clock when it was received."""
+    """The host's clock at reception."""
     interval: int | None
-    """Number of the interval; None where no certificate was known yet: the frame's time is still to be checked."""
+    """Number of the interval; None without a certificate so far, so that the frame's time is still to be checked."""
     is_plausible: bool
-    """Whether its stamps continue those of genuine frames of its anchor, or no frame is known to be genuine yet."""
+    """Whether its stamps continue its anchor's genuine frames; also True before any genuine frame."""
 
 
 class _AnchorFault(Struct, frozen=True, gc=False):
@@ -170,7 +169,7 @@ class _AnchorFault(Struct, frozen=True, gc=False):
 
 
 class Verifier:
-    """Verifies the beacons of one site. It does no I/O and reads no clock."""
+    """Verifies the beacons of one site. No I/O; reads no clock."""
 
     def __init__(
         self,
@@ -182,7 +181,7 @@ class Verifier:
         least_serial: int = 0,
         certificates: "Iterable[bytes]" = (),
     ) -> None:
-        """``clock_bound_s``: how far the host's clock may be from those of anchors.
+        """``clock_bound_s``: largest difference of the host's clock from those of anchors.
 
         ``certificates``: those of an earlier run.
         """
@@ -196,15 +195,15 @@ class Verifier:
         self._arrivals = Arrivals()
         self._codes: set[bytes] = set()
         self._codes_before: set[bytes] = set()
-        """Codes of the last genuine frames; a second frame with one of them is a repetition."""
+        """Codes of recent genuine frames; a second frame with one of them is a repetition."""
         self._anchors: set[int] = set()
         """Anchors that have sent a genuine frame."""
         self.newest_ticks = 0
-        """When the last frame of the site was received: own counter, unwrapped."""
+        """Reception of the site's last frame: own counter, unwrapped."""
         self._has_new_key = False
 
     def waiting(self) -> "Iterable[ReceivedFrame]":
-        """Frames that wait, in the order in which they were received; nothing shows yet whether they are genuine."""
+        """Undecided frames in order of reception."""
         return tuple(self._waiting)
 
     def faults(self) -> dict[int, Fault]:
@@ -250,9 +249,9 @@ class Verifier:
         return frame
 
     def decided(self) -> list[tuple[ReceivedFrame, Fault | None]]:
-        """Frames of which it is known by now whether they are genuine; in the order of reception, each once.
+        """Newly decided frames in order of reception, each once.
 
-        None with a genuine one, else why it is not accepted. ``NO_KEY`` and ``FIRST`` do not mean that it was forged.
+        The fault is None for a genuine frame. ``NO_KEY`` and ``FIRST`` do not mean that it was forged.
         """
         decided: list[tuple[ReceivedFrame, Fault | None]] = []
         waiting = self._waiting
@@ -277,7 +276,7 @@ class Verifier:
     def _without_delayed(
         self, decided: list[tuple[ReceivedFrame, Fault | None]]
     ) -> list[tuple[ReceivedFrame, Fault | None]]:
-        """The same, where genuine frames that came late by the counters are not accepted either."""
+        """The decisions, with genuine frames refused that arrived late by the counters."""
         genuine = [one for one, fault in decided if fault is None]
         arrivals = self._arrivals.of([Stamps(one.beacon.anchor, one.rx_ticks, one.beacon.tx_ticks) for one in genuine])
         if all(arrival is Arrival.IN_TIME for arrival in arrivals):
@@ -293,7 +292,7 @@ class Verifier:
         return [(one, next(answers) if fault is None else fault) for one, fault in decided]
 
     def _fault(self, one: ReceivedFrame, timing: ChainTiming) -> Fault | None:
-        """What is wrong with a frame; ``NO_KEY`` while the key of its interval is not known."""
+        """The fault of a frame; ``NO_KEY`` while the key of its interval is unknown."""
         interval = one.interval
         if interval is None:
             present = timing.interval_at(self.clock.upper_at(one.unix_s, timing))
@@ -316,7 +315,7 @@ class Verifier:
         return None
 
     def _is_key_lost(self, one: ReceivedFrame) -> bool:
-        """Whether a frame's key is not known though a later one is: a section has ended, or begun, in between."""
+        """Whether a later key is known but not this frame's: a section has ended, or begun, in between."""
         return one.interval is not None and one.interval <= self.keys.newest and not self.clock.is_late
 
     def _on_certificate(self, anchor: int, sent: bytes, rx_ticks: int) -> None:
@@ -341,7 +340,7 @@ class Verifier:
             self._counters["forged-key"] += 1
 
     def _refuse(self, anchor: int, fault: Fault, rx_ticks: int) -> None:
-        """Count a frame that is not used, and remember its anchor's fault."""
+        """Count a refused frame, and remember its anchor's fault."""
         self._counters[fault] += 1
         before = self._faults.pop(anchor, None)
         if before is not None and before.fault is Fault.REVOKED_CHAIN and rx_ticks - before.rx_ticks < FAULT_TICKS:
@@ -354,7 +353,7 @@ class Verifier:
 
 
 def _time_fault(interval: int, present: int, lag: int) -> Fault | None:
-    """What is wrong with a frame of an interval that was received in another, or before it."""
+    """The fault of a frame received in another interval than its own, or before it."""
     if interval + lag <= present:
         return Fault.LATE
     return Fault.EARLY if interval > present else None

@@ -1,1 +1,1 @@
-"""The part of ``core`` that is also C: its types and arithmetic, and the library that is made from it."""
+"""The part of ``core`` that is also C: its types, its arithmetic, and the library compiled from it."""

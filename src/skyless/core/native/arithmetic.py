@@ -12,20 +12,20 @@ _LN_2_HIGH: Final = 0.6931471803691238
 """The leading bits of ln 2: products with small whole numbers are exact."""
 _LN_2_LOW: Final = 1.9082149292705877e-10
 _LOWEST: Final = -700.0
-"""Its exponential counts as 0."""
+"""Exponentials of smaller numbers are 0."""
 _LARGEST: Final = 9e18
-"""Whole numbers of 64 bits are smaller."""
+"""All 64-bit integers are smaller."""
 
 
 def floor(x: float) -> int:
-    """The largest whole number that is not larger, of 64 bits; 0 for what has none."""
+    """The largest 64-bit integer not above x; 0 if there is none."""
     return _floor(x) if -_LARGEST < x < _LARGEST else 0
 
 
 def exp(x: float) -> float:
     """The exponential of a number up to 0, to four units in the last place.
 
-    x = k·ln 2 + r with |r| ≤ ½·ln 2, where the diagonal Padé approximant of order 6 leaves less than rounding.
+    x = k·ln 2 + r with |r| ≤ ½·ln 2, where the error of the diagonal Padé approximant of order 6 is below rounding.
     """
     if x < _LOWEST:
         return 0.0
@@ -60,7 +60,7 @@ def log(x: float) -> float:
 
 
 def hypot(x: float, y: float) -> float:
-    """The length of a vector; for lengths in a site, whose squares are numbers."""
+    """Length of a vector, without protection against overflow of the squares."""
     return sqrt(x * x + y * y)
 
 
@@ -74,13 +74,13 @@ def square(x: float) -> float:
 # A symmetric matrix is kept as its lower triangle, row by row: element (i, j) with j ≤ i is number i·(i + 1)/2 + j.
 
 SINGULAR_PIVOT: Final = 1e-12
-"""A pivot below this part of its diagonal element is rounding noise: the matrix is singular."""
+"""A pivot below this fraction of its diagonal element is rounding noise: the matrix is singular."""
 DEPENDENT: Final = 1e-6
-"""Columns are not independent if their smallest singular value is below this part of the largest."""
+"""Columns are dependent if their smallest singular value is below this fraction of the largest."""
 ORTHOGONAL: Final = 1e-14
-"""Columns are orthogonal if the cosine of their angle is not larger."""
+"""Columns are orthogonal if the cosine of their angle does not exceed this."""
 MAX_SWEEPS: Final = 12
-"""Rotations of all pairs of columns; they converge quadratically, with four columns after about six."""
+"""Most sweeps over all pairs of columns; they converge quadratically, four columns in about six."""
 MAX_ROWS: Final = MAX_ANCHORS
 MAX_COLUMNS: Final = 4
 
@@ -89,9 +89,9 @@ MAX_COLUMNS: Final = 4
 
 
 def factorise(A: Reals, size: int) -> bool:
-    """Replace A by its lower factor L, with L·Lᵀ = A.
+    """Replace A by its lower Cholesky factor L, L·Lᵀ = A.
 
-    False where A is not positive definite, or singular, or not finite; its elements are then undefined.
+    Returns False, with undefined elements, if A is not positive definite, singular or not finite.
     """
     for i in range(size):
         row = i * (i + 1) // 2
@@ -164,7 +164,7 @@ def orthogonalise(m: Columns) -> None:
 
 
 def _has_rotated(m: Columns, one: int, other: int) -> bool:
-    """Make two columns orthogonal and order them, by the smallest rotation; False where they are so already."""
+    """Make two columns orthogonal and order them by the smallest rotation. Returns False if they are so already."""
     square, square_other, product = (
         _scalar_product(m, one, one),
         _scalar_product(m, other, other),
@@ -208,7 +208,7 @@ def _rotate_columns(
 
 
 def least_squares(m: Columns, right: Reals, x: Reals) -> bool:
-    """Find the x that minimises |A·x − right|, after ``orthogonalise``; False where A does not determine it."""
+    """Find the x that minimises |A·x − right|, after ``orthogonalise``. Returns False if A does not determine it."""
     if not m.squares[m.columns - 1] > DEPENDENT * DEPENDENT * m.squares[0]:
         return False
     for k in range(m.columns):
@@ -230,7 +230,7 @@ FAR_TAIL: Final = 3.0
 """From here on the normal tail's continued fraction converges faster than its series."""
 TERMS: Final = 60
 NEWTON_STEPS: Final = 10
-"""The logarithm is concave, and the first z too large: each step doubles the right digits."""
+"""The logarithm is concave and the first z too large, so each step doubles the number of correct digits."""
 
 
 def normal_tail(z: float) -> float:
@@ -252,7 +252,7 @@ def normal_tail(z: float) -> float:
 
 
 def normal_quantile(tail: float) -> float:
-    """What a standard normal variable exceeds with a probability below ½, by Newton's method for its logarithm."""
+    """The value that a standard normal variable exceeds with this probability below ½, by Newton's method."""
     z = sqrt(-2.0 * log(tail))
     for _ in range(NEWTON_STEPS):
         found = normal_tail(z)
@@ -283,7 +283,7 @@ def chi2_tail(dof: int, chi2: float) -> float:
 
 
 def mean_if_positive(mean: float, sigma: float) -> float:
-    """Mean of a normal variable given that it is positive: E[w²], where w² was measured and may be near 0."""
+    """Mean of a normal variable given that it is positive: E[w²] if w² was measured and may be near 0."""
     z = mean / sigma
     if z < -FAR_TAIL:  # where the mean and what is added to it would cancel
         return sigma / _continued_fraction(-z, 2)

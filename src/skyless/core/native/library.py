@@ -1,4 +1,4 @@
-"""The library that is made from the Python of ``core`` (``tools/translator``), and its functions.
+"""The library compiled from the Python of ``core`` (``tools/translator``), and its functions.
 
 With ``SKYLESS_UNCOMPILED=1`` in the environment the Python itself runs: the same bits, some thousand times slower.
 """
@@ -20,14 +20,14 @@ Result = TypeVar("Result")
 
 UNCOMPILED_VARIABLE: Final = "SKYLESS_UNCOMPILED"
 LIBRARIES: Final = tuple(Path(__file__).with_name(f"libskyless_core{variant}.so") for variant in ("_avx2", ""))
-"""The first is for x86-64 processors with vectors of 256 bits; both give the same bits."""
+"""The first is for x86-64 processors with 256-bit vectors; both give the same bits."""
 _AVX2: Final = frozenset({"avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"})
-"""What Linux calls the instructions of x86-64-v3."""
+"""Linux's names of the instruction sets of x86-64-v3."""
 SOURCE: Final = Path(__file__).with_name("skyless_core.c")
 
 
 def is_compiled() -> bool:
-    """Whether the library's functions are used, and not their Python."""
+    """Whether the library's functions are used rather than their Python."""
     return os.environ.get(UNCOMPILED_VARIABLE, "") in {"", "0"}
 
 
@@ -36,7 +36,7 @@ def library() -> ctypes.CDLL:
     """The library of this installation.
 
     Raises:
-        SkylessError: it is not there, or was not made from the source beside it.
+        SkylessError: it is missing, or was not compiled from the source beside it.
     """
     again = "install Skyless again (in a checkout: scripts/core)"
     file = next((one for one in LIBRARIES[:1] if one.exists() and _has_avx2()), LIBRARIES[-1])
@@ -51,7 +51,7 @@ def library() -> ctypes.CDLL:
 
 
 def _has_avx2() -> bool:
-    """Whether this processor has vectors of 256 bits; where that is not known, it counts as without."""
+    """Whether this processor has 256-bit vectors; False if unknown."""
     try:
         return set(Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").split()) >= _AVX2
     except OSError:
@@ -59,7 +59,7 @@ def _has_avx2() -> bool:
 
 
 def source_digest(source: Path) -> str:
-    """What tells whether a library was made from this file."""
+    """Digest of the source from which a library is compiled."""
     import hashlib  # noqa: PLC0415 - not needed where there is no source
 
     header = source.with_suffix(".h")
@@ -67,9 +67,9 @@ def source_digest(source: Path) -> str:
 
 
 def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """The function of the library that was made from one in Python.
+    """The library's version of a Python function.
 
-    Records are given as they are, arrays as ctypes or NumPy has them, bytes also as ``bytes``. Lengths are not checked.
+    Records are passed as they are, arrays as ctypes or NumPy arrays, bytes also as ``bytes``. Lengths are not checked.
     """
     if not is_compiled():
         return function
@@ -90,16 +90,16 @@ def _argument_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
 
 @cache
 def _address_type(element: Any) -> type:  # noqa: ANN401 - types have no type
-    """The type of an argument that is an array of such elements."""
+    """The type of an argument that is an array of these elements."""
     expected = np.dtype(element)
 
     class Address:
         @classmethod
         def from_param(cls, array: Any) -> Any:  # noqa: ANN401 - arrays of several libraries
-            """What ctypes gives to C.
+            """Convert an array to a C argument.
 
             Raises:
-                TypeError: it has other elements, or they do not follow each other in memory.
+                TypeError: it has other elements, or is not contiguous.
             """
             if getattr(array, "_type_", None) is element or (isinstance(array, bytes) and element is ctypes.c_uint8):
                 return ctypes.c_void_p.from_param(array)

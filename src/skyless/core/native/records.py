@@ -1,6 +1,6 @@
 """Types of the functions that are also translated to C (``tools/translator``): numbers, records and their arrays.
 
-A record is a ``ctypes`` structure, so it has the layout of the C structure of its name and both work on the same
+A record is a ``ctypes`` structure, so it has the layout of the C structure of the same name and both work on the same
 memory. Its fields are declared like those of a dataclass; arrays in it have fixed lengths:
 
     @record
@@ -40,34 +40,34 @@ Read_co = TypeVar("Read_co", covariant=True)
 Made = TypeVar("Made", bound="Record")
 
 Ticks = Annotated[int, ctypes.c_int64]
-"""A whole number of 64 bits. A plain ``int`` has 32: counts and indices."""
+"""A 64-bit integer. A plain ``int`` has 32 bits: counts and indices."""
 
 Count = Annotated[int, ctypes.c_int64]
-"""The same, for what grows for years."""
+"""The same, for counters that grow for years."""
 
 Byte = Annotated[int, ctypes.c_uint8]
 
 LARGEST_TICKS: Final = 1 << 62
-"""Differences of two whole numbers up to this fit 64 bits."""
+"""Differences of two integers up to this fit into 64 bits."""
 _TICKS: Final = Format("<q")
 
 REAL: Final = ctypes.c_double
-"""What a ``float`` of a record is; C's ``real``."""
+"""The type of a record's ``float``; C's ``real``."""
 
 _C_TYPES: Final[dict[object, Any]] = {int: ctypes.c_int32, bool: ctypes.c_bool, float: REAL}
 
 
 class Array(Protocol[Value]):
-    """Elements that follow each other in memory."""
+    """Contiguous elements."""
 
     def __getitem__(self, index: int, /) -> Value:
         """The element, or a reference to it."""
 
     def __setitem__(self, index: int, value: Value, /) -> None:
-        """Copy the value there."""
+        """Copy a value into the element."""
 
     def __iter__(self) -> Iterator[Value]:
-        """All of them; not for functions that are translated."""
+        """All elements; not for translated functions."""
 
 
 class ReadOnly(Protocol[Read_co]):
@@ -92,10 +92,10 @@ class Record(ctypes.Structure):
     """Fields that are records with defaults of their own."""
 
     def __init__(self, **values: Any) -> None:  # noqa: ANN401 - of fields
-        """All fields are zero but those with a default or a value; NaN for a number that is None.
+        """Set all fields to zero, their default or the given value; NaN for a number that is None.
 
         Raises:
-            TypeError: there is no field of a name.
+            TypeError: there is no such field.
         """
         super().__init__()
         self._set_defaults()
@@ -105,14 +105,14 @@ class Record(ctypes.Structure):
         """A copy with other values in these fields.
 
         Raises:
-            TypeError: there is no field of a name.
+            TypeError: there is no such field.
         """
         copy = type(self).from_buffer_copy(self)
         copy._set(values)
         return copy
 
     def values(self) -> dict[str, Any]:
-        """Its fields by name."""
+        """The fields by name."""
         return {name: getattr(self, name) for name in self._names_}
 
     def _set_defaults(self) -> None:
@@ -128,7 +128,7 @@ class Record(ctypes.Structure):
 
 
 def record(made: type[Made]) -> type[Made]:
-    """Give a record the fields that its annotations declare, with their defaults."""
+    """Create a record's fields and defaults from its annotations."""
     hints = get_type_hints(made, include_extras=True)
     made._names_ = tuple(name for name in hints if not name.startswith("_"))
     made._defaults_ = {name: made.__dict__[name] for name in made._names_ if name in made.__dict__}
@@ -138,12 +138,12 @@ def record(made: type[Made]) -> type[Made]:
 
 
 def has_defaults(kind: Any) -> bool:  # noqa: ANN401 - types have no type
-    """Whether a type is a record of which a new one is not all zeros."""
+    """Whether a type is a record whose new instances are not all zeros."""
     return isinstance(kind, type) and issubclass(kind, Record) and bool(kind._defaults_ or kind._nested_)
 
 
 def c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
-    """What an annotation of a field is in ctypes."""
+    """The ctypes type of a field's annotation."""
     if get_origin(hint) is not Annotated:
         return _C_TYPES.get(hint, hint)
     base, *extras = get_args(hint)
@@ -164,15 +164,15 @@ def first(array: Array[Value], count: int) -> list[Value]:
 
 
 def packed(one: Record) -> bytes:
-    """A record's bytes, compressed: what is not in use is zeros."""
+    """A record's bytes, compressed: unused parts are zeros."""
     return compress(bytes(one), level=1)
 
 
 def unpacked(made: type[Made], data: bytes) -> Made:
-    """The record that ``packed`` has turned into bytes.
+    """Decode a record from ``packed``.
 
     Raises:
-        ValueError: they are no bytes of such a record, or C may not have such values in it.
+        ValueError: the bytes are no such record, or contain values that are invalid in C.
     """
     size, reader = ctypes.sizeof(made), decompressobj()
     try:
@@ -190,7 +190,7 @@ def unpacked(made: type[Made], data: bytes) -> Made:
 
 @cache
 def _offsets(made: Any, kind: type) -> tuple[int, ...]:  # noqa: ANN401 - types have no type
-    """Where the numbers of a type stand in a record or an array."""
+    """Offsets of the numbers of a type in a record or an array."""
     if made is kind:
         return (0,)
     if issubclass(made, ctypes.Array):
@@ -203,34 +203,34 @@ def _offsets(made: Any, kind: type) -> tuple[int, ...]:  # noqa: ANN401 - types 
 # Sizes of records on a computer; a board has others (``firmware/source/core_sizes.h``), which its compiler gives C.
 
 MAX_ANCHORS: Final = 32
-"""Most anchors at a time."""
+"""Most anchors in the state."""
 PACKETS_KEPT: Final = 16
-"""Packets of each anchor that are kept for relays to come; divides the range of sequence numbers."""
+"""Packets kept of each anchor for later relays; divides the range of sequence numbers."""
 MAX_RELAYS: Final = 32
 """Most relays with a packet; 13 fit into a frame."""
 PHASE_STATES: Final = 3
-"""States of each anchor for carrier phases; 0 where they are not used."""
+"""States of each anchor for carrier phases; 0 if they are not used."""
 PLANNED_FAULTS: Final = 13
-"""Columns of V for what planning adds: walls, and four impulses along each axis."""
+"""Columns of V for planning: walls, and four impulses along each axis."""
 MOST_WAITING: Final = 8
-"""Most updates of the filter that wait."""
+"""Most queued updates of the filter."""
 PACKED: Final = False
-"""Whether P is kept as its lower triangle alone: half the memory, but rows that vectors do not fit."""
+"""Whether P is kept as a lower triangle: half the memory, but rows that do not fit vectors."""
 MAX_NEIGHBOURS: Final = 256
-"""Most anchors that are known by their own beacons."""
+"""Most anchors known from their own beacons."""
 MAX_SITES: Final = 8
-"""Most sites of which anchors are counted."""
+"""Most sites whose anchors are counted."""
 MAX_COUNTED: Final = 32
-"""Most anchors of each that are counted."""
+"""Most anchors counted of each."""
 MAX_ANCHORS_IN_USE: Final = 24
-"""Most anchors in the estimator's state; more cost accuracy, as each then sends less, and time."""
+"""Most anchors in a tag's state; more reduce accuracy, as each then sends less, and take time."""
 RELAYS_KEPT: Final = 32
-"""Relays of each packet that are kept for the filter which begins."""
+"""Relays kept of each packet for the filter's start."""
 MAX_PAGES: Final = 64
-"""Pages of issues that are not complete."""
+"""Most collected pages of incomplete issues."""
 MAX_SENDERS: Final = 16
-"""Anchors by whose number one page is preferred to another."""
+"""Most senders counted for a page."""
 SHARES_MEMORY: Final = False
-"""Whether the search for a start uses the memory of the state, which is not used meanwhile."""
+"""Whether the search for a start uses the memory of the state, which is unused meanwhile."""
 HAS_ORIGIN: Final = False
-"""Whether positions are from whole metres near the first anchor, as far ones lose millimetres in single precision."""
+"""Whether positions are relative to whole metres near the first anchor, so that single precision suffices."""

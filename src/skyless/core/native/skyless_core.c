@@ -429,7 +429,7 @@ INTERNAL void fill_packet(Tag *t, Neighbour *n, real factor);
 
 /* The exponential of a number up to 0, to four units in the last place.
  *
- * x = k·ln 2 + r with |r| ≤ ½·ln 2, where the diagonal Padé approximant of order 6 leaves less than rounding. */
+ * x = k·ln 2 + r with |r| ≤ ½·ln 2, where the error of the diagonal Padé approximant of order 6 is below rounding. */
 INTERNAL real exp_(real x) {
     if (x < LOWEST) {
         return REAL(0.0);
@@ -468,7 +468,7 @@ INTERNAL real log_(real x) {
     return (real)twos * REAL(0.6931471805599453) + REAL(2.0) * s * total;
 }
 
-/* The length of a vector; for lengths in a site, whose squares are numbers. */
+/* Length of a vector, without protection against overflow of the squares. */
 INTERNAL real hypot_(real x, real y) {
     return SQRT(x * x + y * y);
 }
@@ -480,9 +480,9 @@ INTERNAL real square(real x) {
 
 /* Cholesky's method */
 
-/* Replace A by its lower factor L, with L·Lᵀ = A.
+/* Replace A by its lower Cholesky factor L, L·Lᵀ = A.
  *
- * False where A is not positive definite, or singular, or not finite; its elements are then undefined. */
+ * Returns False, with undefined elements, if A is not positive definite, singular or not finite. */
 INTERNAL bool factorise(real *A, int32_t size) {
     for (int32_t i = 0; i < size; i++) {
         int32_t row = floor_div_32(i * (i + 1), 2);
@@ -556,7 +556,7 @@ INTERNAL void orthogonalise(Columns *m) {
     }
 }
 
-/* Make two columns orthogonal and order them, by the smallest rotation; False where they are so already. */
+/* Make two columns orthogonal and order them by the smallest rotation. Returns False if they are so already. */
 INTERNAL bool has_rotated(Columns *m, int32_t one, int32_t other) {
     real square = scalar_product(m, one, one);
     real square_other = scalar_product(m, other, other);
@@ -606,7 +606,7 @@ INTERNAL void rotate_columns(real (*A)[4], int32_t rows, int32_t one, int32_t ot
     }
 }
 
-/* Find the x that minimises |A·x − right|, after ``orthogonalise``; False where A does not determine it. */
+/* Find the x that minimises |A·x − right|, after ``orthogonalise``. Returns False if A does not determine it. */
 INTERNAL bool least_squares(Columns *m, real *right, real *x) {
     if (!(m->squares[m->columns - 1] > DEPENDENT * DEPENDENT * m->squares[0])) {
         return false;
@@ -650,7 +650,7 @@ INTERNAL real normal_tail(real z) {
     return z >= REAL(0.0) ? tail : REAL(1.0) - tail;
 }
 
-/* What a standard normal variable exceeds with a probability below ½, by Newton's method for its logarithm. */
+/* The value that a standard normal variable exceeds with this probability below ½, by Newton's method. */
 INTERNAL real normal_quantile(real tail) {
     real z = SQRT(-REAL(2.0) * log_(tail));
     for (int32_t time_1 = 0; time_1 < NEWTON_STEPS; time_1++) {
@@ -685,7 +685,7 @@ INTERNAL real chi2_tail(int32_t dof, real chi2) {
     return (is_odd ? REAL(2.0) * normal_tail(SQRT(chi2)) : REAL(0.0)) + exp_(-half) * total;
 }
 
-/* Mean of a normal variable given that it is positive: E[w²], where w² was measured and may be near 0. */
+/* Mean of a normal variable given that it is positive: E[w²] if w² was measured and may be near 0. */
 INTERNAL real mean_if_positive(real mean, real sigma) {
     real z = mean / sigma;
     if (z < -FAR_TAIL) {  /* where the mean and what is added to it would cancel */
@@ -701,14 +701,14 @@ INTERNAL real mean_if_positive(real mean, real sigma) {
 
 /* Physical and radio constants, each with its source. */
 
-/* The unwrapped time that the counter shows and that lies nearest to the expected one. */
+/* The unwrapped time nearest to the expected one that agrees with the counter. */
 INTERNAL int64_t nearest(int64_t counter, int64_t expected_ticks, int32_t bits) {
     int64_t half = 1;
     half = (int64_t)((uint64_t)half << (bits - 1));
     return expected_ticks - half + ((counter - expected_ticks + half) & (2 * half - 1));
 }
 
-/* Whether one crystal's counter may go by ``counter_ticks`` while another's goes by ``elapsed_ticks``. */
+/* Whether one crystal's counter may advance by ``counter_ticks`` while another's advances by ``elapsed_ticks``. */
 INTERNAL bool may_elapse(int64_t counter_ticks, int64_t elapsed_ticks, real slack_ticks) {
     return (real)abs_64(counter_ticks - elapsed_ticks) <= MAX_DRIFT * (real)elapsed_ticks + slack_ticks;
 }
@@ -739,7 +739,7 @@ INTERNAL int64_t unwrap(Unwrapper *u, int64_t counter, real host_s) {
     return ticks;
 }
 
-/* Time of a fix that holds at this master time, given the tag's reading for it, both unwrapped. */
+/* Time of a fix at this master time, given the tag's time of it, both unwrapped. */
 INTERNAL int64_t fix_time_ticks(FixTime *time, int64_t ticks_master, int64_t rx_ticks_tag) {
     if (!time->has_fix) {
         time->has_fix = true;
@@ -1505,56 +1505,56 @@ INTERNAL int32_t received(SiteChoice *choice, int32_t counted, int64_t rx_ticks)
 
 /* Integrity of ``joint``'s fixes: fault tests, protection levels, alerts (``docs/maths.md`` section 8). */
 
-/* ``limits_of`` in the plane. */
+/* ``limits_of`` for the horizontal plane. */
 INTERNAL real horizontal_limit(real risk) {
     return MARGIN * SQRT(-REAL(2.0) * log_(risk));
 }
 
-/* ``limits_of`` along one axis. */
+/* ``limits_of`` for one axis. */
 INTERNAL real vertical_limit(real risk) {
     return MARGIN * normal_quantile(REAL(0.5) * risk);
 }
 
-/* The estimator's state: one record of fixed capacity, and how anchors join and leave by moving blocks in it.
+/* The estimator's state: one record of fixed capacity, in which anchors join and leave by moving blocks.
  *
  * The state vector, all clocks against the tag's own counter, in metres and m/s:
  *
- *     values      position (dim), then for each anchor the offset of its clock: tag's reading − anchor's reading (its
- *                 whole ticks stand in ``Anchor``)
+ *     values      position (dim), then for each anchor its clock's offset: tag's reading − anchor's reading (whole ticks
+ *                 are in ``Anchor``)
  *     rates       velocity (dim), then the rate of each offset
- *     tx noises   of each anchor's newest TX stamp, which all who received it share
- *     ambiguities for each anchor what its carrier's phase shows beyond range and offset, once phases are used
+ *     tx noises   of each anchor's newest TX stamp, common to all who received it
+ *     ambiguities for each anchor what its carrier phase shows beyond range and offset, once phases are in use
  *     meshes      for each anchor the ambiguity of its own receptions of its partner, another anchor
- *     formers     for each anchor its ambiguity up to a gap, while it is not known by how many cycles it has changed since
- *     changes     for each anchor the part of the tag's range error to it that changes as the tag moves
+ *     formers     for each anchor its ambiguity before a gap, while the number of cycles lost in it is unknown
+ *     changes     for each anchor the part of the range error that changes as the tag moves
  *     constants   the part that stays
- *     slope       how ranges lengthen with distance
- *     height      the tag's true height − the one that is given, in two dimensions
- *     zero        what a barometer reads − the tag's true height, in three dimensions
+ *     slope       growth of ranges with distance
+ *     height      true − given height of the tag, in 2-D
+ *     zero        barometer reading − true height of the tag, in 3-D
  *     surveys     for each anchor (dim) its true position − its position in the almanac
  *
- * Range errors and surveys stand last because many a site calls them exact. What is exact has no variance and no
- * covariance, so it is left out of all arithmetic (``State.n``), until a jump or a fault shows otherwise. All that stands
+ * Range errors and surveys are last because many sites state that they are exact. Exact states have no variance and no
+ * covariance and are left out of all arithmetic (``State.n``), until a jump or a fault proves otherwise. Everything
  * behind the states in use is zero. */
 
-/* Where the covariances stand */
+/* Indices of the covariances */
 
-/* Where a state's row of P begins. */
+/* Index in P of a state's row. */
 INTERNAL int32_t row_of(int32_t state) {
     return PACKED ? (state * (state + 1)) >> 1 : state * STATES;
 }
 
-/* How many of the first elements of a row of P there are: all, or those up to the diagonal. */
+/* Length of a row of P up to ``end``: the whole row, or up to the diagonal. */
 INTERNAL int32_t row_end(int32_t state, int32_t end) {
     return PACKED ? min_32(state + 1, end) : end;
 }
 
-/* Where the covariance of two states stands in P. */
+/* Index in P of the covariance of two states. */
 INTERNAL int32_t at(int32_t one, int32_t other) {
     return PACKED && other > one ? row_of(other) + one : row_of(one) + other;
 }
 
-/* Write the covariance of two states, in both places where P has two. */
+/* Write the covariance of two states; if P is square, in both places. */
 INTERNAL void set_covariance(State *s, int32_t one, int32_t other, real value) {
     s->P[at(one, other)] = value;
     if (!PACKED) {
@@ -1562,10 +1562,10 @@ INTERNAL void set_covariance(State *s, int32_t one, int32_t other, real value) {
     }
 }
 
-/* Begin again without anchors at the origin, with the same settings.
+/* Start again without anchors at the origin, with the same settings.
  *
- * ``fault_std_m``: of range errors of all anchors that the levels are to cover; ``has_open_ranges``: expect ranges to
- * be wrong by half a metre and anchors to be misplaced, since what the settings assume of them has been contradicted. */
+ * ``fault_std_m``: range errors of all anchors that the levels have to cover. ``has_open_ranges``: expect range errors
+ * of half a metre and misplaced anchors, because the settings have been contradicted. */
 SKYLESS_EXPORT void skyless_restart(State *s, int64_t rx_ticks, real late_share, real fault_std_m, bool has_open_ranges)
         {
     Status status = {0};
@@ -1580,7 +1580,7 @@ SKYLESS_EXPORT void skyless_restart(State *s, int64_t rx_ticks, real late_share,
     s->status.epoch_ticks = rx_ticks;
 }
 
-/* Forget all states and anchors. What is not in use is zero already, unless a search has used the memory. */
+/* Clear all states and anchors. Unused memory is zero already unless a search has used it. */
 INTERNAL void clear(State *s) {
     int32_t states = s->layout.end;
     int32_t rows = s->rows;
@@ -1620,7 +1620,7 @@ INTERNAL void clear(State *s) {
     s->count = 0;
 }
 
-/* Initialise a state that is all zeros but for its settings and dimensions. */
+/* Initialise a state that is zero except for its settings and dimensions. */
 INTERNAL void prepare(State *s) {
     Status *status = &s->status;
     EstimatorSettings *settings = &s->settings;
@@ -1653,7 +1653,7 @@ INTERNAL void prepare(State *s) {
     }
 }
 
-/* Find where the states stand with the present number of anchors. */
+/* Compute the layout for the present number of anchors. */
 INTERNAL void set_layout(State *s) {
     Layout *where = &s->layout;
     int32_t count = s->count;
@@ -1677,7 +1677,7 @@ INTERNAL void set_layout(State *s) {
     make_uncertain(s, s->status.range_errors);
 }
 
-/* From now on at least these range errors are not known to be zero; finds the number of uncertain states. */
+/* Treat at least these range errors as uncertain, and update the number of uncertain states. */
 INTERNAL void make_uncertain(State *s, int32_t range_errors) {
     s->status.range_errors = max_32(s->status.range_errors, range_errors);
     int32_t end = s->layout.change;
@@ -1702,9 +1702,9 @@ SKYLESS_EXPORT int32_t skyless_find_anchor(State *s, int32_t identifier) {
     return -1;
 }
 
-/* Let an anchor join, of whose clock and, if it is open, range error nothing is known; its index.
+/* Add an anchor with an unknown clock and, if ``is_open``, an unknown range error. Returns its index.
  *
- * ``std_m``: of each coordinate of this anchor; below 0 for that of the settings. There must be room. */
+ * ``std_m``: survey standard deviation of each coordinate; the settings' if negative. There must be room. */
 SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *position_m, real std_m, bool is_open) {
     EstimatorSettings *settings = &s->settings;
     Tuning *tuning = &s->tuning;
@@ -1715,7 +1715,7 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     for (int32_t time_1 = 0; time_1 < dim; time_1++) {
         insert_state(s, where->end);
     }
-    insert_state(s, where->slope);  /* behind the block of constants, and so on: from the last to the first */
+    insert_state(s, where->slope);  /* from the last block to the first, as each index is behind those inserted before */
     insert_state(s, where->constant);
     if (s->status.has_phases) {
         insert_state(s, where->change);
@@ -1770,7 +1770,7 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     return anchor;
 }
 
-/* From now on there are ambiguities, all of which are still to begin. */
+/* Add ambiguities for all anchors, none of them known yet. */
 INTERNAL void use_phases(State *s) {
     if (!s->status.has_phases) {
         for (int32_t time_1 = 0, time_1_end = 3 * s->count; time_1 < time_1_end; time_1++) {
@@ -1781,7 +1781,7 @@ INTERNAL void use_phases(State *s) {
     }
 }
 
-/* Nothing has been relayed from one anchor to another yet. */
+/* Reset a link to no relays. */
 INTERNAL void clear_link(Link *link, real variance_m2) {
     link->tx_ticks = NEVER;
     link->constant_m = REAL(0.0);
@@ -1791,7 +1791,7 @@ INTERNAL void clear_link(Link *link, real variance_m2) {
     link->contradicts = false;
 }
 
-/* Let an anchor leave the state. */
+/* Remove an anchor from the state. */
 INTERNAL void remove_anchor(State *s, int32_t anchor) {
     Layout *where = &s->layout;
     int32_t dim = s->dim;
@@ -1831,7 +1831,7 @@ INTERNAL void remove_anchor(State *s, int32_t anchor) {
     set_layout(s);
 }
 
-/* Move all states from an index on one place back; the one that is there then is zero. */
+/* Move all states from an index on back by one, and set the state at the index to zero. */
 INTERNAL void insert_state(State *s, int32_t index_) {
     int32_t end = s->layout.end;
     for (int32_t state = end; state > index_; state--) {
@@ -1857,7 +1857,7 @@ INTERNAL void insert_state(State *s, int32_t index_) {
     s->layout.end = end + 1;
 }
 
-/* Move all states behind an index one place forward. */
+/* Move all states behind an index forward by one. */
 INTERNAL void remove_state(State *s, int32_t index_) {
     int32_t end = s->layout.end;
     for (int32_t state = index_; state < end - 1; state++) {
@@ -1883,7 +1883,7 @@ INTERNAL void remove_state(State *s, int32_t index_) {
     s->layout.end = end - 1;
 }
 
-/* Move all faults from an index on one place back; the one that is there then is zero. */
+/* Move all faults from an index on back by one, and set the fault at the index to zero. */
 INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults) {
     for (int32_t state = 0, state_end = s->layout.end; state < state_end; state++) {
         insert(s->V[state], index_, s->rows);
@@ -1903,7 +1903,7 @@ INTERNAL void insert_fault(State *s, int32_t index_, int32_t faults) {
     insert(s->evidence, index_, faults);
 }
 
-/* Move all faults behind an index one place forward. */
+/* Move all faults behind an index forward by one. */
 INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults) {
     for (int32_t state = 0, state_end = s->layout.end; state < state_end; state++) {
         remove_(s->V[state], index_, s->rows);
@@ -1923,7 +1923,7 @@ INTERNAL void remove_fault(State *s, int32_t index_, int32_t faults) {
     remove_(s->evidence, index_, faults);
 }
 
-/* The same of what is known of lasting faults, given that this anchor has none. */
+/* Remove an anchor from the lasting faults, given that it has none. */
 INTERNAL void remove_lasting(State *s, int32_t anchor) {
     real (*covariance)[MAX_ANCHORS] = s->lasting_covariance;
     int32_t end = s->count;
@@ -1942,7 +1942,7 @@ INTERNAL void remove_lasting(State *s, int32_t anchor) {
     remove_(s->lasting_m, anchor, end);
 }
 
-/* Move numbers from an index up to an end one place back. */
+/* Move numbers from an index up to an end back by one, and set the number at the index to zero. */
 INTERNAL void insert(real *numbers, int32_t index_, int32_t end) {
     for (int32_t place = end; place > index_; place--) {
         numbers[place] = numbers[place - 1];
@@ -1950,7 +1950,7 @@ INTERNAL void insert(real *numbers, int32_t index_, int32_t end) {
     numbers[index_] = REAL(0.0);
 }
 
-/* Move numbers behind an index one place forward. */
+/* Move numbers behind an index forward by one. */
 INTERNAL void remove_(real *numbers, int32_t index_, int32_t end) {
     for (int32_t place = index_; place < end - 1; place++) {
         numbers[place] = numbers[place + 1];
@@ -1958,9 +1958,9 @@ INTERNAL void remove_(real *numbers, int32_t index_, int32_t end) {
     numbers[end - 1] = REAL(0.0);
 }
 
-/* What is known of lasting faults */
+/* Lasting faults */
 
-/* M of the lasting faults gains weight·m·mᵀ, and y weight·m·shown (Sherman and Morrison 1950). */
+/* Add weight·m·mᵀ to M of the lasting faults and weight·m·shown to y (Sherman and Morrison 1950). */
 INTERNAL void learn_lasting(State *s, real *m, real weight, real shown) {
     real *c = s->work[1];
     real variance = REAL(1.0);
@@ -1986,7 +1986,7 @@ INTERNAL void learn_lasting(State *s, real *m, real weight, real shown) {
     }
 }
 
-/* The lasting fault of an anchor becomes a state, with its own variance beforehand; another one may follow. */
+/* Reset a lasting fault to its prior, because it has become a state of its own. */
 INTERNAL void forget_lasting(State *s, int32_t anchor) {
     real variance = square(s->status.fault_std_m[LASTING]);
     weigh_zero(s, anchor, REAL(1.0) / square(s->tuning.late_std_m) - REAL(1.0) / variance);
@@ -1998,7 +1998,7 @@ INTERNAL void forget_lasting(State *s, int32_t anchor) {
     s->lasting_m[anchor] = REAL(0.0);
 }
 
-/* It is known with this weight besides that the lasting fault of an anchor is zero. */
+/* Add the information, with this weight, that an anchor's lasting fault is zero. */
 INTERNAL void weigh_zero(State *s, int32_t anchor, real weight) {
     real *m = s->work[2];
     for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
@@ -2013,9 +2013,9 @@ INTERNAL void weigh_zero(State *s, int32_t anchor, real weight) {
 
 /* Time update */
 
-/* Time update to a reading of the tag: F·P·Fᵀ + Q for constant velocity and constant clock rates.
+/* Time update to a tag time: F·P·Fᵀ + Q for constant velocity and constant clock rates.
  *
- * The tag's oscillator is in all offsets, so its noise is common to them. */
+ * All offsets contain the tag's oscillator, so its noise is common to them. */
 INTERNAL void predict(State *s, int64_t rx_ticks) {
     real walk = 0;
     Status *status = &s->status;
@@ -2043,7 +2043,7 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     real cube_s = dt * dt * dt / REAL(3.0);
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         add_noise(s, axis, axis, motion * cube_s, motion * square_s, motion * dt);
-        int32_t unknown = FAULT_KINDS * s->count + axis;  /* an acceleration that the filter does not know of */
+        int32_t unknown = FAULT_KINDS * s->count + axis;  /* acceleration unknown to the filter */
         s->V[axis][unknown] -= REAL(0.5) * dt * dt;
         s->V[where->velocity + axis][unknown] -= dt;
     }
@@ -2063,13 +2063,13 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
 
 /* Whether the tag has shown no motion for long enough to count as stationary.
  *
- * Phases show that it rests by themselves, and what it then begins to do: ambiguities would take that up first. */
+ * Never while phases are in use: they show rest by themselves, and ambiguities would absorb the onset of motion. */
 INTERNAL bool is_stationary(State *s) {
     return (REAL(0.0) < s->settings.stationary_s && s->settings.stationary_s < s->status.stationary_s) &&
             !s->status.has_phases;
 }
 
-/* The values, which are the first states, gain dt·(their rates), which follow in the same order: F·P·Fᵀ. */
+/* Add dt·(rates) to the values; the values are the first states, their rates follow in the same order. F·P·Fᵀ. */
 INTERNAL void advance(State *s, real dt) {
     int32_t values = s->layout.velocity;
     for (int32_t value = 0; value < values; value++) {
@@ -2104,7 +2104,7 @@ INTERNAL void advance(State *s, real dt) {
     }
 }
 
-/* The same for the lower triangle: of values among each other in two steps, between which their rates change. */
+/* ``_advance`` for a lower triangle: values among each other in two steps, between which their rates change. */
 INTERNAL void advance_packed(State *s, int32_t values, real dt) {
     for (int32_t value = 0; value < values; value++) {
         int32_t row = row_of(value);
@@ -2130,7 +2130,7 @@ INTERNAL void advance_packed(State *s, int32_t values, real dt) {
     }
 }
 
-/* Q of a value and its rate, or what two such pairs have in common: white noise of values, walk of rates. */
+/* Add Q of a value and its rate, or of two such pairs with common noise: white for values, a walk for rates. */
 INTERNAL void add_noise(State *s, int32_t value, int32_t other, real of_values, real of_both, real of_rates) {
     int32_t rate = s->layout.velocity + value;
     int32_t other_rate = s->layout.velocity + other;
@@ -2144,16 +2144,16 @@ INTERNAL void add_noise(State *s, int32_t value, int32_t other, real of_values, 
 
 /* Range errors that change */
 
-/* 1 where range errors have jumped recently, 0 where none has. */
+/* 1 if range errors have jumped recently, 0 if none has. */
 INTERNAL real jump_share(State *s) {
     return min_real(s->status.obstruction, REAL(1.0));
 }
 
-/* What an anchor's range errors keep over what has passed and was walked since its newest packet.
+/* Decay of an anchor's range errors over the time and the walked distance since its newest packet.
  *
- * Of the changing part: the share that is kept and its variance in the long run; then the share of the constant part.
- * The changing part is a Gauss–Markov process of walked distance and of time. Where range errors jump, both parts
- * forget within seconds; one that has jumped itself wanders and returns to zero. */
+ * Returns the kept share of the changing part, its long-term variance, and the kept share of the constant part. The
+ * changing part is a Gauss–Markov process of walked distance and time. Where range errors jump, both parts are
+ * forgotten within seconds; one that has jumped itself wanders and returns to zero. */
 INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, real dt, real walked_m) {
     real variance = 0;
     real kept = 0;
@@ -2179,13 +2179,13 @@ INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, r
     return (range_error_decay_results){kept, variance, kept_constant};
 }
 
-/* Time update of an anchor's range errors since its newest packet, by what ``range_error_decay`` says. */
+/* Time update of an anchor's range errors since its newest packet, by ``range_error_decay``. */
 INTERNAL void relax_range_error(State *s, int32_t anchor, real dt, real walked_m) {
     const range_error_decay_results results_1 = range_error_decay(s, anchor, dt, walked_m);
     real kept = results_1.item_0;
     real variance = results_1.item_1;
     real kept_constant = results_1.item_2;
-    if (variance > REAL(0.0)) {  /* also where the site calls ranges exact: multipath is learnt there as well */
+    if (variance > REAL(0.0)) {  /* also if the site states exact ranges: multipath is learnt there too */
         make_uncertain(s, CHANGING_RANGE_ERRORS);
         decay(s, s->layout.change + anchor, kept, variance);
     }
@@ -2194,7 +2194,7 @@ INTERNAL void relax_range_error(State *s, int32_t anchor, real dt, real walked_m
     }
 }
 
-/* A state decays towards zero and keeps, in the long run, that variance: Gauss–Markov. */
+/* Decay a state towards zero with the given long-term variance (Gauss–Markov). */
 INTERNAL void decay(State *s, int32_t state, real kept, real variance) {
     s->x[state] *= kept;
     for (int32_t other = 0, other_end = s->used; other < other_end; other++) {
@@ -2206,7 +2206,7 @@ INTERNAL void decay(State *s, int32_t state, real kept, real variance) {
     }
 }
 
-/* Forget a state: zero, uncorrelated, with that variance. */
+/* Reset a state to zero, uncorrelated, with the given variance. */
 INTERNAL void reset_state(State *s, int32_t state, real variance) {
     s->x[state] = REAL(0.0);
     for (int32_t other = 0, other_end = s->used; other < other_end; other++) {
@@ -2218,7 +2218,7 @@ INTERNAL void reset_state(State *s, int32_t state, real variance) {
     }
 }
 
-/* Let what was taken for known err along the first of ``U``, which holds so much of each fault as ``G`` says. */
+/* Add uncertainty along the first of ``U``, which depends on each fault by the first of ``G``. */
 INTERNAL void open_direction(State *s, real variance, int32_t faults) {
     real *opened = s->U[0];
     real *shared = s->G[0];
@@ -2236,7 +2236,7 @@ INTERNAL void open_direction(State *s, real variance, int32_t faults) {
 #ifndef SKYLESS_BY_HAND
 /* Measurement update */
 
-/* Write P·h of the measurement in ``h`` into the next of ``U``; returns hᵀ·P·h. Counts updates that wait. */
+/* Write P·h of the measurement in ``h`` into the next of ``U``, including queued updates. Returns hᵀ·P·h. */
 INTERNAL real compute_ph(State *s) {
     if (s->waiting == MOST_WAITING) {
         finish_updates(s);
@@ -2270,7 +2270,7 @@ INTERNAL real compute_ph(State *s) {
 }
 #endif
 
-/* The measurement in ``h`` times what stands in the order of states. */
+/* The scalar product of ``h`` and a vector over the states. */
 INTERNAL real h_dot(State *s, real *states) {
     real total = REAL(0.0);
     for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
@@ -2310,19 +2310,19 @@ INTERNAL void compute_fault_input(State *s, int32_t own) {
 }
 #endif
 
-/* Scalar update by a measurement whose P·h and shares of faults are the next of ``U`` and ``G``.
+/* Scalar update by the measurement whose P·h and fault inputs are the next of ``U`` and ``G``.
  *
- * K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; a measurement whose variance counts more has the S that
- * follows, and 1. P changes by −u·uᵀ with u = P·h/√S, which is symmetric to the bit. No update may wait. */
+ * K = gain_scale·P·h/S. A scale of 1 is the Kalman gain; an inflated variance is in S, with a scale of 1. P changes by
+ * −u·uᵀ with u = P·h/√S, which is symmetric to the bit. No updates may be queued. */
 INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale) {
     note_update(s, innovation, innovation_variance, gain_scale);
     apply_updates(s);
 }
 
-/* The same for a measurement that shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
+/* Queue an update by a measurement that also shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
  *
- * P, V and M wait for ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and V.
- * What is known of lasting faults does not wait. */
+ * P, V and M follow in ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and
+ * V. Lasting faults are updated at once. */
 INTERNAL void update_later(State *s, real innovation, real innovation_variance) {
     real *g = s->G[s->waiting];
     real normalised = innovation / SQRT(innovation_variance);
@@ -2333,7 +2333,7 @@ INTERNAL void update_later(State *s, real innovation, real innovation_variance) 
     learn_lasting(s, g, REAL(1.0), normalised);
 }
 
-/* Update x, and make u = P·h/√S and g = s/√S of what stands in ``U`` and ``G``, for P and V. */
+/* Update x, and scale the next of ``U`` and ``G`` to u = P·h/√S and g = s/√S for P and V. */
 INTERNAL void note_update(State *s, real innovation, real innovation_variance, real gain_scale) {
     real inverse = REAL(1.0) / SQRT(innovation_variance);
     real step = gain_scale * inverse;
@@ -2352,7 +2352,7 @@ INTERNAL void note_update(State *s, real innovation, real innovation_variance, r
     s->waiting += 1;
 }
 
-/* Let P, V and M follow the updates that wait. */
+/* Apply the queued updates to P, V and M. */
 INTERNAL void finish_updates(State *s) {
     if (s->waiting > 0) {
         inform(s);
@@ -2361,7 +2361,7 @@ INTERNAL void finish_updates(State *s) {
 }
 
 #ifndef SKYLESS_BY_HAND
-/* M ← M + Σ s·sᵀ/S over the updates that wait, of which ``G`` has s/√S. */
+/* M ← M + Σ s·sᵀ/S over the queued updates, whose s/√S are in ``G``. */
 INTERNAL void inform(State *s) {
     int32_t faults = FAULT_KINDS * s->count;
     for (int32_t group = 0, group_end = fill_groups(s); group < group_end; group++) {
@@ -2380,7 +2380,7 @@ INTERNAL void inform(State *s) {
 }
 #endif
 
-/* Fill the updates that wait with zeros up to a multiple of four; returns a quarter of their number. */
+/* Pad the queued updates with zeros to a multiple of four. Returns the number of groups of four. */
 INTERNAL int32_t fill_groups(State *s) {
     int32_t groups = floor_div_32(s->waiting + 3, 4);
     for (int32_t one = s->waiting; one < 4 * groups; one++) {
@@ -2395,7 +2395,7 @@ INTERNAL int32_t fill_groups(State *s) {
 }
 
 #ifndef SKYLESS_BY_HAND
-/* P ← P − Σ u·uᵀ and V ← V + Σ u·gᵀ over the updates that wait, four at a time: P is read and written once. */
+/* P ← P − Σ u·uᵀ and V ← V + Σ u·gᵀ over the queued updates, four at a time: P is read and written once. */
 INTERNAL void apply_updates(State *s) {
     if (s->waiting <= 2) {
         for (int32_t one = 0, one_end = s->waiting; one < one_end; one++) {
@@ -2441,29 +2441,29 @@ INTERNAL void apply_four(State *s, int32_t k) {
     }
 }
 
-/* Faults of anchors: what they do to the state, what innovations show of them, and the verdicts.
+/* Faults of anchors: their effect on the state, the evidence for them in innovations, and the tests.
  *
- * Where all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b, and the
- * innovation of a measurement h holds s_j·b (Friedland 1969):
+ * If all that the tag receives of anchor j is late by b metres, the estimate errs by V_j·b, and the innovation of a
+ * measurement h contains s_j·b (Friedland 1969):
  *
  *     s = [own reception of j] − h·V        V ← F·V  (time)        V ← V + K·s  (update)
  *
- * With y = Σ s·ν/S and M = Σ s·sᵀ/S over the innovations ν of variance S, and σ_f²·I the faults' variance beforehand, all
- * anchors' faults are b̂ = (M + I/σ_f²)⁻¹·y with the covariance (M + I/σ_f²)⁻¹, and yᵀ·(M + I/σ_f²)⁻¹·y tests whether there
- * are any. Where V, y and M forget, b is the present size of a fault that has grown as fast as they forget: within packets
- * (recent) or seconds (creeping). A fault that is sure is added to the anchor's range error, which gives the state that
- * the filter would have, had that error been open from the beginning. */
+ * With y = Σ s·ν/S and M = Σ s·sᵀ/S over the innovations ν of variance S, and the prior variances σ_f²·I of the faults,
+ * the estimate of all anchors' faults is b̂ = (M + I/σ_f²)⁻¹·y with the covariance (M + I/σ_f²)⁻¹, and
+ * yᵀ·(M + I/σ_f²)⁻¹·y tests whether there are any. Where V, y and M are faded, b is the present size of a fault that
+ * has grown as fast as they fade: within packets (recent) or seconds (creeping). A fault beyond doubt is added to the
+ * anchor's range error, which gives the state that the filter would have if that error had been open from the beginning. */
 
 /* What innovations show (gathered by ``kalman.update_later``) */
 
-/* Subtract the reception of the first anchor of a difference: its faults count with the opposite sign. */
+/* Subtract the input of the first anchor of a difference, whose faults have the opposite sign. */
 INTERNAL void subtract_fault_input(State *s, int32_t anchor) {
     for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
         s->G[s->waiting][kind * s->count + anchor] -= REAL(1.0);
     }
 }
 
-/* Forget, once in a round of packets, a share of what has not lasted has done, and of the evidence for it. */
+/* Fade the effect of, and the evidence for, recent and creeping faults; once a round of packets. */
 INTERNAL void fade_faults(State *s) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
@@ -2499,7 +2499,7 @@ INTERNAL void fade_faults(State *s) {
 
 /* Compute L⁻¹·r of the vectors r in the rows behind a symmetric matrix M = L·Lᵀ in ``work``, by Cholesky's method.
  *
- * So r·M⁻¹·q is the product of what becomes of r and of q. Rows of vectors are treated as rows of the matrix. */
+ * The scalar product of two results is r·M⁻¹·q. Rows of vectors are treated like rows of the matrix. */
 INTERNAL void whiten(State *s, int32_t count, int32_t vectors) {
     for (int32_t column = 0; column < count; column++) {
         real *pivot = s->work[column];
@@ -2519,16 +2519,16 @@ INTERNAL void whiten(State *s, int32_t count, int32_t vectors) {
     }
 }
 
-/* The test of all faults of a kind; leaves what they do to that number of axes, as factors, in rows of ``work``.
+/* Test all faults of a kind. Leaves their effect on the first ``axes`` states, as factors, in rows of ``work``.
  *
- * In row ``count`` f, in those behind it A: A·f is how far the estimate of the faults moves a position. With L·Lᵀ =
- * M + I/σ_f² these are L⁻¹·y and L⁻¹·V, and A·Aᵀ is the covariance of that; for lasting faults A·Bᵀ, with B behind A. */
+ * Row ``count`` is f, those behind it are A: the estimated faults move a position by A·f. With L·Lᵀ = M + I/σ_f² these
+ * are L⁻¹·y and L⁻¹·V, and A·Aᵀ is the covariance of that shift; for lasting faults it is A·Bᵀ, with B behind A. */
 INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
     int32_t count = s->count;
     int32_t begin = kind * s->count;
     int32_t first = s->count + 1;
     real total = REAL(0.0);
-    if (kind == LASTING) {  /* their covariance is known as it is */
+    if (kind == LASTING) {  /* whose covariance is kept explicitly */
         for (int32_t axis = 0; axis < axes; axis++) {
             real *a = s->work[first + axis];
             real *b = s->work[first + AXES + axis];
@@ -2568,7 +2568,7 @@ INTERNAL real fault_chi2(State *s, int32_t kind, int32_t axes) {
 
 /* How much of the test of all lasting faults one anchor or two explain.
  *
- * ``other`` is not above ``one``, and the same for one anchor. */
+ * ``other`` is not above ``one``; equal for one anchor. */
 INTERNAL real explained_chi2(State *s, int32_t one, int32_t other) {
     real weight = REAL(1.0) / square(s->tuning.late_std_m);
     real y_one = s->evidence[one];
@@ -2582,7 +2582,7 @@ INTERNAL real explained_chi2(State *s, int32_t one, int32_t other) {
     return (b * square(y_one) - REAL(2.0) * both * y_one * y_other + a * square(y_other)) / (a * b - both * both);
 }
 
-/* How much the fault of an anchor explains; that it is early is less likely, and counts less. */
+/* How much an anchor's fault explains. An early one is less likely, and weighted less. */
 INTERNAL real explained_alone(State *s, int32_t kind, int32_t anchor) {
     int32_t fault = kind * s->count + anchor;
     real y = s->evidence[fault];
@@ -2591,7 +2591,7 @@ INTERNAL real explained_alone(State *s, int32_t kind, int32_t anchor) {
             square(s->tuning.late_std_m));
 }
 
-/* How much the fault of a single anchor explains at most. */
+/* The most that the fault of a single anchor explains. */
 INTERNAL real largest(State *s, int32_t kind) {
     real most = REAL(0.0);
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
@@ -2602,10 +2602,10 @@ INTERNAL real largest(State *s, int32_t kind) {
 
 /* Adding faults to the state */
 
-/* Add faults to the state where the test of all of a kind is sure, of the kind that explains most.
+/* If the test of all faults of a kind is beyond doubt, add faults of the kind that explains most to the state.
  *
- * After a start that was contradicted, none are selected: any number of anchors may be late then, and those that
- * explain the test are now and then the wrong ones. */
+ * None are selected after a start that was contradicted: any number of anchors may be late then, and those that
+ * explain the test best are sometimes the wrong ones. */
 INTERNAL void open_faults(State *s) {
     real sure_chi2 = s->tuning.sure_chi2;
     if (s->status.fault_std_m[LASTING] > s->tuning.lasting_std_m) {
@@ -2625,10 +2625,10 @@ INTERNAL void open_faults(State *s) {
     }
 }
 
-/* Open the range errors of the anchors whose faults explain the innovations about as well as any other's.
+/* Open the range errors of the anchors whose faults explain the innovations about as well as the best one.
  *
- * A single one opens by itself; where it is open which of several it is, the position uses none of them,
- * as long as enough anchors are left. None opens where there are too few anchors to contradict it afterwards. */
+ * If several explain them, all of these are opened, as long as enough anchors are left; none if too few anchors remain
+ * to contradict the choice later. */
 INTERNAL void open_new_faults(State *s, int32_t kind) {
     int32_t spare = s->count - s->dim - 1;
     real *explained = s->work[0];
@@ -2657,7 +2657,7 @@ INTERNAL void open_new_faults(State *s, int32_t kind) {
     }
 }
 
-/* Note that an anchor's range error has jumped; it may still be changing. */
+/* Mark that an anchor's range error has jumped and may still be changing. */
 INTERNAL void begin_obstruction(State *s, int32_t anchor) {
     Anchor *a = &s->anchors[anchor];
     a->outliers_in_row = 0;
@@ -2667,12 +2667,12 @@ INTERNAL void begin_obstruction(State *s, int32_t anchor) {
     note_jump(s);
 }
 
-/* Range errors jump at present. */
+/* Raise the estimated rate of jumps of range errors. */
 INTERNAL void note_jump(State *s) {
     s->status.obstruction = min_real(s->status.obstruction + s->tuning.jump_rise, REAL(2.0));
 }
 
-/* Add the lasting faults of one or two anchors to the state, where no others explain the test as well. */
+/* Add the lasting faults of one or two anchors to the state, if no others explain the test as well. */
 INTERNAL void open_lasting_faults(State *s, real chi2) {
     real apart_chi2 = s->tuning.apart_chi2;
     for (int32_t faults = 1, faults_end = min_32(MAX_FAULTS, s->count - s->dim - 2) + 1; faults < faults_end; faults++)
@@ -2710,10 +2710,10 @@ INTERNAL void open_lasting_faults(State *s, real chi2) {
     }
 }
 
-/* Add a lasting fault to the state, and note that the anchor has one.
+/* Add a lasting fault to the state and to the anchor's record.
  *
- * Nothing makes ranges much shorter. Where single packets are often late, the first packet was, from which the
- * anchor's clock was taken: it leaves the state instead, to join again with its next packet. */
+ * Nothing makes ranges much shorter. If single packets are often late, the first packet was, which initialised the
+ * anchor's clock: the anchor leaves the state instead, and joins again with its next packet. */
 INTERNAL void open_lasting_fault(State *s, int32_t anchor) {
     if (s->status.late_share > s->tuning.late_often_share && s->lasting_m[anchor] < -s->tuning.lasting_std_m) {
         remove_anchor(s, anchor);
@@ -2723,14 +2723,14 @@ INTERNAL void open_lasting_fault(State *s, int32_t anchor) {
     s->anchors[anchor].has_fault = true;
 }
 
-/* End a fault: an anchor's packets have been late since it joined, and are not any more. */
+/* End a fault: the anchor's packets had been late since it joined, and no longer are. */
 INTERNAL void end_lasting_fault(State *s, int32_t anchor) {
     open_fault(s, LASTING, anchor);
     reset_state(s, s->layout.constant + anchor, square(s->settings.range_std_m));
     note_jump(s);
 }
 
-/* Add a fault to its anchor's range error; all other hypotheses are conditioned on it (Schur's complement). */
+/* Add a fault to its anchor's range error, and condition all other hypotheses on it (Schur's complement). */
 INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
     bool is_lasting = kind == LASTING;
     int32_t chosen = kind * s->count + anchor;
@@ -2739,7 +2739,7 @@ INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
     real gain = REAL(1.0) / (s->information[chosen][chosen] + REAL(1.0) / square(s->tuning.late_std_m));
     real fault_m = gain * s->evidence[chosen];
     real variance = is_lasting ? gain : gain + fault_m * fault_m;
-    real *opened = s->U[0];  /* what it adds to each state: 1 − V for the range error, −V for all others */
+    real *opened = s->U[0];  /* change of each state per metre: 1 − V for the range error, −V for the others */
     real *shared = s->G[0];
     for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
         opened[state] = -s->V[state][chosen];
@@ -2772,39 +2772,39 @@ INTERNAL void open_fault(State *s, int32_t kind, int32_t anchor) {
     s->status.faults_opened += 1;
 }
 
-/* What the estimator's counters say of its state: whether a new start is needed, and what that has to expect. */
+/* Verdicts on the state: whether a new start is needed, and what it has to expect */
 
-/* Whether single packets are late often. */
+/* Whether single packets are often late. */
 INTERNAL bool is_late_often(State *s) {
     return s->status.late_share > s->tuning.late_often_share;
 }
 
-/* Whether most measurements lie beyond the gate. */
+/* Whether most measurements are beyond the gate. */
 INTERNAL bool rejects_most(State *s) {
     return s->status.rejected_share > s->tuning.lost_share;
 }
 
-/* Whether more packets are rejected than a right state would reject. */
+/* Whether more packets are rejected than a correct state would reject. */
 INTERNAL bool is_lost(State *s) {
     int32_t in_row = s->status.rejected_in_row + s->status.stale_in_row;
     real late = min_real(s->status.late_share, MOST_LATE);
     return rejects_most(s) || (real)in_row * (REAL(1.0) - REAL(2.0) * late) >= s->tuning.lost_in_row;
 }
 
-/* Whether most of what anchors received of each other does not fit: a wrong position shifts all clocks. */
+/* Whether most relays do not fit: a wrong position shifts all clocks. */
 INTERNAL bool relays_contradict(State *s) {
     Status *status = &s->status;
     return status->relays_lately_rejected > max_real(s->tuning.max_relays_rejected, status->relays_lately_accepted);
 }
 
-/* Whether most of what anchors received of each other fits, and that is more than a few receptions. */
+/* Whether most relays fit, and enough of them for a judgement. */
 INTERNAL bool relays_fit(State *s) {
     Status *status = &s->status;
     return status->relays_lately_accepted > max_real(s->tuning.max_relays_rejected, REAL(4.0) *
             status->relays_lately_rejected);
 }
 
-/* Sum of the variances of x and y ``ahead_s`` later, if nothing is received until then. */
+/* Sum of the variances of x and y after ``ahead_s`` without receptions. */
 INTERNAL real horizontal_variance_m2(State *s, real ahead_s) {
     real total = REAL(2.0) * s->settings.qa * s->status.q_scale * ahead_s * ahead_s * ahead_s / REAL(3.0);
     for (int32_t axis = 0; axis < 2; axis++) {
@@ -2815,7 +2815,7 @@ INTERNAL real horizontal_variance_m2(State *s, real ahead_s) {
     return total;
 }
 
-/* Whether the constants of the ranges are as small as the settings state, as far as they are known. */
+/* Whether the range constants are as small as the settings state, as far as they are known. */
 INTERNAL bool fits_settings(State *s) {
     int32_t first = s->layout.constant;
     int32_t count = s->count;
@@ -2834,29 +2834,29 @@ INTERNAL bool fits_settings(State *s) {
     return chi2 < s->tuning.fitting_chi2 * (real)count;
 }
 
-/* Which measurements are used, and how process noise is adapted to innovations.
+/* Which measurements are used, and how process noise adapts to innovations.
  *
- * It must handle
+ * Covered are
  *
  * 1. single late receptions, as paths are blocked for a moment: the gate;
- * 2. an anchor behind an obstacle from now on, and its return: its range error jumps, and is estimated again;
+ * 2. an anchor behind a new obstacle, and its return: its range error jumps and is estimated again;
  * 3. a person or a wall that obstructs several anchors in turn: a jump raises the process noise of all range errors;
- * 4. reflections that change as the tag walks: learnt from what range errors differ by from step to step;
- * 5. a tag that moves more than assumed: innovations stay on one side along an axis;
- * 6. the tag's oscillator that warms up, at once or slowly: innovations of all anchors are on one side;
- * 7. an anchor's oscillator that warms up, or its counter that jumps: relays show it;
- * 8. a tag that stands still, so that noise does not move it;
- * 9. all that does not fit any of these: covariances grow with the mean NIS.
+ * 4. reflections that change as the tag walks: learnt from the differences of range errors from step to step;
+ * 5. a tag that moves more than assumed: innovations along an axis stay on one side;
+ * 6. the tag's oscillator warming up, suddenly or slowly: innovations of all anchors are on one side;
+ * 7. an anchor's oscillator warming up, or its counter jumping: relays show it;
+ * 8. a tag at rest, which noise must not move;
+ * 9. everything else: covariances grow with the mean NIS.
  *
- * Anchors that are late from the start, or ever more, without a jump are found by ``faults``. ``docs/estimator_table.md``
- * says what each of these buys. */
+ * Anchors that are late from the start, or increasingly late without a jump, are found by ``faults``.
+ * ``docs/estimator_table.md`` shows what each mechanism buys. */
 
 /* Whether two packets of each anchor have been processed since the start. */
 INTERNAL bool is_warm(State *s) {
     return s->status.packets > 2 * s->count;
 }
 
-/* Count the receptions of an anchor in a row that are off by the same amount. */
+/* Count consecutive receptions of an anchor that are off by the same amount. */
 INTERNAL void note_outlier(State *s, int32_t anchor, real innovation, real innovation_variance) {
     Anchor *a = &s->anchors[anchor];
     Tuning *tuning = &s->tuning;
@@ -2874,15 +2874,15 @@ INTERNAL void note_outlier(State *s, int32_t anchor, real innovation, real innov
     }
 }
 
-/* Whether enough receptions in a row are off to show that the anchor's range error has jumped. */
+/* Whether enough consecutive receptions are off to show that the anchor's range error has jumped. */
 INTERNAL bool has_jumped(State *s, int32_t anchor) {
     real needed = is_late_often(s) ? s->tuning.in_row_where_late : s->tuning.in_row;
     return (real)s->anchors[anchor].outliers_in_row >= needed;
 }
 
-/* Whether the newest innovations of all anchors but one, which may show nothing, lie on the side of this one.
+/* Whether the newest innovations of all anchors but at most one small one are on the side of this innovation.
  *
- * The tag's clock it is then. A faulty anchor draws the others to the opposite side of its own. */
+ * The tag's clock is the cause then. A faulty anchor draws the others to the opposite side of its own. */
 INTERNAL bool is_common(State *s, real normalised) {
     int32_t others = 0;
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
@@ -2896,16 +2896,16 @@ INTERNAL bool is_common(State *s, real normalised) {
     return s->count > s->dim && others <= 1;
 }
 
-/* Whether it is an anchor's clock that has jumped, and not its range error.
+/* Whether the anchor's clock has jumped rather than its range error.
  *
- * Then the mean of its relays' innovations is off zero with the sign of its reception's. After a jump of the range
- * error it has the opposite sign: the receptions have pulled the clock's estimate away from what relays show. */
+ * The mean of its relays' innovations is then off zero with the sign of its reception's. After a jump of the range
+ * error the sign is opposite: the receptions have pulled the clock's estimate away from what relays show. */
 INTERNAL bool is_of_clock(State *s, int32_t anchor, real innovation) {
     real relay_mean = s->anchors[anchor].relay_mean;
     return is_off_zero(s, relay_mean) && relay_mean * innovation > REAL(0.0);
 }
 
-/* Let an anchor's range error be estimated again from a jump on. */
+/* Estimate an anchor's range error again after a jump. */
 INTERNAL void open_range_error(State *s, int32_t anchor, real innovation) {
     int32_t change = s->layout.change + anchor;
     s->status.obstructions += 1;
@@ -2921,19 +2921,19 @@ INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised) {
     a->change_scale = adapted(s, a->change_scale, is_off_zero(s, a->change_mean), s->tuning.max_scale);
 }
 
-/* Factor on process noise after an innovation, which says whether that is too small. */
+/* Factor on process noise after an innovation, which shows whether the noise is too small. */
 INTERNAL real adapted(State *s, real scale, bool is_too_small, real largest) {
     scale *= is_too_small ? s->tuning.noise_growth : s->tuning.noise_loss;
     return min_real(max_real(scale, REAL(1.0)), largest);
 }
 
-/* Whether a running mean of normalised innovations is further off zero than chance makes it. */
+/* Whether a running mean of normalised innovations is farther from zero than chance explains. */
 INTERNAL bool is_off_zero(State *s, real mean) {
     real gain = s->tuning.mean_gain;
     return mean * mean * (REAL(2.0) - gain) / gain > square(s->tuning.suspect);
 }
 
-/* End an obstruction that has gone without a jump back: the range error is known, and is hardly there. */
+/* End an obstruction that has disappeared without a jump: the range error is known and close to zero. */
 INTERNAL void end_small_obstruction(State *s, int32_t anchor) {
     Tuning *tuning = &s->tuning;
     Anchor *a = &s->anchors[anchor];
@@ -2971,15 +2971,15 @@ INTERNAL void note_innovation(State *s, real innovation, real innovation_varianc
     }
 }
 
-/* Whether a normalised innovation is small enough to be used; NaN is not. */
+/* Whether a normalised innovation is within the gate; False for NaN. */
 INTERNAL bool is_within_gate(State *s, real normalised) {
     return -s->settings.gate <= normalised && normalised <= s->settings.gate;
 }
 
 /* Factor on the variance of a measurement with this normalised innovation; 0 beyond the gate.
  *
- * Large innovations have less weight where receptions are late often, and always in time differences, of which
- * either anchor may be late. */
+ * Large innovations are down-weighted if receptions are often late, and always in time differences, of which either
+ * anchor may be late. */
 INTERNAL real variance_scale(State *s, real normalised, bool is_difference) {
     Tuning *tuning = &s->tuning;
     if (!is_within_gate(s, normalised)) {
@@ -2991,9 +2991,9 @@ INTERNAL real variance_scale(State *s, real normalised, bool is_difference) {
     return is_late_often(s) ? max_real(REAL(1.0), abs_real(normalised) / tuning->reception_huber) : REAL(1.0);
 }
 
-/* Let the variance of an anchor's changing range error track its estimate: the mean of its square.
+/* Track the variance of an anchor's changing range error: the mean square of its estimate.
  *
- * The maximisation step of expectation maximisation (Shumway and Stoffer 1982) with a memory that fades. */
+ * The maximisation step of expectation maximisation (Shumway and Stoffer 1982) with fading memory. */
 INTERNAL void adapt_change_variance(State *s, int32_t anchor, real elapsed_s) {
     Tuning *tuning = &s->tuning;
     EstimatorSettings *settings = &s->settings;
@@ -3010,10 +3010,10 @@ INTERNAL void adapt_change_variance(State *s, int32_t anchor, real elapsed_s) {
     }
 }
 
-/* Learn how range errors change with the distance walked, from what they differ by after one and two steps.
+/* Learn how range errors change with walked distance, from their differences after one and after two steps.
  *
- * Half the mean square of the differences is noise + σ²·(1 − c) after one step and noise + σ²·(1 − c²) after two, for
- * a Gauss–Markov process of variance σ² with the correlation c over a step (a semivariogram, Matheron 1963). */
+ * For a Gauss–Markov process of variance σ² with correlation c over a step, half the mean square difference is noise +
+ * σ²·(1 − c) after one step and noise + σ²·(1 − c²) after two (a semivariogram, Matheron 1963). */
 INTERNAL void learn_place(State *s, int32_t anchor, real residual_m) {
     Tuning *tuning = &s->tuning;
     EstimatorSettings *settings = &s->settings;
@@ -3051,7 +3051,7 @@ INTERNAL void learn_place(State *s, int32_t anchor, real residual_m) {
     }
 }
 
-/* Count for how long the tag has shown no motion: neither its position, nor innovations that stay on one side. */
+/* Update the time without motion, shown by the position or by innovations that stay on one side. */
 INTERNAL void update_stationary(State *s, real dt) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
@@ -3064,7 +3064,7 @@ INTERNAL void update_stationary(State *s, real dt) {
     if (moved) {
         status->stationary_s = REAL(0.0);
     }
-    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {  /* a place that has become known better moves as well */
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {  /* also if the position has become better known */
         if (moved || s->P[at(axis, axis)] < tuning->better_known * status->stationary_m2[axis]) {
             status->stationary_m[axis] = s->x[axis];
             status->stationary_m2[axis] = s->P[at(axis, axis)];
@@ -3074,7 +3074,7 @@ INTERNAL void update_stationary(State *s, real dt) {
 
 /* Adapt the process noise of the tag's motion and clock to an innovation.
  *
- * The direction to the anchor stands in ``h``, the first of the measurement's terms. */
+ * The direction to the anchor is in the first terms of ``h``. */
 INTERNAL void adapt_process_noise(State *s, real normalised) {
     Tuning *tuning = &s->tuning;
     Status *status = &s->status;
@@ -3092,14 +3092,14 @@ INTERNAL void adapt_process_noise(State *s, real normalised) {
     status->walk_scale = adapted(s, status->walk_scale, is_clock_off, tuning->max_walk_scale);
 }
 
-/* Adapt the process noise of an anchor's clock to what a relay shows of it. */
+/* Adapt the process noise of an anchor's clock to a relay's innovation. */
 INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised) {
     Anchor *a = &s->anchors[anchor];
     a->relay_mean += s->tuning.mean_gain * (normalised - a->relay_mean);
     a->walk_scale = adapted(s, a->walk_scale, is_off_zero(s, a->relay_mean), s->tuning.max_walk_scale);
 }
 
-/* Factor on the position's covariance while innovations are larger than the filter expects.
+/* Factor on the position's covariance while innovations are larger than expected.
  *
  * Most of an innovation is the stamps' noise, so the state errs by more than the innovations show. */
 INTERNAL real covariance_scale(State *s) {
@@ -3107,18 +3107,18 @@ INTERNAL real covariance_scale(State *s) {
     return nis > s->tuning.wrong_nis ? nis * nis : REAL(1.0);
 }
 
-/* Protection levels: how wrong a position may be, even if receptions are late (``docs/maths.md`` section 8).
+/* Protection levels: bounds on the position error even if receptions are late (``docs/maths.md`` section 8).
  *
  * Hypothesis: the tag's receptions of every anchor are late (or early) by a constant of its own, all at once. With the
  * faults b̂ and their sensitivities V (``faults``) the estimate under the hypothesis and its covariance are
  *
  *     x + V·b̂        P + V·(M + I/σ_f²)⁻¹·Vᵀ
  *
- * so the error exceeds |V·b̂| + k·σ with the stated risk only, whichever anchors are at fault. Three kinds are considered:
- * constants since an anchor joined, what has begun recently, and what grows for seconds. What is larger than σ_f shows, as
- * a jump or in yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then there is no number. */
+ * so the error exceeds |V·b̂| + k·σ only with the stated risk, whichever anchors are at fault. Three kinds are considered:
+ * constants since an anchor joined, recent changes, and growth over seconds. A fault larger than σ_f is detected as a
+ * jump or by yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then no level is stated. */
 
-/* Write the levels in metres and the tests of faults. */
+/* Compute the levels in metres and the tests of faults. */
 INTERNAL void protect(State *s) {
     EstimatorSettings *settings = &s->settings;
     real *levels = s->levels;
@@ -3171,7 +3171,7 @@ INTERNAL void protect(State *s) {
     levels[VPL] += settings->max_acceleration_mps2 * SQRT(up);
 }
 
-/* The largest test of faults, χ² with as many degrees of freedom as there are anchors if there are none. */
+/* The largest test of faults; without faults χ² with one degree of freedom for each anchor. */
 INTERNAL real largest_test(State *s) {
     real largest = REAL(0.0);
     for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
@@ -3180,9 +3180,9 @@ INTERNAL real largest_test(State *s) {
     return largest;
 }
 
-/* Whether the anchors determine on which side of them the tag is */
+/* Whether the anchors determine on which side of their plane the tag is */
 
-/* Find the plane of least squares through the anchors; where the height is given, the line on the floor plan. */
+/* Fit the least-squares plane through the anchors; with a given height, the line on the floor plan. */
 SKYLESS_EXPORT void skyless_fit_plane(State *s) {
     Status *status = &s->status;
     for (int32_t axis = 0; axis < AXES; axis++) {
@@ -3214,7 +3214,9 @@ SKYLESS_EXPORT void skyless_fit_plane(State *s) {
     find_least_axis(s, s->dim);
 }
 
-/* Write the axis along which the symmetric matrix in ``work`` is smallest into the plane's normal (Jacobi 1846). */
+/* Write the eigenvector of the matrix in ``work`` with the smallest eigenvalue into the plane's normal.
+ *
+ * By Jacobi's method (1846). */
 INTERNAL void find_least_axis(State *s, int32_t dim) {
     real (*M)[MAX_ANCHORS] = s->work;
     int32_t axes = AXES;
@@ -3243,14 +3245,14 @@ INTERNAL void find_least_axis(State *s, int32_t dim) {
     }
 }
 
-/* Rotate two axes of the matrix in ``work`` so that their common element becomes zero. */
+/* Rotate two axes of the matrix in ``work`` so that their off-diagonal element becomes zero. */
 INTERNAL void rotate(State *s, int32_t dim, int32_t one, int32_t other) {
     real (*M)[MAX_ANCHORS] = s->work;
     real half = REAL(0.5) * (M[other][other] - M[one][one]) / M[one][other];
     real tangent = (half >= REAL(0.0) ? REAL(1.0) : -REAL(1.0)) / (abs_real(half) + SQRT(half * half + REAL(1.0)));
     real cosine = REAL(1.0) / SQRT(tangent * tangent + REAL(1.0));
     real sine = tangent * cosine;
-    for (int32_t row = 0; row < AXES + dim; row++) {  /* columns, and of the axes behind the matrix as well */
+    for (int32_t row = 0; row < AXES + dim; row++) {  /* columns, including those of the axes behind the matrix */
         if (row < dim || row >= AXES) {
             real kept = M[row][one];
             M[row][one] = cosine * kept - sine * M[row][other];
@@ -3266,10 +3268,10 @@ INTERNAL void rotate(State *s, int32_t dim, int32_t one, int32_t other) {
     M[one][other] = REAL(0.0);
 }
 
-/* Whether the tag and its mirror image behind the anchors' plane, or in 2-D their line, explain the ranges alike.
+/* Whether the tag and its mirror image in the anchors' plane (2-D: line) explain the ranges about equally well.
  *
- * Range errors make up for what the tag's clock and a shift of the image, by least squares, leave of the difference.
- * Not where the image lies where the tag cannot be, nor while a sensor measures the height. */
+ * The tag's clock and a shift of the image absorb the difference by least squares; range errors must explain the rest.
+ * Not if the tag cannot be where the image is, nor while a sensor measures the height. */
 INTERNAL bool is_side_open(State *s) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
@@ -3292,9 +3294,9 @@ INTERNAL bool is_side_open(State *s) {
     return left_by_image(s, off_m, variance) < tuning->apart_chi2 * variance;
 }
 
-/* What the tag's clock and a shift of the image leave of the ranges' difference: the sum of squares [m²].
+/* Sum of squares [m²] of the ranges' difference that the tag's clock and a shift of the image leave.
  *
- * ``off_m``: from the plane to the tag; ``variance``: of a range. */
+ * ``off_m``: signed distance of the tag from the plane; ``variance``: of a range. */
 INTERNAL real left_by_image(State *s, real off_m, real variance) {
     EstimatorSettings *settings = &s->settings;
     int32_t dim = s->dim;
@@ -3347,7 +3349,7 @@ INTERNAL real left_by_image(State *s, real off_m, real variance) {
 
 /* Whether a position can be relied on */
 
-/* Whether a position's levels can be relied on: ``SOUND``, ``OBSTRUCTED``, ``CONTRADICTED`` or ``UNAVAILABLE``. */
+/* Whether the position's levels are reliable: ``SOUND``, ``OBSTRUCTED``, ``CONTRADICTED`` or ``UNAVAILABLE``. */
 INTERNAL int32_t integrity_state(State *s) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
@@ -3359,9 +3361,9 @@ INTERNAL int32_t integrity_state(State *s) {
             state = OBSTRUCTED;
         }
     }
-    bool was_contradicted = status->fault_std_m[LASTING] > tuning->lasting_std_m;  /* then none are selected */
+    bool was_contradicted = status->fault_std_m[LASTING] > tuning->lasting_std_m;  /* then no anchor is selected */
     real limit = was_contradicted ? tuning->sure_chi2 : tuning->uncovered_chi2;
-    real share = SQRT(s->P[at(0, 0)] + s->P[at(1, 1)]) / max_real(range_m, REAL(1e-06));  /* levels are of first order in it */
+    real share = SQRT(s->P[at(0, 0)] + s->P[at(1, 1)]) / max_real(range_m, REAL(1e-06));  /* levels are a first-order approximation in this share */
     if (status->withholds_levels || largest_test(s) > limit) {
         state = CONTRADICTED;
     }
@@ -3389,16 +3391,16 @@ INTERNAL int32_t integrity_state(State *s) {
  *
  * with offsets b, TX noise w, all in metres. ``docs/maths.md`` section 6 derives them. */
 
-/* The terms of a measurement */
+/* Terms of a measurement */
 
-/* The measurement holds so much of a state. */
+/* Add a term: weight × state. */
 INTERNAL void add_term(State *s, int32_t state, real weight) {
     s->h[s->terms] = weight;
     s->h_index[s->terms] = state;
     s->terms += 1;
 }
 
-/* h·x of the terms from ``begin`` on. */
+/* Sum of h·x over the terms from ``begin`` on. */
 INTERNAL real h_dot_x(State *s, int32_t begin) {
     real total = REAL(0.0);
     for (int32_t term = begin, term_end = s->terms; term < term_end; term++) {
@@ -3407,23 +3409,23 @@ INTERNAL real h_dot_x(State *s, int32_t begin) {
     return total;
 }
 
-/* Terms of a distance: the position, the anchor's survey error and, in two dimensions, the height's error. */
+/* Number of terms of a distance: position, survey error and, in 2-D, the height's error. */
 INTERNAL int32_t direction_terms(State *s) {
     return s->dim + 3;
 }
 
-/* The measurement holds the distance to an anchor, by the unit vector from there; returns the distance.
+/* Add the distance to an anchor, linearised with the unit vector away from it. Returns the distance.
  *
- * The anchor's survey error follows with the opposite sign, and the height's: ``direction_terms`` in all. The vector
- * is that of the held point, of the surveyed anchor and of the given height: were it that of the newest estimate, its
- * noise would seem to give information on what the ranges leave open. */
+ * The anchor's survey error follows with the opposite sign, and in 2-D the height's error: ``direction_terms`` in all.
+ * The vector belongs to the held point, the surveyed anchor and the given height. If it followed the newest estimate,
+ * that estimate's noise would seem to carry information on what the ranges leave open. */
 INTERNAL real add_direction(State *s, int32_t anchor, real sign) {
     Anchor *a = &s->anchors[anchor];
     hold_direction(s, anchor);
     return add_direction_from(s, anchor, sign, a->held_m, a->held_range_m);
 }
 
-/* The same with the direction from a point at a distance from the anchor. */
+/* Like ``add_direction``, with the direction from the anchor to a given point at that range. */
 INTERNAL real add_direction_from(State *s, int32_t anchor, real sign, real *point_m, real point_range_m) {
     Layout *where = &s->layout;
     Anchor *a = &s->anchors[anchor];
@@ -3447,7 +3449,7 @@ INTERNAL real add_direction_from(State *s, int32_t anchor, real sign, real *poin
     return max_real(SQRT(squared), REAL(1e-06));
 }
 
-/* Move the point at which ranges to an anchor are linearised onto the estimate, once that is far enough away. */
+/* Move the point at which ranges to an anchor are linearised to the estimate, once that is far enough away. */
 INTERNAL void hold_direction(State *s, int32_t anchor) {
     Tuning *tuning = &s->tuning;
     Anchor *a = &s->anchors[anchor];
@@ -3475,7 +3477,7 @@ INTERNAL void hold_direction(State *s, int32_t anchor) {
     }
 }
 
-/* The measurement holds an anchor's range errors: the part that changes, the part that stays, and the slope. */
+/* Add an anchor's range errors: changing part, constant part and slope. */
 INTERNAL void add_range_errors(State *s, int32_t anchor, real sign) {
     Layout *where = &s->layout;
     real from_m = s->tuning.slope_from_m;
@@ -3485,10 +3487,10 @@ INTERNAL void add_range_errors(State *s, int32_t anchor, real sign) {
     add_term(s, where->slope, sign * far);
 }
 
-/* Half the position's variance across the direction, over the range: what the range is longer by on average.
+/* Mean excess of the range over its linearisation: half the variance across the direction, over the range.
  *
- * The second term of its Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 where that is
- * small compared with that of the stamps. The direction stands in the first terms of the measurement. */
+ * The second term of the Taylor series, with the variance 2·bend² (Jazwinski 1970, section 9.3); 0 if negligible
+ * against the variance of the stamps. The direction is in the first terms of ``h``. */
 INTERNAL real find_curvature_m(State *s, real range_m, real variance) {
     real across = REAL(0.0);
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
@@ -3507,7 +3509,7 @@ INTERNAL real find_curvature_m(State *s, real range_m, real variance) {
 
 /* The tag receives an anchor */
 
-/* Write the tag's reception of an anchor into ``h``; returns their distance. */
+/* Write the tag's reception of an anchor into ``h``. Returns the distance. */
 INTERNAL real reception_terms(State *s, int32_t anchor, bool has_tx_noise) {
     s->terms = 0;
     real range_m = add_direction(s, anchor, REAL(1.0));
@@ -3521,8 +3523,8 @@ INTERNAL real reception_terms(State *s, int32_t anchor, bool has_tx_noise) {
 
 /* Process the tag's reception of an anchor's packet: ``USED``, ``UNUSED`` or ``CLOCK_JUMPED``.
  *
- * R − T = |p − a − δa| + b + w + change + constant + slope·far + noise. A reception whose path looks blocked has
- * its variance multiplied; it is gated as any other, as it is late rather than noisy. */
+ * R − T = |p − a − δa| + b + w + change + constant + slope·far + noise. ``variance_factor`` is above 1 for a reception
+ * whose path looks blocked; such a reception is late rather than noisy, so it is gated without the factor. */
 INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks, real variance_factor) {
     Tuning *tuning = &s->tuning;
     EstimatorSettings *settings = &s->settings;
@@ -3595,7 +3597,7 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
     return scale > REAL(0.0) ? USED : UNUSED;
 }
 
-/* Carry whole ticks of an offset to where they stand. */
+/* Move whole ticks of an offset state into ``offset_ticks``. */
 INTERNAL void carry_ticks(State *s, int32_t anchor) {
     int32_t offset = s->layout.offset + anchor;
     int64_t steps = floor_real(s->x[offset] / TICK_M);
@@ -3603,13 +3605,13 @@ INTERNAL void carry_ticks(State *s, int32_t anchor) {
     s->x[offset] -= (real)steps * TICK_M;
 }
 
-/* An anchor's range error has jumped: back to what it was before it was obstructed, or to something new.
+/* Handle a jump of an anchor's range error: back to the value before an obstruction, or to a new one.
  *
- * Obstacles make packets late: an early jump of an anchor that is not known to be obstructed ends an obstruction that
- * has been there since it joined, and all its earlier receptions are considered again.
+ * Obstacles make packets late. So an early jump of an anchor not known to be obstructed ends an obstruction that
+ * existed since it joined, and all its earlier receptions are reconsidered.
  *
- * Returns the innovation that is left. If that is early by more than antennas explain and packets are late often, the
- * range error stays as it is: the first packet, from which the anchor's clock was taken, was late. */
+ * Returns the remaining innovation. If that is earlier than antennas explain and packets are often late, the range
+ * error is not opened: the first packet, which initialised the anchor's clock, was late. */
 INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance) {
     Anchor *a = &s->anchors[anchor];
     Tuning *tuning = &s->tuning;
@@ -3635,10 +3637,10 @@ INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance) 
     return innovation;
 }
 
-/* Initialise an anchor's clock: the limit of an update of an offset of which nothing was known.
+/* Initialise an anchor's clock: the limit of an update of an unknown offset.
  *
- * All errors of the position and of the range are then in the offset. Its rate follows (``find_rate``). Where packets
- * are often late, this one may be, which its variance then counts. */
+ * The offset then contains all errors of position and range. Its rate follows (``find_rate``). If packets are often
+ * late, the variance covers that this one may be. */
 INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks, real variance_factor) {
     EstimatorSettings *settings = &s->settings;
     Layout *where = &s->layout;
@@ -3669,10 +3671,10 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     a->range_m = range_m;
 }
 
-/* Initialise the covariance of a state by a measurement: the limit of an update when nothing was known of it.
+/* Initialise the covariance of a state from a measurement: the limit of an update of an unknown state.
  *
- * All errors of the measurement, of that variance, are in it then. ``h`` holds all but the state, which has been
- * reset; P·h of that is the first of ``U``. ``own``: the anchor whose reception by the tag it is, or −1. */
+ * The state then contains all errors of the measurement, of this variance. ``h`` holds every term but this state,
+ * which has been reset; their P·h is the first of ``U``. ``own``: the anchor if the tag received it, or −1. */
 INTERNAL void open_state(State *s, int32_t state, int32_t own, real variance) {
     compute_fault_input(s, own);
     for (int32_t other = 0, other_end = s->n; other < other_end; other++) {
@@ -3684,11 +3686,11 @@ INTERNAL void open_state(State *s, int32_t state, int32_t own, real variance) {
     }
 }
 
-/* Initialise the rate of an anchor's clock by the first measurement of its offset after that of its first packet.
+/* Initialise the rate of an anchor's clock from the first measurement of its offset after its first packet.
  *
- * The limit of an update of a rate of which nothing was known: the offset takes all of the innovation. With a variance
- * of the rate in P instead, what is left of it were the difference of large numbers. P·h of the measurement and its
- * shares of faults are the first of ``U`` and ``G``. */
+ * The limit of an update of an unknown rate, in which the offset takes the whole innovation. With a large variance of
+ * the rate in P instead, the result would be a difference of large numbers. The measurement's P·h and fault inputs are
+ * the first of ``U`` and ``G``. */
 INTERNAL void find_rate(State *s, int32_t anchor, real innovation, real innovation_variance, real elapsed_s) {
     int32_t offset = s->layout.offset + anchor;
     int32_t rate = s->layout.rate + anchor;
@@ -3707,7 +3709,7 @@ INTERNAL void find_rate(State *s, int32_t anchor, real innovation, real innovati
 
 /* An anchor received another */
 
-/* Write an anchor's reception of another, ``age_s`` ago, into ``h``. */
+/* Write an anchor's reception of another anchor, ``age_s`` ago, into ``h``. */
 INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s, bool has_tx_noise) {
     Layout *where = &s->layout;
     s->terms = 0;
@@ -3720,27 +3722,25 @@ INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s
     }
 }
 
-/* Variance of such a reception: of its RX stamp, and of what two oscillators have done since. */
+/* Variance of a relay: its RX stamp and the noise of two oscillators since. */
 INTERNAL real relay_variance(State *s, int32_t listener, int32_t sender, real age_s) {
     EstimatorSettings *settings = &s->settings;
     real walk = settings->walk * max_real(s->anchors[listener].walk_scale, s->anchors[sender].walk_scale);
     return settings->rx_variance_m2 + REAL(2.0) * age_s * (settings->white + walk * age_s * age_s / REAL(3.0));
 }
 
-/* How long ago an anchor received a packet of another, which the tag received as well. */
+/* Time since an anchor received a packet that the tag received too. */
 INTERNAL real relay_age_s(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks) {
     real flown_m = s->anchors[sender].range_m - find_distance_m(s, listener, sender);
     return (real)(s->status.epoch_ticks - packet_rx_ticks) * TICK_S + flown_m / SPEED_OF_LIGHT_MPS;
 }
 
-/* Process the reception, by the anchor ``listener``, of a packet of ``sender`` that the tag has received as well.
+/* Process the reception, by ``listener``, of a packet of ``sender`` that the tag received too. True if used.
  *
- * Whether it was used.
- *
- * S − T = |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + constant of the pair + noise, when the packet reached anchor i. Both offsets go
- * back to that moment by their rates; what their oscillators have done since counts as noise. The pair's constant,
- * in which the survey is, is estimated outside the filter: as both directions of a pair hold it with the same sign
- * and the offsets with opposite ones, neither depends on the other. */
+ * S − T = |aᵢ − aⱼ| + bⱼ − bᵢ + wⱼ + constant of the pair + noise, when the packet reached anchor i. Both offsets are
+ * extrapolated back to that moment by their rates; the noise of their oscillators since then is added. The pair's
+ * constant, which contains the survey error, is estimated outside the filter: both directions of a pair contain it
+ * with the same sign and the offsets with opposite signs, so neither depends on the other. */
 INTERNAL bool relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks, int64_t packet_rx_ticks, int64_t
         rx_ticks) {
     Tuning *tuning = &s->tuning;
@@ -3796,12 +3796,12 @@ INTERNAL bool relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks
     return true;
 }
 
-/* What is kept of two anchors in common, in the row of the lower index. */
+/* The link of two anchors, kept in the row of the lower index. */
 INTERNAL Link *pair(State *s, int32_t one, int32_t other) {
     return &s->links[min_32(one, other)][max_32(one, other)];
 }
 
-/* How far two anchors are apart in the almanac. */
+/* Distance between two anchors in the almanac. */
 INTERNAL real find_distance_m(State *s, int32_t one, int32_t other) {
     real squared = REAL(0.0);
     for (int32_t axis = 0; axis < AXES; axis++) {
@@ -3810,13 +3810,13 @@ INTERNAL real find_distance_m(State *s, int32_t one, int32_t other) {
     return SQRT(squared);
 }
 
-/* Update by the measurement in ``h``, which is no reception of the tag's, and by what it shows of faults; later. */
+/* Queue an update, and its evidence of faults, by the measurement in ``h``, which is no reception of the tag's. */
 INTERNAL void use(State *s, real innovation, real innovation_variance) {
     compute_fault_input(s, -1);
     update_later(s, innovation, innovation_variance);
 }
 
-/* Use the range between two anchors for their survey; anchors that contradict most of theirs are misplaced. */
+/* Use the measured range between two anchors for their survey; an anchor that contradicts most is misplaced. */
 INTERNAL void survey_pair(State *s, int32_t one, int32_t other) {
     pair_range(s, one, other);
     int32_t contradicted = 0;
@@ -3861,7 +3861,7 @@ INTERNAL void pair_range(State *s, int32_t one, int32_t other) {
     }
 }
 
-/* The measurement holds what survey errors change in the distance of two anchors. */
+/* Add the effect of survey errors on the distance of two anchors. */
 INTERNAL void add_pair_survey(State *s, int32_t one, int32_t other) {
     Anchor *a = &s->anchors[one];
     Anchor *b = &s->anchors[other];
@@ -3873,14 +3873,14 @@ INTERNAL void add_pair_survey(State *s, int32_t one, int32_t other) {
     }
 }
 
-/* An anchor reports what its clock reads against the master's */
+/* An anchor's report of its clock against the master's */
 
-/* Let what an anchor knows of its clock against the master's replace what the filter knows, where that is worse.
+/* Replace the filter's estimate of an anchor's clock against the master's by the anchor's own, if that is better.
  *
- * The anchor has received all packets of the master that were relayed to the tag, and more, so its error is
- * uncorrelated with the difference of both estimates, of variance P − q (P: the filter's, q: the anchor's), and the
- * other states change by P_xd/P times that difference. ``subticks``: the anchor's reading less the master's at the
- * packet's TX stamp, modulo 2⁴⁸. */
+ * The anchor has received all packets of the master that were relayed to the tag, and more. Its error is therefore
+ * uncorrelated with the difference of the two estimates, which has the variance P − q (P: the filter's, q: the
+ * anchor's), and the other states change by P_xd/P times that difference. ``subticks``: the anchor's reading minus the
+ * master's at the packet's TX stamp, modulo 2⁴⁸. */
 INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks, real variance_m2) {
     Anchor *a = &s->anchors[anchor];
     Status *status = &s->status;
@@ -3926,9 +3926,9 @@ INTERNAL void report(State *s, int32_t anchor, int32_t master, int64_t subticks,
 
 /* A ready-made time difference */
 
-/* Write a difference of ranges, to anchor b less to anchor a, into ``h``; returns the difference.
+/* Write a difference of ranges, to anchor b minus to anchor a, into ``h``. Returns the difference.
  *
- * Its gradient stands in the first terms, as the other kinds' directions do. */
+ * Its gradient is in the first terms, like the direction of the other kinds. */
 INTERNAL real difference_terms(State *s, int32_t a, int32_t b) {
     s->terms = 0;
     real far_m = add_direction(s, b, REAL(1.0));
@@ -3945,10 +3945,10 @@ INTERNAL real difference_terms(State *s, int32_t a, int32_t b) {
     return far_m - near_m;
 }
 
-/* Process a ready-made difference of ranges, to anchor b less to anchor a: ``USED`` or ``UNUSED``.
+/* Process a ready-made difference of ranges, to anchor b minus to anchor a: ``USED`` or ``UNUSED``.
  *
- * d = |p − b| − |p − a| + range errors of b − those of a + noise. Nothing is estimated of clocks, which whoever made
- * the difference has removed. */
+ * d = |p − b| − |p − a| + range errors of b − those of a + noise. No clocks are estimated: whoever made the
+ * difference has removed them. */
 INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, real difference_m) {
     EstimatorSettings *settings = &s->settings;
     real walked_m = s->status.walked_m;
@@ -3980,7 +3980,7 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
     return USED;
 }
 
-/* Move changing parts that are below their bound onto it: the likeliest state of all where nothing is earlier. */
+/* Raise changing parts below their bound to it: the likeliest state if nothing can be earlier. */
 INTERNAL void bound_changes(State *s) {
     for (int32_t change = s->layout.change, change_end = s->layout.constant; change < change_end; change++) {
         real missing_m = s->settings.earliest_m - s->x[change];
@@ -3994,9 +3994,9 @@ INTERNAL void bound_changes(State *s) {
 
 /* The tag has a sensor of its height */
 
-/* Process the tag's height as a sensor measures it: ``USED`` or ``UNUSED``.
+/* Process the reading of a height sensor: ``USED`` or ``UNUSED``.
  *
- * Where a height is given, it corrects that. A barometer's zero is estimated as well, from its first reading on. */
+ * A given height is corrected by it. A barometer's zero is estimated too, from its first reading on. */
 INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer) {
     EstimatorSettings *settings = &s->settings;
     Status *status = &s->status;
@@ -4032,7 +4032,7 @@ INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer) 
 
 /* The tag stands still */
 
-/* Process the knowledge that a stationary tag has no velocity, one axis after the other. */
+/* Process a velocity of zero for a stationary tag, axis by axis. */
 INTERNAL void zero_velocity(State *s) {
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         int32_t speed = s->layout.velocity + axis;
@@ -4044,21 +4044,21 @@ INTERNAL void zero_velocity(State *s) {
     }
 }
 
-/* The phase of the carrier: what a reception shows besides its stamp, 20 times as fine but modulo a wavelength.
+/* Carrier phase: 20 times as precise as a stamp, but known only modulo a wavelength.
  *
  *     R − X  =  |p − a| + b + ambiguity + noise                 (mod λ)      (the tag receives an anchor)
  *     S − X  =  |aᵢ − aⱼ| + bⱼ − bᵢ + ambiguity + noise         (mod λ)      (anchor i receives its partner j)
  *
- * X is when the sender's counter says that the frame left: carriers start at a phase that the counter gives, so the noise
- * of its TX stamp is not in it. An ambiguity holds what is constant as long as both radios keep their supply, and what
- * reflections add, which changes as the tag walks. It stays a real number: as the tag walks, directions to the anchors
- * turn, and ranges that are known to millimetres but for a constant tell where it is. ``docs/maths.md`` section 6.7.
+ * X is the sender's counter when the frame leaves: the carrier starts at a phase given by the counter, so the noise of the
+ * TX stamp is not in it. An ambiguity contains what is constant while both radios keep their supply, and the effect of
+ * reflections, which changes as the tag walks. It is estimated as a real number: as the tag walks, directions to the
+ * anchors turn, and ranges known to millimetres up to a constant determine the position. ``docs/maths.md`` section 6.7.
  *
- * A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase counts only with a stamp that
- * was used, where it is predicted to a tenth of a wavelength; else its ambiguity begins again, from which nothing is
- * learnt. Where stamps contradict, all begin again. */
+ * A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase is used only together with a
+ * stamp that was used, and only if it is predicted to a tenth of a wavelength; otherwise its ambiguity starts again, which
+ * provides no information. If stamps contradict the state, all ambiguities start again. */
 
-/* Process the phase of a reception of the tag's whose stamp was used; it is in [0, 1) and falls as stamps grow. */
+/* Process the phase, in [0, 1), of a reception of the tag's whose stamp was used. It falls as stamps grow. */
 INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
@@ -4098,9 +4098,9 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     }
 }
 
-/* Process the phase of an anchor's reception of its partner, whose stamp was used; of others' it does nothing.
+/* Process the phase of an anchor's reception of its partner, whose stamp was used; ignore other senders.
  *
- * The partner is the anchor of lowest identifier that it relays, so that all clocks are tied to one. */
+ * The partner is the relayed anchor of lowest identifier, so that all clocks are tied to one. */
 INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks, real phase_cycles) {
     Anchor *i = &s->anchors[listener];
     Anchor *j = &s->anchors[sender];
@@ -4126,7 +4126,7 @@ INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t pa
     use_phase(s, where->mesh + listener, &i->mesh, innovation, variance);
 }
 
-/* Cycles in whole ticks, in [0, 1). */
+/* Fractional cycles, in [0, 1), of a number of ticks. */
 INTERNAL real whole_cycles(State *s, int64_t ticks) {
     return (real)floor_mod_64((ticks & (CYCLE_TICKS - 1)) * s->settings.carrier_cycles, CYCLE_TICKS) /
             (real)CYCLE_TICKS;
@@ -4136,12 +4136,12 @@ INTERNAL real wavelength_m(State *s) {
     return (real)CYCLE_TICKS * TICK_M / (real)s->settings.carrier_cycles;
 }
 
-/* Variance of a prediction up to which there is no doubt of the cycle. */
+/* Largest variance of a prediction that leaves no doubt of the cycle. */
 INTERNAL real certain_m2(State *s) {
     return square(s->tuning.phase_share * wavelength_m(s));
 }
 
-/* By how much a phase is off what is expected, without whole cycles. */
+/* Difference between a phase and its prediction, to the nearest cycle. */
 INTERNAL real innovation_m(State *s, real cycles, real expected_m) {
     real off = cycles - expected_m / wavelength_m(s);
     return (off - (real)floor_real(off + REAL(0.5))) * wavelength_m(s);
@@ -4171,7 +4171,7 @@ INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovat
     return PHASE_USED;
 }
 
-/* Square of the innovation beyond which a phase is more likely random than noisy, or could be a cycle off. */
+/* Squared innovation beyond which a phase is more likely random than noisy, or may be off by a cycle. */
 INTERNAL real limit_m2(State *s, real variance) {
     real gate_squared = square(s->settings.gate);
     real odds = min_real(s->status.wild_share, REAL(0.5)) * SQRT(TWO_PI * variance) / wavelength_m(s);
@@ -4181,7 +4181,7 @@ INTERNAL real limit_m2(State *s, real variance) {
     return min_real(gate_squared * variance, square(s->tuning.phase_gate * wavelength_m(s)));
 }
 
-/* Let the variance of phases follow what innovations show beyond their prediction: reflections differ in size. */
+/* Adapt the variance of phases to innovations beyond their prediction: reflections differ in size. */
 INTERNAL void learn_noise(State *s, real shown_m2) {
     Tuning *tuning = &s->tuning;
     Status *status = &s->status;
@@ -4190,7 +4190,7 @@ INTERNAL void learn_noise(State *s, real shown_m2) {
             square(max_real(tuning->phase_max_std_m, s->settings.phase_std_m)));
 }
 
-/* Whether the tag's phases may count: neither just after the start nor where stamps contradict the state. */
+/* Whether the tag's phases may be used: neither just after the start nor while stamps contradict the state. */
 INTERNAL bool may_count(State *s) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
@@ -4201,7 +4201,7 @@ INTERNAL bool may_count(State *s) {
     return is_settled && status->mean_nis <= tuning->wrong_nis;
 }
 
-/* Let all ambiguities of the tag's phases begin again: what they were taken for may be wrong by cycles. */
+/* Restart all ambiguities of the tag's receptions, which may be wrong by cycles. */
 INTERNAL void close_phases(State *s) {
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         s->anchors[anchor].has_former = false;
@@ -4209,7 +4209,7 @@ INTERNAL void close_phases(State *s) {
     }
 }
 
-/* Add a step to the tag's way where it has gone so far. */
+/* Add a step to the tag's way once it has moved by its length. */
 INTERNAL void measure_way(State *s) {
     real squared = REAL(0.0);
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
@@ -4223,10 +4223,10 @@ INTERNAL void measure_way(State *s) {
     }
 }
 
-/* See that the point at which phases are linearised is near the tag.
+/* Keep the point at which phases are linearised near the tag.
  *
- * It moves as the tag does, but not as estimates of its place are corrected. Were it the newest estimate, corrections
- * would turn the directions to the anchors, and phases would seem to show where the tag is. */
+ * The point moves as the tag does, but not with corrections of the estimate. At the newest estimate, corrections would
+ * turn the directions to the anchors, and phases would seem to measure the position. */
 INTERNAL void follow_line(State *s) {
     real away_m2 = REAL(0.0);
     bool is_in_use = false;
@@ -4255,9 +4255,9 @@ INTERNAL void follow_line(State *s) {
     }
 }
 
-/* Let an ambiguity's error hold that of the place by the direction from the estimate instead of that from the line.
+/* Change the direction to which an ambiguity's error refers, from that of the line to that of the estimate.
  *
- * a ← a − (h' − h)·(p − δa): what is known of the place by itself does not change. */
+ * a ← a − (h' − h)·(p − δa): the information on the position itself does not change. */
 INTERNAL void turn(State *s, int32_t anchor, int32_t ambiguity) {
     Anchor *a = &s->anchors[anchor];
     int32_t survey = s->layout.survey + s->dim * anchor;
@@ -4271,7 +4271,7 @@ INTERNAL void turn(State *s, int32_t anchor, int32_t ambiguity) {
     }
 }
 
-/* A state's error loses so much of that of another. */
+/* Subtract ``weight`` times another state's error from a state's error. */
 INTERNAL void subtract(State *s, int32_t state, int32_t other, real weight) {
     s->P[at(state, state)] -= weight * s->P[at(other, state)];
     for (int32_t one = 0, one_end = s->n; one < one_end; one++) {
@@ -4285,7 +4285,7 @@ INTERNAL void subtract(State *s, int32_t state, int32_t other, real weight) {
     }
 }
 
-/* Distance of a point, at the given height, from an anchor. */
+/* Distance of a point, at the given height in 2-D, from an anchor. */
 INTERNAL real line_range_m(State *s, int32_t anchor, real *point_m) {
     Anchor *a = &s->anchors[anchor];
     real squared = REAL(0.0);
@@ -4298,7 +4298,7 @@ INTERNAL real line_range_m(State *s, int32_t anchor, real *point_m) {
     return max_real(SQRT(squared), REAL(1e-06));
 }
 
-/* Write a phase of the tag's into ``h``; returns what is expected of it but for whole ticks of the offset. */
+/* Write a phase of the tag's into ``h``. Returns its prediction without whole ticks of the offset. */
 INTERNAL real phase_terms(State *s, int32_t anchor) {
     s->terms = 0;
     real *line_m = s->status.line_m;
@@ -4309,11 +4309,11 @@ INTERNAL real phase_terms(State *s, int32_t anchor) {
     return range_m + h_dot_x(s, first);
 }
 
-/* Let an ambiguity, the last term of ``h``, begin, so that this phase is as expected. */
+/* Start an ambiguity, the last term of ``h``, so that this phase agrees with it. */
 INTERNAL void open(State *s, int32_t state, Ambiguity *one, real innovation, real variance) {
     s->status.phases_opened += 1;
     one->is_known = true;
-    one->refused_in_row = truncated(s->tuning.phases_in_row) - 1;  /* one that the next does not confirm was wrong */
+    one->refused_in_row = truncated(s->tuning.phases_in_row) - 1;  /* if the next phase does not confirm this one, it was wrong */
     real ambiguity_m = s->x[state] + innovation;
     reset_state(s, state, REAL(0.0));
     s->terms -= 1;
@@ -4321,9 +4321,9 @@ INTERNAL void open(State *s, int32_t state, Ambiguity *one, real innovation, rea
     s->x[state] = ambiguity_m;
 }
 
-/* By how many cycles an ambiguity has changed over a gap */
+/* Resolving the cycles lost in a gap */
 
-/* Keep an ambiguity that ends, unless there is one already that has not been kept for long. */
+/* Keep an ambiguity that ends, unless a recent one is kept already. */
 INTERNAL void keep_former(State *s, int32_t anchor) {
     Anchor *a = &s->anchors[anchor];
     int32_t former = s->layout.former + anchor;
@@ -4347,9 +4347,9 @@ INTERNAL real former_age_s(State *s, int32_t anchor) {
     return (real)(s->status.epoch_ticks - s->anchors[anchor].former_ticks) * TICK_S;
 }
 
-/* Let an ambiguity and its former one be the same but for whole cycles, once their number is beyond doubt.
+/* Equate an ambiguity and its former one up to whole cycles, once their number is beyond doubt.
  *
- * What was received after a gap shows how clocks and tag have moved within it. */
+ * Receptions after a gap show how clocks and tag have moved within it. */
 INTERNAL void rejoin(State *s, int32_t anchor) {
     Anchor *a = &s->anchors[anchor];
     if (former_age_s(s, anchor) > s->tuning.phase_former_s) {
@@ -4375,9 +4375,9 @@ INTERNAL void rejoin(State *s, int32_t anchor) {
 
 /* Covariance analysis */
 
-/* Process a phase at the tag's true position, with an innovation of zero, for a bound: there are no cycles.
+/* Process a phase at the tag's true position with an innovation of zero, for a bound without cycles.
  *
- * ``walked_m``: since the phase before of this anchor. Noise and wander are as stated. */
+ * ``walked_m``: since this anchor's last phase. Noise and wander are as stated. */
 INTERNAL void known_phase(State *s, int32_t anchor, real walked_m) {
     int32_t ambiguity = s->layout.ambiguity + anchor;
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
@@ -4388,15 +4388,15 @@ INTERNAL void known_phase(State *s, int32_t anchor, real walked_m) {
     use_phase(s, ambiguity, &s->anchors[anchor].own, REAL(0.0), s->status.phase_variance_m2);
 }
 
-/* The phase that is expected of a reception, in cycles: ``own_phase`` then has an innovation of zero. */
+/* The predicted phase of a reception in cycles, for which ``own_phase`` has an innovation of zero. */
 INTERNAL real expected_phase(State *s, int32_t anchor) {
     real expected_m = phase_terms(s, anchor);
     return -(expected_m / wavelength_m(s) + whole_cycles(s, s->anchors[anchor].offset_ticks));
 }
 
-/* What the estimator does with a packet, a ready-made difference or a height; and with many packets in one loop. */
+/* Processing a packet, a ready-made difference or a height; and a batch of packets in one loop. */
 
-/* Let an anchor leave the state, if it is there. */
+/* Remove an anchor from the state, if it is there. */
 SKYLESS_EXPORT void skyless_leave(State *s, int32_t identifier) {
     int32_t anchor = skyless_find_anchor(s, identifier);
     if (anchor >= 0) {
@@ -4407,21 +4407,21 @@ SKYLESS_EXPORT void skyless_leave(State *s, int32_t identifier) {
 
 /* One packet */
 
-/* Process a packet and what it relays; returns what became of it, and leaves ``levels`` and ``fix``. */
+/* Process a packet and its relays. Returns the outcome and fills ``levels`` and ``fix``. */
 INTERNAL int32_t process(State *s, Packet *packet, Relays *relays) {
     int32_t outcome = process_packet(s, packet, relays);
     fill_fix(s);
     return outcome;
 }
 
-/* ``process`` with more relays, as frames carry them. */
+/* ``process`` with further relays, encoded as in a frame. */
 SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, Relays *relays, uint8_t *packed, int32_t
         packed_bytes) {
     take_relays(packet, relays, packed, packed_bytes);
     return process(s, packet, relays);
 }
 
-/* Add relays as frames carry them to those of a packet, as far as there is space. */
+/* Append encoded relays to those of a packet, as far as there is space. */
 INTERNAL void take_relays(Packet *packet, Relays *relays, uint8_t *packed, int32_t packed_bytes) {
     for (int32_t begin = 0; begin < packed_bytes; begin += 8) {
         if (relays->count < MAX_RELAYS) {
@@ -4446,12 +4446,12 @@ INTERNAL void take_relays(Packet *packet, Relays *relays, uint8_t *packed, int32
 
 /* The unwrapped stamp of a relay.
  *
- * ``tx_ticks`` is the listener's stamp of a packet that the tag received ``elapsed`` later than the relayed one. */
+ * ``tx_ticks`` is the listener's stamp of a packet that the tag received ``elapsed`` after the relayed one. */
 INTERNAL int64_t relay_rx_ticks(Relay *relayed, int64_t tx_ticks, int64_t elapsed) {
     return relayed->is_short ? nearest(relayed->rx_ticks, tx_ticks - elapsed, SHORT_BITS) : relayed->rx_ticks;
 }
 
-/* Process a packet; its anchor joins where it is not in the state. */
+/* Process a packet. Its anchor joins if it is not in the state. */
 INTERNAL int32_t process_packet(State *s, Packet *packet, Relays *relays) {
     Status *status = &s->status;
     Place *place = &packet->place;
@@ -4475,7 +4475,7 @@ INTERNAL int32_t process_packet(State *s, Packet *packet, Relays *relays) {
     return outcome;
 }
 
-/* The index of an anchor, which joins where it is not in the state, or has moved; −1 where there is no room. */
+/* The index of an anchor, which is added or moved if needed; −1 if there is no room. */
 INTERNAL int32_t present(State *s, Place *place) {
     int32_t anchor = skyless_find_anchor(s, place->anchor);
     bool is_new = false;
@@ -4495,7 +4495,7 @@ INTERNAL int32_t present(State *s, Place *place) {
     return anchor;
 }
 
-/* Let anchors leave that have been silent for too long. */
+/* Remove anchors that have been silent for too long. */
 INTERNAL void remove_silent(State *s, int64_t rx_ticks) {
     for (int32_t anchor = s->count - 1; anchor > -1; anchor--) {
         Anchor *a = &s->anchors[anchor];
@@ -4557,7 +4557,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
     return outcome;
 }
 
-/* ``JOINED`` or ``ACCEPTED`` for a packet that can be processed; for others what becomes of them, counted. */
+/* Return ``JOINED`` or ``ACCEPTED`` for a packet that can be processed; otherwise count and return its outcome. */
 INTERNAL int32_t admit(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks) {
     Anchor *a = &s->anchors[anchor];
     Status *status = &s->status;
@@ -4580,7 +4580,7 @@ INTERNAL int32_t admit(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ti
     return ACCEPTED;
 }
 
-/* Whether no clock can have gone from an anchor's newest packet to this one. */
+/* Whether no clock can have got from the anchor's newest packet to this one. */
 INTERNAL bool is_impossible(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks) {
     Anchor *a = &s->anchors[anchor];
     int64_t elapsed = rx_ticks - a->rx_ticks;
@@ -4588,7 +4588,7 @@ INTERNAL bool is_impossible(State *s, int32_t anchor, int64_t rx_ticks, int64_t 
     return change_m > s->tuning.restart_m + MAX_RATE_MPS * (real)elapsed * TICK_S;
 }
 
-/* Keep what later packets and relays of this one need. */
+/* Keep what later packets of the anchor, and relays of this one, need. */
 INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet) {
     Anchor *a = &s->anchors[anchor];
     KeptPacket *kept = &s->packets[anchor][floor_mod_32(packet->sequence, PACKETS_KEPT)];
@@ -4601,7 +4601,7 @@ INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet) {
     kept->rx_ticks = packet->rx_ticks;
 }
 
-/* Process a relayed reception once, if the tag has received that very packet. */
+/* Process a relay once, if the tag has received that packet. */
 INTERNAL void process_relay(State *s, Relay *relayed) {
     int32_t listener = skyless_find_anchor(s, relayed->listener);
     int32_t sender = skyless_find_anchor(s, relayed->anchor);
@@ -4622,7 +4622,7 @@ INTERNAL void process_relay(State *s, Relay *relayed) {
     }
 }
 
-/* Check whether the tag stands still and, once in a round of packets, for faults.
+/* Check whether the tag is stationary and, once a round of packets, whether there are faults.
  *
  * An anchor whose clock is wrong leaves the state, to join again with its next packet. */
 INTERNAL void check_motion_and_faults(State *s, real elapsed_s) {
@@ -4643,7 +4643,7 @@ INTERNAL void check_motion_and_faults(State *s, real elapsed_s) {
 
 /* What a fix carries */
 
-/* Write all that a fix carries. */
+/* Fill the rows of a fix. */
 INTERNAL void fill_fix(State *s) {
     int32_t velocity = s->layout.velocity;
     real scale = covariance_scale(s);
@@ -4669,7 +4669,7 @@ INTERNAL void fill_fix(State *s) {
 
 /* Ready-made differences and heights */
 
-/* Process a ready-made difference of ranges, to anchor b less to anchor a, and leave all that a fix carries. */
+/* Process a ready-made difference of ranges, to anchor b minus to anchor a, and fill the rows of a fix. */
 SKYLESS_EXPORT int32_t skyless_process_difference(State *s, Place *a, Place *b, int64_t rx_ticks, real difference_m) {
     Status *status = &s->status;
     if (rx_ticks < status->epoch_ticks) {
@@ -4696,7 +4696,7 @@ SKYLESS_EXPORT int32_t skyless_process_difference(State *s, Place *a, Place *b, 
     return outcome;
 }
 
-/* An anchor was used in a difference. */
+/* Record the use of an anchor in a difference. */
 INTERNAL void note_difference(State *s, int32_t anchor, int64_t rx_ticks) {
     Anchor *a = &s->anchors[anchor];
     a->packets += 1;
@@ -4704,7 +4704,7 @@ INTERNAL void note_difference(State *s, int32_t anchor, int64_t rx_ticks) {
     a->walked_m = s->status.walked_m;
 }
 
-/* Process a sensor's height of the tag, and leave all that a fix carries. */
+/* Process a height sensor's reading, and fill the rows of a fix. */
 SKYLESS_EXPORT int32_t skyless_process_height(State *s, real height_m, real std_m, bool is_barometer) {
     int32_t outcome = height(s, height_m, std_m, is_barometer) == USED ? ACCEPTED : REJECTED;
     fill_fix(s);
@@ -4713,7 +4713,7 @@ SKYLESS_EXPORT int32_t skyless_process_height(State *s, real height_m, real std_
 
 /* Many packets in one loop */
 
-/* Process many packets, and write a row for each. */
+/* Process a batch of packets, and write a row for each. */
 SKYLESS_EXPORT void skyless_track(State *s, Place *places, BatchPacket *packets, Relay *relays, BatchRow *rows, int32_t
         count, bool has_levels) {
     Packet packet = {0};
@@ -4757,22 +4757,22 @@ INTERNAL void fill_row(State *s, BatchRow *row, bool has_levels) {
     }
 }
 
-/* Covariance analysis: the filter's own steps without measurements, for planning and for Cramér–Rao bounds.
+/* Covariance analysis: the filter's own steps without measurements, for planning and Cramér–Rao bounds.
  *
- * What the filter will claim of a tag at rest at some place of a site: a superframe of messages is processed with
- * innovations of zero until the position's variance repeats. That holds what the filter allows for accelerations, which
- * such a tag does not have. Their part follows from sensitivities: rows of V begin, at moments of a superframe, as a
- * velocity that the filter does not know of, and the squares of what they do to the position, integrated over the time
- * after that, are what accelerations add to P. Another row of V holds the walls' delays.
+ * Computes what the filter will claim for a tag at rest at some place of a site: a superframe of messages is processed
+ * with innovations of zero until the position's variance repeats. That variance includes the accelerations that the
+ * filter allows for and that such a tag does not have. Their part follows from sensitivities: rows of V start, at moments
+ * of a superframe, as a velocity unknown to the filter; the squares of their effect on the position, integrated over the
+ * time after, are what accelerations add to P. Another row of V is the effect of the walls' delays.
  *
- * Where only a share of an anchor's packets arrives, the stamps of all count for as much less: their variances are divided
- * by the share, and those of relayed receptions by the share of all three that they take. */
+ * If only a share of an anchor's packets arrives, all its stamps carry correspondingly less information: their variances
+ * are divided by the share, and those of relays by the share of all three packets involved. */
 
 /* The position's variance, or a sum, counts as complete when it changes by less than this share between two looks. */
 
 /* Find the steady state of a tag at the state's position.
  *
- * After ``most`` of the superframes it counts as steady in any case; sums are compared every ``step`` of them. */
+ * Ends after ``most`` superframes in any case; the sums are compared every ``step`` superframes. */
 SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count,
         int32_t most, int32_t step, SteadyState *found) {
     s->rows = walls(s) + 1 + IMPULSES * s->dim;
@@ -4814,10 +4814,10 @@ SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages
     }
 }
 
-/* Find what the filter claims of a tag that has rested for superframes and then walked for others.
+/* Find what the filter claims for a tag that rests for some superframes and then walks for others.
  *
- * ``found`` has the fixes and variances of the last of them. A state with phases has them of each message of which at
- * least half arrive; what they show is as expected, so that cycles are in doubt where they are for the filter. */
+ * ``found`` holds the fixes and variances of the last superframe. A state with phases gets one for each message of
+ * which at least half arrive; the phases are as predicted, so cycles are in doubt wherever they are for the filter. */
 SKYLESS_EXPORT void skyless_find_walked(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int32_t
         at_rest, real *velocity_mps, int32_t walked, SteadyState *found) {
     s->rows = walls(s) + 1;
@@ -4835,12 +4835,12 @@ SKYLESS_EXPORT void skyless_find_walked(State *s, PlannedMessage *messages, Plan
     }
 }
 
-/* The row of V for the walls' delays; those of the impulses follow. */
+/* The row of V for the walls' delays; the rows of the impulses follow. */
 INTERNAL int32_t walls(State *s) {
     return FAULT_KINDS * s->count + s->dim;
 }
 
-/* Process the messages of a superframe from now on; impulses act in the one that begins at ``impulses_ticks``. */
+/* Process a superframe from ``now`` on; impulses act in the one that begins at ``impulses_ticks``. */
 INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int64_t now,
         int64_t impulses_ticks, int64_t superframe, SteadyState *found) {
     int32_t begin = 0;
@@ -4879,7 +4879,7 @@ INTERNAL void add_fix(State *s, real share, SteadyState *found) {
     }
 }
 
-/* Time update, with a velocity of 1 m/s that the filter does not know of from each impulse on. */
+/* Time update; from each impulse on the tag has a velocity of 1 m/s that the filter does not know of. */
 INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_ticks, int64_t superframe) {
     int64_t before = s->status.epoch_ticks;
     predict(s, now);
@@ -4896,7 +4896,7 @@ INTERNAL void predict_with_impulses(State *s, int64_t now, int64_t impulses_tick
     }
 }
 
-/* The tag's reception of a message. */
+/* Process the tag's reception of a message. */
 INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
     Anchor *a = &s->anchors[message->anchor];
     Layout *where = &s->layout;
@@ -4925,7 +4925,7 @@ INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
     a->packets += 1;
 }
 
-/* A relayed reception. */
+/* Process a relay. */
 INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *relayed) {
     relay_terms(s, message->anchor, relayed->sender, relayed->age_s, true);
     real variance = relay_variance(s, message->anchor, relayed->sender, relayed->age_s) / relayed->share;
@@ -4941,8 +4941,8 @@ INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *rel
 
 /* Process a frame at the tag's true position, with innovations of zero.
  *
- * ``known``: which receptions of it are known, of each anchor and then of the tag; those of anchors before ``first``
- * are left out. ``elapsed_s``, ``walked_m``: since the frame before of this anchor that the tag received. */
+ * ``known``: whether each anchor's reception of it, and then the tag's, is known; anchors before ``first`` are left
+ * out. ``elapsed_s``, ``walked_m``: since this anchor's previous frame that the tag received. */
 SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_ticks, real *position_m, uint8_t *known,
         int32_t first, real elapsed_s, real walked_m) {
     predict(s, rx_ticks);
@@ -4973,14 +4973,14 @@ SKYLESS_EXPORT void skyless_process_known(State *s, int32_t sender, int64_t rx_t
     }
 }
 
-/* The search for positions that explain a set of TDoAs: starts, descent, and the distinct minima. */
+/* Search for the positions that explain a set of TDoAs: starting points, descent, distinct minima. */
 
-/* Anchors are in one plane if they leave it by less than this part of the smallest TDoA sigma. */
+/* Anchors are coplanar if they deviate from the plane by less than this fraction of the smallest TDoA sigma … */
 
-/* Move the anchors into axes with the reference at the origin, and choose the kind of problem.
+/* Transform the anchors into axes with the reference at the origin, and choose the kind of problem.
  *
- * Without a given height, the axes are those of the anchors' figure, the longest first. False where the anchors are
- * in one line or in one point. */
+ * Without a given height, the axes are the principal axes of the anchors' figure, the longest first.
+ * Returns False if the anchors are collinear. */
 INTERNAL bool choose_axes(LocateProblem *p) {
     Columns m = {0};
     m.rows = p->anchors;
@@ -5046,9 +5046,9 @@ INTERNAL real least_sigma_m(LocateProblem *p) {
     return least_m;
 }
 
-/* It also ends where a step promises to lower the cost by less than this part: steps of 10⁻⁷ sigma. */
+/* … or with a step that promises to lower the cost by less than this fraction: 10⁻⁷ sigma. */
 
-/* Move the state to the minimum of its surroundings; returns how it ended. */
+/* Move the state to the nearest minimum. Returns how the iteration ended. */
 INTERNAL int32_t descend(LocateProblem *p) {
     int32_t gradient = floor_div_32(p->dims * (p->dims + 1), 2);
     real cost = assemble(p, p->state, p->normal);
@@ -5100,7 +5100,7 @@ INTERNAL int32_t descend(LocateProblem *p) {
     return EXHAUSTED;
 }
 
-/* Linearise, whiten where it is weighted, and write systemᵀ·system into ``normal``; returns the cost. */
+/* Linearise, whiten if weighted, and write systemᵀ·system into ``normal``. Returns the cost. */
 INTERNAL real assemble(LocateProblem *p, real *state, real *normal) {
     linearise(p, state);
     if (p->is_weighted) {
@@ -5120,7 +5120,7 @@ INTERNAL real assemble(LocateProblem *p, real *state, real *normal) {
     return normal[element - 1];
 }
 
-/* Write ``system``; an anchor at the very position has no direction and counts with zeros. */
+/* Write ``system``. An anchor at the state itself has no direction; its derivatives are zero. */
 INTERNAL void linearise(LocateProblem *p, real *state) {
     real reference_m = REAL(0.0);
     real reference_x = REAL(0.0);
@@ -5143,7 +5143,7 @@ INTERNAL void linearise(LocateProblem *p, real *state) {
             reference_z = z;
         } else {
             real *row = p->system[i - 1];
-            row[2] = z - reference_z;  /* and then the residual, where the height is given */
+            row[2] = z - reference_z;  /* overwritten by the residual below if the height is given */
             row[0] = x - reference_x;
             row[1] = y - reference_y;
             row[p->dims] = p->tdoa_m[i - 1] - (distance_m - reference_m);
@@ -5166,7 +5166,7 @@ INTERNAL void whiten_system(LocateProblem *p) {
     }
 }
 
-/* Solve (N + damping·diag N)·step = gradient; False where the matrix is singular. */
+/* Solve (N + damping·diag N)·step = gradient. Returns False if the matrix is singular. */
 INTERNAL bool find_damped_step(LocateProblem *p, real damping) {
     int32_t gradient = floor_div_32(p->dims * (p->dims + 1), 2);
     for (int32_t k = 0; k < gradient; k++) {
@@ -5183,7 +5183,7 @@ INTERNAL bool find_damped_step(LocateProblem *p, real damping) {
     return true;
 }
 
-/* Whether the state has left for infinity, or is no number. */
+/* Whether the state has diverged or is NaN. */
 INTERNAL bool is_far(LocateProblem *p) {
     for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
         real reach = abs_real(p->state[j]) / p->scale[j];
@@ -5194,7 +5194,7 @@ INTERNAL bool is_far(LocateProblem *p) {
     return false;
 }
 
-/* Next damping after a success, by the ratio of what it gained to what was predicted (H. B. Nielsen 1999). */
+/* Next damping after a success, from the ratio of the actual to the predicted gain (H. B. Nielsen 1999). */
 INTERNAL real eased(real damping, real ratio) {
     if (ratio < REAL(0.5)) {
         damping = max_real(damping, FIRST_DAMPING);
@@ -5206,7 +5206,7 @@ INTERNAL real eased(real damping, real ratio) {
 
 /* The equations are not weighted. */
 
-/* Add what the closed forms find. */
+/* Add the closed-form solutions as starting points. */
 INTERNAL void add_algebraic_starts(LocateProblem *p) {
     int32_t coordinates = p->kind == FREE ? 3 : 2;
     if (p->kind != PLANE) {
@@ -5222,7 +5222,7 @@ INTERNAL void add_algebraic_starts(LocateProblem *p) {
 
 /* Add the points x = u − v·ρ for each non-negative root ρ of |x|² = ρ².
  *
- * Where noise leaves no real root, the vertex of the parabola is used. The roots' form does not cancel. */
+ * If noise leaves no real root, the parabola's vertex is used. The roots are computed without cancellation. */
 INTERNAL void add_intersections(LocateProblem *p, int32_t coordinates) {
     Equations e = {0};
     fill(p, &e, coordinates, false);
@@ -5261,7 +5261,7 @@ INTERNAL void add_at_distance(LocateProblem *p, Equations *e, real distance_m) {
     }
 }
 
-/* Add the solution of the equations for these coordinates and ρ; with two of three, both that have this ρ. */
+/* Add the solution for these coordinates and ρ; with two of three coordinates, both points at the distance ρ. */
 INTERNAL void add_interpolation(LocateProblem *p, int32_t coordinates) {
     Equations e = {0};
     fill(p, &e, coordinates, true);
@@ -5284,7 +5284,7 @@ INTERNAL void add_interpolation(LocateProblem *p, int32_t coordinates) {
     }
 }
 
-/* Write the equations for these coordinates and, if it has it, for ρ. */
+/* Write the equations for these coordinates and, if ``has_distance``, for ρ. */
 INTERNAL void fill(LocateProblem *p, Equations *e, int32_t coordinates, bool has_distance) {
     Columns *m = &e->left;
     m->rows = p->anchors - 1;
@@ -5301,12 +5301,12 @@ INTERNAL void fill(LocateProblem *p, Equations *e, int32_t coordinates, bool has
     orthogonalise(m);
 }
 
-/* The given height above the reference anchor; 0 where none is given. */
+/* The given height relative to the reference anchor; 0 if none is given. */
 INTERNAL real given_height_m(LocateProblem *p) {
     return p->kind == HEIGHT ? p->height_m - p->origin_m[2] : REAL(0.0);
 }
 
-/* Add the anchors' centroid; where the height is unknown, half their extent off their plane. */
+/* Add the anchors' centroid; if the height is unknown, shifted off their plane by half their extent. */
 INTERNAL void add_central_starts(LocateProblem *p) {
     real x = REAL(0.0);
     real y = REAL(0.0);
@@ -5325,7 +5325,7 @@ INTERNAL void add_central_starts(LocateProblem *p) {
     }
 }
 
-/* Add the state's mirror image behind the anchors' line or plane of least squares; a given height stays. */
+/* Add the mirror image of the state in the anchors' least-squares line or plane; a given height stays. */
 INTERNAL void add_image(LocateProblem *p) {
     Columns m = {0};
     m.rows = p->anchors;
@@ -5360,12 +5360,12 @@ INTERNAL void add(LocateProblem *p, real x, real y, real z) {
     p->start_count += 1;
 }
 
-/* Two minima are distinct where one lies outside the 3-sigma ellipsoid of the other. */
+/* Two minima are distinct if one lies outside the 3-sigma ellipsoid of the other. */
 
-/* Fill ``minima`` with all that are found, the best first; returns how the last iteration that failed ended.
+/* Fill ``minima``, the best first. Returns how the last failed iteration ended, ``CONVERGED`` if none failed.
  *
- * The closed form's starts depend on the reference and miss about one rival in a hundred; the anchors' centroid
- * finds most of these, and the mirror image of what is found the rest where anchors are nearly in one line or plane. */
+ * The closed-form starts depend on the reference and miss about one rival in a hundred. The anchors' centroid finds
+ * most of these, and the mirror image of a minimum the rest, where anchors are nearly collinear or coplanar. */
 INTERNAL int32_t find_minima(LocateProblem *p) {
     add_algebraic_starts(p);
     add_central_starts(p);
@@ -5389,7 +5389,7 @@ INTERNAL int32_t find_minima(LocateProblem *p) {
     return status;
 }
 
-/* Whether the state is at a minimum that has been found before. */
+/* Whether the state is at a minimum that was found before. */
 INTERNAL bool is_found(LocateProblem *p) {
     for (int32_t index_ = 0, index__end = p->minimum_count; index_ < index__end; index_++) {
         real apart = REAL(0.0);
@@ -5403,9 +5403,9 @@ INTERNAL bool is_found(LocateProblem *p) {
     return false;
 }
 
-/* Insert the minimum at the state, unless it is singular there.
+/* Insert the minimum at the state, unless it is singular.
  *
- * Its covariance is G·Σ·Gᵀ with the G of the estimate, (HᵀΣ⁻¹H)⁻¹HᵀΣ⁻¹ or, not weighted, (HᵀH)⁻¹Hᵀ. */
+ * Its covariance is G·Σ·Gᵀ with the estimator's G: (HᵀΣ⁻¹H)⁻¹HᵀΣ⁻¹ or, unweighted, (HᵀH)⁻¹Hᵀ. */
 INTERNAL void assess(LocateProblem *p) {
     Minimum found = {0};
     found.iterations = p->iterations;
@@ -5429,7 +5429,7 @@ INTERNAL void assess(LocateProblem *p) {
             }
         }
     }
-    if (!(found.covariance[floor_div_32(p->dims * (p->dims + 1), 2) - 1] > REAL(0.0))) {  /* too small for a number */
+    if (!(found.covariance[floor_div_32(p->dims * (p->dims + 1), 2) - 1] > REAL(0.0))) {  /* underflow */
         return;
     }
     if (!p->is_weighted) {
@@ -5447,7 +5447,7 @@ INTERNAL void assess(LocateProblem *p) {
     p->minimum_count += 1;
 }
 
-/* Write a column of G·L into ``step``; where it is weighted, ``system`` holds L⁻¹·H. */
+/* Write a column of G·L into ``step``; if weighted, ``system`` is L⁻¹·H. */
 INTERNAL void find_gain(LocateProblem *p, int32_t index_) {
     for (int32_t j = 0, j_end = p->dims; j < j_end; j++) {
         if (p->is_weighted) {
@@ -5462,7 +5462,7 @@ INTERNAL void find_gain(LocateProblem *p, int32_t index_) {
     solve(p->factor, p->dims, p->step);
 }
 
-/* Keep the best minimum and those that explain the TDoAs about as well from somewhere else. */
+/* Keep the best minimum and the distinct ones that explain the TDoAs about as well. */
 INTERNAL void keep_rivals(LocateProblem *p) {
     int32_t kept = 1;
     Minimum *best = &p->minima[0];
@@ -5496,13 +5496,13 @@ INTERNAL bool is_outside(LocateProblem *p, Minimum *minimum, real *state) {
     return !(chi2 <= DISTINCT_MINIMA_CHI2);
 }
 
-/* The position of a set of TDoAs: by the search's minima, and ``locate``, its Python function. */
+/* Position from one set of TDoAs: choice among the search's minima, and ``locate``, the Python function. */
 
-/* Mirror images have merged while the square of their distance from the plane is within these sigmas of zero. */
+/* Mirror images have merged if their squared distance from the plane is within these sigmas of zero. */
 
-/* Locate a tag by TDoAs whose numbers are finite; returns why there is no position.
+/* Locate a tag by finite TDoAs. Returns ``FOUND`` or the reason for no position.
  *
- * Needs 4 anchors, with a given height 3; with fewer, no position is determined. The problem is used up. */
+ * Needs 4 anchors, or 3 with a given height. Overwrites the problem. */
 SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found) {
     p->start_count = 0;
     p->minimum_count = 0;
@@ -5520,7 +5520,7 @@ SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found) {
     found->dof = p->anchors - 1 - p->dims;
     real below = p->kind == PLANE ? below_plane(best) : REAL(0.0);
     found->chi2 = best->chi2 + below;
-    int32_t dof = max_32(found->dof + (below > REAL(0.0) ? 1 : 0), 1);  /* without any, residuals are zero unless nothing fits at all */
+    int32_t dof = max_32(found->dof + (below > REAL(0.0) ? 1 : 0), 1);  /* with no redundancy, residuals are zero unless nothing fits at all */
     if (chi2_tail(dof, found->chi2) < p->residual_tail) {
         return RESIDUALS;
     }
@@ -5533,7 +5533,7 @@ SKYLESS_EXPORT int32_t skyless_find_position(LocateProblem *p, Found *found) {
     return decide(p, found);
 }
 
-/* The reason when no iteration ended in a minimum. */
+/* The reason if no iteration ended in a minimum. */
 INTERNAL int32_t why_none(LocateProblem *p, int32_t status) {
     for (int32_t i = 0, i_end = p->anchors - 1; i < i_end; i++) {
         real *anchor = p->anchors_m[i + 1];
@@ -5547,13 +5547,13 @@ INTERNAL int32_t why_none(LocateProblem *p, int32_t status) {
 
 /* Anchors in a plane */
 
-/* What the constraint s ≥ 0 adds to chi2: s²/σ_s² where the square of a distance came out negative. */
+/* Contribution of the constraint s ≥ 0 to chi2: s²/σ_s² if s is negative. */
 INTERNAL real below_plane(Minimum *minimum) {
     real s = minimum->state[2];
     return s < REAL(0.0) ? s * s / minimum->covariance[5] : REAL(0.0);
 }
 
-/* From s = w² to w: the two images, or one in the plane where s cannot be distinguished from 0. */
+/* Convert s = w² to w: two mirror images, or one point in the plane if s is not distinguishable from 0. */
 INTERNAL void unfold(LocateProblem *p) {
     Minimum *best = &p->minima[0];
     Minimum *image = &p->minima[1];
@@ -5581,7 +5581,7 @@ INTERNAL void unfold(LocateProblem *p) {
 
 /* Decision */
 
-/* Choose among rivals by the height's bounds, and reject what is not resolved. */
+/* Choose among rivals by the height bounds, and reject what stays ambiguous or too uncertain. */
 INTERNAL int32_t decide(LocateProblem *p, Found *found) {
     int32_t chosen = 0;
     if (p->minimum_count > 1) {
@@ -5618,7 +5618,7 @@ INTERNAL int32_t decide(LocateProblem *p, Found *found) {
     return FOUND;
 }
 
-/* The only position within the bounds, else the one that exceeds them least and by little; −1 if there is none. */
+/* The only position within the height bounds, else the one that exceeds them least and by little; −1 if none. */
 INTERNAL int32_t chosen_by_height(LocateProblem *p) {
     int32_t chosen = -1;
     int32_t equals = 0;
@@ -5676,13 +5676,13 @@ INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum) {
     }
 }
 
-/* The cold start: where the tag is, from packets alone and without a guess.
+/* Cold start: the tag's first position, from packets alone and without an initial guess.
  *
- * When anchor i relays its reception of a packet of anchor j that the tag received too, the difference of their clocks at
- * that moment is known but for noise. Along such links all TX times are carried to the clock of one anchor,
- * unless more anchors state theirs on the master's. The tag's clock runs up to 20 ppm off, so pseudoranges of one
- * superframe drift by tens of metres. Two messages of the same anchor give the drift; then all anchors' newest
- * pseudoranges are carried to one time and solved in closed form. */
+ * When anchor i relays its reception of a packet of anchor j that the tag received too, the offset between the two
+ * anchors' clocks at that moment is known up to noise. Along such links all TX times are converted to the clock of one
+ * anchor, unless more anchors state theirs on the master's scale. The tag's clock is up to 20 ppm off, so pseudoranges
+ * drift by tens of metres within one superframe. Two packets of the same anchor measure that drift; the newest
+ * pseudoranges of all anchors are then propagated to a common time and solved in closed form. */
 
 /* Forget all packets. */
 INTERNAL void forget_all(Acquisition *q) {
@@ -5690,7 +5690,7 @@ INTERNAL void forget_all(Acquisition *q) {
     q->count = 0;
 }
 
-/* Forget what was received of an anchor. */
+/* Forget an anchor's packets and links. */
 INTERNAL void forget_packets(Acquisition *q, int32_t anchor) {
     int32_t place = find_heard(q, anchor);
     if (place >= 0) {
@@ -5706,9 +5706,9 @@ INTERNAL void forget_packets(Acquisition *q, int32_t anchor) {
     q->link_count = kept;
 }
 
-/* Add one packet; try to start each time an anchor comes around again.
+/* Add a packet and, if its anchor was heard before, try to start.
  *
- * Returns why there is no start, ``FOUND`` if ``start`` is one. */
+ * Returns ``FOUND`` if ``q.start`` is a start, otherwise the reason why not. */
 INTERNAL int32_t try_start(Acquisition *q, Packet *packet, Relays *relays) {
     int64_t now = packet->rx_ticks;
     int32_t anchor = packet->place.anchor;
@@ -5769,9 +5769,9 @@ INTERNAL void forget_old_packets(Acquisition *q, int64_t now) {
     }
 }
 
-/* Keep an anchor's two newest packets, without an attempt to start; whether it had two before.
+/* Keep a packet without trying to start. Returns True if two packets of its anchor were kept already.
  *
- * With too many anchors a new one takes the place of that which has not fitted the others for longest. */
+ * If the table is full, a new anchor replaces the one that has not fitted the others for longest. */
 INTERNAL bool gather_packet(Acquisition *q, Packet *packet, Relays *relays) {
     add_links(q, packet, relays);
     int32_t place = find_heard(q, packet->place.anchor);
@@ -5808,7 +5808,7 @@ INTERNAL int32_t longest_unfitting(Acquisition *q) {
     return longest;
 }
 
-/* Keep what an anchor relays of packets that the tag has received. */
+/* Keep the relays that concern packets the tag has received itself. */
 INTERNAL void add_links(Acquisition *q, Packet *packet, Relays *relays) {
     for (int32_t index_ = 0, index__end = relays->count; index_ < index__end; index_++) {
         Relay *relayed = &relays->rows[index_];
@@ -5869,7 +5869,7 @@ INTERNAL void forget_links_before(Acquisition *q, int64_t now) {
     q->link_count = kept;
 }
 
-/* Choose the anchors with two packets, the newer of them young. */
+/* Choose the anchors with two packets of which the newer is recent. */
 INTERNAL void choose_pairs(Acquisition *q, int64_t now) {
     q->pair_count = 0;
     for (int32_t place = 0, place_end = q->count; place < place_end; place++) {
@@ -5887,7 +5887,7 @@ INTERNAL int32_t anchor_of(Acquisition *q, int32_t pair) {
 
 /* One scale for all TX times */
 
-/* Put packets on the scale of the anchor that reaches most others, or on the master's if that is more. */
+/* Convert TX times to the clock of the anchor that reaches most others, or to the master's if that covers more. */
 INTERNAL void put_on_one_scale(Acquisition *q, int64_t now) {
     int32_t stated = 0;
     for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
@@ -5938,7 +5938,7 @@ INTERNAL void measure_rate(Acquisition *q, int32_t pair, Packet *first, Packet *
     }
 }
 
-/* Find every anchor to which links lead, by as few of them as can be. */
+/* Build the tree of links from ``reference`` to every anchor it reaches, each by the fewest links. */
 INTERNAL void reach_from(Acquisition *q, int32_t reference) {
     Reach *r = &q->reach;
     for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
@@ -5980,7 +5980,7 @@ INTERNAL int32_t find_pair(Acquisition *q, int32_t anchor) {
     return -1;
 }
 
-/* Convert a packet's TX time to the clock of the reference; links go out of date at the difference of two rates. */
+/* Convert a packet's TX time to the reference clock; each link is propagated with the two clocks' rates. */
 INTERNAL void convert(Acquisition *q, int32_t pair, HeardPacket *one) {
     Reach *r = &q->best;
     int64_t rx_ticks = one->packet.rx_ticks;
@@ -6004,7 +6004,7 @@ INTERNAL void convert(Acquisition *q, int32_t pair, HeardPacket *one) {
     one->scaled.variance_m2 = variance_m2;
 }
 
-/* Rate of the tag's clock against the common scale in m/s, from two messages; that of light where out of order. */
+/* Rate of the tag's clock against the common scale in m/s, from two packets; c if they are out of order. */
 INTERNAL real clock_rate_mps(HeardAnchor *one) {
     int64_t elapsed = one->newer.packet.rx_ticks - one->older.packet.rx_ticks;
     if (elapsed <= 0) {
@@ -6016,7 +6016,7 @@ INTERNAL real clock_rate_mps(HeardAnchor *one) {
     return change_m / ((real)elapsed * TICK_S);
 }
 
-/* Drop pairs of messages that no crystal can have sent. */
+/* Drop pairs of packets whose clock rate no crystal can have. */
 INTERNAL void drop_impossible(Acquisition *q, int64_t now) {
     int32_t kept = 0;
     for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
@@ -6032,7 +6032,7 @@ INTERNAL void drop_impossible(Acquisition *q, int64_t now) {
 
 /* Positions */
 
-/* Locate the tag by the newest packets of all pairs but one (−1: of all); returns why there is no start. */
+/* Locate the tag from the newest packets of all pairs but ``left_out`` (−1: all). Returns ``FOUND`` or a reason. */
 INTERNAL int32_t solve_start(Acquisition *q, int32_t left_out, int64_t now, real residual_tail) {
     if (q->pair_count < 3 + (left_out >= 0 ? 1 : 0)) {
         return TOO_FEW_ANCHORS;
@@ -6085,7 +6085,7 @@ INTERNAL int32_t solve_start(Acquisition *q, int32_t left_out, int64_t now, real
     return reason;
 }
 
-/* Locate the tag by pseudoranges: by their differences against the first, with its variance in common. */
+/* Locate the tag from differences to the first pseudorange, whose variance they share. */
 INTERNAL int32_t locate(Acquisition *q, int32_t count, real residual_tail) {
     LocateProblem *p = &q->problem;
     p->anchors = count;
@@ -6119,9 +6119,9 @@ INTERNAL int32_t locate(Acquisition *q, int32_t count, real residual_tail) {
     return skyless_find_position(p, &q->found);
 }
 
-/* Whether ranges are curved within a start's standard deviation by more than their noise.
+/* Whether the curvature of the ranges within the start's standard deviation exceeds their noise.
  *
- * Updates would then make the filter sure of a wrong position. */
+ * The linearised updates would then make the filter overconfident in a wrong position. */
 INTERNAL bool is_wide(Acquisition *q) {
     Start *start = &q->start;
     int32_t dims = q->knows_height ? 2 : 3;
@@ -6138,7 +6138,7 @@ INTERNAL bool is_wide(Acquisition *q) {
     return !(square(curvature_m) < q->variance_m2 + q->error_variance_m2);
 }
 
-/* Whether a wide start is held back: more anchors may come, or too few agree with it to use it as it is. */
+/* Whether a wide start is withheld: more anchors may still be heard, or too few support it. */
 INTERNAL bool is_worth_waiting(Acquisition *q) {
     Start *start = &q->start;
     int32_t dims = q->knows_height ? 2 : 3;
@@ -6146,9 +6146,9 @@ INTERNAL bool is_worth_waiting(Acquisition *q) {
     return start->count <= dims + 1 || waited_s <= q->tuning.start_patience_s;
 }
 
-/* If exactly one anchor contradicts all others, leave it out. The others must still be able to contradict.
+/* Exclude an anchor if it is the only one without which the others agree; enough must remain to detect a misfit.
  *
- * If there is no such anchor for half a second, start from all of them as they are. */
+ * If there is no such anchor for ``start_patience_s``, start from all of them. */
 INTERNAL int32_t solve_without_one(Acquisition *q, int64_t now) {
     if (!q->is_contradicted) {
         q->is_contradicted = true;
@@ -6177,14 +6177,14 @@ INTERNAL int32_t solve_without_one(Acquisition *q, int64_t now) {
     return reason;
 }
 
-/* A tag from its first packet on: it looks for a start, follows its course, and begins again where it is lost.
+/* A tag from its first packet on: search for a start, filtering, and starting again when the tag is lost.
  *
- * The filter's state and the search for a start are not used at the same time, so that a board may keep both in the same
- * memory (``SHARES_MEMORY``): a filter begins with copies of what was found. */
+ * The filter's state and the search are never used at the same time, so a board may keep both in the same memory
+ * (``SHARES_MEMORY``): a new filter starts from copies of the search's results. */
 
-/* A tag that knows where it is: what becomes of a packet, and when it has to begin again. */
+/* A tag with a filter: the outcome of each packet, and when the tag must start again. */
 
-/* Process a packet of a tag that knows where it is, as ``process_frame``; what becomes of it. */
+/* Process a packet by ``process_frame`` while the tag has a filter. Returns the outcome. */
 INTERNAL int32_t process_in_course(Course *c, State *s, FixTime *time, Packet *packet, Relays *relays, uint8_t *packed,
         int32_t packed_bytes) {
     int32_t outcome = skyless_process_frame(s, packet, relays, packed, packed_bytes);
@@ -6199,7 +6199,7 @@ INTERNAL int32_t process_in_course(Course *c, State *s, FixTime *time, Packet *p
     return settle(c, s, time, packet->rx_ticks);
 }
 
-/* Whether the state is a fix: in three dimensions its height may be worse than the anchors' extent. */
+/* Return FIX or BAD_GEOMETRY: a 3-D fix needs a height standard deviation within the extent of the anchors. */
 INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks) {
     if (s->dim == AXES && s->P[at(2, 2)] > square(c->extent_m)) {
         return BAD_GEOMETRY;
@@ -6208,18 +6208,18 @@ INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks) {
     return FIX;
 }
 
-/* Whether the last packet is so recent that the filter can predict from it without a check. */
+/* Whether the last packet is recent enough for the filter to predict without a check. */
 INTERNAL bool is_surely_in_reach(Course *c, int64_t rx_ticks) {
     return 0 <= rx_ticks - c->newest_ticks && rx_ticks - c->newest_ticks < SURELY_IN_REACH_TICKS;
 }
 
-/* Record what relays and faults say of the start. Return True if they contradict it, so that a new one is needed.
+/* Return True if relays or faults contradict the start, so that a new one is needed.
  *
- * What the new start has to expect is then recorded as well. */
+ * Also records what the new start has to expect. */
 INTERNAL bool judge_start(Course *c, State *s, int64_t rx_ticks) {
     Tuning *tuning = &s->tuning;
     if (c->start_was_contradicted && is_late_often(s)) {
-        c->start_was_contradicted = false;  /* it was by single late packets */
+        c->start_was_contradicted = false;  /* caused by single late packets */
         c->open_range_errors = false;
         return true;
     }
@@ -6227,7 +6227,7 @@ INTERNAL bool judge_start(Course *c, State *s, int64_t rx_ticks) {
     if (age_s >= tuning->new_start_s) {
         c->may_begin_again = true;
     } else if (c->may_begin_again && s->fix[QUALITY][0] > tuning->wrong_nis) {
-        c->may_begin_again = false;  /* if it does not help, all is noisier than stated */
+        c->may_begin_again = false;  /* if a new start does not help, everything is noisier than stated */
         return true;
     }
     if (c->is_open && age_s > tuning->new_start_s && fits_settings(s)) {
@@ -6250,7 +6250,7 @@ INTERNAL bool judge_start(Course *c, State *s, int64_t rx_ticks) {
 
 /* Anchors in use */
 
-/* Note that a packet of an anchor was accepted, and forget those that have been silent for too long. */
+/* Record an accepted packet of an anchor, and drop the anchors that have been silent for too long. */
 INTERNAL void use_anchor(Course *c, Place *place, int64_t rx_ticks) {
     int32_t index_ = 0;
     while (index_ < c->count && c->used[index_].anchor != place->anchor) {
@@ -6306,7 +6306,7 @@ INTERNAL void forget_silent(Course *c, int64_t rx_ticks) {
     c->count = kept;
 }
 
-/* Take the anchors' span along an axis into account. */
+/* Include the anchors' span along an axis in ``extent_m``. */
 INTERNAL void widen(Course *c, int32_t axis) {
     real highest = c->used[0].position_m[axis];
     real lowest = c->used[0].position_m[axis];
@@ -6317,7 +6317,7 @@ INTERNAL void widen(Course *c, int32_t axis) {
     c->extent_m = max_real(c->extent_m, highest - lowest);
 }
 
-/* Begin with the settings in ``c``, and with the packets that a search has gathered so far. */
+/* Search for a start with the settings in ``c``, keeping the packets gathered so far. */
 SKYLESS_EXPORT void skyless_begin_course(Course *c, Acquisition *q) {
     c->in_use_s = max_real(c->tuning.short_silence_s, REAL(1.5) * c->superframe_s);
     c->start_was_contradicted = false;
@@ -6338,13 +6338,13 @@ SKYLESS_EXPORT void skyless_begin_course(Course *c, Acquisition *q) {
     begin_search(c, q);
 }
 
-/* Give up the filter, but for what it knows of late packets. */
+/* Abandon the filter and search again. Only the share of late packets is kept. */
 SKYLESS_EXPORT void skyless_begin_again(Course *c, State *s, Acquisition *q) {
     c->late_share = s->status.late_share;
     begin_search(c, q);
 }
 
-/* Look for a start, with nothing that a filter has received. */
+/* Set up the search. It keeps its packets only if no filter has run in between. */
 INTERNAL void begin_search(Course *c, Acquisition *q) {
     EstimatorSettings *settings = &c->settings;
     Tuning *tuning = &c->tuning;
@@ -6367,7 +6367,7 @@ INTERNAL void begin_search(Course *c, Acquisition *q) {
     q->has_been_wide = false;
 }
 
-/* Process a packet with more relays, as frames carry them; what becomes of it. */
+/* Process a packet whose further relays are still encoded (``packed``). Returns the outcome. */
 SKYLESS_EXPORT int32_t skyless_follow(Course *c, State *s, Acquisition *q, FixTime *time, Packet *packet, Relays
         *relays, uint8_t *packed, int32_t packed_bytes) {
     int64_t rx_ticks = packet->rx_ticks;
@@ -6387,7 +6387,7 @@ SKYLESS_EXPORT int32_t skyless_follow(Course *c, State *s, Acquisition *q, FixTi
         return outcome_of(found);
     }
     if (q->start.is_contradicted && !q->start.has_misfit && was_late_often(c)) {
-        return OUTLIER;  /* single packets are late: others will not be */
+        return OUTLIER;  /* single packets are late; the next ones will not be */
     }
     if (c->superframe_s > c->tuning.longest_superframe_s) {
         fill_alone(c, q);
@@ -6417,9 +6417,9 @@ INTERNAL bool was_late_often(Course *c) {
     return c->late_share > c->tuning.late_often_share;
 }
 
-/* Whether a filter can go on */
+/* Whether the filter can continue */
 
-/* Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back. */
+/* Whether the filter cannot predict to this time: the silence is too long, or the tag's counter went back. */
 INTERNAL bool is_out_of_reach(Course *c, State *s, int64_t rx_ticks) {
     Tuning *tuning = &c->tuning;
     real silent_s = (real)(rx_ticks - c->newest_ticks) * TICK_S;
@@ -6433,7 +6433,7 @@ INTERNAL bool is_out_of_reach(Course *c, State *s, int64_t rx_ticks) {
     return SQRT(horizontal_variance_m2(s, silent_s)) > part * mean_range_m(c, s->x);
 }
 
-/* From a position to the anchors in use. */
+/* Mean distance from a position to the anchors in use. */
 INTERNAL real mean_range_m(Course *c, real *position_m) {
     real total_m = REAL(0.0);
     for (int32_t index_ = 0, index__end = c->count; index_ < index__end; index_++) {
@@ -6442,7 +6442,7 @@ INTERNAL real mean_range_m(Course *c, real *position_m) {
     return total_m / (real)max_32(c->count, 1);
 }
 
-/* Of two points, where the height is given a horizontal one. */
+/* Distance between two points; horizontal only if the height is given. */
 INTERNAL real distance_m(Course *c, real *one_m, real *other_m) {
     real total = REAL(0.0);
     for (int32_t axis = 0, axis_end = c->dim; axis < axis_end; axis++) {
@@ -6451,9 +6451,9 @@ INTERNAL real distance_m(Course *c, real *one_m, real *other_m) {
     return SQRT(total);
 }
 
-/* From a start on */
+/* From a start to a filter */
 
-/* Use the anchors of a start and no others. */
+/* Make the anchors of the start the only ones in use. */
 INTERNAL void use_only(Course *c, Acquisition *q) {
     c->count = 0;
     c->extent_m = REAL(0.0);
@@ -6463,7 +6463,7 @@ INTERNAL void use_only(Course *c, Acquisition *q) {
     }
 }
 
-/* Write what a start knows by itself: a position, and of the velocity that it is a tag's; no protection level. */
+/* Write a fix from the start alone: position, assumed speed, no protection level. */
 INTERNAL void fill_alone(Course *c, Acquisition *q) {
     use_only(c, q);
     for (int32_t row = 0; row < PROTECTED_ROWS; row++) {
@@ -6484,9 +6484,9 @@ INTERNAL void fill_alone(Course *c, Acquisition *q) {
     c->alone[PROTECTION][STATE] = (real)UNAVAILABLE;
 }
 
-/* Begin at the start's position, and process the packets that led there.
+/* Start the filter at the start's position and process the packets behind it.
  *
- * False where anchors that are late may have moved it by more than their distance: it says nothing then. */
+ * Returns False if late anchors may have shifted the start by more than their distance; the start is useless then. */
 INTERNAL bool begin_filter(Course *c, State *s, Acquisition *q, Relays *relays) {
     Beginning b = {0};
     b.start = q->start;
@@ -6541,10 +6541,10 @@ INTERNAL bool begin_filter(Course *c, State *s, Acquisition *q, Relays *relays) 
     return true;
 }
 
-/* Copy the last packets of each anchor with which to begin.
+/* Choose the packets of each anchor that the filter starts with.
  *
- * The start's residuals are those of each anchor's newer packet. If earlier packets contradicted each other and these
- * do not, an older one may be late. Its variance is then larger, where relays show the anchor's clock as well. */
+ * The start's residuals belong to each anchor's newer packet. If earlier packets were inconsistent and these are not,
+ * an older one may be late, so its variance is increased where relays determine the anchor's clock too. */
 INTERNAL void choose_packets(Course *c, Acquisition *q, Beginning *b) {
     real factor = REAL(1.0);
     if (q->is_linked && q->is_contradicted && !q->start.is_contradicted) {
@@ -6562,7 +6562,7 @@ INTERNAL void choose_packets(Course *c, Acquisition *q, Beginning *b) {
     }
 }
 
-/* Add a packet behind those received earlier; ``factor`` is on its variance. */
+/* Insert a packet in order of reception; ``factor`` scales its variance. */
 INTERNAL void insert_packet(Beginning *b, HeardPacket *one, real factor) {
     int32_t place = b->count;
     while (place > 0 && b->packets[place - 1].packet.rx_ticks > one->packet.rx_ticks) {
@@ -6574,7 +6574,7 @@ INTERNAL void insert_packet(Beginning *b, HeardPacket *one, real factor) {
     b->count += 1;
 }
 
-/* Whether a filter begins with an anchor, given its place in the table of those that are heard. */
+/* Whether the filter starts with the anchor at index ``place`` of ``heard``. */
 INTERNAL bool is_chosen(Course *c, Acquisition *q, int32_t place) {
     Start *start = &q->start;
     if (c->most_anchors == 0 || (start->has_misfit && q->heard[place].newer.packet.place.anchor == start->misfit)) {
@@ -6594,11 +6594,11 @@ INTERNAL bool is_chosen(Course *c, Acquisition *q, int32_t place) {
     return is_used && nearer < c->most_anchors;
 }
 
-/* Which frames a tag admits: of the site in use, with stamps that are possible on its sender's and its own counter. */
+/* Which frames a tag accepts: those of its site whose stamps are possible on the sender's and on its own counter. */
 
-/* Unwrap the tag's stamp of a frame, and find out whether its site is in use; ``ADMITTED`` or why not.
+/* Unwrap the tag's stamp of a frame and check its site. Returns ``ADMITTED`` or why it is rejected.
  *
- * ``host_s``: the host's time of it, NaN where that is not known. */
+ * ``host_s``: the host's time of reception, NaN if unknown. */
 SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t anchor, int64_t rx_counter, real host_s)
         {
     a->former = a->own;
@@ -6634,7 +6634,7 @@ SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t 
     return ADMITTED;
 }
 
-/* Unwrap the TX stamp of a frame of the site in use; ``ADMITTED`` or why it is not used. */
+/* Unwrap the TX stamp of a frame of the site in use. Returns ``ADMITTED`` or why it is rejected. */
 SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
         period_ticks) {
     int32_t stamp = skyless_unwrap_stamp(&a->neighbours, anchor, sequence, tx_counter, a->rx_ticks, period_ticks);
@@ -6646,9 +6646,9 @@ SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t
     return stamp;
 }
 
-/* Which anchors of a large site a tag uses: the strongest of those that other anchors receive too. */
+/* Which anchors of a large site a tag uses: the strongest of those that other anchors receive too */
 
-/* Process the power of a beacon; NaN where the radio reports none. */
+/* Update an anchor's mean power; NaN if the radio reports none. */
 INTERNAL void add_power(Neighbour *n, real power_dbm) {
     if (abs_real(power_dbm) <= MAX_POWER_DBM) {
         n->power_dbm = n->has_power ? n->power_dbm + POWER_GAIN * (power_dbm - n->power_dbm) : power_dbm;
@@ -6656,7 +6656,7 @@ INTERNAL void add_power(Neighbour *n, real power_dbm) {
     }
 }
 
-/* Process what an anchor relays, so that it confirms others. */
+/* Mark the anchors that a beacon relays as confirmed. */
 INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks) {
     for (int32_t begin = 0, begin_end = b->relay_bytes; begin < begin_end; begin += 8) {
         int32_t anchor = two_bytes(b->relays, begin);
@@ -6666,10 +6666,10 @@ INTERNAL void add_relays(Neighbours *t, BeaconFields *b, int64_t rx_ticks) {
     }
 }
 
-/* How many receptions that an anchor relays fit what the tag has received itself: so it really receives them.
+/* Number of relayed receptions consistent with the tag's own, which proves that the anchor really receives them.
  *
- * Only packets of anchors in use count. A reception fits if, on the anchor's counter, it lies as long before its own
- * frame as on the tag's, to 1 µs (300 m) and the drift of crystals. */
+ * Only packets of anchors in use count. A reception fits if it precedes the anchor's own frame by as much on the
+ * anchor's counter as on the tag's, to 1 µs (300 m) and the drift of crystals. */
 INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_t rx_ticks) {
     int32_t fitting = 0;
     int32_t bits = b->has_phases ? SHORT_BITS : TICK_BITS;
@@ -6690,7 +6690,7 @@ INTERNAL int32_t fitting_relays(Neighbours *t, State *s, BeaconFields *b, int64_
     return fitting;
 }
 
-/* The index of the anchor in use that the newest anchor should replace: the weakest; −1 where none is weaker. */
+/* Index of the weakest anchor in use if the newest anchor should replace it, otherwise −1. */
 INTERNAL int32_t replaced_by(Neighbours *t, State *s, int32_t *origin_mm) {
     int32_t weakest = -1;
     real least_dbm = power_dbm(&t->rows[t->row], s, origin_mm) - BETTER_DB;
@@ -6704,7 +6704,7 @@ INTERNAL int32_t replaced_by(Neighbours *t, State *s, int32_t *origin_mm) {
     return weakest;
 }
 
-/* The mean power of an anchor or, where the radio reports none, a nominal one at its distance. */
+/* The mean power of an anchor; if the radio reports none, a nominal one at its distance. */
 INTERNAL real power_dbm(Neighbour *n, State *s, int32_t *origin_mm) {
     if (n->has_power) {
         return n->power_dbm;
@@ -6716,16 +6716,16 @@ INTERNAL real power_dbm(Neighbour *n, State *s, int32_t *origin_mm) {
     return NOMINAL_POWER_DBM - DB_PER_LOG * log_(max_real(SQRT(total), REAL(0.1)));
 }
 
-/* A coordinate of an anchor from the origin. */
+/* A coordinate of an anchor relative to the origin. */
 INTERNAL real place_m(Neighbour *n, int32_t *origin_mm, int32_t axis) {
     return (real)(n->place.position_mm[axis] - origin_mm[axis]) / (real)MM_PER_M;
 }
 
-/* ``joint``: the estimator as a positioning method: cold start, packet by packet updates, new starts when lost. */
+/* ``joint``: the estimator as a positioning method, with cold start, updates by packet, and restarts when lost. */
 
-/* Relays of packets that are older than both are not used. */
+/* Relays of older packets are not used; the longer of the two counts. */
 
-/* Fill in what the pages say. */
+/* Fill in the settings that the pages state. */
 INTERNAL void read_accuracy(EstimatorSettings *e, uint8_t *noise, uint8_t *accuracy) {
     fill_noise(e, float_at(noise, 1), float_at(noise, 5), float_at(noise, 9), float_at(noise, 13));
     e->survey_std_m = (real)two_bytes(accuracy, 1) / (real)STD_STEPS_PER_M;
@@ -6736,7 +6736,7 @@ INTERNAL void read_accuracy(EstimatorSettings *e, uint8_t *noise, uint8_t *accur
     e->place_time_s = (real)two_bytes(accuracy, 11) / (real)STEPS_PER_S;
 }
 
-/* Fill in the variances of stamps and oscillators of this noise (``NoisePage``). */
+/* Fill in the variances of stamps and oscillators (``NoisePage``). */
 INTERNAL void fill_noise(EstimatorSettings *e, real tx_stamp_s, real rx_stamp_s, real white_fm, real random_walk_fm) {
     e->tx_variance_m2 = LIGHT_2 * square(tx_stamp_s);
     e->rx_variance_m2 = LIGHT_2 * (square(rx_stamp_s) + ROUNDING_S2);
@@ -6746,13 +6746,13 @@ INTERNAL void fill_noise(EstimatorSettings *e, real tx_stamp_s, real rx_stamp_s,
     e->walk = new_2;
 }
 
-/* Fill in after which times packets and anchors count no more; anchors after ``drop_s`` at least. */
+/* Fill in the ages beyond which packets and anchors are dropped; anchors not before ``drop_s``. */
 INTERNAL void fill_ages(EstimatorSettings *e, real superframe_s, real drop_s) {
     e->drop_s = max_real(drop_s, REAL(4.0) * superframe_s);
     e->relay_age_s = max_real(RELAY_AGE_S, RELAY_SUPERFRAMES * superframe_s);
 }
 
-/* The number in four bytes, which is 0 or, in IEEE 754, a positive one below 1; pages have been checked. */
+/* Decode an IEEE 754 number from four bytes; checked pages hold only 0 and positive numbers below 1. */
 INTERNAL real float_at(uint8_t *data, int32_t at) {
     int64_t bits = unsigned_(data, at, 4);
     int64_t halvings = 150 - (bits >> 23);
@@ -6769,11 +6769,11 @@ INTERNAL real float_at(uint8_t *data, int32_t at) {
 
 /* A tag of protocol 2: from a frame's bytes to a fix. */
 
-/* Its owner */
+/* Start, wake, counter restarts */
 
-/* Begin to listen to a site or, with ``NO_SITE``, that with most anchors, and with an empty search.
+/* Initialise a tag that listens to one site or, with ``NO_SITE``, to the one with most anchors.
  *
- * The rest is of ``EstimatorSettings``. */
+ * The other arguments are fields of ``EstimatorSettings``. */
 SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest_m, real highest_m, real height_std_m,
         real max_acceleration_mps2, real integrity_risk, real alert_limit_m) {
     t->owner = (EstimatorSettings){.qa = REAL(0.5), .start_speed_std_mps = REAL(2.0), .white = REAL(3.6e-05), .walk =
@@ -6847,11 +6847,9 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
     forget_moves(t);
 }
 
-/* Its counter and its site */
-
-/* Begin again at the same site and near the same height, after a sleep in which the tag's counter was lost.
+/* Start again at the same site and near the same height after a sleep in which the tag's counter was lost.
  *
- * ``rx_counter``: what it reads now. */
+ * ``rx_counter`` is the counter's present reading. */
 SKYLESS_EXPORT void skyless_wake(Tag *t, State *s, Acquisition *q, int64_t rx_counter, real slept_s) {
     Admission *a = &t->admission;
     Course *c = &t->course;
@@ -6877,7 +6875,7 @@ SKYLESS_EXPORT void skyless_wake(Tag *t, State *s, Acquisition *q, int64_t rx_co
     }
 }
 
-/* Forget what has become useless with the beacon at hand. */
+/* Forget what the current beacon's events have made invalid. */
 INTERNAL void handle_events(Tag *t, Acquisition *q) {
     t->events = t->admission.events;
     t->admission.events = 0;
@@ -6890,7 +6888,7 @@ INTERNAL void handle_events(Tag *t, Acquisition *q) {
     }
 }
 
-/* The tag's counter has restarted: forget all but what the site has in common. */
+/* Forget everything but the site's own data, because the tag's counter has restarted. */
 INTERNAL void forget_stamps(Tag *t, Acquisition *q) {
     t->has_settings = false;
     t->pages.has_first = false;
@@ -6904,7 +6902,7 @@ INTERNAL void forget_stamps(Tag *t, Acquisition *q) {
 
 /* The site's pages */
 
-/* Make the settings that the pages in use require. */
+/* Derive the settings from the pages in use. */
 INTERNAL void read_pages(Tag *t) {
     Course *c = &t->course;
     uint8_t *site = t->pages.used[SITE_KIND].contents;
@@ -6919,14 +6917,14 @@ INTERNAL void read_pages(Tag *t) {
     }
 }
 
-/* Begin with the pages in use. */
+/* Start with the pages in use. */
 SKYLESS_EXPORT void skyless_begin_here(Tag *t, Acquisition *q) {
     read_pages(t);
     skyless_begin_course(&t->course, q);
     t->has_settings = true;
 }
 
-/* Begin with the pages in use, at a site whose anchors have the present periods. */
+/* Start with the pages in use and the longest period of the anchors that are present. */
 INTERNAL void begin_with_pages(Tag *t, Acquisition *q) {
     int64_t oldest_ticks = 0;
     Neighbours *neighbours = &t->admission.neighbours;
@@ -6948,7 +6946,7 @@ INTERNAL void begin_with_pages(Tag *t, Acquisition *q) {
     skyless_begin_here(t, q);
 }
 
-/* Forget the packets of anchors that no other confirms. */
+/* Forget the packets of anchors that no other anchor confirms. */
 INTERNAL void forget_unconfirmed(Tag *t, Acquisition *q) {
     Neighbours *neighbours = &t->admission.neighbours;
     for (int32_t place = q->count - 1; place > -1; place--) {
@@ -6960,9 +6958,9 @@ INTERNAL void forget_unconfirmed(Tag *t, Acquisition *q) {
     }
 }
 
-/* Beacons that are not just the next of an anchor in use */
+/* Beacons that are more than the next one of an anchor in use */
 
-/* Process the beacon at hand with its page, while anything is new: what becomes of it. */
+/* Process the current beacon while something is new: page, anchor, position or start. Returns the outcome. */
 INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame) {
     Admission *a = &t->admission;
     Course *c = &t->course;
@@ -6981,7 +6979,7 @@ INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame) 
     if (!n->has_place) {
         return NO_POSITION;
     }
-    if (!t->has_settings) {  /* others may confirm the anchor before the pages are complete */
+    if (!t->has_settings) {  /* other anchors may confirm this one before the pages are complete */
         take_relays(&t->packet, &t->relays, t->beacon.relays, t->beacon.relay_bytes);
         gather_packet(q, &t->packet, &t->relays);
         return NO_PAGES;
@@ -6991,7 +6989,7 @@ INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame) 
         return outcome;
     }
     outcome = skyless_follow(c, s, q, &a->time, &t->packet, &t->relays, t->beacon.relays, t->beacon.relay_bytes);
-    if (was_starting && !c->is_starting) {  /* from now on what anchors in use have received counts, and what those have */
+    if (was_starting && !c->is_starting) {  /* from now on only what anchors in use have received or relayed counts */
         for (int32_t row = 0, row_end = a->neighbours.count; row < row_end; row++) {
             Neighbour *other = &a->neighbours.rows[row];
             other->own_relays_ticks = NEVER;
@@ -7002,7 +7000,7 @@ INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame) 
     return outcome;
 }
 
-/* Whether an anchor is in use or may be: others have received it, and it is not weaker than those in use. */
+/* Return ``JOINS`` if an anchor is in use or may be: others confirm it, and it is no weaker than those in use. */
 INTERNAL int32_t join(Tag *t, State *s, Neighbour *n) {
     Course *c = &t->course;
     if (!c->is_starting && skyless_find_anchor(s, n->anchor) >= 0) {
@@ -7024,7 +7022,7 @@ INTERNAL int32_t join(Tag *t, State *s, Neighbour *n) {
 
 /* Anchors that have moved */
 
-/* Use all anchors together. */
+/* Use all anchors together again. */
 INTERNAL void forget_moves(Tag *t) {
     t->is_moving = false;
     t->uses_moved = false;
@@ -7034,9 +7032,9 @@ INTERNAL void forget_moves(Tag *t) {
     }
 }
 
-/* An anchor states another position: it leaves, and where too few are left that have not, all begin again. */
+/* Take an anchor that states another position out of use. If too few anchors are left, start again. */
 INTERNAL void separate_moved(Tag *t, State *s, Acquisition *q, Neighbour *n) {
-    if (t->uses_moved && n->has_moved) {  /* those in use move a second time */
+    if (t->uses_moved && n->has_moved) {  /* the anchors in use move a second time */
         forget_moves(t);
     }
     n->has_moved = true;
@@ -7052,7 +7050,7 @@ INTERNAL void separate_moved(Tag *t, State *s, Acquisition *q, Neighbour *n) {
     }
 }
 
-/* End a move of anchors that is over; begin again with those that have moved once they are most. */
+/* End a move that is over, and start again with the moved anchors once they are the majority. */
 INTERNAL void follow_moves(Tag *t, Acquisition *q, Neighbour *n) {
     int64_t calm_ticks = t->admission.rx_ticks - t->moved_ticks;
     if (t->is_moving && calm_ticks >= MOVE_TICKS) {
@@ -7071,7 +7069,7 @@ INTERNAL bool is_kept_apart(Tag *t, Neighbour *n) {
     return t->is_moving && n->has_moved != t->uses_moved;
 }
 
-/* Whether most of the anchors that are there, with a position, have moved. */
+/* Whether most of the present anchors with a position have moved. */
 INTERNAL bool have_most_moved(Tag *t) {
     int32_t present = 0;
     int32_t moved = 0;
@@ -7085,10 +7083,10 @@ INTERNAL bool have_most_moved(Tag *t) {
     return 2 * moved > present;
 }
 
-/* Process a frame from the air; what becomes of it.
+/* Process a frame from the air. Returns the outcome.
  *
- * That is one of ``DROP_COUNTERS``, of ``following.py`` or this file, or ``MALFORMED`` and more.
- * ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known. */
+ * That is one of ``DROP_COUNTERS``, of the outcomes in ``following.py`` or here, or ``MALFORMED`` plus a fault.
+ * If unknown, ``host_s`` and the powers are NaN and the phase is negative. */
 SKYLESS_EXPORT int32_t skyless_hear_frame(Tag *t, State *s, Acquisition *q, uint8_t *frame, int32_t length, int64_t
         rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles) {
     int32_t fault = skyless_read_frame(frame, length, &t->beacon);
@@ -7098,7 +7096,7 @@ SKYLESS_EXPORT int32_t skyless_hear_frame(Tag *t, State *s, Acquisition *q, uint
     return skyless_hear_fields(t, s, q, frame, rx_counter, host_s, rx_power_dbm, first_path_power_dbm, phase_cycles);
 }
 
-/* The same of a beacon that has been read already; its page stands in ``frame``. */
+/* Process a beacon that has been decoded into ``t.beacon``, with its page in ``frame``. Returns the outcome. */
 SKYLESS_EXPORT int32_t skyless_hear_fields(Tag *t, State *s, Acquisition *q, uint8_t *frame, int64_t rx_counter, real
         host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles) {
     Admission *a = &t->admission;
@@ -7127,7 +7125,7 @@ SKYLESS_EXPORT int32_t skyless_hear_fields(Tag *t, State *s, Acquisition *q, uin
     return outcome;
 }
 
-/* Process a beacon that is admitted. */
+/* Process an admitted beacon. Returns the outcome. */
 INTERNAL int32_t hear_admitted(Tag *t, State *s, Acquisition *q, Neighbour *n, uint8_t *frame) {
     Course *c = &t->course;
     BeaconFields *b = &t->beacon;
@@ -7140,9 +7138,9 @@ INTERNAL int32_t hear_admitted(Tag *t, State *s, Acquisition *q, Neighbour *n, u
     return skyless_follow(c, s, q, &t->admission.time, &t->packet, &t->relays, b->relays, relay_bytes);
 }
 
-/* Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender.
+/* Record the anchors this beacon confirms. Return True if its own sender is confirmed by others.
  *
- * Only then its pages take part in the majority, and its relays confirm others. */
+ * Only then do its pages count for the majority and its relays confirm others. */
 INTERNAL bool confirm(Tag *t, State *s) {
     BeaconFields *b = &t->beacon;
     Neighbours *rows = &t->admission.neighbours;
@@ -7159,9 +7157,9 @@ INTERNAL bool confirm(Tag *t, State *s) {
     return by_others;
 }
 
-/* Whether fewer anchors in use are still received than a fix takes, so that relays of any anchor confirm.
+/* Whether fewer anchors in use are still received than a fix needs, so that relays of any anchor confirm.
  *
- * A tag may come to where none of its anchors is received, nor receives the next ones: out of a lift. */
+ * This lets a tag go on where none of its anchors is received or receives the new ones, such as after a lift. */
 INTERNAL bool has_too_few(State *s, int64_t rx_ticks) {
     int32_t heard = 0;
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
@@ -7173,7 +7171,9 @@ INTERNAL bool has_too_few(State *s, int64_t rx_ticks) {
     return heard < MIN_ANCHORS;
 }
 
-/* Keep where an anchor says that it is; whether that is used from now on instead of another place. */
+/* Keep the position that an anchor states. Return True if it is used from now on instead of another one.
+ *
+ * Another position is used once it has been stated twice in a row. */
 INTERNAL bool keep_place(Neighbour *n, StatedPlace *place) {
     if (n->has_place && is_same(&n->place, place)) {
         n->has_other = false;
@@ -7200,7 +7200,7 @@ INTERNAL bool is_same(StatedPlace *one, StatedPlace *other) {
     return one->std_mm == other->std_mm && one->floor_ == other->floor_ && one->zone == other->zone;
 }
 
-/* Write the beacon at hand as the filter takes it, but for its relays. */
+/* Fill ``t.packet`` from the current beacon, without its relays. */
 INTERNAL void fill_packet(Tag *t, Neighbour *n, real factor) {
     Packet *packet = &t->packet;
     Place *place = &t->packet.place;

@@ -68,14 +68,14 @@ typedef double real;
 #define BAD_PERIOD 10
 /* Bytes 53 B0; the low half of the second is the version. */
 #define BEACON_MAGIC 45139
-/* By which another anchor must be stronger to replace the weakest. */
+/* An anchor replaces the weakest one if it is stronger by this. */
 #define BETTER_DB REAL(3.0)
 /* Difference of powers in dB at which the factor starts to rise and at which it is greatest: the maker's 6 and 10, plus
  * 1 dB. Lines of sight of the UTIL data set reach 8.4 dB; paths through metal, the only ones much later, start at 11.3. */
 #define BLOCKED_DB REAL(11.0)
 #define BOUND_SIGMAS REAL(3.0)
 #define BROADCAST 65535
-/* After which silence an anchor leaves the estimator at least, where tags move from cell to cell. */
+/* An anchor leaves the estimator after at least this silence at sites where tags move from cell to cell. */
 #define CELL_DROP_S REAL(1.0)
 /* Length of a certificate (``skyless.core.keys.chain``). */
 #define CERTIFICATE_BYTES 94
@@ -91,7 +91,7 @@ typedef double real;
 #define CONTRADICTED 2
 #define CONVERGED 0
 #define COUNTER_JUMPED 1
-/* Two stamps in a row that go back farther than radios and hosts reorder them mean that the tag's own counter has
+/* Two consecutive stamps that go back by more than radios and hosts reorder them mean that the tag's own counter has
  * restarted; a single one is damaged. */
 #define COUNTER_JUMP_TICKS INT64_C(63897600000)
 #define COUNT_BITS 4
@@ -102,12 +102,12 @@ typedef double real;
 /* Polynomial of Ethernet's check sequence, bits reversed. */
 #define CRC_32 INT64_C(3988292384)
 #define CREEPING 2
-/* Whole cycles of each channel's carrier fit into this number of ticks: ``EstimatorSettings.carrier_cycles``. */
+/* Number of ticks with a whole number of carrier cycles in every channel: ``EstimatorSettings.carrier_cycles``. */
 #define CYCLE_TICKS 128
 #define DB_PER_LOG REAL(8.685889638065035)
 /* DX_TIME ignores its low nine bits: transmissions start on 8.013 ns boundaries (DW1000 User Manual, p. 26). */
 #define DELAYED_TX_GRANULARITY_TICKS 512
-/* Columns are not independent if their smallest singular value is below this part of the largest. */
+/* Columns are dependent if their smallest singular value is below this fraction of the largest. */
 #define DEPENDENT REAL(1e-06)
 #define DISTINCT_MINIMA_CHI2 REAL(9.0)
 #define DIVERGED 2
@@ -121,14 +121,14 @@ typedef double real;
 #define FAULT_KINDS 3
 #define FCS_BYTES 2
 #define FIRST_DAMPING REAL(0.01)
-/* Where ``protect`` writes the tests of all kinds of faults, after ``HPL`` and ``VPL``. */
+/* Index of the tests of faults in ``levels``, after ``HPL`` and ``VPL``. */
 #define FIRST_TEST 2
 #define FIX 20
 /* Length of the fields that every beacon has. */
 #define FIXED_BYTES 20
 #define FLAGS_AT 11
 #define FLAT REAL(1e-09)
-/* Flight times differ between anchors by less than this (300 m). */
+/* Largest difference of flight times between anchors (300 m). */
 #define FLIGHT_SLACK_TICKS 63898
 #define FOREIGN 0
 #define FOREIGN_SITE 5
@@ -140,7 +140,7 @@ typedef double real;
 #define GEOREFERENCE_PAGE 4
 #define HAS_AUTHENTICATION 4
 #define HAS_CERTIFICATE 8
-/* Whether positions are from whole metres near the first anchor, as far ones lose millimetres in single precision. */
+/* Whether positions are relative to whole metres near the first anchor, so that single precision suffices. */
 #ifndef HAS_ORIGIN
 #define HAS_ORIGIN false
 #endif
@@ -169,52 +169,52 @@ typedef double real;
 #define IS_UNSETTLED 29
 #define JOINED 2
 #define JOINS 0
-/* Numbers in a vector of 256 bits, where rows of P begin at one. */
+/* Numbers in a 256-bit vector; rows of P start at vector boundaries. */
 #define LANES (PACKED ? 1 : 4)
-/* Metres, or m²: anything beyond is no site, and no number here overflows before it. */
+/* Limit in m or m². No site is larger, and nothing here overflows below it. */
 #define LARGEST REAL(1000000000.0)
 #define LASTING 0
-/* A year of ticks, whose differences fit 64 bits; a host's clock that jumps by more was set. */
+/* A year of ticks, so that differences fit into 64 bits; a host's clock that jumps by more was set. */
 #define LAST_TICKS INT64_C(2305843009213693952)
-/* Numbers that ``levels.protect`` writes: ``HPL``, ``VPL``, and the tests of all kinds of faults. */
+/* Numbers written by ``levels.protect``: ``HPL``, ``VPL``, and the test of each kind of faults. */
 #define LEVELS 5
 #define LIGHT_2 REAL(8.987551787368176e+16)
 /* The leading bits of ln 2: products with small whole numbers are exact. */
 #define LN_2_HIGH REAL(0.6931471803691238)
 #define LN_2_LOW REAL(1.9082149292705877e-10)
 #define LOG_FACTOR REAL(3.58351893845611)
-/* No jump of a host's clock counts as a longer one: the ticks of three years fit 64 bits. */
+/* Longer jumps of a host's clock are limited to this: the ticks of three years fit into 64 bits. */
 #define LONGEST_JUMP_S REAL(100000000.0)
 /* 4 s: a gap of one and a half periods is shorter than half a wrap of a counter. */
 #define LONGEST_PERIOD_CODE 159
-/* The longest time update: of more, squares of variances are no numbers in single precision. */
+/* Longest time update: beyond it, squares of variances overflow in single precision. */
 #define LONGEST_S REAL(1000.0)
 #define LOST 22
-/* Its exponential counts as 0. */
+/* Exponentials of smaller numbers are 0. */
 #define LOWEST REAL(-700.0)
 #define MAGIC_MASK 61695
-/* The bytes are no beacon; the fault's number is added. */
+/* Added to the fault's number if the bytes are no beacon. */
 #define MALFORMED 40
-/* Factor on all standard deviations, as errors are not quite Gaussian and figures not quite the filter's. */
+/* Factor on all standard deviations, as errors are not quite Gaussian and noise figures not quite right. */
 #define MARGIN REAL(1.05)
-/* Most anchors at a time. */
+/* Most anchors in the state. */
 #ifndef MAX_ANCHORS
 #define MAX_ANCHORS 32
 #endif
-/* Most anchors in the estimator's state; more cost accuracy, as each then sends less, and time. */
+/* Most anchors in a tag's state; more reduce accuracy, as each then sends less, and take time. */
 #ifndef MAX_ANCHORS_IN_USE
 #define MAX_ANCHORS_IN_USE 24
 #endif
 #define MAX_BEGINNING (2 * MAX_ANCHORS)
 /* Coordinates and heights beyond 1000 km from the origin are errors; a page has 32-bit millimetres, ±2147 km. */
 #define MAX_COORDINATE_MM 1000000000
-/* Most anchors of each that are counted. */
+/* Most anchors counted of each. */
 #ifndef MAX_COUNTED
 #define MAX_COUNTED 32
 #endif
 /* Magnitude above which a value is not a valid power. */
 #define MAX_DIFFERENCE_DB REAL(1000.0)
-/* Two clocks cannot drift apart faster: each within 20 ppm (IEEE 802.15.4-2015, 16.4.9), and room for motion. */
+/* Largest relative drift of two clocks: 20 ppm each (IEEE 802.15.4-2015, 16.4.9), and room for motion. */
 #define MAX_DRIFT REAL(5e-05)
 #define MAX_FAULTS 2
 /* Longest PSDU (IEEE 802.15.4-2015, aMaxPhyPacketSize). */
@@ -223,17 +223,17 @@ typedef double real;
 #define MAX_HEARD 12
 #define MAX_ITERATIONS 200
 #define MAX_LINKS (MAX_ANCHORS * (MAX_ANCHORS - 1))
-/* Most anchors that are known by their own beacons. */
+/* Most anchors known from their own beacons. */
 #ifndef MAX_NEIGHBOURS
 #define MAX_NEIGHBOURS 256
 #endif
 /* 2⁻¹⁹ as a float32; non-negative float32 values are ordered by their bits. */
 #define MAX_NOISE_BITS 905969664
-/* Pages of issues that are not complete. */
+/* Most collected pages of incomplete issues. */
 #ifndef MAX_PAGES
 #define MAX_PAGES 64
 #endif
-/* No radio reports more, nor less than its negative. */
+/* Larger magnitudes are not a radio's power. */
 #define MAX_POWER_DBM REAL(1000.0)
 #define MAX_RATE_MPS REAL(29979.2458)
 /* Most relays with a packet; 13 fit into a frame. */
@@ -241,18 +241,18 @@ typedef double real;
 #define MAX_RELAYS 32
 #endif
 #define MAX_ROWS (MAX_ANCHORS)
-/* Anchors by whose number one page is preferred to another. */
+/* Most senders counted for a page. */
 #ifndef MAX_SENDERS
 #define MAX_SENDERS 16
 #endif
-/* Most sites of which anchors are counted. */
+/* Most sites whose anchors are counted. */
 #ifndef MAX_SITES
 #define MAX_SITES 8
 #endif
 #define MAX_STARTS 9
 /* Longest superframe: under half a wrap of the counter (8.6 s), as stamps would become ambiguous. */
 #define MAX_SUPERFRAME_TICKS INT64_C(549755813887)
-/* Rotations of all pairs of columns; they converge quadratically, with four columns after about six. */
+/* Most sweeps over all pairs of columns; they converge quadratically, four columns in about six. */
 #define MAX_SWEEPS 12
 #define MAX_TRIALS 256
 /* Factor on the variance of a blocked path: metal delayed messages by 0.2 to 0.4 m, 4 to 8 times the noise. */
@@ -261,13 +261,13 @@ typedef double real;
 /* With fewer anchors no majority counts, unless the tag receives no more for ``PRESENT_TICKS``. */
 #define MIN_ANCHORS 3
 #define MIN_DAMPING REAL(0.0001)
-/* An anchor that relays this number of receptions of anchors in use, and they fit, is there. */
+/* An anchor exists if it relays at least this many receptions of anchors in use that fit. */
 #define MIN_FITTING 2
 #define MIRROR 7
 #define MM_PER_M 1000
-/* A larger share of late packets counts as this. */
+/* Upper limit of the share of late packets in ``is_lost``. */
 #define MOST_LATE REAL(0.45)
-/* Most updates of the filter that wait. */
+/* Most queued updates of the filter. */
 #ifndef MOST_WAITING
 #define MOST_WAITING 8
 #endif
@@ -278,19 +278,19 @@ typedef double real;
  * has moved for ``MOVE_TICKS``. It switches to the moved ones once they are the majority and none has moved for
  * ``MOVED_HOLD_TICKS``. */
 #define MOVE_TICKS INT64_C(638976000000)
-/* A smaller square of a distance counts as this. */
+/* Lower limit of a squared distance. */
 #define NEAREST_M2 REAL(1e-18)
-/* Earlier than any reading. */
+/* Earlier than any time. */
 #define NEVER (INT64_C(-4611686018427387904))
-/* The logarithm is concave, and the first z too large: each step doubles the right digits. */
+/* The logarithm is concave and the first z too large, so each step doubles the number of correct digits. */
 #define NEWTON_STEPS 10
-/* The identifier of no anchor. */
+/* Stands for no anchor. */
 #define NOBODY (-1)
 #define NOISE_KIND 0
 #define NOISE_PAGE 3
-/* 0.3 m allow for the noise of two stamps of one anchor. */
+/* Allowance of 0.3 m for the noise of two stamps of one anchor. */
 #define NOISE_TICKS 64
-/* Assumed power at 1 m where the radio reports none, so that nearer anchors count as stronger. */
+/* Assumed power at 1 m if the radio reports none, so that nearer anchors count as stronger. */
 #define NOMINAL_POWER_DBM REAL(-63.0)
 #define NOT_A_BEACON 4
 #define NO_COVARIANCE 1
@@ -302,17 +302,17 @@ typedef double real;
 #define NO_SITE (-1)
 #define OBSTRUCTED 1
 #define ONES INT64_C(4294967295)
-/* Columns are orthogonal if the cosine of their angle is not larger. */
+/* Columns are orthogonal if the cosine of their angle does not exceed this. */
 #define ORTHOGONAL REAL(1e-14)
 #define OTHER_PAGES 1
 #define OTHER_SETTINGS 2
 #define OUTLIER 21
 #define OUT_OF_ORDER 2
-/* Whether P is kept as its lower triangle alone: half the memory, but rows that vectors do not fit. */
+/* Whether P is kept as a lower triangle: half the memory, but rows that do not fit vectors. */
 #ifndef PACKED
 #define PACKED false
 #endif
-/* Packets of each anchor that are kept for relays to come; divides the range of sequence numbers. */
+/* Packets kept of each anchor for later relays; divides the range of sequence numbers. */
 #ifndef PACKETS_KEPT
 #define PACKETS_KEPT 16
 #endif
@@ -321,18 +321,18 @@ typedef double real;
 #define PAGE_KINDS 4
 #define PHASE_BEGINS 0
 #define PHASE_REFUSED 1
-/* States of each anchor for carrier phases; 0 where they are not used. */
+/* States of each anchor for carrier phases; 0 if they are not used. */
 #ifndef PHASE_STATES
 #define PHASE_STATES 3
 #endif
 /* Phase steps in a cycle; also the bit that marks the presence of a phase. */
 #define PHASE_STEPS 128
 #define PHASE_USED 2
-/* A comparison of range errors counts as this many times their mean at most, as jumps are not multipath. */
+/* Squared differences of range errors are limited to this multiple of their mean, as jumps are not multipath. */
 #define PLACE_LIMIT REAL(2.0)
 #define PLACE_LIMITED_MEAN REAL(0.7421917)
 #define PLANE 2
-/* Columns of V for what planning adds: walls, and four impulses along each axis. */
+/* Columns of V for planning: walls, and four impulses along each axis. */
 #ifndef PLANNED_FAULTS
 #define PLANNED_FAULTS 13
 #endif
@@ -344,15 +344,15 @@ typedef double real;
 /* Anchors received within this time count. */
 #define PRESENT_TICKS INT64_C(63897600000)
 #define PROTECTED_ROWS 10
-/* The first three of the levels (``estimator/levels.py``), for methods that know some. */
+/* The first three levels (``estimator/levels.py``); only of methods that compute them. */
 #define PROTECTION 9
-/* Chi-square and mean squared residual in m². */
+/* Row of chi-square and mean squared residual in m². */
 #define QUALITY 4
 #define RECENT 1
 #define REJECTED 0
 /* How long a reception confirms its sender, if received by an anchor in use or by one that is confirmed itself. */
 #define RELAYED_TICKS INT64_C(127795200000)
-/* Relays of each packet that are kept for the filter which begins. */
+/* Relays kept of each packet for the filter's start. */
 #ifndef RELAYS_KEPT
 #define RELAYS_KEPT 32
 #endif
@@ -364,7 +364,7 @@ typedef double real;
 #define RESTART_SILENCE_PERIODS 4
 #define RESTART_SILENCE_TICKS INT64_C(12779520000)
 #define RIVAL_MINIMUM_CHI2 REAL(9.0)
-/* What rounding in single precision may make of a variance of lasting faults that is smaller. */
+/* Smaller variances of lasting faults may be rounding errors of single precision. */
 #define ROUNDING_M2 REAL(1e-07)
 /* Variance of rounding to whole ticks. */
 #define ROUNDING_S2 REAL(2.0410312834001283e-23)
@@ -374,18 +374,18 @@ typedef double real;
 #define SEARCHING 26
 /* Capacity for columns of V. */
 #define SENSITIVITIES (FAULTS + AXES + PLANNED_FAULTS)
-/* Whether the search for a start uses the memory of the state, which is not used meanwhile. */
+/* Whether the search for a start uses the memory of the state, which is unused meanwhile. */
 #ifndef SHARES_MEMORY
 #define SHARES_MEMORY false
 #endif
-/* Time between two packets of an anchor at least: a frame takes longer. */
+/* Shortest time between two packets of an anchor: a frame takes longer. */
 #define SHORTEST_S REAL(5e-05)
 /* Bits of the stamp of such an entry. */
 #define SHORT_BITS 32
 /* The highest bit of four bytes; as a float32 on its own it is −0. */
 #define SIGN INT64_C(2147483648)
 #define SINGULAR 5
-/* A pivot below this part of its diagonal element is rounding noise: the matrix is singular. */
+/* A pivot below this fraction of its diagonal element is rounding noise: the matrix is singular. */
 #define SINGULAR_PIVOT REAL(1e-12)
 #define SITE_CHANGED 4
 #define SITE_KIND 3
@@ -410,18 +410,18 @@ typedef double real;
 /* Units of an accuracy page: standard deviations, distance, time. */
 #define STEPS_PER_S 10
 #define STEP_TOLERANCE REAL(1e-10)
-/* Parts of a tick; the air's unit of the site's time, of which beacons carry 48 bits. */
+/* Subdivisions of a tick: the unit of the site's time on the air, of which beacons carry 48 bits. */
 #define SUBTICKS 256
 #define SUBTICK_MASK INT64_C(281474976710655)
-/* Silences up to this need no check of the filter. */
+/* After silences up to this the filter predicts without a check. */
 #define SURELY_IN_REACH_TICKS INT64_C(6389759999)
-/* Of Jacobi's rotations: each squares what is left off the diagonal. */
+/* Sweeps of Jacobi rotations; each squares what is left off the diagonal. */
 #define SWEEPS 8
 #define TERMS 60
 #define THIN_SIGMAS REAL(0.1)
 /* Width of the timestamp counter (DW1000 User Manual v2.12, 7.2.8); it wraps every 17.2074 s. */
 #define TICK_BITS 40
-/* What light travels in one tick, 4.692 mm. */
+/* Distance that light travels in one tick, 4.692 mm. */
 #define TICK_M REAL(0.0046917639786157855)
 #define TICK_MASK INT64_C(1099511627775)
 /* Rate of the DW1000's timestamp counter, 63.8976 GHz (DW1000 User Manual v2.12, 7.2.8). */
@@ -446,7 +446,7 @@ typedef double real;
 #define UNUSABLE 20
 #define UNUSED 0
 #define USED 1
-/* The velocity, then three rows of its covariance, for methods that know it. */
+/* The velocity, then three rows of its covariance; only of methods that estimate it. */
 #define VELOCITY 5
 #define VERSION_2 45651
 #define VPL 1
@@ -523,12 +523,12 @@ typedef struct Neighbours {
     Neighbour rows[MAX_NEIGHBOURS];
 } Neighbours;
 
-/* Turns one counter's wrapped stamps into int64 ticks that never wrap (``unwrap``). */
+/* Converts one counter's wrapped stamps to int64 ticks that never wrap (``unwrap``). */
 typedef struct Unwrapper {
-    int32_t bits;  /* Width of the counter, 62 at most. */
+    int32_t bits;  /* Width of the counter, at most 62. */
     bool has_stamp;
     int64_t last_ticks;
-    real last_host_s;  /* NaN where no stamp has had a host time. */
+    real last_host_s;  /* NaN if no stamp has had a host time. */
 } Unwrapper;
 
 /* An anchor of a counted site. */
@@ -562,7 +562,7 @@ typedef struct SiteChoice {
     CountedSite sites[MAX_SITES];
 } SiteChoice;
 
-/* Counts from the first fix of a receiver and never goes back, even if the master or the method changes. */
+/* Time of fixes, counted from a receiver's first one; it never goes back, even if master or method change. */
 typedef struct FixTime {
     bool has_fix;
     int64_t first_ticks_master;
@@ -570,59 +570,57 @@ typedef struct FixTime {
     int64_t last_rx_ticks_tag;
 } FixTime;
 
-/* What a tag knows of its own counter, of sites and of anchors. */
+/* What a tag knows of its own counter, of the sites and of the anchors. */
 typedef struct Admission {
     Unwrapper own;
-    Unwrapper former;  /* ``own`` before the frame at hand, restored where that is not admitted. */
-    /* Whether the stamp of the newest frame is from before others by more than ``COUNTER_JUMP_TICKS``. */
-    bool went_back;
+    Unwrapper former;  /* ``own`` before the current frame; restored if that is rejected. */
+    bool went_back;  /* Whether the newest frame's stamp is earlier than others by more than ``COUNTER_JUMP_TICKS``. */
     SiteChoice choice;
     FixTime time;
     Neighbours neighbours;
-    int64_t rx_ticks;  /* The tag's stamp of the frame at hand, unwrapped. */
-    int32_t events;  /* What has happened since its owner last looked. */
+    int64_t rx_ticks;  /* The tag's unwrapped stamp of the current frame. */
+    int32_t events;  /* Events since the owner last looked. */
 } Admission;
 
-/* What the filter assumes; standard deviations are one sigma. */
+/* The filter's assumptions at a site; standard deviations are one sigma. */
 typedef struct EstimatorSettings {
     real qa;  /* Spectral density of the tag's acceleration, m²/s³ per axis. */
-    /* Standard deviation of the tag's speed at the start. It smears pseudoranges, which are not taken at once. */
+    /* Standard deviation of the tag's speed at the start, when pseudoranges are not simultaneous. */
     real start_speed_std_mps;
     real white;  /* White frequency noise of each oscillator, m²/s. */
     real walk;  /* Random walk of each oscillator's rate, m²/s³. */
     real tx_variance_m2;
     real rx_variance_m2;  /* Variances of one stamp each. */
     real gate;  /* Innovations beyond this number of standard deviations are not used. */
-    real height_m;  /* Height of the tag where it is given; NaN to estimate it. */
+    real height_m;  /* Given height of the tag; NaN to estimate it. */
     real height_std_m;  /* Standard deviation of the given height. */
     real lowest_m;
     real highest_m;  /* Bounds of the tag's height. */
-    /* Cycles of the carrier in 128 ticks, 13 of channel 5, whose phases count where packets have them; 0: never. */
+    /* Carrier cycles in 128 ticks for the use of phases, 13 for channel 5; 0: phases are not used. */
     int32_t carrier_cycles;
-    real phase_std_m;  /* Least standard deviation of a phase as the tag measures it. */
-    real phase_wander;  /* What reflections at least change in the phases of an anchor as the tag walks, m²/m. */
-    real drop_s;  /* Anchors that are silent for longer leave the state. */
-    real relay_age_s;  /* Older packets are not relayed, as sequence numbers come around. */
+    real phase_std_m;  /* Smallest standard deviation of a phase as the tag measures it. */
+    real phase_wander;  /* Smallest change of an anchor's phases by reflections as the tag walks, m²/m. */
+    real drop_s;  /* Anchors leave the state after this silence. */
+    real relay_age_s;  /* Relays of older packets are not used, as sequence numbers wrap around. */
     real survey_std_m;  /* Standard deviation of each coordinate of an anchor. */
     real range_std_m;  /* Standard deviation of the constant error of a tag's ranges to one anchor. */
     /* Standard deviation of the constant error of the range between two anchors.
      *
      * It is not used where survey and ranges are exact. */
     real pair_std_m;
-    real slope_std_m;  /* By how much ranges lengthen for each unit of clip((range − 4 m)/4 m, −1, 1). */
-    /* Standard deviation of the part of a range's error that changes as the tag moves (the site file's name). */
+    real slope_std_m;  /* Growth of ranges per unit of clip((range − 4 m)/4 m, −1, 1). */
+    /* Standard deviation of the part of a range error that changes as the tag moves (named as in the site file). */
     real place_std_m;
     real place_distance_m;  /* Distance over which that part changes. */
     real place_time_s;  /* Time over which that part changes while the tag is stationary. */
-    /* Time within which the size of each anchor's changing part is estimated again; 0 where it is ``place_std_m``. */
-    real change_memory_s;
-    /* Random walk of a barometer's zero, m²/s: 5 cm in ten seconds, as where doors and windows are opened. */
+    real change_memory_s;  /* Time constant of estimating each anchor's changing part; 0 if it is ``place_std_m``. */
+    /* Random walk of a barometer's zero, m²/s: 5 cm in ten seconds, as when doors and windows are opened. */
     real barometer_walk;
-    real least_change_std_m;  /* No changing part is estimated to be smaller. */
-    real earliest_m;  /* No changing part is below this: obstacles only lengthen ranges. */
+    real least_change_std_m;  /* Lower limit of the estimated changing part. */
+    real earliest_m;  /* Lower bound of the changing part: obstacles only lengthen ranges. */
     real difference_std_m;  /* Standard deviation of each ready-made time difference. */
-    real stationary_s;  /* A tag that has not shown any motion for this time counts as stationary; 0: never. */
-    real max_acceleration_mps2;  /* The tag's largest acceleration, as far as levels are to cover it beyond ``qa``. */
+    real stationary_s;  /* A tag without motion for this time counts as stationary; 0: never. */
+    real max_acceleration_mps2;  /* The tag's largest acceleration that levels cover beyond ``qa``. */
     real integrity_risk;
     real alert_limit_m;  /* Fixes with a higher horizontal protection level have an alert; NaN for none. */
 } EstimatorSettings;
@@ -654,251 +652,248 @@ typedef struct SitePages {
     CollectedPage collected[MAX_PAGES];
 } SitePages;
 
-/* Constants of the estimator, which are the same at every site; ``docs/estimator_table.md`` says what each buys.
+/* Constants of the estimator, the same at every site; ``docs/estimator_table.md`` shows what each one buys.
  *
- * Normalised: over its standard deviation. A running mean's weight is that of the newest value. */
+ * Normalised means divided by the standard deviation. The weight of a running mean is that of the newest value. */
 typedef struct Tuning {
-    real restart_m;  /* Paths that change by more than this between packets are impossible [m]. */
-    /* Factor on the random walk of the tag's oscillator at a start: it warms up after it was switched on. */
+    real restart_m;  /* A change of path by more than this between packets is impossible [m]. */
+    /* Factor on the random walk of the tag's oscillator at a start, as it warms up after power-on. */
     real start_walk_scale;
     /* Weight in running means of normalised innovations (along each axis, of all anchors, of an anchor's relays), and
-     * loss of the counts of recent relays with each packet. */
+     * decay of the counts of recent relays with each packet. */
     real mean_gain;
-    real noise_growth;  /* Growth of adapted process noise with each innovation that calls for more … */
-    /* Largest factor on the random walk of a clock, and that of the tag's once all innovations are on one side. */
+    real noise_growth;  /* Growth of adapted process noise with each innovation that requires more … */
+    /* Largest factor on the random walk of a clock; for the tag's, at once when all innovations are on one side. */
     real max_walk_scale;
-    real noise_loss;  /* … and its factor with each other one. */
-    /* Normalised innovations of all anchors beyond this on one side: the tag's clock has left its rate. */
+    real noise_loss;  /* … and its factor with every other innovation. */
+    /* If the normalised innovations of all anchors are beyond this on one side, the tag's clock has left its rate. */
     real common;
-    /* Number of relays of a pair in a row beyond the gate that show that its path has jumped; fewer may be late. */
+    /* Consecutive relays of a pair beyond the gate that show that its path has jumped; fewer may be late. */
     real relays_in_row;
-    /* Factor on the random walk of a clock up to which an anchor's report of it is used: its filter assumes 1. */
+    /* Largest factor on the random walk of a clock at which an anchor's report is used: its filter assumes 1. */
     real steady_walk_scale;
-    real max_scale;  /* Largest factor on the process noise of motion, and of a range error that has jumped. */
-    /* Mean square of the innovations along the axes, 1 where the filter is right, beyond which that noise grows. */
+    real max_scale;  /* Largest factor on the process noise of motion, and on that of a range error that has jumped. */
+    /* Mean square of the innovations along the axes (1 if the filter is right) beyond which that noise grows. */
     real lag_limit;
-    real better_known;  /* The place of a tag at rest moves when its variance has shrunk to this part. */
-    /* Part of the process noise of motion that a tag at rest keeps: 5 cm within half a minute. */
-    real stationary_noise_share;
+    real better_known;  /* The position of a tag at rest is updated once its variance has shrunk to this fraction. */
+    real stationary_noise_share;  /* Fraction of the process noise of motion kept at rest: 5 cm within half a minute. */
     real stationary_std_mps;  /* Standard deviation of the velocity of a tag at rest [m/s]. */
-    /* Distance of the estimate from the point of linearisation, of ranges or of phases, at which that moves [m]. */
+    /* Distance of the estimate from the point of linearisation, of ranges or phases, that moves the point [m]. */
     real held_step_m;
-    real held_max_m;  /* It stays within ``suspect`` standard deviations of the estimate, up to this distance [m]. */
+    /* The point stays within ``suspect`` standard deviations of the estimate, and within this distance [m]. */
+    real held_max_m;
     real curvature_share;  /* Share of the stamps' variance below which the curvature of ranges is neglected. */
-    /* Range at which errors that grow with distance pass through zero, and by which they change once [m] (APS011). */
+    /* Range at which distance-dependent errors are zero, and over which they reach their full size [m] (APS011). */
     real slope_from_m;
-    /* Weight in the mean NIS, in the share of rejected innovations and in the mean square along axes: the last 50. */
+    /* Weight in the mean NIS, the share of rejected innovations and the mean square along axes: the last 50. */
     real forgetting;
-    /* Mean NIS beyond which covariances are scaled by its square, phases are not used, and a new start is given up,
-     * once: it was wrong, for example by packets that were late. */
+    /* Mean NIS beyond which covariances are scaled by its square, phases are not used and a new start is abandoned,
+     * once: it was wrong, for example because of late packets. */
     real wrong_nis;
-    /* Weight in the shares of late receptions and of phases beyond the gate, and in the phases' noise: the last 200. */
+    /* Weight in the shares of late receptions and of wild phases, and in the phases' noise: the last 200. */
     real slow_forgetting;
-    real late_often_share;  /* Share of late receptions beyond which single ones are late often. */
-    /* Normalised innovation beyond which receptions have less weight where they are late often (Huber 1964). */
+    real late_often_share;  /* Share of late receptions beyond which single receptions are often late. */
+    /* Normalised innovation beyond which receptions are down-weighted if they are often late (Huber 1964). */
     real reception_huber;
-    real difference_huber;  /* The same of time differences, always. */
-    real max_relays_rejected;  /* Count of recent relays beyond the gate up to which they may be late ones. */
-    /* Number of rejected packets in a row, single late ones left out, at which the state is wrong. */
-    real lost_in_row;
-    real lost_share;  /* Share of rejected innovations at which it is. */
-    /* Normalised innovation beyond which a reception may be a jump, two of them differ by chance, and a running mean
-     * over its expectation calls for more process noise. */
+    real difference_huber;  /* The same for time differences, always. */
+    real max_relays_rejected;  /* Count of recent relays beyond the gate that late packets may explain. */
+    real lost_in_row;  /* Consecutive rejected packets, without single late ones, at which the state is wrong. */
+    real lost_share;  /* Share of rejected innovations at which the state is wrong. */
+    /* Normalised innovation beyond which a reception may be a jump and two of them differ by more than chance; also for
+     * a running mean over its expectation, which then requires more process noise. */
     real suspect;
-    /* Number of such receptions in a row that make a jump, and of impossible ones if a counter has restarted … */
+    /* Consecutive receptions of that kind that make a jump, and impossible ones that show a counter's restart … */
     real in_row;
-    real in_row_where_late;  /* … and where single receptions are late often. */
-    real together;  /* Sum of two such normalised innovations: by chance once in some million packets. */
-    /* Factor on the process noise of a range error that has just jumped: it may still be changing. */
+    real in_row_where_late;  /* … and the number if single receptions are often late. */
+    real together;  /* Sum of two such normalised innovations, reached by chance once in some million packets. */
+    /* Factor on the process noise of a range error that has just jumped, as it may still be changing. */
     real first_change_scale;
-    real ended_std_m;  /* An obstruction has ended where the range error is known to this [m] … */
-    real ended;  /* … and within this number of standard deviations of zero. */
-    real obstructed_walk;  /* Density with which a range error that has jumped wanders [m²/s]. */
-    real obstruction_memory_s;  /* Time in which it returns to zero, and in which a jump is forgotten [s]. */
+    real ended_std_m;  /* An obstruction has ended once the range error is known to this [m] … */
+    real ended;  /* … and is within this number of standard deviations of zero. */
+    real obstructed_walk;  /* Spectral density of the random walk of a range error that has jumped [m²/s]. */
+    real obstruction_memory_s;  /* Time constant of its return to zero, and of forgetting a jump [s]. */
     real obstruction_return_m;  /* Largest return in that time [m]: long delays are no less likely to stay. */
-    real jump_rise;  /* Part of its full size by which a jump raises the process noise of all range errors. */
-    real obstructed_std_m;  /* Standard deviation by which all range errors change where some have jumped [m] … */
-    real obstructed_s;  /* … and the time in which they do [s]. */
+    real jump_rise;  /* Fraction of its full size by which a jump raises the process noise of all range errors. */
+    real obstructed_std_m;  /* Standard deviation by which all range errors change after jumps [m] … */
+    real obstructed_s;  /* … and the time constant of that change [s]. */
     real place_step_m;  /* Length of a step [m]. */
-    real place_first;  /* Number of comparisons for which the stamps' noise stands beforehand. */
-    real place_samples;  /* Number of comparisons that are needed … */
-    real place_memory;  /* … and that are remembered. */
-    real place_min_m2;  /* Least variance between two steps that counts as multipath [m²]. */
-    real place_kept;  /* Least correlation over a step, and least loss of it. */
-    /* Largest standard deviation of the part of a range error that changes as the tag moves, and that of a pair's range
-     * that has jumped [m]. */
+    real place_first;  /* Number of comparisons that the stamps' noise counts for initially. */
+    real place_samples;  /* Comparisons needed … */
+    real place_memory;  /* … and remembered. */
+    real place_min_m2;  /* Smallest variance between two steps that counts as multipath [m²]. */
+    real place_kept;  /* Smallest correlation over a step, and smallest loss of correlation. */
+    /* Largest standard deviation of the changing part of a range error, and of a pair's range after a jump [m]. */
     real max_change_std_m;
-    /* Standard deviation of each coordinate of an anchor that stands elsewhere, and of a fault since it joined [m] … */
+    /* Standard deviation of each coordinate of a misplaced anchor, and of a fault since the anchor joined [m] … */
     real lasting_std_m;
-    real recent_std_m;  /* … of one that has begun recently without a visible jump [m] … */
+    real recent_std_m;  /* … of one that began recently without a visible jump [m] … */
     real creeping_std_m;  /* … and of one that grows for seconds [m]. */
-    real recent_packets;  /* Number of packets of each anchor over which a fault is recent. */
-    real creeping_s;  /* Time in which a creeping fault has become e times as large [s]. */
-    /* Standard deviation beforehand of a fault that is added to the state, and of all faults at the start [m]. */
+    real recent_packets;  /* Packets of each anchor over which a fault is recent. */
+    real creeping_s;  /* Time in which a creeping fault grows by a factor of e [s]. */
+    /* Prior standard deviation of a fault that is added to the state, and of all faults at the start [m]. */
     real late_std_m;
-    /* Test beyond which there is a fault: χ² of eight degrees of freedom with a probability of 4·10⁻⁸. */
+    /* Test beyond which there is a fault: χ² with eight degrees of freedom has a probability of 4·10⁻⁸. */
     real sure_chi2;
-    real early_weight;  /* Weight of what an early fault explains: obstacles make packets late. */
+    real early_weight;  /* Weight of what an early fault explains, as obstacles make packets late. */
     /* Standard deviation of the range between two anchors against the survey, before it is measured [m]. */
     real open_pair_std_m;
-    real pair_relays;  /* Number of relays in either direction after which their mean is a range. */
-    /* Number of such ranges beyond ``suspect``, and more than the other end has, that make an anchor misplaced. */
+    real pair_relays;  /* Relays in each direction after which their mean is a range. */
+    /* Number of such ranges beyond ``suspect``, more than at the other end, that mark an anchor as misplaced. */
     real misplaced_pairs;
-    /* Older packets are not used for a start; where superframes are longer, for the rate of the clock only [s]. */
+    /* Older packets are not used for a start; in longer superframes, only for the rate of the clock [s]. */
     real start_age_s;
-    /* Part of the mean range beyond which ranges are curved within a standard deviation: updates would make the filter
-     * sure of a wrong position. It has no level, and is not predicted further. */
+    /* Fraction of the mean range beyond which ranges are curved within a standard deviation, and updates would make the
+     * filter overconfident in a wrong position. There is no level then, and no prediction. */
     real curved_std;
-    real start_patience_s;  /* Time for which a start waits that is wide or contradicted: more anchors may come [s]. */
-    /* Probability with which residuals of a start are larger by chance than those that contradict it, and weight below
-     * which other positions are no rivals. */
+    /* Time for which a wide or contradicted start is withheld, as more anchors may be heard [s]. */
+    real start_patience_s;
+    /* Tail probability below which residuals contradict a start, and weight below which other positions are no
+     * rivals. */
     real start_tail;
-    /* Time for which a start is new [s]: one with open range errors is not repeated within it, and phases are not used,
-     * as places that still move by the stamps' noise would turn the directions to the anchors. */
+    /* Time for which a start is new [s]. Until then a start with open range errors is not repeated, and phases are not
+     * used, as a position that still moves with the stamps' noise would turn the directions to the anchors. */
     real new_start_s;
-    /* Factor on the start's covariance, as the filter is then given the packets that it rests on. */
+    /* Factor on the start's covariance, as the filter then processes the packets that it was computed from. */
     real start_margin;
-    /* No state grows much wider over shorter silences; packets that are late by less are late from the radio [s]. */
+    /* Shorter silences hardly widen the state, and packets late by less are delayed by the radio [s]. */
     real short_silence_s;
-    real longest_silence_s;  /* After a longer one the state is worse than a new start [s]. */
+    real longest_silence_s;  /* After a longer silence the state is worse than a new start [s]. */
     /* In longer superframes, where a new start takes seconds, a silence may widen the state more [s] … */
     real slow_superframe_s;
-    real slow_curved_std;  /* … up to this part of the mean range. */
-    /* In longer ones a tag may be metres away: nothing is predicted, and each round of packets is a start [s]. */
+    real slow_curved_std;  /* … up to this fraction of the mean range. */
+    /* In longer superframes a tag may move by metres: each round of packets is a start of its own [s]. */
     real longest_superframe_s;
-    real heights_in_row;  /* Number of heights in a row that do not fit, after which the position is wrong. */
-    /* Standard deviation of each coordinate of an anchor after a start that was contradicted [m]. */
-    real open_survey_std_m;
-    real fitting_chi2;  /* χ² for each anchor below which range errors are as the settings state them. */
-    /* Number of anchors that are late at the start at most: on the floor or behind metal one often is. */
-    real most_late;
-    real late_penalty;  /* What each of them adds to χ²: odds of 1 to 3. */
-    /* Part of an anchor's lateness at the start that stays: its mean, and its standard deviation. */
+    real heights_in_row;  /* Consecutive heights that do not fit at which the position is wrong. */
+    real open_survey_std_m;  /* Standard deviation of each coordinate of an anchor after a contradicted start [m]. */
+    real fitting_chi2;  /* χ² per anchor below which range errors agree with the settings. */
+    real most_late;  /* Most late anchors at the start: on the floor or behind metal one often is. */
+    real late_penalty;  /* Penalty on χ² for each of them: odds of 1 to 3. */
+    /* Fraction of an anchor's lateness at the start that stays: its mean, and its standard deviation. */
     real staying_share;
-    real window;  /* Number of ready-made time differences from which a start is looked for … */
+    real window;  /* Ready-made time differences used to find a start … */
     real window_s;  /* … or those of this time [s]. */
     real median_difference_std_m;  /* Standard deviation of the median of a pair's differences [m]. */
     real late_start_std_m;  /* Standard deviation of each anchor's error at the start, before any are estimated [m]. */
-    /* Distance from which two positions are rivals; anchors lie elsewhere for a tag that has moved as far [m]. */
+    /* Distance from which two positions are rivals; after it a moving tag is late to other anchors [m]. */
     real rival_m;
-    /* Starts lie no higher above or below anchors of different heights than this, unless bounds are given [m]. */
+    /* Starts are within this height above and below anchors of different heights, unless bounds are given [m]. */
     real height_margin_m;
-    /* A tag without beacons that is farther from the anchors' centre than this part of their diagonal is lost. */
+    /* A tag without beacons that is farther from the anchors' centre than this fraction of their diagonal is lost. */
     real neighbourhood;
-    real most_horizontal_std_m;  /* While its horizontal standard deviation is larger, there is no fix [m]. */
-    real zero_variance_m2;  /* Variance of a barometer's zero at first [m²]. */
-    real phase_start_std_m;  /* Standard deviation of a phase before innovations show another [m] … */
-    real phase_max_std_m;  /* … and its upper bound, or that of the settings [m]. */
+    real most_horizontal_std_m;  /* Largest horizontal standard deviation of a fix [m]. */
+    real zero_variance_m2;  /* Initial variance of a barometer's zero [m²]. */
+    real phase_start_std_m;  /* Standard deviation of a phase until innovations show another [m] … */
+    real phase_max_std_m;  /* … and its upper limit, unless the settings exceed it [m]. */
     real phase_mesh_std_m;  /* Standard deviation of a phase that an anchor measured of another [m]. */
-    /* What reflections change in an ambiguity as the tag walks, in variances of a phase for each metre [1/m]. */
+    /* Change of an ambiguity by reflections as the tag walks, in variances of a phase per metre [1/m]. */
     real phase_wander;
-    /* Part of a wavelength beyond which no innovation is used: near half of one the sign is not known. */
+    /* Fraction of a wavelength beyond which no innovation is used: near one half the sign is unknown. */
     real phase_gate;
-    /* Part of a wavelength up to which the standard deviation of a predicted phase leaves no doubt of the cycle. */
+    /* Fraction of a wavelength up to which the standard deviation of a prediction leaves no doubt of the cycle. */
     real phase_share;
     real phase_step_m;  /* Length of the steps by which reflections change phases [m]. */
-    /* Time for which an ambiguity from before a gap is kept to find by how many cycles it has changed [s]. */
+    /* Time for which an ambiguity from before a gap is kept, to resolve the cycles lost in it [s]. */
     real phase_former_s;
-    /* Number of phases of an anchor in a row beyond the gate at which its ambiguity begins again. */
-    real phases_in_row;
-    real uncovered_chi2;  /* Test beyond which faults are larger than levels cover. */
-    /* Part of the mean range beyond which, where all range errors are open, a standard deviation has no level. */
+    real phases_in_row;  /* Consecutive phases of an anchor beyond the gate at which its ambiguity restarts. */
+    real uncovered_chi2;  /* Test beyond which faults exceed what levels cover. */
+    /* Fraction of the mean range: a larger standard deviation has no level while all range errors are open. */
     real max_open_level_std;
-    /* Time without a level after a start that was contradicted: several late anchors may agree on a wrong place [s]. */
+    /* Time without a level after a contradicted start: several late anchors may agree on a wrong position [s]. */
     real contradicted_start_s;
-    real probe_m;  /* Least distance from the anchors' plane at which its two sides are compared [m]. */
-    /* Standard deviation of the best place on the other side about the mirror image, over that distance. */
+    real probe_m;  /* Smallest distance from the anchors' plane at which its two sides are compared [m]. */
+    /* Standard deviation of the best position on the other side about the mirror image, over that distance. */
     real shift_part;
-    /* Squared difference over its variance from which two things differ: ranges of both sides, two starts, or what
-     * faults of other anchors explain. */
+    /* Squared difference over its variance from which two things differ: ranges of both sides, two starts, or the
+     * explanations by faults of two anchors. */
     real apart_chi2;
     real sensor_valid_s;  /* Time for which a sensor's height decides between them [s]. */
 } Tuning;
 
-/* An anchor in use. */
+/* An anchor whose packets were accepted recently. */
 typedef struct UsedAnchor {
     int32_t anchor;
     real position_m[3];
-    int64_t rx_ticks;  /* The tag's stamp of its last accepted packet. */
+    int64_t rx_ticks;  /* Tag time of its last accepted packet. */
 } UsedAnchor;
 
-/* What has become of the starts so far, and whose packets were accepted recently. */
+/* The history of the tag's starts, and the anchors in use. */
 typedef struct Course {
-    EstimatorSettings settings;  /* Those with which a filter begins, as the next four. */
+    EstimatorSettings settings;  /* Settings of the next filter, as are the next four fields. */
     Tuning tuning;
     int32_t dim;
     real horizontal_k;
     real vertical_k;
-    real superframe_s;  /* Of slow sites, else 0. */
-    /* With which a filter begins, the nearest, and none that does not belong to the start; 0: with all. */
+    real superframe_s;  /* Superframe of slow sites, otherwise 0. */
+    /* A filter starts with at most this many anchors: those of the start, nearest first. 0: with all. */
     int32_t most_anchors;
-    bool is_starting;  /* Whether no position is known; else the search is not used, now the state is not. */
-    real late_share;  /* That of the last filter. */
-    int32_t misfit;  /* The anchor that contradicted the others at the start. */
-    real alone[10][3];  /* What a fix carries that is a start's, without a filter. */
+    /* Whether there is no position yet. While True the search is in use, otherwise the filter's state. */
+    bool is_starting;
+    real late_share;  /* Share of late packets that the last filter estimated. */
+    int32_t misfit;  /* The anchor that was inconsistent with the others at the start. */
+    real alone[10][3];  /* Rows of a fix that comes from a start alone, without a filter. */
     bool open_range_errors;  /* Whether the next start expects larger range errors than the settings state. */
-    bool is_open;  /* Whether the last start did. */
+    bool is_open;  /* Whether the last start did so. */
     bool start_was_contradicted;
     bool relays_may_contradict;
-    bool may_begin_again;  /* Whether a start that fits badly from the beginning is given up: not twice in a row. */
+    bool may_begin_again;  /* Whether a start with a poor fit may be abandoned: not twice in a row. */
     int32_t heights_rejected;
     int64_t master_less_tag_ticks;
     int64_t started_ticks;
     int64_t newest_ticks;
     real in_use_s;  /* An anchor counts as in use while its last accepted packet is younger than this. */
-    int64_t checked_ticks;  /* When that was checked last. */
-    real extent_m;  /* The largest span in x, y or z that anchors in use have had since the start. */
-    int64_t changes;  /* How often the anchors in use, or their positions, have changed. */
+    int64_t checked_ticks;  /* Tag time of the last such check. */
+    real extent_m;  /* Largest span of the anchors in use along x, y or z since the start. */
+    int64_t changes;  /* Number of changes of the anchors in use or of their positions. */
     int32_t count;
     UsedAnchor used[MAX_ANCHORS];
-    int64_t time_ticks;  /* Of the newest fix, since the first one. */
+    int64_t time_ticks;  /* Time of the newest fix, counted from the first one. */
 } Course;
 
-/* An anchor and where it stands. */
+/* An anchor and its position. */
 typedef struct Place {
     int32_t anchor;  /* Identifier. */
     real position_m[3];
-    real std_m;  /* Standard deviation of each coordinate; below 0 for that of the settings. */
+    real std_m;  /* Standard deviation of each coordinate; if negative, that of the settings. */
     bool is_open;  /* Whether it joins with range errors beyond those of the settings. */
 } Place;
 
-/* A TX time on a scale that packets of several anchors have in common. */
+/* A TX time on a scale common to packets of several anchors. */
 typedef struct ScaledTime {
     int64_t ticks;
     real fraction_ticks;
     real variance_m2;
 } ScaledTime;
 
-/* A packet that the tag received; all stamps are unwrapped. */
+/* A packet received by the tag, with unwrapped stamps. */
 typedef struct Packet {
     Place place;
     int32_t sequence;
-    int64_t rx_ticks;  /* The tag's stamp. */
-    int64_t tx_ticks;  /* The anchor's own. */
-    real variance_factor;  /* On the variance of the tag's reception. */
+    int64_t rx_ticks;  /* RX time on the tag's clock. */
+    int64_t tx_ticks;  /* TX time on the anchor's own clock. */
+    real variance_factor;  /* Factor on the variance of the tag's reception. */
     bool has_phase;
-    real phase_cycles;  /* Phase of the carrier as the tag received it, in [0, 1). */
-    /* Identifier of the anchor against whose clock this one reports its own; −1 where it reports nothing. */
-    int32_t master;
-    int64_t subticks;  /* The anchor's reading less the master's at the packet's TX stamp, modulo 2⁴⁸. */
+    real phase_cycles;  /* Carrier phase as the tag received it, in [0, 1). */
+    int32_t master;  /* Identifier of the anchor against whose clock this one reports its own; −1 without a report. */
+    int64_t subticks;  /* The anchor's reading minus the master's at the packet's TX stamp, modulo 2⁴⁸. */
     real report_variance_m2;
     bool is_stated;  /* Whether the anchor states its TX time on the master's scale … */
     ScaledTime stated;  /* … and that time, which only starts use. */
-    bool relays_have_phases;  /* Whether its frame carries phases of its relays, and short stamps. */
+    bool relays_have_phases;  /* Whether its frame carries phases in its relays, and therefore short stamps. */
 } Packet;
 
-/* When an anchor, that of the packet as a rule, received a packet of another. */
+/* One anchor's reception of another's packet. The listener is usually the sender of the packet with the relay. */
 typedef struct Relay {
-    int32_t listener;  /* Identifier of the one that received it. */
-    int32_t anchor;  /* Identifier of the other. */
+    int32_t listener;  /* Identifier of the receiving anchor. */
+    int32_t anchor;  /* Identifier of the received anchor. */
     int32_t sequence;
-    int64_t rx_ticks;  /* The listener's stamp, unwrapped; where it is short its lowest bits (``relay_rx_ticks``). */
+    /* The listener's stamp: unwrapped, or only the lowest bits if it is short (``relay_rx_ticks``). */
+    int64_t rx_ticks;
     bool is_short;
     bool has_phase;
-    real phase_cycles;  /* Phase of the carrier as the listener received it, in [0, 1). */
+    real phase_cycles;  /* Carrier phase as the listener received it, in [0, 1). */
 } Relay;
 
-/* What came with a packet. */
+/* The relays of a packet. */
 typedef struct Relays {
     int32_t count;
     Relay rows[MAX_RELAYS];
@@ -906,42 +901,43 @@ typedef struct Relays {
 
 /* A tag of protocol 2. */
 typedef struct Tag {
-    EstimatorSettings owner;  /* What its owner has chosen; the site's pages state the rest. */
+    EstimatorSettings owner;  /* Settings chosen by the tag's owner; the site's pages state the rest. */
     Admission admission;
     SitePages pages;
     Course course;
-    bool has_settings;  /* Whether the pages are known, so that it looks for a start or follows its course. */
-    int64_t period_ticks;  /* Longest mean time between two beacons of an anchor, when the settings were made. */
-    bool is_moving;  /* Whether anchors of the site have stated other positions recently (``Neighbour.has_moved``). */
-    int64_t moved_ticks;  /* When the last one did. */
-    bool uses_moved;  /* Whether those are in use, and not the others. */
-    int32_t origin_mm[3];  /* To be added to all positions, where ``HAS_ORIGIN``. */
+    bool has_settings;  /* Whether the pages are known, so that the tag searches for a start or has a filter. */
+    int64_t period_ticks;  /* Longest mean beacon period of an anchor when the settings were derived. */
+    bool is_moving;  /* Whether anchors have stated other positions recently (``Neighbour.has_moved``). */
+    int64_t moved_ticks;  /* Time of the last such statement. */
+    bool uses_moved;  /* Whether the moved anchors are in use rather than the others. */
+    int32_t origin_mm[3];  /* Origin of all positions, if ``HAS_ORIGIN``. */
     bool has_origin;
-    int32_t most_relays;  /* Of a beacon that follows its course, the newest ones: fewer where its processor is late. */
+    /* Relays used of each beacon while there is a filter, newest first: fewer on a processor that falls behind. */
+    int32_t most_relays;
     BeaconFields beacon;
     bool has_moved;  /* Whether its sender states another position than before. */
-    Packet packet;  /* The same for the filter. */
+    Packet packet;  /* The beacon as the filter takes it. */
     Relays relays;
-    int32_t events;  /* What has happened with it (``admission.COUNTER_JUMPED`` and others). */
+    int32_t events;  /* Its events (``COUNTER_JUMPED`` and others). */
 } Tag;
 
-/* A packet. */
+/* A received packet with the relays that it carried. */
 typedef struct HeardPacket {
     Packet packet;
     int32_t relay_count;
     Relay relays[RELAYS_KEPT];
-    ScaledTime scaled;  /* Its TX time on the scale of the trial at hand. */
+    ScaledTime scaled;  /* TX time on the common scale of the current attempt. */
 } HeardPacket;
 
-/* An anchor's newest packets. */
+/* An anchor's two newest packets. */
 typedef struct HeardAnchor {
     int32_t count;
-    int64_t fitted_ticks;  /* The tag's reading when it last had a place on the common scale, at a possible rate. */
+    int64_t fitted_ticks;  /* Tag time when the anchor was last on the common scale with a plausible clock rate. */
     HeardPacket older;
     HeardPacket newer;
 } HeardAnchor;
 
-/* Reading of one anchor's clock less that of another's, when the tag's read ``rx_ticks_tag``. */
+/* Listener's clock minus sender's clock at the tag's time ``rx_ticks_tag``. */
 typedef struct ClockLink {
     int32_t listener;
     int32_t sender;
@@ -950,38 +946,38 @@ typedef struct ClockLink {
     real fraction_ticks;
 } ClockLink;
 
-/* A first position. */
+/* A start: the first position and its covariance. */
 typedef struct Start {
     int64_t rx_ticks_tag;
     int32_t count;
-    int32_t used[MAX_ANCHORS];  /* Where the anchors that it uses stand in the table of those that are heard. */
+    int32_t used[MAX_ANCHORS];  /* Indices into ``heard`` of the anchors used. */
     real position_m[3];
     real covariance_m2[3][3];
-    bool is_contradicted;  /* Whether the messages of all anchors contradict each other. */
+    bool is_contradicted;  /* Whether the packets of all anchors are inconsistent with each other. */
     bool has_misfit;
-    int32_t misfit;  /* An anchor that is not in ``used``: without it there is no contradiction. */
+    int32_t misfit;  /* The excluded anchor; the others agree without it. */
 } Start;
 
-/* Along which links an anchor's TX times become those of the reference: a tree. */
+/* Tree of links that lead from each anchor's clock to the reference anchor's. */
 typedef struct Reach {
     int32_t count;
-    int32_t order[MAX_ANCHORS];  /* Pairs in the order in which they are reached; the first is the reference. */
+    int32_t order[MAX_ANCHORS];  /* Pairs in breadth-first order; the first is the reference. */
     int32_t is_reached[MAX_ANCHORS];
     int32_t parent[MAX_ANCHORS];
     int32_t link[MAX_ANCHORS];
     int32_t sign[MAX_ANCHORS];
 } Reach;
 
-/* A minimum of the cost, in the problem's axes. */
+/* A local minimum of the cost, in the problem's axes. */
 typedef struct Minimum {
     int32_t iterations;
     real cost;
-    real chi2;  /* rᵀΣ⁻¹r, also where the cost is not weighted by Σ⁻¹. */
+    real chi2;  /* rᵀΣ⁻¹r, even if the cost is not weighted by Σ⁻¹. */
     real state[3];
-    real covariance[10];  /* A lower triangle; zeros for a given height. */
+    real covariance[10];  /* Lower triangle; zeros for a given height. */
 } Minimum;
 
-/* A set of TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``, and how far its solution is. */
+/* A set of TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``, and the state of its solution. */
 typedef struct LocateProblem {
     int32_t anchors;
     bool knows_height;
@@ -990,38 +986,38 @@ typedef struct LocateProblem {
     real height_m;
     real low_m;
     real high_m;
-    real residual_tail;  /* Residuals that noise exceeds more rarely are not noise. */
-    real anchors_m[MAX_ANCHORS][3];  /* The reference first; ``choose_axes`` moves them into its axes. */
+    real residual_tail;  /* Residuals with a smaller tail probability are not noise. */
+    real anchors_m[MAX_ANCHORS][3];  /* The reference first; ``choose_axes`` transforms them into its axes. */
     real tdoa_m[MAX_ANCHORS];
-    real covariance[TRIANGLE];  /* The lower triangle of Σ, and then of its factor L. */
+    real covariance[TRIANGLE];  /* Lower triangle of Σ, later of its factor L. */
     int32_t kind;
     int32_t dims;  /* Number of unknowns. */
-    real extent_m;  /* Size of the anchors' figure. */
+    real extent_m;  /* Distance of the farthest anchor from the reference. */
     real origin_m[3];
-    real axes[3][3];  /* Its rows; a position is origin + axesᵀ·state. */
-    real scale[3];  /* What the extent is for each unknown. */
+    real axes[3][3];  /* In rows; a position is origin + axesᵀ·state. */
+    real scale[3];  /* Scale of each unknown: the extent, or its square for s. */
     int32_t start_count;
     int32_t minimum_count;
     real starts[9][3];
-    Minimum minima[9];  /* The best first. */
+    Minimum minima[9];  /* Ascending in cost. */
     int32_t iterations;
     real state[3];
     real trial[3];
     real step[3];
     real system[MAX_ANCHORS][4];  /* Rows [∂TDoA/∂state, measured − predicted]. */
-    real normal[10];  /* The lower triangle of systemᵀ·system. */
+    real normal[10];  /* Lower triangle of systemᵀ·system. */
     real next_normal[10];
     real factor[10];
 } LocateProblem;
 
-/* A position and how well it is known. Metres, site frame. */
+/* A position and its uncertainty. Metres, site frame. */
 typedef struct Found {
     bool has_mirror;
     int32_t dof;
     int32_t iterations;
     real chi2;
     real position_m[3];
-    real mirror_m[3];  /* The other position that fits as well. */
+    real mirror_m[3];  /* The other position that fits equally well. */
     real covariance_m2[3][3];
     real residuals_m[MAX_ANCHORS];  /* Measured minus predicted TDoAs. */
 } Found;
@@ -1033,61 +1029,61 @@ typedef struct Acquisition {
     bool has_bounds;
     real low_m;
     real high_m;
-    real variance_m2;  /* Of a TX and an RX stamp together. */
+    real variance_m2;  /* Variance of a TX and an RX timestamp together. */
     real max_age_s;
-    real speed_std_mps;  /* Assumed speed of the tag. */
-    real error_variance_m2;  /* Of survey and ranges. */
+    real speed_std_mps;  /* Assumed standard deviation of the tag's speed. */
+    real error_variance_m2;  /* Variance of survey and range errors. */
     Tuning tuning;
     int32_t count;
     HeardAnchor heard[MAX_ANCHORS];  /* In the order in which they were first heard. */
     int32_t link_count;
     ClockLink links[MAX_LINKS];
     bool has_been_wide;
-    int64_t wide_ticks;  /* When a start was first possible, but wide. */
-    bool is_linked;  /* Whether TX times are on a common scale by relays, and not as anchors state them. */
+    int64_t wide_ticks;  /* Time of the first start that was too wide to use. */
+    bool is_linked;  /* Whether the common scale comes from relays rather than from the anchors' stated times. */
     bool is_contradicted;
     int64_t contradicted_ticks;  /* When packets first contradicted each other. */
-    /* Anchors with which two positions fitted alike; as many of them are tried again once a superframe only. */
+    /* Number of anchors when two positions last fitted equally well; the same number is retried once a superframe. */
     int32_t rival_count;
     Start start;
     int32_t pair_count;
-    int32_t pairs[MAX_ANCHORS];  /* Anchors with two packets, by their place in ``heard``. */
-    real rates[MAX_ANCHORS];  /* How much faster the clock of each runs than the tag's, as a fraction … */
-    real rate_variances[MAX_ANCHORS];  /* … and the variance of that in m²/s². */
-    /* Rates of the tag's clock against the common scale, one of each anchor; ``_solve_start`` sorts them. */
+    int32_t pairs[MAX_ANCHORS];  /* Indices into ``heard`` of the anchors with two packets. */
+    real rates[MAX_ANCHORS];
+    real rate_variances[MAX_ANCHORS];
+    /* Rate of the tag's clock against the common scale, measured with each anchor; ``_solve_start`` sorts them. */
     real clock_rates_mps[MAX_ANCHORS];
     Reach reach;
     Reach best;
     Start found_alone;
-    real ranges_m[MAX_ANCHORS];  /* Pseudoranges at one time … */
-    real variances_m2[MAX_ANCHORS];  /* … and their variances. */
+    real ranges_m[MAX_ANCHORS];
+    real variances_m2[MAX_ANCHORS];
     LocateProblem problem;
     Found found;
 } Acquisition;
 
-/* Where the states stand: the index of the first of each block. */
+/* Index of the first state of each block. */
 typedef struct Layout {
-    int32_t offset;  /* Of the first anchor; the others' follow, as in all blocks. */
+    int32_t offset;  /* That of the first anchor; the others follow, as in all blocks. */
     int32_t velocity;
     int32_t rate;
     int32_t tx_noise;
     int32_t ambiguity;
     int32_t mesh;
-    int32_t former;  /* All where phases are used; else they are the change's place, and not used. */
+    int32_t former;  /* The last three exist only with phases; without, they equal ``change`` and are not used. */
     int32_t change;
     int32_t constant;
     int32_t slope;
-    int32_t height;  /* In two dimensions; in three it is one of the position. */
-    int32_t zero;  /* In three dimensions; in two it is the slope's place, and not used. */
+    int32_t height;  /* In 2-D; in 3-D it is the position's third element. */
+    int32_t zero;  /* In 3-D; in 2-D it equals ``slope`` and is not used. */
     int32_t survey;  /* ``dim`` states for each anchor. */
     int32_t end;
 } Layout;
 
-/* The estimator's counters and running means. */
+/* Counters and running means of the estimator. */
 typedef struct Status {
-    int64_t epoch_ticks;  /* The tag's reading at the newest packet. */
-    int64_t start_ticks;  /* The tag's reading at the start. */
-    int64_t faded_ticks;  /* The tag's reading when faults that are not lasting last faded. */
+    int64_t epoch_ticks;  /* Tag time of the newest packet. */
+    int64_t start_ticks;  /* Tag time of the start. */
+    int64_t faded_ticks;  /* Tag time when faults that are not lasting were last faded. */
     int64_t packets;
     int64_t accepted;
     int64_t rejected;
@@ -1104,7 +1100,7 @@ typedef struct Status {
     int64_t ends_of_obstructions;
     int64_t faults_opened;
     real mean_nis;
-    real mean_square_m2;  /* Of innovations. */
+    real mean_square_m2;  /* Mean square of innovations. */
     real rejected_share;
     real late_share;
     real relays_lately_accepted;  /* Running counts that fade. */
@@ -1112,133 +1108,133 @@ typedef struct Status {
     real lag[3];  /* Running mean of innovations along each axis. */
     real lag_square;
     real q_scale;  /* Factor on qa. */
-    real common_mean;  /* Running mean of all innovations: the tag's own clock. */
+    real common_mean;  /* Running mean of all innovations, which shows the tag's own clock. */
     real walk_scale;  /* Factor on its random walk. */
-    int32_t place_samples;  /* Comparisons of range errors at places a step apart. */
-    real place_square_m2[2];  /* Half their mean square after one and two steps. */
-    real place_variance_m2;  /* Of what multipath changes in them, 0 where not more than stated. */
+    int32_t place_samples;  /* Number of comparisons of range errors one step apart. */
+    real place_square_m2[2];  /* Half the mean square of their differences after one and after two steps. */
+    real place_variance_m2;  /* Variance of range errors by multipath; 0 if no larger than stated. */
     real place_distance_m;  /* Distance over which multipath changes. */
-    real obstruction;  /* 1 where range errors have jumped recently, 0 where they do not. */
+    real obstruction;  /* 1 if range errors have jumped recently, 0 if not. */
     real walked_m;
-    real stationary_s;  /* Since the tag last showed motion. */
-    real stationary_m[3];  /* Where it was then. */
-    real stationary_m2[3];  /* Variance of that on each axis. */
+    real stationary_s;  /* Time since the tag last showed motion. */
+    real stationary_m[3];  /* Its position then … */
+    real stationary_m2[3];  /* … and the variance along each axis. */
     bool withholds_levels;  /* Whether the anchors' positions are known to be wrong. */
-    int64_t height_ticks;  /* The tag's reading when a sensor's height was used last. */
-    real plane_m[3];  /* A point of the plane that lies closest to the anchors. */
+    int64_t height_ticks;  /* Tag time of the last height used from a sensor. */
+    real plane_m[3];  /* A point of the plane that fits the anchors best. */
     real plane_normal[3];  /* Normal of that plane. */
-    bool has_phases;  /* Whether phases are used, so that there are ambiguities. */
-    real line_m[3];  /* Where phases are linearised: a place of the tag, from there on moved by its velocity alone. */
-    real step_m[3];  /* The tag's place after its last step … */
-    real way_m;  /* … and the sum of all steps: unlike ``walked_m`` it does not grow at rest. */
-    real phase_variance_m2;  /* Of a phase, as innovations show it. */
+    bool has_phases;  /* Whether phases are in use, so that there are ambiguities. */
+    /* Point at which phases are linearised: a position of the tag, moved from then on by its velocity alone. */
+    real line_m[3];
+    real step_m[3];  /* The tag's position after its last step … */
+    real way_m;  /* … and the length of all steps: unlike ``walked_m`` it does not grow at rest. */
+    real phase_variance_m2;  /* Variance of a phase, learnt from innovations. */
     real wild_share;  /* Running share of phases beyond the gate. */
     int64_t phases_used;
     int64_t phases_refused;
-    int64_t phases_opened;  /* Ambiguities that began, or began again … */
-    /* … and of these the ones of which it was then found by how many cycles they differ from the former. */
-    int64_t phases_rejoined;
+    int64_t phases_opened;  /* Ambiguities that began or restarted … */
+    int64_t phases_rejoined;  /* … and those of them whose number of lost cycles was resolved afterwards. */
     bool has_open_ranges;  /* Whether anchors join with range errors beyond those of the settings. */
-    int32_t range_errors;  /* NO_RANGE_ERRORS, CHANGING_RANGE_ERRORS or ALL_RANGE_ERRORS. */
-    real fault_std_m[3];  /* Of each kind of faults, beforehand. */
+    int32_t range_errors;  /* ``NO_RANGE_ERRORS``, ``CHANGING_RANGE_ERRORS`` or ``ALL_RANGE_ERRORS``. */
+    real fault_std_m[3];  /* Prior standard deviation of each kind of faults. */
 } Status;
 
-/* What is kept of an ambiguity in addition to its state. */
+/* Record of an ambiguity beside its state. */
 typedef struct Ambiguity {
     bool is_known;
-    int32_t refused_in_row;  /* Phases beyond the gate. */
-    int64_t ticks;  /* The tag's reading at its newest phase. */
+    int32_t refused_in_row;  /* Consecutive phases beyond the gate. */
+    int64_t ticks;  /* Tag time of its newest phase. */
 } Ambiguity;
 
-/* What is kept of an anchor in addition to its states. */
+/* Record of an anchor beside its states. */
 typedef struct Anchor {
     int32_t identifier;
     real position_m[3];
-    int64_t tx_ticks;  /* Newest packet, by its own clock. */
-    int64_t rx_ticks;  /* Newest packet, by the tag's clock. */
+    int64_t tx_ticks;  /* Its newest packet's TX time, on its own clock. */
+    int64_t rx_ticks;  /* Its newest packet's RX time, on the tag's clock. */
     int64_t offset_ticks;  /* Whole ticks of the offset. */
-    real range_m;  /* At its newest packet. */
-    real held_m[3];  /* The tag's position at which ranges to it are linearised. */
-    real held_range_m;  /* Distance of that point. */
+    real range_m;  /* Range at its newest packet. */
+    real held_m[3];  /* Position at which ranges to it are linearised. */
+    real held_range_m;  /* Range from there. */
     real walked_m;  /* The tag's walked distance at its newest packet. */
     bool is_relayed;  /* Whether others relay its packets. */
-    bool has_rate;  /* Whether its clock's rate is known: more than its first packet has shown its offset. */
+    bool has_rate;  /* Whether its clock's rate is known: the offset has been measured more than once. */
     bool has_tx_noise;  /* Whether its newest packet's TX noise is a state. */
     int64_t packets;
-    real innovation;  /* Its newest one, normalised. */
+    real innovation;  /* Its newest innovation, normalised. */
     int32_t outliers_in_row;
-    real outlier_m;  /* The newest of them. */
-    bool is_obstructed;  /* Whether its range error has jumped and not come back. */
-    real change_mean;  /* Running mean of its innovations since then, normalised. */
+    real outlier_m;  /* Innovation of the newest outlier. */
+    bool is_obstructed;  /* Whether its range error has jumped and not returned. */
+    real change_mean;  /* Running mean of its normalised innovations since then. */
     real change_scale;  /* Factor on the process noise of a range error that has jumped. */
-    bool has_fault;  /* Whether a lasting fault of it was added to the state. */
-    real relay_mean;  /* Running mean of what relays show of its clock, normalised. */
+    bool has_fault;  /* Whether a lasting fault of it has been added to the state. */
+    real relay_mean;  /* Running mean of its clock's normalised innovations in relays. */
     real walk_scale;  /* Factor on its oscillator's random walk. */
-    real change_variance_m2;  /* Of the part of its range error that changes as the tag moves. */
-    int32_t place_steps;  /* Steps of the tag after which its range error was compared, in a row. */
-    real place_walked_m;  /* The tag's walked distance at the newest of them. */
-    real place_residual_m[2];  /* What its reception left after the last two. */
-    Ambiguity own;  /* Of the tag's receptions of it. */
-    Ambiguity mesh;  /* Of its receptions of its partner. */
-    int32_t partner;  /* Identifier of that, −1 for none. */
+    real change_variance_m2;  /* Variance of the changing part of its range error. */
+    int32_t place_steps;  /* Consecutive steps of the tag after which its range error was compared. */
+    real place_walked_m;  /* The tag's walked distance at the newest step. */
+    real place_residual_m[2];  /* Residuals of its receptions after the last two steps. */
+    Ambiguity own;  /* Ambiguity of the tag's receptions of it. */
+    Ambiguity mesh;  /* Ambiguity of its receptions of its partner. */
+    int32_t partner;  /* Identifier of the partner, −1 if none. */
     bool has_former;
-    int64_t former_ticks;  /* The tag's reading when its former ambiguity ended. */
-    real phase_way_m;  /* The tag's way at its newest phase. */
+    int64_t former_ticks;  /* Tag time of the end of its former ambiguity. */
+    real phase_way_m;  /* ``Status.way_m`` at its newest phase. */
 } Anchor;
 
-/* A packet that others may relay. */
+/* A packet that other anchors may relay. */
 typedef struct KeptPacket {
     int32_t sequence;
     int64_t tx_ticks;
     int64_t rx_ticks;
 } KeptPacket;
 
-/* A pair of anchors, listener and sender. */
+/* An ordered pair of anchors: listener and sender. */
 typedef struct Link {
     int64_t tx_ticks;  /* Newest packet of the sender whose reception by the listener was processed. */
-    int64_t relays;  /* Used in this direction. */
-    real constant_m;  /* Estimated constant of the pair, in the row of the lower index. */
-    real variance_m2;  /* Variance of that. */
+    int64_t relays;  /* Relays used in this direction. */
+    real constant_m;  /* Estimated constant of the pair, in the row of the lower index … */
+    real variance_m2;  /* … and its variance. */
     int32_t outliers_in_row;
     bool contradicts;  /* Whether its range contradicts the survey. */
 } Link;
 
-/* Everything that the estimator keeps of one tag. What loops run over stands first: its rows fill cache lines. */
+/* The estimator's state of one tag. What loops run over comes first, so that its rows fill cache lines. */
 typedef struct State {
     real x[STATES];
     real P[COVARIANCES];  /* Row by row, symmetric to the bit; see ``at``. */
-    /* What faults do to x: of each kind for each metre by which receptions of an anchor are late, then for each m/s² of
-     * acceleration along an axis, then what planning adds. */
+    /* Sensitivity of x to faults: for each kind to each metre by which an anchor is received late, then to each m/s² of
+     * acceleration along an axis, then to faults added by planning. */
     real V[STATES][SENSITIVITIES];
     EstimatorSettings settings;
     Tuning tuning;
-    real horizontal_k;  /* How many standard deviations the risk of levels allows. */
+    real horizontal_k;  /* Standard deviations that cover the risk of the levels. */
     real vertical_k;
-    int32_t dim;  /* Dimensions of the position: 2 where the height is given, else 3. */
-    int32_t count;  /* Anchors in the state. */
-    int32_t used;  /* States that are not known to be exact; covariances with all others are zero. */
-    int32_t n;  /* The same up to a multiple of ``LANES``: what loops along rows of P go to. */
+    int32_t dim;  /* Dimensions of the position: 2 if the height is given, otherwise 3. */
+    int32_t count;  /* Number of anchors. */
+    int32_t used;  /* Number of uncertain states; all covariances with others are zero. */
+    int32_t n;  /* The same rounded up to a multiple of ``LANES``: the end of loops along rows of P. */
     int32_t rows;  /* Columns of V in use. */
     Layout layout;
     Status status;
-    real information[FAULTS][FAULTS];  /* Information of the innovations on all faults; the lower half. */
-    real evidence[FAULTS];  /* What innovations show of them. */
-    /* Of the lasting faults: (M + I/σ_f²)⁻¹. Their M grows without end, next to which 1/σ_f² would be lost. */
+    real information[FAULTS][FAULTS];  /* Information of the innovations on all faults, M; lower triangle. */
+    real evidence[FAULTS];  /* Evidence of the innovations for all faults, y. */
+    /* Covariance of the lasting faults, (M + I/σ_f²)⁻¹, as M grows without limit and 1/σ_f² would be lost in it. */
     real lasting_covariance[MAX_ANCHORS][MAX_ANCHORS];
-    real lasting_m[MAX_ANCHORS];  /* Their estimate: that times y. */
+    real lasting_m[MAX_ANCHORS];  /* Estimate of the lasting faults: that times y. */
     Anchor anchors[MAX_ANCHORS];
     KeptPacket packets[MAX_ANCHORS][PACKETS_KEPT];
-    Link links[MAX_ANCHORS][MAX_ANCHORS];  /* Of listener and sender. */
-    int32_t terms;  /* Terms of the measurement at hand, which stand in ``h``. */
-    real h[20];  /* The measurement where it is not zero, at the indices in ``h_index``. */
+    Link links[MAX_ANCHORS][MAX_ANCHORS];  /* By listener and sender. */
+    int32_t terms;  /* Terms of the current measurement, in ``h``. */
+    real h[20];  /* Nonzero elements of the current measurement, at the indices in ``h_index``. */
     int32_t h_index[20];
-    int32_t waiting;  /* Updates that are not in P and V yet: those of a packet's relays go there together. */
-    real U[MOST_WAITING][STATES];  /* Of each its u = P·h/√S; then P·h of the measurement at hand. */
-    /* Of each, over √S, by how much each fault is in its innovation; then the same of the measurement at hand. */
+    int32_t waiting;  /* Queued updates, not yet in P and V: a packet's relays are applied together. */
+    real U[MOST_WAITING][STATES];  /* u = P·h/√S of each queued update, then P·h of the current measurement. */
+    /* Fault inputs over √S of each queued update, then those of the current measurement. */
     real G[MOST_WAITING][SENSITIVITIES];
     real work[WORK_ROWS][MAX_ANCHORS];  /* Scratch for systems of equations of all faults of one kind. */
     real levels[5];
-    real fix[10][3];  /* What a fix carries (``POSITION`` and the following). */
+    real fix[10][3];  /* Rows of a fix (``POSITION`` and the following). */
 } State;
 
 /* Candidates for each page of an issue. */
@@ -1257,31 +1253,31 @@ typedef struct Columns {
     real squares[4];  /* Squares of the singular values, the largest first. */
 } Columns;
 
-/* Linear equations of a start. */
+/* The linear equations of a closed-form start. */
 typedef struct Equations {
     Columns left;
-    real right[MAX_ANCHORS];  /* What is known: (|a_i|² − d_i²)/2, less what a given height contributes. */
+    real right[MAX_ANCHORS];  /* Right-hand side: (|a_i|² − d_i²)/2, less the contribution of a given height. */
     real u[4];
     real v[4];
 } Equations;
 
-/* What a filter begins with. */
+/* What a filter starts from. */
 typedef struct Beginning {
     Start start;
     int32_t count;
-    HeardPacket packets[MAX_BEGINNING];  /* In the order of their receptions. */
+    HeardPacket packets[MAX_BEGINNING];  /* In order of reception. */
 } Beginning;
 
 /* A packet of a batch. */
 typedef struct BatchPacket {
-    int32_t place;  /* Row of its anchor in the table of places. */
+    int32_t place;  /* Index of its anchor in the table of places. */
     int32_t sequence;
     int64_t rx_ticks;
     int64_t tx_ticks;
     real variance_factor;
     bool has_phase;
     real phase_cycles;
-    int32_t end;  /* Where its relays end in their table; they begin where those of the packet before end. */
+    int32_t end;  /* End of its relays in their table; they begin at the end of the previous packet's. */
 } BatchPacket;
 
 /* The state after a packet of a batch. */
@@ -1289,34 +1285,34 @@ typedef struct BatchRow {
     real position_m[3];
     real velocity_mps[3];
     real covariance_m2[3][3];
-    real levels[5];  /* As ``protect`` writes them, where they are asked for. */
+    real levels[5];  /* As written by ``protect``, if requested. */
     int32_t integrity;
     int32_t outcome;
 } BatchRow;
 
 /* A message of a superframe. */
 typedef struct PlannedMessage {
-    int32_t anchor;  /* Index of its anchor in the state; −1 where the tag does not receive it. */
-    int64_t gap_ticks;  /* Time since the message before. */
+    int32_t anchor;  /* Index of its anchor in the state; −1 if the tag does not receive it. */
+    int64_t gap_ticks;  /* Time since the previous message. */
     real share;  /* Share of its anchor's messages that arrive. */
-    real late_m;  /* By how much walls delay them. */
-    int32_t end;  /* Where its relays end in their table; they begin where those of the message before end. */
+    real late_m;  /* Delay by walls. */
+    int32_t end;  /* End of its relays in their table; they begin at the end of the previous message's. */
 } PlannedMessage;
 
-/* A reception that is relayed with a message. */
+/* A relay carried by a message. */
 typedef struct PlannedRelay {
-    int32_t sender;  /* Index of the anchor that was received; −1 where the tag does not receive it itself. */
+    int32_t sender;  /* Index of the received anchor; −1 if the tag does not receive it itself. */
     real age_s;
-    real share;  /* Share of its receptions of which the tag gets to know. */
+    real share;  /* Share of these receptions that reach the tag. */
     real late_m;
 } PlannedRelay;
 
-/* What a superframe's fixes sum up to, each by how often its message arrives. */
+/* Sums over the fixes of a superframe, each weighted by the share of its message that arrives. */
 typedef struct SteadyState {
     real fixes;
-    real variance_m2[3];  /* Of each axis as the filter claims it. */
-    real square_bias_m2;  /* Of the error that walls leave. */
-    real motion_m2[3];  /* What accelerations have of each axis' variance, for one fix. */
+    real variance_m2[3];  /* Variance of each axis as the filter claims it. */
+    real square_bias_m2;  /* Squared error caused by walls. */
+    real motion_m2[3];  /* Contribution of accelerations to the variance of each axis, for one fix. */
 } SteadyState;
 
 SKYLESS_EXPORT int32_t skyless_unwrap_stamp(Neighbours *t, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t

@@ -1,4 +1,4 @@
-"""Records and their arrays as NumPy sees them, in the same memory."""
+"""Records and their arrays as NumPy arrays in the same memory."""
 
 import ctypes
 from functools import cache
@@ -16,7 +16,7 @@ _CACHE_LINE: Final = 64
 
 
 def view(array: Any) -> NDArray[Any]:  # noqa: ANN401 - ctypes' arrays have no common type
-    """A record, or an array of numbers or records, as NumPy sees the same memory."""
+    """A record, or an array of numbers or records, as a NumPy array in the same memory."""
     element: Any = type(array)
     shape: list[int] = []
     while issubclass(element, ctypes.Array):
@@ -27,7 +27,7 @@ def view(array: Any) -> NDArray[Any]:  # noqa: ANN401 - ctypes' arrays have no c
 
 @cache
 def _dtype(element: type) -> np.dtype[Any]:
-    """NumPy takes longer over the fields of a record than over its memory."""
+    """Cached, as creating the fields of a record takes NumPy longer than viewing its memory."""
     return np.dtype(element)
 
 
@@ -37,7 +37,7 @@ def records(made: type[Made], array: NDArray[np.void]) -> Array[Made]:
 
 
 def aligned(made: type[Made]) -> Made:
-    """A record of zeros that begins at a cache line. Pages of it that are never used take no memory."""
+    """A zeroed record at the start of a cache line. Pages that are never touched use no memory."""
     memory = np.zeros(ctypes.sizeof(made) + _CACHE_LINE, np.uint8)
     begin = -memory.ctypes.data % _CACHE_LINE
     return made.from_buffer(memory[begin : begin + ctypes.sizeof(made)].data)

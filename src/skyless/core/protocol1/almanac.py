@@ -27,7 +27,7 @@ _CONFIRMATIONS: Final = 2
 """A frame corrupted on the air passes its FCS once in 65,536 times; the same error twice in a row is not expected."""
 
 _MAX_ANCHORS: Final = 255
-"""The most that a site can have; forged pages beyond that use no memory."""
+"""Most anchors of a site; forged pages beyond that use no memory."""
 
 _ASSUMED_ACCURACY: Final = AccuracyPage(**asdict(AccuracySite()))
 
@@ -67,9 +67,10 @@ def page_for(pages: tuple[Page, ...], superframe: int, slot: int) -> Page:
 
 
 def almanac_issue(pages: tuple[Page, ...]) -> int:
-    """Return 8 bits that depend on the contents of all pages and on nothing else.
+    """An 8-bit checksum of the contents of all pages.
 
-    A changed almanac keeps its issue once in 256 times; then pages replace each other one by one (``AlmanacAssembly``).
+    A changed almanac has the same issue once in 256 times; then pages replace each other one by one
+    (``AlmanacAssembly``).
     """
     folded = crc32(b"".join(map(encode_page, pages)))
     folded ^= folded >> 16
@@ -89,7 +90,7 @@ _PageBytes = Annotated[bytes, Meta(min_length=PAGE_BYTES, max_length=PAGE_BYTES)
 
 
 class AlmanacState(Struct, frozen=True):
-    """What an ``AlmanacAssembly`` holds, pages as they are on the air."""
+    """The saved state of an ``AlmanacAssembly``, pages encoded as on the air."""
 
     issue: int | None
     pages: tuple[_PageBytes, ...]
@@ -102,14 +103,14 @@ class AlmanacState(Struct, frozen=True):
 class AlmanacAssembly:
     """Collects the pages of one site from its beacons.
 
-    What contradicts the pages held must be received twice. A new issue replaces them all once two frames in a row
-    carry it. A page that differs from the one held under the same issue replaces it once it was received twice with no
-    other page of its key in between. So one corrupt frame that passed its FCS cannot do lasting harm.
+    Contradictions must be received twice. A new issue replaces all pages once two consecutive frames carry it. A page
+    that differs from the one held under the same issue replaces it once it was received twice without another page of
+    its key in between. So one corrupt frame that passed its FCS cannot do lasting harm.
     """
 
     def __init__(self) -> None:
         self.issue: int | None = None
-        """Issue of the almanac held, None before the first beacon."""
+        """Issue of the almanac held; None before the first beacon."""
         self._next_issue: int | None = None
         self._next_frames = 0
         self._next_pages: list[Page] = []
@@ -127,7 +128,7 @@ class AlmanacAssembly:
         self.georeference: GeoreferencePage | None = None
 
     def state(self) -> AlmanacState:
-        """All that it holds."""
+        """Save the present state."""
         pages, unconfirmed, next_pages = (
             tuple(map(encode_page, group))
             for group in (self._pages.values(), self._unconfirmed.values(), self._next_pages)
@@ -135,10 +136,10 @@ class AlmanacAssembly:
         return AlmanacState(self.issue, pages, unconfirmed, self._next_issue, self._next_frames, next_pages)
 
     def restore(self, state: AlmanacState) -> None:
-        """Continue from a state.
+        """Continue from a saved state.
 
         Raises:
-            ValueError: it holds something that is not a page.
+            ValueError: it contains something that is not a page.
         """
         self._clear()
         for page in _decoded(state.pages):
@@ -148,7 +149,7 @@ class AlmanacAssembly:
         self._next_pages = _decoded(state.next_pages)
 
     def slot_of(self, anchor: int | None) -> int | None:
-        """First slot of an anchor, once its page was heard."""
+        """First slot of an anchor, once its page was received."""
         page = self._pages.get(anchor)
         return page.slot if isinstance(page, AnchorPage) else None
 
@@ -159,7 +160,7 @@ class AlmanacAssembly:
         return schedule is not None and self.noise is not None and len(self.anchors_m) >= schedule.anchors
 
     def add_page(self, issue: int, page: Page | None) -> bool:
-        """Process the issue and the page (if any) of one beacon; return whether the almanac changed."""
+        """Process the issue and the page (if any) of a beacon. Returns True if the almanac changed."""
         if issue != self.issue:
             if self.issue is not None:
                 return self._add_to_next_issue(issue, page)

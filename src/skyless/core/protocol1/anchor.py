@@ -1,7 +1,7 @@
 """``Anchor``: the protocol machine of one anchor of protocol 1. Bytes and ticks in, frames and ticks out; no I/O.
 
-A driver (simulator, daemon) hands it every reception, asks when its next frame is due, at the latest every 5 ms while
-there is none, and fetches that frame as late as its radio allows, so that it carries the latest receptions.
+A driver (simulator, daemon) passes it every reception, asks when its next frame is due, at least every 5 ms while there
+is none, and fetches that frame as late as its radio allows, so that it carries the latest receptions.
 """
 
 import math
@@ -44,24 +44,24 @@ from skyless.core.ticks import (
 # The election of the master, as one anchor sees it and takes part in it (``docs/protocol.md``, "The master").
 
 SILENT_SUPERFRAMES: Final = 3
-"""After this many without news the master may have failed; a master that cannot send for that long resigns."""
+"""Without news for this many, the master may have failed; a master that cannot send for as long resigns."""
 
 PROCESSING_TICKS: Final = from_seconds(0.5e-3)
-"""From the RMARKER of a frame until the receiving host has it."""
+"""Time from a frame's RMARKER until the receiving host has it."""
 
 FIRST_LISTENING_SUPERFRAMES: Final = 3
-"""For how many the anchor of the highest rank listens before it starts the site's time."""
+"""Superframes for which the anchor of the highest rank listens before it starts the site's time."""
 
 LISTENING_TICKS: Final = from_seconds(0.5)
 LISTENING_STEP_TICKS: Final = from_seconds(0.25)
-"""For how long the others listen, and how much longer each next rank; on slow sites 8 superframes, and 4 more each."""
+"""Time for which the others listen, and the step from rank to rank; on slow sites 8 superframes, and 4 more each."""
 
 CONFIRMATION_SUPERFRAMES: Final = 16
-"""A newer master term is accepted when it is received twice within this."""
+"""A newer master term is accepted once it is received twice within this time."""
 
 
 class Role(StrEnum):
-    """What an anchor is."""
+    """An anchor's role."""
 
     LISTENING = "listening"
     """Without a master, and not yet one itself."""
@@ -70,14 +70,14 @@ class Role(StrEnum):
 
 
 class Verdict(StrEnum):
-    """What a beacon is to the anchor that received it."""
+    """Meaning of a beacon to the anchor that received it."""
 
     FROM_MASTER = "from-master"
-    """It is from the present master."""
+    """From the present master."""
     FROM_NEW_MASTER = "from-new-master"
-    """It is from an anchor that is the master from now on. The clock may go on."""
+    """From an anchor that is the master from now on. The clock may continue."""
     FROM_FIRST_MASTER = "from-first-master"
-    """The same, but what was known of the site's time no longer counts."""
+    """The same, but previous knowledge of the site's time is void."""
     STALE = "stale-master"
     """Its master has been replaced."""
     UNKNOWN = "unknown-master"
@@ -86,16 +86,16 @@ class Verdict(StrEnum):
 
 
 class MasterElection:
-    """Tracks the master terms of the beacons received. Times are the own counter's, unwrapped.
+    """Tracks the master terms in received beacons. Times are the own counter's, unwrapped.
 
-    An anchor's rank is 0 for the site's first master, then it counts in the order of the site file.
+    The site's first master has rank 0, the others follow in the order of the site file.
     """
 
     def __init__(self, site: Site, anchor_id: int, schedule: Schedule) -> None:
         order = [site.master, *(anchor.id for anchor in site.anchors if anchor.id != site.master)]
         self.role = Role.LISTENING
         self.master_term: MasterTerm | None = None
-        """The last one that was accepted; that of the anchor itself while it is the master."""
+        """The last accepted term; its own while the anchor is the master."""
         self._own = anchor_id
         self._rank = {anchor: rank for rank, anchor in enumerate(order)}
         self._superframe = schedule.superframe_ticks
@@ -131,7 +131,7 @@ class MasterElection:
         return Verdict.OTHER
 
     def _on_older(self, master_term: MasterTerm, rx_ticks: int) -> Verdict:
-        """A master of an older term is better than none: a follower does not take over, and accepts it in the end."""
+        """Handle a master of an older term, which is better than none: do not take over, and accept it in the end."""
         if self.role is Role.MASTER:
             return Verdict.STALE
         self._waits_from_ticks = rx_ticks
@@ -140,7 +140,7 @@ class MasterElection:
         return self._accept(master_term, rx_ticks, Verdict.FROM_FIRST_MASTER)
 
     def _on_newer(self, master_term: MasterTerm, by_master: bool, rx_ticks: int) -> Verdict:
-        """Leave the present master, or the own role, for a newer term; a master known by others is waited for."""
+        """Leave the present master, or the own role, for a newer term; a master known only from others is awaited."""
         if not by_master:
             self.role, self.master_term = Role.LISTENING, master_term
             return Verdict.OTHER
@@ -159,7 +159,7 @@ class MasterElection:
         return is_newer(master_term.term, self.master_term.term)
 
     def must_become_master(self, now_ticks: int, clock_is_good: bool) -> bool:
-        """Whether the anchor has to take the role now; ``clock_is_good``: it can carry the site's time on."""
+        """Whether the anchor has to take the role now; ``clock_is_good``: it can continue the site's time."""
         if self._waits_from_ticks is None:
             self._waits_from_ticks = now_ticks
         if self.role is Role.LISTENING:
@@ -167,7 +167,7 @@ class MasterElection:
         return self.role is Role.FOLLOWER and self._must_take_over(now_ticks, clock_is_good)
 
     def _must_take_over(self, now_ticks: int, clock_is_good: bool) -> bool:
-        """Whether the master has failed, and all anchors of higher rank had their time to take over."""
+        """Whether the master has failed and all anchors of higher rank had time to take over."""
         silent_from = max(self._watch.news_ticks, self._waits_from_ticks or 0)
         silence = now_ticks - silent_from - PROCESSING_TICKS
         if silence < SILENT_SUPERFRAMES * self._superframe:
@@ -183,17 +183,17 @@ class MasterElection:
         return silence >= SILENT_SUPERFRAMES * self._superframe and self._watch.is_dead(silence // self._turn)
 
     def _others_since(self, ticks: int) -> list[int]:
-        """Anchors received after a time, except the master."""
+        """Anchors other than the master received after a time."""
         master = None if self.master_term is None else self.master_term.master
         return [other for other, heard in self._heard_ticks.items() if heard > ticks and other != master]
 
     def _listening_ticks(self) -> int:
-        """How long to listen before starting the site's time."""
+        """Time to listen before starting the site's time."""
         first = self._rank[self._own] == 0
         return FIRST_LISTENING_SUPERFRAMES * self._superframe if first else self._takeover_ticks()
 
     def _takeover_ticks(self) -> int:
-        """How long to wait without any other anchor: the lower the rank, the longer."""
+        """Time to wait without any other anchor: the lower the rank, the longer."""
         step = max(LISTENING_STEP_TICKS, 4 * self._superframe)
         return self._isolation_ticks() + max(self._rank[self._own] - 1, 0) * step
 
@@ -201,46 +201,46 @@ class MasterElection:
         return max(LISTENING_TICKS, 8 * self._superframe)
 
     def become_master(self, now_ticks: int) -> None:
-        """Take the role, in a term of its own."""
+        """Take the role in a new term."""
         term = 0 if self.master_term is None else (self.master_term.term + 1) % TERMS
         self.role, self.master_term = Role.MASTER, MasterTerm(term, self._own)
         self._sent_ticks = now_ticks
 
     def on_sent(self, tx_ticks: int) -> None:
-        """Note that a frame was made."""
+        """Record that a frame was made."""
         self._sent_ticks = tx_ticks
 
     def resign_if_silent(self, now_ticks: int) -> None:
-        """A master that could not send for longer than others wait before they take over listens before it sends."""
+        """Listen again if this master could not send for longer than others wait before they take over."""
         silence = now_ticks - self._sent_ticks
         if self.role is Role.MASTER and silence > SILENT_SUPERFRAMES * self._superframe:
             self.role, self._waits_from_ticks = Role.LISTENING, now_ticks
 
 
 MAX_OFFSET_STD_M: Final = 0.3
-"""An anchor sends only while its offset is known better than this (``docs/maths.md`` section 6)."""
+"""An anchor sends only while its offset's standard deviation is below this (``docs/maths.md`` section 6)."""
 
 MAX_TAKEOVER_STD_M: Final = 3.0
-"""An anchor takes over the master's role only while its offset is known better than this, by which the site's time may
-then jump, on sites whose superframes last a second."""
+"""An anchor takes the master's role only while its offset's standard deviation is below this, by which the site's time
+may jump, on sites whose superframes last a second."""
 
 
 class SiteTimeState(Struct, frozen=True):
-    """How well an anchor knows the site's time, and whose."""
+    """An anchor's knowledge of the site's time."""
 
     role: Role
     master: int | None
-    """The present master, which may be the anchor itself; None before it has received one."""
+    """The present master, possibly the anchor itself; None before it has received one."""
     term: int | None
-    """Counts the takeovers of the master's role, modulo 256."""
+    """Number of takeovers of the master's role, modulo 256."""
     beacons: int
     """Master beacons used since the clock filter's last start."""
     is_known: bool
     rate_ppm: float
     offset_std_m: float
-    """After the last beacon, in metres of light; 0 for the master itself."""
+    """After the last beacon, in metres of light; 0 for the master."""
     offset_s: float | None
-    """Own counter less the site's time, modulo the wrap; None before it is known."""
+    """Own counter minus site time, modulo the wrap; None while unknown."""
     superframe: int | None
 
 
@@ -248,9 +248,9 @@ class Anchor:
     """One anchor of a site."""
 
     def __init__(self, site: Site, anchor_id: int, lead_s: float = 1e-3) -> None:
-        """``lead_s``: how long before its RMARKER a frame must be in the driver's hands.
+        """``lead_s``: how long before its RMARKER the driver needs a frame.
 
-        The radio is configured with the antenna delays of ``site``, and keeps them.
+        The radio is configured with the antenna delays of ``site`` and keeps them.
         """
         self.id = anchor_id
         self.counters: Counter[str] = Counter()
@@ -258,7 +258,7 @@ class Anchor:
         self._anchors = {anchor.id: anchor for anchor in site.anchors}
         self._radio_delay_ticks = self._anchors[anchor_id].tx_antenna_delay_ticks
         self._correction_ticks = 0
-        """What frames state of their TX stamps beyond the radio's, as another site corrects its delays."""
+        """Correction of the radio's TX stamps in frames, if another site corrects its delays."""
         self._lead_ticks = round(lead_s * TICK_RATE_HZ)
         self._schedule = schedule_of(site)
         self._slots = self._schedule.slots_of(first_slots(site)[anchor_id])
@@ -273,9 +273,9 @@ class Anchor:
         self._sequence = 0
 
     def place(self, site: Site) -> None:
-        """Use other positions and antenna delays of the same anchors, with the same schedule, and go on.
+        """Continue with other positions and antenna delays of the same anchors, with the same schedule.
 
-        Own stamps stay as the radio makes them; frames state them corrected.
+        The radio's own stamps do not change; frames state them corrected.
         """
         self._anchors = {anchor.id: anchor for anchor in site.anchors}
         self._correction_ticks = delay_change_ticks(self._site, site, self.id)
@@ -317,7 +317,7 @@ class Anchor:
         )
 
     def hear(self, reception: Reception) -> None:
-        """Process a frame from the air; one that does not belong here is counted and dropped."""
+        """Process a frame from the air. Frames of others are counted and dropped."""
         beacon = decode_cached(reception.frame)
         if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
@@ -334,7 +334,7 @@ class Anchor:
             self._update_master(beacon, heard, rx_ticks)
 
     def _update_master(self, beacon: Beacon, heard: Heard, rx_ticks: int) -> None:
-        """Track which anchor is the master, and set the clock by the master's own beacons."""
+        """Track which anchor is the master, and set the clock from the master's own beacons."""
         verdict = self._election.on_beacon(beacon, rx_ticks)
         if verdict in {Verdict.STALE, Verdict.UNKNOWN}:
             self.counters[verdict] += 1
@@ -348,7 +348,7 @@ class Anchor:
             self._master_heard = heard
 
     def next_transmission_ticks(self, now_ticks: int) -> int | None:
-        """TX stamp (40-bit, own counter) of the next frame that can still be made; None while the clock is unknown."""
+        """TX stamp (40-bit, own counter) of the next frame that can still be prepared; None if the clock is unknown."""
         now = self._own_ticks.unwrap(now_ticks)
         self._election.resign_if_silent(now)
         self._take_over_if_due(now)
@@ -365,10 +365,10 @@ class Anchor:
         return wrap(tx_ticks)
 
     def transmission(self, tx_ticks: int) -> Transmission:
-        """The frame for a time that ``next_transmission_ticks`` gave.
+        """The frame for the time last returned by ``next_transmission_ticks``.
 
         Raises:
-            KeyError: the time is not the one that was given last.
+            KeyError: it was another time.
         """
         superframe, slot = self._pending.pop(tx_ticks)
         unwrapped = self._own_ticks.expect(tx_ticks)
@@ -380,7 +380,7 @@ class Anchor:
         return Transmission(encode(beacon), tx_ticks)
 
     def _take_over_if_due(self, now: int) -> None:
-        """Take the master's role if no anchor has it: the site's time goes on by the own clock."""
+        """Take the master's role if no anchor has it: the site's time continues on the own clock."""
         good = self._clock.updates > 1 and self._clock.variance_m2(now) < MAX_TAKEOVER_STD_M**2
         if self._election.must_become_master(now, good):
             self.counters["takeover"] += self._election.master_term is not None
@@ -410,14 +410,14 @@ class Anchor:
         )
 
     def _relayed(self, ticks_own: int, master: int) -> tuple[Heard, ...]:
-        """Recent receptions of the anchors other than the master, the most recent first."""
+        """Recent receptions of anchors other than the master, the most recent first."""
         oldest = ticks_own - MAX_RELAY_AGE_TICKS
         return tuple(
             heard for heard, rx_ticks in reversed(self._heard.values()) if rx_ticks > oldest and heard.anchor != master
         )
 
     def _master_time(self, ticks_own: int) -> MasterTime | None:
-        """Site time of a frame; None for one that was due when its sender lost its master."""
+        """Site time of a frame; None if its sender has just lost its master."""
         role = self._election.role
         if role is Role.LISTENING or (role is Role.FOLLOWER and self._clock.updates < 2):
             return None
@@ -425,7 +425,7 @@ class Anchor:
         return MasterTime(wrap(self._clock.subticks(ticks_own), 48), std_ticks)
 
     def _may_send(self, ticks_own: int) -> bool:
-        """Whether the own clock is known well enough."""
+        """Whether the own clock is accurate enough for sending."""
         if self.is_master:
             return True
         following = self._election.role is Role.FOLLOWER and self._clock.updates > 1

@@ -1,4 +1,4 @@
-"""The site's time in protocol 1: an anchor's own counter against it, the master's term, and its scale."""
+"""The site's time in protocol 1: an anchor's clock against it, the master's term, and its scale."""
 
 from collections import Counter
 from typing import Final
@@ -18,24 +18,24 @@ from skyless.core.ticks import (
 )
 
 MISFITS_BEFORE_RESTART: Final = 3
-"""If this number of master beacons in a row do not fit, the site's time, or the own clock, has jumped."""
+"""After this many consecutive misfits of master beacons, the site's time or the own clock has jumped."""
 
 GRID_SLACK_TICKS: Final = 8 * DELAYED_TX_GRANULARITY_TICKS
-"""By how much a master's frames, which lie on its radio's grid, may be off their slots."""
+"""Largest distance of a master's frames, which are on its radio's grid, from their slots."""
 
 MASTER_CHANGE_INFLATION: Final = 2.0
-"""A new master's clock was known as well as the own one: their difference has at most twice the variance."""
+"""A new master's clock was as uncertain as the own one: their difference has at most twice the variance."""
 
 PLACEMENT_STD_M: Final = 1.0
-"""By which the offset may change when a survey has corrected positions and antenna delays."""
+"""Standard deviation of the offset's change when a survey has corrected positions and antenna delays."""
 
 
 class SiteClock:
-    """Own time to site time and back, and where the superframes lie."""
+    """Conversion between own time and site time, and the phase of the superframes."""
 
     def __init__(self, clock: ClockFilter, schedule: Schedule, counters: Counter[str]) -> None:
         self.epoch_ticks: int | None = None
-        """Site time at which superframe 0 began, unwrapped as the site time is; None before that is known."""
+        """Unwrapped site time at the start of superframe 0; None while unknown."""
         self._clock = clock
         self._schedule = schedule
         self._counters = counters
@@ -48,7 +48,7 @@ class SiteClock:
 
     @property
     def updates(self) -> int:
-        """Master beacons filtered since the filter's last start."""
+        """Master beacons used since the filter's last start."""
         return self._clock.updates if self._last is not None else 0
 
     @property
@@ -62,7 +62,7 @@ class SiteClock:
         return self._clock.offset_std_m if self._own_site_time is None else 0.0
 
     def track_master(self, range_m: float, restart: bool) -> None:
-        """Synchronise to another master at this distance; ``restart``: forget what was known of the site's time."""
+        """Synchronise to another master at this distance; ``restart``: forget the site's time."""
         self._range_m = range_m
         self._last_raw = self._last_frame = None
         self._misfits = 0
@@ -73,12 +73,12 @@ class SiteClock:
             self._clock.inflate_covariance(MASTER_CHANGE_INFLATION)
 
     def correct_range(self, range_m: float) -> None:
-        """Use another distance to the same master, whose antenna delay may have been corrected with it."""
+        """Use another distance to the same master, whose antenna delay may have been corrected too."""
         self._range_m = range_m
         self._clock.add_offset_variance(PLACEMENT_STD_M**2)
 
     def become_master(self, ticks_own: int) -> None:
-        """Become the master: the site's time goes on from here as far as it is known, else the own counter is it."""
+        """Become the master: continue the site's time if it is known, otherwise start it from the own counter."""
         if self._own_site_time is None:
             if self.updates > 1:
                 self._own_site_time = SiteTime.onwards(
@@ -90,18 +90,18 @@ class SiteClock:
             self.epoch_ticks = self._own_site_time.subticks(ticks_own) // SUBTICKS
 
     def subticks(self, ticks_own: int) -> int:
-        """Site time of an own reading in 1/256 tick, both unwrapped."""
+        """Site time of an own time in 1/256 tick, both unwrapped."""
         if self._own_site_time is not None:
             return self._own_site_time.subticks(ticks_own)
         ticks, fraction, _ = self._clock.to_master(ticks_own)
         return ticks * SUBTICKS + round(fraction * SUBTICKS)
 
     def variance_m2(self, ticks_own: int) -> float:
-        """Variance of the site time of an own reading."""
+        """Variance of the site time of an own time."""
         return 0.0 if self._own_site_time is not None else self._clock.to_master(ticks_own)[2]
 
     def ticks_own(self, ticks_site: int) -> int:
-        """Nearest own reading of a site time."""
+        """Own time nearest to a site time."""
         return (
             self._clock.from_master(ticks_site)
             if self._own_site_time is None
@@ -109,7 +109,7 @@ class SiteClock:
         )
 
     def on_master_beacon(self, beacon: Beacon, rx_ticks: int) -> bool:
-        """Process a beacon of the master; one that does not fit changes nothing, unless others like it come."""
+        """Process a beacon of the master. A misfit changes nothing unless others like it follow. True if used."""
         if self._last_frame == (beacon.tx_ticks, beacon.sequence):
             self._counters["duplicate"] += 1
             return False
@@ -137,7 +137,7 @@ class SiteClock:
         return ticks_site, beacon.superframe
 
     def _filter(self, beacon: Beacon, whole: int, rx_ticks: int, range_m: float) -> tuple[int, int] | None:
-        """Process a beacon by the filter; its site time and superframe, unwrapped, or None where it does not fit."""
+        """Update the filter with a beacon. Returns unwrapped site time and superframe, or None for a misfit."""
         if self._last is None or self.epoch_ticks is None:
             return self._begin(beacon, whole, rx_ticks, range_m)
         ticks_site = _unwrapped(whole, *self._last, rx_ticks)
@@ -159,7 +159,7 @@ class SiteClock:
 
 
 def _unwrapped(counter: int, last_ticks: int, last_rx_ticks: int, rx_ticks: int) -> int | None:
-    """The unwrapped time of a 40-bit counter that ran on by the own clock since the last one; None if it did not."""
+    """The unwrapped time of a 40-bit counter that has run along with the own clock since the last one; None if not."""
     elapsed = rx_ticks - last_rx_ticks
     return continued(counter, last_ticks, elapsed) if elapsed > 0 else None
 
@@ -168,20 +168,20 @@ _RATE_BITS: Final = 64
 
 
 class SiteTime(Struct, frozen=True):
-    """Own counter to site time and back, exact to 1/256 tick at any distance (``docs/maths.md`` section 6)."""
+    """Conversion between own counter and site time, exact to 1/256 tick at any distance (``docs/maths.md`` 6)."""
 
     epoch_own_ticks: int
     epoch_subticks: int
-    """Site time at that reading, in 1/256 tick."""
+    """Site time at that own time, in 1/256 tick."""
     subticks_per_tick: int
-    """Site time that passes in one own tick, in 2⁻⁶⁴ of 1/256 tick."""
+    """Site time per own tick, in 2⁻⁶⁴ of 1/256 tick."""
 
     def subticks(self, ticks_own: int) -> int:
-        """Site time of an own reading, in 1/256 tick, both unwrapped."""
+        """Site time of an own time, in 1/256 tick, both unwrapped."""
         return self.epoch_subticks + ((ticks_own - self.epoch_own_ticks) * self.subticks_per_tick >> _RATE_BITS)
 
     def ticks_own(self, ticks_site: int) -> int:
-        """Nearest own reading of a site time in whole ticks."""
+        """Own time nearest to a site time in whole ticks."""
         elapsed = (ticks_site * SUBTICKS - self.epoch_subticks) << _RATE_BITS
         return self.epoch_own_ticks + (elapsed + self.subticks_per_tick // 2) // self.subticks_per_tick
 
@@ -192,13 +192,13 @@ class SiteTime(Struct, frozen=True):
 
     @classmethod
     def onwards(cls, ticks_own: int, ticks_site: int, fraction_ticks: float, rate: float) -> "SiteTime":
-        """The map that goes on from a reading and the site time known for it; ``rate`` is the own clock's."""
+        """Continue from an own time and its site time; ``rate`` is the own clock's."""
         subticks_per_tick = int(SUBTICKS / (1.0 + rate) * 2.0**_RATE_BITS)
         return cls(ticks_own, ticks_site * SUBTICKS + round(fraction_ticks * SUBTICKS), subticks_per_tick)
 
 
 OWN_COUNTER: Final = SiteTime(0, 0, SUBTICKS << _RATE_BITS)
-"""The time of a site that its first master starts is the master's own counter."""
+"""A site's time starts as its first master's own counter."""
 
 
 # The master term of a beacon, which of two terms is the newer, and which one a tag uses.
@@ -206,14 +206,14 @@ OWN_COUNTER: Final = SiteTime(0, 0, SUBTICKS << _RATE_BITS)
 TERMS: Final = 256
 
 _CONFIRMATION_TICKS: Final = from_seconds(0.5)
-"""A newer term is accepted when two beacons carry it within this time."""
+"""A newer term is accepted once two beacons carry it within this time."""
 
 _OLDER_AFTER_TICKS: Final = from_seconds(0.5)
 """A whole site that was switched off and on counts its terms from 0 again."""
 
 
 class MasterTerm(Struct, frozen=True, gc=False):
-    """Whose time an anchor states: the master, and how often that role has changed hands, modulo 256."""
+    """A master, and the number of takeovers of its role so far, modulo 256."""
 
     term: int
     master: int
@@ -225,17 +225,17 @@ def master_term_of(beacon: Beacon) -> MasterTerm:
 
 
 def is_newer(term: int, other: int) -> bool:
-    """Whether one term came after another: serial arithmetic (RFC 1982), right up to 127 takeovers apart."""
+    """Whether one term came after another: serial arithmetic (RFC 1982), correct up to 127 takeovers apart."""
     return 0 < (term - other) % TERMS < TERMS // 2
 
 
 class Confirmations(Struct):
-    """Master terms received once, so that two frames are needed: one corrupted past its FCS makes no new master."""
+    """Master terms received once: two frames are required, so that a single corrupted one makes no new master."""
 
     seen: dict[MasterTerm, int] = {}
 
     def confirm(self, master_term: MasterTerm, rx_ticks: int, within_ticks: int) -> bool:
-        """Add a master term; whether it was received before, no longer ago than that."""
+        """Add a master term. Returns True if it was received before within this time."""
         self.seen = {other: ticks for other, ticks in self.seen.items() if 0 < rx_ticks - ticks < within_ticks}
         confirmed = master_term in self.seen
         self.seen[master_term] = rx_ticks
@@ -243,7 +243,7 @@ class Confirmations(Struct):
 
 
 class FollowedMaster(Struct):
-    """The master term that a tag uses: the newest one, or what it receives once that one has fallen silent."""
+    """The master term that a tag uses: the newest one, or another one once that has fallen silent."""
 
     master_term: MasterTerm | None = None
     rx_ticks: int = 0
@@ -255,9 +255,9 @@ class FollowedMaster(Struct):
         return None if self.master_term is None else self.master_term.master
 
     def on_beacon(self, beacon: Beacon, rx_ticks: int, superframe_ticks: int) -> bool:
-        """Update the master term from a beacon; False if the beacon's master has been replaced.
+        """Update the master term from a beacon. Returns False if the beacon's master has been replaced.
 
-        A newer term counts from its second beacon on; the first one may be used, as time goes on unchanged. Another
+        A newer term counts from its second beacon on; the first one may be used, as the site's time continues. Another
         master of the same term counts after a superframe and a half without the present one, an older term after three
         superframes and at least half a second. ``superframe_ticks`` is 0 before the schedule is known.
         """
@@ -293,7 +293,7 @@ class MasterScale(Struct):
 
     master_term: MasterTerm | None = None
     points: tuple[tuple[int, int, int, int], ...] = ()
-    """Site time and its lead on the master's counter, each in ticks and subticks: 64 bits cannot hold subticks."""
+    """Site time and its lead over the master's counter, each in ticks and subticks: 64 bits cannot hold subticks."""
 
     def update(self, master_term: MasterTerm, site_subticks: int, tx_ticks: int) -> None:
         """Process a packet of the master."""
@@ -307,12 +307,12 @@ class MasterScale(Struct):
             self.points = (self.points[0], point) if fits else (point,)
 
     def difference(self, master_term: MasterTerm | None, site_subticks: int, tx_ticks: int) -> int | None:
-        """An anchor's reading less the master's at its TX stamp, in subticks modulo 2⁴⁸; None while not known."""
+        """An anchor's time minus the master's at its TX stamp, in subticks modulo 2⁴⁸; None if unknown."""
         lead = self._lead(site_subticks) if master_term == self.master_term else None
         return None if lead is None else (lead - site_subticks + tx_ticks * SUBTICKS) & SITE_TIME_MASK
 
     def _lead(self, site_subticks: int) -> int | None:
-        """Lead of the site's time on the master's counter, on the line; None too far from what is known."""
+        """Lead of the site's time over the master's counter, on the line; None too far beyond it."""
         if len(self.points) < 2:
             return None
         (first, before), (last, lead) = ((a * SUBTICKS + b, c * SUBTICKS + d) for a, b, c, d in self.points)

@@ -1,6 +1,6 @@
 """``Receiver``: the protocol machine of one tag of protocol 1. Bytes and ticks in, fixes out; no I/O, no clock.
 
-It needs nothing but beacons: anchors, schedule and noise figures come from the almanac on the air.
+It needs only beacons: anchors, schedule and noise figures come from the almanac on the air.
 """
 
 import math
@@ -39,7 +39,7 @@ from skyless.core.ticks import FLIGHT_SLACK_TICKS, SUBTICKS, TICK_M, may_elapse,
 
 
 class ReceiverState(Struct, frozen=True, tag="protocol-1"):
-    """All that a ``Receiver`` keeps."""
+    """The saved state of a ``Receiver``."""
 
     admission: AdmissionState
     admitted: bytes
@@ -50,7 +50,7 @@ class ReceiverState(Struct, frozen=True, tag="protocol-1"):
     master_scale: MasterScale
     superframe_ticks: int
     has_method_key: bool
-    """Whether a method has been looked for since stamps were forgotten."""
+    """Whether a method has been chosen since stamps were forgotten."""
     method: EstimationState | SnapshotsState | None
 
 
@@ -66,9 +66,9 @@ class Receiver(BeaconReceiver):
         z_bounds_m: tuple[float, float] | None = None,
         integrity: IntegrityRequirement | None = None,
     ) -> None:
-        """Make a tag that knows nothing yet.
+        """Create a tag that has heard nothing.
 
-        ``method`` is one of ``METHODS``; the rest as of ``skyless.Receiver``, where ``qa`` and ``integrity`` serve
+        ``method`` is one of ``METHODS``; the rest as for ``skyless.Receiver``, with ``qa`` and ``integrity`` for
         ``joint`` only.
 
         Raises:
@@ -82,7 +82,7 @@ class Receiver(BeaconReceiver):
         self.almanac = AlmanacAssembly()
         self._schedule: Schedule | None = None
         self._scale: tuple[int, int] | None = None
-        """The master's time and the tag's, both unwrapped, when they were last compared."""
+        """Master time and tag time, both unwrapped, when last compared."""
         self._method: Estimation | Snapshots | None = None
         self._method_key: object = None
         self._superframe_ticks = 0
@@ -93,7 +93,7 @@ class Receiver(BeaconReceiver):
         self._positions_issue: int | None = None
 
     def state(self) -> ReceiverState:
-        """All that it keeps, as it is now; to be used or encoded before its next frame, as parts are shared."""
+        """The present state. Shares memory with the receiver: use or encode it before its next frame."""
         return ReceiverState(
             admission=self._admission_state(),
             admitted=packed(self._admission),
@@ -109,10 +109,10 @@ class Receiver(BeaconReceiver):
 
     @classmethod
     def from_state(cls, state: ReceiverState) -> "Receiver":
-        """A receiver that continues with the same bits as the one with this state.
+        """Restore a receiver that continues bit by bit as the saved one would.
 
         Raises:
-            ValueError: no receiver has such a state.
+            ValueError: the state is invalid.
         """
         made = cls(state.admission.options.method)
         made._admission = unpacked(Admission, state.admitted)
@@ -136,12 +136,12 @@ class Receiver(BeaconReceiver):
 
     @property
     def admission(self) -> Admission:
-        """What it knows of its own counter, of sites and of anchors."""
+        """What the tag knows of its own counter, of the sites and of the anchors."""
         return self._admission
 
     @property
     def method(self) -> Estimation | Snapshots | None:
-        """The positioning method in use, None before the almanac is known."""
+        """The positioning method in use; None before the almanac is known."""
         return self._method
 
     @property
@@ -150,16 +150,16 @@ class Receiver(BeaconReceiver):
 
     @property
     def heard_site(self) -> HeardSite | None:
-        """Positions of the anchors and the georeference so far, once the almanac is complete."""
+        """Known anchor positions and the georeference, once the almanac is complete."""
         almanac = self.almanac
         if not almanac.complete:
             return None
         return HeardSite(almanac.anchors_m, almanac.georeference, is_complete=almanac.georeference is not None)
 
     def hear(self, reception: Reception) -> Fix | None:
-        """Process a frame from the air; a fix if it made one, else ``reason`` is set.
+        """Process a frame from the air. Returns a fix if it made one, otherwise sets ``reason``.
 
-        What does not belong here is counted in ``counters`` and dropped; nothing on the air raises.
+        Unusable frames are counted in ``counters`` and dropped; no frame raises.
         """
         beacon = decode_cached(reception.frame)
         if isinstance(beacon, Malformed):
@@ -168,7 +168,7 @@ class Receiver(BeaconReceiver):
         return self.hear_beacon(beacon, reception)
 
     def hear_beacon(self, beacon: Beacon, reception: Reception) -> Fix | None:
-        """Process a beacon that is decoded already, as ``hear`` does."""
+        """Process a decoded beacon as ``hear`` does."""
         if not self._admit(beacon, reception):
             return None
         self.counters["heard"] += 1
@@ -178,7 +178,7 @@ class Receiver(BeaconReceiver):
         return self._judge(result)
 
     def _admit(self, beacon: Beacon, reception: Reception) -> bool:
-        """Whether a beacon is of an anchor of the site in use and of the present master, with possible stamps."""
+        """Check a beacon's site, anchor, stamps and master. Returns True if it is admitted; otherwise counts it."""
         admission, host_s = self._admission, reception.host_s
         outcome = _admit_sender(
             admission, beacon.site, beacon.anchor, reception.rx_ticks, nan if host_s is None else host_s
@@ -205,7 +205,7 @@ class Receiver(BeaconReceiver):
         return False
 
     def _process(self, beacon: Beacon, reception: Reception) -> Fix | NoFixReason:
-        """Process a beacon that is admitted."""
+        """Process an admitted beacon."""
         neighbours, rx_ticks = self._admission.neighbours, self._admission.rx_ticks
         tx_ticks = neighbours.rows[neighbours.row].tx_ticks
         self._read_almanac(beacon)
@@ -217,7 +217,7 @@ class Receiver(BeaconReceiver):
     def _observation(
         self, beacon: Beacon, reception: Reception, anchor_m: Array, rx_ticks: int, tx_ticks: int
     ) -> Observation:
-        """A beacon with relays and the master's term, or with its round and the stamp of the master's frame."""
+        """The observation of a beacon: filters get its relays, snapshots its round and the master's stamp."""
         ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
         factor = variance_factor_of(reception.diagnostics)
         if self._options.method not in FILTERS:
@@ -234,7 +234,7 @@ class Receiver(BeaconReceiver):
         )  # fmt: skip
 
     def _report(self, beacon: Beacon, tx_ticks: int, ticks_master: int | None) -> tuple[int, int] | None:
-        """What an anchor reports of its clock against the master's (``Observation.report``)."""
+        """An anchor's report of its clock against the master's (``Observation.report``)."""
         if beacon.master_time is None or ticks_master is None:
             return None
         master_term, subticks = master_term_of(beacon), beacon.master_time.tx_subticks_master % SUBTICKS
@@ -257,7 +257,7 @@ class Receiver(BeaconReceiver):
     def _master_time(self, beacon: Beacon, rx_ticks: int) -> tuple[int | None, float, float]:
         """TX time on the master's scale: unwrapped whole ticks, fraction, variance in m².
 
-        Only the master, and anchors that agree with what was received before, continue the scale.
+        Only the master, and anchors that agree with previous beacons, advance the scale.
         """
         time, scale = beacon.master_time, self._scale
         if time is None:
@@ -278,9 +278,9 @@ class Receiver(BeaconReceiver):
         self._method = self._method_key = None
 
     def _read_almanac(self, beacon: Beacon) -> None:
-        """Add the page; another issue, schedule, noise or accuracy replaces the method.
+        """Add the page. Another issue, schedule, noise or accuracy replaces the method.
 
-        So does another master where the method uses the master's own stamps; filters continue.
+        So does another master if the method uses the master's own stamps; filters continue.
         """
         almanac, master = self.almanac, self._followed.master
         if almanac.add_page(beacon.almanac_issue, beacon.page):
@@ -298,7 +298,7 @@ class Receiver(BeaconReceiver):
         self._positions = {anchor: np.array(point) for anchor, point in self.almanac.anchors_m.items()}
 
     def _choose_method(self) -> None:
-        """Make the method that almanac and master require, unless it is in use already."""
+        """Create the method that almanac and master require, unless it is in use already."""
         almanac, options, master = self.almanac, self._options, self._master
         method_master = None if options.method in FILTERS else master
         schedule_page, noise, accuracy = almanac.schedule, almanac.noise, almanac.accuracy
@@ -313,7 +313,7 @@ class Receiver(BeaconReceiver):
     def _new_method(
         self, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage
     ) -> Estimation | Snapshots:
-        """Make the method for a site with this schedule and noise, where that anchor is the master."""
+        """Create the method for a site with this master, schedule and noise."""
         options, height_m = self._options, schedule.tag_height_m
         if options.method not in FILTERS:
             variances = stamp_variances(noise)

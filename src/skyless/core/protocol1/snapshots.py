@@ -161,7 +161,7 @@ _UNWEIGHTED: Final = frozenset({SnapshotMethod.LITERAL, SnapshotMethod.LITERAL_D
 
 
 class SnapshotSettings(Struct, frozen=True):
-    """What a snapshot method must know of the site."""
+    """What a snapshot method needs to know of the site."""
 
     master: int
     anchors: int
@@ -173,7 +173,7 @@ class SnapshotSettings(Struct, frozen=True):
 
 
 class SnapshotsState(Struct, tag="snapshots"):
-    """What ``Snapshots`` keeps: the observations of two rounds, by anchor."""
+    """The saved state of ``Snapshots``: the observations of two rounds, by anchor."""
 
     round: int | None = None
     previous: dict[int, Observation] = {}
@@ -184,22 +184,22 @@ class Snapshots:
     """Collects two rounds of beacons and solves them."""
 
     def __init__(self, method: SnapshotMethod, settings: SnapshotSettings, fix_time: FixTime | None = None) -> None:
-        """``fix_time``: the receiver's, where it outlives this method."""
+        """``fix_time``: the receiver's, if it outlives this object."""
         self._method = method
         self._settings = settings
         self._kept = SnapshotsState()
         self._time = fix_time or FixTime()
 
     def state(self) -> SnapshotsState:
-        """All that it keeps, as it is now."""
+        """Save the present state."""
         return self._kept
 
     def restore(self, state: SnapshotsState) -> None:
-        """Continue from a state."""
+        """Continue from a saved state."""
         self._kept = state
 
     def update(self, observation: Observation) -> Fix | NoFixReason:
-        """Process one observation; a fix when it completes its round or is the first of the next one."""
+        """Process an observation. It gives a fix if it completes its round or is the first of the next one."""
         result: Fix | NoFixReason = NoFixReason.ACQUIRING
         kept = self._kept
         if observation.round != kept.round:
@@ -293,7 +293,7 @@ def _synchronised(first: Observation, second: Observation, reference: tuple[Obse
 
 
 def _is_plausible_interval(elapsed_ticks: int, first: Observation, second: Observation) -> bool:
-    """Whether an interval on an anchor's clock can be the one that the tag measured between two receptions."""
+    """Whether an interval on an anchor's clock agrees with the tag's between two receptions."""
     elapsed = second.rx_ticks_tag - first.rx_ticks_tag
     return elapsed > 0 and may_elapse(elapsed_ticks, elapsed, FLIGHT_SLACK_TICKS)
 

@@ -1,10 +1,10 @@
-"""The cold start: where the tag is, from packets alone and without a guess.
+"""Cold start: the tag's first position, from packets alone and without an initial guess.
 
-When anchor i relays its reception of a packet of anchor j that the tag received too, the difference of their clocks at
-that moment is known but for noise. Along such links all TX times are carried to the clock of one anchor,
-unless more anchors state theirs on the master's. The tag's clock runs up to 20 ppm off, so pseudoranges of one
-superframe drift by tens of metres. Two messages of the same anchor give the drift; then all anchors' newest
-pseudoranges are carried to one time and solved in closed form.
+When anchor i relays its reception of a packet of anchor j that the tag received too, the offset between the two
+anchors' clocks at that moment is known up to noise. Along such links all TX times are converted to the clock of one
+anchor, unless more anchors state theirs on the master's scale. The tag's clock is up to 20 ppm off, so pseudoranges
+drift by tens of metres within one superframe. Two packets of the same anchor measure that drift; the newest
+pseudoranges of all anchors are then propagated to a common time and solved in closed form.
 """
 
 from typing import Annotated, Final
@@ -18,36 +18,36 @@ from skyless.core.tag.search import LARGEST, LocateProblem
 from skyless.core.ticks import MAX_DRIFT, NEVER, SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 
 UNUSABLE, TOO_FEW_ANCHORS, ACQUIRING = range(20, 23)
-"""Why there is no start, beside the reasons of ``find_position``; ``FOUND`` if there is one. Numbers may be absurd."""
+"""Reasons for no start, in addition to those of ``find_position``. ``UNUSABLE``: the input is out of range."""
 
 MAX_LINKS: Final = MAX_ANCHORS * (MAX_ANCHORS - 1)
 
 
 @record
 class HeardPacket(Record):
-    """A packet."""
+    """A received packet with the relays that it carried."""
 
     packet: Packet
     relay_count: int
     relays: Annotated[Array[Relay], RELAYS_KEPT]
     scaled: ScaledTime
-    """Its TX time on the scale of the trial at hand."""
+    """TX time on the common scale of the current attempt."""
 
 
 @record
 class HeardAnchor(Record):
-    """An anchor's newest packets."""
+    """An anchor's two newest packets."""
 
     count: int
     fitted_ticks: Ticks
-    """The tag's reading when it last had a place on the common scale, at a possible rate."""
+    """Tag time when the anchor was last on the common scale with a plausible clock rate."""
     older: HeardPacket
     newer: HeardPacket
 
 
 @record
 class ClockLink(Record):
-    """Reading of one anchor's clock less that of another's, when the tag's read ``rx_ticks_tag``."""
+    """Listener's clock minus sender's clock at the tag's time ``rx_ticks_tag``."""
 
     listener: int
     sender: int
@@ -58,11 +58,11 @@ class ClockLink(Record):
 
 @record
 class Reach(Record):
-    """Along which links an anchor's TX times become those of the reference: a tree."""
+    """Tree of links that lead from each anchor's clock to the reference anchor's."""
 
     count: int
     order: Annotated[Integers, MAX_ANCHORS]
-    """Pairs in the order in which they are reached; the first is the reference."""
+    """Pairs in breadth-first order; the first is the reference."""
     is_reached: Annotated[Integers, MAX_ANCHORS]
     parent: Annotated[Integers, MAX_ANCHORS]
     link: Annotated[Integers, MAX_ANCHORS]
@@ -71,19 +71,19 @@ class Reach(Record):
 
 @record
 class Start(Record):
-    """A first position."""
+    """A start: the first position and its covariance."""
 
     rx_ticks_tag: Ticks
     count: int
     used: Annotated[Integers, MAX_ANCHORS]
-    """Where the anchors that it uses stand in the table of those that are heard."""
+    """Indices into ``heard`` of the anchors used."""
     position_m: Annotated[Reals, 3]
     covariance_m2: Annotated[Matrix, 3, 3]
     is_contradicted: bool
-    """Whether the messages of all anchors contradict each other."""
+    """Whether the packets of all anchors are inconsistent with each other."""
     has_misfit: bool
     misfit: int
-    """An anchor that is not in ``used``: without it there is no contradiction."""
+    """The excluded anchor; the others agree without it."""
 
 
 @record
@@ -96,12 +96,12 @@ class Acquisition(Record):
     low_m: float
     high_m: float
     variance_m2: float
-    """Of a TX and an RX stamp together."""
+    """Variance of a TX and an RX timestamp together."""
     max_age_s: float
     speed_std_mps: float
-    """Assumed speed of the tag."""
+    """Assumed standard deviation of the tag's speed."""
     error_variance_m2: float
-    """Of survey and ranges."""
+    """Variance of survey and range errors."""
     tuning: Tuning
     count: int
     heard: Annotated[Array[HeardAnchor], MAX_ANCHORS]
@@ -110,32 +110,30 @@ class Acquisition(Record):
     links: Annotated[Array[ClockLink], MAX_LINKS]
     has_been_wide: bool
     wide_ticks: Ticks
-    """When a start was first possible, but wide."""
+    """Time of the first start that was too wide to use."""
     is_linked: bool
-    """Whether TX times are on a common scale by relays, and not as anchors state them."""
+    """Whether the common scale comes from relays rather than from the anchors' stated times."""
     is_contradicted: bool
     contradicted_ticks: Ticks
     """When packets first contradicted each other."""
     rival_count: int
-    """Anchors with which two positions fitted alike; as many of them are tried again once a superframe only."""
+    """Number of anchors when two positions last fitted equally well; the same number is retried once a superframe."""
     start: Start
-    # What a trial works with
+    # Scratch space of one attempt
     pair_count: int
     pairs: Annotated[Integers, MAX_ANCHORS]
-    """Anchors with two packets, by their place in ``heard``."""
+    """Indices into ``heard`` of the anchors with two packets."""
+    # Rate of each anchor's clock relative to the tag's, as a fraction, and its variance in m²/s².
     rates: Annotated[Reals, MAX_ANCHORS]
-    """How much faster the clock of each runs than the tag's, as a fraction …"""
     rate_variances: Annotated[Reals, MAX_ANCHORS]
-    """… and the variance of that in m²/s²."""
     clock_rates_mps: Annotated[Reals, MAX_ANCHORS]
-    """Rates of the tag's clock against the common scale, one of each anchor; ``_solve_start`` sorts them."""
+    """Rate of the tag's clock against the common scale, measured with each anchor; ``_solve_start`` sorts them."""
     reach: Reach
     best: Reach
     found_alone: Start
+    # Pseudoranges at a common time, and their variances.
     ranges_m: Annotated[Reals, MAX_ANCHORS]
-    """Pseudoranges at one time …"""
     variances_m2: Annotated[Reals, MAX_ANCHORS]
-    """… and their variances."""
     problem: LocateProblem
     found: Found
 
@@ -146,7 +144,7 @@ def forget_all(q: Acquisition) -> None:
 
 
 def forget_packets(q: Acquisition, anchor: int) -> None:
-    """Forget what was received of an anchor."""
+    """Forget an anchor's packets and links."""
     place = _find_heard(q, anchor)
     if place >= 0:
         _remove_heard(q, place)
@@ -159,9 +157,9 @@ def forget_packets(q: Acquisition, anchor: int) -> None:
 
 
 def try_start(q: Acquisition, packet: Packet, relays: Relays) -> int:
-    """Add one packet; try to start each time an anchor comes around again.
+    """Add a packet and, if its anchor was heard before, try to start.
 
-    Returns why there is no start, ``FOUND`` if ``start`` is one.
+    Returns ``FOUND`` if ``q.start`` is a start, otherwise the reason why not.
     """
     now, anchor = packet.rx_ticks, packet.place.anchor
     _forget_old_packets(q, now)
@@ -211,9 +209,9 @@ def _forget_old_packets(q: Acquisition, now: Ticks) -> None:
 
 
 def gather_packet(q: Acquisition, packet: Packet, relays: Relays) -> bool:
-    """Keep an anchor's two newest packets, without an attempt to start; whether it had two before.
+    """Keep a packet without trying to start. Returns True if two packets of its anchor were kept already.
 
-    With too many anchors a new one takes the place of that which has not fitted the others for longest.
+    If the table is full, a new anchor replaces the one that has not fitted the others for longest.
     """
     _add_links(q, packet, relays)
     place = _find_heard(q, packet.place.anchor)
@@ -244,7 +242,7 @@ def _longest_unfitting(q: Acquisition) -> int:
 
 
 def _add_links(q: Acquisition, packet: Packet, relays: Relays) -> None:
-    """Keep what an anchor relays of packets that the tag has received."""
+    """Keep the relays that concern packets the tag has received itself."""
     for index in range(relays.count):
         relayed = relays.rows[index]
         place = _find_heard(q, relayed.anchor)
@@ -291,7 +289,7 @@ def _forget_links_before(q: Acquisition, now: Ticks) -> None:
 
 
 def _choose_pairs(q: Acquisition, now: Ticks) -> None:
-    """Choose the anchors with two packets, the newer of them young."""
+    """Choose the anchors with two packets of which the newer is recent."""
     q.pair_count = 0
     for place in range(q.count):
         age_s = (now - q.heard[place].newer.packet.rx_ticks) * TICK_S
@@ -308,7 +306,7 @@ def _anchor_of(q: Acquisition, pair: int) -> int:
 
 
 def _put_on_one_scale(q: Acquisition, now: Ticks) -> None:
-    """Put packets on the scale of the anchor that reaches most others, or on the master's if that is more."""
+    """Convert TX times to the clock of the anchor that reaches most others, or to the master's if that covers more."""
     stated = 0
     for pair in range(q.pair_count):
         one = q.heard[q.pairs[pair]]
@@ -348,7 +346,7 @@ def _measure_rate(q: Acquisition, pair: int, first: Packet, second: Packet) -> N
 
 
 def _reach_from(q: Acquisition, reference: int) -> None:
-    """Find every anchor to which links lead, by as few of them as can be."""
+    """Build the tree of links from ``reference`` to every anchor it reaches, each by the fewest links."""
     r = q.reach
     for pair in range(q.pair_count):
         r.is_reached[pair] = 0
@@ -379,7 +377,7 @@ def _find_pair(q: Acquisition, anchor: int) -> int:
 
 
 def _convert(q: Acquisition, pair: int, one: HeardPacket) -> None:
-    """Convert a packet's TX time to the clock of the reference; links go out of date at the difference of two rates."""
+    """Convert a packet's TX time to the reference clock; each link is propagated with the two clocks' rates."""
     r, rx_ticks = q.best, one.packet.rx_ticks
     ticks, fraction, variance_m2 = one.packet.tx_ticks, 0.0, 0.0
     place = pair
@@ -396,7 +394,7 @@ def _convert(q: Acquisition, pair: int, one: HeardPacket) -> None:
 
 
 def _clock_rate_mps(one: HeardAnchor) -> float:
-    """Rate of the tag's clock against the common scale in m/s, from two messages; that of light where out of order."""
+    """Rate of the tag's clock against the common scale in m/s, from two packets; c if they are out of order."""
     elapsed = one.newer.packet.rx_ticks - one.older.packet.rx_ticks
     if elapsed <= 0:
         return SPEED_OF_LIGHT_MPS
@@ -406,7 +404,7 @@ def _clock_rate_mps(one: HeardAnchor) -> float:
 
 
 def _drop_impossible(q: Acquisition, now: Ticks) -> None:
-    """Drop pairs of messages that no crystal can have sent."""
+    """Drop pairs of packets whose clock rate no crystal can have."""
     kept = 0
     for pair in range(q.pair_count):
         if abs(q.clock_rates_mps[pair]) <= MAX_DRIFT * SPEED_OF_LIGHT_MPS:
@@ -420,7 +418,7 @@ def _drop_impossible(q: Acquisition, now: Ticks) -> None:
 
 
 def _solve_start(q: Acquisition, left_out: int, now: Ticks, residual_tail: float) -> int:
-    """Locate the tag by the newest packets of all pairs but one (−1: of all); returns why there is no start."""
+    """Locate the tag from the newest packets of all pairs but ``left_out`` (−1: all). Returns ``FOUND`` or a reason."""
     if q.pair_count < 3 + (1 if left_out >= 0 else 0):
         return TOO_FEW_ANCHORS
     start, count = q.start, 0
@@ -460,7 +458,7 @@ def _solve_start(q: Acquisition, left_out: int, now: Ticks, residual_tail: float
 
 
 def _locate(q: Acquisition, count: int, residual_tail: float) -> int:
-    """Locate the tag by pseudoranges: by their differences against the first, with its variance in common."""
+    """Locate the tag from differences to the first pseudorange, whose variance they share."""
     p = q.problem
     p.anchors, p.knows_height, p.height_m, p.is_weighted = count, q.knows_height, q.height_m, True
     p.has_bounds, p.low_m, p.high_m, p.residual_tail = q.has_bounds, q.low_m, q.high_m, residual_tail
@@ -482,9 +480,9 @@ def _locate(q: Acquisition, count: int, residual_tail: float) -> int:
 
 
 def _is_wide(q: Acquisition) -> bool:
-    """Whether ranges are curved within a start's standard deviation by more than their noise.
+    """Whether the curvature of the ranges within the start's standard deviation exceeds their noise.
 
-    Updates would then make the filter sure of a wrong position.
+    The linearised updates would then make the filter overconfident in a wrong position.
     """
     start, dims = q.start, 2 if q.knows_height else 3
     range_m = 0.0
@@ -498,16 +496,16 @@ def _is_wide(q: Acquisition) -> bool:
 
 
 def _is_worth_waiting(q: Acquisition) -> bool:
-    """Whether a wide start is held back: more anchors may come, or too few agree with it to use it as it is."""
+    """Whether a wide start is withheld: more anchors may still be heard, or too few support it."""
     start, dims = q.start, 2 if q.knows_height else 3
     waited_s = (start.rx_ticks_tag - q.wide_ticks) * TICK_S
     return start.count <= dims + 1 or waited_s <= q.tuning.start_patience_s
 
 
 def _solve_without_one(q: Acquisition, now: Ticks) -> int:
-    """If exactly one anchor contradicts all others, leave it out. The others must still be able to contradict.
+    """Exclude an anchor if it is the only one without which the others agree; enough must remain to detect a misfit.
 
-    If there is no such anchor for half a second, start from all of them as they are.
+    If there is no such anchor for ``start_patience_s``, start from all of them.
     """
     if not q.is_contradicted:
         q.is_contradicted, q.contradicted_ticks = True, now

@@ -1,4 +1,4 @@
-"""Which frames a tag admits: of the site in use, with stamps that are possible on its sender's and its own counter."""
+"""Which frames a tag accepts: those of its site whose stamps are possible on the sender's and on its own counter."""
 
 from math import log as _log
 from typing import Annotated, Final
@@ -46,41 +46,41 @@ from skyless.core.ticks import (
 )
 
 COUNTER_JUMP_TICKS: Final = from_seconds(1.0)
-"""Two stamps in a row that go back farther than radios and hosts reorder them mean that the tag's own counter has
+"""Two consecutive stamps that go back by more than radios and hosts reorder them mean that the tag's own counter has
 restarted; a single one is damaged."""
 
 ADMITTED: Final = STAMP_FITS
 FOREIGN_SITE, IMPOSSIBLE_HOST_TIME = range(len(STAMP_COUNTERS), len(STAMP_COUNTERS) + 2)
-"""What becomes of a frame, beside what its stamp is."""
+"""Further outcomes of a frame, beside those of its stamp."""
 DROP_COUNTERS: Final = (*STAMP_COUNTERS, ("foreign-site",), ("impossible-host-time",))
-"""By what each is counted."""
+"""Counter of each outcome."""
 
 COUNTER_JUMPED, HOST_JUMPED, SITE_CHANGED = 1, 2, 4
-"""What has happened: the tag's counter has restarted, its host's clock was set, or it uses another site."""
+"""Events: the tag's counter has restarted, its host's clock was set, or it uses another site."""
 
 
 @record
 class Admission(Record):
-    """What a tag knows of its own counter, of sites and of anchors."""
+    """What a tag knows of its own counter, of the sites and of the anchors."""
 
     own: Unwrapper
     former: Unwrapper
-    """``own`` before the frame at hand, restored where that is not admitted."""
+    """``own`` before the current frame; restored if that is rejected."""
     went_back: bool
-    """Whether the stamp of the newest frame is from before others by more than ``COUNTER_JUMP_TICKS``."""
+    """Whether the newest frame's stamp is earlier than others by more than ``COUNTER_JUMP_TICKS``."""
     choice: SiteChoice
     time: FixTime
     neighbours: Neighbours
     rx_ticks: Ticks
-    """The tag's stamp of the frame at hand, unwrapped."""
+    """The tag's unwrapped stamp of the current frame."""
     events: int
-    """What has happened since its owner last looked."""
+    """Events since the owner last looked."""
 
 
 def admit_sender(a: Admission, site: int, anchor: int, rx_counter: Ticks, host_s: float) -> int:
-    """Unwrap the tag's stamp of a frame, and find out whether its site is in use; ``ADMITTED`` or why not.
+    """Unwrap the tag's stamp of a frame and check its site. Returns ``ADMITTED`` or why it is rejected.
 
-    ``host_s``: the host's time of it, NaN where that is not known.
+    ``host_s``: the host's time of reception, NaN if unknown.
     """
     a.former = a.own
     a.rx_ticks = unwrap(a.own, rx_counter, host_s)
@@ -109,7 +109,7 @@ def admit_sender(a: Admission, site: int, anchor: int, rx_counter: Ticks, host_s
 
 
 def admit_stamp(a: Admission, anchor: int, sequence: int, tx_counter: Ticks, period_ticks: Ticks) -> int:
-    """Unwrap the TX stamp of a frame of the site in use; ``ADMITTED`` or why it is not used."""
+    """Unwrap the TX stamp of a frame of the site in use. Returns ``ADMITTED`` or why it is rejected."""
     stamp = unwrap_stamp(a.neighbours, anchor, sequence, tx_counter, a.rx_ticks, period_ticks)
     if stamp == STAMP_FITS:
         a.choice.heard_ticks = a.rx_ticks
@@ -119,10 +119,10 @@ def admit_stamp(a: Admission, anchor: int, sequence: int, tx_counter: Ticks, per
 
 
 def check(a: Admission) -> None:
-    """Check what compiled functions use as indices, in a record that may come from anywhere.
+    """Check the indices that compiled functions use, in a record from any source.
 
     Raises:
-        ValueError: one is beyond its table.
+        ValueError: an index is beyond its table.
     """
     limits = [
         ("anchors", a.neighbours.count, MAX_NEIGHBOURS),
@@ -141,35 +141,35 @@ def check(a: Admission) -> None:
             raise ValueError(f"the receiver's state has {number} {name}; it can have up to {most}")
 
 
-# Which anchors of a large site a tag uses: the strongest of those that other anchors receive too.
+# Which anchors of a large site a tag uses: the strongest of those that other anchors receive too
 
 BETTER_DB: Final = 3.0
-"""By which another anchor must be stronger to replace the weakest."""
+"""An anchor replaces the weakest one if it is stronger by this."""
 
 MIN_FITTING: Final = 2
-"""An anchor that relays this number of receptions of anchors in use, and they fit, is there."""
+"""An anchor exists if it relays at least this many receptions of anchors in use that fit."""
 
 POWER_GAIN: Final = 0.1
 """Weight of the newest value in the running mean of an anchor's received power."""
 
 MAX_POWER_DBM: Final = 1000.0
-"""No radio reports more, nor less than its negative."""
+"""Larger magnitudes are not a radio's power."""
 
 NOMINAL_POWER_DBM: Final = -63.0
-"""Assumed power at 1 m where the radio reports none, so that nearer anchors count as stronger."""
+"""Assumed power at 1 m if the radio reports none, so that nearer anchors count as stronger."""
 _DB_PER_LOG: Final = 20.0 / _log(10.0)
 MM_PER_M: Final = 1000
 
 
 def add_power(n: Neighbour, power_dbm: float) -> None:
-    """Process the power of a beacon; NaN where the radio reports none."""
+    """Update an anchor's mean power; NaN if the radio reports none."""
     if abs(power_dbm) <= MAX_POWER_DBM:
         n.power_dbm = n.power_dbm + POWER_GAIN * (power_dbm - n.power_dbm) if n.has_power else power_dbm
         n.has_power = True
 
 
 def add_relays(t: Neighbours, b: BeaconFields, rx_ticks: Ticks) -> None:
-    """Process what an anchor relays, so that it confirms others."""
+    """Mark the anchors that a beacon relays as confirmed."""
     for begin in range(0, b.relay_bytes, HEARD_BYTES):
         anchor = two_bytes(b.relays, begin)
         row = neighbour_of(t, anchor, rx_ticks)
@@ -178,10 +178,10 @@ def add_relays(t: Neighbours, b: BeaconFields, rx_ticks: Ticks) -> None:
 
 
 def fitting_relays(t: Neighbours, s: State, b: BeaconFields, rx_ticks: Ticks) -> int:
-    """How many receptions that an anchor relays fit what the tag has received itself: so it really receives them.
+    """Number of relayed receptions consistent with the tag's own, which proves that the anchor really receives them.
 
-    Only packets of anchors in use count. A reception fits if, on the anchor's counter, it lies as long before its own
-    frame as on the tag's, to 1 µs (300 m) and the drift of crystals.
+    Only packets of anchors in use count. A reception fits if it precedes the anchor's own frame by as much on the
+    anchor's counter as on the tag's, to 1 µs (300 m) and the drift of crystals.
     """
     fitting, bits = 0, SHORT_BITS if b.has_phases else TICK_BITS
     tx_ticks = t.rows[t.row].tx_ticks
@@ -197,7 +197,7 @@ def fitting_relays(t: Neighbours, s: State, b: BeaconFields, rx_ticks: Ticks) ->
 
 
 def replaced_by(t: Neighbours, s: State, origin_mm: Integers) -> int:
-    """The index of the anchor in use that the newest anchor should replace: the weakest; −1 where none is weaker."""
+    """Index of the weakest anchor in use if the newest anchor should replace it, otherwise −1."""
     weakest, least_dbm = -1, _power_dbm(t.rows[t.row], s, origin_mm) - BETTER_DB
     for index in range(s.count):
         row = find_neighbour(t, s.anchors[index].identifier)
@@ -207,7 +207,7 @@ def replaced_by(t: Neighbours, s: State, origin_mm: Integers) -> int:
 
 
 def _power_dbm(n: Neighbour, s: State, origin_mm: Integers) -> float:
-    """The mean power of an anchor or, where the radio reports none, a nominal one at its distance."""
+    """The mean power of an anchor; if the radio reports none, a nominal one at its distance."""
     if n.has_power:
         return n.power_dbm
     total = 0.0
@@ -217,11 +217,11 @@ def _power_dbm(n: Neighbour, s: State, origin_mm: Integers) -> float:
 
 
 def place_m(n: Neighbour, origin_mm: Integers, axis: int) -> float:
-    """A coordinate of an anchor from the origin."""
+    """A coordinate of an anchor relative to the origin."""
     return (n.place.position_mm[axis] - origin_mm[axis]) / MM_PER_M
 
 
-# What a tag of protocol 2 keeps beside its filter (``State``) and its search for a start (``Acquisition``).
+# A tag's state beside its filter (``State``) and its search for a start (``Acquisition``)
 
 
 @record
@@ -229,31 +229,31 @@ class Tag(Record):
     """A tag of protocol 2."""
 
     owner: EstimatorSettings
-    """What its owner has chosen; the site's pages state the rest."""
+    """Settings chosen by the tag's owner; the site's pages state the rest."""
     admission: Admission
     pages: SitePages
     course: Course
     has_settings: bool
-    """Whether the pages are known, so that it looks for a start or follows its course."""
+    """Whether the pages are known, so that the tag searches for a start or has a filter."""
     period_ticks: Ticks
-    """Longest mean time between two beacons of an anchor, when the settings were made."""
+    """Longest mean beacon period of an anchor when the settings were derived."""
     is_moving: bool
-    """Whether anchors of the site have stated other positions recently (``Neighbour.has_moved``)."""
+    """Whether anchors have stated other positions recently (``Neighbour.has_moved``)."""
     moved_ticks: Ticks
-    """When the last one did."""
+    """Time of the last such statement."""
     uses_moved: bool
-    """Whether those are in use, and not the others."""
+    """Whether the moved anchors are in use rather than the others."""
     origin_mm: Annotated[Integers, AXES]
-    """To be added to all positions, where ``HAS_ORIGIN``."""
+    """Origin of all positions, if ``HAS_ORIGIN``."""
     has_origin: bool
     most_relays: int
-    """Of a beacon that follows its course, the newest ones: fewer where its processor is late."""
-    # The beacon at hand
+    """Relays used of each beacon while there is a filter, newest first: fewer on a processor that falls behind."""
+    # The current beacon
     beacon: BeaconFields
     has_moved: bool
     """Whether its sender states another position than before."""
     packet: Packet
-    """The same for the filter."""
+    """The beacon as the filter takes it."""
     relays: Relays
     events: int
-    """What has happened with it (``admission.COUNTER_JUMPED`` and others)."""
+    """Its events (``COUNTER_JUMPED`` and others)."""

@@ -1,7 +1,7 @@
-"""A tag from its first packet on: it looks for a start, follows its course, and begins again where it is lost.
+"""A tag from its first packet on: search for a start, filtering, and starting again when the tag is lost.
 
-The filter's state and the search for a start are not used at the same time, so that a board may keep both in the same
-memory (``SHARES_MEMORY``): a filter begins with copies of what was found.
+The filter's state and the search are never used at the same time, so a board may keep both in the same memory
+(``SHARES_MEMORY``): a new filter starts from copies of the search's results.
 """
 
 from typing import Annotated, Final
@@ -35,59 +35,59 @@ from skyless.core.tag.position import FOUND, IMPOSSIBLE, MIRROR, RESIDUALS, UNSE
 from skyless.core.tag.search import LARGEST
 from skyless.core.ticks import TICK_S, FixTime, fix_time_ticks, from_seconds
 
-# A tag that knows where it is: what becomes of a packet, and when it has to begin again.
+# A tag with a filter: the outcome of each packet, and when the tag must start again.
 
 FIX, OUTLIER, LOST, START_CONTRADICTED, BAD_GEOMETRY = range(20, 25)
-"""What becomes of a packet. After ``LOST`` and ``START_CONTRADICTED`` the tag has to begin again."""
+"""Outcomes of a packet. After ``LOST`` and ``START_CONTRADICTED`` the tag must start again."""
 
 SURELY_IN_REACH_TICKS: Final = from_seconds(TUNING.short_silence_s) - 1
-"""Silences up to this need no check of the filter."""
+"""After silences up to this the filter predicts without a check."""
 
 
 NOBODY: Final = -1
-"""The identifier of no anchor."""
+"""Stands for no anchor."""
 
 
 @record
 class UsedAnchor(Record):
-    """An anchor in use."""
+    """An anchor whose packets were accepted recently."""
 
     anchor: int
     position_m: Annotated[Reals, AXES]
     rx_ticks: Ticks
-    """The tag's stamp of its last accepted packet."""
+    """Tag time of its last accepted packet."""
 
 
 @record
 class Course(Record):
-    """What has become of the starts so far, and whose packets were accepted recently."""
+    """The history of the tag's starts, and the anchors in use."""
 
     settings: EstimatorSettings
-    """Those with which a filter begins, as the next four."""
+    """Settings of the next filter, as are the next four fields."""
     tuning: Tuning
     dim: int
     horizontal_k: float
     vertical_k: float
     superframe_s: float
-    """Of slow sites, else 0."""
+    """Superframe of slow sites, otherwise 0."""
     most_anchors: int
-    """With which a filter begins, the nearest, and none that does not belong to the start; 0: with all."""
+    """A filter starts with at most this many anchors: those of the start, nearest first. 0: with all."""
     is_starting: bool = True
-    """Whether no position is known; else the search is not used, now the state is not."""
+    """Whether there is no position yet. While True the search is in use, otherwise the filter's state."""
     late_share: float
-    """That of the last filter."""
+    """Share of late packets that the last filter estimated."""
     misfit: int = NOBODY
-    """The anchor that contradicted the others at the start."""
+    """The anchor that was inconsistent with the others at the start."""
     alone: Annotated[Matrix, PROTECTED_ROWS, AXES]
-    """What a fix carries that is a start's, without a filter."""
+    """Rows of a fix that comes from a start alone, without a filter."""
     open_range_errors: bool
     """Whether the next start expects larger range errors than the settings state."""
     is_open: bool
-    """Whether the last start did."""
+    """Whether the last start did so."""
     start_was_contradicted: bool
     relays_may_contradict: bool = True
     may_begin_again: bool = True
-    """Whether a start that fits badly from the beginning is given up: not twice in a row."""
+    """Whether a start with a poor fit may be abandoned: not twice in a row."""
     heights_rejected: int
     master_less_tag_ticks: Ticks
     started_ticks: Ticks
@@ -95,21 +95,21 @@ class Course(Record):
     in_use_s: float
     """An anchor counts as in use while its last accepted packet is younger than this."""
     checked_ticks: Ticks
-    """When that was checked last."""
+    """Tag time of the last such check."""
     extent_m: float
-    """The largest span in x, y or z that anchors in use have had since the start."""
+    """Largest span of the anchors in use along x, y or z since the start."""
     changes: Count
-    """How often the anchors in use, or their positions, have changed."""
+    """Number of changes of the anchors in use or of their positions."""
     count: int
     used: Annotated[Array[UsedAnchor], MAX_ANCHORS]
     time_ticks: Ticks
-    """Of the newest fix, since the first one."""
+    """Time of the newest fix, counted from the first one."""
 
 
 def process_in_course(
     c: Course, s: State, time: FixTime, packet: Packet, relays: Relays, packed: Bytes, packed_bytes: int
 ) -> int:
-    """Process a packet of a tag that knows where it is, as ``process_frame``; what becomes of it."""
+    """Process a packet by ``process_frame`` while the tag has a filter. Returns the outcome."""
     outcome = process_frame(s, packet, relays, packed, packed_bytes)
     c.newest_ticks = max(c.newest_ticks, packet.rx_ticks)
     if outcome in (REJECTED, STALE):
@@ -121,7 +121,7 @@ def process_in_course(
 
 
 def settle(c: Course, s: State, time: FixTime, rx_ticks: Ticks) -> int:
-    """Whether the state is a fix: in three dimensions its height may be worse than the anchors' extent."""
+    """Return FIX or BAD_GEOMETRY: a 3-D fix needs a height standard deviation within the extent of the anchors."""
     if s.dim == AXES and s.P[at(2, 2)] > square(c.extent_m):
         return BAD_GEOMETRY
     c.time_ticks = fix_time_ticks(time, rx_ticks + c.master_less_tag_ticks, rx_ticks)
@@ -129,24 +129,24 @@ def settle(c: Course, s: State, time: FixTime, rx_ticks: Ticks) -> int:
 
 
 def is_surely_in_reach(c: Course, rx_ticks: Ticks) -> bool:
-    """Whether the last packet is so recent that the filter can predict from it without a check."""
+    """Whether the last packet is recent enough for the filter to predict without a check."""
     return 0 <= rx_ticks - c.newest_ticks < SURELY_IN_REACH_TICKS
 
 
 def _judge_start(c: Course, s: State, rx_ticks: Ticks) -> bool:
-    """Record what relays and faults say of the start. Return True if they contradict it, so that a new one is needed.
+    """Return True if relays or faults contradict the start, so that a new one is needed.
 
-    What the new start has to expect is then recorded as well.
+    Also records what the new start has to expect.
     """
     tuning = s.tuning
     if c.start_was_contradicted and is_late_often(s):
-        c.open_range_errors = c.start_was_contradicted = False  # it was by single late packets
+        c.open_range_errors = c.start_was_contradicted = False  # caused by single late packets
         return True
     age_s = (rx_ticks - c.started_ticks) * TICK_S
     if age_s >= tuning.new_start_s:
         c.may_begin_again = True
     elif c.may_begin_again and s.fix[QUALITY][0] > tuning.wrong_nis:
-        c.may_begin_again = False  # if it does not help, all is noisier than stated
+        c.may_begin_again = False  # if a new start does not help, everything is noisier than stated
         return True
     if c.is_open and age_s > tuning.new_start_s and fits_settings(s):
         c.open_range_errors = False
@@ -167,7 +167,7 @@ def _judge_start(c: Course, s: State, rx_ticks: Ticks) -> bool:
 
 
 def use_anchor(c: Course, place: Place, rx_ticks: Ticks) -> None:
-    """Note that a packet of an anchor was accepted, and forget those that have been silent for too long."""
+    """Record an accepted packet of an anchor, and drop the anchors that have been silent for too long."""
     index = 0
     while index < c.count and c.used[index].anchor != place.anchor:
         index += 1
@@ -210,7 +210,7 @@ def _forget_silent(c: Course, rx_ticks: Ticks) -> None:
 
 
 def _widen(c: Course, axis: int) -> None:
-    """Take the anchors' span along an axis into account."""
+    """Include the anchors' span along an axis in ``extent_m``."""
     lowest = highest = c.used[0].position_m[axis]
     for index in range(1, c.count):
         lowest = min(lowest, c.used[index].position_m[axis])
@@ -219,24 +219,23 @@ def _widen(c: Course, axis: int) -> None:
 
 
 START_FIX, SEARCHING, HAS_TOO_FEW, IS_MIRRORED, IS_UNSETTLED = range(25, 30)
-"""What becomes of a packet besides: a fix that is a start's alone (``Course.alone``), or why there is
-no start yet."""
+"""Further outcomes: a fix from a start alone (``Course.alone``), or why there is no start yet."""
 
 MAX_BEGINNING: Final = 2 * MAX_ANCHORS
 
 
 @record
 class Beginning(Record):
-    """What a filter begins with."""
+    """What a filter starts from."""
 
     start: Start
     count: int
     packets: Annotated[Array[HeardPacket], MAX_BEGINNING]
-    """In the order of their receptions."""
+    """In order of reception."""
 
 
 def begin_course(c: Course, q: Acquisition) -> None:
-    """Begin with the settings in ``c``, and with the packets that a search has gathered so far."""
+    """Search for a start with the settings in ``c``, keeping the packets gathered so far."""
     c.in_use_s = max(c.tuning.short_silence_s, 1.5 * c.superframe_s)
     c.open_range_errors = c.is_open = c.start_was_contradicted = False
     c.relays_may_contradict = c.may_begin_again = True
@@ -249,13 +248,13 @@ def begin_course(c: Course, q: Acquisition) -> None:
 
 
 def begin_again(c: Course, s: State, q: Acquisition) -> None:
-    """Give up the filter, but for what it knows of late packets."""
+    """Abandon the filter and search again. Only the share of late packets is kept."""
     c.late_share = s.status.late_share
     _begin_search(c, q)
 
 
 def _begin_search(c: Course, q: Acquisition) -> None:
-    """Look for a start, with nothing that a filter has received."""
+    """Set up the search. It keeps its packets only if no filter has run in between."""
     settings, tuning = c.settings, c.tuning
     if not c.is_starting:
         forget_all(q)
@@ -282,7 +281,7 @@ def follow(
     packed: Bytes,
     packed_bytes: int,
 ) -> int:
-    """Process a packet with more relays, as frames carry them; what becomes of it."""
+    """Process a packet whose further relays are still encoded (``packed``). Returns the outcome."""
     rx_ticks = packet.rx_ticks
     if not c.is_starting and not is_surely_in_reach(c, rx_ticks) and _is_out_of_reach(c, s, rx_ticks):
         begin_again(c, s, q)
@@ -296,7 +295,7 @@ def follow(
     if found != FOUND:
         return _outcome_of(found)
     if q.start.is_contradicted and not q.start.has_misfit and _was_late_often(c):
-        return OUTLIER  # single packets are late: others will not be
+        return OUTLIER  # single packets are late; the next ones will not be
     if c.superframe_s > c.tuning.longest_superframe_s:
         _fill_alone(c, q)
         c.time_ticks = fix_time_ticks(time, rx_ticks + c.master_less_tag_ticks, rx_ticks)
@@ -320,11 +319,11 @@ def _was_late_often(c: Course) -> bool:
     return c.late_share > c.tuning.late_often_share
 
 
-# Whether a filter can go on
+# Whether the filter can continue
 
 
 def _is_out_of_reach(c: Course, s: State, rx_ticks: Ticks) -> bool:
-    """Whether the filter cannot predict up to here: too long a silence for it, or the tag's counter fell back."""
+    """Whether the filter cannot predict to this time: the silence is too long, or the tag's counter went back."""
     tuning, silent_s = c.tuning, (rx_ticks - c.newest_ticks) * TICK_S
     if silent_s < -tuning.short_silence_s or silent_s > tuning.longest_silence_s:
         return True
@@ -335,7 +334,7 @@ def _is_out_of_reach(c: Course, s: State, rx_ticks: Ticks) -> bool:
 
 
 def _mean_range_m(c: Course, position_m: Reals) -> float:
-    """From a position to the anchors in use."""
+    """Mean distance from a position to the anchors in use."""
     total_m = 0.0
     for index in range(c.count):
         total_m += _distance_m(c, c.used[index].position_m, position_m)
@@ -343,18 +342,18 @@ def _mean_range_m(c: Course, position_m: Reals) -> float:
 
 
 def _distance_m(c: Course, one_m: Reals, other_m: Reals) -> float:
-    """Of two points, where the height is given a horizontal one."""
+    """Distance between two points; horizontal only if the height is given."""
     total = 0.0
     for axis in range(c.dim):
         total += square(one_m[axis] - other_m[axis])
     return sqrt(total)
 
 
-# From a start on
+# From a start to a filter
 
 
 def _use_only(c: Course, q: Acquisition) -> None:
-    """Use the anchors of a start and no others."""
+    """Make the anchors of the start the only ones in use."""
     c.count, c.extent_m = 0, 0.0
     for index in range(q.start.count):
         newest = q.heard[q.start.used[index]].newer.packet
@@ -362,7 +361,7 @@ def _use_only(c: Course, q: Acquisition) -> None:
 
 
 def _fill_alone(c: Course, q: Acquisition) -> None:
-    """Write what a start knows by itself: a position, and of the velocity that it is a tag's; no protection level."""
+    """Write a fix from the start alone: position, assumed speed, no protection level."""
     _use_only(c, q)
     for row in range(PROTECTED_ROWS):
         for axis in range(AXES):
@@ -378,9 +377,9 @@ def _fill_alone(c: Course, q: Acquisition) -> None:
 
 
 def _begin_filter(c: Course, s: State, q: Acquisition, relays: Relays) -> bool:
-    """Begin at the start's position, and process the packets that led there.
+    """Start the filter at the start's position and process the packets behind it.
 
-    False where anchors that are late may have moved it by more than their distance: it says nothing then.
+    Returns False if late anchors may have shifted the start by more than their distance; the start is useless then.
     """
     b = Beginning()
     b.start = q.start
@@ -424,10 +423,10 @@ def _begin_filter(c: Course, s: State, q: Acquisition, relays: Relays) -> bool:
 
 
 def _choose_packets(c: Course, q: Acquisition, b: Beginning) -> None:
-    """Copy the last packets of each anchor with which to begin.
+    """Choose the packets of each anchor that the filter starts with.
 
-    The start's residuals are those of each anchor's newer packet. If earlier packets contradicted each other and these
-    do not, an older one may be late. Its variance is then larger, where relays show the anchor's clock as well.
+    The start's residuals belong to each anchor's newer packet. If earlier packets were inconsistent and these are not,
+    an older one may be late, so its variance is increased where relays determine the anchor's clock too.
     """
     factor = 1.0
     if q.is_linked and q.is_contradicted and not q.start.is_contradicted:
@@ -441,7 +440,7 @@ def _choose_packets(c: Course, q: Acquisition, b: Beginning) -> None:
 
 
 def _insert_packet(b: Beginning, one: HeardPacket, factor: float) -> None:
-    """Add a packet behind those received earlier; ``factor`` is on its variance."""
+    """Insert a packet in order of reception; ``factor`` scales its variance."""
     place = b.count
     while place > 0 and b.packets[place - 1].packet.rx_ticks > one.packet.rx_ticks:
         b.packets[place] = b.packets[place - 1]
@@ -452,7 +451,7 @@ def _insert_packet(b: Beginning, one: HeardPacket, factor: float) -> None:
 
 
 def _is_chosen(c: Course, q: Acquisition, place: int) -> bool:
-    """Whether a filter begins with an anchor, given its place in the table of those that are heard."""
+    """Whether the filter starts with the anchor at index ``place`` of ``heard``."""
     start = q.start
     if c.most_anchors == 0 or (start.has_misfit and q.heard[place].newer.packet.place.anchor == start.misfit):
         return True

@@ -46,10 +46,10 @@ from skyless.core.tag.following import FIX, START_FIX, Course, begin_course, fol
 from skyless.core.tag.joint import fill_ages, read_accuracy
 from skyless.core.ticks import NEVER, TICK_RATE_HZ, TICK_S, from_seconds
 
-# What changes rarely for a tag of protocol 2: its site, the site's pages, its counter, anchors that move or join.
+# What changes rarely for a tag: its site, the site's pages, its counter, anchors that move or join.
 
 CELL_DROP_S: Final = 1.0
-"""After which silence an anchor leaves the estimator at least, where tags move from cell to cell."""
+"""An anchor leaves the estimator after at least this silence at sites where tags move from cell to cell."""
 
 MOVED_HOLD_TICKS: Final = from_seconds(0.3)
 MOVE_TICKS: Final = from_seconds(10.0)
@@ -59,11 +59,11 @@ has moved for ``MOVE_TICKS``. It switches to the moved ones once they are the ma
 ``MOVED_HOLD_TICKS``."""
 
 NO_PAGES, MOVED_ANCHOR, NO_POSITION, UNCONFIRMED_ANCHOR, WEAKER_ANCHOR = range(30, 35)
-"""What becomes of a beacon besides (``following.py``)."""
+"""Further outcomes of a beacon (see ``following.py``)."""
 JOINS: Final = 0
 
 
-# Its owner
+# Start, wake, counter restarts
 
 
 def begin_tag(
@@ -77,9 +77,9 @@ def begin_tag(
     integrity_risk: float,
     alert_limit_m: float,
 ) -> None:
-    """Begin to listen to a site or, with ``NO_SITE``, that with most anchors, and with an empty search.
+    """Initialise a tag that listens to one site or, with ``NO_SITE``, to the one with most anchors.
 
-    The rest is of ``EstimatorSettings``.
+    The other arguments are fields of ``EstimatorSettings``.
     """
     t.owner = EstimatorSettings()
     t.admission = Admission()
@@ -96,13 +96,10 @@ def begin_tag(
     _forget_moves(t)
 
 
-# Its counter and its site
-
-
 def wake(t: Tag, s: State, q: Acquisition, rx_counter: Ticks, slept_s: float) -> None:
-    """Begin again at the same site and near the same height, after a sleep in which the tag's counter was lost.
+    """Start again at the same site and near the same height after a sleep in which the tag's counter was lost.
 
-    ``rx_counter``: what it reads now.
+    ``rx_counter`` is the counter's present reading.
     """
     a, c = t.admission, t.course
     had_height = not c.is_starting and c.dim == AXES
@@ -121,7 +118,7 @@ def wake(t: Tag, s: State, q: Acquisition, rx_counter: Ticks, slept_s: float) ->
 
 
 def handle_events(t: Tag, q: Acquisition) -> None:
-    """Forget what has become useless with the beacon at hand."""
+    """Forget what the current beacon's events have made invalid."""
     t.events, t.admission.events = t.admission.events, 0
     if t.events & SITE_CHANGED != 0:
         t.pages = SitePages()
@@ -131,7 +128,7 @@ def handle_events(t: Tag, q: Acquisition) -> None:
 
 
 def _forget_stamps(t: Tag, q: Acquisition) -> None:
-    """The tag's counter has restarted: forget all but what the site has in common."""
+    """Forget everything but the site's own data, because the tag's counter has restarted."""
     t.pages.has_first = t.has_settings = False
     t.course.is_starting = True
     forget_all(q)
@@ -144,7 +141,7 @@ def _forget_stamps(t: Tag, q: Acquisition) -> None:
 
 
 def _read_pages(t: Tag) -> None:
-    """Make the settings that the pages in use require."""
+    """Derive the settings from the pages in use."""
     c, site = t.course, t.pages.used[SITE_KIND].contents
     c.settings = t.owner
     read_accuracy(c.settings, t.pages.used[NOISE_KIND].contents, t.pages.used[ACCURACY_KIND].contents)
@@ -156,14 +153,14 @@ def _read_pages(t: Tag) -> None:
 
 
 def begin_here(t: Tag, q: Acquisition) -> None:
-    """Begin with the pages in use."""
+    """Start with the pages in use."""
     _read_pages(t)
     begin_course(t.course, q)
     t.has_settings = True
 
 
 def _begin_with_pages(t: Tag, q: Acquisition) -> None:
-    """Begin with the pages in use, at a site whose anchors have the present periods."""
+    """Start with the pages in use and the longest period of the anchors that are present."""
     oldest_ticks: Ticks = 0
     neighbours = t.admission.neighbours
     for row in range(neighbours.count):
@@ -180,7 +177,7 @@ def _begin_with_pages(t: Tag, q: Acquisition) -> None:
 
 
 def _forget_unconfirmed(t: Tag, q: Acquisition) -> None:
-    """Forget the packets of anchors that no other confirms."""
+    """Forget the packets of anchors that no other anchor confirms."""
     neighbours = t.admission.neighbours
     for place in range(q.count - 1, -1, -1):
         anchor = q.heard[place].newer.packet.place.anchor
@@ -189,11 +186,11 @@ def _forget_unconfirmed(t: Tag, q: Acquisition) -> None:
             forget_packets(q, anchor)
 
 
-# Beacons that are not just the next of an anchor in use
+# Beacons that are more than the next one of an anchor in use
 
 
 def process_rare(t: Tag, s: State, q: Acquisition, frame: Bytes) -> int:
-    """Process the beacon at hand with its page, while anything is new: what becomes of it."""
+    """Process the current beacon while something is new: page, anchor, position or start. Returns the outcome."""
     a, c = t.admission, t.course
     n = a.neighbours.rows[a.neighbours.row]
     was_starting = c.is_starting
@@ -206,7 +203,7 @@ def process_rare(t: Tag, s: State, q: Acquisition, frame: Bytes) -> int:
         return MOVED_ANCHOR
     if not n.has_place:
         return NO_POSITION
-    if not t.has_settings:  # others may confirm the anchor before the pages are complete
+    if not t.has_settings:  # other anchors may confirm this one before the pages are complete
         take_relays(t.packet, t.relays, t.beacon.relays, t.beacon.relay_bytes)
         gather_packet(q, t.packet, t.relays)
         return NO_PAGES
@@ -214,7 +211,7 @@ def process_rare(t: Tag, s: State, q: Acquisition, frame: Bytes) -> int:
     if outcome != JOINS:
         return outcome
     outcome = follow(c, s, q, a.time, t.packet, t.relays, t.beacon.relays, t.beacon.relay_bytes)
-    if was_starting and not c.is_starting:  # from now on what anchors in use have received counts, and what those have
+    if was_starting and not c.is_starting:  # from now on only what anchors in use have received or relayed counts
         for row in range(a.neighbours.count):
             other = a.neighbours.rows[row]
             other.relayed_ticks = other.own_relays_ticks = NEVER
@@ -223,7 +220,7 @@ def process_rare(t: Tag, s: State, q: Acquisition, frame: Bytes) -> int:
 
 
 def _join(t: Tag, s: State, n: Neighbour) -> int:
-    """Whether an anchor is in use or may be: others have received it, and it is not weaker than those in use."""
+    """Return ``JOINS`` if an anchor is in use or may be: others confirm it, and it is no weaker than those in use."""
     c = t.course
     if not c.is_starting and find_anchor(s, n.anchor) >= 0:
         return JOINS
@@ -242,15 +239,15 @@ def _join(t: Tag, s: State, n: Neighbour) -> int:
 
 
 def _forget_moves(t: Tag) -> None:
-    """Use all anchors together."""
+    """Use all anchors together again."""
     t.is_moving, t.uses_moved, t.moved_ticks = False, False, NEVER
     for row in range(t.admission.neighbours.count):
         t.admission.neighbours.rows[row].has_moved = False
 
 
 def _separate_moved(t: Tag, s: State, q: Acquisition, n: Neighbour) -> None:
-    """An anchor states another position: it leaves, and where too few are left that have not, all begin again."""
-    if t.uses_moved and n.has_moved:  # those in use move a second time
+    """Take an anchor that states another position out of use. If too few anchors are left, start again."""
+    if t.uses_moved and n.has_moved:  # the anchors in use move a second time
         _forget_moves(t)
     n.has_moved, t.is_moving = True, True
     t.moved_ticks = max(t.moved_ticks, t.admission.rx_ticks)
@@ -263,7 +260,7 @@ def _separate_moved(t: Tag, s: State, q: Acquisition, n: Neighbour) -> None:
 
 
 def _follow_moves(t: Tag, q: Acquisition, n: Neighbour) -> None:
-    """End a move of anchors that is over; begin again with those that have moved once they are most."""
+    """End a move that is over, and start again with the moved anchors once they are the majority."""
     calm_ticks = t.admission.rx_ticks - t.moved_ticks
     if t.is_moving and calm_ticks >= MOVE_TICKS:
         _forget_moves(t)
@@ -280,7 +277,7 @@ def _is_kept_apart(t: Tag, n: Neighbour) -> bool:
 
 
 def _have_most_moved(t: Tag) -> bool:
-    """Whether most of the anchors that are there, with a position, have moved."""
+    """Whether most of the present anchors with a position have moved."""
     present, moved = 0, 0
     for row in range(t.admission.neighbours.count):
         n = t.admission.neighbours.rows[row]
@@ -291,7 +288,7 @@ def _have_most_moved(t: Tag) -> bool:
 
 
 MALFORMED: Final = 40
-"""The bytes are no beacon; the fault's number is added."""
+"""Added to the fault's number if the bytes are no beacon."""
 
 
 def hear_frame(
@@ -306,10 +303,10 @@ def hear_frame(
     first_path_power_dbm: float,
     phase_cycles: float,
 ) -> int:
-    """Process a frame from the air; what becomes of it.
+    """Process a frame from the air. Returns the outcome.
 
-    That is one of ``DROP_COUNTERS``, of ``following.py`` or this file, or ``MALFORMED`` and more.
-    ``host_s`` and the powers are NaN, and the phase is below 0, where they are not known.
+    That is one of ``DROP_COUNTERS``, of the outcomes in ``following.py`` or here, or ``MALFORMED`` plus a fault.
+    If unknown, ``host_s`` and the powers are NaN and the phase is negative.
     """
     fault = read_frame(frame, length, t.beacon)
     if fault != INTACT:
@@ -328,7 +325,7 @@ def hear_fields(
     first_path_power_dbm: float,
     phase_cycles: float,
 ) -> int:
-    """The same of a beacon that has been read already; its page stands in ``frame``."""
+    """Process a beacon that has been decoded into ``t.beacon``, with its page in ``frame``. Returns the outcome."""
     a, b = t.admission, t.beacon
     outcome = admit_sender(a, b.site, b.anchor, rx_counter, host_s)
     if outcome == ADMITTED:
@@ -350,7 +347,7 @@ def hear_fields(
 
 
 def _hear_admitted(t: Tag, s: State, q: Acquisition, n: Neighbour, frame: Bytes) -> int:
-    """Process a beacon that is admitted."""
+    """Process an admitted beacon. Returns the outcome."""
     c, b = t.course, t.beacon
     is_new = t.has_moved or t.is_moving or b.almanac_issue != t.pages.issue or not n.has_place
     if c.is_starting or is_new or find_anchor(s, b.anchor) < 0:
@@ -361,9 +358,9 @@ def _hear_admitted(t: Tag, s: State, q: Acquisition, n: Neighbour, frame: Bytes)
 
 
 def _confirm(t: Tag, s: State) -> bool:
-    """Process which anchors a beacon confirms by its relays; whether other anchors confirm its sender.
+    """Record the anchors this beacon confirms. Return True if its own sender is confirmed by others.
 
-    Only then its pages take part in the majority, and its relays confirm others.
+    Only then do its pages count for the majority and its relays confirm others.
     """
     b, rows, rx_ticks, is_starting = t.beacon, t.admission.neighbours, t.admission.rx_ticks, t.course.is_starting
     n = rows.rows[rows.row]
@@ -377,9 +374,9 @@ def _confirm(t: Tag, s: State) -> bool:
 
 
 def _has_too_few(s: State, rx_ticks: Ticks) -> bool:
-    """Whether fewer anchors in use are still received than a fix takes, so that relays of any anchor confirm.
+    """Whether fewer anchors in use are still received than a fix needs, so that relays of any anchor confirm.
 
-    A tag may come to where none of its anchors is received, nor receives the next ones: out of a lift.
+    This lets a tag go on where none of its anchors is received or receives the new ones, such as after a lift.
     """
     heard = 0
     for anchor in range(s.count):
@@ -390,7 +387,10 @@ def _has_too_few(s: State, rx_ticks: Ticks) -> bool:
 
 
 def keep_place(n: Neighbour, place: StatedPlace) -> bool:
-    """Keep where an anchor says that it is; whether that is used from now on instead of another place."""
+    """Keep the position that an anchor states. Return True if it is used from now on instead of another one.
+
+    Another position is used once it has been stated twice in a row.
+    """
     if n.has_place and _is_same(n.place, place):
         n.has_other = False
         return False
@@ -410,7 +410,7 @@ def _is_same(one: StatedPlace, other: StatedPlace) -> bool:
 
 
 def _fill_packet(t: Tag, n: Neighbour, factor: float) -> None:
-    """Write the beacon at hand as the filter takes it, but for its relays."""
+    """Fill ``t.packet`` from the current beacon, without its relays."""
     packet, place = t.packet, t.packet.place
     if HAS_ORIGIN and n.has_place and not t.has_origin:
         t.has_origin = True

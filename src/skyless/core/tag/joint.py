@@ -1,4 +1,4 @@
-"""``joint``: the estimator as a positioning method: cold start, packet by packet updates, new starts when lost."""
+"""``joint``: the estimator as a positioning method, with cold start, updates by packet, and restarts when lost."""
 
 import ctypes
 from typing import Final
@@ -42,7 +42,7 @@ from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S, FixTime
 
 
 class EstimationState(Struct, frozen=True, tag="joint"):
-    """All that an ``Estimation`` keeps."""
+    """The saved state of an ``Estimation``."""
 
     estimator: SavedEstimator
     start: bytes | None
@@ -50,7 +50,7 @@ class EstimationState(Struct, frozen=True, tag="joint"):
 
 
 class Estimation:
-    """One tag's estimator from the first beacon on."""
+    """One tag's estimator, from its first beacon on."""
 
     def __init__(
         self,
@@ -61,9 +61,9 @@ class Estimation:
         *,
         course: Course | None = None,
     ) -> None:
-        """``fix_time``: the receiver's, where it outlives this method; ``superframe_s``: of slow sites.
+        """``fix_time``: the receiver's, if it outlives this object. ``superframe_s``: of slow sites, otherwise 0.
 
-        ``course``: a tag's, with its settings.
+        ``course``: an existing tag's, with its settings.
         """
         if z_bounds_m is not None:
             settings = settings.changed(lowest_m=z_bounds_m[0], highest_m=z_bounds_m[1])
@@ -71,7 +71,7 @@ class Estimation:
         self._estimator = Estimator(settings)
         self._time = fix_time or FixTime()
         self._listed = -1
-        """The course's changes for which these are the anchors in use, and whether the height is known."""
+        """Value of ``course.changes`` at which the next three were listed."""
         self._anchors: tuple[int, ...] = ()
         self._anchors_m: Array = np.empty((0, 3))
         self._height_known = False
@@ -85,15 +85,15 @@ class Estimation:
         self.course = course
 
     def state(self) -> EstimationState:
-        """All that it keeps, as it is now."""
+        """Save the present state."""
         start = packed(self.search) if self.is_starting else None
         return EstimationState(self._estimator.save(not self.is_starting), start, packed(self.course))
 
     def restore(self, state: EstimationState) -> None:
-        """Continue from the state of one with the same settings.
+        """Continue from a state saved with the same settings.
 
         Raises:
-            ValueError: the estimator's arrays are not sound.
+            ValueError: the saved arrays are not valid.
         """
         course = unpacked(Course, state.course)
         if not 0 <= course.count <= MAX_ANCHORS:
@@ -111,25 +111,25 @@ class Estimation:
 
     @property
     def estimator(self) -> Estimator:
-        """The filter with all its states."""
+        """The filter."""
         return self._estimator
 
     @property
     def is_starting(self) -> bool:
-        """Whether no position is known yet."""
+        """Whether there is no position yet."""
         return self.course.is_starting
 
     def clock(self, anchor: int) -> tuple[int, float, float] | None:
-        """The tag's clock less that of an anchor in the state: whole ticks, the rest in metres, rate in m/s."""
+        """Tag's clock minus an anchor's: whole ticks, the rest in m, rate in m/s. None if it is not in the state."""
         return self._estimator.clock(anchor)
 
     @property
     def excluded(self) -> tuple[int, ...]:
-        """Anchors whose range error has jumped and not come back."""
+        """Anchors whose range error has jumped and not returned."""
         return self._estimator.obstructed
 
     def update(self, observation: Observation) -> Fix | NoFixReason:
-        """Process one observation; a fix for every accepted packet once started."""
+        """Process one observation. Once started, every accepted packet gives a fix."""
         if observation.tx_ticks_master is not None:
             self.course.master_less_tag_ticks = observation.tx_ticks_master - observation.rx_ticks_tag
         given, relays = self._packet(observation), observation.packed_relays
@@ -137,18 +137,18 @@ class Estimation:
         return self.result_of(_follow(self.course, state, self.search, self._time, *given, relays, len(relays)))
 
     def result_of(self, outcome: int) -> Fix | NoFixReason:
-        """What the outcome of a packet means."""
+        """Convert a packet's outcome to a fix or a reason."""
         if outcome == FIX:
             return self.fix(self._estimator.rows)
         return self.fix(view(self.course.alone).tobytes()) if outcome == START_FIX else REASONS[outcome]
 
     def fix(self, rows: bytes) -> Fix:
-        """The fix of the packet that was processed last."""
+        """The fix of the last packet, from its rows."""
         course = self.course
         if course.changes != self._listed:
             self._list_anchors()
         time_s, anchors, anchors_m = course.time_ticks * TICK_S, self._anchors, self._anchors_m
-        # in the order of the fields: with their names it takes as long as all the rest
+        # positional arguments: keywords would take as long as all the rest
         return Fix(time_s, rows, anchors, anchors_m, "joint", self._height_known, 1, self._requirement)
 
     def _list_anchors(self) -> None:
@@ -157,9 +157,9 @@ class Estimation:
         self._listed, self._height_known = self.course.changes, self.course.dim == AXES - 1
 
     def update_height(self, height_m: float, std_m: float) -> bool:
-        """Process the tag's height as a sensor measures it, at the newest packet; True if it was used.
+        """Process a height sensor's measurement at the time of the newest packet. Returns True if it was used.
 
-        Before a start it bounds the heights of the search. Where many in a row do not fit, the start was wrong.
+        Before a start it bounds the search. Many rejections in a row mean that the start was wrong.
         """
         if self.is_starting:
             margin_m = self.course.settings.gate * std_m
@@ -174,7 +174,7 @@ class Estimation:
         return used
 
     def coast(self, observation: Observation) -> Fix | NoFixReason:
-        """A fix when a packet came that was not used itself: by all others, and by what was relayed with it."""
+        """A fix for a packet that was not used itself, from all others and from the relays that it carried."""
         if self.is_starting:
             return NoFixReason.RESIDUALS
         return self.result_of(settle(self.course, self._estimator.state, self._time, observation.rx_ticks_tag))
@@ -200,7 +200,7 @@ class Estimation:
         return packet, relays
 
     def _report(self, observation: Observation) -> Report:
-        """What the anchor reports of its clock against the master's."""
+        """The anchor's report of its clock against the master's."""
         if observation.report is None or observation.tx_variance_m2 <= 0.0:
             return NO_REPORT
         return Report(*observation.report, observation.tx_variance_m2)
@@ -237,7 +237,7 @@ _SEARCH_SETTINGS: Final = (
     "error_variance_m2",
     "tuning",
 )
-"""The same of a search for a start; bounds of the height may be a sensor's."""
+"""The same for a search; height bounds are not among them because they may come from a sensor."""
 
 _begin_course: Final = compiled(begin_course)
 _begin_again: Final = compiled(begin_again)
@@ -245,12 +245,12 @@ _follow: Final = compiled(follow)
 
 
 def _restore_search(fresh: Acquisition, data: bytes) -> None:
-    """Continue a search from bytes that may come from anywhere: what compiled functions use as an index is checked.
+    """Restore a search from untrusted bytes, checking everything that compiled functions use as an index.
 
-    ``fresh``: one with the settings of this site.
+    ``fresh``: a search with the settings of this site.
 
     Raises:
-        ValueError: they are no bytes of one, or an index is beyond its table.
+        ValueError: the bytes are no search, or an index is beyond its table.
     """
     made = unpacked(Acquisition, data)
     for setting in _SEARCH_SETTINGS:
@@ -267,12 +267,12 @@ def _restore_search(fresh: Acquisition, data: bytes) -> None:
     ctypes.pointer(fresh)[0] = made
 
 
-# What the estimator assumes at a site, from its pages of noise and accuracy.
+# What the estimator assumes at a site, from its pages of noise and accuracy
 
 DROP_S: Final = 2.0
-"""An anchor that is silent for longer, or for four superframes, leaves the estimator."""
+"""An anchor leaves the estimator after this silence, or after four superframes if that is longer."""
 
-# Relays of packets that are older than both are not used.
+# Relays of older packets are not used; the longer of the two counts.
 RELAY_AGE_S: Final = 1.0
 RELAY_SUPERFRAMES: Final = 2.5
 
@@ -282,7 +282,7 @@ _ROUNDING_S2: Final = TICK_S**2 / 12.0
 
 
 def read_accuracy(e: EstimatorSettings, noise: Bytes, accuracy: Bytes) -> None:
-    """Fill in what the pages say."""
+    """Fill in the settings that the pages state."""
     fill_noise(e, _float_at(noise, 1), _float_at(noise, 5), _float_at(noise, 9), _float_at(noise, 13))
     e.survey_std_m = two_bytes(accuracy, 1) / STD_STEPS_PER_M
     e.range_std_m = two_bytes(accuracy, 3) / STD_STEPS_PER_M
@@ -295,20 +295,20 @@ def read_accuracy(e: EstimatorSettings, noise: Bytes, accuracy: Bytes) -> None:
 def fill_noise(
     e: EstimatorSettings, tx_stamp_s: float, rx_stamp_s: float, white_fm: float, random_walk_fm: float
 ) -> None:
-    """Fill in the variances of stamps and oscillators of this noise (``NoisePage``)."""
+    """Fill in the variances of stamps and oscillators (``NoisePage``)."""
     e.tx_variance_m2 = _LIGHT_2 * square(tx_stamp_s)
     e.rx_variance_m2 = _LIGHT_2 * (square(rx_stamp_s) + _ROUNDING_S2)
     e.white, e.walk = _LIGHT_2 * square(white_fm), _LIGHT_2 * square(random_walk_fm)
 
 
 def fill_ages(e: EstimatorSettings, superframe_s: float, drop_s: float) -> None:
-    """Fill in after which times packets and anchors count no more; anchors after ``drop_s`` at least."""
+    """Fill in the ages beyond which packets and anchors are dropped; anchors not before ``drop_s``."""
     e.drop_s = max(drop_s, 4.0 * superframe_s)
     e.relay_age_s = max(RELAY_AGE_S, RELAY_SUPERFRAMES * superframe_s)
 
 
 def _float_at(data: Bytes, at: int) -> float:
-    """The number in four bytes, which is 0 or, in IEEE 754, a positive one below 1; pages have been checked."""
+    """Decode an IEEE 754 number from four bytes; checked pages hold only 0 and positive numbers below 1."""
     bits = unsigned(data, at, 4)
     halvings, value = 150 - (bits >> 23), float(bits & 0x7FFFFF | 0x800000)
     if bits < 0x800000 or bits >= 0x80000000:

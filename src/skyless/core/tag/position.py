@@ -1,4 +1,4 @@
-"""The position of a set of TDoAs: by the search's minima, and ``locate``, its Python function."""
+"""Position from one set of TDoAs: choice among the search's minima, and ``locate``, the Python function."""
 
 from functools import cache
 from typing import Annotated, Final
@@ -27,19 +27,19 @@ from skyless.core.tag.search import (
 )
 
 FOUND, NO_COVARIANCE, COLLINEAR_ANCHORS, IMPOSSIBLE, UNSETTLED, SINGULAR, RESIDUALS, MIRROR, UNCERTAIN = range(9)
-"""Why there is no position: Σ is not positive definite; the anchors are in one line; a TDoA is larger than its anchors'
-distance; the iterations did not settle; the anchors determine no position there; no position fits; two fit equally
-well; the position's error exceeds its distance from the anchors."""
+"""Reasons for no position: Σ is not positive definite; the anchors are collinear; a TDoA exceeds its anchors' distance;
+the iteration did not converge; the anchors do not determine a position there; no position fits; two fit equally well;
+the position's error exceeds its distance from the anchors."""
 
 BOUND_SIGMAS: Final = 3.0  # a height may exceed the bounds by these sigmas if its mirror image exceeds them more
-IMPOSSIBLE_SIGMAS: Final = 6.0  # a TDoA that exceeds its anchors' distance by these sigmas belongs to no position
-# Mirror images have merged while the square of their distance from the plane is within these sigmas of zero.
+IMPOSSIBLE_SIGMAS: Final = 6.0  # a TDoA that exceeds its anchors' distance by these sigmas matches no position
+# Mirror images have merged if their squared distance from the plane is within these sigmas of zero.
 MERGED_SIGMAS: Final = 2.0
 
 
 @record
 class Found(Record):
-    """A position and how well it is known. Metres, site frame."""
+    """A position and its uncertainty. Metres, site frame."""
 
     has_mirror: bool
     dof: int
@@ -47,16 +47,16 @@ class Found(Record):
     chi2: float
     position_m: Annotated[Reals, 3]
     mirror_m: Annotated[Reals, 3]
-    """The other position that fits as well."""
+    """The other position that fits equally well."""
     covariance_m2: Annotated[Matrix, 3, 3]
     residuals_m: Annotated[Reals, MAX_ANCHORS]
     """Measured minus predicted TDoAs."""
 
 
 def find_position(p: LocateProblem, found: Found) -> int:
-    """Locate a tag by TDoAs whose numbers are finite; returns why there is no position.
+    """Locate a tag by finite TDoAs. Returns ``FOUND`` or the reason for no position.
 
-    Needs 4 anchors, with a given height 3; with fewer, no position is determined. The problem is used up.
+    Needs 4 anchors, or 3 with a given height. Overwrites the problem.
     """
     p.start_count = 0
     p.minimum_count = 0
@@ -71,7 +71,9 @@ def find_position(p: LocateProblem, found: Found) -> int:
     found.dof = p.anchors - 1 - p.dims
     below = _below_plane(best) if p.kind == PLANE else 0.0
     found.chi2 = best.chi2 + below
-    dof = max(found.dof + (1 if below > 0.0 else 0), 1)  # without any, residuals are zero unless nothing fits at all
+    dof = max(
+        found.dof + (1 if below > 0.0 else 0), 1
+    )  # with no redundancy, residuals are zero unless nothing fits at all
     if chi2_tail(dof, found.chi2) < p.residual_tail:
         return RESIDUALS
     if p.kind == PLANE:
@@ -83,7 +85,7 @@ def find_position(p: LocateProblem, found: Found) -> int:
 
 
 def _why_none(p: LocateProblem, status: int) -> int:
-    """The reason when no iteration ended in a minimum."""
+    """The reason if no iteration ended in a minimum."""
     for i in range(p.anchors - 1):
         anchor = p.anchors_m[i + 1]
         baseline_m = sqrt(anchor[0] * anchor[0] + anchor[1] * anchor[1] + anchor[2] * anchor[2])
@@ -96,13 +98,13 @@ def _why_none(p: LocateProblem, status: int) -> int:
 
 
 def _below_plane(minimum: Minimum) -> float:
-    """What the constraint s ≥ 0 adds to chi2: s²/σ_s² where the square of a distance came out negative."""
+    """Contribution of the constraint s ≥ 0 to chi2: s²/σ_s² if s is negative."""
     s = minimum.state[2]
     return s * s / minimum.covariance[5] if s < 0.0 else 0.0
 
 
 def _unfold(p: LocateProblem) -> None:
-    """From s = w² to w: the two images, or one in the plane where s cannot be distinguished from 0."""
+    """Convert s = w² to w: two mirror images, or one point in the plane if s is not distinguishable from 0."""
     best, image = p.minima[0], p.minima[1]
     s, sigma = best.state[2], sqrt(best.covariance[5])
     p.minimum_count = 1
@@ -128,7 +130,7 @@ def _unfold(p: LocateProblem) -> None:
 
 
 def _decide(p: LocateProblem, found: Found) -> int:
-    """Choose among rivals by the height's bounds, and reject what is not resolved."""
+    """Choose among rivals by the height bounds, and reject what stays ambiguous or too uncertain."""
     chosen = 0
     if p.minimum_count > 1:
         found.has_mirror = True
@@ -157,7 +159,7 @@ def _decide(p: LocateProblem, found: Found) -> int:
 
 
 def _chosen_by_height(p: LocateProblem) -> int:
-    """The only position within the bounds, else the one that exceeds them least and by little; −1 if there is none."""
+    """The only position within the height bounds, else the one that exceeds them least and by little; −1 if none."""
     chosen, equals, least_m = -1, 0, 0.0
     if not p.has_bounds:
         return chosen
@@ -201,14 +203,11 @@ def _fill_residuals(p: LocateProblem, found: Found, minimum: Minimum) -> None:
         found.residuals_m[i] = p.system[i][p.dims]
 
 
-# Positions from one set of TDoAs, without an initial guess and without hiding an ambiguity.
-#
-# ``search.py`` finds the minima: starts in closed form, then damped Gauss–Newton steps. They are unfolded from a plane
-# and decided between by the height's bounds.
+# The Python functions: no initial guess, and no hidden ambiguity
 
 _find_position = compiled(find_position)
 
-RESIDUAL_TAIL: Final = 1e-9  # residuals that noise exceeds this rarely are not noise
+RESIDUAL_TAIL: Final = 1e-9  # residuals with a smaller tail probability are not noise
 
 _REASONS: Final = {
     NO_COVARIANCE: (NoFixReason.BAD_GEOMETRY, "the TDoAs' covariance is not positive definite"),
@@ -227,24 +226,24 @@ _REASONS: Final = {
 
 
 class Solution(Struct, frozen=True, gc=False):
-    """A position and how well it is known. Arrays in metres, site frame."""
+    """A position and its uncertainty. Arrays in metres, site frame."""
 
     position_m: Array
     """Shape (3,)."""
     covariance_m2: Array
-    """Shape (3, 3); a given height has zeros."""
+    """Shape (3, 3); zeros for a given height."""
     residuals_m: Array
     """Measured minus predicted TDoAs, shape (n,)."""
     chi2: float
-    """rᵀΣ⁻¹r, also where the estimate is not weighted by Σ⁻¹."""
+    """rᵀΣ⁻¹r, even if the estimate is not weighted by Σ⁻¹."""
     dof: int
     mirror_m: Array | None
-    """The position that fits as well and that the height's bounds ruled out, shape (3,)."""
+    """The position that fits equally well and that the height bounds excluded, shape (3,)."""
     iterations: int
 
 
 class PseudorangeSolution(Solution, frozen=True, gc=False):
-    """A position together with the pseudoranges' common bias, for example a receiver's clock."""
+    """A position together with the common bias of the pseudoranges, such as a receiver's clock offset."""
 
     bias_m: float
     covariance_joint_m2: Array
@@ -270,15 +269,14 @@ def locate(
 ) -> Solution | NoSolution:
     """Locate a tag by TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``.
 
-    ``anchors_m``: shape (n + 1, 3), the reference first. ``covariance_m2``: Σ of the TDoAs, shape (n, n),
-    symmetric. ``height_m``: the tag's known height (2-D positioning; anchors may have any
-    heights). ``weighted=False`` minimises the plain sum of squares; its covariance still follows from Σ.
+    ``anchors_m``: shape (n + 1, 3), the reference first. ``covariance_m2``: Σ of the TDoAs, shape (n, n), symmetric.
+    ``height_m``: the tag's known height (2-D positioning; anchors may have any height). ``weighted=False`` minimises
+    the unweighted sum of squares; the covariance still follows from Σ.
 
-    Where two positions explain the data about equally well, as the two sides of the anchors' plane do
-    in 3-D, ``z_bounds_m`` may decide; else the answer is MIRROR. A tag so near that plane that the two have merged is
-    put into it, with a variance that covers both. Residuals less likely than ``residual_tail`` give RESIDUALS (0 lets
-    everything pass). No value raises; arrays that do not fit each other, and more than ``MAX_ANCHORS`` anchors, raise
-    ValueError.
+    If two positions explain the data about equally well, like the two sides of the anchors' plane in 3-D,
+    ``z_bounds_m`` may decide; otherwise the answer is MIRROR. A tag so near that plane that the two have merged is
+    placed in it, with a variance that covers both. Residuals less likely than ``residual_tail`` give RESIDUALS (0
+    accepts any). Values never raise; mismatched shapes and more than ``MAX_ANCHORS`` anchors raise ValueError.
     """
     anchors, tdoa = np.array(anchors_m, np.float64, ndmin=2), np.array(tdoa_m, np.float64, ndmin=1)
     covariance, count = np.array(covariance_m2, np.float64), len(tdoa)
@@ -319,7 +317,7 @@ def locate(
 
 @cache
 def _lower_triangle(size: int) -> tuple[Integers, Integers]:
-    """Rows and columns of a lower triangle's elements, row by row."""
+    """Row and column indices of a lower triangle, row by row."""
     return np.tril_indices(size)
 
 
@@ -346,8 +344,8 @@ def locate_pseudoranges(
 ) -> PseudorangeSolution | NoSolution:
     """Locate a tag by pseudoranges |p − anchors_m[i]| + bias with independent errors.
 
-    ``anchors_m``: shape (n, 3); ``pseudoranges_m`` and ``variances_m2``: shape (n,). The rest as in ``locate``,
-    which sees their differences against the first, with its variance in common; nothing is lost by that.
+    ``anchors_m``: shape (n, 3); ``pseudoranges_m`` and ``variances_m2``: shape (n,). The other arguments are those of
+    ``locate``, which gets the differences to the first pseudorange with its variance in common; this loses nothing.
     """
     anchors = np.array(anchors_m, np.float64, ndmin=2)
     pseudoranges, variances = np.array(pseudoranges_m, np.float64), np.array(variances_m2, np.float64)
@@ -374,7 +372,7 @@ def locate_pseudoranges(
 def _with_bias(
     solution: Solution, anchors: Array, pseudoranges: Array, weights: Array, dims: int
 ) -> PseudorangeSolution:
-    """Add the weighted mean of what the ranges leave over.
+    """Add the bias: the weighted mean of the ranges' residuals.
 
     That mean's own error is uncorrelated with all differences of pseudoranges, hence with the position p; so
     bias = mean − hᵀp with h the mean direction, and its covariances follow from p's.

@@ -1,6 +1,6 @@
 """``Receiver``: the protocol machine of one tag. Bytes and ticks in, fixes out; no I/O, no clock.
 
-It needs nothing but beacons of protocol 2: anchors state their positions, and the common pages of a site the rest.
+It needs only beacons of protocol 2: anchors state their positions, the site's common pages everything else.
 """
 
 import ctypes
@@ -41,75 +41,75 @@ from skyless.core.tag.hearing import (
 from skyless.core.tag.joint import DROP_S, Estimation, EstimationState, fill_ages, fill_noise
 from skyless.core.ticks import FixTime
 
-# What the receivers of both protocols have in common.
+# Common to the receivers of both protocols
 
 NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
 """Counters of a receiver that do not count dropped frames."""
 
 
 class MethodOptions(Struct, frozen=True):
-    """What the tag's owner configures."""
+    """Options that the tag's owner sets."""
 
     method: str
     """One of ``METHODS``."""
     qa: float
     """Spectral density of the tag's acceleration, m²/s³ per axis (filters)."""
     z_bounds_m: tuple[float, float] | None
-    """Decides between mirror solutions."""
+    """Height bounds that choose between mirror solutions."""
     integrity: IntegrityRequirement
-    """What is required of the protection levels (``joint``)."""
+    """Requirements for the protection levels (``joint``)."""
 
 
 class HeardSite(Struct, frozen=True):
-    """What beacons have made known of a site for others than the tag itself."""
+    """What a tag has learnt of its site from beacons, for other parts of the program."""
 
     anchors_m: dict[int, tuple[float, float, float]]
     """Positions of the anchors."""
     georeference: GeoreferencePage | None
     is_complete: bool
-    """Whether a georeference cannot come any more; protocol 1 does not say whether there is one."""
+    """Whether no georeference can follow; protocol 1 does not tell whether there is one."""
 
 
 class SiteListener(Protocol):
-    """What programs show of a tag, besides its fixes."""
+    """What programs show of a tag besides its fixes."""
 
     @property
     def counters(self) -> Counter[str]:
-        """Frames by what became of them."""
+        """Frames by outcome."""
 
     @property
     def reason(self) -> NoFixReason:
-        """Why the last frame has made no fix."""
+        """Why the last frame made no fix."""
 
     @property
     def site(self) -> int | None:
-        """Identifier of the site that it receives, None before the first beacon."""
+        """Identifier of the site in use; None before the first beacon."""
 
     @property
     def heard_site(self) -> HeardSite | None:
-        """The site in use, once all that a tag needs of it is known."""
+        """The site in use, once a tag knows all that it needs of it."""
 
     @property
     def multipath_m(self) -> tuple[float, float] | None:
-        """Standard deviation by which ranges change, and over which distance, where it exceeds what the site states."""
+        """Standard deviation and distance of changing range errors, if it exceeds the stated one."""
 
     @property
     def phase_anchors(self) -> tuple[int, ...]:
-        """Identifiers of the anchors the phases of whose carriers are in use."""
+        """Anchors whose carrier phases are in use."""
 
 
 class TagReceiver(SiteListener, Protocol):
-    """What programs, replays and simulations see of a tag. Bytes and ticks in, fixes out; no I/O, no clock."""
+    """A tag as programs, replays and simulations see it. Bytes and ticks in, fixes out; no I/O, no clock."""
 
     def hear(self, reception: Reception) -> Fix | None:
-        """Process a frame from the air; a fix if it made one, else ``reason`` is set."""
+        """Process a frame from the air. Returns a fix if it made one, otherwise sets ``reason``."""
 
     def state(self) -> Struct:
-        """All that it keeps, as it is now; to be used or encoded before its next frame, as parts are shared."""
+        """The present state. Shares memory with the receiver: use or encode it before its next frame."""
 
 
 class AdmissionState(Struct, frozen=True):
-    """What a ``BeaconReceiver`` keeps itself."""
+    """The saved state of a ``BeaconReceiver`` itself."""
 
     options: MethodOptions
     only_site: int | None
@@ -118,10 +118,10 @@ class AdmissionState(Struct, frozen=True):
 
 
 class BeaconReceiver(ABC):
-    """One listening tag that understands one protocol."""
+    """A listening tag that understands one protocol."""
 
     def __init__(self, options: MethodOptions) -> None:
-        """Make one that has heard nothing."""
+        """Create a tag that has heard nothing."""
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self._options = options
@@ -129,42 +129,42 @@ class BeaconReceiver(ABC):
     @property
     @abstractmethod
     def admission(self) -> Admission:
-        """What it knows of its own counter, of sites and of anchors."""
+        """What the tag knows of its own counter, of the sites and of the anchors."""
 
     @property
     def site(self) -> int | None:
-        """Identifier of the site that it receives, None before the first beacon."""
+        """Identifier of the site in use; None before the first beacon."""
         choice = self.admission.choice
         return _site_of(choice.only_site if choice.site == NO_SITE else choice.site)
 
     @property
     @abstractmethod
     def heard_site(self) -> HeardSite | None:
-        """The site in use, once all that a tag needs of it is known."""
+        """The site in use, once a tag knows all that it needs of it."""
 
     @property
     @abstractmethod
     def _estimation(self) -> Estimation | None:
-        """The method in use where it is ``joint``."""
+        """The estimator, if the method in use is ``joint``."""
 
     @property
     def multipath_m(self) -> tuple[float, float] | None:
-        """Standard deviation by which ranges change, and over which distance, where it exceeds what the site states."""
+        """Standard deviation and distance of changing range errors, if it exceeds the stated one."""
         return None if self._estimation is None else self._estimation.estimator.multipath_m
 
     @property
     def phase_anchors(self) -> tuple[int, ...]:
-        """Identifiers of the anchors the phases of whose carriers are in use."""
+        """Anchors whose carrier phases are in use."""
         return () if self._estimation is None else self._estimation.estimator.phase_anchors
 
     def hear_height(self, height_m: float, std_m: float) -> bool:
-        """Process a reading of the tag's height sensor, above the site's origin, at the present; True if it was used.
+        """Process a reading of the tag's height sensor above the site's origin. Returns True if it was used.
 
-        Only ``joint`` uses it. Before the first fix it bounds the heights of the search. Recordings do
-        not hold these readings, so a replay lacks them.
+        Only ``joint`` uses it. Before the first fix it bounds the search. Recordings lack these readings, and so do
+        replays.
 
         Raises:
-            ValueError: the height is not finite, or its standard deviation not a length.
+            ValueError: the height is not finite, or its standard deviation is not a positive length.
         """
         if not (isfinite(height_m) and 0.0 < std_m < inf):
             raise ValueError(
@@ -174,11 +174,11 @@ class BeaconReceiver(ABC):
         return method is not None and method.update_height(height_m, std_m)
 
     def continue_time_of(self, other: "BeaconReceiver", fix_time: FixTime) -> None:
-        """Count the tag's counter on as another receiver does, and the time of fixes from ``fix_time`` on."""
+        """Continue another receiver's counter, and count the time of fixes with ``fix_time``."""
         self.admission.time, self.admission.own = fix_time, other.admission.own
 
     def _count_events(self, events: int) -> None:
-        """Count what has happened to the tag's counter and site."""
+        """Count restarts of the tag's counter and changes of site."""
         if events & COUNTER_JUMPED:
             self.counters["counter-jump"] += 1
         if events & SITE_CHANGED:
@@ -190,7 +190,7 @@ class BeaconReceiver(ABC):
             self.counters[name] += 1
 
     def _judge(self, result: Fix | NoFixReason) -> Fix | None:
-        """Count what a beacon that is used has led to."""
+        """Count the result of a beacon that is used. Returns it if it is a fix."""
         if isinstance(result, Fix):
             self.counters["fixes"] += 1
             return result
@@ -204,7 +204,7 @@ class BeaconReceiver(ABC):
         return AdmissionState(self._options, only_site, dict(self.counters), self.reason)
 
     def _restore_admission(self, state: AdmissionState) -> None:
-        """Continue; raises ValueError where the admission, which has been restored already, is of another site."""
+        """Restore counters and options. Raises ValueError if the restored admission is invalid or of another site."""
         check(self.admission)
         if state.only_site != _site_of(self.admission.choice.only_site):
             raise ValueError(f"the receiver's state is of site {state.only_site}, and listens to another one")
@@ -217,11 +217,11 @@ def _site_of(site: int) -> int | None:
     return None if site == NO_SITE else site
 
 
-# The settings of a tag's filter from pages and options, and a receiver's state as values.
+# Settings of a tag's filter from pages and options; a receiver's state as values
 
 
 def as_required(settings: EstimatorSettings, options: MethodOptions) -> EstimatorSettings:
-    """The settings with what is required of the protection levels."""
+    """The settings with the requirements for the protection levels filled in."""
     return settings.changed(
         max_acceleration_mps2=options.integrity.max_acceleration_mps2,
         integrity_risk=options.integrity.risk,
@@ -231,14 +231,14 @@ def as_required(settings: EstimatorSettings, options: MethodOptions) -> Estimato
 
 
 def stamp_variances(noise: NoisePage) -> tuple[float, float]:
-    """Variances of a TX and of an RX stamp, m²."""
+    """Variances of a TX and of an RX timestamp, m²."""
     return stamp_variance_m2(noise.tx_stamp_s, rounded=False), stamp_variance_m2(noise.rx_stamp_s, rounded=True)
 
 
 def estimator_settings(
     qa: float, height_m: float | None, noise: NoisePage, accuracy: AccuracyPage, superframe_s: float
 ) -> EstimatorSettings:
-    """What the estimator assumes at a site with this noise and accuracy."""
+    """The estimator's settings at a site with this noise and accuracy."""
     settings = EstimatorSettings(
         qa=qa,
         height_m=height_m,
@@ -255,7 +255,7 @@ def estimator_settings(
 
 
 class ReceiverState(Struct, frozen=True, tag="protocol-2"):
-    """All that a ``Receiver`` keeps; to be used or encoded before its next frame, as they share some parts."""
+    """The saved state of a ``Receiver``. Shares memory with it: use or encode it before its next frame."""
 
     admission: AdmissionState
     tag: bytes
@@ -269,11 +269,11 @@ _UNUSED: Final = {
     UNCONFIRMED_ANCHOR: (NoFixReason.TOO_FEW_ANCHORS, "unconfirmed-anchor"),
     WEAKER_ANCHOR: (NoFixReason.TOO_FEW_ANCHORS, "weaker-anchor"),
 }
-"""Why there is no fix of a beacon that is admitted, and by what it is counted."""
+"""Reason for no fix, and counter, of an admitted beacon."""
 
 
 class Receiver(BeaconReceiver):
-    """One listening tag of protocol 2; its positioning method is ``joint``."""
+    """A listening tag of protocol 2, with the method ``joint``."""
 
     def __init__(
         self,
@@ -283,17 +283,17 @@ class Receiver(BeaconReceiver):
         z_bounds_m: tuple[float, float] | None = None,
         integrity: IntegrityRequirement | None = None,
     ) -> None:
-        """Make a tag that knows nothing yet.
+        """Create a tag that has heard nothing.
 
-        ``site`` is the only site to listen to, by default that with most anchors; ``qa`` the tag's process noise in
-        m²/s³; ``z_bounds_m`` decides between mirror solutions; ``integrity`` is the requirement for the protection
-        levels.
+        ``site``: the only site to listen to, by default the one with most anchors. ``qa``: process noise in m²/s³.
+        ``z_bounds_m``: height bounds that choose between mirror solutions. ``integrity``: requirements for the
+        protection levels.
         """
         super().__init__(MethodOptions(DEFAULT_METHOD, qa, z_bounds_m, integrity or IntegrityRequirement()))
         self._begin(NO_SITE if site is None else site)
 
     def _begin(self, site: int) -> None:
-        """Be a tag with these options that knows nothing yet."""
+        """Reset to a tag with these options that has heard nothing."""
         options, required = self._options, self._options.integrity
         limit_m = nan if required.alert_limit_m is None else required.alert_limit_m
         bounds_m = options.z_bounds_m or (-inf, inf)
@@ -304,15 +304,15 @@ class Receiver(BeaconReceiver):
         self._method = Estimation(self._tag.owner, course=self._tag.course)
 
     def state(self) -> ReceiverState:
-        """All that it keeps, as it is now; to be used or encoded before its next frame, as parts are shared."""
+        """The present state. Shares memory with the receiver: use or encode it before its next frame."""
         return ReceiverState(self._admission_state(), packed(self._tag), self._method.state())
 
     @classmethod
     def from_state(cls, state: ReceiverState) -> "Receiver":
-        """A receiver that continues with the same bits as the one with this state.
+        """Restore a receiver that continues bit by bit as the saved one would.
 
         Raises:
-            ValueError: no receiver has such a state.
+            ValueError: the state is invalid.
         """
         made, kept = cls(), unpacked(Tag, state.tag)
         _check(kept)
@@ -330,22 +330,22 @@ class Receiver(BeaconReceiver):
 
     @property
     def tag(self) -> Tag:
-        """What it keeps beside its filter, and the beacon at hand."""
+        """The tag's state beside its filter, with the current beacon."""
         return self._tag
 
     @property
     def admission(self) -> Admission:
-        """What it knows of its own counter, of sites and of anchors."""
+        """What the tag knows of its own counter, of the sites and of the anchors."""
         return self._tag.admission
 
     @property
     def almanac(self) -> LocalAlmanac:
-        """What it knows of its site."""
+        """What the tag knows of its site."""
         return LocalAlmanac(self._tag.pages, self._tag.admission.neighbours)
 
     @property
     def method(self) -> Estimation | None:
-        """The positioning method, None before the pages of the site are known."""
+        """The estimator; None before the pages of the site are known."""
         return self._method if self._tag.has_settings else None
 
     @property
@@ -354,14 +354,14 @@ class Receiver(BeaconReceiver):
 
     @property
     def heard_site(self) -> HeardSite | None:
-        """Positions of the anchors so far, and the georeference, once the pages of the site are known."""
+        """Known anchor positions and the georeference, once the pages of the site are known."""
         pages = self.almanac.pages
         return None if pages is None else HeardSite(self.almanac.points_m(), pages.georeference, is_complete=True)
 
     def hear(self, reception: Reception) -> Fix | None:
-        """Process a frame from the air; a fix if it made one, else ``reason`` is set.
+        """Process a frame from the air. Returns a fix if it made one, otherwise sets ``reason``.
 
-        What does not belong here is counted in ``counters`` and dropped; nothing on the air raises.
+        Unusable frames are counted in ``counters`` and dropped; no frame raises.
         """
         frame, diagnostics, host_s = reception.frame, reception.diagnostics, reception.host_s
         rx_dbm, first_path_dbm = (nan, nan) if diagnostics is None else powers_dbm(diagnostics)
@@ -388,7 +388,7 @@ class Receiver(BeaconReceiver):
         return self._after(outcome)
 
     def hear_beacon(self, beacon: Beacon, reception: Reception) -> Fix | None:
-        """Process a beacon that is decoded already, as ``hear`` does; the frame itself may be empty."""
+        """Process a decoded beacon as ``hear`` does; ``reception.frame`` may be empty."""
         page, self._tag.beacon = b"", fields_of(beacon)
         if beacon.page is not None:
             page, self._tag.beacon.page_at = b"\0" + encode_page(beacon.page), 1
@@ -399,7 +399,7 @@ class Receiver(BeaconReceiver):
         return self._after(outcome)
 
     def _after(self, outcome: int) -> Fix | None:
-        """What has become of a beacon."""
+        """Count a beacon by its outcome. Returns the fix, if it made one."""
         self._count_events(self._tag.events)
         if outcome < len(DROP_COUNTERS):
             self._count_drop(outcome)
@@ -420,10 +420,10 @@ _hear_fields: Final = compiled(hear_fields)
 
 
 def _check(t: Tag) -> None:
-    """Check what compiled functions use as an index, and the pages, in a record that may come from anywhere.
+    """Check everything in a record from any source that compiled functions use as an index, and the pages.
 
     Raises:
-        ValueError: one is beyond its table, or a page is damaged.
+        ValueError: an index is beyond its table, or a page is damaged.
     """
     pages = [*t.pages.used, *t.pages.collected]
     senders = [one.sender_count for one in t.pages.collected]

@@ -1,4 +1,4 @@
-"""The search for positions that explain a set of TDoAs: starts, descent, and the distinct minima."""
+"""Search for the positions that explain a set of TDoAs: starting points, descent, distinct minima."""
 
 from typing import Annotated, Final
 
@@ -14,43 +14,43 @@ from skyless.core.native.arithmetic import (
 )
 from skyless.core.native.records import MAX_ANCHORS, Array, Matrix, Reals, Record, record
 
-# A set of TDoAs, in the axes in which their solution is simplest.
+# A set of TDoAs, in the axes in which the solution is simplest
 
 TRIANGLE: Final = MAX_ANCHORS * (MAX_ANCHORS - 1) // 2
 SMALL_TRIANGLE: Final = MAX_COLUMNS * (MAX_COLUMNS + 1) // 2
 MAX_STARTS: Final = 9
 
 FREE, HEIGHT, PLANE = range(3)
-"""Kinds of problems: the state is (x, y, z); or (x, y), and its third element is the given height; or all anchors have
-z = 0, and it is (x, y, s) with s = z², negative where noise makes it so."""
+"""Kinds of problems. FREE: the state is (x, y, z). HEIGHT: it is (x, y), and its third element is the given height.
+PLANE: all anchors have z = 0, and it is (x, y, s) with s = z², negative where noise makes it so."""
 
-# Anchors are in one line, or one point, if their figure's width is below this part of its length.
+# Anchors are collinear if the width of their figure is below this fraction of its length.
 COLLINEAR: Final = 1e-6
-# Anchors are in one plane if they leave it by less than this part of the smallest TDoA sigma.
+# Anchors are coplanar if they deviate from the plane by less than this fraction of the smallest TDoA sigma …
 THIN_SIGMAS: Final = 0.1
-FLAT: Final = 1e-9  # or if they leave it by less than this part of their extent
+FLAT: Final = 1e-9  # … or of their extent.
 
 
 LARGEST: Final = 1e9
-"""Metres, or m²: anything beyond is no site, and no number here overflows before it."""
+"""Limit in m or m². No site is larger, and nothing here overflows below it."""
 
 
 @record
 class Minimum(Record):
-    """A minimum of the cost, in the problem's axes."""
+    """A local minimum of the cost, in the problem's axes."""
 
     iterations: int
     cost: float
     chi2: float
-    """rᵀΣ⁻¹r, also where the cost is not weighted by Σ⁻¹."""
+    """rᵀΣ⁻¹r, even if the cost is not weighted by Σ⁻¹."""
     state: Annotated[Reals, 3]
     covariance: Annotated[Reals, SMALL_TRIANGLE]
-    """A lower triangle; zeros for a given height."""
+    """Lower triangle; zeros for a given height."""
 
 
 @record
 class LocateProblem(Record):
-    """A set of TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``, and how far its solution is."""
+    """A set of TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``, and the state of its solution."""
 
     anchors: int
     knows_height: bool
@@ -61,29 +61,29 @@ class LocateProblem(Record):
     low_m: float
     high_m: float
     residual_tail: float
-    """Residuals that noise exceeds more rarely are not noise."""
+    """Residuals with a smaller tail probability are not noise."""
     anchors_m: Annotated[Matrix, MAX_ANCHORS, 3]
-    """The reference first; ``choose_axes`` moves them into its axes."""
+    """The reference first; ``choose_axes`` transforms them into its axes."""
     tdoa_m: Annotated[Reals, MAX_ANCHORS]
     covariance: Annotated[Reals, TRIANGLE]
-    """The lower triangle of Σ, and then of its factor L."""
+    """Lower triangle of Σ, later of its factor L."""
 
     kind: int
     dims: int
     """Number of unknowns."""
     extent_m: float
-    """Size of the anchors' figure."""
+    """Distance of the farthest anchor from the reference."""
     origin_m: Annotated[Reals, 3]
     axes: Annotated[Matrix, 3, 3]
-    """Its rows; a position is origin + axesᵀ·state."""
+    """In rows; a position is origin + axesᵀ·state."""
     scale: Annotated[Reals, 3]
-    """What the extent is for each unknown."""
+    """Scale of each unknown: the extent, or its square for s."""
 
     start_count: int
     minimum_count: int
     starts: Annotated[Matrix, MAX_STARTS, 3]
     minima: Annotated[Array[Minimum], MAX_STARTS]
-    """The best first."""
+    """Ascending in cost."""
 
     iterations: int
     state: Annotated[Reals, 3]
@@ -92,16 +92,16 @@ class LocateProblem(Record):
     system: Annotated[Matrix, MAX_ANCHORS, MAX_COLUMNS]
     """Rows [∂TDoA/∂state, measured − predicted]."""
     normal: Annotated[Reals, SMALL_TRIANGLE]
-    """The lower triangle of systemᵀ·system."""
+    """Lower triangle of systemᵀ·system."""
     next_normal: Annotated[Reals, SMALL_TRIANGLE]
     factor: Annotated[Reals, SMALL_TRIANGLE]
 
 
 def choose_axes(p: LocateProblem) -> bool:
-    """Move the anchors into axes with the reference at the origin, and choose the kind of problem.
+    """Transform the anchors into axes with the reference at the origin, and choose the kind of problem.
 
-    Without a given height, the axes are those of the anchors' figure, the longest first. False where the anchors are
-    in one line or in one point.
+    Without a given height, the axes are the principal axes of the anchors' figure, the longest first.
+    Returns False if the anchors are collinear.
     """
     m = Columns()
     m.rows = p.anchors
@@ -153,25 +153,25 @@ def _least_sigma_m(p: LocateProblem) -> float:
     return least_m
 
 
-# Gauss–Newton steps, damped after Levenberg and Marquardt where they fail, to a minimum of TDoAs' residuals.
+# Gauss–Newton steps, with Levenberg–Marquardt damping where they fail, to a minimum of the residuals
 
 CONVERGED, UNDETERMINED, DIVERGED, EXHAUSTED = range(4)
-"""How the iteration ended: in a minimum, where the unknowns are not determined, on its way to infinity, or not at all
-after ``MAX_ITERATIONS``."""
+"""How the iteration ended: in a minimum, with undetermined unknowns, on its way to infinity, or not within
+``MAX_ITERATIONS``."""
 MAX_ITERATIONS: Final = 200
-# The iteration ends with a step below this part of the anchors' extent (1 nm in 10 m).
+# The iteration ends with a step below this fraction of the anchors' extent (1 nm in 10 m) …
 STEP_TOLERANCE: Final = 1e-10
-# It also ends where a step promises to lower the cost by less than this part: steps of 10⁻⁷ sigma.
+# … or with a step that promises to lower the cost by less than this fraction: 10⁻⁷ sigma.
 GAIN_TOLERANCE: Final = 1e-13
-FAR_EXTENTS: Final = 1e4  # nobody locates a tag at ten thousand times the anchors' extent
+FAR_EXTENTS: Final = 1e4  # in anchors' extents; farther away is a divergence
 FIRST_DAMPING: Final = 1e-2
-MIN_DAMPING: Final = 1e-4  # smaller damping is none
+MIN_DAMPING: Final = 1e-4  # anything smaller is set to 0
 NEAREST_M2: Final = 1e-18
-"""A smaller square of a distance counts as this."""
+"""Lower limit of a squared distance."""
 
 
 def descend(p: LocateProblem) -> int:
-    """Move the state to the minimum of its surroundings; returns how it ended."""
+    """Move the state to the nearest minimum. Returns how the iteration ended."""
     gradient = p.dims * (p.dims + 1) // 2
     cost = assemble(p, p.state, p.normal)
     damping, growth = 0.0, 2.0
@@ -208,7 +208,7 @@ def descend(p: LocateProblem) -> int:
 
 
 def assemble(p: LocateProblem, state: Reals, normal: Reals) -> float:
-    """Linearise, whiten where it is weighted, and write systemᵀ·system into ``normal``; returns the cost."""
+    """Linearise, whiten if weighted, and write systemᵀ·system into ``normal``. Returns the cost."""
     linearise(p, state)
     if p.is_weighted:
         whiten_system(p)
@@ -224,7 +224,7 @@ def assemble(p: LocateProblem, state: Reals, normal: Reals) -> float:
 
 
 def linearise(p: LocateProblem, state: Reals) -> None:
-    """Write ``system``; an anchor at the very position has no direction and counts with zeros."""
+    """Write ``system``. An anchor at the state itself has no direction; its derivatives are zero."""
     reference_m, reference_x, reference_y, reference_z = 0.0, 0.0, 0.0, 0.0
     for i in range(p.anchors):
         anchor = p.anchors_m[i]
@@ -238,7 +238,7 @@ def linearise(p: LocateProblem, state: Reals) -> None:
             reference_m, reference_x, reference_y, reference_z = distance_m, x, y, z
         else:
             row = p.system[i - 1]
-            row[2] = z - reference_z  # and then the residual, where the height is given
+            row[2] = z - reference_z  # overwritten by the residual below if the height is given
             row[0] = x - reference_x
             row[1] = y - reference_y
             row[p.dims] = p.tdoa_m[i - 1] - (distance_m - reference_m)
@@ -257,7 +257,7 @@ def whiten_system(p: LocateProblem) -> None:
 
 
 def _find_damped_step(p: LocateProblem, damping: float) -> bool:
-    """Solve (N + damping·diag N)·step = gradient; False where the matrix is singular."""
+    """Solve (N + damping·diag N)·step = gradient. Returns False if the matrix is singular."""
     gradient = p.dims * (p.dims + 1) // 2
     for k in range(gradient):
         p.factor[k] = p.normal[k]
@@ -271,7 +271,7 @@ def _find_damped_step(p: LocateProblem, damping: float) -> bool:
 
 
 def _is_far(p: LocateProblem) -> bool:
-    """Whether the state has left for infinity, or is no number."""
+    """Whether the state has diverged or is NaN."""
     for j in range(p.dims):
         reach = abs(p.state[j]) / p.scale[j]
         if not (sqrt(reach) if p.kind == PLANE and j == 2 else reach) < FAR_EXTENTS:
@@ -280,7 +280,7 @@ def _is_far(p: LocateProblem) -> bool:
 
 
 def _eased(damping: float, ratio: float) -> float:
-    """Next damping after a success, by the ratio of what it gained to what was predicted (H. B. Nielsen 1999)."""
+    """Next damping after a success, from the ratio of the actual to the predicted gain (H. B. Nielsen 1999)."""
     if ratio < 0.5:
         damping = max(damping, FIRST_DAMPING)
     excess = 2.0 * ratio - 1.0
@@ -288,7 +288,7 @@ def _eased(damping: float, ratio: float) -> float:
     return eased if eased > MIN_DAMPING else 0.0
 
 
-# States from which the iterations start: from TDoAs in closed form, without a guess.
+# Starting points: closed-form solutions of the TDoAs, without an initial guess
 #
 # With the reference anchor at the origin, x the tag, ρ = |x| its distance from there, and the measured d_i = |x −
 # a_i| − ρ, squaring ρ + d_i = |x − a_i| leaves equations that are linear in x and ρ:
@@ -303,17 +303,17 @@ def _eased(damping: float, ratio: float) -> float:
 
 @record
 class Equations(Record):
-    """Linear equations of a start."""
+    """The linear equations of a closed-form start."""
 
     left: Columns
     right: Annotated[Reals, MAX_ANCHORS]
-    """What is known: (|a_i|² − d_i²)/2, less what a given height contributes."""
+    """Right-hand side: (|a_i|² − d_i²)/2, less the contribution of a given height."""
     u: Annotated[Reals, MAX_COLUMNS]
     v: Annotated[Reals, MAX_COLUMNS]
 
 
 def add_algebraic_starts(p: LocateProblem) -> None:
-    """Add what the closed forms find."""
+    """Add the closed-form solutions as starting points."""
     coordinates = 3 if p.kind == FREE else 2
     if p.kind != PLANE:
         _add_intersections(p, coordinates)
@@ -326,7 +326,7 @@ def add_algebraic_starts(p: LocateProblem) -> None:
 def _add_intersections(p: LocateProblem, coordinates: int) -> None:
     """Add the points x = u − v·ρ for each non-negative root ρ of |x|² = ρ².
 
-    Where noise leaves no real root, the vertex of the parabola is used. The roots' form does not cancel.
+    If noise leaves no real root, the parabola's vertex is used. The roots are computed without cancellation.
     """
     e = Equations()
     _fill(p, e, coordinates, False)
@@ -357,7 +357,7 @@ def _add_at_distance(p: LocateProblem, e: Equations, distance_m: float) -> None:
 
 
 def _add_interpolation(p: LocateProblem, coordinates: int) -> None:
-    """Add the solution of the equations for these coordinates and ρ; with two of three, both that have this ρ."""
+    """Add the solution for these coordinates and ρ; with two of three coordinates, both points at the distance ρ."""
     e = Equations()
     _fill(p, e, coordinates, True)
     if not least_squares(e.left, e.right, e.u):
@@ -377,7 +377,7 @@ def _add_interpolation(p: LocateProblem, coordinates: int) -> None:
 
 
 def _fill(p: LocateProblem, e: Equations, coordinates: int, has_distance: bool) -> None:
-    """Write the equations for these coordinates and, if it has it, for ρ."""
+    """Write the equations for these coordinates and, if ``has_distance``, for ρ."""
     m = e.left
     m.rows = p.anchors - 1
     m.columns = coordinates + (1 if has_distance else 0)
@@ -392,12 +392,12 @@ def _fill(p: LocateProblem, e: Equations, coordinates: int, has_distance: bool) 
 
 
 def _given_height_m(p: LocateProblem) -> float:
-    """The given height above the reference anchor; 0 where none is given."""
+    """The given height relative to the reference anchor; 0 if none is given."""
     return p.height_m - p.origin_m[2] if p.kind == HEIGHT else 0.0
 
 
 def add_central_starts(p: LocateProblem) -> None:
-    """Add the anchors' centroid; where the height is unknown, half their extent off their plane."""
+    """Add the anchors' centroid; if the height is unknown, shifted off their plane by half their extent."""
     x, y, z, off_m = 0.0, 0.0, 0.0, 0.5 * p.extent_m
     for i in range(p.anchors):
         x += p.anchors_m[i][0] / p.anchors
@@ -411,7 +411,7 @@ def add_central_starts(p: LocateProblem) -> None:
 
 
 def add_image(p: LocateProblem) -> None:
-    """Add the state's mirror image behind the anchors' line or plane of least squares; a given height stays."""
+    """Add the mirror image of the state in the anchors' least-squares line or plane; a given height stays."""
     m = Columns()
     m.rows = p.anchors
     m.columns = p.dims
@@ -440,19 +440,19 @@ def _add(p: LocateProblem, x: float, y: float, z: float) -> None:
     p.start_count += 1
 
 
-# Two iterations ended in one point if that is within this part of the extent, which is far above their tolerance.
+# Two iterations ended in the same point if they are closer than this fraction of the extent, far above tolerance.
 SAME_POINT: Final = 1e-6
-# A second minimum is a rival while its chi2 is less than this above the best one (a likelihood ratio of 90).
+# A second minimum is a rival if its chi2 exceeds the best one's by less than this (a likelihood ratio of 90).
 RIVAL_MINIMUM_CHI2: Final = 9.0
-# Two minima are distinct where one lies outside the 3-sigma ellipsoid of the other.
+# Two minima are distinct if one lies outside the 3-sigma ellipsoid of the other.
 DISTINCT_MINIMA_CHI2: Final = 9.0
 
 
 def find_minima(p: LocateProblem) -> int:
-    """Fill ``minima`` with all that are found, the best first; returns how the last iteration that failed ended.
+    """Fill ``minima``, the best first. Returns how the last failed iteration ended, ``CONVERGED`` if none failed.
 
-    The closed form's starts depend on the reference and miss about one rival in a hundred; the anchors' centroid
-    finds most of these, and the mirror image of what is found the rest where anchors are nearly in one line or plane.
+    The closed-form starts depend on the reference and miss about one rival in a hundred. The anchors' centroid finds
+    most of these, and the mirror image of a minimum the rest, where anchors are nearly collinear or coplanar.
     """
     add_algebraic_starts(p)
     add_central_starts(p)
@@ -472,7 +472,7 @@ def find_minima(p: LocateProblem) -> int:
 
 
 def _is_found(p: LocateProblem) -> bool:
-    """Whether the state is at a minimum that has been found before."""
+    """Whether the state is at a minimum that was found before."""
     for index in range(p.minimum_count):
         apart = 0.0
         for j in range(p.dims):
@@ -483,9 +483,9 @@ def _is_found(p: LocateProblem) -> bool:
 
 
 def _assess(p: LocateProblem) -> None:
-    """Insert the minimum at the state, unless it is singular there.
+    """Insert the minimum at the state, unless it is singular.
 
-    Its covariance is G·Σ·Gᵀ with the G of the estimate, (HᵀΣ⁻¹H)⁻¹HᵀΣ⁻¹ or, not weighted, (HᵀH)⁻¹Hᵀ.
+    Its covariance is G·Σ·Gᵀ with the estimator's G: (HᵀΣ⁻¹H)⁻¹HᵀΣ⁻¹ or, unweighted, (HᵀH)⁻¹Hᵀ.
     """
     found = Minimum()
     found.iterations = p.iterations
@@ -503,7 +503,7 @@ def _assess(p: LocateProblem) -> None:
             for k in range(j + 1):
                 found.covariance[element] += p.step[j] * p.step[k]
                 element += 1
-    if not found.covariance[p.dims * (p.dims + 1) // 2 - 1] > 0.0:  # too small for a number
+    if not found.covariance[p.dims * (p.dims + 1) // 2 - 1] > 0.0:  # underflow
         return
     if not p.is_weighted:
         whiten_system(p)
@@ -518,7 +518,7 @@ def _assess(p: LocateProblem) -> None:
 
 
 def _find_gain(p: LocateProblem, index: int) -> None:
-    """Write a column of G·L into ``step``; where it is weighted, ``system`` holds L⁻¹·H."""
+    """Write a column of G·L into ``step``; if weighted, ``system`` is L⁻¹·H."""
     for j in range(p.dims):
         if p.is_weighted:
             p.step[j] = p.system[index][j]
@@ -530,7 +530,7 @@ def _find_gain(p: LocateProblem, index: int) -> None:
 
 
 def keep_rivals(p: LocateProblem) -> None:
-    """Keep the best minimum and those that explain the TDoAs about as well from somewhere else."""
+    """Keep the best minimum and the distinct ones that explain the TDoAs about as well."""
     kept, best = 1, p.minima[0]
     for index in range(1, p.minimum_count):
         other = p.minima[index]

@@ -1,15 +1,10 @@
 """The picture of a replay: track and height over truth, errors and stated σ over time, histograms of the errors."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from skyless.core.arrays import Matrix, Vector
-
-if TYPE_CHECKING:
-    pass
 
 
 def track_figure(rows: Matrix, title: str) -> Figure:
