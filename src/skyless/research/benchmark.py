@@ -45,25 +45,25 @@ _TRUTHS: Final = ("_pose", "_truth", "_lighthouse")
 _ANCHORS: Final = ("anchors*.csv", "anchors/anchors*.csv", "anchor_positions.yaml")
 
 _SMALLEST: Final = 200
-"""Bytes that a recording has at least."""
+"""Smallest size of a recording in bytes."""
 
 
 class Found(Struct, frozen=True):
-    """A recording and what belongs to it."""
+    """A recording with its companion files."""
 
     name: str
-    """Its path from the folder, without endings."""
+    """Path relative to the folder, without endings."""
     path: Path
     format: str
     truth: Path | None = None
-    """A table of the body's positions beside it."""
+    """Table of the body's positions beside it."""
     anchors: Path | None = None
     has_body_truth: bool = False
-    """Whether the truth, of the table or in the recording itself, is of the body that carries the antenna."""
+    """Whether the truth, in the table or in the recording, is of the body that carries the antenna."""
 
 
 def recordings_below(folder: Path) -> Iterator[Found]:
-    """All recordings that can be read, by their content, in the order of their names."""
+    """All readable recordings, recognised by content, in order of name."""
     paths = sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
     truths = {companion for path in paths if (companion := truth_of(path))}
     for path in paths:
@@ -84,7 +84,7 @@ def recordings_below(folder: Path) -> Iterator[Found]:
 
 
 def truth_of(path: Path) -> Path | None:
-    """The table of truth that lies beside a recording."""
+    """The table of truth beside a recording."""
     companions = (path.with_name(_TABLE.sub(word, path.name)) for word in _TRUTHS if _TABLE.search(path.name))
     return next((one for one in companions if one.is_file()), None)
 
@@ -92,7 +92,7 @@ def truth_of(path: Path) -> Path | None:
 def anchors_of(path: Path, folder: Path) -> Path | None:
     """The nearest table of anchors: one of ``_ANCHORS`` beside the recording or above.
 
-    Of several the one whose ending stands in the recording's path, as ``const1`` of ``anchors_const1.csv``.
+    Of several, the one whose suffix is in the recording's path, as ``const1`` of ``anchors_const1.csv``.
     """
     for place in (one for one in path.parents if one == folder or folder in one.parents):
         tables = sorted(table for name in _ANCHORS for table in place.glob(name))
@@ -115,11 +115,11 @@ def anchors_of(path: Path, folder: Path) -> Path | None:
 
 GATE, BITCRAZE = range(2)
 TDOA_STD_M: Final = {GATE: 0.22, BITCRAZE: 0.15}
-"""Noise of a difference: without tuning, and the default of Bitcraze's firmware."""
+"""Noise of a difference: untuned, and the default of Bitcraze's firmware."""
 
 QA_M2PS3: Final = 2.0
-"""Density of the acceleration. From 1 to 9 errors of most flights change by less than a tenth; from 4 on some noisy
-logs diverge."""
+"""Spectral density of the acceleration. From 1 to 9, errors of most flights change by less than a tenth; from 4 on
+some noisy logs diverge."""
 
 GATE_STD: Final = 3.0
 START_STD_M: Final = 0.1
@@ -135,8 +135,8 @@ def plain_track(
 ) -> tuple[Matrix, Array]:
     """Positions after each of n differences, shape (n, 3), and their covariances, shape (n, 3, 3).
 
-    ``a_m`` and ``b_m``: the anchors' positions, shape (n, 3); a difference is the range to b less that to a. ``start``:
-    position and velocity, shape (6,); the height stays as it is where ``is_planar``.
+    ``a_m`` and ``b_m``: the anchors' positions, shape (n, 3); a difference is the range to b minus that to a.
+    ``start``: position and velocity, shape (6,); the height is fixed if ``is_planar``.
     """
     axes = np.array([1.0, 1.0, 0.0 if is_planar else 1.0])
     P = np.diag(np.concatenate([axes * START_STD_M**2, axes * START_STD_MPS**2]))
@@ -202,14 +202,14 @@ def _run(
 # Estimators without a filter, as they are written in an afternoon: a gradient, and least squares over a window.
 
 _STEP: Final = 0.2
-"""Share of a difference's error that a step takes away."""
+"""Share of a difference's error corrected in one step."""
 
 _WINDOW, _BETWEEN, _ITERATIONS = 30, 10, 5
-"""Differences that are fitted at a time, those from one fit to the next, and iterations of each."""
+"""Differences per fit, differences between fits, and iterations of each fit."""
 
 
 class Gradient:
-    """Goes a step down the gradient of each difference's error, from the middle of the first two anchors."""
+    """Steps down the gradient of each difference's error, starting between the first two anchors."""
 
     def __init__(self) -> None:
         self._position_m: Vector | None = None
@@ -225,7 +225,7 @@ class Gradient:
 
 
 class LeastSquares:
-    """Fits a position to the newest differences, by Gauss and Newton from the one before."""
+    """Fits a position to the newest differences by Gauss–Newton, starting from the previous one."""
 
     def __init__(self) -> None:
         self._rows: list[tuple[float, ...]] = []
@@ -247,7 +247,7 @@ class LeastSquares:
 
 
 def _errors(position_m: Vector, a_m: Array, b_m: Array, tdoa_m: Vector) -> tuple[Vector, Array]:
-    """Differences less those at a position, shape (n,), and their slopes there, shape (n, 3)."""
+    """Residuals of differences at a position, shape (n,), and their gradients there, shape (n, 3)."""
     to_a, to_b = position_m - a_m, position_m - b_m
     range_a, range_b = (np.maximum(np.linalg.norm(to, axis=1), 1e-3) for to in (to_a, to_b))
     return tdoa_m - (range_b - range_a), to_b / range_b[:, None] - to_a / range_a[:, None]
@@ -257,17 +257,17 @@ JOINT, SMOOTHED, CALIBRATED, PLAIN, BITCRAZE_RULE = "joint", "joint-smoothed", "
 RULES: Final = {PLAIN: GATE, BITCRAZE_RULE: BITCRAZE}
 SIMPLE: Final = {"gradient": Gradient, "least-squares": LeastSquares}
 BEST: Final = "best simple"
-"""The best of ``PLAIN`` and ``SIMPLE`` on each recording, known afterwards."""
+"""The best of ``PLAIN`` and ``SIMPLE`` on each recording, chosen in hindsight."""
 
 DRAWN: Final = 600
-"""Fixes of a recording that its pictures show."""
+"""Fixes of a recording in its pictures."""
 
 SPEED_OVER_S: Final = 0.1
-"""The plain filters' velocity at the start is that of the truth over so long."""
+"""The plain filters start with the truth's mean velocity over this time."""
 
 
 class Result(Struct, frozen=True):
-    """A recording by a method."""
+    """A recording's result by one method."""
 
     recording: str
     method: str
@@ -275,7 +275,7 @@ class Result(Struct, frozen=True):
     reason: str = ""
     """Why there are no figures."""
     drawn: tuple[tuple[float | None, ...], ...] = ()
-    """Rows of time, position, truth, and levels of an even sample of the fixes; None where it is not known."""
+    """Rows of time, position, truth and levels of an even sample of the fixes; None if unknown."""
 
 
 class Asked(Struct, frozen=True):
@@ -297,7 +297,7 @@ class Asked(Struct, frozen=True):
 
 
 def methods_of(found: Found, asked: Asked, calibrated: Collection[Path | None]) -> Iterator[str]:
-    """The methods that a recording is replayed by; ``calibrated``: tables of anchors that are calibrated."""
+    """Methods for replaying a recording; ``calibrated``: tables of anchors that are calibrated."""
     yield JOINT
     if found.format == SITE_FORMAT:
         return
@@ -310,7 +310,7 @@ def methods_of(found: Found, asked: Asked, calibrated: Collection[Path | None]) 
 def results_of(
     found: Sequence[Found], asked: Asked, kept: Path, on_progress: Callable[[float], None]
 ) -> Iterator[Result]:
-    """All results, as they come; those in the folder ``kept`` are not computed again."""
+    """Yield all results as they come; those in the folder ``kept`` are not computed again."""
     calibrated = {one.anchors for one in found if asked.is_calibrated_on(one)}
     cells = [(one, method) for one in found for method in methods_of(one, asked, calibrated)]
     calibrations: dict[Path, DifferenceCalibration] = {}
@@ -330,7 +330,7 @@ def results_of(
 
 
 def with_best(results: Sequence[Result]) -> Iterator[Result]:
-    """The results, and for each recording that of ``PLAIN`` or ``SIMPLE`` with the smallest error once more."""
+    """The results, plus for each recording the one of ``PLAIN`` and ``SIMPLE`` with the smallest error."""
     yield from results
     simple = [(_error_m(one), one) for one in results if one.method in {PLAIN, *SIMPLE} and one.figures]
     for recording in dict.fromkeys(one.recording for _, one in simple):
@@ -340,13 +340,13 @@ def with_best(results: Sequence[Result]) -> Iterator[Result]:
 
 
 def _error_m(result: Result) -> float:
-    """The RMSE, in 3-D where the recording has heights; infinite where there is none."""
+    """The RMSE, in 3-D if the recording has heights; infinite without figures."""
     figures = result.figures
     return np.inf if figures is None else figures.rmse_3d_m or figures.rmse_2d_m or np.inf
 
 
 def _kept(file: Path) -> tuple[Result, ...] | None:
-    """Results of an earlier run; None where there are none, or they are damaged."""
+    """Results of an earlier run; None if missing or damaged."""
     try:
         return msgspec.json.decode(file.read_bytes(), type=tuple[Result, ...])
     except (FileNotFoundError, msgspec.DecodeError):
@@ -355,12 +355,12 @@ def _kept(file: Path) -> tuple[Result, ...] | None:
 
 @cache
 def _newest_source() -> int:
-    """When the program was last changed."""
+    """Time of the last change of the program."""
     return max(source.stat().st_mtime_ns for source in Path(skyless.__file__).parent.rglob("*.py"))
 
 
 def _key(found: Found, method: str, asked: Asked) -> str:
-    """Name of a result: whatever could change it makes another one."""
+    """Name of a result; anything that could change the result changes the name."""
     programs = asked.programs if method in asked.estimators else ()
     files = [one for one in (found.path, found.truth, found.anchors, *programs) if one]
     states = [(str(one), one.stat().st_size, one.stat().st_mtime_ns) for one in files if one.is_file()]

@@ -1,4 +1,4 @@
-"""Everything that is not ideal in a world: crystals, channel, range errors, carrier phases, faults."""
+"""Everything in a world that is not ideal: crystals, channel, range errors, carrier phases, faults."""
 
 import math
 from typing import Any, Final
@@ -20,20 +20,20 @@ from skyless.site.kernels import kernel
 # processes (exponential correlation) along time or along the path of a tag, drawn at knots and interpolated.
 
 _KNOTS: Final = 20
-"""In a correlation length. Between two of them a straight line keeps 98.7 % of the standard deviation or more."""
+"""Knots per correlation length. Linear interpolation between them keeps at least 98.7 % of the standard deviation."""
 
 _SLOPE_MIDDLE_M: Final = 4.0
-"""The slope's error is 0 at this distance, and reaches its size at 0 and at twice this distance."""
+"""The slope's error is 0 at this distance and reaches its size at 0 and at twice the distance."""
 
 _PURPOSE: Final = 2
-"""Purpose of a tag's stream of random numbers, other than its noise and its crystal."""
+"""Purpose of a tag's random stream beside its noise and its crystal."""
 
 
 class RangeErrorModel(Struct, frozen=True, forbid_unknown_fields=True):
-    """Range errors at tags, in metres; positive: the tag receives the anchor late.
+    """Range errors at tags in metres; positive: the tag receives the anchor late.
 
     Raises:
-        ValueError: errors that change have no correlation length, or two.
+        ValueError: changing errors have no correlation length, or two.
     """
 
     constant_m: float = 0.0
@@ -41,11 +41,11 @@ class RangeErrorModel(Struct, frozen=True, forbid_unknown_fields=True):
     slope_m: float = 0.0
     """Same for all pairs: slope_m·clip((d − 4 m)/4 m, −1, 1) at the true distance d."""
     changing_m: float = 0.0
-    """Standard deviation of each pair's error that changes."""
+    """Standard deviation of each pair's changing error."""
     correlation_s: float | None = None
-    """Time in which its correlation falls to 1/e."""
+    """Time in which its correlation falls to 1/e …"""
     correlation_m: float | None = None
-    """Instead of that, the path length in which it falls to 1/e."""
+    """… or, instead, the path length in which it does."""
 
     def __post_init__(self) -> None:
         lengths = [one for one in (self.correlation_s, self.correlation_m) if one is not None]
@@ -57,17 +57,17 @@ class RangeErrorModel(Struct, frozen=True, forbid_unknown_fields=True):
 
 @kernel
 def slope_error_m(slope_m: float, distance_m: float) -> float:
-    """Range error that grows with the true distance (``RangeErrorModel.slope_m``)."""
+    """Range error that depends on the true distance (``RangeErrorModel.slope_m``)."""
     return slope_m * min(max((distance_m - _SLOPE_MIDDLE_M) / _SLOPE_MIDDLE_M, -1.0), 1.0)
 
 
 class RangeErrors:
-    """The present errors of all pairs. Those of a tag depend on the seed, its number and its path alone."""
+    """The present errors of all pairs. A tag's errors depend only on the seed, its number and its path."""
 
     def __init__(self, model: RangeErrorModel, tags: int, anchors: int, seed: int, purpose: int = _PURPOSE) -> None:
-        """``purpose``: that of the tags' streams of random numbers."""
+        """``purpose`` of the tags' random streams."""
         self.present_m: Array = np.zeros((anchors + tags, anchors))
-        """Shape (nodes, anchors) as the kernels count them, without the slope part; those of anchors stay as set."""
+        """Shape (nodes, anchors) in the kernels' numbering, without the slope part; those of anchors stay as set."""
         self._model, self._anchors = model, anchors
         self._constant_m = np.zeros((tags, anchors))
         self._step = (model.correlation_s or model.correlation_m or math.inf) / _KNOTS
@@ -86,13 +86,13 @@ class RangeErrors:
         self.present_m[anchors:] = self._constant_m
 
     def _next(self, tag: int) -> Array:
-        """The errors at the knot after the present one; the correlation over one step is exp(−1/_KNOTS)."""
+        """Errors at the knot after the present one; the correlation over one step is exp(−1/_KNOTS)."""
         kept = math.exp(-1.0 / _KNOTS)
         gained_m = self._model.changing_m * math.sqrt(1.0 - kept**2)
         return np.asarray(kept * self._before_m[tag] + gained_m * self._draws[tag].standard_normal(self._anchors))
 
     def advance_to(self, t_s: float, stations: Records) -> None:
-        """Bring the errors to a true time ; ``stations`` hold the tags' motion."""
+        """Advance the errors to a true time; ``stations`` contain the tags' motion."""
         if self._model.changing_m == 0.0:
             return
         if self._model.correlation_s is not None:
@@ -132,7 +132,7 @@ def _positions_m(tags: NDArray[Any], t_s: float) -> Array:
 # the same with and without carrier.
 
 PERIOD_TICKS: Final = 128
-"""Ticks that hold whole cycles of each channel's carrier."""
+"""Ticks with a whole number of carrier cycles in every channel."""
 
 _CYCLES_PER_TICK: Final = CHANNEL_5_HZ / TICK_RATE_HZ
 _WAVELENGTH_M: Final = SPEED_OF_LIGHT_MPS / CHANNEL_5_HZ
@@ -145,25 +145,25 @@ _CONSTANTS: Final = 9
 
 
 class CarrierModel(Struct, frozen=True, forbid_unknown_fields=True):
-    """What phases err by; sizes as far as four recorded DW1000s show them (``docs/phases.md``)."""
+    """Errors of carrier phases; sizes from four recorded DW1000s as far as they show them (``docs/phases.md``)."""
 
     noise_rad: float = 0.05
     """Gaussian noise of each phase, standard deviation."""
     reflections: RangeErrorModel = RangeErrorModel(changing_m=0.003, correlation_m=0.05)
-    """What reflections change in the carrier's path to a tag."""
+    """Change of the carrier's path to a tag by reflections."""
     obstructed: float = 8.0 / 3.0
-    """How many times as much they do where a wall or something else is in the way."""
+    """Factor on that if a wall or another obstacle is in the way."""
     slips: float = 0.0
-    """Chance that a tag's phase is half a cycle off from this reception on."""
+    """Probability, at each reception, that a tag's phase shifts by half a cycle for good."""
     wild: float = 0.0
-    """Chance that a tag's phase is random."""
+    """Probability that a tag's phase is random."""
 
 
 class Carriers:
-    """The carriers of a site's radios; phases are in cycles, multiples of 2⁻¹⁶ in [0, 1) as drivers give them."""
+    """The carriers of a site's radios; phases in cycles, multiples of 2⁻¹⁶ in [0, 1) as from drivers."""
 
     def __init__(self, model: CarrierModel, anchors: list[int], tags: int, seed: int) -> None:
-        """``anchors``: their identifiers, in the order of the nodes."""
+        """``anchors``: identifiers in the order of the nodes."""
         self._model, self._anchors = model, len(anchors)
         self._reflections = RangeErrors(model.reflections, tags, len(anchors), seed, _REFLECTIONS)
         keys = [(ANCHOR_KEY, anchor) for anchor in anchors] + [(TAG_KEY, tag) for tag in range(tags)]
@@ -174,17 +174,17 @@ class Carriers:
         self._slipped = np.zeros((len(keys), len(anchors)))
 
     def restart(self, node: int) -> None:
-        """A node was switched on again."""
+        """Draw new constants for a node that was switched on again."""
         self._constants[node] = self._powering[node].random(2)
 
     def advance_to(self, t_s: float, stations: Records) -> None:
-        """Bring reflections to a true time; ``stations`` hold the tags' motion."""
+        """Advance reflections to a true time; ``stations`` contain the tags' motion."""
         self._reflections.advance_to(t_s, stations)
 
     def phases_cycles(self, sender: int, tx_ticks: int, late_ticks: float, heard: Records) -> Array:
         """Phases of a frame at the nodes that received it (``RECEPTION_RECORD``), shape (n,).
 
-        ``tx_ticks``: the sender's counter when it left, ``late_ticks`` by how much later than that it really did.
+        ``tx_ticks``: the sender's counter at emission; ``late_ticks``: how much later it really left.
         """
         model, nodes = self._model, heard["node"]
         factors = np.where(heard["extra_m"] > 0.0, model.obstructed, 1.0)
@@ -218,9 +218,9 @@ class AnchorBias(Struct, frozen=True, forbid_unknown_fields=True):
     """Time between bursts; the first burst begins after one pause."""
     from_s: float = 0.0
     to_s: float = math.inf
-    """With ``from_s``: the interval of true time that has a bias, or bursts of it."""
+    """… and its end."""
     creep_mps: float = 0.0
-    """By how much the bias grows from ``from_s`` on."""
+    """Growth of the bias from ``from_s`` on."""
 
     def active_m(self, t_s: float) -> float:
         """Bias at a true time, 0 between bursts."""
@@ -238,18 +238,18 @@ class DelayError(Struct, frozen=True, forbid_unknown_fields=True):
     tx_ticks: float = 0.0
     rx_ticks: float = 0.0
     from_s: float = 0.0
-    """True time at which the delays become these; another error of the same anchor may hold before."""
+    """True time from which these apply; an earlier error of the same anchor may apply before."""
 
 
 class AnchorDisplacement(Struct, frozen=True, forbid_unknown_fields=True):
-    """True minus configured position of an anchor: frames travel from and to the true one, machines know the other."""
+    """True minus configured position of an anchor: frames travel from and to the true one."""
 
     anchor: int
     x_m: float = 0.0
     y_m: float = 0.0
     z_m: float = 0.0
     from_s: float = 0.0
-    """True time at which the anchor moves there; another displacement of the same anchor may hold before."""
+    """True time of the move; an earlier displacement of the same anchor may apply before."""
 
 
 class PairError(Struct, frozen=True, forbid_unknown_fields=True):
@@ -258,9 +258,9 @@ class PairError(Struct, frozen=True, forbid_unknown_fields=True):
     a: int
     b: int
     late_m: float = 0.0
-    """What either receives the other late."""
+    """Delay of each one's reception of the other."""
     blocked: bool = False
-    """Neither receives the other at all."""
+    """Whether neither receives the other."""
 
 
 class WarmUp(Struct, frozen=True, forbid_unknown_fields=True):
@@ -270,7 +270,7 @@ class WarmUp(Struct, frozen=True, forbid_unknown_fields=True):
     tau_s: float
     start_s: float = 0.0
     anchor: int | None = None
-    """Whose crystal; None for those of all tags. A second one of the same crystal replaces the first."""
+    """The crystal's anchor; None for those of all tags. A second warm-up of a crystal replaces the first."""
 
 
 class Body(Struct, frozen=True, forbid_unknown_fields=True):
@@ -284,7 +284,7 @@ class Body(Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Outage(Struct, frozen=True, forbid_unknown_fields=True):
-    """A node is off in [off_s, on_s); when it comes back its counter and its machine are new."""
+    """A node is off in [off_s, on_s); afterwards its counter and its machine are new."""
 
     off_s: float
     on_s: float = math.inf
@@ -315,13 +315,13 @@ class Impairments(Struct, frozen=True, forbid_unknown_fields=True):
     body: Body | None = None
     warm_ups: tuple[WarmUp, ...] = ()
     carrier: CarrierModel | None = None
-    """Phases of the carrier; None where radios do not measure them."""
+    """Carrier phases; None if radios do not measure them."""
     diagnostics: bool = False
-    """Whether receptions carry power and carrier offset."""
+    """Whether receptions include power and carrier offset."""
 
 
 def lab_impairments(noise_ps: float) -> Impairments:
-    """Return the world of the scenario ``lab`` (``docs/maths.md`` section 5), for the site of ``skyless.sim.world``.
+    """The world of the scenario ``lab`` (``docs/maths.md`` section 5), for the site of ``skyless.sim.world``.
 
     Crystals of ±10 ppm with white FM 2·10⁻¹¹ and random-walk FM 10⁻⁹/√s, Gaussian noise of ``noise_ps`` on every TX
     and every RX stamp, stamps rounded to ticks, no loss and no obstacle.

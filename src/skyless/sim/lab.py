@@ -15,8 +15,8 @@ _POSITIONS_M: Final = ((0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (6.0, 8.0), (0.0, 8.0
 def lab_site(noise_ps: float = 100.0, accuracy: AccuracySite = _TYPICAL) -> Site:
     """Six anchors on the walls of 6 m × 8 m that send at random instants; tags at the anchors' height (2-D).
 
-    ``noise_ps``: noise of every TX and RX stamp that the filters assume. ``accuracy``: errors of survey and ranges
-    that they assume; by default the typical ones of a real site.
+    ``noise_ps``: noise of TX and RX stamps assumed by the filters. ``accuracy``: errors of survey and ranges assumed by
+    them, by default those of a typical real site.
     """
     return Site(
         name="lab",
@@ -31,7 +31,7 @@ def lab_site(noise_ps: float = 100.0, accuracy: AccuracySite = _TYPICAL) -> Site
 
 
 def ideal_lab_site(noise_ps: float = 100.0) -> Site:
-    """The same site with exact survey and ranges, as the simulated world has them by default."""
+    """The same site with exact survey and ranges, like the simulated world's by default."""
     return lab_site(noise_ps, EXACT)
 
 

@@ -1,8 +1,8 @@
 """Which nodes receive a frame, with which stamp, and why others do not: one compiled step over all nodes.
 
-A node that sends receives nothing meanwhile (half duplex). Frames that overlap at a listener destroy each other,
-unless one is stronger than every other by the capture margin; real receivers that locked on the weaker one first
-would lose both, which is not modelled.
+A sending node receives nothing (half duplex). Frames that overlap at a listener destroy each other unless one is
+stronger than every other by the capture margin. Not modelled: real receivers that locked on the weaker one first lose
+both.
 """
 
 import math
@@ -33,7 +33,7 @@ from skyless.site.kernels import kernel, part
 
 
 class TagSpec(Struct, frozen=True):
-    """A tag of a world, without what it computes."""
+    """A tag of a world, without its computations."""
 
     trajectory: Trajectory
     outages: tuple[Outage, ...] = ()
@@ -61,7 +61,7 @@ STATION: Final = np.dtype(
 
 
 def make_stations(anchors: Sequence[AnchorSite], tags: Sequence[TagSpec], impairments: Impairments) -> Records:
-    """Stations of a world, shape (anchors + tags,), all off; the tags' positions are not yet set."""
+    """Stations of a world, shape (anchors + tags,), all off; the tags' positions are not set yet."""
     stations = np.zeros(len(anchors) + len(tags), dtype=STATION)
     stations["tx_noise_ticks"] = impairments.tx_stamp_ps * 1e-12 / TICK_S
     stations["rx_noise_ticks"] = impairments.rx_stamp_ps * 1e-12 / TICK_S
@@ -118,7 +118,7 @@ def velocity_mps(stations: Records, node: int, axis: int, t_s: float) -> float:
 
 @kernel
 def body_m(stations: Records, sender: int, node: int, t_s: float) -> float:
-    """Delay of a sender's messages through the body that carries a listener, 0 where it is not in between."""
+    """Delay of a sender's messages through the body that carries a listener, 0 if it is not in between."""
     s = stations[node]
     delay_m: float = s["body_m"]
     if delay_m == 0.0:
@@ -132,7 +132,7 @@ def body_m(stations: Records, sender: int, node: int, t_s: float) -> float:
 
 
 class Outcome(StrEnum):
-    """What became of a frame at a listener; the values are shown in reports."""
+    """Outcome of a frame at a listener; the values appear in reports."""
 
     HEARD = "heard"
     WEAK = "below-sensitivity"
@@ -209,9 +209,9 @@ def overlap_outcome(
     arrival_s: tuple[float, float],
     power_dbm: float,
 ) -> int:
-    """Outcome at a listener of the frames that overlap: heard, half duplex or collision.
+    """Outcome at a listener of overlapping frames: heard, half duplex or collision.
 
-    ``arrival_s`` is when the frame begins and ends at the listener, from its RMARKER's emission.
+    ``arrival_s``: begin and end of the frame at the listener, relative to its RMARKER's emission.
     """
     outcome = _HEARD
     for k in range(others.shape[0]):
@@ -230,7 +230,7 @@ def overlap_outcome(
 
 @part
 def reception_outcome(channel: Records, normals: Array, cursors: Integers, node: int, power_dbm: float) -> int:
-    """Outcome at a listener of power and chance: heard, weak or lost. Draws only where chance decides."""
+    """Outcome at a listener by power and chance: heard, weak or lost. Draws only if chance decides."""
     sensitivity_dbm, width_db = channel[0]["sensitivity_dbm"], channel[0]["sensitivity_width_db"]
     margin = (power_dbm - sensitivity_dbm) / width_db
     if margin < -30.0:
@@ -275,7 +275,7 @@ def stamp(
     arrival_ticks: float,
     error_ticks: float,
 ) -> int:
-    """RX stamp of a node, rounded to ticks; ``arrival_ticks`` is counted from ``emission_ticks``."""
+    """RX stamp of a node, rounded to ticks; ``arrival_ticks`` counts from ``emission_ticks``."""
     carry = math.floor(arrival_ticks)
     advance(clocks, normals, cursors, node, emission_ticks + int(carry), arrival_ticks - carry)
     noise_ticks = stations[node]["rx_noise_ticks"] * draw_normal(normals, cursors, node)
@@ -324,13 +324,13 @@ def receive_frame(
     heard: Records,
     tally: Integers,
 ) -> tuple[int, int, int]:
-    """Let every node that is on receive one frame, or lose it.
+    """Deliver one frame to every node that is on, or lose it.
 
-    ``span_s`` is the frame's begin and end from its RMARKER, ``others`` as from ``OnAir.others``, ``range_errors_m``
-    has shape (nodes, anchors), with infinity for a listener that the sender does not reach, and ``slope_m`` is that of
-    ``RangeErrorModel``. Fills ``heard`` (``RECEPTION_RECORD``, one row a node that received it) and counts into
-    ``tally``, shape (2, outcomes), for anchors and tags. Returns how many anchors and how many nodes received it, and
-    the highest cursor.
+    ``span_s``: begin and end of the frame relative to its RMARKER. ``others`` comes from ``OnAir.others``.
+    ``range_errors_m`` has shape (nodes, anchors), with infinity if the sender does not reach the listener, and
+    ``slope_m`` is that of ``RangeErrorModel``. Fills ``heard`` (``RECEPTION_RECORD``, one row per receiving node) and
+    counts into ``tally``, shape (2, outcomes), for anchors and tags. Returns the numbers of anchors and of nodes that
+    received it, and the highest cursor.
     """
     t_s = (emission_ticks + emission_fraction) * TICK_S
     anchors, count, highest = 0, 0, 0

@@ -36,9 +36,9 @@ from skyless.sim.streams import ANCHOR_KEY, TAG_KEY, Streams, stream
 from skyless.site.channel import pack_channel, pack_walls
 
 TURNAROUND_S: Final = 0.2e-3
-"""What a host needs to hand a frame to its radio; a preamble that should begin earlier is too late (HPDWARN).
+"""Time that a host needs to pass a frame to its radio; a preamble due earlier is too late (HPDWARN).
 
-Longer than any frame after its RMARKER (177 µs), so that all frames that overlap it are known when the RMARKER leaves.
+Longer than any frame after its RMARKER (177 µs), so that all overlapping frames are known when the RMARKER leaves.
 """
 
 _PREAMBLE_TICKS: Final = from_seconds(preamble_s())
@@ -47,13 +47,13 @@ _DX_MASK: Final = ~(DELAYED_TX_GRANULARITY_TICKS - 1)
 _NO_OTHERS: Final = np.empty((0, 3))
 _KEPT_TICKS: Final = round(2e-3 * TICK_RATE_HZ)
 _FARTHEST_TICKS: Final = round(10e-6 * TICK_RATE_HZ)
-"""Flight times up to 10 µs (3 km) may turn neighbours on the air into an overlap."""
+"""Flight times up to 10 µs (3 km) can make consecutive frames overlap."""
 
 Result = TypeVar("Result")
 
 
 class Timeline(Generic[Result]):
-    """Events in the order of true time (whole ideal ticks); those of one tick in the order of their planning."""
+    """Events in order of true time (whole ideal ticks); those of the same tick in the order of planning."""
 
     def __init__(self) -> None:
         self.now_ticks = 0
@@ -62,12 +62,12 @@ class Timeline(Generic[Result]):
 
     @property
     def next_ticks(self) -> int | None:
-        """When the next event happens; None while nothing is planned."""
+        """Time of the next event; None if nothing is planned."""
         return self._events[0][0] if self._events else None
 
     @property
     def until_ticks(self) -> int:
-        """Where the present ``run`` ends."""
+        """End of the present ``run``."""
         return self._until_ticks
 
     def at(self, ticks: int, happen: Callable[[], Result | None]) -> None:
@@ -76,7 +76,7 @@ class Timeline(Generic[Result]):
         heapq.heappush(self._events, (max(ticks, self.now_ticks), self._serial, happen))
 
     def pass_to(self, ticks: int) -> bool:
-        """Let time pass up to ``ticks`` at once if no event and no end of ``run`` lies before; whether it did."""
+        """Advance to ``ticks`` at once if no event and no end of ``run`` comes first. Returns True if advanced."""
         if ticks > self._until_ticks or (self._events and self._events[0][0] <= ticks):
             return False
         self.now_ticks = max(self.now_ticks, ticks)
@@ -95,32 +95,32 @@ class Timeline(Generic[Result]):
 
 @dataclass(slots=True, eq=False)
 class Flight:
-    """One frame on its way; times are true time in whole ticks."""
+    """One frame in flight; times are true time in whole ticks."""
 
     sender: int
     """Node that sends."""
     boot: int
-    """How often the sender had been switched on, so that a frame from before a restart is not sent."""
+    """Number of times the sender had been switched off, so that a frame from before is not sent."""
     frame: bytes
     marker_local_ticks: int
-    """Sender's unwrapped counter when the RMARKER leaves, noise and delay error apart."""
+    """Sender's unwrapped counter when the RMARKER leaves, without noise and delay error."""
     begin_ticks: int
     """Start of the preamble."""
     marker_ticks: int
     end_ticks: int
     emission_ticks: int = 0
     emission_fraction: float = 0.0
-    """With ``emission_ticks``: when the RMARKER really left."""
+    """With ``emission_ticks``: the RMARKER's true emission."""
 
 
 class OnAir:
-    """The frames that are, recently were, or soon will be on the air."""
+    """The frames that are, recently were or soon will be on the air."""
 
     def __init__(self) -> None:
         self._flights: deque[Flight] = deque()
 
     def add(self, flight: Flight, now_ticks: int) -> None:
-        """Add a frame; those that ended long ago are removed."""
+        """Add a frame, and remove those that ended long ago."""
         while self._flights and self._flights[0].end_ticks < now_ticks - _KEPT_TICKS:
             self._flights.popleft()
         self._flights.append(flight)
@@ -130,7 +130,7 @@ class OnAir:
         self._flights.remove(flight)
 
     def between(self, from_ticks: int, until_ticks: int) -> list[Flight]:
-        """Frames whose RMARKER leaves after a time and before another."""
+        """Frames whose RMARKER leaves after one time and before another."""
         return [flight for flight in self._flights if from_ticks < flight.marker_ticks < until_ticks]
 
     def others(self, flight: Flight) -> Array:
@@ -153,15 +153,15 @@ class Tally(Struct, frozen=True):
 
     transmissions: int
     late_transmissions: int
-    """Frames that were too late and not sent."""
+    """Frames not sent because they came too late."""
     at_anchors: dict[str, int]
-    """Outcomes (``Outcome``) of frames at anchors that were on."""
+    """Frames at anchors that were on, by ``Outcome``."""
     at_tags: dict[str, int]
 
 
 @dataclass(slots=True, eq=False)
 class Delivery:
-    """A frame that has just ended, and the rows (``RECEPTION_RECORD``) of the nodes that received it."""
+    """A frame that has just ended, with the rows (``RECEPTION_RECORD``) of the nodes that received it."""
 
     flight: Flight
     by_anchors: Records
@@ -169,10 +169,10 @@ class Delivery:
 
 
 class Medium(Generic[Result]):
-    """A site's air, deterministic by its seed; memory stays flat however long it runs.
+    """A site's air, deterministic given the seed; memory use does not grow with time.
 
-    Nodes are numbered: the site's anchors in the order of its file, then the tags; all are off at first. A node's noise
-    depends on the seed and on its own key alone: more tags do not change what the others receive.
+    Nodes are numbered: the site's anchors in the order of its file, then the tags; all start off. A node's noise
+    depends only on the seed and its own key: more tags do not change what others receive.
     """
 
     def __init__(
@@ -184,19 +184,19 @@ class Medium(Generic[Result]):
         deliver: Callable[[Delivery], Result | None],
         turnaround_s: float = TURNAROUND_S,
     ) -> None:
-        """``deliver`` is called with every frame when it ends; ``run`` yields what it returns.
+        """``deliver`` is called with every frame at its end; ``run`` yields its results.
 
-        ``turnaround_s``: how long before its preamble a frame must come.
+        ``turnaround_s``: how long before its preamble a frame must be passed in.
 
-        Raises ValueError when an impairment names an anchor that the site has not.
+        Raises ValueError if an impairment names an anchor that is not the site's.
         """
         self._anchors, self._tags, self._impairments = site.anchors, tuple(tags), impairments
         self.node_of = {anchor.id: node for node, anchor in enumerate(site.anchors)}
-        """Nodes of the anchors, by their identifiers."""
+        """Nodes of the anchors by identifier."""
         self.stations = make_stations(site.anchors, self._tags, impairments)
         self._piece_ends_s = np.full(len(self._tags), -math.inf)
         self.boots = [0] * len(self.stations)
-        """How often each node was switched off."""
+        """Number of times each node was switched off."""
         self._counts = np.zeros((2, len(OUTCOMES)), dtype=np.int64)
         self._transmissions = self._late = 0
         self._deliver = deliver
@@ -220,23 +220,23 @@ class Medium(Generic[Result]):
         self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls, site.storeys)
         self._air = OnAir()
         self._missed_ticks = 0
-        """Frames that should have left before are not sent."""
+        """Frames due before this are not sent."""
         self._received = np.zeros(len(keys), dtype=RECEPTION_RECORD)
 
     @property
     def tally(self) -> Tally:
-        """What was sent, heard and lost so far, by reason."""
+        """Counts of what was sent, heard and lost so far, by reason."""
         names = [str(outcome) for outcome in OUTCOMES]
         at_anchors, at_tags = (dict(zip(names, row, strict=True)) for row in self._counts.tolist())
         return Tally(self._transmissions, self._late, at_anchors, at_tags)
 
     @property
     def now_s(self) -> float:
-        """True time that has passed."""
+        """The present true time."""
         return self.timeline.now_ticks * TICK_S
 
     def run(self, until_s: float) -> Iterator[Result]:
-        """Let true time pass up to ``until_s``. Can be called again."""
+        """Advance true time to ``until_s``. Can be called repeatedly."""
         return self.timeline.run(from_seconds(until_s))
 
     def switch_off(self, node: int) -> None:
@@ -255,14 +255,14 @@ class Medium(Generic[Result]):
     # Clocks
 
     def _warm_up(self) -> None:
-        """Let crystals warm up, those of all tags where no anchor is named."""
+        """Set the crystals' warm-ups, for all tags if no anchor is named."""
         every_tag = range(len(self._anchors), len(self.clocks))
         for one in self._impairments.warm_ups:
             for node in every_tag if one.anchor is None else (self.node_of[one.anchor],):
                 warm_up(self.clocks, node, one.ppm, one.start_s, one.tau_s)
 
     def read_counter(self, node: int) -> int:
-        """Bring a node to the present and return its unwrapped counter."""
+        """Advance a node to the present and return its unwrapped counter."""
         cursors = self._streams.cursors
         advance(self.clocks, self._streams.normals, cursors, node, self.timeline.now_ticks, 0.0)
         self._streams.refill(int(cursors[node]))
@@ -289,7 +289,7 @@ class Medium(Generic[Result]):
     # Transmissions
 
     def transmit(self, node: int, transmission: Transmission) -> bool:
-        """Plan the flight of a frame; False, and a count, if it comes too late."""
+        """Plan the flight of a frame. Returns False, and counts it, if it comes too late."""
         local_ticks = self.read_counter(node)
         delay_ticks = self._anchors[node].tx_antenna_delay_ticks
         leaves = wrap(((transmission.tx_ticks - delay_ticks) & _DX_MASK) + delay_ticks)
@@ -306,16 +306,16 @@ class Medium(Generic[Result]):
         return True
 
     def miss(self, until_s: float) -> tuple[int, ...]:
-        """Withdraw all frames whose RMARKER would leave before ``until_s``, because time was let pass too late.
+        """Withdraw all frames whose RMARKER would leave before ``until_s``, because the caller was too slow.
 
-        Returns the nodes that planned them.
+        Returns their senders.
         """
         self._missed_ticks = from_seconds(until_s)
         missed = self._air.between(self.timeline.now_ticks, self._missed_ticks)
         return tuple(flight.sender for flight in missed if flight.boot == self.boots[flight.sender])
 
     def _radiate(self, flight: Flight) -> None:
-        """Let the RMARKER leave, and every node that can receive the frame stamp it."""
+        """Emit the RMARKER, and stamp the frame at every node that can receive it."""
         node, streams = flight.sender, self._streams
         if flight.marker_ticks < self._missed_ticks or flight.boot != self.boots[node]:
             self._air.withdraw(flight)

@@ -1,12 +1,12 @@
-"""Crystal oscillators and the 40-bit counters that they drive.
+"""Crystal oscillators and the 40-bit counters driven by them.
 
-A node's state is its counter's value at one instant of true time. Both are a whole number of ticks and a
-fraction: true time counts ideal ticks from the start of the world, the counter is kept unwrapped, so that
-no precision is lost over months (``docs/maths.md`` section 3).
+A node's state is its counter's value at one instant of true time. Both are a whole number of ticks and a fraction: true
+time counts ideal ticks from the start of the world; the counter is kept unwrapped, so that no precision is lost over
+months (``docs/maths.md`` section 3).
 
-The noise is the two-state model, sampled exactly between any two instants dt apart: phase and fractional
-frequency gain a normal pair of covariance [[q_w dt + q_rw dt³/3, q_rw dt²/2], [q_rw dt²/2, q_rw dt]], with
-q_w = white_fm² and q_rw = random_walk_fm². Allan deviation: σ_y(τ)² = q_w/τ + q_rw τ/3.
+The noise is the two-state model, sampled exactly between any two instants dt apart: phase and fractional frequency gain
+a normal pair of covariance [[q_w dt + q_rw dt³/3, q_rw dt²/2], [q_rw dt²/2, q_rw dt]], with q_w = white_fm² and q_rw =
+random_walk_fm². Allan deviation: σ_y(τ)² = q_w/τ + q_rw τ/3.
 """
 
 import math
@@ -41,11 +41,11 @@ CLOCK: Final = np.dtype(
     ],
     align=True,
 )
-"""One node's oscillator and counter; an array of them is what the kernels work on."""
+"""One node's oscillator and counter; kernels work on an array of them."""
 
 
 class Temperature(Struct, frozen=True, forbid_unknown_fields=True):
-    """How a node's temperature moves, and what that does to its crystal.
+    """A node's temperature and its effect on the crystal.
 
     The deviation from the start is warm_up_k·(1 − exp(−t/warm_up_s)) + swing_k·sin(2πt/swing_period_s + φ), with
     a random phase φ for each node.
@@ -96,7 +96,7 @@ def _set_temperature(clock: np.void, temperature: Temperature | None, phase_rad:
 
 
 def warm_up(clocks: Records, node: int, ppm: float, start_s: float, tau_s: float) -> None:
-    """Let a node's crystal warm up from ``start_s`` on, with the time constant ``tau_s``, by ``ppm`` in the end."""
+    """Warm a node's crystal up from ``start_s`` on, with the time constant ``tau_s``, by ``ppm`` in the end."""
     clocks[node]["drift"] = ppm * 1e-6
     clocks[node]["drift_start_s"] = start_s
     clocks[node]["drift_tau_s"] = tau_s
@@ -126,7 +126,7 @@ def clock_rate(clocks: Records, node: int) -> float:
 
 @part
 def temperature_phase_s(clocks: Records, node: int, from_s: float, to_s: float) -> float:
-    """Phase in seconds that the temperature adds between two true times: its rate, integrated in closed form."""
+    """Phase in seconds added by temperature between two true times: the closed-form integral of its rate."""
     clock = clocks[node]
     tau_s = clock["warm_up_s"]
     warm_up = (to_s - from_s) + tau_s * (math.exp(-to_s / tau_s) - math.exp(-from_s / tau_s))
@@ -140,7 +140,7 @@ def temperature_phase_s(clocks: Records, node: int, from_s: float, to_s: float) 
 
 @kernel
 def drift_phase_s(clocks: Records, node: int, from_s: float, to_s: float) -> float:
-    """Phase in seconds that a warm-up adds between two true times: its rate, integrated in closed form."""
+    """Phase in seconds added by a warm-up between two true times: the closed-form integral of its rate."""
     clock = clocks[node]
     start_s, tau_s = clock["drift_start_s"], clock["drift_tau_s"]
     since_s, until_s = max(from_s - start_s, 0.0), max(to_s - start_s, 0.0)
@@ -159,9 +159,9 @@ def advance(
     true_ticks: int,
     true_fraction: float,
 ) -> None:
-    """Bring a node to a true time, drawing two normals for the noise of the interval.
+    """Advance a node to a true time, drawing two normals for the noise of the interval.
 
-    A step of at most a flight time backwards (two frames under way at once) is extrapolated without noise.
+    A step backwards by at most a flight time (two frames in flight at once) is extrapolated without noise.
     """
     clock = clocks[node]
     whole = true_ticks - clock["true_ticks"]
@@ -190,7 +190,7 @@ def advance(
 
 @kernel
 def foresee(clocks: Records, node: int, local_ticks: int) -> int:
-    """True time, in whole ticks, at which the node's unwrapped counter will show a value if its rate holds."""
+    """True time, in whole ticks, at which the node's unwrapped counter will show a value if its rate stays."""
     clock = clocks[node]
     ahead = (local_ticks - clock["local_ticks"]) / (1.0 + clock_rate(clocks, node))
     forecast: int = clock["true_ticks"] + math.floor(ahead)
@@ -207,11 +207,11 @@ def emit(
     tx_noise_ticks: float,
     tx_error_ticks: float,
 ) -> tuple[int, float]:
-    """Bring a node to the instant at which its counter shows a value; return when its frame really left.
+    """Advance a node to the instant at which its counter shows a value. Returns when its frame really left.
 
-    The instant is foreseen, the oscillator's noise sampled up to there, and the remaining error removed to
-    first order. Returns true ticks and fraction, later by ``tx_error_ticks`` (antenna delay error) and by emission
-    noise of standard deviation ``tx_noise_ticks``.
+    The instant is predicted, the oscillator's noise sampled up to there, and the remaining error removed to first
+    order. Returns true ticks and fraction, later by ``tx_error_ticks`` (antenna delay error) and by emission noise of
+    standard deviation ``tx_noise_ticks``.
     """
     clock = clocks[node]
     advance(clocks, normals, cursors, node, foresee(clocks, node, local_ticks), 0.0)

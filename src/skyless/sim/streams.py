@@ -1,7 +1,7 @@
 """Random numbers for many nodes: every node draws from its own stream.
 
-The stream of a node depends on the seed and on the node's own key alone, so that another tag, or another
-anchor, does not change what the others draw.
+A node's stream depends only on the seed and the node's own key, so that another tag or anchor does not change what
+others draw.
 """
 
 import math
@@ -16,19 +16,19 @@ BLOCK: Final = 1024
 """Normals drawn ahead for each node."""
 
 MAX_DRAWS: Final = 16
-"""Most numbers that one step of a node may draw; a rest of a block below that is discarded."""
+"""Most numbers that one step of a node may draw; a smaller rest of a block is discarded."""
 
 ANCHOR_KEY: Final = 0
 TAG_KEY: Final = 1
 
 
 def stream(seed: int, kind: int, number: int, purpose: int = 0) -> np.random.Generator:
-    """Return the generator of one node (or of one purpose of it), independent of all other keys."""
+    """The random generator of one node (or of one purpose of it), independent of all other keys."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(kind, number, purpose))))
 
 
 class Streams:
-    """Standard normals of every node, shape (nodes, BLOCK), with a cursor each; kernels move the cursors."""
+    """Standard normals of every node, shape (nodes, BLOCK), with a cursor each that the kernels move."""
 
     def __init__(self, generators: list[np.random.Generator]) -> None:
         self._generators = generators
@@ -38,7 +38,7 @@ class Streams:
             self._refill(node)
 
     def refill(self, highest_cursor: int) -> None:
-        """Renew the blocks that are nearly used up; pass the highest cursor that the last step left behind."""
+        """Refill nearly used-up blocks; ``highest_cursor`` is that after the last step."""
         if highest_cursor > BLOCK - MAX_DRAWS:
             for node in np.flatnonzero(self.cursors > BLOCK - MAX_DRAWS):
                 self._refill(int(node))
@@ -58,5 +58,5 @@ def draw_normal(normals: Array, cursors: Integers, node: int) -> float:
 
 @part
 def draw_uniform(normals: Array, cursors: Integers, node: int) -> float:
-    """Next uniform number of the node in (0, 1): a normal through its own distribution function."""
+    """Next uniform number of the node in (0, 1): a normal mapped by its distribution function."""
     return 0.5 * math.erfc(-draw_normal(normals, cursors, node) / math.sqrt(2.0))

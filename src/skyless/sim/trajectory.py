@@ -1,7 +1,7 @@
-"""How tags move: paths made of pieces of constant acceleration, as functions of true time.
+"""Motion of tags: paths made of pieces of constant acceleration, as functions of true time.
 
-A path returns the piece that holds at an instant, so that the compiled channel evaluates positions and calls
-Python only when a piece ends.
+A path returns the piece valid at an instant, so that the compiled channel evaluates positions and calls Python only at
+the end of a piece.
 """
 
 import bisect
@@ -19,7 +19,7 @@ _ROAM_KEY: Final = 5
 
 
 class Piece(NamedTuple):
-    """Motion of constant acceleration in [start_s, end_s); the vectors have shape (3,) and hold at ``origin_s``."""
+    """Motion of constant acceleration in [start_s, end_s); vectors have shape (3,) and apply at ``origin_s``."""
 
     start_s: float
     end_s: float
@@ -34,7 +34,7 @@ class Trajectory(ABC):
 
     @abstractmethod
     def piece(self, t_s: float) -> Piece:
-        """The piece that holds at a true time; cheapest when asked in the order of time."""
+        """The piece valid at a true time; fastest when asked in order of time."""
 
     def position(self, t_s: float) -> Array:
         """Position at a true time in metres, shape (3,)."""
@@ -64,10 +64,10 @@ class Static(Trajectory):
 
 
 class Waypoints(Trajectory):
-    """Walking from point to point along straight lines at a constant speed.
+    """Walking from point to point along straight lines at constant speed.
 
     With ``corner_s`` the velocity turns over that time around every corner (and at start and end) at constant
-    acceleration, cutting the corner a little; without it, at once. ``loop`` joins the last point to the first and
+    acceleration, cutting the corner slightly; without it, at once. ``loop`` joins the last point to the first and
     repeats for ever. Before ``start_s`` the tag rests at the first point.
     """
 
@@ -112,7 +112,7 @@ class Waypoints(Trajectory):
         )
 
     def _last_corner(self, t_s: float) -> int:
-        """Number of the last corner passed, counting on from lap to lap; -1 before the first."""
+        """Number of the last corner passed, counted across laps; -1 before the first."""
         within_s = t_s - self._first_s
         lap = int(within_s // self._lap_s) if self._loop else 0
         within_s -= lap * self._lap_s
@@ -157,11 +157,11 @@ def _as_points(points_m: ArrayLike) -> Array:
 
 
 class Roaming(Trajectory):
-    """A random walk about a point: a random acceleration every ``step_s``, without abrupt turns.
+    """A random walk about a point: a new random acceleration every ``step_s``, without abrupt turns.
 
-    The velocity gains variance qa per second and axis, the process noise that a constant-velocity filter assumes.
-    Damping and a spring hold the walk. From the start on each coordinate is normal about the middle, with ``std_m``,
-    and its velocity has a standard deviation of √(qa·damping_s/2). An axis whose ``std_m`` is 0 does not move.
+    The velocity gains variance qa per second and axis, the process noise of a constant-velocity filter. Damping and a
+    spring bound the walk. From the start each coordinate is normal about the middle, with ``std_m``, and its velocity
+    has a standard deviation of √(qa·damping_s/2). An axis with a ``std_m`` of 0 does not move.
     """
 
     def __init__(
@@ -184,7 +184,7 @@ class Roaming(Trajectory):
         self._begin()
 
     def piece(self, t_s: float) -> Piece:
-        """See ``Trajectory``; going back in time starts again."""
+        """See ``Trajectory``; going back in time starts over."""
         if t_s < self._piece.start_s:
             self._begin()
         while t_s >= self._piece.end_s:
@@ -201,7 +201,7 @@ class Roaming(Trajectory):
         self._append(self._middle_m + self._std_m * offset, np.where(self._free, self._speed_mps * motion, 0.0))
 
     def _append(self, position_m: Array, velocity_mps: Array) -> None:
-        """Append a piece with an acceleration of its own."""
+        """Append a piece with a new acceleration."""
         away_m = position_m + 0.5 * self._step_s * velocity_mps - self._middle_m  # halfway through the piece
         held = -self._pull_per_s2 * away_m - velocity_mps / self._damping_s
         push = np.where(self._free, held + self._kick_mps2 * self._generator.standard_normal(3), 0.0)

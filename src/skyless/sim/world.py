@@ -1,7 +1,7 @@
-"""The world: anchors' machines on the simulated medium, tags that listen, and true time.
+"""The world: anchors' machines on the simulated medium, listening tags, and true time.
 
-Three events make a transmission: its frame is fetched (the lead time before its RMARKER), the RMARKER leaves, and
-the frame ends, when the listeners get it.
+A transmission has three events: its frame is fetched (the lead time before its RMARKER), the RMARKER leaves, and the
+frame ends, when the listeners get it.
 """
 
 import math
@@ -26,16 +26,16 @@ _RETRY_TICKS: Final = from_seconds(5e-3)
 
 @dataclass(slots=True, eq=False)
 class Broadcast:
-    """One frame, at the moment that its end arrived, with the tags that received it and their true motion."""
+    """One frame at its end, with the tags that received it and their true motion."""
 
     anchor: int
     """Identifier of the sender."""
     frame: bytes
     emission_ticks: int
-    """True time at which the RMARKER left the antenna, in ideal ticks since the start; and its fraction."""
+    """True time, in ideal ticks since the start, at which the RMARKER left the antenna …"""
     emission_fraction: float
     end_s: float
-    """True time of the frame's end, which the receptions carry as the host's time."""
+    """True time of the frame's end, the host's time in receptions."""
     tags: Integers
     """Indices of the tags that received it, shape (n,)."""
     rx_ticks: Integers
@@ -43,9 +43,9 @@ class Broadcast:
     positions_m: Array
     """Their true positions at the emission, shape (n, 3)."""
     diagnostics: tuple[Diagnostics, ...] | None
-    """What their radios measured, where the impairments ask for it."""
+    """Their radios' measurements, if the impairments require them."""
     phases_cycles: Array | None = None
-    """Phases of the carrier, shape (n,), where they are simulated."""
+    """Carrier phases, shape (n,), if simulated."""
 
     @property
     def emission_s(self) -> float:
@@ -63,12 +63,12 @@ class Broadcast:
 
 
 def diagnostics_of(row: np.void) -> Diagnostics:
-    """Diagnostics in a row (``RECEPTION_RECORD``) of a node."""
+    """Diagnostics of a node's row (``RECEPTION_RECORD``)."""
     return Diagnostics(float(row["rx_power_dbm"]), float(row["first_path_power_dbm"]), float(row["carrier_offset_ppm"]))
 
 
 class World:
-    """A site on the air, deterministic by its seed; memory stays flat however long it runs."""
+    """A site on the air, deterministic given the seed; memory use does not grow with time."""
 
     def __init__(
         self,
@@ -80,11 +80,11 @@ class World:
         *,
         lead_s: float = 1e-3,
     ) -> None:
-        """``anchor_factory`` makes a machine for an anchor's identifier, again when that anchor restarts.
+        """``anchor_factory`` creates the machine of an anchor by identifier, again when that anchor restarts.
 
         ``lead_s``: how long before its RMARKER a frame is fetched.
 
-        Raises ValueError when an impairment names an anchor that the site has not.
+        Raises ValueError if an impairment names an anchor that is not the site's.
         """
         self._anchors, self._tags, self._impairments = site.anchors, tuple(tags), impairments
         self._factory = anchor_factory
@@ -98,16 +98,16 @@ class World:
 
     @property
     def tally(self) -> Tally:
-        """What was sent, heard and lost so far, by reason."""
+        """Counts of what was sent, heard and lost so far, by reason."""
         return self.medium.tally
 
     @property
     def now_s(self) -> float:
-        """True time that has passed."""
+        """The present true time."""
         return self.medium.now_s
 
     def run(self, until_s: float) -> Iterator[Broadcast]:
-        """Let true time pass up to ``until_s``; yields every frame when it ended, in order. Can be called again."""
+        """Advance true time to ``until_s`` and yield every frame at its end, in order. Can be called repeatedly."""
         return self.medium.run(until_s)
 
     # Power
@@ -164,7 +164,7 @@ class World:
             self._timeline.at(self._timeline.now_ticks + _RETRY_TICKS, partial(self._ask, node, boot))
 
     def _deliver(self, delivery: Delivery) -> Broadcast:
-        """Pass the frame to the anchors that received it; returns the receptions of the tags."""
+        """Pass the frame to the anchors that received it. Returns the tags' receptions."""
         flight, by_anchors, by_tags = delivery.flight, delivery.by_anchors, delivery.by_tags
         end_s, diagnostics = self.now_s, self._impairments.diagnostics
         has_phases = self._impairments.carrier is not None

@@ -40,14 +40,14 @@ _MOST_FIELDS: Final = 64
 _LONGEST_NAME: Final = 1 << 10
 
 CANDIDATES, CHOSEN = "estTdoaCand", "estTDOA"
-"""Differences of all pairs, which newer firmware logs, and those that its filter was given."""
+"""Differences of all pairs, logged by newer firmware, and those used by its filter."""
 
 _TRUTHS: Final = ("estPose", "estPosition", "lhPosition")
-"""Events with a position of motion capture or lighthouse, the better first."""
+"""Events with a position from motion capture or lighthouse, the better first."""
 
 _SENSOR, _BAROMETER = "estTOF", "estBarometer"
 _MILLIMETRES_FROM: Final = 20.0
-"""A ranger's reading from here on is in millimetres: it reaches four metres."""
+"""A ranger's reading above this is in millimetres: its range is four metres."""
 
 BAROMETER_STD_M: Final = 0.2
 
@@ -55,7 +55,7 @@ BAROMETER_STD_M: Final = 0.2
 class _Kind(NamedTuple):
     name: str
     fields: tuple[str, ...]
-    """Without what stands before a dot."""
+    """Without the prefix up to the dot."""
     binary: Binary
 
 
@@ -76,7 +76,7 @@ def recognise(head: bytes) -> bool:
 
 
 def read(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:
-    """Yield the differences: of all candidates where the log has them, else those that the firmware used."""
+    """Yield the differences: of all candidates if the log has them, otherwise those used by the firmware."""
     log = _Log(stream, drops)
     wanted = CANDIDATES if CANDIDATES in log.names else CHOSEN
     for event in log.events():
@@ -93,7 +93,7 @@ def read(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:
 
 
 def read_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None:
-    """Positions of motion capture or lighthouse in the log; None where it has none."""
+    """Positions from motion capture or lighthouse in the log; None if it has none."""
     found: dict[str, list[tuple[float, ...]]] = {name: [] for name in _TRUTHS}
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
     with open_source(path) as stream:
@@ -109,13 +109,13 @@ def read_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None
 
 
 def in_order(table: Array) -> Array:
-    """Rows whose numbers are all finite, in the order of their times, which stand first."""
+    """Rows with only finite numbers, in order of their first column, time."""
     table = table[np.isfinite(table).all(axis=1)]
     return table[np.argsort(table[:, 0], kind="stable")] if len(table) else table
 
 
 def read_heights(path: str | PathLike[str], *, is_barometer: bool) -> Array | None:
-    """Rows of time, height and standard deviation of the ranger or the barometer; None where the log has none."""
+    """Rows of time, height and standard deviation of the ranger or the barometer; None if the log has none."""
     wanted = _BAROMETER if is_barometer else _SENSOR
     with open_source(path) as stream:
         events = [event for event in _Log(stream, Counter()).events() if event.name == wanted and event.values]
@@ -124,7 +124,7 @@ def read_heights(path: str | PathLike[str], *, is_barometer: bool) -> Array | No
 
 
 def heights_of(rows: Array, *, is_barometer: bool) -> Array | None:
-    """Rows of time and reading as rows of time, height in metres and standard deviation; None of none."""
+    """Convert rows of time and reading to time, height in metres and standard deviation; None if empty."""
     rows = rows[np.isfinite(rows).all(axis=1)]
     if len(rows) == 0:
         return None
@@ -134,7 +134,7 @@ def heights_of(rows: Array, *, is_barometer: bool) -> Array | None:
 
 
 class _Log:
-    """A log as it is read: first what events there are, then the events."""
+    """A log being read: first the kinds of events, then the events."""
 
     def __init__(self, stream: BufferedIOBase, drops: Drops) -> None:
         self._drops = drops
@@ -192,7 +192,7 @@ class _Log:
         return _TIMES.get(version, _TIMES[2])
 
     def events(self) -> Iterator[_Event]:
-        """All events up to where the log breaks off, or is no log any more."""
+        """All events up to where the log is cut off or invalid."""
         binary, unit_s = self._time
         begin: int | None = None
         while (head := self._take(binary.size)) is not None:
@@ -247,7 +247,7 @@ def read_yaml(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
 
 
 def _documents(stream: BufferedIOBase, drops: Drops) -> Iterator[bytes]:
-    """Yield the documents, each beginning with the end of its separator's line."""
+    """Yield the documents, each starting with the end of its separator's line."""
     rest = b"\n"
     skipping = False
     for chunk in chunks(stream, drops):
@@ -279,7 +279,7 @@ def _scan_document(document: bytes) -> Packet | str | None:
 
 
 def _parse_document(document: bytes) -> Packet | str | None:
-    """Packet of a document of any shape, or the reason why it has none; None for an empty one."""
+    """Packet of a document of any shape, or why it has none; None for an empty one."""
     text = document.partition(b"\n")[2]
     if not text.strip():
         return None
@@ -299,7 +299,7 @@ def _parse_document(document: bytes) -> Packet | str | None:
 
 
 def _top_level(text: bytes) -> dict[str, str]:
-    """Scalars of the outermost mapping, by key; walked over as events, so that nesting costs no stack."""
+    """Scalars of the outermost mapping by key, read as events so that nesting costs no stack."""
     values: dict[str, str] = {}
     depth = 0
     key: str | None = None
@@ -321,7 +321,7 @@ def _top_level(text: bytes) -> dict[str, str]:
 
 
 def _packet_of_document(base64: bytes, sender: int, rx_ticks: int, host_s: float | None) -> Packet | str:
-    """Raises ValueError for what is not base64."""
+    """Decode a document's packet. Raises ValueError for invalid base64."""
     if not 0 <= rx_ticks <= _LAST_STAMP:
         return "impossible-stamp"
     if host_s is not None and not 0.0 <= host_s < _LAST_HOST_S:

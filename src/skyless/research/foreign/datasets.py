@@ -58,11 +58,11 @@ _DELAY: Final = 600 << 16
 _TX_ANTENNA_TICKS: Final = 32_880
 _GRID: Final = 512
 _MAX_STALE_TICKS: Final = round(2e-6 * TICK_RATE_HZ)
-"""By how much the tag's stamps of a round may be off the programmed delay; beyond, some are of an earlier packet."""
+"""Largest deviation of a round's tag stamps from the programmed delay; beyond, some are of an earlier packet."""
 
 _STOPS_S: Final = ((0.25, 3.75), (5.25, 11.5), (13.0, 19.25), (20.5, 27.0), (28.25, 34.5), (35.75, 39.75))
 _STOPS_ROUNDS: Final = 14_032
-"""When the tag stood in the recording location1_2, known by its number of rounds: the file does not hold that."""
+"""Stops of the tag in the recording location1_2, recognised by its number of rounds: the file lacks them."""
 
 
 def recognise(head: bytes) -> bool:
@@ -71,7 +71,7 @@ def recognise(head: bytes) -> bool:
 
 
 def arrays_of(stream: BufferedIOBase, drops: Drops, *names: str) -> dict[str, Any] | None:
-    """Some arrays of a recording by their names; None, counted, where one is missing or damaged."""
+    """Arrays of a recording by name; None, counted, if one is missing or damaged."""
     try:
         with zipfile.ZipFile(stream) as archive:
             found = {}
@@ -89,7 +89,7 @@ def arrays_of(stream: BufferedIOBase, drops: Drops, *names: str) -> dict[str, An
 
 
 def read_muloc(stream: BufferedIOBase, drops: Drops, channel: int | None = None) -> Iterator[Packet]:
-    """Yield what the tag received; ``channel``: on this one alone, with the phases of its carrier."""
+    """Yield the tag's receptions; with ``channel``, only of that one and with its carrier phases."""
     names = ("index", "channel", "rx_ticks") if channel is None else ("index", "channel", "rx_ticks", "iq", "rcphase")
     arrays = arrays_of(stream, drops, *names)
     if arrays is None:
@@ -129,31 +129,31 @@ def read_muloc(stream: BufferedIOBase, drops: Drops, channel: int | None = None)
 
 
 def _phase_at(phases: Array | None, number: int, sender: int, observer: int) -> float | None:
-    """The phase of a packet of a round as an observer measured it, where phases are read."""
+    """Phase of a round's packet as an observer measured it, if phases are read."""
     return None if phases is None else float(phases[number, sender, observer])
 
 
 def phases_cycles(iq: NDArray[Any], rcphase: NDArray[Any]) -> Array:
-    """Phases of the carrier in [0, 1), of accumulator samples, shape (…, 2), and RCPHASE in 1/128 cycles, shape (…)."""
+    """Carrier phases in [0, 1), from accumulator samples, shape (…, 2), and RCPHASE in 1/128 cycles, shape (…)."""
     angles = np.arctan2(iq[..., 1].astype(np.float64), iq[..., 0].astype(np.float64))
     return np.asarray((angles / (2.0 * np.pi) - rcphase / 128.0) % 1.0, np.float64)
 
 
 def _is_stale(stamps: list[int]) -> bool:
-    """Whether the tag's stamps of a round are not those of one packet after the other."""
+    """Whether the tag's stamps of a round are not of consecutive packets."""
     gaps = (difference(b, a, TICK_BITS) for a, b in pairwise(stamps))
     return any(abs(gap - _DELAY - _TX_ANTENNA_TICKS) > _MAX_STALE_TICKS for gap in gaps)
 
 
 def muloc_anchors(path: str | PathLike[str]) -> dict[int, Point]:
-    """Where the anchors stand, in one plane, as their heights are not known; empty where the file is damaged."""
+    """Anchor positions, all at z = 0 as their heights are unknown; empty if the file is damaged."""
     with open_source(path) as stream:
         arrays = arrays_of(stream, Counter(), "anchors_m")
     return {} if arrays is None else {k: (x_m, y_m, 0.0) for k, (x_m, y_m) in enumerate(arrays["anchors_m"].tolist())}
 
 
 def muloc_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None:
-    """Where the tag stood, at even steps from its first stop to its last, while it did; None where that is damaged."""
+    """Positions of the tag at its stops, evenly spaced from the first to the last; None if damaged."""
     with open_source(path) as stream:
         arrays = arrays_of(stream, Counter(), "index", "start_m", "end_m")
         held = arrays_of(stream, Counter(), "stops_s")
@@ -178,7 +178,7 @@ FLIGHT_COLUMNS: Final = ("t_s", "idA", "idB", "tdoa_m")
 _OUR_NAMES: Final = {"idA": "anchor_a", "idB": "anchor_b"}
 
 UTIL_COLUMNS: Final = ("t_tdoa", "idA", "idB", "tdoa_meas")
-"""The same in UTIL's own tables, which have the columns of other sensors, of other lengths, beside them."""
+"""The same in UTIL's own tables, which have columns of other sensors, of other lengths, beside them."""
 
 _POSE_COLUMNS: Final = ("t_pose", "pose_x", "pose_y", "pose_z", "pose_qx", "pose_qy", "pose_qz", "pose_qw")
 
@@ -186,7 +186,7 @@ _POSE_COLUMNS: Final = ("t_pose", "pose_x", "pose_y", "pose_z", "pose_qx", "pose
 def read_tdoas(stream: BufferedIOBase, drops: Drops, columns: Sequence[str] = TDOA_COLUMNS) -> Iterator[PairTdoa]:
     """Yield the TDoAs of a table, in its own time.
 
-    Rows of UTIL's tables without any of them are those of other sensors, and not counted.
+    Rows of UTIL's tables without TDoA are of other sensors, and are not counted.
     """
     for time, a, b, tdoa in rows(stream, drops, [_OUR_NAMES.get(name, name) for name in columns], _OUR_NAMES):
         try:
@@ -205,12 +205,12 @@ def read_tdoas(stream: BufferedIOBase, drops: Drops, columns: Sequence[str] = TD
 
 
 def recognise_tdoas(head: bytes) -> bool:
-    """Whether it is a table of TDoAs, by either names of its columns."""
+    """Whether it is a table of TDoAs, by either set of column names."""
     return has_columns(TDOA_COLUMNS, head) or has_columns(FLIGHT_COLUMNS, head)
 
 
 def _identifier(text: bytes) -> int:
-    """A whole number, which UTIL's tables write as ``7.0``. Raises ValueError."""
+    """A whole number, written as ``7.0`` in UTIL's tables. Raises ValueError."""
     return int(text.removesuffix(b".0"))
 
 
@@ -220,21 +220,21 @@ def read_util(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:
 
 
 def read_util_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None:
-    """Poses of motion capture in one of UTIL's tables; None where it has none."""
+    """Poses of motion capture in one of UTIL's tables; None if it has none."""
     table = numbers(path, _POSE_COLUMNS)
     return Truth(table[:, 0], table[:, 1:4], table[:, 4:8]) if len(table) else None
 
 
 def read_util_heights(path: str | PathLike[str], *, is_barometer: bool) -> Array | None:
-    """Rows of time, height and standard deviation of its ranger or barometer; None where it has none."""
+    """Rows of time, height and standard deviation of its ranger or barometer; None if it has none."""
     columns = ("t_baro", "baro") if is_barometer else ("t_tof", "tof")
     return heights_of(numbers(path, columns), is_barometer=is_barometer)
 
 
 def numbers(path: str | PathLike[str], columns: tuple[str, ...], tag: tuple[str, str | None] | None = None) -> Array:
-    """Rows of numbers of some columns where all of them are given, in the order of the first.
+    """Rows of numbers of these columns in which all are given, in order of the first.
 
-    ``tag``: the column that names whose rows they are, and whose are wanted, by default those of the first row's.
+    ``tag``: the column that identifies the tag, and the wanted tag, by default that of the first row.
     """
     found = []
     names = columns if tag is None else (columns[0], tag[0], *columns[1:])
@@ -249,7 +249,7 @@ def numbers(path: str | PathLike[str], columns: tuple[str, ...], tag: tuple[str,
 
 
 def rows_of(given: Iterable[list[bytes]], drops: Drops, listener: str | None) -> Iterator[list[bytes]]:
-    """Rows that one listener made, whom their second field names; by default the one of the first row."""
+    """Rows of one listener, named by their second field; by default that of the first row."""
     wanted = None if listener is None else listener.encode()
     for row in given:
         wanted = wanted or row[1]
@@ -276,13 +276,13 @@ _POSITIONS: Final = tuple(f"gt_{node}_{axis}_m" for node in "IR" for axis in "xy
 MILUV_COLUMNS: Final = ("t_s", "listener", "initiator", "responder", *_STAMP_COLUMNS, *_POSITIONS)
 _STAMP_BITS: Final = 32
 _MARGIN_M: Final = 1.0
-"""By how much a TDoA may exceed the distance of its nodes; beyond, the messages mostly are of different exchanges."""
+"""By how much a TDoA may exceed the distance of its nodes; beyond, the messages are mostly of different exchanges."""
 
 _MAX_RATE: Final = 100e-6
 
 
 def read_miluv(stream: BufferedIOBase, drops: Drops, listener: str | None = None) -> Iterator[PairTdoa]:
-    """Yield what one listener overheard; by default the one of the first row."""
+    """Yield what one listener overheard; by default that of the first row."""
     for row in rows_of(rows(stream, drops, MILUV_COLUMNS), drops, listener):
         tdoa = _overheard(row)
         if isinstance(tdoa, str):
@@ -292,7 +292,7 @@ def read_miluv(stream: BufferedIOBase, drops: Drops, listener: str | None = None
 
 
 def _overheard(row: list[bytes]) -> PairTdoa | str:
-    """TDoA of a row whose fields are ``MILUV_COLUMNS``, or the reason why it has none."""
+    """TDoA of a row with the fields ``MILUV_COLUMNS``, or the reason why it has none."""
     time, _, initiator, responder, *rest = row
     try:
         stamps = [int(field) for field in rest[: len(_STAMP_COLUMNS)]]
@@ -312,9 +312,9 @@ def _overheard(row: list[bytes]) -> PairTdoa | str:
 
 
 def overheard_tdoa_m(stamps: list[int]) -> float | None:
-    """TDoA of the responder against the initiator in metres; None for stamps that no clocks can make.
+    """TDoA of the responder against the initiator in metres; None for stamps that no clocks can produce.
 
-    ``stamps`` are the nine of ``_STAMPS``, in that order.
+    ``stamps`` are the nine of ``_STAMP_COLUMNS``, in that order.
     """
     l_rx1, l_rx2, l_rx3, i_tx1, r_rx1, r_tx2, i_rx2, r_tx3, i_rx3 = stamps
     reply = _elapsed(r_tx2, r_rx1)
@@ -330,7 +330,7 @@ def overheard_tdoa_m(stamps: list[int]) -> float | None:
 
 
 def _elapsed(later: int, earlier: int) -> int:
-    """Ticks from one stamp to the next of the same clock, less than one wrap of 67.2 ms."""
+    """Ticks between two stamps of the same clock, less than one wrap of 67.2 ms."""
     return (later - earlier) & ((1 << _STAMP_BITS) - 1)
 
 

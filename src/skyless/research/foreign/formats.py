@@ -1,4 +1,4 @@
-"""The table of formats, and how a recording of any of them is opened."""
+"""The table of recording formats, and opening a recording of any of them."""
 
 import os
 import re
@@ -29,33 +29,33 @@ Record = Packet | PairTdoa
 
 @dataclass(frozen=True)
 class Format:
-    """One format: how to recognise and how to read it."""
+    """A format: how to recognise and read it."""
 
     name: str
     summary: str
     recognise: Callable[[bytes], bool]
     """From the first bytes, decompressed."""
     read: Callable[..., Iterator[Record]]
-    """From an open stream and a counter of drops; with ``listener`` where ``any_listener``, and ``anchors_m`` where
+    """From an open stream and a counter of drops; with ``listener`` if ``any_listener``, and ``anchors_m`` if
     ``is_dl_tdoa``."""
     tx_bits: int | None
     """Width of the anchors' stamps in its packets; None for a format of ready TDoAs."""
     any_listener: bool = False
     """One recording holds several listeners, one of which is chosen."""
     is_dl_tdoa: bool = False
-    """FiRa's: packets may state where their senders are, and relay only initiators and those that answered them."""
+    """FiRa's: packets may state their senders' positions, and relay only initiators and those that answered them."""
     read_truth: Callable[[str | PathLike[str], str | None], Truth | None] | None = None
-    """The truth that a recording itself holds, from its path and the listener; None for a format that holds none."""
+    """The truth in the recording itself, from its path and the listener; None for formats without."""
     truth_is_of_body: bool = False
-    """That truth is of the body that carries the antenna, not of the antenna itself."""
+    """Whether that truth is of the body that carries the antenna."""
     read_heights: Callable[..., Array | None] | None = None
-    """Rows of time, height and standard deviation of a sensor that was recorded, from the path and ``is_barometer``."""
+    """Rows of time, height and standard deviation of a recorded sensor, from the path and ``is_barometer``."""
     read_anchors: Callable[[str | PathLike[str]], dict[int, Point]] | None = None
-    """Where its anchors stand, from the path, where the recording itself holds that for all."""
+    """Positions of all anchors, from the path, if the recording itself has them."""
     channels: tuple[int, ...] = ()
-    """Of these one can be chosen, and its packets have phases of the carrier then."""
+    """Selectable channels; with one selected, packets have carrier phases."""
     delays_ticks: int = 0
-    """Antenna delays of a sender and a receiver together, where its stamps include them."""
+    """Antenna delays of a sender and a receiver together, if its stamps include them."""
 
 
 _bitcraze: Final = partial(Format, tx_bits=bitcraze.STAMP_BITS, delays_ticks=bitcraze.ANTENNA_DELAYS_TICKS)
@@ -170,7 +170,7 @@ FORMATS: Final = (
         fira.read_binary,
     ),
 )
-"""In the order in which they are tried: the more particular first."""
+"""In the order of recognition: the more specific first."""
 
 
 @dataclass
@@ -195,7 +195,7 @@ class Recording:
 
     @property
     def bytes_read(self) -> int:
-        """How far into the file the reading has come, compressed bytes where it is compressed."""
+        """Position of reading in the file, in compressed bytes if it is compressed."""
         return os.lseek(self.stream.fileno(), 0, os.SEEK_CUR)
 
     def close(self) -> None:
@@ -210,14 +210,14 @@ def open_recording(
     anchors_m: Mapping[int, Point] | None = None,
     channel: int | None = None,
 ) -> Recording:
-    """Open a recording of a named format, or of the one that its first bytes show.
+    """Open a recording of a named format, or of the one recognised from its first bytes.
 
-    ``listener`` chooses one receiver where a recording holds several; by default that of the first row. ``anchors_m``:
-    positions that replace all that the anchors of a recording of DL-TDoA state. ``channel``: the only one to read, with
-    phases of its carrier.
+    ``listener`` selects one receiver if a recording has several; by default that of the first row. ``anchors_m``:
+    positions that replace those stated by the anchors of a DL-TDoA recording. ``channel``: the only one to read, with
+    its carrier phases.
 
     Raises:
-        ConfigurationError: the file cannot be opened, its format is not known, or listener or channel make no sense.
+        ConfigurationError: the file cannot be opened, its format is unknown, or listener or channel are invalid.
     """
     chosen = format_of(path, format_name)
     read = _listening(path, chosen, listener)
@@ -234,17 +234,17 @@ def open_recording(
 
 
 _TABLES: Final = (tdoa_tables.TDOA_COLUMNS, tdoa_tables.UTIL_COLUMNS, datasets.RECEPTION_COLUMNS, starloc.COLUMNS)
-"""Columns that people may have meant where a table has others; of equals the first."""
+"""Columns that a user may have meant if a table has others; of equal matches the first."""
 _HEADER: Final = re.compile(r"[A-Za-z_][\w. ]*(,[ \w.]+)+")
 
 _MCAP: Final = b"\x89MCAP0"
 
 
 def format_of(path: str | PathLike[str], name: str | None = None) -> Format:
-    """Format of that name, or the one that the file's first bytes show.
+    """The named format, or the one recognised from the file's first bytes.
 
     Raises:
-        ConfigurationError: the file cannot be opened, or its format is not known.
+        ConfigurationError: the file cannot be opened, or its format is unknown.
     """
     return _recognised(path) if name is None else _named(path, name)
 

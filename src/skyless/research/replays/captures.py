@@ -1,4 +1,4 @@
-"""Replay of recordings: records in, fixes out, judged against the truth where there is one."""
+"""Replay of recordings: records in, fixes out, judged against the truth if there is one."""
 
 import time
 from collections import Counter
@@ -63,14 +63,14 @@ class PairNoise(Struct, frozen=True):
     anchor_b: int
     count: int
     median_m: float
-    """Median of the difference, or of its error where the truth is known."""
+    """Median of the difference, or of its error if the truth is known."""
     noise_m: float
-    """1.4826 times the median absolute deviation, a standard deviation that outliers do not touch."""
+    """1.4826 times the median absolute deviation, a standard deviation insensitive to outliers."""
     against_truth: bool
 
 
 class NoiseByPair:
-    """Keeps an even sample of every pair's differences, less what the truth predicts where it is known."""
+    """Keeps an even sample of every pair's differences, minus the truth's prediction if known."""
 
     def __init__(self, truth: Truth | None, anchors_m: Mapping[int, Point]) -> None:
         self.truth = truth
@@ -90,7 +90,7 @@ class NoiseByPair:
         sample.add((pair.time_s, pair.tdoa_m, *a_m, *b_m))
 
     def pairs(self) -> tuple[PairNoise, ...]:
-        """What is known of each pair that was heard often enough."""
+        """Noise of each pair received often enough."""
         found = []
         for (a, b), sample in sorted(self._samples.items()):
             time_s, tdoa_m, places_m = sample.rows[:, 0], sample.rows[:, 1], sample.rows[:, 2:].reshape(-1, 2, 3)
@@ -111,35 +111,35 @@ class NoiseByPair:
 Record = Packet | PairTdoa
 
 Measured = tuple[float, Record, bool]
-"""A time, what the estimator was given, and whether it used that."""
+"""A time, the record passed to the estimator, and whether it was used."""
 
 _SAMPLED: Final = 128
 _SAMPLED_OF: Final = 1024
-"""The first 128 of each 1024 packets are made into time differences as well, to measure the recording's noise."""
+"""The first 128 of each 1024 packets are also converted to time differences, to measure the recording's noise."""
 
 
 class Pipeline:
-    """A way from records to fixes; this one's are made into time differences of pairs, where they are none already."""
+    """A way from records to fixes; this one converts packets to time differences of pairs."""
 
     contradictions_m: Mapping[tuple[int, int], float] = {}
     """Pairs of anchors whose own ranging contradicts the table."""
     reason = NoFixReason.NO_BEACONS
-    """Why there was no fix of late."""
+    """Why there was no recent fix."""
 
     def __init__(self, engine: PairEngine | None, noise: NoiseByPair) -> None:
         self._engine, self._noise = engine, noise
         self.measured: Sequence[Measured] = ()
-        """What the last ``process``, or ``rest``, gave the estimator."""
+        """Input of the estimator in the last ``process`` or ``rest``."""
 
     def process(self, record: Record) -> tuple[float | None, Fix | None]:
-        """Process one record: the time of its differences, and a fix if it made one."""
+        """Process one record. Returns the time of its differences, and a fix if it made one."""
         raise NotImplementedError
 
     def process_height(self, height: Height) -> None:
-        """Process a reading of the tag's height sensor, which came before the next record; left out by default."""
+        """Process a height reading that precedes the next record; ignored by default."""
 
     def rest(self, _on_progress: Callable[[float], None]) -> Iterable[Fix]:
-        """Fixes that only the whole recording makes, at its end; ``on_progress`` gets the share that is done."""
+        """Fixes that need the whole recording, at its end; ``on_progress`` gets the share done."""
         self.measured = ()
         return ()
 
@@ -165,7 +165,7 @@ def _measured(pairs: Iterable[PairTdoa], used: Iterable[bool]) -> Sequence[Measu
 
 
 class ByPairs(Pipeline):
-    """Time differences and the filter of pairs."""
+    """Time differences, and the filter of pairs."""
 
     def __init__(self, tracking: DifferenceTracking, engine: PairEngine | None, noise: NoiseByPair) -> None:
         super().__init__(engine, noise)
@@ -222,7 +222,7 @@ class Smoothed(ByPairs):
 
 
 class ByPackets(Pipeline):
-    """Packets as they are; a part of them is made into differences as well, to measure the recording's noise."""
+    """Packets as they are; some are also converted to differences, to measure the recording's noise."""
 
     def __init__(self, tracking: PacketTracking, engine: PairEngine, noise: NoiseByPair) -> None:
         super().__init__(engine, noise)
@@ -250,7 +250,7 @@ class ByPackets(Pipeline):
 
 
 class ByOwnEstimator(Pipeline):
-    """Time differences and an estimator of the reader's own, which gets no heights."""
+    """Time differences, and the user's own estimator, which gets no heights."""
 
     def __init__(
         self, estimator: OwnEstimator, anchors_m: Mapping[int, Point], engine: PairEngine | None, noise: NoiseByPair
@@ -280,24 +280,24 @@ PROFILES: Final[Mapping[str, EstimatorSettings]] = {
 """Settings for formats that need others: MILUV's exchanges come once or twice a second, among obstacles."""
 
 BATCH: Final = 512
-"""Records that are read at a time: reading and filtering by turns evict each other from the processor's caches."""
+"""Records read at a time: alternating reading and filtering evict each other from the processor's caches."""
 
 READING_SHARE: Final = 0.1
-"""Part of the time of a smoothed replay in which the recording is read."""
+"""Share of a smoothed replay's time that reading takes."""
 
 FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
-"""Formats of which packets are used by default, as real captures showed that to be better; of Avalue's it was not."""
+"""Formats whose packets are used by default, as that is better on real captures; on Avalue's it is not."""
 
 
 _MAX_WITHOUT_ANCHORS: Final = 20_000
-"""Records within which a recording that carries its anchors' positions has one of them."""
+"""A recording that carries anchor positions has one within this many records."""
 
 _MAX_TO_FIND_ANCHORS: Final = 2_000
-"""Records within which every anchor of a recording of DL-TDoA is heard."""
+"""Every anchor of a DL-TDoA recording is heard within this many records."""
 
 
 class ReplayReport(Figures, frozen=True, kw_only=True):
-    """Result of a replay: metres and seconds, None where it is not known."""
+    """Result of a replay: metres and seconds, None if unknown."""
 
     format: str
     receptions: int
@@ -309,8 +309,7 @@ class ReplayReport(Figures, frozen=True, kw_only=True):
     tdoa_noise_m: float | None = None
     """Median over the pairs of anchors of their differences' noise (1.4826 MAD), about the truth or the median."""
     truth_offset_s: float | None = None
-    """What would have to be added to the truth's times, beyond what was asked for, to fit the fixes best; None where
-    that does not show."""
+    """Further offset of the truth's times that fits the fixes best; None if none stands out."""
     height_m: float | None
     reason: str | None
     """Why there is no fix at all."""
@@ -320,16 +319,15 @@ class ReplayReport(Figures, frozen=True, kw_only=True):
     receptions_per_s: float
     method: str | None
     measurements: str | None = None
-    """What the filter was given, one of ``MEASUREMENTS``; None for the receptions of a site."""
+    """Input of the filter, one of ``MEASUREMENTS``; None for the receptions of a site."""
     contradictions_m: dict[str, float] = field(default_factory=dict)
-    """Pairs of anchors whose own ranging contradicts the table: by how much they are farther (if negative, nearer)
-    than there."""
+    """Pairs of anchors whose own ranging contradicts the table: how much farther (if negative, nearer) they are."""
 
 
 def common_figures(
     figures: Figures, receptions: int, fixes: int, drops: dict[str, int], wall_s: float
 ) -> dict[str, Any]:
-    """What every ``ReplayReport`` holds of figures and of counts."""
+    """Fields common to all reports: figures and counts."""
     return {
         **structs.asdict(figures),
         "receptions": receptions,
@@ -342,7 +340,7 @@ def common_figures(
 
 
 class CaptureReplay:
-    """One recording of another system on its way through the filter."""
+    """Replays one recording of another system through the filter."""
 
     def __init__(self, asked: ReplayOptions, calibration: DifferenceCalibration | None = None) -> None:
         """Open the recording; ``calibration`` is used instead of that of the table of anchors. Raises SkylessError."""
@@ -511,7 +509,7 @@ class CaptureReplay:
             on_fix(fix)
 
     def _check_truth(self, table: FixTable) -> None:
-        """See that the listener was in the recording, and that the truth was of it. Raises SkylessError."""
+        """Check that the listener is in the recording, and that the truth overlaps it. Raises SkylessError."""
         asked, truth, times_s = self._asked, self._truth, table.time_s
         if asked.listener is not None and self.receptions == 0:
             raise ConfigurationError(asked.file, "listener", asked.listener, "one that the recording names")
@@ -545,7 +543,7 @@ class CaptureReplay:
 
 
 def _check_carries_anchors(asked: ReplayOptions) -> None:
-    """See that a recording without a table of anchors says something of them itself, before the whole of it is read.
+    """Check that a recording without a table of anchors has their positions, before it is read as a whole.
 
     Raises SkylessError.
     """
@@ -563,13 +561,13 @@ def _check_carries_anchors(asked: ReplayOptions) -> None:
 
 
 def how_to_find_anchors(file: str | Path, kind: Format) -> str:
-    """The command that finds the anchors of a recording in which they range each other; empty for others."""
+    """The command that finds the anchors of a recording in which they range each other; otherwise empty."""
     ranges = kind.tx_bits is not None and not kind.is_dl_tdoa
     return f"; skyless survey --recording {file} --out anchors.csv finds them" if ranges else ""
 
 
 def _stated_anchors(asked: ReplayOptions, kind: Format) -> dict[int, Point]:
-    """Where the anchors of a recording of DL-TDoA say that they are."""
+    """Positions stated by the anchors of a DL-TDoA recording."""
     if not kind.is_dl_tdoa:
         return {}
     with open_recording(asked.file, asked.format) as recording:
@@ -578,7 +576,7 @@ def _stated_anchors(asked: ReplayOptions, kind: Format) -> dict[int, Point]:
 
 
 def distances_of(file: str | Path, name: str) -> dict[str, float]:
-    """Distances of the anchors, where the recording itself measures them."""
+    """Distances between anchors, if the recording measures them."""
     if name != "avalue":
         return {}
     return {f"{a}-{b}": metres for (a, b), metres in sorted(anchor_distances_m(file, Counter()).items())}

@@ -1,4 +1,4 @@
-"""What a replay or a survey is given with a recording: anchors, truth and heights, as values."""
+"""Inputs of a replay or survey besides the recording: anchors, truth and heights."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -38,14 +38,14 @@ AnyTruth = ArrayLike | str | Path
 
 
 TOO_FLAT = "the anchors' mean: they lie too flat to determine the height"
-"""Where a height is from that nobody gave."""
+"""Source of a height that nobody gave."""
 
 
 YAML_SUFFIXES: Final = frozenset({".yaml", ".yml"})
 
 
 def known_anchors(anchors: Anchors | None, site: Site | str | Path | None) -> tuple[dict[int, Point], float | None]:
-    """Positions of the anchors, and the tags' height where a site states it. Raises SkylessError."""
+    """Positions of the anchors, and the tags' height if a site states it. Raises SkylessError."""
     if anchors is not None and site is not None:
         raise SkylessError("give either --anchors or --site, not both")
     if site is not None:
@@ -66,7 +66,7 @@ def known_anchors(anchors: Anchors | None, site: Site | str | Path | None) -> tu
 
 
 def _read_yaml(path: Path) -> dict[int, Point]:
-    """Positions of anchors as Bitcraze's programs keep them, x, y and z by identifier. Raises ConfigurationError."""
+    """Anchor positions from a YAML file of Bitcraze's programs: x, y and z by identifier. Raises ConfigurationError."""
     import yaml  # noqa: PLC0415 - of the extra research
 
     try:
@@ -77,7 +77,7 @@ def _read_yaml(path: Path) -> dict[int, Point]:
 
 
 def known_truth(path: Path, asked: "RecordingOptions") -> Truth | None:
-    """Where the antenna was, by an array, a table, or the recording itself. Raises SkylessError."""
+    """Positions of the antenna, from an array, a table or the recording itself. Raises SkylessError."""
     truth, arm_m = asked.truth, asked.lever_arm_m
     own, known = format_of(path, asked.format).read_truth, None
     if truth is None and own is not None:
@@ -108,7 +108,7 @@ def _truth_of(given: ArrayLike) -> Truth:
 
 
 def known_heights(asked: "ReplayOptions") -> deque[Height]:
-    """Readings of the tag's height sensor by time, by an array or a table. Raises SkylessError."""
+    """Readings of the tag's height sensor by time, from an array or a table. Raises SkylessError."""
     given = asked.heights
     if given is None:
         return deque()
@@ -134,7 +134,7 @@ def known_heights(asked: "ReplayOptions") -> deque[Height]:
 def height_to_hold(
     wish: float | str, anchors_m: dict[int, Point], site_m: float | None, truth: Truth | None, format_name: str
 ) -> tuple[float | None, float, str]:
-    """Height to hold (None where it is estimated), its standard deviation, and where it is from.
+    """Height to hold (None to estimate it), its standard deviation, and its source.
 
     ``wish``: metres, or one of ``HEIGHT_WORDS``. Raises SkylessError.
     """
@@ -155,7 +155,7 @@ def height_to_hold(
 
 
 def flight_height(wish: float | None, truth: Truth | None) -> float | None:
-    """Height above which fixes are judged: the wish, or where the truth begins on the floor and rises well above it."""
+    """Height above which fixes are judged: ``wish``, or 0.3 m if the truth starts on the floor and rises above it."""
     if wish is not None or truth is None:
         return wish
     return FLIGHT_M if flies(truth) else None

@@ -1,4 +1,4 @@
-"""What is asked of a replay: options of ``skyless replay``, and what a survey of a recording shares with it."""
+"""Options of ``skyless replay``, some of which a survey of a recording shares."""
 
 from functools import partial
 from pathlib import Path
@@ -43,14 +43,14 @@ if TYPE_CHECKING:
 
 PACKETS, DIFFERENCES_MADE = "packets", "differences"
 MEASUREMENTS: Final = (PACKETS, DIFFERENCES_MADE)
-"""What the filter is given: anchors' packets as they are, or time differences made of them."""
+"""Input of the filter: anchors' packets as they are, or time differences derived from them."""
 
 AUTO: Final = "auto"
 
 HEIGHT_SENSOR, BAROMETER, RECORDED = "sensor", "barometer", "recording"
 
 HEIGHT_WORDS: Final = ("truth", "free", "auto")
-"""What a tag's height may be instead of metres: the truth's median, estimated, or what suits."""
+"""Alternatives to a tag's height in metres: the truth's median, estimated, or automatic."""
 
 
 _read_height = partial(read_height, words=HEIGHT_WORDS)
@@ -114,7 +114,7 @@ class _Recording(RecordingOptions, frozen=True):
 
 
 def read_estimator(name: str, text: str) -> Any:  # noqa: ANN401 - any class
-    """A class of a file of the reader's, given as FILE.py:CLASS. Raises SkylessError."""
+    """Load a user's class, given as FILE.py:CLASS. Raises SkylessError."""
     path, _, named = text.rpartition(":")
     file = existing_file(name, path or text)
     try:
@@ -127,7 +127,7 @@ def read_estimator(name: str, text: str) -> Any:  # noqa: ANN401 - any class
 
 
 def check_estimator(name: str, value: Any) -> Any:  # noqa: ANN401 - any class
-    """See that it makes something that has ``hear``. Raises SkylessError."""
+    """Check that it creates something that has ``hear``. Raises SkylessError."""
     if not callable(value) or (isinstance(value, type) and not callable(getattr(value, "hear", None))):
         raise wrong(name, value, "a class with a method hear(observation), or what makes an instance of one")
     return value
@@ -195,7 +195,7 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
 
     @property
     def needs_differences(self) -> str:
-        """The option that only time differences can serve; empty where there is none."""
+        """The option that requires time differences; empty if there is none."""
         asked = {
             "--smooth": self.smooth,
             "--estimator": self.estimator is not None,
@@ -204,7 +204,7 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
         return next((option for option, is_asked in asked.items() if is_asked), "")
 
     def check(self) -> None:
-        """See that the options fit one another. Raises SkylessError."""
+        """Check that the options are compatible. Raises SkylessError."""
         if self.estimator is not None:
             self.leave_out("smooth", "heights", "qa", "dynamics", "tdoa_std_m", why="the estimator is your own")
         if self.heights is None:
@@ -214,7 +214,7 @@ class ReplayOptions(_Recording, frozen=True, kw_only=True):
 
     @property
     def requirement(self) -> "IntegrityRequirement | None":
-        """What is required of the levels instead of what the tag did; None where nothing is."""
+        """Requirements for the levels that replace the tag's own; None without any."""
         asked = ProtectionOptions(
             integrity_risk=self.integrity_risk,
             alert_limit_m=self.alert_limit_m,

@@ -1,4 +1,4 @@
-"""The picture of a replay: track and height over truth, errors and stated σ over time, histograms of the errors."""
+"""The picture of a replay: track and height against truth, errors and stated σ over time, histograms of the errors."""
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,7 +8,7 @@ from skyless.core.arrays import Matrix, Vector
 
 
 def track_figure(rows: Matrix, title: str) -> Figure:
-    """Draw rows of time, position, truth (NaN where unknown) and σ of each axis, shape (n, 10); of none, the title."""
+    """Draw rows of time, position, truth (NaN if unknown) and σ of each axis, shape (n, 10); no rows: the title."""
     figure = Figure(figsize=(15, 8), layout="constrained")
     figure.suptitle(title)
     if len(rows):
@@ -48,7 +48,7 @@ def _height(axes: Axes, rows: Matrix, judged: Matrix) -> None:
 
 
 def _over_time(axes: Axes, time_s: Vector, errors: Matrix, std_m: Matrix, *, known: bool) -> None:
-    """Errors of x and y, or of z, and the largest σ of them."""
+    """Errors of x and y, or of z, and their largest σ."""
     names = "xy" if errors.shape[1] == 2 else "z"
     for axis, name in enumerate(names):
         axes.plot(time_s, errors[:, axis], linewidth=0.7, label=name)

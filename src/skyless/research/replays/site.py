@@ -1,4 +1,4 @@
-"""Replay of a running site: every tag's receptions once more, judged against the truth and the recorded fixes."""
+"""Replay of a running site: every tag's receptions again, judged against the truth and the recorded fixes."""
 
 import time
 from collections import Counter, OrderedDict, defaultdict
@@ -35,21 +35,21 @@ from skyless.site.tables import Truth
 _T = TypeVar("_T")
 
 _MAX_WAITING: Final = 20_000
-"""Fixes that wait for their counterpart; those that the recording lacks never get one."""
+"""Most fixes that wait for their counterpart; those missing in the recording never get one."""
 
 SAME_FIX_S: Final = 2.0
-"""Serial numbers begin again with the tag; fixes of one number that are farther apart are different ones."""
+"""Serial numbers restart with the tag; fixes of one number farther apart than this are different ones."""
 
 
 class Identical(Struct, frozen=True):
-    """Recorded fixes against those of the replay, bit by bit."""
+    """Bitwise comparison of recorded and replayed fixes."""
 
     compared: int
     different: int
 
 
 class Comparison:
-    """Pairs of a recorded and a replayed fix, matched by serial number and time, whichever comes first."""
+    """Matches recorded and replayed fixes by serial number and time, whichever comes first."""
 
     def __init__(self, tag: str) -> None:
         self._tag = tag
@@ -58,7 +58,7 @@ class Comparison:
         self._compared = self._different = 0
 
     def result(self) -> Identical:
-        """How they compare so far."""
+        """The comparison so far."""
         return Identical(self._compared, self._different)
 
     def recorded(self, message: FixMessage) -> None:
@@ -70,7 +70,7 @@ class Comparison:
             self._judge(found[0], message)
 
     def replayed(self, serial: int, fix: Fix, unix_s: float) -> None:
-        """Add one of the replay."""
+        """Add a replayed fix."""
         found = self._recorded.pop(serial, None)
         if found is None or abs(found.unix_s - unix_s) > SAME_FIX_S:
             _keep(self._replayed, serial, (fix, unix_s))
@@ -98,7 +98,7 @@ _SITE_TIME_MASK: Final = (1 << 48) - 1
 
 
 class DelayChange(Struct, frozen=True):
-    """New less old antenna delays of one anchor, ticks."""
+    """New minus old antenna delays of one anchor, ticks."""
 
     tx_ticks: int
     rx_ticks: int
@@ -108,7 +108,7 @@ _UNCHANGED: Final = DelayChange(0, 0)
 
 
 def delay_changes(recorded: Site, wanted: Site) -> dict[int, DelayChange]:
-    """Changes by anchor, of those that both sites have."""
+    """Changes of the anchors that both sites have."""
     old = {anchor.id: anchor for anchor in recorded.anchors}
     return {
         new.id: DelayChange(
@@ -121,7 +121,7 @@ def delay_changes(recorded: Site, wanted: Site) -> dict[int, DelayChange]:
 
 
 def with_delays(reception: Reception, changes: dict[int, DelayChange]) -> Reception:
-    """The reception of the same frame as its sender would have filled it."""
+    """The reception with its frame as the sender would have filled it."""
     beacon = decode_any(reception.frame)
     if isinstance(beacon, Malformed):
         return reception
@@ -149,7 +149,7 @@ def _relay(heard: Heard, own: DelayChange) -> Heard:
 
 
 class _Heard(Struct, frozen=True):
-    """A reception whose time is not known yet, its fix if it made one, and the fix's number where that is known."""
+    """A reception whose time is unknown so far, its fix if it made one, and the fix's number if known."""
 
     reception: Reception
     fix: Fix | None
@@ -157,11 +157,11 @@ class _Heard(Struct, frozen=True):
 
 
 class Replayed(Struct, frozen=True):
-    """A fix of the replay."""
+    """A replayed fix."""
 
     fix: Fix
     unix_s: float
-    """The end of its last frame, without the delays of the host."""
+    """End of its last frame, without the host's delays."""
 
 
 class TagReplay:
@@ -175,26 +175,26 @@ class TagReplay:
         integrity: IntegrityRequirement | None = None,
         stamps_only: bool = False,
     ) -> None:
-        """``method`` and ``integrity``: others than the tag's own; ``delays``: other antenna delays. All begin cold.
+        """``method`` and ``integrity``: instead of the tag's own; ``delays``: other antenna delays. All start cold.
 
-        ``stamps_only``: without phases, cold as well.
+        ``stamps_only``: without phases, cold too.
         """
         self._delays, self._stamps_only = delays, stamps_only
         self._integrity = integrity
         self._is_as_it_was = method is None and delays is None and integrity is None and not stamps_only
         self.tag = tag
         self.method = method
-        """As recorded, once known, or as asked for."""
+        """As recorded, once known, or as requested."""
         self.receptions = self.fixes = self.segments = self.cold_starts = 0
         self.begun_s: float | None = None
         """Unix time of the first reception."""
         self.drops: Drops = Counter()
         self.reason = "no-beacons"
-        """Why there is no fix, as given last."""
+        """The last reason for no fix."""
         self._asked = method
         self._receiver: AnyReceiver | None = None
         self._serial: int | None = None
-        """Serial of the last fix; None if the receiver did not continue where the tag's was."""
+        """Serial of the last fix; None if the receiver did not continue the tag's state."""
         self._restored = False
         self._segment = ""
         self._next = 0
@@ -204,7 +204,7 @@ class TagReplay:
         self._comparison = Comparison(tag)
 
     def process(self, message: ReceptionsMessage) -> Iterator[Replayed]:
-        """Process a run of receptions; the fixes that they make, or that runs before have made."""
+        """Process a run of receptions. Yields the fixes that they, or earlier runs, make."""
         clock = self._clock
         fresh = self._unheard(message)
         if self._clock is not clock:
@@ -235,7 +235,7 @@ class TagReplay:
         return _Heard(reception, fix, self._serial)
 
     def _timed(self, found: list[tuple[_Heard, float]]) -> Iterator[Replayed]:
-        """Fixes of receptions whose Unix time is known now."""
+        """Fixes of receptions whose Unix time is now known."""
         for made, unix_s in found:
             self.begun_s = unix_s if self.begun_s is None else self.begun_s
             if self.on_measured is not None:
@@ -259,17 +259,17 @@ class TagReplay:
 
     @property
     def identical(self) -> Identical | None:
-        """How the fixes compare; None with another method than the tag's own, or other antenna delays."""
+        """The comparison of fixes; None with another method than the tag's own, or other antenna delays."""
         return self._comparison.result() if self._is_as_it_was else None
 
     def all_drops(self) -> dict[str, int]:
-        """What could not be used, by reason, the receiver's own included."""
+        """What could not be used, by reason, including the receiver's own."""
         own: Counter[str] = Counter() if self._receiver is None else self._receiver.counters
         total = self.drops + Counter({reason: n for reason, n in own.items() if reason not in NOT_DROPS})
         return {str(reason): number for reason, number in sorted(total.items()) if number}
 
     def _unheard(self, message: ReceptionsMessage) -> tuple[RawReception, ...]:
-        """What a message has beyond those before it; it may come twice, or after a loss."""
+        """The new receptions of a message, which may come twice, or after a loss."""
         if message.segment != self._segment:
             if message.start is None:
                 self.drops["receptions-without-beginning"] += len(message.receptions)
@@ -333,7 +333,7 @@ class TagReplay:
 
 
 def reception_of(raw: RawReception) -> Reception | None:
-    """A recorded reception; None for one that no radio gives."""
+    """A recorded reception; None if no radio can have made it."""
     if not 0 <= raw.rx_ticks < WRAP_TICKS or (raw.host_s is not None and not abs(raw.host_s) < 1e12):
         return None
     phase_cycles = raw.carrier_phase_cycles
@@ -345,7 +345,7 @@ def reception_of(raw: RawReception) -> Reception | None:
 
 
 class _TagSettings(Struct, frozen=True):
-    """The settings of a tag's program, with the defaults where a recording does not hold them."""
+    """Settings of a tag's program, with defaults for those that a recording lacks."""
 
     method: str | None = None
     site: int | None = None
@@ -359,7 +359,7 @@ class _TagSettings(Struct, frozen=True):
 
 
 def _receiver_of(start: SegmentStart, method: str | None, integrity: IntegrityRequirement | None) -> AnyReceiver | None:
-    """A receiver that knows nothing, made as the tag's was; None where that makes no sense."""
+    """A fresh receiver with the tag's settings; None if they are invalid."""
     try:
         settings = msgspec.convert(start.settings, _TagSettings)
         integrity = integrity or IntegrityRequirement(
@@ -380,11 +380,11 @@ SITE_FORMAT: Final = "skyless-mcap"
 
 
 class TagReport(ReplayReport, frozen=True, kw_only=True):
-    """Result of the replay of one tag; times are Unix seconds."""
+    """Result of a tag's replay; times are Unix seconds."""
 
     tag: str
     identical: Identical | None
-    """Against the fixes that the tag published; None with another method than its own."""
+    """Comparison with the published fixes; None with another method than the tag's own."""
     segments: int
     """Runs of receptions without a gap."""
     cold_starts: int
@@ -471,7 +471,7 @@ class SiteReplay:
     def _add(
         self, replay: TagReplay, fixes: Iterable[Replayed], on_fix: Callable[[str, Replayed], None] | None
     ) -> None:
-        """Judge fixes of a tag."""
+        """Judge a tag's fixes."""
         tag = replay.tag
         for made in fixes:
             first_s, _ = self._spans.get(tag, (made.unix_s, 0.0))
@@ -516,7 +516,7 @@ class SiteReplay:
 
 
 def summary_of(reports: Sequence[TagReport]) -> dict[str, Any]:
-    """One tag's report as that of any other recording; of several, their sums and the reports by tag."""
+    """One tag's report like that of any other recording; for several tags, sums and the reports by tag."""
     if len(reports) == 1:
         return {**msgspec.to_builtins(reports[0]), "height_note": "from the site"}
     compared = [report.identical for report in reports if report.identical is not None]
@@ -539,7 +539,7 @@ def recorded_site(recording: McapRecording, identifier: int | None = None) -> Si
     """The site of a recording.
 
     Raises:
-        ConfigurationError: it does not hold its site, or another one than ``identifier`` is wanted.
+        ConfigurationError: the recording lacks its site, or has another one than ``identifier``.
     """
     found = recording.site
     if found is None:
@@ -552,7 +552,7 @@ def recorded_site(recording: McapRecording, identifier: int | None = None) -> Si
 
 
 def recorded_truth(recording: McapRecording) -> dict[str, Truth]:
-    """Where each tag truly was, by Unix time; times that go back are left out."""
+    """True positions of each tag by Unix time; times that go back are left out."""
     rows: dict[str, list[tuple[float, ...]]] = defaultdict(list)
     for moment in recording.truth():
         for tag, motion in moment.tags.items():

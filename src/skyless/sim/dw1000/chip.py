@@ -1,6 +1,6 @@
 """A register-level model of the DW1000 behind its SPI, on the emulated air (DW1000 User Manual v2.12).
 
-Here: the chip as its host sees it, with its clocks, reset, microcode, one-time memory and sensors, and a driver's bus.
+This file: the chip as its host sees it, with clocks, reset, microcode, one-time memory and sensors, and a driver's bus.
 """
 
 from collections import Counter
@@ -23,17 +23,17 @@ _FAST_HZ: Final = 16_000_000
 """Rates at which the bus clocks the SPI."""
 
 _LOCK_S: Final = 15e-6
-"""Until the PLL has locked after a reset; the manual states no guaranteed figure, drivers wait for CPLOCK."""
+"""Time for the PLL to lock after a reset; the manual guarantees no figure, drivers wait for CPLOCK."""
 _LOAD_S: Final = 150e-6
-"""Until the microcode is loaded (UM 2.5.5.10: table 4)."""
+"""Time to load the microcode (UM 2.5.5.10: table 4)."""
 _MAX_CRYSTAL_HZ: Final = 3_000_000
 """Fastest SPI while the chip runs on the crystal (UM 2.3.2: INIT)."""
 _MAX_PLL_HZ: Final = 20_000_000
 
 _SELECTED_S: Final = 500e-6
-"""How long chip select must be low to wake a chip that sleeps (UM 2.3, p. 17)."""
+"""Time for which chip select must be low to wake a sleeping chip (UM 2.3, p. 17)."""
 _WAKE_S: Final = 4e-3
-"""Until it answers then: its crystal has to start (assumed; the data sheet gives some 3 ms)."""
+"""Time until it answers then: its crystal has to start (assumed; the data sheet gives some 3 ms)."""
 
 RECEIVING_A: Final = 134e-3
 IDLE_A: Final = 18e-3
@@ -75,7 +75,7 @@ class Sensors(Struct, frozen=True):
 
 
 class Clocking:
-    """What must have happened before the chip can send or receive. ``seconds`` is any clock that runs on."""
+    """Preconditions of sending and receiving. ``seconds`` is any monotonic clock."""
 
     def __init__(self, memory: Memory, misuse: Counter[str], seconds: Callable[[], float], sensors: Sensors) -> None:
         self._memory, self._misuse, self._seconds, self._sensors = memory, misuse, seconds, sensors
@@ -84,7 +84,7 @@ class Clocking:
         self.in_reset = False
 
     def restart(self) -> None:
-        """As after power-on or a reset: nothing is loaded, the PLL begins to lock."""
+        """Return to the state after power-on or reset: nothing is loaded, the PLL starts to lock."""
         self._loaded_s = None
         self._lock_s = self._seconds() + _LOCK_S
 
@@ -101,15 +101,15 @@ class Clocking:
 
     @property
     def microcode_loaded(self) -> bool:
-        """Whether the leading edge is searched for."""
+        """Whether the leading-edge search works."""
         return self._loaded_s is not None and self._seconds() >= self._loaded_s
 
     def accepts(self, hz: int) -> bool:
-        """Whether a transfer at that rate arrives unspoilt."""
+        """Whether a transfer at this rate arrives intact."""
         return hz <= (_MAX_PLL_HZ if self.locked else _MAX_CRYSTAL_HZ)
 
     def on_pmsc_written(self) -> int | None:
-        """Apply PMSC_CTRL0; returns SOFTRESET where it resets something."""
+        """Apply PMSC_CTRL0. Returns SOFTRESET if it resets something."""
         kind = self._memory.get(r.PMSC_CTRL0) >> r.SOFTRESET_SHIFT
         if kind == r.SOFTRESET_ALL and not self.in_reset:
             if self._memory.get(r.PMSC_CTRL0) & r.SYSCLKS != r.SYSCLKS_XTI:
@@ -144,7 +144,7 @@ class Clocking:
 
 
 class Chip:
-    """One DW1000 with its antenna in an air. ``seconds`` is a clock for what has nothing to do with the air."""
+    """One DW1000 with its antenna in an air. ``seconds`` is a clock for everything that does not concern the air."""
 
     def __init__(
         self,
@@ -154,13 +154,13 @@ class Chip:
         seconds: Callable[[], float],
         sensors: Sensors | None = None,
     ) -> None:
-        """The true delays between chip and antenna, which do not depend on what the host sets."""
+        """``tx_delay_ticks``, ``rx_delay_ticks``: the true antenna delays, independent of the host's settings."""
         self.misuse: Counter[str] = Counter()
         """Violations of the manual by the host."""
         self.arrivals: Counter[str] = Counter()
-        """What became of the frames that reached the antenna."""
+        """Outcomes of the frames that reached the antenna."""
         self.on_wake: Callable[[], None] = lambda: None
-        """Called when it wakes: the counter begins again, and the crystal may have another rate; both are the air's."""
+        """Called when it wakes: the counter restarts, and the crystal may have another rate; both belong to the air."""
         self._air, self._rx_delay_ticks, self._seconds = air, rx_delay_ticks, seconds
         self._begin_s, self._slept_s = seconds(), 0.0
         self._asleep_since_s: float | None = None
@@ -173,12 +173,12 @@ class Chip:
     # Pins
 
     def power_cycle(self) -> None:
-        """The supply failed and is back."""
+        """The supply has failed and returned."""
         self._slept_s, self._asleep_since_s = self.asleep_s, None
         self.pull_reset()
 
     def pull_reset(self) -> None:
-        """RSTn was low for a moment; as after power-on. One that sleeps does not notice it (assumed)."""
+        """RSTn was low for a moment; as after power-on. A sleeping chip ignores it (assumed)."""
         if self._asleep_since_s is not None:
             self.misuse["reset-while-asleep"] += 1
             return
@@ -190,7 +190,7 @@ class Chip:
         self.memory.set(r.SYS_STATUS, r.SLP2INIT)
 
     def select(self, seconds: float) -> None:
-        """Chip select was low for this time, which wakes a chip that sleeps if it is long enough."""
+        """Chip select was low for this time, which wakes a sleeping chip if it is long enough."""
         if self._asleep_since_s is not None and seconds >= _SELECTED_S:
             self.on_wake()
             self.power_cycle()
@@ -211,25 +211,25 @@ class Chip:
 
     @property
     def receiving_s(self) -> float:
-        """How long the receiver has been on in all."""
+        """Total time that the receiver has been on."""
         self.transceiver.update()
         return self.transceiver.receiving_ticks * TICK_S
 
     @property
     def asleep_s(self) -> float:
-        """How long the chip has slept in all."""
+        """Total time that the chip has slept."""
         return self._slept_s + (0.0 if self._asleep_since_s is None else self._seconds() - self._asleep_since_s)
 
     @property
     def charge_c(self) -> float:
-        """What the module has drawn since its power-on."""
+        """Charge drawn by the module since power-on."""
         receiving_s, asleep_s = self.receiving_s, self.asleep_s
         idle_s = self._seconds() - self._begin_s - receiving_s - asleep_s
         return RECEIVING_A * receiving_s + IDLE_A * idle_s + ASLEEP_A * asleep_s
 
     @property
     def irq(self) -> bool:
-        """The interrupt line: an event that SYS_MASK lets through, with the polarity of SYS_CFG."""
+        """The interrupt line: an event enabled in SYS_MASK, with the polarity of SYS_CFG."""
         if self._asleep_since_s is not None:
             return False
         self._update()
@@ -241,7 +241,7 @@ class Chip:
     # SPI
 
     def transfer(self, out: bytes, hz: int) -> bytes:
-        """One transaction: the octets that the chip sends while it receives ``out``, as many."""
+        """One transaction: the octets that the chip returns while it receives ``out``."""
         if self._asleep_since_s is not None or self._seconds() < self._awake_s:
             if self._asleep_since_s is None or 8 * len(out) / hz < _SELECTED_S:
                 self.misuse["spi-while-asleep"] += 1
@@ -262,14 +262,14 @@ class Chip:
         return bytes(access.octets) + self._read(access, len(body))
 
     def _garbled(self, access: Access, length: int) -> bytes:
-        """Bits are lost: what is read is shifted by one, what is written does not arrive."""
+        """Lose bits: reads are shifted by one, writes do not arrive."""
         if access.is_write:
             return bytes(length)
         right = int.from_bytes(self.memory.read(access.file, access.sub, length - access.octets), "big")
         return (right << 1 | 1).to_bytes(length + 1, "big")[1:]
 
     def _update(self) -> None:
-        """Show in the registers what has happened up to now."""
+        """Update the registers to the present."""
         if self.clocking.in_reset:
             return
         self.transceiver.update()
@@ -293,7 +293,7 @@ class Chip:
         return self.memory.read(access.file, access.sub, length)
 
     def _read_accumulator(self, sub: int, length: int) -> bytes:
-        """Behind one octet that means nothing, and only on a clock of its own (UM 7.2.38, 7.2.50.1)."""
+        """Read after one dummy octet, and only with its own clock enabled (UM 7.2.38, 7.2.50.1)."""
         clocks = r.FACE | r.AMCE
         if self.memory.get(r.PMSC_CTRL0) & clocks != clocks:
             self.misuse["accumulator-without-its-clock"] += 1
@@ -321,7 +321,7 @@ class Chip:
             self.transceiver.command(control)
 
     def _apply_written(self, access: Access, length: int) -> None:
-        """Perform what writing these registers starts."""
+        """Execute what writing these registers triggers."""
         if access.file == r.PMSC.file and access.sub < 4:
             kind = self.clocking.on_pmsc_written()
             if kind == r.SOFTRESET_ALL:
@@ -339,7 +339,7 @@ class Chip:
                 self._sleep()
 
     def _soft_reset(self) -> None:
-        """All registers but the bits that hold the chip in reset (UM 7.2.50.1)."""
+        """Reset all registers but the bits that hold the chip in reset (UM 7.2.50.1)."""
         self.transceiver.reset()
         self.memory.reset()
         self.memory.set(r.PMSC_CTRL0, r.PMSC_CTRL0.reset & ~(0xF << r.SOFTRESET_SHIFT))
@@ -357,9 +357,9 @@ class Chip:
         *,
         carrier_phase_cycles: float | None = None,
     ) -> str:
-        """A frame has ended whose RMARKER reached the antenna at ``rx_ticks`` of the counter; what became of it.
+        """Process a frame that has ended, whose RMARKER reached the antenna at ``rx_ticks``. Returns the outcome.
 
-        ``carrier_phase_cycles`` is that of its first path (``Reception``); None where the air has none.
+        ``carrier_phase_cycles`` is that of its first path (``Reception``); None if the air has none.
         """
         if self._asleep_since_s is not None:
             self.arrivals["receiver-off"] += 1
@@ -376,7 +376,7 @@ class Chip:
 class ModelBus:
     """A driver's bus to a model of the chip (``skyless.radio.dw1000.radio.Bus``).
 
-    ``spend`` lets the host's time pass; a transfer reaches the chip when its time is over.
+    ``spend`` advances the host's time; a transfer reaches the chip at its end.
     """
 
     def __init__(
@@ -393,7 +393,7 @@ class ModelBus:
         return self.chip.transfer(out, self._hz)
 
     def set_spi_fast(self, fast: bool) -> None:
-        """Clock fast or slowly from now on."""
+        """Use the fast or the slow clock."""
         self._hz = _FAST_HZ if fast else _SLOW_HZ
 
     def reset_chip(self) -> None:

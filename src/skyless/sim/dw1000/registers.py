@@ -1,6 +1,6 @@
 """Registers of the DW1000 and their bits, from sections 7.2 and 2.5 of the User Manual v2.12 ("UM").
 
-The driver has a table of its own; ``tests/simulation/test_dw1000_tables.py`` compares both with a third.
+The driver has its own table; ``tests/simulation/test_dw1000_tables.py`` compares both with a third.
 """
 
 from collections import Counter
@@ -17,9 +17,9 @@ class Register(Struct, frozen=True):
     length: int
     """Octets."""
     reset: int = 0
-    """Value after a reset; of tuning registers only those that section 2.5 names for a change are known exactly."""
+    """Value after a reset; of tuning registers, only those that section 2.5 says to change are known exactly."""
     access: str = "RW"
-    """RW; RO, which writing does not change; WO, which reads as zeros."""
+    """RW; RO, unaffected by writing; WO, reads as zeros."""
 
 
 # Identity and configuration (UM 7.2.2 to 7.2.14)
@@ -141,13 +141,13 @@ ICRBP: Final = 1 << 31
 TXPUTE: Final = 1 << 34
 
 READ_ONLY: Final = IRQS | HPDWARN | HSRBP | ICRBP
-"""What writing a 1 does not clear (pp. 86, 91, 92)."""
+"""Bits that writing a 1 does not clear (pp. 86, 91, 92)."""
 OF_BUFFER: Final = LDEDONE | RXDFR | RXFCG | RXFCE
 """Each of the two receive buffers has its own (UM 4.3.1)."""
 OF_SENDING: Final = TXFRB | TXPRS | TXPHS | TXFRS | TXPUTE
-"""Forgotten when the transmitter is enabled again."""
+"""Cleared when the transmitter is enabled again."""
 OF_RECEIVING: Final = OF_BUFFER | RXPRD | RXSFDD | RXPHD | RXPHE | RXRFSL | RXRFTO | LDEERR | RXSFDTO
-"""Forgotten when the receiver is enabled again."""
+"""Cleared when the receiver is enabled again."""
 
 # SYS_CFG (UM 7.2.6)
 HIRQ_POL: Final = 1 << 9
@@ -190,13 +190,13 @@ class Access(Struct, frozen=True):
     file: int
     sub: int
     octets: int
-    """How long the header is."""
+    """Length of the header."""
 
 
 def decode_header(out: bytes) -> Access | None:
-    """Header of one to three octets: bit 7 writes, bit 6 announces a sub-address of 7 or, with its bit 7, of 15 bits.
+    """Decode a header of one to three octets: bit 7 writes, bit 6 announces a sub-address of 7 or (its bit 7) 15 bits.
 
-    None where the transaction ends before its header.
+    Returns None if the transaction ends within its header.
     """
     octets = 1 if not out[:1] or not out[0] & 0x40 else 2 if len(out) < 2 or not out[1] & 0x80 else 3
     if len(out) < octets:
@@ -206,7 +206,7 @@ def decode_header(out: bytes) -> Access | None:
 
 
 class Memory:
-    """All register files; what is reserved reads as 0."""
+    """All register files; reserved parts read as 0."""
 
     def __init__(self, misuse: Counter[str]) -> None:
         self._misuse = misuse
@@ -218,7 +218,7 @@ class Memory:
         self.reset()
 
     def reset(self) -> None:
-        """All registers as after power-on."""
+        """Set all registers to their power-on values."""
         for octets in self._files.values():
             octets[:] = bytes(len(octets))
         for one in ALL_REGISTERS.values():
@@ -231,7 +231,7 @@ class Memory:
         return int.from_bytes(octets[register.sub : register.sub + register.length], "little")
 
     def exchange(self, hidden: dict[int, bytearray]) -> None:
-        """Let register files and others of the same numbers change places."""
+        """Swap register files with others of the same numbers."""
         for file, octets in hidden.items():
             hidden[file], self._files[file] = self._files[file], octets
 
@@ -251,14 +251,14 @@ class Memory:
         return bytes(self._files[register.file][register.sub : register.sub + register.length])
 
     def read(self, file: int, sub: int, length: int) -> bytes:
-        """What the host reads."""
+        """The host's read."""
         octets = self._files.get(file)
         if octets is None or sub + length > len(octets):
             self._misuse["read-beyond-register"] += 1
         return bytes(octets[sub : sub + length] if octets is not None else b"").ljust(length, b"\0")
 
     def write(self, file: int, sub: int, data: bytes) -> None:
-        """What the host writes, but where a register is read-only; it must not write beyond a register (UM p. 11)."""
+        """The host's write, except to read-only registers; it must not exceed a register (UM p. 11)."""
         octets = self._files.get(file)
         if octets is None or sub + len(data) > len(octets):
             self._misuse["write-beyond-register"] += 1

@@ -1,7 +1,8 @@
 """The chip's transmitter and receiver (DW1000 User Manual v2.12, sections 3, 4, 7.2.18 to 7.2.23).
 
-Only delayed transmission is modelled, and reception until a frame, an error or the end of its window, into one buffer
-or two; no reception that goes on by itself (RXAUTR), filtering, acknowledgement, sniffing, long frames, other timeouts.
+Modelled are delayed transmission, and reception until a frame, an error or the end of its window, into one or two
+buffers. Not modelled: automatic re-enabling (RXAUTR), filtering, acknowledgement, sniffing, long frames, other
+timeouts.
 """
 
 import cmath
@@ -30,7 +31,7 @@ from skyless.sim.dw1000.registers import Memory
 DX_MASK: Final = ~(DELAYED_TX_GRANULARITY_TICKS - 1)
 PREAMBLE_TICKS: Final = from_seconds(preamble_s())
 _POWER_UP_TICKS: Final = from_seconds(10e-6)
-"""What the transmitter needs to power up before the preamble; less gives TXPUTE (assumed: the manual states none)."""
+"""Power-up time of the transmitter before the preamble; less gives TXPUTE (assumed: the manual states none)."""
 _SFD_TICKS: Final = from_seconds(SFD_SYMBOLS * PREAMBLE_SYMBOL_S)
 _HEADER_TICKS: Final = from_seconds(21 * HEADER_SYMBOL_S)
 
@@ -40,23 +41,23 @@ _FAULT_EVENTS: Final[dict[Fault, int]] = {
     "parity": r.RXPRD | r.RXSFDD | r.RXPHD | r.RXRFSL,
     "delimiter": r.RXPRD | r.RXSFDTO,
 }
-"""What SYS_STATUS shows of a frame that is spoilt in its header, in its data, or before its delimiter."""
+"""SYS_STATUS events of a frame damaged in its header, in its data, or before its delimiter."""
 _COMPLETE: Final = r.RXPRD | r.RXSFDD | r.RXPHD | r.RXDFR
-"""What SYS_STATUS shows of every whole frame."""
+"""SYS_STATUS events of every complete frame."""
 
 _NEEDED_SYMBOLS: Final = 64
-"""How many of the preamble's 128 a receiver needs that is turned on while a frame comes in (assumed)."""
+"""Preamble symbols of 128 needed by a receiver that is enabled while a frame arrives (assumed)."""
 _MISSABLE_TICKS: Final = from_seconds((128 - _NEEDED_SYMBOLS) * PREAMBLE_SYMBOL_S)
 
 _SUSPECT_TICKS: Final = 1024
-"""How wrong the stamp is after an error without a reset of the receiver (assumed; UM 4.1.6 states that it may be)."""
+"""Error of the stamp after an error without a receiver reset (assumed; UM 4.1.6 only warns of it)."""
 
 PRF_64_DB: Final = 121.74
 """The constant of both powers at 64 MHz PRF (UM 4.7.1, 4.7.2)."""
 _ACCUMULATED_SYMBOLS: Final = 118
-"""Symbols that are accumulated of a preamble of 128: assumed; some pass before it is detected."""
+"""Accumulated symbols of a preamble of 128: assumed, as some pass before detection."""
 _SFD_COUNTED: Final = 5
-"""Symbols of the delimiter that RXPACC counts where it equals RXPACC_NOSAT, for the standard one (UM table 18)."""
+"""Delimiter symbols that RXPACC counts if it equals RXPACC_NOSAT, for the standard one (UM table 18)."""
 HZ_PER_STEP: Final = CHIP_RATE_HZ / 1024 / 131072
 """Step of the carrier integrator (UM 7.2.40.11), at 850 kbit/s and above."""
 _CARRIER_HALF: Final = 1 << 20
@@ -64,14 +65,14 @@ _CARRIER_HALF: Final = 1 << 20
 _GREATEST: Final = 0xFFFF
 
 _FILES_OF_BUFFER: Final = (r.RX_FINFO, r.RX_BUFFER, r.STD_NOISE, r.RX_TTCKO, r.RX_STAMP)
-"""Register files that each of the two receive buffers has (UM 4.3.1); carrier offset and accumulator have one place."""
+"""Register files that exist in each of the two receive buffers (UM 4.3.1)."""
 
 RCPHASE_STEPS: Final = 128
 """Steps of RCPHASE in a turn."""
 _STD_NOISE: Final = 40
 """Of the accumulator's samples (assumed)."""
 _FIRST_PATH_SAMPLE: Final = 740
-"""Where about the first path lies in the accumulator (assumed)."""
+"""Approximate index of the first path in the accumulator (assumed)."""
 _GREATEST_SAMPLE: Final = 0x7FFF
 _SAMPLE: Final = struct.Struct("<2h")
 
@@ -83,19 +84,19 @@ class Air(Protocol):
         """The node's 40-bit counter; the chip shows it in steps of 512."""
 
     def transmit(self, frame: bytes, leaves_ticks: int) -> bool:
-        """Let the RMARKER leave the antenna at that reading of the counter; False if it is too late."""
+        """Emit the RMARKER at that counter reading. Returns False if it is too late."""
 
     def withdraw(self) -> None:
         """Cancel what has not been sent."""
 
 
 class Sending(Struct):
-    """A frame that waits or is on its way; ticks without antenna delay."""
+    """A pending or transmitting frame; ticks without antenna delay."""
 
     marker_ticks: int
     end_ticks: int
     missed: bool
-    """Its time has passed: the chip would send it when the counter comes there again, 17 s later."""
+    """Its time has passed: the chip would send it when the counter returns there, 17 s later."""
 
 
 class Transceiver:
@@ -107,11 +108,11 @@ class Transceiver:
         self.counts: Counter[str] = Counter()
         self.sending: Sending | None = None
         self.listening_since: int | None = None
-        """When the receiver went on, or will."""
+        """When the receiver was, or will be, enabled."""
         self.suspect = False
-        """After an error the receiver needs a reset, or the next stamp is wrong (UM 4.1.6)."""
+        """After an error the receiver needs a reset, otherwise the next stamp is wrong (UM 4.1.6)."""
         self.receiving_ticks = 0
-        """How long the receiver has been on in all, up to the last ``update``."""
+        """Total time that the receiver has been on, up to the last ``update``."""
         self._counted_ticks = 0
         self._window_end_ticks: int | None = None
         self._hidden = {one.file: bytearray(r.FILE_LENGTHS[one.file]) for one in _FILES_OF_BUFFER}
@@ -121,7 +122,7 @@ class Transceiver:
         self._is_exchanged = False
 
     def reset(self) -> None:
-        """Everything off."""
+        """Turn everything off."""
         self.off()
         self.suspect = False
         self._host_buffer = self._chip_buffer = self._hidden_events = 0
@@ -134,7 +135,7 @@ class Transceiver:
         return (r.HSRBP if self._host_buffer else 0) | (r.ICRBP if self._chip_buffer else 0)
 
     def raise_bits(self, events: int) -> None:
-        """Show events in SYS_STATUS."""
+        """Set events in SYS_STATUS."""
         self._memory.set(r.SYS_STATUS, self._memory.get(r.SYS_STATUS) | events)
 
     def drop_bits(self, events: int) -> None:
@@ -144,7 +145,7 @@ class Transceiver:
     # Commands (UM 7.2.15)
 
     def command(self, control: int) -> None:
-        """Obey what was written into SYS_CTRL."""
+        """Execute a write to SYS_CTRL."""
         if control & r.TRXOFF:
             self.off()
         if control & r.HRBPT:
@@ -156,7 +157,7 @@ class Transceiver:
             self._listen(delayed=bool(control & r.RXDLYE))
 
     def off(self) -> None:
-        """TRXOFF: abort what is under way; HPDWARN goes with what it warned of (UM p. 91)."""
+        """TRXOFF: abort everything; HPDWARN is cleared with its cause (UM p. 91)."""
         self._withdraw()
         self.stop_listening()
         self.sending = None
@@ -168,7 +169,7 @@ class Transceiver:
             self.counts["withdrawn"] += 1
 
     def _start(self) -> None:
-        """TXSTRT and TXDLYS: send at DX_TIME, whose low nine bits do not count (UM p. 26)."""
+        """TXSTRT and TXDLYS: send at DX_TIME, whose low nine bits are ignored (UM p. 26)."""
         if self.sending is not None or self.listening_since is not None:
             self._misuse["txstrt-while-busy"] += 1
             return
@@ -189,21 +190,21 @@ class Transceiver:
             self.raise_bits(r.HPDWARN)
 
     def _hand_over(self, frame: bytes, leaves_ticks: int) -> bool:
-        """A frame with other settings than the air's is sent as well, but no receiver understands it."""
+        """Pass a frame to the air; with other settings than the air's it is sent, but no receiver understands it."""
         if not can_send(self._memory):
             self.counts["sent-with-other-settings"] += 1
             return True
         return self._air.transmit(frame, leaves_ticks)
 
     def _frame(self) -> bytes:
-        """TFLEN octets from TXBOFFS on, the last two made by the chip (UM 3.1, 7.2.10)."""
+        """TFLEN octets from TXBOFFS on, the last two generated by the chip (UM 3.1, 7.2.10)."""
         control = self._memory.get(r.TX_FCTRL)
         length, offset = control & 0x7F, control >> 22 & 0x3FF
         octets = self._memory.octets(r.TX_BUFFER)[offset : offset + length]
         return octets if length < 2 else octets[:-2] + fcs(octets[:-2])
 
     def _listen(self, *, delayed: bool) -> None:
-        """RXENAB, and RXDLYE: at DX_TIME (UM 4.2)."""
+        """RXENAB, and with RXDLYE at DX_TIME (UM 4.2)."""
         if self.sending is not None or self.listening_since is not None:
             self._misuse["rxenab-while-busy"] += 1
             return
@@ -221,7 +222,7 @@ class Transceiver:
             self._window_end_ticks = wrap(since + (memory.get(r.RX_FWTO) << 16))  # of 512 chips (UM 7.2.14)
 
     def stop_listening(self) -> None:
-        """The receiver is off."""
+        """Turn the receiver off."""
         self._count_receiving(self._air.now_ticks())
         self.listening_since = self._window_end_ticks = None
 
@@ -231,7 +232,7 @@ class Transceiver:
             self._counted_ticks = until_ticks
 
     def _exchange_buffers(self) -> None:
-        """Show the other receive buffer."""
+        """Switch to the other receive buffer."""
         shown = self._memory.get(r.SYS_STATUS)
         self._memory.exchange(self._hidden)
         self._memory.set(r.SYS_STATUS, shown & ~r.OF_BUFFER | self._hidden_events)
@@ -240,7 +241,7 @@ class Transceiver:
     # What passes with time
 
     def update(self) -> None:
-        """Show everything that has happened up to now."""
+        """Update the status to the present."""
         now = self._air.now_ticks()
         if self.sending is not None and not self.sending.missed:
             self._progress(self.sending, now)
@@ -253,16 +254,16 @@ class Transceiver:
 
     @property
     def window_left_ticks(self) -> int | None:
-        """Until the receiver's window ends, if it has one."""
+        """Time left in the receiver's window, if it has one."""
         return None if self._window_end_ticks is None else difference(self._window_end_ticks, self._air.now_ticks())
 
     def finish(self) -> None:
-        """The air reports that the frame's end has left."""
+        """The air reports that the frame has been sent."""
         if self.sending is not None and not self.sending.missed:
             self._progress(self.sending, self.sending.end_ticks)
 
     def fail(self) -> None:
-        """The air reports that the frame came too late for it; nothing will show, as when a frame is aborted."""
+        """The air reports that the frame came too late; nothing will show it, as when a frame is aborted."""
         if self.sending is not None:
             self.sending.missed = True
             self.counts["refused-by-the-air"] += 1
@@ -297,9 +298,9 @@ class Transceiver:
         fault: Fault | None = None,
         carrier_phase_cycles: float | None = None,
     ) -> str:
-        """Receive a frame whose RMARKER was at the antenna at that reading of the counter; what became of it.
+        """Receive a frame whose RMARKER was at the antenna at this counter reading. Returns the outcome.
 
-        ``antenna_ticks`` counts the antenna delay in, as the chip's own stamp does before LDE_RXANTD is taken off.
+        ``antenna_ticks`` includes the antenna delay, like the chip's own stamp before LDE_RXANTD is subtracted.
         """
         memory = self._memory
         reason = self._why_not_received(antenna_ticks)
@@ -341,7 +342,7 @@ class Transceiver:
         return None if can_receive(self._memory) else "other-settings"
 
     def _end_reception(self, events: int, *, is_error: bool) -> None:
-        """The receiver turns itself off."""
+        """End a reception; the receiver turns itself off."""
         self.suspect = self.suspect or is_error
         self.stop_listening()
         self.raise_bits(events)
@@ -352,7 +353,7 @@ class Transceiver:
             self._chip_buffer ^= 1
 
     def _fill_registers(self, frame: bytes, diagnostics: Diagnostics) -> None:
-        """RX_FINFO, the frame, and what was measured of it; zeros for what the air does not report.
+        """Set RX_FINFO, the frame, and its measurements; zeros if the air does not report them.
 
         The formulas are those of UM 4.7.1, 4.7.2, 7.2.22 and 7.2.40.11, inverted.
         """
@@ -373,10 +374,10 @@ class Transceiver:
         memory.set(r.DRX_CAR_INT, min(max(carrier, -_CARRIER_HALF), _CARRIER_HALF - 1) & (2 * _CARRIER_HALF - 1))
 
     def _fill_accumulator(self, frame: bytes, phase_cycles: float | None) -> None:
-        """RCPHASE, FP_INDEX, and four samples from there; zeros for what the air does not report.
+        """Set RCPHASE, FP_INDEX and four samples from there; zeros if the air does not report a phase.
 
-        The second one's angle less RCPHASE is the phase; its neighbours have others. Where the first path lies, and
-        RCPHASE within four steps, follow from the frame's octets in the place of chance. FP_AMPL3, FP_AMPL2 and
+        The second sample's angle minus RCPHASE is the phase; its neighbours have others. The first path's index, and
+        RCPHASE within four steps, are derived from the frame's octets instead of chance. FP_AMPL3, FP_AMPL2 and
         FP_AMPL1 are the sizes of the second, third and fourth (UM 7.2.20, 7.2.23).
         """
         memory, chance = self._memory, zlib.crc32(frame)
@@ -398,7 +399,7 @@ class Transceiver:
 def _cir_power(power_dbm: float | None) -> tuple[int, int]:
     """RXPACC and CIR_PWR with power = 10 log10(CIR_PWR · 2^17 / RXPACC²) - A.
 
-    Where CIR_PWR would overflow fewer symbols are accumulated: a stand-in for the gain control.
+    If CIR_PWR would overflow, fewer symbols are accumulated: a substitute for the gain control.
     """
     if power_dbm is None:
         return _ACCUMULATED_SYMBOLS, 0
@@ -408,7 +409,7 @@ def _cir_power(power_dbm: float | None) -> tuple[int, int]:
 
 
 def _first_path(power_dbm: float | None, symbols: int) -> tuple[int, int, int]:
-    """FP_AMPL1 to 3 with power = 10 log10((F1² + F2² + F3²) / RXPACC²) - A; the middle one the greatest."""
+    """FP_AMPL1 to 3 with power = 10 log10((F1² + F2² + F3²) / RXPACC²) - A; the middle one is the largest."""
     if power_dbm is None:
         return 0, 0, 0
     total = 10.0 ** ((power_dbm + PRF_64_DB) / 10.0) * symbols * symbols

@@ -1,6 +1,6 @@
-"""Figures that one can cite: errors of fixes against the truth, and whether what fixes claim of them holds.
+"""Citable figures: errors of fixes against the truth, and whether the fixes' own claims hold.
 
-``docs/recordings.md`` defines each. Replays, benchmarks and Python have them from here alone.
+``docs/recordings.md`` defines each. Replays, benchmarks and the Python interface all take them from here.
 """
 
 import math
@@ -25,7 +25,7 @@ from skyless.site.tables import Truth
 # Sums are exact; percentiles, medians and plots come from an even sample of the run.
 
 _SAMPLE_ROWS: Final = 1 << 17
-"""Rows kept at most; with fewer, percentiles are exact."""
+"""Most rows kept; with fewer, percentiles are exact."""
 
 
 class FirstFixes:
@@ -45,7 +45,7 @@ class FirstFixes:
 
 
 class EvenSample:
-    """Every k-th row of a stream, k doubling whenever the store is full: an even sample, reproducible."""
+    """Every k-th row of a stream, with k doubling whenever the store is full: even and reproducible."""
 
     def __init__(self, columns: int, rows: int = _SAMPLE_ROWS) -> None:
         self._columns = columns
@@ -70,17 +70,17 @@ class EvenSample:
 
     @property
     def rows(self) -> Array:
-        """The rows kept, shape (kept, columns), in their order; a copy."""
+        """The rows kept, shape (kept, columns), in order; a copy."""
         return np.array(self._store).reshape(-1, self._columns)
 
 
 def dimensions(*, planar: bool) -> str:
-    """What percentiles and the like are of, for people: of the horizontal error where the height was given."""
+    """Which errors percentiles refer to, for display: horizontal ones if the height was given."""
     return "2-D" if planar else "3-D"
 
 
 class ErrorSummary(Struct, frozen=True):
-    """Errors of a run in metres; None where there were none to judge."""
+    """Errors of a run in metres; None if there were none to judge."""
 
     count: int
     rmse_2d_m: float | None
@@ -91,14 +91,14 @@ class ErrorSummary(Struct, frozen=True):
 
 
 class ErrorStatistics:
-    """Position errors, one vector at a time."""
+    """Accumulates position errors."""
 
     def __init__(self, *, planar: bool) -> None:
-        """``planar``: percentiles and the maximum are of the horizontal error, because the height was given."""
+        """``planar``: percentiles and maximum refer to the horizontal error, as the height was given."""
         self._planar = planar
         self._count = 0
         self._origin = (0.0, 0.0, 0.0)
-        """The first vector: sums are about it, so that far from the site's origin no digits are lost."""
+        """The first vector: sums are relative to it, so that no digits are lost far from the site's origin."""
         self._sum = [0.0, 0.0, 0.0]
         self._squares = [0.0, 0.0, 0.0]
         self._max = 0.0
@@ -119,11 +119,11 @@ class ErrorStatistics:
 
     @property
     def count(self) -> int:
-        """How many errors there were."""
+        """Number of errors."""
         return self._count
 
     def std(self) -> tuple[float, float, float]:
-        """Standard deviation of each component about its mean."""
+        """Standard deviation of each component."""
         x, y, z = (variance**0.5 for variance in self._variances())
         return x, y, z
 
@@ -158,25 +158,25 @@ class LevelCounts(Struct, frozen=True):
     levels: Array
     """Fixes with a horizontal protection level."""
     exceeded: Array
-    """Those whose horizontal error is larger than it."""
+    """Those of them whose horizontal error exceeds it."""
     unwarned: Array
-    """Those of them that carry no alert."""
+    """Those of them without an alert."""
     hpl_m: Array
-    """Levels, an even sample of them."""
+    """An even sample of the levels."""
 
 
 class LevelReport(Struct, frozen=True):
-    """Protection levels of all judged fixes, of a method that gives levels."""
+    """Protection levels of all judged fixes of a method that has them."""
 
     integrity_risk: float
     available: float
-    """Share of fixes that give a level."""
+    """Share of fixes with a level."""
     misleading: int
     """Fixes whose horizontal or vertical error exceeds their level."""
     hpl_m: float | None
-    """Median of the horizontal levels, None where there is none."""
+    """Median of the horizontal levels, None if there are none."""
     alerts: dict[str, int]
-    """How many fixes carry which alert."""
+    """Fixes by alert."""
 
 
 class LevelTally:
@@ -209,14 +209,14 @@ class LevelTally:
             self._counts[3, tag] += integrity.alert is Alert.NONE
 
     def counts(self) -> LevelCounts | None:
-        """By tag; None where no fix was judged, or the method gives no levels."""
+        """Counts by tag; None if no fix was judged or the method has no levels."""
         if self._risk is None:
             return None
         fixes, levels, exceeded, unwarned = self._counts
         return LevelCounts(fixes, levels, exceeded, unwarned, self._sample.rows[:, 0])
 
     def report(self) -> LevelReport | None:
-        """Report of all tags together; None where no fix was judged, or the method gives no levels."""
+        """Report of all tags together; None if no fix was judged or the method has no levels."""
         if self._risk is None:
             return None
         fixes, levels = self._counts[:2].sum(axis=1).tolist()
@@ -229,25 +229,25 @@ class LevelTally:
 Triple = tuple[float, float, float]
 
 FLIGHT_M: Final = 0.3
-"""Above this height a drone flies."""
+"""A drone above this height is flying."""
 
 MAX_GAP_S: Final = 1.0
-"""There is no truth within longer gaps of its table."""
+"""Longer gaps in the table have no truth."""
 
 _WIDEST_OFFSET_S: Final = 5.0
 _OFFSET_STEPS_S: Final = (0.1, 0.01, 0.001)
 _OFFSET_ROWS: Final = 5_000
-"""Fixes with which an offset is estimated, an even sample."""
+"""Fixes used to estimate an offset, an even sample."""
 
 
 def flies(truth: Truth) -> bool:
-    """Whether the tag begins on the floor and then spends most of its time well above it."""
+    """Whether the tag starts on the floor and then spends most of its time well above it."""
     heights = truth.position_m[:, 2]
     return bool(heights[0] < FLIGHT_M and np.median(heights) > 2.0 * FLIGHT_M)
 
 
 def antenna_truth(truth: Truth, lever_arm_m: Triple) -> Truth:
-    """Carry the truth from the body to the antenna; without an attitude the body is taken to stay level.
+    """The truth moved from the body to the antenna; without an attitude the body is assumed level.
 
     ``lever_arm_m`` is the antenna in the body's frame.
     """
@@ -260,7 +260,7 @@ def antenna_truth(truth: Truth, lever_arm_m: Triple) -> Truth:
 
 
 def truth_at(truth: Truth | None, times_s: Vector) -> Matrix:
-    """True positions by linear interpolation, shape (n, 3): NaN outside the table and within its gaps."""
+    """True positions by linear interpolation, shape (n, 3): NaN outside the table and in its gaps."""
     times_s = np.asarray(times_s, dtype=np.float64)
     if truth is None or len(truth.t_s) == 0:
         return np.full((len(times_s), 3), np.nan)
@@ -274,14 +274,14 @@ def truth_at(truth: Truth | None, times_s: Vector) -> Matrix:
 
 
 class TruthTrack:
-    """``truth_at`` for one time after the other, which takes a tenth of the time of arrays of one."""
+    """``truth_at`` for single times, ten times as fast as with arrays of one."""
 
     def __init__(self, truth: Truth | None) -> None:
         self._times: list[float] = [] if truth is None else truth.t_s.tolist()
         self._places: Array = np.empty((0, 3)) if truth is None else truth.position_m
 
     def at(self, time_s: float) -> Triple | None:
-        """True position, None outside the table and within its gaps."""
+        """True position, None outside the table and in its gaps."""
         times = self._times
         if not times or not times[0] <= time_s <= times[-1]:
             return None
@@ -300,9 +300,9 @@ def shifted(truth: Truth, offset_s: float) -> Truth:
 
 
 def estimated_offset_s(truth: Truth, times_s: Vector, position_m: Matrix) -> float | None:
-    """What is to be added to the truth's times so that it fits positions of shape (n, 3) best; None where none shows.
+    """The offset of the truth's times at which it fits positions of shape (n, 3) best; None if none stands out.
 
-    The median horizontal error is least there, up to five seconds away. A tag at rest shows none.
+    It minimises the median horizontal error within five seconds. A tag at rest has none.
     """
     kept = slice(None, None, max(len(times_s) // _OFFSET_ROWS, 1))
     times_s, position_m = times_s[kept], position_m[kept]
@@ -323,10 +323,10 @@ def estimated_offset_s(truth: Truth, times_s: Vector, position_m: Matrix) -> flo
 
 
 KEPT_FIXES: Final = 1 << 19
-"""Of a recording with more fixes, every second, fourth, … is judged."""
+"""Of recordings with more fixes, every second, fourth, … one is judged."""
 
 HOLD_S: Final = 1.0
-"""A fix counts as the newest until the next one, for this time at most."""
+"""A fix counts as current until the next one, but no longer than this."""
 
 STEP_M: Final = 1.0
 """Length of the true path over which relative errors are taken."""
@@ -338,7 +338,7 @@ _ALERTS: Final = tuple(Alert)
 _NUMBER: Final = {alert: float(number) for number, alert in enumerate(_ALERTS)}
 _NO_LEVELS: Final = (np.nan, np.nan, -1.0)
 _PLACE: Final = Format("12d")
-"""A position and its covariance, with which the rows of a fix begin."""
+"""The position and covariance at the beginning of a fix's rows."""
 
 
 class FixTable(Struct, frozen=True):
@@ -349,21 +349,21 @@ class FixTable(Struct, frozen=True):
     position_m: Matrix
     """Shape (n, 3)."""
     covariance_m2: Array
-    """Shape (n, 3, 3); NaN where none is claimed."""
+    """Shape (n, 3, 3); NaN if none is claimed."""
     levels_m: Matrix
-    """Shape (n, 2): protection levels, horizontal and vertical; NaN where there is none."""
+    """Shape (n, 2): protection levels, horizontal and vertical; NaN if there is none."""
     alert: Vector
     """Shape (n,): number of the alert in ``Alert``; −1 without levels."""
 
 
 def axes_std_m(covariance_m2: Array) -> Matrix:
-    """Standard deviations of x, y and z of covariances of shape (n, 3, 3), shape (n, 3)."""
+    """Standard deviations of x, y and z from covariances of shape (n, 3, 3), shape (n, 3)."""
     std_m: Matrix = np.sqrt(np.diagonal(covariance_m2, axis1=1, axis2=2))
     return std_m
 
 
 class FixSamples:
-    """Gathers fixes, 104 bytes each, in bounded memory."""
+    """Collects fixes, 104 bytes each, in bounded memory."""
 
     def __init__(self) -> None:
         self._sample = EvenSample(13, KEPT_FIXES)
@@ -379,36 +379,36 @@ class FixSamples:
 
     @property
     def count(self) -> int:
-        """How many fixes there were."""
+        """Number of fixes added."""
         return self._sample.seen
 
     def table(self) -> FixTable:
-        """All of them, or an even sample."""
+        """All fixes, or an even sample."""
         rows = self._sample.rows
         covariance_m2 = rows[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].reshape(-1, 3, 3)
         return FixTable(rows[:, 0], rows[:, 1:4], covariance_m2, rows[:, 10:12], rows[:, 12])
 
 
 class Judged(Struct, frozen=True):
-    """Which fixes are judged: those of a recording after it has settled, where the truth is known and high enough."""
+    """Which fixes are judged: those after settling with a known and high enough true position."""
 
     truth: Truth | None
     begin_s: float | None
-    """Time of the first record; None before there is one."""
+    """Time of the first record; None before it."""
     end_s: float
     planar: bool
-    """Whether the height was given: then the horizontal error is judged alone."""
+    """Whether the height was given: then only the horizontal error is judged."""
     settle_s: float
     above_m: float | None = None
     """True height above which fixes are judged."""
 
     def of(self, times_s: Vector) -> tuple[Matrix, Mask]:
-        """The truth at these times, shape (n, 3), and whether fixes of them are judged, shape (n,)."""
+        """The truth at these times, shape (n, 3), and whether their fixes are judged, shape (n,)."""
         truth_m, masks = self.masks(times_s)
         return truth_m, masks["judged"]
 
     def masks(self, times_s: Vector) -> tuple[Matrix, dict[str, Mask]]:
-        """The truth at these times, and which are judged or left out why."""
+        """The truth at these times, and masks of judged fixes and of each reason for leaving fixes out."""
         truth_m = truth_at(self.truth, times_s)
         settled = times_s - (self.begin_s or 0.0) >= self.settle_s
         known = np.isfinite(truth_m[:, 0])
@@ -422,21 +422,21 @@ class Judged(Struct, frozen=True):
 
 
 class Figures(Struct, frozen=True, kw_only=True):
-    """Figures of a run; metres and seconds, None where they are not known."""
+    """Figures of a run; metres and seconds, None if unknown."""
 
     judged: int = 0
-    """Fixes that are judged, ..."""
+    """Judged fixes, ..."""
     judged_s: float = 0.0
     """... the time that they cover, ..."""
     left_out: dict[str, int] = {}
-    """... and how many are not, by reason: ``settling``, ``without-truth``, ``below-height``, ``thinned``."""
+    """... and the number left out by reason: ``settling``, ``without-truth``, ``below-height``, ``thinned``."""
     median_m: Triple | None = None
     """Median position after the settling time."""
     std_m: Triple | None = None
     """Standard deviation of the position after the settling time, for tags at rest."""
     rmse_2d_m: float | None = None
     rmse_3d_m: float | None = None
-    """Root mean square errors; all figures in three dimensions are None where the height was given."""
+    """Root mean square errors; all 3-D figures are None if the height was given."""
     rmse_axes_m: Triple | None = None
     p50_2d_m: float | None = None
     p75_2d_m: float | None = None
@@ -452,9 +452,9 @@ class Figures(Struct, frozen=True, kw_only=True):
     sigma_3d_m: float | None = None
     """Claimed: root of the mean trace of the covariances."""
     nees: float | None = None
-    """Mean of the squared error over the claimed covariance, by degree of freedom: 1 where the claim is right."""
+    """Mean of the squared error over the claimed covariance, per degree of freedom: 1 if the claim is right."""
     beyond_95: float | None = None
-    """Share of the fixes outside the ellipse, or the ellipsoid, that should hold 95 % of them."""
+    """Share of fixes outside the ellipse or ellipsoid that should contain 95 % of them."""
     ate_m: float | None = None
     """Absolute trajectory error: RMSE after the best rotation and translation."""
     rpe_m: float | None = None
@@ -463,14 +463,14 @@ class Figures(Struct, frozen=True, kw_only=True):
     """Fixes with a protection level and a known truth, from the first fix on, ..."""
     exceeded_horizontal: int = 0
     exceeded_vertical: int = 0
-    """... how many of them have a larger error, ..."""
+    """... those of them whose error exceeds it, ..."""
     exceeded_unalerted: int = 0
-    """... and how many of those carry no alert."""
+    """... and those of these without an alert."""
     hpl_m: float | None = None
     vpl_m: float | None = None
     """Medians of the levels."""
     alerts: dict[str, int] = {}
-    """How many fixes carry which alert, from the first fix on."""
+    """Fixes by alert, from the first fix on."""
     availability: float | None = None
     """Share of the recording's time in which the newest fix is at most ``HOLD_S`` old."""
     first_fix_s: float | None = None
@@ -479,7 +479,7 @@ class Figures(Struct, frozen=True, kw_only=True):
 
 
 def figures_of(table: FixTable, how: Judged, count: int | None = None) -> Figures:
-    """Figures of fixes; ``count`` is how many there were where the table is a sample of them."""
+    """Figures of fixes; ``count`` is the total number if the table is a sample."""
     if how.begin_s is None or len(table.time_s) == 0:
         return Figures()
     dim, time_s = 2 if how.planar else 3, table.time_s
@@ -544,7 +544,7 @@ def _claims(error_m: Matrix, covariance_m2: Array) -> dict[str, Any]:
 
 
 def _trajectory(position_m: Matrix, truth_m: Matrix, dim: int) -> dict[str, Any]:
-    """Trajectory errors as the programs that compare trajectories define them (Sturm et al. 2012)."""
+    """Trajectory errors as defined by common tools for comparing trajectories (Sturm et al. 2012)."""
     if len(position_m) < 3:
         return {}
     position_m, truth_m = position_m.copy(), truth_m.copy()

@@ -1,4 +1,4 @@
-"""A site in the simulated world with tags that compute, and their errors against the truth."""
+"""A site in the simulated world with computing tags, and their errors against the truth."""
 
 import time
 from collections import Counter
@@ -25,66 +25,66 @@ from skyless.sim.trajectory import Static, Trajectory
 from skyless.sim.world import World
 
 _LEVEL_ROWS: Final = 1 << 16
-"""Protection levels kept, of which the median is reported."""
+"""Protection levels kept for the median."""
 
 
 class JudgedFix(Struct, frozen=True, gc=False):
-    """A fix and the truth at the moment it was made."""
+    """A fix with the truth."""
 
     tag: int
     time_s: float
-    """True time at which the last frame of the fix ended."""
+    """True time at the end of the fix's last frame."""
     fix: Fix
     truth_m: Array
-    """Where the tag truly was when that frame was sent, shape (3,)."""
+    """True position of the tag when that frame was sent, shape (3,)."""
 
     @property
     def error_m(self) -> Array:
-        """Position less truth, shape (3,)."""
+        """Position minus truth, shape (3,)."""
         return self.fix.position_m - self.truth_m
 
 
 class TagReceiver(Protocol):
-    """What a tag computes with."""
+    """A tag's receiver."""
 
     @property
     def counters(self) -> Counter[str]:
-        """Frames by what became of them."""
+        """Frames by outcome."""
 
     @property
     def reason(self) -> NoFixReason:
-        """Why the last frame has made no fix."""
+        """Why the last frame made no fix."""
 
     def hear(self, reception: Reception) -> Fix | None:
-        """Process a frame from the air; a fix if it made one."""
+        """Process a frame from the air. Returns a fix if it made one."""
 
     def hear_beacon(self, beacon: SiteBeacon, reception: Reception) -> Fix | None:
-        """Process a beacon that is decoded already, as ``hear`` does."""
+        """Process a decoded beacon as ``hear`` does."""
 
 
 class FleetSettings(Struct, frozen=True):
-    """How the tags compute, and from when on they are judged."""
+    """How the tags compute, and which fixes are judged."""
 
     method: str = DEFAULT_METHOD
     qa: float = 0.3
     warmup_s: float = 2.0
-    """True time before which no fix counts for the errors; ``first_fix_s`` reports cold starts."""
+    """Fixes before this true time are not judged; ``first_fix_s`` reports cold starts."""
     most_fixes: int | None = None
-    """Judged fixes per tag after which no more are judged."""
+    """Most judged fixes per tag."""
     integrity: IntegrityRequirement = IntegrityRequirement()
     silences: tuple[Outage, ...] = ()
     """True times in which no tag's radio receives."""
     new_receiver: Callable[[], TagReceiver] | None = None
-    """Makes each tag's receiver, instead of one of the method."""
+    """Creates each tag's receiver, instead of one of the method."""
 
 
 class ReceiverWithOutages(AnyReceiver):
-    """Counts as dropped what arrives while its radio is off; unlike after a loss of power, its counter has gone on."""
+    """A receiver that drops and counts frames while its radio is off; its counter keeps running."""
 
     def __init__(
         self, method: str, *, qa: float, integrity: IntegrityRequirement, silences: tuple[Outage, ...]
     ) -> None:
-        """``silences`` are in the time of the host, which in the simulated world is the true one.
+        """``silences`` are in host time, which in the simulated world is true time.
 
         Raises:
             ValueError: there is no such method.
@@ -102,7 +102,7 @@ class ReceiverWithOutages(AnyReceiver):
 
 
 class TagRecord(Struct):
-    """What one tag has done."""
+    """Counts of one tag."""
 
     messages: int = 0
     fixes: int = 0
@@ -112,16 +112,16 @@ class TagRecord(Struct):
 
 
 def world_of(site: Site, trajectories: Sequence[Trajectory], impairments: Impairments, seed: int) -> World:
-    """A world of the site's anchors, as they run on their hosts, and of tags on the trajectories."""
+    """A world with the site's anchors, as they run on their hosts, and tags on the trajectories."""
     tags = [TagSpec(trajectory) for trajectory in trajectories]
     return World(site, lambda anchor: new_anchor(site, anchor), tags, impairments, seed)
 
 
 class TagFleet:
-    """Tags that compute, and their errors; how they receive is the matter of ``Fleet`` and ``CellFleet``."""
+    """Computing tags and their errors; ``Fleet`` and ``CellFleet`` differ in how tags receive."""
 
     step_s = 0.25
-    """True time in which it is best to run."""
+    """Suitable true time per call of ``run``."""
 
     def __init__(self, site: Site, tags: int, settings: FleetSettings) -> None:
         self._settings = settings
@@ -135,16 +135,16 @@ class TagFleet:
 
     @property
     def now_s(self) -> float:
-        """True time that has passed."""
+        """The present true time."""
         raise NotImplementedError
 
     @property
     def tally(self) -> Tally:
-        """What was on the air."""
+        """Counts of what was on the air."""
         raise NotImplementedError
 
     def run(self, until_s: float) -> Iterator[JudgedFix]:
-        """Let true time pass; every fix of every tag, with the truth."""
+        """Advance true time. Yields every fix of every tag, with the truth."""
         raise NotImplementedError
 
     def _new_receiver(self) -> TagReceiver:
@@ -156,7 +156,7 @@ class TagFleet:
         return AnyReceiver(asked.method, qa=asked.qa, integrity=asked.integrity)
 
     def add(self, tag: int, fix: Fix | None, truth_m: Array, at_s: float) -> JudgedFix | None:
-        """Count a frame that a tag has processed, which ended at that true time, and judge the fix if it made one."""
+        """Count a processed frame that ended at ``at_s``, and judge its fix if there is one."""
         record = self.records[tag]
         record.messages += 1
         if fix is None:
@@ -183,7 +183,7 @@ class TagFleet:
 
     @property
     def drops(self) -> dict[str, int]:
-        """Frames that the tags did not use, by reason."""
+        """Frames not used by the tags, by reason."""
         total: Counter[str] = Counter()
         for receiver in self.receivers:
             total.update(receiver.counters)
@@ -236,23 +236,23 @@ class FleetReport(Struct, frozen=True):
     tags: int
     messages: int
     fixes: int
-    """Fixes that were judged."""
+    """Judged fixes."""
     rmse_m: float | None
     p95_m: float | None
     max_m: float | None
     updates_per_s: float
-    """Fixes per second and tag, all of them."""
+    """All fixes per second and tag."""
     dropped: int
     std_m: float | None
     """Root mean square error about the mean error."""
     sigma_m: float | None
-    """Predicted by the fixes: the root of the mean trace of their covariances."""
+    """As claimed by the fixes: the root of the mean trace of their covariances."""
     bias_m: tuple[float, float, float] | None
     first_fix_s: float | None
-    """Median over the tags of the true time of the first fix, from a cold start of the whole site."""
+    """Median over the tags of the true time of the first fix, after a cold start of the whole site."""
     tags_without_fix: int
     levels: LevelReport | None
-    """None for methods that give no protection levels."""
+    """None for methods without protection levels."""
     drops: dict[str, int]
     air: Tally
     simulated_s: float
@@ -262,7 +262,7 @@ class FleetReport(Struct, frozen=True):
 
 
 def report(fleet: TagFleet, method: str, started_s: float) -> FleetReport:
-    """Sum a run up; ``started_s`` is ``time.perf_counter()`` at its start."""
+    """Summarise a run; ``started_s`` is ``time.perf_counter()`` at its start."""
     wall_s = time.perf_counter() - started_s
     summary = fleet.errors.summary()
     simulated_s = fleet.now_s
@@ -305,7 +305,7 @@ def _std_m(rmse_m: float | None, summary: ErrorSummary) -> float | None:
 
 
 def compile_kernels(method: str = DEFAULT_METHOD) -> None:
-    """Run a fifth of a second of the lab; for snapshots that of the paper, as they need its protocol."""
+    """Simulate a fifth of a second of the lab; for snapshots, that of the paper with its protocol."""
     site = lab_site() if method in FILTERS else paper_lab_site()
     fleet = Fleet(site, [Static(3.0, 4.0)], lab_impairments(100.0), 0, FleetSettings(method, warmup_s=0.0))
     for _ in fleet.run(0.2):

@@ -1,4 +1,4 @@
-"""What is asked of a simulation, but for its site: the options that ``skyless simulate`` and a ``Request`` share."""
+"""A simulation's options, except for its site: shared by ``skyless simulate`` and ``Request``."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Simulations by name and number: from what a person asks for to a fleet in a world."""
+"""Named and numbered simulations: from a user's request to a fleet in a world."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -50,7 +50,7 @@ _ROAM_KEY: Final = 6
 
 
 class Room(Struct, frozen=True):
-    """What is wrong in a real room in addition to noise: errors of survey and ranges, drawn from a world's seed.
+    """Errors of a real room in addition to noise: survey and ranges, drawn from a world's seed.
 
     The sizes are those that recordings of DW1000s show after a survey and a calibration by hand (``docs/studies.md``).
     """
@@ -64,19 +64,19 @@ class Room(Struct, frozen=True):
     """Errors of the ranges at tags."""
     is_stated: bool = False
     """Whether these are the errors that the site's file states: anchors with their own ``std_m`` have that, and tags
-    without a given motion walk as in exact air; else they accelerate at random."""
+    without a given motion walk as in exact air; otherwise they accelerate at random."""
 
 
 class Request(Conditions, frozen=True):
-    """A simulation: a site, the options of ``skyless simulate``, and what only programs ask for."""
+    """A simulation: a site, the options of ``skyless simulate``, and options for programs only."""
 
     site: Site
     room: Room | None = None
     """Errors of survey and ranges (``room_of``); None for anchors at the site's positions and exact ranges."""
     new_receiver: Callable[[], TagReceiver] | None = None
-    """Makes each tag's receiver, instead of one of the method."""
+    """Creates each tag's receiver, instead of one of the method."""
     diagnostics: bool = False
-    """Whether receptions carry powers, of which the first path's is low where they are late."""
+    """Whether receptions include powers; the first path's is low if they are late."""
     body: Body | None = None
     warm_ups: tuple[WarmUp, ...] = ()
     walls_between_anchors: bool = True
@@ -85,7 +85,7 @@ class Request(Conditions, frozen=True):
 def stated_room(site: Site, *, slope_m: float, at_rest: bool) -> Room:
     """Errors of survey and ranges as large as the site's file states them.
 
-    Multipath changes with time for tags at rest, else with the distance moved.
+    Multipath changes with time for tags at rest, otherwise with the distance moved.
     """
     accuracy = site.accuracy
     ranges = RangeErrorModel(
@@ -99,7 +99,7 @@ def stated_room(site: Site, *, slope_m: float, at_rest: bool) -> Room:
 
 
 def room_of(site: Site, seed: int, *, is_named_room: bool, at_rest: bool) -> Room | None:
-    """Errors of a simulation: the named room's, else what the site states; None if there are none."""
+    """Errors of a simulation: the named room's, otherwise what the site states; None if there are none."""
     if is_named_room:
         return Room()
     if site.accuracy.is_exact and not any(anchor.std_m for anchor in site.anchors):
@@ -109,7 +109,7 @@ def room_of(site: Site, seed: int, *, is_named_room: bool, at_rest: bool) -> Roo
 
 
 def errors_words(site: Site, room: Room | None) -> str:
-    """Which errors a simulation draws, for people."""
+    """Description of the errors that a simulation draws, for display."""
     if room is None:
         return "none: positions and ranges are exact"
     if not room.is_stated:
@@ -128,12 +128,12 @@ def errors_words(site: Site, room: Room | None) -> str:
 
 
 def position_stds_m(site: Site) -> list[float]:
-    """How well each anchor's position is known, per axis."""
+    """Standard deviation of each anchor's position, per axis."""
     return [site.accuracy.survey_std_m if anchor.std_m is None else anchor.std_m for anchor in site.anchors]
 
 
 def check_can_be_simulated(site: Site, method: str = DEFAULT_METHOD) -> None:
-    """See that tags of the site can have fixes by the method. Raises SkylessError."""
+    """Check that tags of the site can have fixes by the method. Raises SkylessError."""
     if not site.schedule.needs_master and method in SNAPSHOTS:
         raise SkylessError(
             f"--method is {method!r}, which needs a master, and site {site.name!r} has none (mode "
@@ -144,7 +144,7 @@ def check_can_be_simulated(site: Site, method: str = DEFAULT_METHOD) -> None:
 
 
 def fleet_of(request: Request) -> Fleet:
-    """Make the world and its tags; the anchors are the machines that would run on radios.
+    """Create the world and its tags; the anchors are the machines that would run on radios.
 
     Raises:
         ValueError: an anchor that is to fail does not exist, or the method needs a master and the site has none.
@@ -159,10 +159,10 @@ def fleet_of(request: Request) -> Fleet:
 
 
 def fleet_of_any_size(request: Request) -> TagFleet:
-    """As ``fleet_of``, but for anchors of protocol 2 that are too many to run their machines: simulated on demand.
+    """Like ``fleet_of``, but simulates the anchors of large sites of protocol 2 on demand.
 
     Raises:
-        ValueError: as ``fleet_of``, or something is to go wrong that is not modelled at such a site.
+        ValueError: as ``fleet_of``, or a requested fault is not modelled at such a site.
     """
     site, room = request.site, request.room
     if site.schedule.needs_master or len(site.anchors) <= MAX_MACHINES:
@@ -237,7 +237,7 @@ def impairments_of(request: Request, site: Site) -> Impairments:
 
 
 def trajectories_of(request: Request) -> list[Trajectory]:
-    """Tags at the given positions and on the given paths, else walking about inside the box around the anchors.
+    """Tags at the given positions and on the given paths, otherwise walking inside the box around the anchors.
 
     Those of a room wander with random acceleration.
     """
@@ -256,7 +256,7 @@ def wanderers(site: Site, tags: int, seed: int) -> list[Trajectory]:
 
 
 def displacements(room: Room, site: Site, seed: int) -> tuple[AnchorDisplacement, ...]:
-    """True positions of the anchors less the stated ones; the first draws are the same for all rooms of a seed."""
+    """True minus stated positions of the anchors; the first draws are the same for all rooms of a seed."""
     draw = stream(seed, _ROOM_KEY, 0)
     count = len(site.anchors)
     shifts_m = _axis_stds_m(room, site)[:, None] * draw.standard_normal((count, 3))
@@ -276,7 +276,7 @@ def _axis_stds_m(room: Room, site: Site) -> Array:
 
 
 def wanderer(low_m: Array, high_m: Array, seed: int, tag: int, qa_m2ps3: float = ROOM_QA_M2PS3) -> Roaming:
-    """A tag with random acceleration that is in the box for 99.7 % of the time along each axis."""
+    """A tag with random acceleration that is inside the box for 99.7 % of the time along each axis."""
     own = int(stream(seed, _ROAM_KEY, tag).integers(2**62))
     return Roaming((low_m + high_m) / 2.0, (high_m - low_m) / (2.0 * _BOX_SIGMAS), qa_m2ps3=qa_m2ps3, seed=own)
 
@@ -291,7 +291,7 @@ def _path(points: list[tuple[float, float, float]], speed_mps: float) -> Waypoin
 
 
 def _walk(request: Request, index: int) -> Trajectory:
-    """Walk between random points inside the box, round and round, turning gently at each."""
+    """Walk in a loop between random points inside the box, turning gently at each."""
     low, high = _walkable_box(request.site, walked_floor(request.site, request.tags or 1, index))
     generator = np.random.default_rng([request.seed, index])
     points = [generator.uniform(low, high)]
@@ -303,7 +303,7 @@ def _walk(request: Request, index: int) -> Trajectory:
 
 
 def _smooth_path(points: Sequence[ArrayLike], speed_mps: float, *, loop: bool = True) -> Waypoints:
-    """Path whose corners are as gentle as the legs allow, at most ``COMFORT_MPS2``; ``loop``: round and round."""
+    """Path with corners as gentle as the legs allow, at most ``COMFORT_MPS2``; ``loop``: round and round."""
     points_m = np.array(points, dtype=np.float64)
     steps_m = np.roll(points_m, -1, axis=0) - points_m
     legs_m = np.linalg.norm(steps_m if loop else steps_m[:-1], axis=1)
@@ -312,7 +312,7 @@ def _smooth_path(points: Sequence[ArrayLike], speed_mps: float, *, loop: bool = 
 
 
 def walked_floor(site: Site, tags: int, index: int) -> FloorSite | None:
-    """The floor of a tag: the one that a ``TagCount`` names, else each in turn; None at a site without floors.
+    """The floor of a tag: the one named by a ``TagCount``, otherwise each in turn; None for a site without floors.
 
     Raises SkylessError: the site has no such floor.
     """
@@ -330,7 +330,7 @@ def walked_floor(site: Site, tags: int, index: int) -> FloorSite | None:
 
 
 def _walkable_box(site: Site, floor: FloorSite | None = None) -> tuple[Array, Array]:
-    """Where tags walk: among the anchors, on a floor among its own and at the height at which tags are carried."""
+    """Box in which tags walk: among the anchors; on a floor, among its own at the height at which tags are carried."""
     own = [anchor for anchor in site.anchors if floor is not None and anchor.floor == floor.number] or site.anchors
     points_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in own])
     low, high = points_m.min(axis=0), points_m.max(axis=0)
@@ -348,7 +348,7 @@ def _walkable_box(site: Site, floor: FloorSite | None = None) -> tuple[Array, Ar
 
 
 def patrols(site: Site, tags: int, speed_mps: float = 1.0) -> list[Trajectory]:
-    """Tags walking round the site one behind the other, each on a narrower path: what the demo shows."""
+    """Tags walking round the site one behind the other, each on a narrower path, as in the demo."""
     paths: list[Trajectory] = []
     for index in range(tags):
         low, high = _walkable_box(site, walked_floor(site, tags, index))
@@ -375,7 +375,7 @@ def run_fleet(
     on_fix: Callable[[JudgedFix], None] | None,
     on_progress: Callable[[float], None],
 ) -> None:
-    """Run the world in steps; ``on_fix`` gets every fix, ``on_progress`` now and then the share done."""
+    """Run the world in steps; ``on_fix`` gets every fix, ``on_progress`` the share done from time to time."""
     fixes, now_s = request.fixes, 0.0
     while now_s < until_s and not _is_enough(fleet, request, now_s):
         now_s = min(now_s + fleet.step_s, until_s)
@@ -386,7 +386,7 @@ def run_fleet(
 
 
 def _is_enough(fleet: TagFleet, request: Request, now_s: float) -> bool:
-    """Whether all tags have their fixes, or those that have not wait too long, with nothing planned to come back."""
+    """Whether all tags have their fixes, or the others have waited too long with no planned return."""
     fixes = request.fixes
     if fixes is None:
         return False
