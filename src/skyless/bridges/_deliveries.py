@@ -1,7 +1,7 @@
-"""Messages about alarms on their way to one receiver: each is tried until it is accepted, refused or too old.
+"""Delivery of alarm messages to one receiver: each is retried until it is accepted, refused or too old.
 
-Attempts block and run in a thread of their own, one at a time. A receiver that hangs, refuses or is slow delays nothing
-but its own messages.
+Attempts block and run in a thread of their own, one at a time. A receiver that hangs, refuses or is slow delays only
+its own messages.
 """
 
 import asyncio
@@ -24,15 +24,15 @@ from skyless.run.mqtt.messages import AlarmMessage
 from skyless.run.web import BRIDGES as LIMITS
 
 TIMEOUT_S: Final = 10.0
-"""For each attempt, all of it."""
+"""For one whole attempt."""
 
 FIRST_PAUSE_S: Final = 1.0
 LONGEST_PAUSE_S: Final = 300.0
 KEPT_S: Final = 86_400.0
-"""A message that has not been delivered for this long is dropped."""
+"""An undelivered message is dropped after this time."""
 
 LAST_S: Final = 3.0
-"""For all that waits when the bridge stops."""
+"""For everything that waits when the bridge stops."""
 
 _MAX_KNOWN: Final = 10_000
 _MAX_SECRET_BYTES: Final = 4096
@@ -46,7 +46,7 @@ class RefusedError(Exception):
 
 
 class Delivery(Struct, eq=False):
-    """What has become of an alarm, until it is delivered."""
+    """A message about an alarm, until it is delivered."""
 
     what: What
     alarm: AlarmMessage
@@ -54,23 +54,23 @@ class Delivery(Struct, eq=False):
     due_s: float
     pause_s: float
     reached: set[str] = set()
-    """Who has accepted a mail to several people, and does not get it again."""
+    """Recipients who have accepted a mail to several people, and do not get it again."""
 
     @property
     def key(self) -> str:
-        """The same for each attempt, also of another run of the bridge."""
+        """The same for each attempt, also in another run of the bridge."""
         return f"{self.alarm.id}/{self.what}"
 
 
 Open = Callable[[socket.socket | None], None]
-"""To be called with the socket of an attempt, which is closed when its time is over."""
+"""Called with the socket of an attempt, which is closed when its time is over."""
 
 
 class AlarmTarget(Target):
-    """Base of targets that get what becomes of alarms. ``attempt`` is called in a thread."""
+    """Base of targets that get changes of alarms. ``attempt`` is called in a thread."""
 
     def __init__(self, text: str, log: Callable[[str], None], kinds: frozenset[What]) -> None:
-        """``kinds`` are those that are delivered."""
+        """``kinds``: the changes to deliver."""
         super().__init__(text)
         self.site: BridgedSite | None = None
         self.delivered = 0
@@ -82,14 +82,14 @@ class AlarmTarget(Target):
         self._wake = asyncio.Event()
 
     def attempt(self, delivery: Delivery, on_open: Open) -> None:
-        """Deliver. Raises RefusedError where it makes no sense to try again, and OSError where it does."""
+        """Deliver once. Raises RefusedError if retrying is pointless, OSError if it is not."""
         raise NotImplementedError
 
     def on_site(self, site: BridgedSite) -> None:
         self.site = site
 
     def on_alarm(self, alarm: AlarmMessage) -> None:
-        """An alarm as it is now. Of those from before the start, only active ones that nobody has seen are new."""
+        """Process an alarm's state. Of those from before the start, only active unacknowledged ones are new."""
         states = _states(alarm)
         known = self._known.pop(alarm.id, None)
         self._known[alarm.id] = states
@@ -107,7 +107,7 @@ class AlarmTarget(Target):
         self._wake.set()
 
     async def run(self) -> None:
-        """Deliver until cancelled; what waits then is tried once more."""
+        """Deliver until cancelled, then try everything that waits once more."""
         try:
             await self._deliver()
         except asyncio.CancelledError:
@@ -142,7 +142,7 @@ class AlarmTarget(Target):
             self._log(f"{self.text}: stopped; messages that were not delivered: {len(self._waiting)}")
 
     def _next(self) -> Delivery | None:
-        """The message whose turn comes first. Those about one alarm keep their order."""
+        """The message to send next. Those about the same alarm keep their order."""
         firsts: dict[str, Delivery] = {}
         for one in self._waiting:
             firsts.setdefault(one.alarm.id, one)
@@ -166,14 +166,14 @@ class AlarmTarget(Target):
             self._waiting.remove(one)
 
     def _report(self, trouble: str) -> None:
-        """Log a trouble when it begins and when it is over."""
+        """Log a fault when it begins and when it is over."""
         if trouble != self._trouble:
             self._trouble = trouble
             self._log(f"{self.text}: {trouble[:240] or 'delivered again'}")
 
 
 def _states(alarm: AlarmMessage) -> list[What]:
-    """What has become of an alarm so far."""
+    """The changes of an alarm so far."""
     states: list[What] = ["raised"]
     if alarm.acknowledged_unix_s is not None:
         states.append("acknowledged")
@@ -183,7 +183,7 @@ def _states(alarm: AlarmMessage) -> list[What]:
 
 
 async def _in_thread(work: Callable[[Open], None]) -> None:
-    """Run what blocks in a thread that the end of the program does not wait for, for at most ``TIMEOUT_S``."""
+    """Run blocking work in a daemon thread, for at most ``TIMEOUT_S``."""
     done: Future[None] = Future()
     done.set_running_or_notify_cancel()
     sockets: list[socket.socket | None] = []
@@ -209,7 +209,7 @@ async def _in_thread(work: Callable[[Open], None]) -> None:
 
 
 def read_secret(text: str, key: str, name: str) -> str:
-    """The first line of a file that only its owner may read. Raises SkylessError."""
+    """The first line of a file readable only by its owner. Raises SkylessError."""
     path = Path(name)
     try:
         with path.open("rb") as file:

@@ -1,4 +1,4 @@
-"""``foxglove://``: a server that Foxglove, Lichtblick and other clients of its WebSocket protocol, version 1, open.
+"""``foxglove://``: a server for Foxglove, Lichtblick and other clients of the Foxglove WebSocket protocol, version 1.
 
 Source: https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md
 """
@@ -41,10 +41,10 @@ from skyless.run.web import BRIDGES as LIMITS
 from skyless.run.web import is_local_origin, is_own_host, own_names, same_origin
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""Names of the protocol, the newer first; what they share is all that is used here."""
+"""Names of the protocol, the newer first; only their common part is used here."""
 
 _APPLICATIONS: Final = ("https://app.foxglove.dev", "file://")
-"""Origins of Foxglove's own application, in a browser and on the desktop."""
+"""Origins of Foxglove's own applications, in a browser and on the desktop."""
 
 _ORIGIN: Final = re.compile(r"[a-z+-]+://[^/\s,]*")
 
@@ -57,13 +57,13 @@ _MESSAGE_DATA: Final = Format("<BIQ")
 _LAST_NS: Final = 2**64 - 1
 
 _MAX_IDS: Final = 1000
-"""Largest number of channels in one request."""
+"""Most channels in one request."""
 
 Identifier = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
 
 
 class Channel(Struct, frozen=True, rename="camel"):
-    """A topic that clients can subscribe."""
+    """A topic to which clients can subscribe."""
 
     id: int
     topic: str
@@ -74,20 +74,20 @@ class Channel(Struct, frozen=True, rename="camel"):
 
 
 class Subscription(Struct, frozen=True, rename="camel"):
-    """A client's own number for a channel that it wants."""
+    """A client's own number for a channel."""
 
     id: Identifier
     channel_id: Identifier
 
 
 class Subscribe(Struct, frozen=True, tag_field="op", tag="subscribe"):
-    """The client wants these channels."""
+    """The client subscribes to these channels."""
 
     subscriptions: Annotated[tuple[Subscription, ...], Meta(max_length=_MAX_IDS)]
 
 
 class Unsubscribe(Struct, frozen=True, tag_field="op", tag="unsubscribe", rename="camel"):
-    """The client does not want these any more."""
+    """The client ends these subscriptions."""
 
     subscription_ids: Annotated[tuple[Identifier, ...], Meta(max_length=_MAX_IDS)]
 
@@ -98,7 +98,7 @@ _decoder: Final[msgspec.json.Decoder[Subscribe | Unsubscribe]] = msgspec.json.De
 
 
 def decode_request(data: str | bytes) -> Request | None:
-    """What a client asks for; None for anything that this server does not offer or understand."""
+    """Decode a client's request; None for anything that this server does not support."""
     if isinstance(data, bytes):  # published data and calls of services
         return None
     try:
@@ -108,7 +108,7 @@ def decode_request(data: str | bytes) -> Request | None:
 
 
 def server_info(name: str, session: str) -> str:
-    """The first message to a client; with another ``session`` it forgets what it had from this server."""
+    """The first message to a client; with another ``session`` it discards what it had from this server."""
     return _text(
         {
             "op": "serverInfo",
@@ -122,17 +122,17 @@ def server_info(name: str, session: str) -> str:
 
 
 def advertise(channels: Sequence[Channel]) -> str:
-    """These channels are there."""
+    """Announce channels."""
     return _text({"op": "advertise", "channels": channels})
 
 
 def status(level: int, message: str) -> str:
-    """A line for the person who uses the client."""
+    """A line for the client's user."""
     return _text({"op": "status", "level": level, "message": message})
 
 
 def message_data(subscription: int, unix_s: float, payload: bytes) -> bytes:
-    """A message of a subscribed channel. Raises ValueError or OverflowError: the time cannot be stated."""
+    """A message of a subscribed channel. Raises ValueError or OverflowError if the time cannot be encoded."""
     time_ns = round(unix_s * 1e9)
     if not 0 <= time_ns <= _LAST_NS:
         raise OverflowError("the time is before 1970, or after what 64 bits can state")
@@ -144,37 +144,37 @@ def _text(value: dict[str, Any]) -> str:
 
 
 STUCK_S: Final = 10.0
-"""A client that has accepted nothing for so long, while its messages were being dropped, is disconnected."""
+"""A client that has accepted nothing for this time, while its messages were dropped, is disconnected."""
 
 _MAX_TEXTS: Final = 2000
-"""Texts for one client, which are never dropped; a client with more of them waiting is disconnected."""
+"""Most waiting texts, which are never dropped; beyond it the client is disconnected."""
 
 
 class Session:
-    """One client. Nothing here waits, but ``run``."""
+    """One client. Only ``run`` waits."""
 
     def __init__(self, connection: ServerConnection) -> None:
         self._connection = connection
         self._numbers: dict[int, int] = {}
-        """The client's numbers of its subscriptions, by channel."""
+        """The client's subscription numbers by channel."""
         self._texts: deque[str] = deque()
         self._data: deque[bytes] = deque(maxlen=LIMITS.waiting_messages)
         self._ready = asyncio.Event()
         self._sent_s = asyncio.get_running_loop().time()
 
     def wants(self, channel: int) -> bool:
-        """Whether it has subscribed a channel."""
+        """Whether the client has subscribed to a channel."""
         return channel in self._numbers
 
     def send_text(self, text: str) -> None:
-        """Send what must not be dropped."""
+        """Queue a message that must not be dropped."""
         self._texts.append(text)
         self._ready.set()
         if len(self._texts) > _MAX_TEXTS:
             self.end()
 
     def send_data(self, channel: int, unix_s: float, payload: bytes) -> bool:
-        """Send a message of a channel that it wants; whether nothing was dropped for that."""
+        """Queue a message of a subscribed channel. Returns False if an older one was dropped for it."""
         full = len(self._data) == self._data.maxlen
         if not self._data and not self._texts:
             self._sent_s = asyncio.get_running_loop().time()
@@ -185,7 +185,7 @@ class Session:
         return not full
 
     def on_request(self, data: str | bytes, channels: dict[int, Channel]) -> tuple[tuple[int, ...], int]:
-        """Do what the client asks for: which channels it has now subscribed, and how much could not be done."""
+        """Process a request. Returns the newly subscribed channels, and the number of faults."""
         request = decode_request(data)
         if request is None:
             self.send_text(status(WARNING, "skyless bridge offers subscriptions only; this request does nothing"))
@@ -207,7 +207,7 @@ class Session:
         return tuple(added), wrong
 
     async def run(self) -> None:
-        """Send what waits until the connection closes."""
+        """Send queued messages until the connection closes."""
         loop = asyncio.get_running_loop()
         while True:
             await self._ready.wait()
@@ -217,16 +217,16 @@ class Session:
                 self._sent_s = loop.time()
 
     def end(self) -> None:
-        """Close the connection at once; what waits is dropped."""
+        """Close the connection at once; queued messages are dropped."""
         self._connection.transport.abort()
 
 
 _PORT: Final = 8765
 _SEND_BUFFER_BYTES: Final = 1 << 16
-"""In the system, for each client: what is there is sent before anything newer."""
+"""System buffer per client: its contents are sent before anything newer."""
 
 _GOODBYE_S: Final = 0.5
-"""For clients to close their connections when the program ends."""
+"""Time for clients to close their connections when the program ends."""
 
 _quiet = logging.getLogger("skyless.bridges.foxglove")
 _quiet.addHandler(logging.NullHandler())
@@ -235,7 +235,7 @@ _quiet.propagate = False
 
 
 class FoxgloveTarget(Target):
-    """Serves one site to any number of clients. A channel costs nothing while nobody has subscribed it."""
+    """Serves one site to any number of clients. A channel costs nothing without subscribers."""
 
     def __init__(
         self,
@@ -245,26 +245,26 @@ class FoxgloveTarget(Target):
         origins: Collection[str] = (),
         unix_time: Callable[[], float] = time.time,
     ) -> None:
-        """``origins`` are those of web applications that may connect, besides Foxglove's and those of this computer."""
+        """``origins``: web applications that may connect, besides Foxglove's and those of this computer."""
         super().__init__(text)
         self._origins = {*_APPLICATIONS, *origins}
         self.port = port
-        """The one that is used, where 0 was asked for and the server runs."""
+        """The port in use; with 0 configured, known once the server runs."""
         self._host, self._unix_time = host, unix_time
         self._run = secrets.token_hex(4)
         self._site: BridgedSite | None = None
         self._channels: dict[int, Channel] = {}
         self._numbers: dict[str, int] = {}
-        """Numbers of channels, by topic."""
+        """Numbers of channels by topic."""
         self._sessions: set[Session] = set()
 
     def on_site(self, site: BridgedSite) -> None:
-        """Show its anchors, walls and zones."""
+        """Send its anchors, walls and zones."""
         self._site = site
         self._give(SCENE_TOPIC, foxglove_schema("foxglove.SceneUpdate"), self._unix_time(), self._scene)
 
     def on_fix(self, fix: FixMessage) -> None:
-        """Give a fix in each of the forms that somebody has subscribed."""
+        """Send a fix in each subscribed form."""
         site = self._site
         if site is None:
             return
@@ -281,13 +281,13 @@ class FoxgloveTarget(Target):
             )
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
-        """Give a tag's state, for its rates and reasons."""
+        """Send a tag's state, for its rates and reasons."""
         if isinstance(health, TagHealth):
             topic = f"/tag/{health.tag}/health"
             self._give(topic, schema_of(TagHealth), health.unix_s, lambda: msgspec.json.encode(health))
 
     async def run(self) -> None:
-        """Serve until cancelled. Raises SkylessError: it cannot listen there."""
+        """Serve until cancelled. Raises SkylessError if it cannot listen there."""
         try:
             server = await serve(
                 self._serve,
@@ -308,7 +308,7 @@ class FoxgloveTarget(Target):
             await server.serve_forever()
 
     def _refusal(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
-        """The answer to a page of another site; None where the client may connect."""
+        """The answer to a page of another site; None if the client may connect."""
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
         if not is_own_host(host, own_names(self._host), remote=not is_loopback(self._host)):
             self.dropped["host"] += 1
@@ -320,7 +320,7 @@ class FoxgloveTarget(Target):
         return connection.respond(HTTPStatus.FORBIDDEN, text)
 
     async def _serve(self, connection: ServerConnection) -> None:
-        """Serve one client until it goes."""
+        """Serve one client until it leaves."""
         if len(self._sessions) >= LIMITS.clients:
             self.dropped["too-many-clients"] += 1
             return
@@ -365,7 +365,7 @@ class FoxgloveTarget(Target):
         self._give(topic, schema, fix.unix_s, lambda: encode(fix))
 
     def _give(self, topic: str, schema: tuple[str, bytes], unix_s: float, encode: Callable[[], bytes]) -> None:
-        """Send a message to all who want its channel, which is advertised with its first message."""
+        """Send a message to all subscribers of its channel, which is advertised with its first message."""
         channel = self._numbers.get(topic)
         if channel is None:
             self._advertise(topic, schema)
@@ -394,7 +394,7 @@ class FoxgloveTarget(Target):
 
 
 def make_target(url: TargetUrl, _context: BridgeContext) -> FoxgloveTarget:
-    """The target of ``foxglove://HOST:PORT``; ``origins=`` has web applications that may connect, with commas."""
+    """The target of ``foxglove://HOST:PORT``; ``origins=`` lists web applications that may connect, with commas."""
     origins = tuple(filter(None, url.text_option("origins").split(",")))
     for origin in origins:
         if not _ORIGIN.fullmatch(origin):

@@ -1,8 +1,8 @@
-"""``homeassistant:``: tags as devices of Home Assistant over MQTT, with the room that each is in.
+"""``homeassistant:``: tags as devices of Home Assistant over MQTT, each with its room.
 
-Documents by which it learns of a tag: https://www.home-assistant.io/integrations/mqtt/#device-discovery-payload, since
-2024.11. Everything is retained, so that Home Assistant has it all when it starts. Its recorder keeps each change: rooms
-are sent when they change, positions and accuracies at most once a second, and only when they have changed by much.
+Discovery documents: https://www.home-assistant.io/integrations/mqtt/#device-discovery-payload, since 2024.11.
+Everything is retained, so that Home Assistant has it when it starts. Its recorder keeps each change: rooms are sent
+when they change, positions and accuracies at most once a second, and only after considerable changes.
 """
 
 import asyncio
@@ -44,29 +44,29 @@ Component = dict[str, object]
 
 
 def device_id(site: int, tag: str) -> str:
-    """What identifies a tag for ever; the ids of its entities begin with it."""
+    """Permanent identifier of a tag; the ids of its entities begin with it."""
     return f"skyless_{site}_{tag}"
 
 
 def config_topic(prefix: str, site: int, tag: str) -> str:
-    """Retained document of a tag; an empty one removes the tag."""
+    """Topic of a tag's retained document; an empty one removes the tag."""
     return f"{prefix}/device/{device_id(site, tag)}/config"
 
 
 def birth_topic(prefix: str) -> str:
-    """``online`` when Home Assistant has started."""
+    """Carries ``online`` when Home Assistant has started."""
     return f"{prefix}/status"
 
 
 def document(site: BridgedSite, tag: str, status_topic: str, removed: Mapping[str, str]) -> bytes:
-    """The document of a tag.
+    """The discovery document of a tag.
 
-    It has the sensor Accuracy; where there are zones, the sensor Room and a binary sensor for each of them; a tracker
-    where the site is georeferenced. A tag with an asset has its name, and the asset's group as identifier of the model:
-    a group is no place, so no area is suggested.
+    It has the sensor Accuracy; with zones, the sensor Room and a binary sensor for each of them; on a georeferenced
+    site, a tracker. A tag with an asset has its name, and the asset's group as identifier of the model: a group is no
+    place, so no area is suggested.
 
-    All are unavailable while the bridge is offline or the tag has no usable fix.
-    ``status_topic`` is the bridge's; ``removed`` has the platforms of components that an earlier document had, by key.
+    All are unavailable while the bridge is offline or the tag has no usable fix. ``status_topic`` is the bridge's;
+    ``removed``: platforms of the components of an earlier document, by key.
     """
     components = _components(site, tag)
     for key, component in components.items():
@@ -129,7 +129,7 @@ def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
 
 
 def zone_key(zone: Zone) -> str:
-    """Key of a zone's component: of its id, so that another name changes nothing."""
+    """Key of a zone's component, from its id, so that renaming changes nothing."""
     return f"zone_{zone.id}"
 
 
@@ -144,7 +144,7 @@ def _occupancy(zone: Zone, topic: str) -> Component:
 
 
 def platforms(kept: bytes) -> dict[str, str]:
-    """The platforms of a document's components by key, without those that it removes. Empty for anything else."""
+    """Platforms of a document's components by key, without removed ones. Empty for anything else."""
     try:
         components = msgspec.json.decode(kept, type=_Document).components
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
@@ -165,24 +165,24 @@ NODE_KIND: Final = "homeassistant"
 """Kind of the status on MQTT."""
 
 STALE_S: Final = 5
-"""A tag that this bridge had before it was started again must have a fix within this time."""
+"""A tag known from before a restart of the bridge must have a fix within this time."""
 
 MAX_ANNOUNCED: Final = 500
-"""Further ones are not announced."""
+"""Further tags are not announced."""
 
 _STD_CHANGE: Final = 1.25
-"""An accuracy that has changed by less than this factor counts as the same."""
+"""Accuracies that differ by less than this factor count as equal."""
 
 
 class _Tag(Struct):
-    """What was sent of a tag, and its newest fix."""
+    """A tag's published state and newest fix."""
 
     name: str
     document: bytes = b""
     was_kept: bool = False
-    """Whether a document of it that the broker had, or another bridge's, has been read."""
+    """Whether a retained document of it, or another bridge's, has been read."""
     removed: dict[str, str] = {}
-    """Platforms of components that it had before, by key."""
+    """Platforms of its former components by key."""
     zones: TagZones | None = None
     fix: FixMessage | None = None
     """None while it has no usable one."""
@@ -190,10 +190,10 @@ class _Tag(Struct):
 
 
 class Announcer:
-    """The tags of one site, as one Home Assistant gets them."""
+    """Publishes the tags of one site to one Home Assistant."""
 
     def __init__(self, link: Link, site: BridgedSite, name: str, prefix: str, move_m: float) -> None:
-        """``name`` is the bridge's on MQTT, ``prefix`` Home Assistant's for discovery.
+        """``name``: the bridge's on MQTT; ``prefix``: Home Assistant's discovery prefix.
 
         A position is sent again when the tag has moved by ``move_m``.
         """
@@ -203,12 +203,12 @@ class Announcer:
         self._monitor = ZoneMonitor()
         self._monitor.set_zones(site.zones, 0.0)
         self._kept: dict[str, int] = {}
-        """Tags that this bridge had before, by what the broker has kept, and for how many seconds to wait for them."""
+        """Tags that this bridge had before, from retained messages, and the seconds left to wait for them."""
         link.subscribe(birth_topic(prefix), self._on_birth)
         link.subscribe(tag_zones_topic(site.id, "+"), self._on_kept_zones, 1)
 
     def on_site(self, site: BridgedSite) -> None:
-        """Another place, other zones: announce all tags again."""
+        """Announce all tags again, because place or zones have changed."""
         self._site = site
         self._monitor.set_zones(site.zones, 0.0)
         for tag in self._tags.values():
@@ -217,7 +217,7 @@ class Announcer:
             self._remove(tag, before)
 
     def on_fix(self, fix: FixMessage) -> None:
-        """A usable fix."""
+        """Process a usable fix."""
         tag = self._tags.get(fix.tag) or self._add(fix.tag)
         if tag is None:
             return
@@ -228,7 +228,7 @@ class Announcer:
             self._send_position(tag, fix)
 
     def on_no_fix(self, name: str, unix_s: float) -> None:
-        """A tag has no usable fix any more."""
+        """The tag no longer has a usable fix."""
         self._monitor.remove_tag(name, unix_s)
         tag = self._tags.get(name)
         if tag is not None:
@@ -241,7 +241,7 @@ class Announcer:
             self.on_no_fix(name, unix_s)
 
     def on_second(self, unix_s: float) -> None:
-        """Send what has changed by much; once a second."""
+        """Send considerable changes; once a second."""
         for tag in self._tags.values():
             if tag.fix is not None and self._has_changed(tag, tag.fix):
                 self._send_position(tag, tag.fix)
@@ -271,7 +271,7 @@ class Announcer:
         self._publish(self._config_topic(tag.name), tag.document)
 
     def _remove(self, tag: _Tag, before: dict[str, str]) -> None:
-        """Let Home Assistant remove components that an earlier document had."""
+        """Let Home Assistant remove components of an earlier document."""
         now = platforms(tag.document)
         tag.removed = {key: platform for key, platform in (tag.removed | before).items() if key not in now}
         if not before.keys() <= now.keys():
@@ -324,7 +324,7 @@ class Announcer:
     # What comes from the broker
 
     def _on_birth(self, _topic: str, payload: bytes) -> None:
-        """Home Assistant has started: say all of the tags that are there again."""
+        """Home Assistant has started: publish all present tags again."""
         if payload != b"online":
             return
         for tag in self._tags.values():
@@ -338,9 +338,9 @@ class Announcer:
                         self._publish(topic, message)
 
     def _on_kept(self, name: str, kept: bytes) -> None:
-        """A document of a tag: an empty one has removed it; an older one may have components that are no more.
+        """Process a retained document: an empty one removes its tag, an older one may have obsolete components.
 
-        Only one is read: two bridges that know different zones would answer each other without end.
+        Only one is read: two bridges with different zones would answer each other for ever.
         """
         tag = self._tags.get(name)
         if tag is None or kept == tag.document:
@@ -356,7 +356,7 @@ class Announcer:
             self._remove(tag, platforms(kept))
 
     def _on_kept_zones(self, _topic: str, payload: bytes) -> None:
-        """What this bridge said before it was started again: it must not stay where the tag has gone meanwhile."""
+        """Process this bridge's statement from before its restart, which must not persist if the tag has gone."""
         try:
             kept = msgspec.json.decode(payload, type=TagZones)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
@@ -366,7 +366,7 @@ class Announcer:
 
 
 def _are_alike(a: float, b: float) -> bool:
-    """Whether two accuracies count as the same."""
+    """Whether two accuracies count as equal."""
     return max(a, b) <= _STD_CHANGE * min(a, b)
 
 
@@ -384,21 +384,21 @@ def _rounded(position: Vector) -> Vector:
 _PREFIX: Final = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
 
 _LIMITS: Final = Limits(topics=4 * MAX_ANNOUNCED + 1, topic_bytes=64_000_000)
-"""Three topics of each tag, one of each that was there before, and the status; 100 zones make a document of 50 kB."""
+"""Three topics of each tag, one of each former tag, and the status; 100 zones make a document of 50 kB."""
 
 SETTLE_S: Final = 3
-"""The site is known for so long before tags are announced, as its zones come after it: Home Assistant would forget what
-a user has set for sensors of zones that are missing."""
+"""Time that the site has to be known before tags are announced, as its zones come after it: Home Assistant would
+lose a user's settings for sensors of missing zones."""
 
 
 class HomeAssistant(Target):
-    """Connects when the first tag has a fix, and the site has been known for ``SETTLE_S``.
+    """Connects when the first tag has a fix and the site has been known for ``SETTLE_S``.
 
-    The bridge's name on MQTT has that tag's name in it, so that bridges on one computer are distinct.
+    The bridge's name on MQTT includes that tag's name, so that bridges on one computer are distinct.
     """
 
     def __init__(self, context: BridgeContext, text: str, address: MqttAddress, prefix: str, move_m: float) -> None:
-        """``prefix`` is that of discovery. A position is sent again when the tag has moved by ``move_m``."""
+        """``prefix`` of discovery. A position is sent again when the tag has moved by ``move_m``."""
         super().__init__(text)
         self._context, self._address, self._prefix, self._move_m = context, address, prefix, move_m
         self._site: BridgedSite | None = None
@@ -406,10 +406,10 @@ class HomeAssistant(Target):
         self._link: Link | None = None
         self._begun = asyncio.Event()
         self._known_s = 0
-        """For how many seconds the site has been known."""
+        """Seconds for which the site has been known."""
 
     def on_site(self, site: BridgedSite) -> None:
-        """Announce what has changed. Raises SkylessError: it is another site."""
+        """Announce what has changed. Raises SkylessError if it is another site."""
         if self._site is not None and site.id != self._site.id:
             if self._announcer is not None:
                 self._announcer.on_site_left(time.time())
@@ -424,25 +424,25 @@ class HomeAssistant(Target):
             self._announcer.on_site(site)
 
     def on_fix(self, fix: FixMessage) -> None:
-        """Its rooms and its position."""
+        """Publish its rooms and position."""
         if self._announcer is None and self._site is not None and self._known_s >= SETTLE_S:
             self._begin(self._site, fix.tag)
         if self._announcer is not None:
             self._announcer.on_fix(fix)
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:  # noqa: ARG002 - Home Assistant has no field for it
-        """It becomes unavailable."""
+        """Make the tag unavailable."""
         if self._announcer is not None:
             self._announcer.on_no_fix(tag, unix_s)
 
     def on_second(self, unix_s: float) -> None:
-        """Positions that have changed."""
+        """Send changed positions."""
         self._known_s += self._site is not None
         if self._announcer is not None:
             self._announcer.on_second(unix_s)
 
     def on_status(self, status: StatusMessage) -> None:
-        """A tag that has gone becomes unavailable at once."""
+        """Make a tag that has left unavailable at once."""
         if self._announcer is not None and status.kind == "tag" and not status.online:
             self._announcer.on_no_fix(status.name, time.time())  # a last will has no time
 

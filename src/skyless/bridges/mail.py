@@ -1,4 +1,4 @@
-"""``smtp://[USER@]HOST:PORT?to=…&from=…`` and ``smtps:``: a mail when an alarm is raised, and one when it has ended."""
+"""``smtp://[USER@]HOST:PORT?to=…&from=…`` and ``smtps:``: a mail when an alarm is raised, another when it has ended."""
 
 import re
 import smtplib
@@ -18,7 +18,7 @@ _ADDRESS: Final = re.compile(r"[^\s@,<>]+@[^\s@,<>]+")
 
 
 class Mail(AlarmTarget):
-    """Sends mails to one or more people over one server."""
+    """Sends mails to one or more people through one server."""
 
     def __init__(self, url: TargetUrl, context: BridgeContext) -> None:
         super().__init__(url.text, context.log, frozenset({"raised", "ended"}))
@@ -89,7 +89,7 @@ class Mail(AlarmTarget):
 
 
 def _header(text: str) -> str:
-    """A text as the value of a header. A name ``=?utf-8?q?=0D=0ABcc:…?=`` adds a header in Python before 3.11.10."""
+    """A text as a header's value. In Python before 3.11.10, a name ``=?utf-8?q?=0D=0ABcc:…?=`` could add a header."""
     return " ".join("".join(one if one.isprintable() else " " for one in text).replace("=?", "= ?").split())
 
 
@@ -101,5 +101,5 @@ def _time(unix_s: float) -> str:
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Mail:
-    """The target of an address. Raises SkylessError."""
+    """Create the target of an address. Raises SkylessError."""
     return Mail(url, context)

@@ -1,4 +1,4 @@
-"""MAVLink for autopilots, without I/O: its frames, what each profile sends of a fix, and answers to the vehicle."""
+"""MAVLink for autopilots, without I/O: frames, the messages of each profile, and answers to the vehicle."""
 
 import struct
 from collections import Counter
@@ -30,7 +30,7 @@ HEADER_BYTES_2: Final = 10
 CHECK_BYTES: Final = 2
 SIGNATURE_BYTES: Final = 13
 IS_SIGNED: Final = 0x01
-"""The only incompatible flag that is defined: a signature follows the checksum."""
+"""The only incompatible flag defined: a signature follows the checksum."""
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -47,7 +47,7 @@ _CRC: Final = _crc_table()
 
 
 def crc(data: bytes, crc_extra: int) -> int:
-    """CRC-16/MCRF4XX of ``data`` and then of the byte that stands for a message's definition."""
+    """CRC-16/MCRF4XX of ``data`` followed by the byte that identifies a message's definition."""
     value = 0xFFFF
     for byte in data:
         value = (value >> 8) ^ _CRC[(value ^ byte) & 0xFF]
@@ -55,38 +55,38 @@ def crc(data: bytes, crc_extra: int) -> int:
 
 
 class Frame(Struct, frozen=True):
-    """A received frame whose check is right."""
+    """A received frame with a correct checksum."""
 
     number: int
     """Number of the message."""
     system: int
     component: int
     payload: bytes
-    """Without the zeros that its sender has cut off."""
+    """Without the trailing zeros cut off by its sender."""
 
 
 def frame(number: int, crc_extra: int, payload: bytes, *, sequence: int, system: int, component: int) -> bytes:
-    """A frame of version 2, unsigned; zeros at the payload's end are cut off, but for its first byte."""
+    """An unsigned frame of version 2; trailing zeros of the payload are cut off, except for its first byte."""
     payload = payload.rstrip(b"\0") or payload[:1]
     body = bytes([len(payload), 0, 0, sequence & 0xFF, system, component]) + number.to_bytes(3, "little") + payload
     return bytes([MAGIC_2]) + body + crc(body, crc_extra).to_bytes(CHECK_BYTES, "little")
 
 
 class FrameReader:
-    """Finds frames of both versions in a stream of bytes; only those of messages in ``crc_extras`` are given.
+    """Finds frames of both versions in a stream of bytes; yields only messages in ``crc_extras``.
 
     Signatures are skipped, not checked.
     """
 
     def __init__(self, crc_extras: Mapping[int, int]) -> None:
-        """``crc_extras``: for each number of a message the byte that stands for its definition."""
+        """``crc_extras``: for each message number, the byte that identifies its definition."""
         self._crc_extras = crc_extras
         self._buffer = bytearray()
         self.damaged = 0
-        """How often something that began like a frame was none."""
+        """Number of frame starts that were no frame."""
 
     def frames(self, data: bytes) -> Iterator[Frame]:
-        """The frames that end in ``data``, which continues what was given before."""
+        """The frames that end in ``data``, which continues the previous call's."""
         self._buffer += data
         while self._find_magic():
             length = self._length()
@@ -109,7 +109,7 @@ class FrameReader:
         return bool(self._buffer)
 
     def _length(self) -> int | None:
-        """Length of the frame at the start; None until enough of it has arrived."""
+        """Length of the frame at the start; None until known."""
         if len(self._buffer) < 3:
             return None
         if self._buffer[0] == MAGIC_1:
@@ -118,7 +118,7 @@ class FrameReader:
         return HEADER_BYTES_2 + self._buffer[1] + CHECK_BYTES + signature
 
     def _checked(self, length: int) -> Frame | None:
-        """The whole frame at the start, None if it is damaged. That of an unknown message cannot be checked."""
+        """The whole frame at the start, None if damaged. An unknown message's checksum cannot be verified."""
         data = bytes(self._buffer[:length])
         payload_bytes = data[1]
         if data[0] == MAGIC_1:
@@ -148,7 +148,7 @@ ARMED: Final = 0x80
 """Flag in a vehicle's ``base_mode``."""
 
 LOCAL_NED: Final = 1
-"""MAV_FRAME: north, east, down of an origin that rests on the Earth."""
+"""MAV_FRAME: north, east, down from an origin fixed to the Earth."""
 ESTIMATOR_VISION: Final = 2
 """MAV_ESTIMATOR_TYPE."""
 
@@ -182,7 +182,7 @@ class SetGpsGlobalOrigin(Struct, frozen=True):
 
 
 class GpsGlobalOrigin(Struct, frozen=True):
-    """GPS_GLOBAL_ORIGIN, by which a vehicle states its origin."""
+    """GPS_GLOBAL_ORIGIN: a vehicle's statement of its origin."""
 
     latitude_1e7: int
     longitude_1e7: int
@@ -191,7 +191,7 @@ class GpsGlobalOrigin(Struct, frozen=True):
 
 
 class Timesync(Struct, frozen=True):
-    """TIMESYNC: a request has ``answered_ns`` 0, and its answer the request's ``asked_ns`` again."""
+    """TIMESYNC: a request has ``answered_ns`` 0; the answer repeats the request's ``asked_ns``."""
 
     answered_ns: int
     asked_ns: int
@@ -210,7 +210,7 @@ class VisionPositionEstimate(Struct, frozen=True):
 
 
 class Odometry(Struct, frozen=True):
-    """ODOMETRY: m, m/s, rad/s; both covariances as in ``VisionPositionEstimate``; NaN where something is unknown."""
+    """ODOMETRY: m, m/s, rad/s; both covariances as in ``VisionPositionEstimate``; NaN if unknown."""
 
     time_us: int
     position: tuple[float, float, float]
@@ -227,7 +227,7 @@ class Odometry(Struct, frozen=True):
 
 
 class GpsInput(Struct, frozen=True):
-    """GPS_INPUT; by default of a receiver without a fix, nothing of which is to be used."""
+    """GPS_INPUT; by default that of a receiver without a fix, with nothing to be used."""
 
     time_us: int
     time_week_ms: int
@@ -273,11 +273,11 @@ _LAYOUTS: Final[dict[type[Message], _Layout]] = {
 _READ: Final[tuple[type[Heartbeat | Timesync | GpsGlobalOrigin], ...]] = (Heartbeat, Timesync, GpsGlobalOrigin)
 _READ_BY_NUMBER: Final = {_LAYOUTS[kind].number: kind for kind in _READ}
 CRC_EXTRAS: Final = {_LAYOUTS[kind].number: _LAYOUTS[kind].crc_extra for kind in _READ}
-"""CRC_EXTRA of the messages that are read here, by number."""
+"""CRC_EXTRA of the messages read here, by number."""
 
 
 def encoded(message: Message, *, sequence: int, system: int, component: int) -> bytes:
-    """The message as a frame of MAVLink 2.
+    """Encode a message as a frame of MAVLink 2.
 
     Raises:
         struct.error, OverflowError: a value does not fit its field.
@@ -291,7 +291,7 @@ def encoded(message: Message, *, sequence: int, system: int, component: int) -> 
 
 
 def decoded(received: Frame) -> Heartbeat | Timesync | GpsGlobalOrigin:
-    """The message of a frame whose number is in ``CRC_EXTRAS``; fields that are missing at its end are 0."""
+    """Decode a frame whose number is in ``CRC_EXTRAS``; missing fields at its end are 0."""
     kind = _READ_BY_NUMBER[received.number]
     fields = _LAYOUTS[kind].fields
     return kind(*fields.unpack(received.payload.ljust(fields.size, b"\0")[: fields.size]))
@@ -306,16 +306,16 @@ Profile = Literal["ardupilot", "px4", "gps"]
 MAVLINK_PROFILES: Final = ("ardupilot", "px4", "gps")
 
 GPS_EPOCH_UNIX_S: Final = 315_964_800
-"""6 January 1980, when GPS time began."""
+"""6 January 1980, the beginning of GPS time."""
 LEAP_S: Final = 18
-"""GPS time less UTC, since 2017."""
+"""GPS time minus UTC, since 2017."""
 WEEK_MS: Final = 604_800_000
 
 UNKNOWN_ANGLE_RAD2: Final = pi**2
-"""Variance of an angle of which nothing is known, for ArduPilot, which does not check for NaN."""
+"""Variance of an unknown angle, for ArduPilot, which does not check for NaN."""
 UNKNOWN_HEIGHT_STD_M: Final = 100.0
 UNKNOWN_CLIMB_STD_MPS: Final = 100.0
-"""Standard deviations of a height that the site assumes (``height_known``) without measuring it, and of its change."""
+"""Standard deviations of a height that is given (``height_known``) rather than measured, and of its change."""
 
 IGNORE_HDOP: Final = 2
 IGNORE_VDOP: Final = 4
@@ -326,19 +326,19 @@ _IGNORE_VELOCITY: Final = IGNORE_HORIZONTAL_VELOCITY | IGNORE_VERTICAL_VELOCITY 
 """GPS_INPUT_IGNORE_FLAGS."""
 
 MAX_SATELLITES: Final = 254
-"""255 states that the count is not known."""
+"""255 means that the count is unknown."""
 
 
 def micros(unix_s: float) -> int:
-    """As a stamp of a message; 0, which states that there is none, before 1970 or for what is not a number."""
+    """Timestamp of a message; 0, meaning none, before 1970 or for NaN and infinity."""
     return round(unix_s * 1e6) if isfinite(unix_s) and unix_s > 0.0 else 0
 
 
 def vision_position_estimate(fix: FixMessage, heading_deg: float, reset_counter: int) -> VisionPositionEstimate:
-    """For ArduPilot: every number is finite, angles are 0 with a variance that states that nothing is known.
+    """For ArduPilot: all numbers are finite; angles are 0 with a variance that marks them as unknown.
 
-    A height that is not measured goes out as it is: ArduPilot makes one number of the three variances, so that a wide
-    one for the height would cost the vehicle its horizontal position as well.
+    A given height is sent unchanged: ArduPilot combines the three variances into one number, so a wide one for the
+    height would cost the vehicle its horizontal position as well.
     """
     return VisionPositionEstimate(
         time_us=micros(fix.unix_s),
@@ -352,7 +352,7 @@ def vision_position_estimate(fix: FixMessage, heading_deg: float, reset_counter:
 
 
 def odometry(fix: FixMessage, heading_deg: float, reset_counter: int) -> Odometry:
-    """For PX4: attitude, rates and an unknown velocity are NaN; a height that is not measured has a wide variance."""
+    """For PX4: attitude, rates and an unknown velocity are NaN; a given height has a wide variance."""
     covariance_m2 = _covariance_ned(fix.covariance_m2, heading_deg)
     if fix.height_known:
         covariance_m2 = _flat(covariance_m2, UNKNOWN_HEIGHT_STD_M)
@@ -383,7 +383,7 @@ def odometry(fix: FixMessage, heading_deg: float, reset_counter: int) -> Odometr
 
 
 def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None = None) -> GpsInput:
-    """A position on the Earth as a GPS receiver would give it; ``satellites`` is by default the number of anchors."""
+    """A position on the Earth as from a GPS receiver; ``satellites`` is by default the number of anchors."""
     latitude_deg, longitude_deg, height_m = geodetic(fix.position_m, origin)
     covariance_m2 = _covariance_ned(fix.covariance_m2, origin.heading_deg)
     hdop, vdop = _dilution(fix.hdop), _dilution(fix.vdop)
@@ -420,13 +420,13 @@ def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None 
 
 
 def no_gps_fix(unix_s: float) -> GpsInput:
-    """A receiver that has no fix: nothing in it is to be used."""
+    """A receiver without a fix, with nothing to be used."""
     week, week_ms = gps_time(unix_s)
     return GpsInput(time_us=micros(unix_s), time_week_ms=week_ms, time_week=week)
 
 
 def global_origin(origin: GeoreferenceSite, target_system: int, unix_s: float) -> SetGpsGlobalOrigin:
-    """Where the site's origin is, which becomes the vehicle's."""
+    """The site's origin, to become the vehicle's."""
     return SetGpsGlobalOrigin(
         latitude_1e7=round(origin.latitude_deg * 1e7),
         longitude_1e7=round(origin.longitude_deg * 1e7),
@@ -437,9 +437,9 @@ def global_origin(origin: GeoreferenceSite, target_system: int, unix_s: float) -
 
 
 def gps_time(unix_s: float) -> tuple[int, int]:
-    """Week of GPS time and the milliseconds in it; (0, 0) before 1980 or after week 65535.
+    """GPS week and milliseconds into it; (0, 0) before 1980 or after week 65535.
 
-    Stamps before 2017 come out late, by the leap seconds added since.
+    Times before 2017 come out late by the leap seconds added since.
     """
     since_ms = (unix_s - GPS_EPOCH_UNIX_S + LEAP_S) * 1e3 if isfinite(unix_s) else -inf
     if not 0.0 <= since_ms < 65536.0 * WEEK_MS:
@@ -449,12 +449,12 @@ def gps_time(unix_s: float) -> tuple[int, int]:
 
 
 def _dilution(value: float | None) -> float:
-    """Dilution of precision as a GPS receiver states it; 0 if it is not known."""
+    """Dilution of precision as a GPS receiver states it; 0 if unknown."""
     return value if value is not None and isfinite(value) else 0.0
 
 
 def _velocity(fix: FixMessage) -> tuple[Vector, Matrix] | None:
-    """Velocity and its covariance, where both are known."""
+    """Velocity and its covariance, if both are known."""
     velocity, covariance = fix.velocity_mps, fix.velocity_covariance
     if velocity is None or covariance is None or not all(map(isfinite, (*velocity, *covariance))):
         return None
@@ -471,13 +471,13 @@ def _covariance_ned(covariance_m2: Matrix, heading_deg: float) -> Matrix:
 
 
 def _swapped(covariance: Matrix) -> Matrix:
-    """From east, north, up to north, east, down."""
+    """Convert from east, north, up to north, east, down."""
     ee, en, eu, ne, nn, nu, ue, un, uu = covariance
     return nn, ne, -nu, en, ee, -eu, -un, -ue, uu
 
 
 def _flat(covariance: Matrix, down_std: float) -> Matrix:
-    """The covariance where nothing is known of the vertical axis."""
+    """The covariance with the vertical axis unknown."""
     nn, ne, _, en, ee, _, _, _, _ = covariance
     return nn, ne, 0.0, en, ee, 0.0, 0.0, 0.0, down_std**2
 
@@ -495,10 +495,10 @@ VISUAL_POSITIONING: Final = 197
 """Ours, MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""
 
 _GONE_S: Final = 3
-"""A vehicle that was silent for this long, in seconds, may have been restarted, and has no origin then."""
+"""A vehicle silent for this time, in seconds, may have restarted and lost its origin."""
 
 _NEAR_1E7: Final = 10
-"""Difference of a degree's 10⁷th parts by which an origin is still the same: 11 cm."""
+"""Origins within this difference, in 10⁻⁷ degrees, count as equal: 11 cm."""
 
 _NEAR_MM: Final = 100
 
@@ -519,10 +519,10 @@ class MavlinkEncoder(Encoder):
         heading_deg: float | None = None,
         log: Callable[[str], None] = lambda _line: None,
     ) -> None:
-        """``system`` is the vehicle's, which is ours as well; ``text`` names the target in messages.
+        """``system``: the vehicle's, used as ours too; ``text`` names the target in messages.
 
-        ``satellites`` is what profile ``gps`` states instead of the number of anchors, and ``heading_deg`` the azimuth
-        of the y axis of a site that does not know where it is on the Earth. ``log`` shows a line to a person.
+        ``satellites``: stated by profile ``gps`` instead of the number of anchors. ``heading_deg``: azimuth of the y
+        axis of a site without georeference. ``log`` shows a line to the user.
         """
         self._profile = profile
         self._text = text
@@ -538,15 +538,15 @@ class MavlinkEncoder(Encoder):
         self._armed = False
         self._log = log
         self._logged: set[str] = set()
-        """What it has logged already."""
+        """Subjects that have been logged."""
         self._silent_s = 0
         """Seconds since the vehicle's last message."""
         self._vehicle_origin: GpsGlobalOrigin | None = None
-        """As the vehicle states it."""
+        """As stated by the vehicle."""
         self.dropped = Counter()
 
     def on_site(self, site: BridgedSite) -> list[bytes]:
-        """Raises SkylessError: profile ``gps`` needs a georeference, and a site that has one a heading of its own."""
+        """Raises SkylessError if profile ``gps`` lacks a georeference, or ``heading`` is given beside one."""
         if self._profile == "gps":
             require_georeference(site, self._text)
         if site.georeference is not None and self._given_heading_deg is not None:
@@ -563,7 +563,7 @@ class MavlinkEncoder(Encoder):
         return []
 
     def on_fix(self, fix: FixMessage) -> list[bytes]:
-        """One message, of the kind that the profile has."""
+        """One message of the profile's kind."""
         if self._site is None:
             return []
         if self._last_serial is not None and fix.serial <= self._last_serial:
@@ -582,11 +582,11 @@ class MavlinkEncoder(Encoder):
             return []
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:  # noqa: ARG002 - the vehicle has no use
-        """A GPS receiver without a fix; the other profiles are silent, by which an autopilot notices it."""
+        """A GPS message without a fix; other profiles are silent, which the autopilot notices."""
         return self._frames([no_gps_fix(unix_s)]) if self._profile == "gps" else []
 
     def on_second(self, unix_s: float) -> list[bytes]:
-        """The heartbeat; and the site's origin, until the vehicle has one or is armed."""
+        """The heartbeat, and the site's origin until the vehicle has one or is armed."""
         self._silent_s += 1
         if self._silent_s >= _GONE_S:
             self._vehicle_origin = None
@@ -597,7 +597,7 @@ class MavlinkEncoder(Encoder):
         return self._frames(messages)
 
     def on_bytes(self, data: bytes, unix_ns: int) -> list[bytes]:
-        """What the vehicle has sent, received at ``unix_ns``: it may ask for the time."""
+        """Process the vehicle's bytes, received at ``unix_ns``. Returns answers to its time requests."""
         answers: list[Message] = []
         damaged = self._reader.damaged
         for frame in self._reader.frames(data):
@@ -617,13 +617,13 @@ class MavlinkEncoder(Encoder):
         return self._frames(answers)
 
     def _origin(self, unix_s: float) -> SetGpsGlobalOrigin | None:
-        """None where the site does not know it, or the vehicle finds it by GPS_INPUT."""
+        """None if the site has none, or the vehicle derives it from GPS_INPUT."""
         if self._site is None or self._site.georeference is None or self._profile == "gps":
             return None
         return global_origin(self._site.georeference, self._system, unix_s)
 
     def _compare_origin(self, vehicle: GpsGlobalOrigin, unix_ns: int) -> None:
-        """Log that the vehicle's origin is not the site's, if so."""
+        """Log a difference between the vehicle's origin and the site's."""
         site = self._origin(unix_ns * 1e-9)
         if site is None or (
             abs(vehicle.latitude_1e7 - site.latitude_1e7) <= _NEAR_1E7
@@ -638,7 +638,7 @@ class MavlinkEncoder(Encoder):
         )
 
     def _log_assumptions(self, fix: FixMessage) -> None:
-        """Log what a vehicle takes for known that is not."""
+        """Log what the vehicle assumes to be known but is not."""
         site = self._site
         if site is not None and site.georeference is None and self._given_heading_deg is None:
             self._log_once(
@@ -667,7 +667,7 @@ class MavlinkEncoder(Encoder):
 
 
 def _has_moved(before: BridgedSite, after: BridgedSite) -> bool:
-    """Whether positions are in another frame than before; a tag may only have learned of more anchors."""
+    """Whether positions are in another frame than before; a tag may just have learned of more anchors."""
     return before.georeference != after.georeference or any(
         after.anchors_m.get(anchor, position_m) != position_m for anchor, position_m in before.anchors_m.items()
     )

@@ -1,4 +1,4 @@
-"""NMEA 0183: fixes as a satellite receiver writes them, for gpsd, QGIS, OpenCPN, autopilots.
+"""NMEA 0183: fixes like those of a satellite receiver, for gpsd, QGIS, OpenCPN, autopilots.
 
 One epoch is one write of five sentences: RMC, GGA, GST, GBS, GSA. Formats: E. S. Raymond, NMEA Revealed
 (https://gpsd.gitlab.io/gpsd/NMEA.html); u-blox, M8 interface description, UBX-13003221, chapter 31.
@@ -18,28 +18,28 @@ from skyless.run.mqtt.messages import FixMessage
 
 KNOT_MPS: Final = 1852.0 / 3600.0
 MINUTE_UNITS: Final = 10_000_000
-"""Minutes of arc have seven decimals: 0.2 mm. Six would lose 2 mm."""
+"""Minutes of arc are written with seven decimals: 0.2 mm. Six would lose 2 mm."""
 
 SLOT_COUNT: Final = 12
-"""Satellites that GSA has fields for; further anchors are only counted, in GGA."""
+"""Satellites that GSA has fields for; further anchors only count in GGA."""
 
 COURSE_SIGMAS: Final = 2.0
-"""A course is given where the speed exceeds this many of its standard deviations."""
+"""A course is given if the speed exceeds this many of its standard deviations."""
 
 _LARGEST_DOP: Final = 99.99
-"""As receivers write it."""
+"""Limit used by receivers."""
 
 _LARGEST_ANCHOR: Final = 999
-"""GSA has room for three digits; anchors with larger numbers are only counted, in GGA."""
+"""GSA has three digits; anchors with larger numbers only count in GGA."""
 
 _FARTHEST_M: Final = 1e5
-"""Coordinates, heights and standard deviations beyond it are no measurement; the sentences have no room for them."""
+"""Larger coordinates, heights and standard deviations are no measurement; the sentences have no room for them."""
 
 _CENTURY_S: Final = (946_684_800.0, 4_102_444_799.0)
-"""Moments that RMC's two digits of the year can state: 2000 to 2099."""
+"""Times that RMC's two-digit year can express: 2000 to 2099."""
 
 _QUALITIES: Final = {"gps": (1, "A"), "rtk": (4, "R"), "simulator": (8, "S")}
-"""What GGA states of a fix, and RMC's mode."""
+"""GGA's quality and RMC's mode of a fix."""
 
 
 class NmeaEncoder(Encoder):
@@ -48,17 +48,17 @@ class NmeaEncoder(Encoder):
     one_tag = True
 
     def __init__(self, quality: str = "auto", geoid_m: float = 0.0) -> None:
-        """``quality``: a name of GGA's quality, or ``auto``: simulator at a simulated site, RTK at a real one.
+        """``quality``: name of GGA's quality, or ``auto``: simulator at a simulated site, RTK at a real one.
 
-        ``geoid_m``: height of the sea level above the ellipsoid at the site; 0 where the site file's height is above
-        sea level.
+        ``geoid_m``: height of the sea level above the ellipsoid at the site; 0 if the site file's height is above sea
+        level.
         """
         self._quality, self._geoid_m = quality, geoid_m
         self.dropped: Counter[str] = Counter()
         self._site: BridgedSite | None = None
 
     def on_site(self, site: BridgedSite) -> list[bytes]:
-        """Raises SkylessError where the site has no georeference."""
+        """Raises SkylessError if the site has no georeference."""
         require_georeference(site, "nmea")
         self._site = site
         return []
@@ -77,7 +77,7 @@ class NmeaEncoder(Encoder):
         return [] if sentences is None else [sentences]
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:  # noqa: ARG002 (NMEA has no reasons)
-        """One epoch that states that there is no position."""
+        """One epoch without a position."""
         sentences = epoch_without_fix(unix_s)
         return [] if sentences is None else [sentences]
 
@@ -91,10 +91,10 @@ def make_encoder(url: TargetUrl, _context: BridgeContext) -> Encoder:
 
 
 def epoch(fix: FixMessage, origin: GeoreferenceSite, quality: str, geoid_m: float = 0.0) -> bytes | None:
-    """Five sentences of one fix; None where a value is beyond what the sentences can state.
+    """Five sentences of one fix; None if a value is outside what the sentences can express.
 
-    Standard deviations are towards north, east, up, each at least 1 cm. Heights are above sea level, ``geoid_m``
-    less than the ellipsoid's. A course is given only where the tag moves (``COURSE_SIGMAS``).
+    Standard deviations are towards north, east, up, each at least 1 cm. Heights are above sea level, ``geoid_m`` less
+    than the ellipsoid's. A course is given only for a moving tag (``COURSE_SIGMAS``).
     """
     moment = _moment(fix.unix_s)
     if moment is None or not all(abs(value) < _FARTHEST_M for value in fix.position_m):
@@ -127,9 +127,9 @@ def epoch(fix: FixMessage, origin: GeoreferenceSite, quality: str, geoid_m: floa
 
 
 def epoch_without_fix(unix_s: float) -> bytes | None:
-    """Four sentences that state the time, and that no position is known; None for a time that RMC cannot state.
+    """Four sentences with the time and without a position; None for a time that RMC cannot express.
 
-    GBS is empty: it ends the epoch, and gpsd reports an epoch when it sees the sentence that ended the ones before.
+    GBS is empty: it ends the epoch, and gpsd reports an epoch at the sentence that ended the previous ones.
     """
     moment = _moment(unix_s)
     if moment is None:
@@ -161,14 +161,14 @@ def _moment(unix_s: float) -> tuple[str, str] | None:
 
 
 def _angle(angle_deg: float, hemispheres: str, digits: int) -> str:
-    """``dddmm.mmmmmmm,H``. Rounded as an integer, as otherwise 59.99999999 minutes would be written as 60."""
+    """``dddmm.mmmmmmm,H``. Rounded as an integer, because 59.99999999 minutes would otherwise be written as 60."""
     whole, rest = divmod(round(abs(angle_deg) * 60 * MINUTE_UNITS), 60 * MINUTE_UNITS)
     minutes, fraction = divmod(rest, MINUTE_UNITS)
     return f"{whole:0{digits}d}{minutes:02d}.{fraction:07d},{hemispheres[angle_deg < 0.0]}"
 
 
 def _motion(fix: FixMessage, heading_deg: float) -> tuple[str, str]:
-    """Speed over ground in knots, and the course where there is one; empty where the method knows no velocity."""
+    """Speed over ground in knots, and the course if there is one; empty if the velocity is unknown."""
     if fix.velocity_mps is None or fix.velocity_covariance is None:
         return "", ""
     east, north, _ = east_north_up(fix.velocity_mps, heading_deg)

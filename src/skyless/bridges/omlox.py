@@ -1,7 +1,7 @@
 """``omlox+ws://HOST/v2/ws/socket``: sends each fix as a location to an omlox hub, Hub 2.0.
 
 Names and types of fields: https://omlox.com/fileadmin/api/omlox_Hub_API_2.0.0.json. Coordinates are longitude and
-latitude where the site says where it is on the Earth, else metres of the site's frame.
+latitude on a georeferenced site, otherwise metres in the site's frame.
 """
 
 import asyncio
@@ -32,10 +32,10 @@ from skyless.run.zones import floor_at
 Object = dict[str, Any]
 
 MAX_BATCH: Final = 100
-"""Locations in one message."""
+"""Most locations in one message."""
 
 MAX_WAITING: Final = 10_000
-"""Locations that wait for the hub. Beyond it the oldest is dropped."""
+"""Most locations waiting for the hub; beyond it the oldest is dropped."""
 
 _GATHER_S: Final = 0.05
 _PAUSE_S: Final = 2.0
@@ -44,12 +44,12 @@ _UUID: Final = re.compile(r"[0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12}")
 
 
 def _foreign_id(site: BridgedSite) -> str:
-    """The name of a site among a hub's zones."""
+    """Name of a site among a hub's zones."""
     return f"skyless-{site.id}"
 
 
 def location(fix: FixMessage, site: BridgedSite, source: str) -> Object:
-    """Where a tag was at the time of a usable fix; ``source`` is the id or foreign id of the hub's zone.
+    """Location of a tag at the time of a usable fix; ``source``: id or foreign id of the hub's zone.
 
     The accuracy is one horizontal standard deviation in the worst direction. Local heights count from the floor.
     """
@@ -84,7 +84,7 @@ def location(fix: FixMessage, site: BridgedSite, source: str) -> Object:
 
 
 def _known(**fields: object) -> Object:
-    """The fields that have a value."""
+    """The fields with a value."""
     return {key: value for key, value in fields.items() if value is not None}
 
 
@@ -110,11 +110,11 @@ class OmloxPush(Target):
         self._waiting: deque[Object] = deque()
 
     def on_site(self, site: BridgedSite) -> None:
-        """Keep it."""
+        """Keep the site."""
         self._site = site
 
     def on_fix(self, fix: FixMessage) -> None:
-        """Let it wait for the hub."""
+        """Queue a fix for the hub."""
         assert self._site is not None
         self._waiting.append(location(fix, self._site, self._zone or _foreign_id(self._site)))
         if len(self._waiting) > MAX_WAITING:
@@ -122,7 +122,7 @@ class OmloxPush(Target):
             self.dropped["not-sent"] += 1
 
     async def run(self) -> None:
-        """Send until cancelled. A hub that is away is tried again for ever."""
+        """Send until cancelled; an unreachable hub is retried for ever."""
         while True:
             try:
                 async with connect(self._address) as hub:
@@ -164,5 +164,5 @@ class OmloxPush(Target):
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> OmloxPush:
-    """The target of an address. Raises SkylessError."""
+    """Create the target of an address. Raises SkylessError."""
     return OmloxPush(url, context.log)

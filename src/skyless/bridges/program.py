@@ -1,6 +1,6 @@
-"""``skyless bridge`` and ``skyless tag --to``: fixes for programs and devices of other kinds.
+"""``skyless bridge`` and ``skyless tag --to``: fixes for other programs and devices.
 
-A bridge gets a site's fixes from its broker, a tag's program gives its own without a broker.
+A bridge gets a site's fixes from its broker; a tag's program passes on its own without a broker.
 """
 
 import asyncio
@@ -50,7 +50,7 @@ if TYPE_CHECKING:  # it compiles kernels, which a bridge of a broker does not ne
 _SILENT_S: Final = 5.0  # after so long without a fix a line says where to look
 
 _GEOREFERENCE_S: Final = 5.0
-"""Where a site sends its georeference, a tag has it this long after the rest: pages come in turn, and some are lost."""
+"""If the site sends a georeference, a tag has it this long after the other pages, which come in turn."""
 
 
 class BridgeState(Struct, frozen=True):
@@ -60,9 +60,9 @@ class BridgeState(Struct, frozen=True):
     fixes: int
     """Usable fixes of all tags."""
     dropped: dict[str, dict[str, int]]
-    """By target and reason: what its readers missed."""
+    """By target and reason: messages that its readers missed."""
     malformed: int
-    """Messages of the broker that could not be read."""
+    """Unreadable messages from the broker."""
 
 
 class BridgeNode:
@@ -156,16 +156,16 @@ class BridgeNode:
 
 
 def _name(hub: Hub) -> str:
-    """The bridge's name on MQTT: always the same for its targets, as the broker keeps the status of each name."""
+    """The bridge's name on MQTT: constant for its targets, as the broker keeps the status of each name."""
     targets = " ".join(route.target.text for route in hub.routes).encode()
     return f"{re.sub(r'[^A-Za-z0-9_-]', '-', platform.node())}-{crc32(targets):08x}"
 
 
 async def run_route(route: Route, log: Log) -> None:
-    """Run a route's target until cancelled. A fault in it is logged, and costs neither a fix nor another target.
+    """Run a route's target until cancelled. A fault is logged, and costs neither fixes nor other targets.
 
     Raises:
-        SkylessError: it cannot begin.
+        SkylessError: it cannot start.
     """
     try:
         while True:
@@ -181,7 +181,7 @@ async def run_route(route: Route, log: Log) -> None:
 
 
 class TagBridge:
-    """What the tags of one process give away."""
+    """Passes on the fixes of one process's tags."""
 
     def __init__(self, hub: Hub, is_simulated: Callable[[], bool], log: Log) -> None:
         self._hub, self._is_simulated, self._log = hub, is_simulated, log
@@ -190,12 +190,12 @@ class TagBridge:
         self._refusal = ""  # why no target can serve the site, as it was logged
 
     def on_fix(self, fix: FixMessage) -> None:
-        """A fix of one of them. It is dropped if the tag is at another site than the one known to the targets."""
+        """Process a fix; dropped if its tag is at another site than the targets."""
         if self._is_here(fix.tag):
             self._hub.on_fix(fix, time.monotonic())
 
     def on_health(self, health: TagHealth, receiver: "SiteListener") -> None:
-        """State of one of them, once a second, and what it has learned of the site."""
+        """Process a tag's state, once a second, and its knowledge of the site."""
         now_s = time.monotonic()
         self._receivers[health.tag] = receiver
         heard = self._sites.setdefault(health.tag, _HeardSite())
@@ -205,11 +205,11 @@ class TagBridge:
         self._hub.on_health(health, now_s)
 
     def on_system_health(self, health: TagHealth) -> None:
-        """State of a tag of another system, whose anchors are configured."""
+        """Process the state of a tag of another system, whose anchors are configured."""
         self._hub.on_health(health, time.monotonic())
 
     def on_site(self, site: BridgedSite) -> None:
-        """The site as one of them knows it: in a large one no tag receives all anchors."""
+        """Add the site as one tag knows it: at a large site no tag receives all anchors."""
         known = self._hub.site
         if known is not None and known.id == site.id:
             anchors_m, georeference = known.anchors_m | site.anchors_m, site.georeference or known.georeference
@@ -233,14 +233,14 @@ class TagBridge:
 
 
 class _HeardSite:
-    """The site of a receiver, once all of it is known."""
+    """A receiver's site, once complete."""
 
     def __init__(self) -> None:
         self._number: int | None = None
         self._complete_s: float | None = None  # since when the rest is known
 
     def update(self, receiver: "SiteListener", now_s: float, *, simulated: bool) -> BridgedSite | None:
-        """The site, or None while it is not complete. ``now_s`` is the host's monotonic clock."""
+        """The site, or None while incomplete. ``now_s``: the host's monotonic clock."""
         number, heard = receiver.site, receiver.heard_site
         if number != self._number:
             self._number, self._complete_s = number, None
@@ -257,7 +257,7 @@ class _HeardSite:
 def heard_site(
     number: int, anchors_m: Mapping[int, Point], page: GeoreferencePage | None = None, *, simulated: bool
 ) -> BridgedSite:
-    """A site whose name is not on the air."""
+    """A site from the air, where it has no name."""
     earth = None
     if page is not None:
         earth = GeoreferenceSite(page.latitude_deg, page.longitude_deg, page.height_m, page.heading_deg)

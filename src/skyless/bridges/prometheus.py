@@ -1,8 +1,8 @@
 """``prometheus:``: serves the figures of a site at ``/metrics``, in Prometheus's text format, version 0.0.4.
 
-Counters only rise, also where a tag or an anchor has been started again. Ages are those of the moment of the scrape.
-Other gauges are given while their source is fresh, so that nothing old looks present.
-Format: https://prometheus.io/docs/instrumenting/exposition_formats/#text-based-format.
+Counters only rise, even if a tag or an anchor restarts. Ages are those at the scrape. Other gauges are given while
+their source is fresh, so that nothing old looks current. Format:
+https://prometheus.io/docs/instrumenting/exposition_formats/#text-based-format.
 """
 
 import asyncio
@@ -25,16 +25,16 @@ CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
 Labels = Mapping[str, str]
 Sample = tuple[Labels, float]
-"""Its labels by name, and its value."""
+"""Labels by name, and the value."""
 
 GAUGE_AGE_S: Final = 5.0
-"""Gauges of an older fix or an older health are not given."""
+"""Gauges of older fixes or health messages are omitted."""
 
 LATENCY_BOUNDS_S: Final = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 
 _MAX_NAMES: Final = 2000
 _MAX_REASONS: Final = 50
-"""Reasons of dropped frames that are counted for one node."""
+"""Most reasons of dropped frames counted per node."""
 
 _FIXES: Final = "skyless_tag_fixes_total"
 _PORT: Final = 9464
@@ -96,7 +96,7 @@ _ESCAPES: Final = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n"})
 
 
 def family(name: str, kind: Literal["counter", "gauge"], text: str, samples: Iterable[Sample]) -> list[str]:
-    """The lines of one metric; none where it has no samples. ``text`` is one line of help."""
+    """Lines of one metric; none without samples. ``text`` is one line of help."""
     lines = [_sample(name, labels, value) for labels, value in samples]
     return [*_header(name, kind, text), *lines] if lines else []
 
@@ -104,9 +104,9 @@ def family(name: str, kind: Literal["counter", "gauge"], text: str, samples: Ite
 def histograms(
     name: str, text: str, bounds: Sequence[float], samples: Iterable[tuple[Labels, Sequence[int], float]]
 ) -> list[str]:
-    """The lines of a histogram: of each sample its labels, how many values each bucket got, and their sum.
+    """Lines of a histogram: for each sample its labels, counts of the buckets, and the sum of values.
 
-    ``bounds`` are the upper ends of the buckets, rising; one more count is of values above them all.
+    ``bounds``: upper limits of the buckets, ascending; one more count is for values above them all.
     """
     lines = []
     for labels, counts, total in samples:
@@ -136,43 +136,43 @@ def _number(value: float) -> str:
 
 
 class Rising:
-    """A counter of a node that begins at 0 whenever the node is started."""
+    """A node's counter, which restarts at 0 with the node."""
 
     def __init__(self) -> None:
         self._before = self._now = 0
 
     @property
     def total(self) -> int:
-        """Over all of the node's runs."""
+        """Over all runs of the node."""
         return self._before + self._now
 
     def update(self, value: int, *, restarted: bool = False) -> None:
-        """Its value in the node's present run; a lower one than before, without a restart, is a late message's."""
+        """Update from the node's present run; a decrease without a restart is due to a late message."""
         if restarted:
             self._before, self._now = self.total, 0
         self._now = max(self._now, value)
 
 
 class _Node:
-    """What is known of a tag or an anchor."""
+    """State of a tag or an anchor."""
 
     def __init__(self) -> None:
         self.online: bool | None = None
-        """None as long as nobody has said."""
+        """None while unknown."""
         self.health: TagHealth | AnchorHealth | None = None
         self.health_s = 0.0
-        """When its last health came."""
+        """Arrival of its last health message."""
         self.counters: dict[str, Rising] = {}
-        """By the metric's name."""
+        """By name of the metric."""
         self.dropped: dict[str, Rising] = {}
         self.fix: FixMessage | None = None
         self.fix_s = 0.0
-        """When the last fix ended, by the clock of arrivals."""
+        """End of its last fix, on the clock of arrivals."""
         self.latency_counts = [0] * (len(LATENCY_BOUNDS_S) + 1)
         self.latency_sum_s = 0.0
 
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
-        """Process the counters of its health."""
+        """Process the counters of its health message."""
         restarted = self.health is not None and health.uptime_s < self.health.uptime_s
         self.health, self.health_s = health, now_s
         counters = _TAG_COUNTERS if isinstance(health, TagHealth) else _ANCHOR_COUNTERS
@@ -189,19 +189,19 @@ _Nodes = list[tuple[Labels, _Node]]
 
 
 class SiteMetrics:
-    """Gathers the figures of one site. It does no I/O; the time is passed in."""
+    """Collects the figures of one site. No I/O; the time is passed in."""
 
     def __init__(self, *, positions: bool = False) -> None:
-        """``positions``: whether to give where tags are."""
+        """``positions``: whether to expose the tags' positions."""
         self.dropped: Counter[str] = Counter()
-        """Messages of nodes that are not counted, by reason."""
+        """Messages of uncounted nodes, by reason."""
         self.site: BridgedSite | None = None
         self._positions = positions
         self._tags: dict[str, _Node] = {}
         self._anchors: dict[str, _Node] = {}
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
-        """A usable fix, which comes at ``now_s`` of the clock of ``text``."""
+        """Process a usable fix that arrives at ``now_s``, on the clock of ``text``."""
         tag = self._known(self._tags, fix.tag)
         if tag is None:
             return
@@ -227,7 +227,7 @@ class SiteMetrics:
             node.online = status.online
 
     def _known(self, nodes: dict[str, _Node], name: str) -> _Node | None:
-        """The node of a name, a new one where there is none; None for what is no name, and where there are too many."""
+        """The node of this name, created if needed; None for an invalid name, or if there are too many."""
         if name not in nodes:
             if not TAG_NAME.fullmatch(name):
                 self.dropped["name"] += 1
@@ -238,7 +238,7 @@ class SiteMetrics:
         return nodes.get(name)
 
     def text(self, now_s: float) -> str:
-        """All of it in Prometheus's format."""
+        """Everything in Prometheus's format."""
         tags: _Nodes = [({"tag": name}, tag) for name, tag in sorted(self._tags.items())]
         anchors: _Nodes = [({"anchor": name}, anchor) for name, anchor in sorted(self._anchors.items())]
         groups = (("tag", self._tags), ("anchor", self._anchors))
@@ -336,7 +336,7 @@ def _trust_lines(
 
 
 def _faults(nodes: Iterable[tuple[Labels, Mapping[str, str]]]) -> list[tuple[Labels, float]]:
-    """The number of anchors for each fault that a node states."""
+    """Number of anchors for each fault stated by a node."""
     return [
         ({**labels, "reason": fault}, count)
         for labels, faults in nodes
@@ -375,21 +375,21 @@ def _dropped(nodes: _Nodes) -> list[Sample]:
 class Prometheus(Target):
     """An HTTP server with one page; each connection carries one request.
 
-    Made by hand, as the servers of libraries wait for ever for the end of a request: here each connection has a limit
-    of time and of bytes, and where there are too many the oldest is ended, so that none keeps a scrape out.
+    Written by hand, because libraries' servers wait indefinitely for the end of a request: here each connection has a
+    limit of time and bytes, and if there are too many the oldest is closed, so that none can block a scrape.
     """
 
     def __init__(self, text: str, host: str, port: int, names: Collection[str] = (), *, positions: bool) -> None:
-        """``names`` are those by which others reach it, besides the computer's own and its addresses."""
+        """``names``: further host names by which it is reached, besides the computer's own and its addresses."""
         super().__init__(text)
         self._names = {*own_names(host), *names}
         self.metrics = SiteMetrics(positions=positions)
         self.dropped = self.metrics.dropped
         self.port = port
-        """The one that is used, where 0 was asked for and the server runs."""
+        """The port in use; with 0 configured, known once the server runs."""
         self._host = host
         self._open: dict[asyncio.StreamWriter, None] = {}
-        """The oldest first."""
+        """Oldest first."""
 
     def on_site(self, site: BridgedSite) -> None:
         """The site is known, or has changed."""
@@ -408,7 +408,7 @@ class Prometheus(Target):
         self.metrics.on_status(status)
 
     async def run(self) -> None:
-        """Serve until cancelled. Raises SkylessError: it cannot listen there."""
+        """Serve until cancelled. Raises SkylessError if it cannot listen there."""
         try:
             server = await asyncio.start_server(self._serve, self._host, self.port, limit=LIMITS.head_bytes)
         except OSError as error:

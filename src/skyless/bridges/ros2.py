@@ -90,7 +90,7 @@ class RosSettings(Struct, frozen=True):
 
 
 class RosEncoder:
-    """Makes the messages of a site; does no I/O and reads no clock."""
+    """Creates the messages of a site; no I/O, reads no clock."""
 
     def __init__(self, settings: RosSettings) -> None:
         self._settings = settings
@@ -98,7 +98,7 @@ class RosEncoder:
         self._names: dict[str, str] = {}
 
     def on_site(self, site: BridgedSite) -> list[RosMessage]:
-        """The anchors, as RViz draws them; at the stamp 0, which means at any time. Nothing if they are known."""
+        """The anchors for RViz, at stamp 0, which means at any time. Nothing if unchanged."""
         if site == self._site:
             return []
         self._site = site
@@ -123,17 +123,17 @@ class RosEncoder:
         return found
 
     def on_no_fix(self, tag: str, unix_s: float) -> list[RosMessage]:
-        """That there is none, on the topic whose type can say so."""
+        """A message without a fix, on the topic whose type can express it."""
         if self._site is None or self._site.georeference is None:
             return []
         return [RosMessage(self._topic(tag, "fix"), NAV_SAT_FIX, _nav_sat_fix(self._name(tag), unix_s, None, None))]
 
     def on_health(self, health: TagHealth | AnchorHealth) -> list[RosMessage]:
-        """The state of a tag or an anchor."""
+        """Diagnostics of a tag or an anchor."""
         return [RosMessage("/diagnostics", DIAGNOSTICS, _diagnostics(health))]
 
     def on_truth(self, tag: str, unix_s: float, position_m: Vector) -> list[RosMessage]:
-        """Where a simulated tag truly was."""
+        """True pose of a simulated tag."""
         writer = _stamped(unix_s, self._settings.frame)
         writer.add("d", *position_m, *_NO_TURN)
         return [RosMessage(self._topic(tag, "truth"), TRUE_POSE, writer.message())]
@@ -142,7 +142,7 @@ class RosEncoder:
         return f"/{self._settings.namespace}/{self._name(tag)}/{what}"
 
     def _name(self, tag: str) -> str:
-        """A tag's name as ROS allows it; tags whose names become equal are numbered as they come."""
+        """A tag's name in ROS's alphabet; equal results are numbered in order of appearance."""
         if tag not in self._names:
             plain = ros_name(tag)
             taken, number = set(self._names.values()), 2
@@ -160,7 +160,7 @@ def ros_name(text: str) -> str:
 
 
 def stamp_of(unix_s: float) -> tuple[int, int]:
-    """``builtin_interfaces/Time``: whole seconds and nanoseconds, to the nearest; 0 for what it cannot hold."""
+    """``builtin_interfaces/Time``: whole seconds and nanoseconds, rounded; 0 if out of range."""
     if not isfinite(unix_s) or not 0.0 <= unix_s < 2**31 - 1:
         return 0, 0
     seconds = floor(unix_s)
@@ -169,19 +169,19 @@ def stamp_of(unix_s: float) -> tuple[int, int]:
 
 
 class CdrWriter:
-    """Gathers the fields of one message in their order, each at a multiple of its own size after the header."""
+    """Collects the fields of one message in order, each aligned to its own size after the header."""
 
     def __init__(self) -> None:
         self._data = bytearray()
 
     def add(self, code: str, *values: float) -> None:
-        """Numbers of one of ``struct``'s types: ``B b H h I i f d``; ``?`` for flags. Raises struct.error."""
+        """Add numbers of one of ``struct``'s types: ``B b H h I i f d``; ``?`` for flags. Raises struct.error."""
         size = struct.calcsize(f"<{code}")
         self._data += bytes(-len(self._data) % size)
         self._data += struct.pack(f"<{len(values)}{code}", *values)
 
     def add_text(self, text: str) -> None:
-        """A string: its length with the NUL that ends it, then both. Other NULs are left out."""
+        """Add a string: its length with the final NUL, then both. Other NULs are omitted."""
         data = text.replace("\0", "").encode() + b"\0"
         self.add("I", len(data))
         self._data += data
@@ -226,7 +226,7 @@ def _velocity(fix: FixMessage, frame: str) -> bytes | None:
 
 
 def _with_angles(covariance: Matrix) -> list[float]:
-    """Six by six, row by row: the given three and unknown angles."""
+    """A 6 × 6 covariance row by row: the given 3 × 3 and unknown angles."""
     rows = [[*covariance[3 * row : 3 * row + 3], *(0.0,) * _ANGLES] for row in range(3)]
     angles = [[UNKNOWN_VARIANCE * (row == column) for column in range(3, 6)] for row in range(3, 6)]
     return [value for row in (*rows, *([0.0, 0.0, 0.0, *angle] for angle in angles)) for value in row]
@@ -235,7 +235,7 @@ def _with_angles(covariance: Matrix) -> list[float]:
 def _nav_sat_fix(frame: str, unix_s: float, earth: Vector | None, covariance_m2: Matrix | None) -> bytes:
     """``sensor_msgs/NavSatFix``: latitude, longitude, height on WGS 84; covariance towards east, north, up.
 
-    Without a position: status no fix, NaN, and a covariance that is not known.
+    Without a position: status no fix, NaN, unknown covariance.
     """
     writer = _stamped(unix_s, frame)
     writer.add("b", _STATUS_NO_FIX if earth is None else _STATUS_FIX)
@@ -326,7 +326,7 @@ def _add_marker(
 
 
 DEPTH: Final = 10
-"""Messages of a topic that are kept for readers that have not confirmed them."""
+"""Messages of a topic kept for readers that have not confirmed them."""
 
 _MAX_BLOCKING_NS: Final = 10_000_000
 
@@ -334,12 +334,12 @@ _SETTINGS: Final = (
     "<CycloneDDS><Domain Id='any'><Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
     "</Domain></CycloneDDS>"
 )
-"""1.15 is Fast DDS's number among vendors, whose descriptions of types Cyclone DDS cannot read: without this, its
-subscribers see the topics and get nothing."""
+"""1.15 is Fast DDS's vendor number, whose type descriptions Cyclone DDS cannot read: without this setting, its
+subscribers see the topics but get no data."""
 
 
 class DdsTypes:
-    """Types of ROS 2's messages as Cyclone DDS announces them. Raises ImportError where a package is missing."""
+    """Types of ROS 2's messages as announced by Cyclone DDS. Raises ImportError if a package is missing."""
 
     def __init__(self) -> None:
         self._idl: Any = import_module("cyclonedds.idl")
@@ -350,11 +350,11 @@ class DdsTypes:
         self._made: dict[str, Any] = {}
 
     def hash(self, name: str) -> str:
-        """What ROS since Iron compares to see that both ends mean the same (REP 2011)."""
+        """The type hash that ROS compares since Iron (REP 2011)."""
         return str(self._store.hash_rihs01(name))
 
     def type(self, name: str) -> Any:  # noqa: ANN401 - a class whose fields only DDS sees
-        """The type ``package/msg/Name``, which DDS knows as ``package::msg::dds_::Name_``."""
+        """The type ``package/msg/Name``, called ``package::msg::dds_::Name_`` in DDS."""
         if name not in self._made:
             fields = {field: self._field(*given) for field, given in self._store.get_msgdef(name).fields}
             package, kind, last = name.split("/")
@@ -372,10 +372,10 @@ class DdsTypes:
 
 
 class DdsPublisher:
-    """A participant of a DDS domain; its methods may wait, for some milliseconds."""
+    """A participant of a DDS domain; its methods may block for some milliseconds."""
 
     def __init__(self, text: str, domain: int) -> None:
-        """``text`` is the target's address. Raises SkylessError: DDS is not installed, or cannot start."""
+        """``text``: the target's address. Raises SkylessError if DDS is not installed or cannot start."""
         try:
             self._dds: Any = import_module("cyclonedds")
             for name in ("core", "domain", "pub", "qos", "topic"):
@@ -396,14 +396,14 @@ class DdsPublisher:
         self._writers: dict[str, Any] = {}
 
     def write(self, message: RosMessage) -> None:
-        """Publish one. Lets the errors of DDS through."""
+        """Publish a message. Errors of DDS pass through."""
         writer = self._writers.get(message.topic)
         if writer is None:
             writer = self._writers[message.topic] = self._writer(message)
         writer.write(writer.data_type.deserialize(message.data))
 
     def close(self) -> None:
-        """Leave the domain, so that subscribers need not wait until they miss us. Nothing can be written any more."""
+        """Leave the domain, so that subscribers need not wait for a timeout. Nothing can be written afterwards."""
         self._writers.clear()
         del self._participant  # Cyclone's objects end when nothing refers to them
 
@@ -425,12 +425,12 @@ class DdsPublisher:
 
 @cache
 def _domain(number: int, given: str) -> Any:  # noqa: ANN401 - a Domain, where the package is
-    """A domain with our settings, then those of CYCLONEDDS_URI. The cache keeps it: its settings would go with it."""
+    """A domain with our settings, then those of CYCLONEDDS_URI. Cached, as its settings end with the object."""
     return import_module("cyclonedds.domain").Domain(number, f"{_SETTINGS},{given}" if given else _SETTINGS)
 
 
 _MAX_DOMAIN: Final = 232
-"""Beyond it, ports would exceed 65535."""
+"""Ports would exceed 65535 beyond it."""
 
 _MAX_WAITING: Final = 500
 _CLOSE_S: Final = 1.0
@@ -438,7 +438,7 @@ _NAMESPACE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}(/[A-Za-z][A-Za-z0-9_
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Target:
-    """The target of an address. Raises SkylessError."""
+    """Create the target of an address. Raises SkylessError."""
     frame, namespace = url.text_option("frame", SITE_FRAME), url.text_option("namespace", NAMESPACE)
     if not FRAME_NAME.fullmatch(frame):
         raise url.wrong(f"with frame= {FRAME_RULE}")
@@ -454,7 +454,7 @@ def make_target(url: TargetUrl, context: BridgeContext) -> Target:
 
 
 def _usual_domain(target: str) -> int:
-    """As programs of ROS choose it. Raises SkylessError."""
+    """The domain that ROS programs would use. Raises SkylessError."""
     text = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not text.isdecimal() or int(text) > _MAX_DOMAIN:
         raise SkylessError(
@@ -473,7 +473,7 @@ class Ros2Target(Target):
         self._waiting: queue.Queue[list[RosMessage] | None] = queue.Queue(_MAX_WAITING)
         self._troubles: set[str] = set()
         self._knows_no_earth = False
-        """Whether it was logged that the site does not know where it is."""
+        """Whether the missing georeference was logged."""
 
     def on_site(self, site: BridgedSite) -> None:
         """Publish its anchors."""
@@ -487,11 +487,11 @@ class Ros2Target(Target):
         self._give(self._encoder.on_fix(fix))
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:  # noqa: ARG002 - NavSatFix has no text
-        """Publish that there is none; the reason is in the diagnostics."""
+        """Publish that there is no fix; the reason is in the diagnostics."""
         self._give(self._encoder.on_no_fix(tag, unix_s))
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
-        """Publish it as diagnostics."""
+        """Publish diagnostics."""
         self._give(self._encoder.on_health(health))
 
     async def run(self) -> None:
@@ -505,7 +505,7 @@ class Ros2Target(Target):
             await asyncio.to_thread(thread.join, _CLOSE_S)
 
     def _give(self, messages: list[RosMessage] | None) -> None:
-        """Let the thread write them; where too many wait, the oldest are dropped."""
+        """Queue messages for the thread; if too many wait, the oldest are dropped."""
         while True:
             try:
                 self._waiting.put_nowait(messages)

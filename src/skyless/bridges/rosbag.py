@@ -1,6 +1,6 @@
-"""A recording of a running site as a bag of ROS 2: a folder with an MCAP of CDR messages and ``metadata.yaml``.
+"""A recording of a running site as a ROS 2 bag: a folder with an MCAP of CDR messages and ``metadata.yaml``.
 
-The messages are those that the target ``ros2://`` publishes while a site runs, and the truth where it is known.
+It has the messages of the target ``ros2://`` for a running site, and the truth if known.
 """
 
 import importlib
@@ -32,11 +32,11 @@ BagVersion = Literal[8, 9]
 
 _KINDS: Final = {"site", "fix", "health", "truth"}
 _KEPT: Final = 10
-"""Depth of the queues that ``ros2 bag play`` then makes, as ``ros2://`` does."""
+"""Depth of the queues of ``ros2 bag play``, as for ``ros2://``."""
 
 
 class Bag(Struct, frozen=True):
-    """What was written."""
+    """Summary of a written bag."""
 
     path: str
     start_s: float
@@ -48,11 +48,11 @@ class Bag(Struct, frozen=True):
     """Type of each topic."""
     fixes: int
     unusable: int
-    """Fixes that were left out because an alert forbids their use, or they are not finite."""
+    """Fixes omitted because an alert forbids their use, or they are not finite."""
     drops: dict[str, int]
-    """What of the recording could not be read."""
+    """Unreadable parts of the recording."""
     finished: bool
-    """False where the recording was cut off, or is still being written."""
+    """False if the recording was cut off or is still being written."""
 
 
 def write_bag(
@@ -66,7 +66,7 @@ def write_bag(
 
     Raises:
         ConfigurationError: the recording cannot be read, or the folder exists.
-        SkylessError: there is no site in it; the folder cannot be written; the package rosbags is missing.
+        SkylessError: it has no site; the folder cannot be written; the package rosbags is missing.
     """
     with McapRecording(recording) as source:
         site = source.site
@@ -104,7 +104,7 @@ def _copy(
 
 
 def _messages_of(found: Recorded, encoder: RosEncoder, tag: str | None) -> list[RosMessage]:
-    """What one recorded message becomes."""
+    """The ROS messages of one recorded message."""
     message = found.message
     if isinstance(message, SiteMessage):
         return encoder.on_site(bridged_site(message.site, simulated=message.simulated))
@@ -121,7 +121,7 @@ def _messages_of(found: Recorded, encoder: RosEncoder, tag: str | None) -> list[
 
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """A folder to be made in the block, which gets its name if the block ends without an error."""
+    """A folder created in the block, which gets its final name if the block ends without an error."""
     if folder.exists():
         raise ConfigurationError(folder, "", None, "a new folder; this one exists and is not overwritten")
     outer = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}")
@@ -134,10 +134,10 @@ def _new_folder(folder: Path) -> Iterator[Path]:
 
 
 class _BagWriter:
-    """Writes messages into a bag; a topic begins with its first one."""
+    """Writes messages into a bag; a topic starts with its first message."""
 
     def __init__(self, folder: Path, version: BagVersion) -> None:
-        """Raises SkylessError: the package that writes bags is missing."""
+        """Raises SkylessError if the package that writes bags is missing."""
         rosbag2, typesys = (extra_module(f"rosbags.{part}", "a bag of ROS 2") for part in ("rosbag2", "typesys"))
         self._writer: Writer = rosbag2.Writer(folder, version=version, storage_plugin=rosbag2.StoragePlugin.MCAP)
         self._writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
@@ -176,7 +176,7 @@ class _BagWriter:
 
 
 def _quality(*, lasting: bool) -> "Qos":
-    """How ``ros2 bag play`` publishes a topic: as ``ros2://`` does."""
+    """Quality of service of ``ros2 bag play`` for a topic, as for ``ros2://``."""
     of = importlib.import_module("rosbags.interfaces")
     never = of.QosTime(0, 0)
     return cast(

@@ -1,4 +1,4 @@
-"""What a target is: a program or device of another kind that gets a site's fixes, named by an address.
+"""Targets: other programs or devices that get a site's fixes, named by an address.
 
 An address is ``SCHEME://HOST:PORT?KEY=VALUE`` or ``SCHEME:PATH?KEY=VALUE``. A target whose readers get bytes consists
 of an ``Encoder``, which does no I/O, and a sender (``targets.py``).
@@ -32,27 +32,27 @@ from skyless.run.mqtt.messages import (
 from skyless.run.process import RateLimit
 
 MIN_STD_M: Final = 0.01
-"""Least standard deviation of an axis that leaves: the gates of other programs reject fixes with honest millimetres."""
+"""Smallest standard deviation per axis in outputs: the gates of other programs reject fixes with honest millimetres."""
 
 _FORBIDDING: Final = (Alert.NOT_EXCLUDED, Alert.LIMIT)
-"""Alerts of fixes that nobody should navigate with."""
+"""Alerts of fixes unfit for navigation."""
 
 
 class BridgedSite(Struct, frozen=True):
-    """What a bridge knows of the site."""
+    """A bridge's knowledge of the site."""
 
     id: int
     name: str
     simulated: bool
-    """True where its radios are emulated."""
+    """Whether its radios are emulated."""
     anchors_m: dict[int, Vector]
-    """Positions of those that are known, in the site's frame."""
+    """Positions of the placed anchors in the site's frame."""
     georeference: GeoreferenceSite | None = None
     zones: tuple[Zone, ...] = ()
     master: int | None = None
-    """The anchor that is the master by the site file; None where there is none, or it is not known."""
+    """The master anchor of the site file; None if there is none, or it is unknown."""
     walls: tuple[WallSite, ...] = ()
-    """A tag by itself knows none."""
+    """Unknown to a tag by itself."""
     assets: Mapping[str, Asset] = {}
     """What tags are attached to, by tag."""
     floors: tuple[FloorSite, ...] = ()
@@ -61,7 +61,7 @@ class BridgedSite(Struct, frozen=True):
 def bridged_site(
     site: Site, zones: tuple[Zone, ...] = (), *, simulated: bool, assets: Mapping[str, Asset] | None = None
 ) -> BridgedSite:
-    """The same of a whole site, as MQTT has it."""
+    """The ``BridgedSite`` of a whole site, as published on MQTT."""
     anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
     earth = site.georeference
     return BridgedSite(
@@ -70,7 +70,7 @@ def bridged_site(
 
 
 def is_usable(fix: FixMessage) -> bool:
-    """Whether its position may be given: it is finite, and no alert forbids its use."""
+    """Whether its position may be passed on: it is finite, and no alert forbids its use."""
     return fix.alert not in _FORBIDDING and all(map(isfinite, (*fix.position_m, *fix.covariance_m2)))
 
 
@@ -82,10 +82,10 @@ def floored(covariance_m2: Matrix) -> Matrix:
 
 
 def require_georeference(site: BridgedSite, target: str) -> GeoreferenceSite:
-    """Where the site is on the Earth, for a target whose positions are global.
+    """The site's georeference, for a target with global positions.
 
     Raises:
-        SkylessError: the site does not know it.
+        SkylessError: the site has none.
     """
     if site.georeference is None:
         raise SkylessError(

@@ -124,10 +124,10 @@ class UdpSender:
     """Sends datagrams to one address: a host, a broadcast address or a multicast group."""
 
     def __init__(self, text: str, host: str, port: int, log: Callable[[str], None]) -> None:
-        """Raises SkylessError: there is no such host."""
+        """Raises SkylessError if there is no such host."""
         self.dropped: Counter[str] = Counter()
         self.received: Callable[[bytes], None] | None = None
-        """Called with each datagram that comes back, while it runs."""
+        """Called with each received datagram while it runs."""
         self._text, self._log, self._trouble = text, log, ""
         try:
             family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -168,22 +168,22 @@ class UdpSender:
 
 
 class PtySender:
-    """Sends to the program that opens a pseudo-terminal, by its path or by a link to it."""
+    """Sends to the program that opens a pseudo-terminal, by its path or a link to it."""
 
     def __init__(self, text: str, link: str, log: Callable[[str], None]) -> None:
-        """``link`` is where the user wants it; empty for none."""
+        """``link``: path of a link to create; empty for none."""
         self.dropped: Counter[str] = Counter()
         self._text, self._link, self._log = text, Path(link) if link else None, log
         self._pty: Pty | None = None
-        """Exists while it runs: a link left behind would lead to the terminal that the system opens next."""
+        """Exists only while running: a stale link would lead to the next terminal that the system opens."""
 
     def send(self, data: bytes) -> None:
-        """Write; where nobody reads, this and what nobody has read is dropped."""
+        """Write; if nobody reads, this and everything unread is dropped."""
         if self._pty is None or not self._pty.send(data):
             self.dropped["not-read"] += 1
 
     async def run(self) -> None:
-        """Keep it until cancelled; what programs write is not read. Raises SkylessError: it cannot be made."""
+        """Keep it open until cancelled; programs' output is not read. Raises SkylessError if it cannot be created."""
         pty = Pty(self._link, held_bytes=0, asked=f"the target {self._text!r} has the path")
         try:
             os.chmod(pty.path, _ANY_PROGRAM)  # noqa: PTH101 - a device, not a file of ours
@@ -198,17 +198,17 @@ class PtySender:
 
 
 class SerialSender:
-    """Sends on a serial port of this computer, which is opened again whenever it was unplugged."""
+    """Sends on a serial port of this computer, which is reopened whenever it was unplugged."""
 
     def __init__(self, text: str, path: str, baud: int, log: Callable[[str], None]) -> None:
         self.dropped: Counter[str] = Counter()
         self.received: Callable[[bytes], None] | None = None
-        """Called with what comes."""
+        """Called with received bytes."""
         self._port = SerialPort(path, baud, lambda reason: log(f"{text}: {reason}"))
         self._write: Callable[[bytes], None] | None = None
 
     def send(self, data: bytes) -> None:
-        """Write, or drop where there is no port or it does not keep up."""
+        """Write, or drop if there is no port or it does not keep up."""
         if self._write is None:
             self.dropped["no-port"] += 1
         elif self._port.waiting_bytes() > self._port.baud // 40:  # what it carries in a quarter of a second
@@ -247,13 +247,13 @@ class Kind(Struct, frozen=True):
     """A scheme of addresses."""
 
     module: str
-    """Below ``skyless.bridges``; imported when it is used. A stream's has ``make_encoder``, others ``make_target``."""
+    """Below ``skyless.bridges``, imported on use. Stream modules have ``make_encoder``, others ``make_target``."""
     hz: float
     """Usual rate of fixes for each tag."""
     max_hz: float
     summary: str
     port: int = 0
-    """Usual port of a stream; other targets know their own."""
+    """Usual port of a stream; other targets have their own."""
 
 
 TARGET_KINDS: Final = {
@@ -283,7 +283,7 @@ TARGET_KINDS: Final = {
 
 
 class _StreamTarget(Target):
-    """Bytes of an encoder, carried by a sender."""
+    """An encoder's bytes, carried by a sender."""
 
     def __init__(self, text: str, encoder: Encoder, sender: Sender) -> None:
         super().__init__(text)
@@ -315,7 +315,7 @@ class _StreamTarget(Target):
 
 
 def open_route(text: str, context: BridgeContext) -> Route:
-    """The target of an address, with its tag and its rate. Raises SkylessError: there is none."""
+    """Open the target of an address, with its tag and rate. Raises SkylessError if there is none."""
     url = TargetUrl(text)
     kind = TARGET_KINDS.get(url.scheme)
     if kind is None:
@@ -338,7 +338,7 @@ def open_route(text: str, context: BridgeContext) -> Route:
 
 
 def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext) -> _StreamTarget:
-    """An encoder and the sender that the scheme names after ``+``."""
+    """Combine an encoder with the sender named after ``+`` in the scheme."""
     sender: Sender
     match url.scheme.partition("+")[2]:
         case "tcp":

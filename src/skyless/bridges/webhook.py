@@ -1,4 +1,4 @@
-"""``webhook+https://HOST/PATH``: posts what becomes of alarms as JSON, signed where a secret is given.
+"""``webhook+https://HOST/PATH``: posts changes of alarms as JSON, signed if a secret is given.
 
 The signature is HMAC-SHA256 of the timestamp, a dot and the body (docs/howto/alarms.md).
 """
@@ -74,5 +74,5 @@ class Webhook(AlarmTarget):
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Webhook:
-    """The target of an address. Raises SkylessError."""
+    """Create the target of an address. Raises SkylessError."""
     return Webhook(url, context)
