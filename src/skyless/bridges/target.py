@@ -105,7 +105,7 @@ class BridgeContext(Struct, frozen=True):
 
 
 class Target:
-    """Base of all targets: does nothing with what it gets. The hub calls it from the event loop, and never waits."""
+    """Base of all targets; ignores everything. The hub calls it from the event loop, and it must not block."""
 
     one_tag = False
     """Whether its readers cannot distinguish tags."""
@@ -117,89 +117,89 @@ class Target:
         """What readers missed, by reason."""
 
     def on_site(self, site: BridgedSite) -> None:
-        """The site is known, or has changed. Raises SkylessError where it lacks what this target needs."""
+        """The site is known or has changed. Raises SkylessError if it lacks what this target needs."""
 
     def on_fix(self, fix: FixMessage) -> None:
-        """A usable fix, no more often than the target's ``hz``; not before the site is known."""
+        """Process a usable fix; called at most at the target's ``hz``, and not before the site is known."""
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
-        """A known tag has had no usable fix for a second: now, and each further second."""
+        """A known tag has had no usable fix for a second; called again each second."""
 
     def on_second(self, unix_s: float) -> None:
-        """Another second has gone by."""
+        """Another second has passed."""
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
-        """State of a tag or an anchor, once a second."""
+        """Process the state of a tag or an anchor, once a second."""
 
     def on_status(self, status: StatusMessage) -> None:
-        """A program of the site has come or gone."""
+        """A program of the site has connected or left."""
 
     def on_alarm(self, alarm: AlarmMessage) -> None:
-        """An alarm as it is now: raised, ended, acknowledged, or kept by the broker from before."""
+        """Process an alarm's present state: raised, ended, acknowledged, or retained from before."""
 
     async def run(self) -> None:
         """Serve until cancelled."""
 
 
 class Encoder:
-    """Base of what makes bytes for readers: each element of a result is one datagram, or one write.
+    """Base of encoders: each element of a result is one datagram or one write.
 
-    Does no I/O and reads no clock.
+    No I/O; reads no clock.
     """
 
     one_tag = False
-    """As of a ``Target``."""
+    """See ``Target``."""
 
     dropped: Counter[str]
-    """As of its ``Target``: what it could not encode, by reason."""
+    """That of its ``Target``: what it could not encode, by reason."""
 
     def greeting(self) -> list[bytes]:
-        """For a reader that has just connected."""
+        """Sent to a reader that has just connected."""
         return []
 
     def on_site(self, site: BridgedSite) -> list[bytes]:  # noqa: ARG002 - most only keep it
-        """As of a ``Target``."""
+        """See ``Target``."""
         return []
 
     def on_fix(self, fix: FixMessage) -> list[bytes]:  # noqa: ARG002 - see above
-        """As of a ``Target``."""
+        """See ``Target``."""
         return []
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:  # noqa: ARG002 - see above
-        """As of a ``Target``."""
+        """See ``Target``."""
         return []
 
     def on_second(self, unix_s: float) -> list[bytes]:  # noqa: ARG002 - see above
-        """As of a ``Target``."""
+        """See ``Target``."""
         return []
 
     def on_bytes(self, data: bytes, unix_ns: int) -> list[bytes]:  # noqa: ARG002 - see above
-        """What a reader has sent, over UDP or a serial port, and when it came; the result answers it."""
+        """Process a reader's bytes, over UDP or a serial port, and their time. Returns the answer."""
         return []
 
 
 def cannot_listen(text: str, host: str, port: int, error: OSError) -> SkylessError:
-    """What a server raises that cannot begin; asyncio's own words are longer and name the same."""
+    """The error of a server that cannot start; asyncio's own text is longer and says the same."""
     reason = os.strerror(error.errno) if error.errno is not None and error.errno > 0 else error
     return SkylessError(f"the target {text!r} cannot listen on {host}:{port}: {reason}")
 
 
 TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
-"""Names that tags may have."""
+"""Valid names of tags."""
 
 _HOST: Final = "//HOST:PORT"
 _USER: Final = "USER@"
 _PATH: Final = "PATH"
-"""Parts of an address, as messages name them."""
+"""Parts of an address as named in messages."""
 
 
 class TargetUrl:
-    """One address; each part is checked when it is read, and ``check_all_read`` refuses what nobody reads."""
+    """One address; each part is checked when read, and ``check_all_read`` refuses parts that nobody has read."""
 
     def __init__(self, text: str) -> None:
         """Raises SkylessError."""
         self.text = hide_password(text)
-        """As it was given, for messages: without a password."""
+        """The address as given, without a password, for messages."""
         scheme, colon, _ = text.partition(":")
         try:
             parts = urlsplit(text)
@@ -219,30 +219,30 @@ class TargetUrl:
         if len(self._options) < len(pairs):
             raise self.wrong("each key once")
         self._parts: set[str] = set()
-        """That have been read, and which keys."""
+        """Parts that have been read; ``_read`` has the keys."""
         self._read: set[str] = set()
 
     def host(self, default: str = "127.0.0.1") -> str:
-        """The host, ``default`` where none is given."""
+        """The host, by default ``default``."""
         self._parts.add(_HOST)
         return self._host or default
 
     def port(self, default: int) -> int:
-        """The port, ``default`` where none is given."""
+        """The port, by default ``default``."""
         return self._port or default
 
     def netloc(self) -> str:
-        """``USER:PASSWORD@HOST:PORT``, as it was given; empty where there is none."""
+        """``USER:PASSWORD@HOST:PORT`` as given; empty if absent."""
         self._parts |= {_HOST, _USER}
         return self._netloc
 
     def path(self) -> str:
-        """Path of a port or a link; empty if there is none."""
+        """Path of a port or a link; empty if absent."""
         self._parts.add(_PATH)
         return self._path
 
     def text_option(self, key: str, default: str = "") -> str:
-        """The value of a key, as it is."""
+        """The value of a key, unchanged."""
         self._read.add(key)
         return self._options.get(key, default)
 
@@ -258,7 +258,7 @@ class TargetUrl:
         return value
 
     def whole_number(self, key: str, default: int, least: int, most: int) -> int:
-        """A number without a fraction, within limits. Raises SkylessError."""
+        """A whole number within limits. Raises SkylessError."""
         value = self.number(key, default, least, most)
         if value % 1:
             raise self._wrong_value(key, f"a whole number from {least} to {most}")
@@ -277,14 +277,14 @@ class TargetUrl:
         return value
 
     def tag(self) -> str | None:
-        """The only tag that is wanted; None for all. Raises SkylessError."""
+        """The selected tag; None for all. Raises SkylessError."""
         name = self.text_option("tag")
         if "tag" in self._options and not TAG_NAME.fullmatch(name):
             raise self._wrong_value("tag", "a tag's name: 1 to 32 letters, digits, - or _")
         return name or None
 
     def check_all_read(self) -> None:
-        """Refuse parts and keys that nobody has read. Raises SkylessError."""
+        """Refuse unread parts and keys. Raises SkylessError."""
         given = {
             _HOST: bool(self._host) or self._port is not None,
             _USER: "@" in self._netloc,
@@ -298,7 +298,7 @@ class TargetUrl:
                 raise SkylessError(f"the target {self.text!r} has {key!r}; its keys are {known}")
 
     def wrong(self, expected: str) -> SkylessError:
-        """What to raise where the address cannot be used."""
+        """The error for an unusable address."""
         return SkylessError(f"the target is {self.text!r}; it should be {expected}")
 
     def _wrong_value(self, key: str, expected: str) -> SkylessError:
@@ -311,22 +311,22 @@ class TargetUrl:
 # No I/O, and the time is passed in.
 
 NO_FIX_S: Final = 1.0
-"""A tag has no fix once its last usable one is older, ..."""
+"""A tag has no fix once its last usable one is older than this, ..."""
 
 _MISSED: Final = 2.5
-"""... where its fixes are rarer, once it is older than this number of their intervals, ..."""
+"""... or, if its fixes are rarer, older than this number of their intervals, ..."""
 
 _LONGEST_S: Final = 10.0
-"""... but than this in any case."""
+"""... but at most this."""
 
 SILENCE_CHECK_S: Final = 0.25
-"""Interval in which ``on_tick`` is to be called."""
+"""Interval at which to call ``on_tick``."""
 
 _SECOND_S: Final = 1.0 - 0.1 * SILENCE_CHECK_S
-"""After so long a second has gone by: ticks come late now and then."""
+"""Threshold for another second, as ticks are sometimes late."""
 
 _FORGET_S: Final = 3600.0
-"""A tag without a fix for so long is not spoken of any more."""
+"""A tag without a fix for this time is forgotten."""
 
 
 class Route(Struct):
@@ -334,35 +334,35 @@ class Route(Struct):
 
     target: Target
     tag: str | None
-    """The only tag; None for all, or for the first where the target carries one."""
+    """The selected tag; None for all, or for the first if the target carries only one."""
     hz: float
     rates: dict[str, RateLimit] = {}
     """Rate limit of each tag."""
     others: bool = False
-    """Whether it needs no line that there are more tags than the target carries: there was one, or the user chose."""
+    """Whether the hint that there are more tags is unnecessary: it was given, or the user chose a tag."""
     refused: str = ""
-    """What the site lacks that the target needs, so that it gets nothing; empty where it serves the site."""
+    """What the site lacks for this target, which then gets nothing; empty if it is served."""
     has_ended: bool = False
-    """Whether it has been closed: a broker's link still receives while it takes leave."""
+    """Whether it has been closed: a broker's link still receives while disconnecting."""
     faults: int = 0
-    """How often it failed."""
+    """Number of failures."""
 
 
 class _Tag(Struct):
-    """What is known of one tag."""
+    """State of one tag."""
 
     usable_s: float
-    """When its last usable fix came, or when it was first heard of."""
+    """Arrival of its last usable fix, or of the first message about it."""
     reason: str
     """Why there is none."""
     intervals_s: tuple[float, float] = (0.0, 0.0)
     """Between its last three usable fixes: a single long one is an outage, two are its rate."""
     reported_s: float = -inf
-    """When targets were informed that it has none."""
+    """When targets were last told that it has no fix."""
 
 
 class Hub:
-    """Distributes what comes from one site."""
+    """Distributes one site's messages to its targets."""
 
     def __init__(self, routes: Sequence[Route], log: Callable[[str], None]) -> None:
         self.routes = tuple(routes)
@@ -371,13 +371,13 @@ class Hub:
         self._log = log
         self._tags: dict[str, _Tag] = {}
         self._second_s = -inf
-        """When the last second began."""
+        """Beginning of the current second."""
 
     def on_site(self, site: BridgedSite) -> None:
-        """The site is known, or has changed.
+        """The site is known or has changed.
 
         Raises:
-            SkylessError: it lacks what each of the targets needs; where it lacks what some need, that is logged.
+            SkylessError: it lacks what every target needs; what only some need is logged.
         """
         if site == self.site:
             return
@@ -393,7 +393,7 @@ class Hub:
             self._log(reason)
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
-        """A tag's fix; ``now_s`` is the host's monotonic clock. One before the site is known is not given."""
+        """Distribute a tag's fix; ``now_s``: the host's monotonic clock. Fixes before the site is known are ignored."""
         tag = self._tags.setdefault(fix.tag, _Tag(now_s, "no fix yet"))
         if not is_usable(fix):
             tag.reason = fix.alert or "position is not finite"
@@ -408,7 +408,7 @@ class Hub:
                 self._guard(route, lambda target: target.on_fix(fix))
 
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
-        """State of a tag or an anchor."""
+        """Distribute the state of a tag or an anchor."""
         if isinstance(health, TagHealth):
             tag = self._tags.setdefault(health.tag, _Tag(now_s, "no fix yet"))
             if health.reason is not None:
@@ -418,19 +418,19 @@ class Hub:
                 self._guard(route, lambda target: target.on_health(health))
 
     def on_status(self, status: StatusMessage) -> None:
-        """A program of the site has come or gone."""
+        """A program of the site has connected or left."""
         for route in self.routes:
             if status.kind != "tag" or route.tag in (None, status.name):
                 self._guard(route, lambda target: target.on_status(status))
 
     def on_alarm(self, alarm: AlarmMessage) -> None:
-        """An alarm as it is now. A target of one tag gets those that concern it."""
+        """Distribute an alarm's present state. A target with a selected tag gets those that concern it."""
         for route in self.routes:
             if route.tag is None or route.tag in alarm.tags:
                 self._guard(route, lambda target: target.on_alarm(alarm))
 
     def on_tick(self, now_s: float, unix_s: float) -> None:
-        """To be called every ``SILENCE_CHECK_S``."""
+        """Report silent tags and seconds; call every ``SILENCE_CHECK_S``."""
         for name, tag in tuple(self._tags.items()):
             age_s = now_s - tag.usable_s
             if age_s > _FORGET_S:
@@ -454,7 +454,7 @@ class Hub:
                 self._guard(route, lambda target: target.on_no_fix(tag, unix_s, reason))
 
     def _guard(self, route: Route, call: Callable[[Target], None]) -> None:
-        """Call a target; a fault in it costs neither a fix nor another target."""
+        """Call a target; a fault in it costs neither fixes nor other targets."""
         if route.refused or route.has_ended:
             return
         try:
@@ -471,7 +471,7 @@ class Hub:
         return route.rates[tag].is_due(now_s)
 
     def _carries(self, route: Route, tag: str) -> bool:
-        """Whether a target gets the fixes of a tag; one that carries a single one keeps to the first that has any."""
+        """Whether a target gets the fixes of a tag; one that carries only one keeps the first tag with a fix."""
         if route.tag is None and route.target.one_tag:
             route.tag = tag
         if route.tag in (None, tag):
@@ -483,7 +483,7 @@ class Hub:
 
 
 def open_hub(routes: Sequence[Route], log: Callable[[str], None]) -> Hub:
-    """The hub of routes. Raises SkylessError: two of them have the same address."""
+    """Create the hub of these routes. Raises SkylessError if two have the same address."""
     texts = [route.target.text for route in routes]
     for text in texts:
         if texts.count(text) > 1:
@@ -492,7 +492,7 @@ def open_hub(routes: Sequence[Route], log: Callable[[str], None]) -> Hub:
 
 
 def _refusal(target: Target, site: BridgedSite) -> str:
-    """Why a target cannot serve a site; empty where it can."""
+    """Why a target cannot serve a site; empty if it can."""
     try:
         target.on_site(site)
     except SkylessError as error:
@@ -501,5 +501,5 @@ def _refusal(target: Target, site: BridgedSite) -> str:
 
 
 def _silence_s(intervals_s: tuple[float, float]) -> float:
-    """How long a tag whose last fixes came at these intervals must be silent to have none."""
+    """How long a tag with these intervals between fixes must be silent to have no fix."""
     return min(max(NO_FIX_S, _MISSED * min(intervals_s)), _LONGEST_S)

@@ -1,4 +1,4 @@
-"""The table of targets, how one is opened by its address, and the senders that carry bytes to readers."""
+"""The table of targets, opening one by its address, and the senders that carry bytes to readers."""
 
 import asyncio
 import contextlib
@@ -27,36 +27,36 @@ from skyless.run.web import BRIDGES as LIMITS
 # first.
 
 _WAITING_BYTES: Final = 1 << 15
-"""Bytes that may wait for one reader in this process, or a single longer message; and as many in the system."""
+"""Most bytes waiting for one reader in this process, or a single longer message; and as many in the system."""
 
 _MAX_DATAGRAM_BYTES: Final = 1 << 16
 
 _STUCK_S: Final = 5.0
-"""A TCP reader that has taken nothing for so long is disconnected."""
+"""A TCP reader that has accepted nothing for this time is disconnected."""
 
 _ANY_PROGRAM: Final = 0o666
-"""Mode of a pseudo-terminal: gpsd, for one, gives up its rights before it opens its devices."""
+"""Mode of a pseudo-terminal: gpsd, for example, drops its privileges before it opens its devices."""
 
 
 class TcpServer:
     """Sends the same bytes to all programs that connect."""
 
     def __init__(self, text: str, host: str, port: int, greeting: Callable[[], list[bytes]]) -> None:
-        """``greeting`` gives what a new reader gets first."""
+        """``greeting`` returns what a new reader gets first."""
         self.dropped: Counter[str] = Counter()
         self.port = port
-        """The one that is used, where 0 was asked for and the server runs."""
+        """The port in use; with 0 configured, known once the server runs."""
         self._text, self._host, self._greeting = text, host, greeting
         self._readers: set[_TcpReader] = set()
 
     def send(self, data: bytes) -> None:
-        """Send to all readers; one whose buffers are full misses it."""
+        """Send to all readers; one with full buffers misses it."""
         for reader in tuple(self._readers):
             if not reader.send(data):
                 self.dropped["slow-reader"] += 1
 
     async def run(self) -> None:
-        """Serve until cancelled. Raises SkylessError: it cannot listen there."""
+        """Serve until cancelled. Raises SkylessError if it cannot listen there."""
         loop = asyncio.get_running_loop()
         try:
             server = await loop.create_server(
@@ -74,7 +74,7 @@ class TcpServer:
 
 
 class _TcpReader(asyncio.Protocol):
-    """One connection; what it sends is not read."""
+    """One connection; its input is ignored."""
 
     def __init__(self, readers: "set[_TcpReader]", greeting: Callable[[], list[bytes]], dropped: Counter[str]) -> None:
         self._readers, self._greeting, self._dropped = readers, greeting, dropped
@@ -82,7 +82,7 @@ class _TcpReader(asyncio.Protocol):
         self._stuck_since_s: float | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Greet it, if there are not too many."""
+        """Greet the reader, if there are not too many."""
         assert isinstance(transport, asyncio.Transport)
         if len(self._readers) >= LIMITS.readers:
             self._dropped["too-many-readers"] += 1
@@ -95,11 +95,11 @@ class _TcpReader(asyncio.Protocol):
             self.send(message)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason makes no difference
-        """It has gone."""
+        """Forget the reader."""
         self._readers.discard(self)
 
     def send(self, data: bytes) -> bool:
-        """Whether the connection accepts it, which it does where nothing waits; one that accepts nothing is ended."""
+        """Write if there is room. Returns False if not; a connection stuck for too long is closed."""
         if self._transport is None or self._transport.is_closing():
             return False
         waiting = self._transport.get_write_buffer_size()
@@ -115,7 +115,7 @@ class _TcpReader(asyncio.Protocol):
         return False
 
     def end(self) -> None:
-        """Close it; what waits is dropped."""
+        """Close the connection; waiting bytes are dropped."""
         if self._transport is not None:
             self._transport.abort()
 

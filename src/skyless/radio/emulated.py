@@ -26,7 +26,7 @@ _LENGTH: Final = struct.Struct("<I")
 
 
 class WireError(ValueError):
-    """The other side does not use this protocol; the connection is to be closed."""
+    """The other side does not use this protocol; the connection must be closed."""
 
 
 class Join(Struct, frozen=True, tag="join"):
@@ -35,7 +35,7 @@ class Join(Struct, frozen=True, tag="join"):
     kind: Literal["anchor", "tag"]
     names: tuple[str, ...]
     tx_delays_ticks: tuple[int, ...] = ()
-    """TX antenna delays that the process sets in its radios, one a node; empty: those of the ether's site."""
+    """TX antenna delays set by the process, one per node; empty: those of the ether's site."""
 
 
 class Send(Struct, frozen=True, tag="send", gc=False):
@@ -47,17 +47,17 @@ class Send(Struct, frozen=True, tag="send", gc=False):
 
 
 class Joined(Struct, frozen=True, tag="joined"):
-    """The nodes are on the air, with new counters."""
+    """All nodes have joined the air with fresh counters."""
 
     machine: str
-    """Which machine's clock ``host_s`` is of."""
+    """The machine whose clock ``host_s`` is."""
     host_s: float
     ticks: tuple[int, ...]
     """The nodes' 40-bit counters at ``host_s``."""
 
 
 class Refused(Struct, frozen=True, tag="refused"):
-    """The nodes are not on the air."""
+    """The nodes were not admitted to the air."""
 
     reason: str
 
@@ -70,7 +70,7 @@ class Clocks(Struct, frozen=True, tag="clocks"):
 
 
 class HeardRow(Struct, frozen=True, array_like=True, gc=False):
-    """A frame at one node that heard it."""
+    """A frame at one node that received it."""
 
     node: int
     rx_ticks: int
@@ -105,7 +105,7 @@ _encoder: Final = msgspec.msgpack.Encoder()
 
 
 def pack(message: Struct) -> bytes:
-    """Bytes of a message, its length before it."""
+    """Encode a message with its length."""
     body = _encoder.encode(message)
     return _LENGTH.pack(len(body)) + body
 
@@ -117,7 +117,7 @@ class Unpacker:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Bodies that are complete with this piece of the stream.
+        """Bodies completed by this piece of the stream.
 
         Raises:
             WireError: a message is longer than any of this protocol.
@@ -138,7 +138,7 @@ class Unpacker:
 
 
 def this_machine() -> str:
-    """Identifier of this machine's present run; processes with an equal one share the monotonic clock."""
+    """Identifier of this machine's present boot; processes with equal ones share the monotonic clock."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
@@ -147,12 +147,12 @@ def this_machine() -> str:
 
 _RECONNECT_S: Final = 0.2
 _SHIFT_S: Final = 15.0
-"""The shift to another machine's clock is measured again after this: clocks of computers drift by 0.1 ms a second."""
+"""The offset to another machine's clock is measured again after this: computers' clocks drift by 0.1 ms a second."""
 _RECEIVE_BUFFER_BYTES: Final = 1 << 16
-"""A radio keeps few frames for a host that does not fetch them; so does this one, 0.2 s of them."""
+"""A radio keeps few frames for a slow host; this buffer holds 0.2 s of them."""
 
 _LEAD_S: Final = 1.8e-3
-"""The preamble, the transfer to the ether, and a host's timers."""
+"""Preamble, transfer to the ether, and the host's timers."""
 
 
 class EmulatedRadio:
@@ -169,12 +169,12 @@ class EmulatedRadio:
         self._ticks_s = 0.0
 
     async def run(self, listener: Listener) -> None:
-        """Receive until cancelled; an ether that goes away is looked for."""
+        """Receive until cancelled; a lost ether is searched for."""
         self._listener = listener
         await self._connection.run()
 
     def advice(self) -> str:
-        """Where to look when nothing comes."""
+        """Where to look if nothing is received."""
         return "no frame on the emulated air: are anchors running?"
 
     def now_ticks(self) -> int | None:
@@ -193,12 +193,12 @@ class EmulatedRadio:
         self._listener(event)
 
     def set_clock(self, ticks: int | None, host_s: float) -> None:
-        """What the counter was at a moment of the host's monotonic clock."""
+        """Set the counter's reading at a time of the host's monotonic clock."""
         self._ticks, self._ticks_s = ticks, host_s
 
 
 class EtherConnection:
-    """The connection of one process; it is made again by itself."""
+    """One process's connection, which reconnects by itself."""
 
     def __init__(self, host: str, port: int, join: Join) -> None:
         self._host, self._port, self._join = host, port, join
@@ -222,7 +222,7 @@ class EtherConnection:
                 task.cancel()
 
     def send(self, message: Send) -> bool:
-        """Whether the message could be handed to the connection."""
+        """Pass a message to the connection. Returns False without one."""
         if self._transport is None:
             return False
         self._transport.write(pack(message))
@@ -250,7 +250,7 @@ class EtherConnection:
             await asyncio.sleep(_RECONNECT_S)
 
     def on_joined(self, message: Joined, shift_s: float, transport: asyncio.Transport) -> None:
-        """The nodes are on the air."""
+        """The nodes have joined the air."""
         self._transport = transport
         self._set_clocks(message.host_s + shift_s, message.ticks)
         self._notify_all(Restarted())
@@ -285,9 +285,9 @@ class EtherConnection:
 
 
 class ClockShift:
-    """What to add to another machine's clock to get this one's, from messages with the time when they were sent.
+    """Offset to another machine's clock, from messages with their sending time.
 
-    The quickest message of the last half minute or so decides: the clocks drift apart, and some messages are slow.
+    The fastest message of the last half minute or so decides: the clocks drift apart, and some messages are slow.
     """
 
     def __init__(self, shift_s: float) -> None:
@@ -296,7 +296,7 @@ class ClockShift:
         self._begun_s: float | None = None
 
     def note(self, sent_s: float, now_s: float) -> None:
-        """A message has come that was sent at a time of the other's clock."""
+        """Process a message sent at ``sent_s`` of the other clock."""
         if self._begun_s is None or now_s - self._begun_s > _SHIFT_S:
             self._begun_s, self._least_before_s, self._least_s = now_s, self._least_s, math.inf
         self._least_s = min(self._least_s, now_s - sent_s)
@@ -304,14 +304,14 @@ class ClockShift:
 
 
 class _Stream(asyncio.Protocol):
-    """The connection from its beginning until it ends; ``ended`` gives the reason."""
+    """The connection from start to end; ``ended`` gives the reason."""
 
     def __init__(self, connection: EtherConnection) -> None:
         self._connection = connection
         self._unpacker = Unpacker()
         self._transport: asyncio.Transport | None = None
         self._shift: ClockShift | None = None
-        """Only of an ether on another machine."""
+        """Only for an ether on another machine."""
         self.ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -354,7 +354,7 @@ class _Stream(asyncio.Protocol):
 
 
 def _why(error: OSError) -> str:
-    """The cause in words; asyncio's message repeats the address and leaves the cause out."""
+    """The cause in words; asyncio's message repeats the address and omits the cause."""
     known = error.errno is not None and error.errno > 0
     return os.strerror(error.errno) if known else error.strerror or str(error)  # type: ignore[arg-type]
 

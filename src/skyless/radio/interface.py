@@ -12,7 +12,7 @@ from skyless.radio.tag_reports import Reported
 
 
 class AntennaDelays(Struct, frozen=True):
-    """What a radio subtracts from its stamps, in ticks."""
+    """Delays that a radio subtracts from its stamps, in ticks."""
 
     tx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
     rx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
@@ -25,30 +25,30 @@ class Sent(Struct, frozen=True, gc=False):
 
 
 class Late(Struct, frozen=True, gc=False):
-    """The frame came too late for its time, and was not sent."""
+    """The frame came too late and was not sent."""
 
     tx_ticks: int
 
 
 class Restarted(Struct, frozen=True, gc=False):
-    """The radio is ready, with a counter that has nothing to do with what it counted before."""
+    """The radio is ready, with a counter unrelated to its earlier one."""
 
 
 class Gone(Struct, frozen=True, gc=False):
-    """The radio does not answer; it looks for it by itself."""
+    """The radio does not answer; it is searched for automatically."""
 
     reason: str
 
 
 class Hint(Struct, frozen=True):
-    """The radio goes on, but a person should look at something."""
+    """The radio works, but a person should check something."""
 
     text: str
 
 
 RadioEvent = Reception | Sent | Late | Restarted | Gone | Hint | Reported
 Listener = Callable[[RadioEvent], None]
-"""Called from the event loop as soon as something happens; must return quickly and not raise."""
+"""Called from the event loop for each event; must return quickly and not raise."""
 
 
 def ignore(_event: object) -> None:
@@ -56,7 +56,7 @@ def ignore(_event: object) -> None:
 
 
 class Radio(Protocol):
-    """One radio. It is used from one event loop."""
+    """One radio, used from one event loop."""
 
     @property
     def name(self) -> str:
@@ -64,20 +64,20 @@ class Radio(Protocol):
 
     @property
     def counters(self) -> Counter[str]:
-        """What was lost or could not be used on the way from the radio, by reason."""
+        """What was lost or unusable on the way from the radio, by reason."""
 
     @property
     def lead_s(self) -> float:
-        """How long before its RMARKER a frame should be handed to ``transmit``, at first; 0 where it cannot send."""
+        """Initial lead time of ``transmit`` before a frame's RMARKER; 0 if it cannot send."""
 
     async def run(self, listener: Listener) -> None:
-        """Configure the radio and receive until cancelled; a radio that has gone is looked for by itself."""
+        """Configure the radio and receive until cancelled; a lost radio is searched for."""
 
     def advice(self) -> str:
-        """Where to look when nothing has come from it for some seconds; without numbers that change."""
+        """Where to look if nothing has been received for some seconds; without changing numbers."""
 
     def now_ticks(self) -> int | None:
-        """The radio's 40-bit counter now, to about 0.1 ms; None while the radio is not ready."""
+        """The radio's 40-bit counter now, to about 0.1 ms; None while it is not ready."""
 
     def transmit(self, transmission: Transmission) -> None:
         """Send a frame so that its RMARKER leaves at ``tx_ticks``; answered by ``Sent`` or ``Late``."""

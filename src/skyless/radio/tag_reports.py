@@ -1,6 +1,6 @@
-"""What a board says that computes its own position: fixes, its state, anchors, the site's place on the Earth.
+"""Reports of a board that computes its own position: fixes, state, anchors, georeference.
 
-The bytes are those of structs in ``firmware/source/fix.h``; records hold them from ``BODY_AT`` on.
+The bytes are those of structs in ``firmware/source/fix.h``; records contain them from ``BODY_AT`` on.
 """
 
 import struct
@@ -19,7 +19,7 @@ from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.ticks import TICK_RATE_HZ
 
 BODY_AT: Final = 2
-"""Where a record's body begins, after kind and number."""
+"""Offset of a record's body, after kind and number."""
 
 _FIX: Final = struct.Struct("<2qQ7I6i16fI2fI")
 _STATUS: Final = struct.Struct("<8I")
@@ -28,19 +28,19 @@ _EARTH: Final = struct.Struct("<3iI")
 _NO_SITE: Final = 0xFFFF
 _ROWS: Final = struct.Struct("<30d")
 _SQUARE: Final = (0, 1, 2, 1, 3, 4, 2, 4, 5)
-"""A covariance row by row out of xx, xy, xz, yy, yz, zz."""
+"""Indices of a full covariance, row by row, into xx, xy, xz, yy, yz, zz."""
 _UPPER: Final = (0, 1, 2, 4, 5, 8)
 """The inverse."""
 _REASONS: Final = (None, *NoFixReason)
 
 
 class BoardFix(Struct, frozen=True):
-    """A fix that the board has computed, without the anchors' positions."""
+    """A fix computed by the board, without the anchors' positions."""
 
     fix: Fix
     site: int
     latency_s: float
-    """From the end of its last frame until the board had it."""
+    """From the end of its last frame until it was computed."""
 
 
 class BoardStatus(Struct, frozen=True):
@@ -48,9 +48,9 @@ class BoardStatus(Struct, frozen=True):
 
     site: int | None
     reason: NoFixReason | None
-    """Why there is no fix; None where there is one."""
+    """Why there is no fix; None if there is one."""
     counters: dict[str, int]
-    """Frames by what became of them, and fixes, since the board's start."""
+    """Frames by outcome, and fixes, since the board's start."""
 
 
 class AnchorPlace(Struct, frozen=True):

@@ -1,4 +1,4 @@
-"""A DW1000 as a radio, driven by this process; its port says where the chip is: on SPI, or a model of one."""
+"""A DW1000 as a radio, driven by this process; its port says where the chip is: on SPI, or a model."""
 
 import asyncio
 import ctypes
@@ -34,7 +34,7 @@ IDLE: Final = 1
 LISTENING: Final = 2
 SENDING: Final = 3
 AWAITING: Final = 4
-"""States."""
+"""States of the chip."""
 
 RECEIVED: Final = 1
 SENT: Final = 2
@@ -42,22 +42,22 @@ FAILED: Final = 4
 CLOCK_SLIPPED: Final = 8
 LOST: Final = 16
 NOTHING: Final = 32
-"""Results of ``poll``: a frame was received, ours was sent; a reception failed; the clock's PLL was losing lock (stamps
-around that time are unreliable); the chip does not answer or was reset; no frame came in the window."""
+"""Results of ``poll``: a frame was received; ours was sent; a reception failed; the clock's PLL was losing lock
+(stamps around that time are unreliable); the chip does not answer or was reset; no frame came in the window."""
 
 QUEUED: Final = 0
 LATE: Final = 1
 BUSY: Final = 2
 NOT_READY: Final = 3
-"""Results of ``transmit_at`` and ``receive_at``: it will happen at its time; or not, as it was too late, the radio is
-busy, or the chip is OFF."""
+"""Results of ``transmit_at`` and ``receive_at``: queued; or not, because it was too late, the radio is busy, or the
+chip is OFF."""
 
 NOT_MEASURED: Final = -32768
-"""A measured value that is missing."""
+"""Marks a missing measurement."""
 NO_PHASE: Final = -1
 MIN_PSDU_BYTES: Final = 3
 MAX_PSDU_BYTES: Final = 127
-"""FCS included, which the chip makes and checks (UM p. 80)."""
+"""Including the FCS, which the chip generates and checks (UM p. 80)."""
 MAX_TRANSFER_BYTES: Final = 132
 _DEVICE_ID_READ: Final = 0x00
 _CPLOCK: Final = 1 << 1
@@ -66,20 +66,20 @@ Value = TypeVar("Value")
 
 
 class ChipError(Exception):
-    """There is no DW1000 on the bus, or it does not start; the message states what was found."""
+    """There is no DW1000 on the bus, or it does not start; the message says what was found."""
 
 
 class Bus(Protocol):
-    """The hardware that the driver needs; each method may raise OSError."""
+    """Hardware access of the driver; each method may raise OSError."""
 
     def transfer(self, out: bytes) -> bytes:
-        """One SPI transaction (mode 0): what the chip sends while it receives ``out``, as many octets."""
+        """One SPI transaction (mode 0): the octets that the chip returns while it receives ``out``."""
 
     def set_spi_fast(self, fast: bool) -> None:
-        """Clock at most 20 MHz from now on, or at most 3 MHz: the chip's PLL has no lock (UM 2.3.2)."""
+        """Clock at most 20 MHz, or at most 3 MHz while the chip's PLL is not locked (UM 2.3.2)."""
 
     def reset_chip(self) -> None:
-        """Pull RSTn low for a moment and let go (never drive it high), where it is wired."""
+        """Pull RSTn low for a moment and release it (never drive it high), if it is wired."""
 
     def pause_us(self, microseconds: int) -> None:
         """Wait at least that long."""
@@ -87,7 +87,7 @@ class Bus(Protocol):
 
 @cache
 def library() -> ctypes.CDLL:
-    """The driver in C, compiled if this is its first use.
+    """The driver in C, compiled at its first use.
 
     Raises:
         SkylessError: there is no compiler, or no folder for its result.
@@ -98,7 +98,7 @@ def library() -> ctypes.CDLL:
 
 
 def declare(loaded: ctypes.CDLL) -> None:
-    """State the types of the driver's functions in a library that contains them."""
+    """Declare the types of the driver's functions in a library."""
     for name in ("log10", "accumulated", "power_cdbm", "first_path_cdbm", "carrier_offset_ppb", "micros_until"):
         getattr(loaded, f"dw1000_{name}").restype = ctypes.c_int32
     loaded.dw1000_angle.restype = ctypes.c_uint32
@@ -111,7 +111,7 @@ def declare(loaded: ctypes.CDLL) -> None:
 
 
 def _compiled() -> Path:
-    """The library of exactly these sources and this compiler, in the user's cache folder."""
+    """Path of the library for these sources and this compiler, in the user's cache folder."""
     command = [*shlex.split(os.environ.get("CC", "cc")), *COMPILED_WITH, str(SOURCES / "dw1000.c"), "-o"]
     digest = hashlib.sha256(" ".join(command).encode())
     for path in sorted(SOURCES.glob("*.[ch]")):
@@ -143,9 +143,9 @@ def _compiled() -> Path:
 
 
 class Hardware(ctypes.Structure):
-    """The first functions of ``struct hardware`` (``c/hardware.h``), all that the driver calls, on a Python object.
+    """The part of ``struct hardware`` (``c/hardware.h``) that the driver calls, backed by a Python object.
 
-    C knows no exceptions: the first is kept in ``failure``, and from then on nothing is called and C reads zeros.
+    C has no exceptions: the first is kept in ``failure``; from then on nothing is called and C reads zeros.
     """
 
     _fields_ = (
@@ -171,14 +171,14 @@ class Hardware(ctypes.Structure):
         )
 
     def connect(self, **functions: Callable[..., object]) -> None:
-        """Set members of the structure, and keep what they call: ctypes forgets some where a structure has a base."""
+        """Set members of the structure and keep their callables: ctypes drops some if a structure has a base."""
         kinds = dict(field[:2] for kind in type(self).__mro__ for field in vars(kind).get("_fields_", ()))
         for name, function in functions.items():
             self._kept[name] = kinds[name](function)
             setattr(self, name, self._kept[name])
 
     def call(self, function: Callable[..., Value], *values: object) -> Value | int:
-        """Call it for C; 0 after a failure."""
+        """Call a function for C; returns 0 after a failure."""
         if self.failure is None:
             try:
                 return function(*values)
@@ -187,19 +187,19 @@ class Hardware(ctypes.Structure):
         return 0
 
     def raise_failure(self) -> None:
-        """Raise what a function has raised while C was running."""
+        """Raise the exception of a function called by C."""
         failure, self.failure = self.failure, None
         if failure is not None:
             raise failure
 
 
 class DW1000(ctypes.Structure):
-    """``struct dw1000`` of ``c/dw1000.h``: one chip. A bus that fails leaves it OFF.
+    """``struct dw1000`` of ``c/dw1000.h``: one chip. A failing bus leaves it OFF.
 
-    Until the next ``poll``, what was received is in ``rx_ticks``, ``frame``, ``rx_power_cdbm``, ``first_path_cdbm``,
-    ``offset_ppb`` and ``phase``: that of the carrier in 2**-16 turns if ``reads_phases`` is set, or NO_PHASE. The stamp
-    of what was SENT is in ``tx_ticks``. ``errors`` are failed receptions of any kind. ``uses_both_buffers``, set before
-    the start of a radio that only listens, has the receiver on while a frame is read.
+    Until the next ``poll``, the last reception is in ``rx_ticks``, ``frame``, ``rx_power_cdbm``, ``first_path_cdbm``,
+    ``offset_ppb`` and ``phase``: the carrier's in 2**-16 turns if ``reads_phases`` is set, or NO_PHASE. The stamp of a
+    SENT frame is in ``tx_ticks``. ``errors`` counts failed receptions of any kind. ``uses_both_buffers``, set before
+    the start of a radio that only listens, keeps the receiver on while a frame is read.
     """
 
     state: int
@@ -241,7 +241,7 @@ class DW1000(ctypes.Structure):
 
     @property
     def frame(self) -> bytes:
-        """The frame that was received last."""
+        """The last received frame."""
         return ctypes.string_at(self._frame, self._frame_bytes)
 
     def _call(self, name: str, *values: object) -> int:
@@ -267,30 +267,30 @@ class DW1000(ctypes.Structure):
         raise ChipError(f"no DW1000{when}: its identifier is DECA0130, read was {found}")
 
     def receive(self) -> None:
-        """Listen from now on; a frame that waits to be sent is sent before."""
+        """Listen from now on; a queued frame is sent first."""
         self._call("receive")
 
     def idle(self) -> None:
-        """Turn the receiver off; a frame that waits to be sent is sent before."""
+        """Turn the receiver off; a queued frame is sent first."""
         self._call("idle")
 
     def receive_at(self, ticks: int, window: int) -> int:
-        """Listen for one frame from ``ticks`` of the counter on, for ``window`` · 65536 ticks; QUEUED, or why not."""
+        """Listen for one frame from ``ticks`` on, for ``window`` · 65536 ticks. Returns QUEUED, or why not."""
         return self._call("receive_at", ticks, window)
 
     def sleep(self) -> None:
-        """Let the chip sleep: it is OFF until ``wake``."""
+        """Put the chip to sleep: it is OFF until ``wake``."""
         self._call("sleep")
 
     def wake(self, tx_delay_ticks: int, rx_delay_ticks: int) -> bool:
-        """Wake and configure a chip that sleeps; False where none answers."""
+        """Wake and configure a sleeping chip. Returns False if none answers."""
         return bool(self._call("wake", tx_delay_ticks, rx_delay_ticks))
 
     def transmit_at(self, dx_ticks: int, frame: bytes) -> int:
-        """Send a PSDU when the counter is at ``dx_ticks``; QUEUED, or why not.
+        """Send a PSDU when the counter is at ``dx_ticks``. Returns QUEUED, or why not.
 
-        Its low nine bits are ignored (UM p. 26). The stamp will be that + the TX antenna delay. The last two bytes of
-        the frame are replaced by the FCS, which the chip makes. Poll before, or a frame that has just come is lost.
+        The low nine bits are ignored (UM p. 26). The stamp will be ``dx_ticks`` plus the TX antenna delay. The chip
+        replaces the last two bytes of the frame by the FCS. Poll before, or a frame that has just arrived is lost.
 
         Raises:
             ValueError: no PSDU has this length.
@@ -300,21 +300,21 @@ class DW1000(ctypes.Structure):
         return self._call("transmit_at", dx_ticks, frame, len(frame))
 
     def cancel(self) -> bool:
-        """Cancel a frame that has not been sent; False where it has, which the next ``poll`` will return."""
+        """Cancel an unsent frame. Returns False if it has been sent, which the next ``poll`` reports."""
         return bool(self._call("cancel"))
 
     def poll(self) -> int:
-        """What has happened since: a sum of RECEIVED, SENT, FAILED, CLOCK_SLIPPED, LOST; 0 for nothing.
+        """Events since the last call: a sum of RECEIVED, SENT, FAILED, CLOCK_SLIPPED, LOST; 0 for none.
 
-        To be called when the interrupt line is high, or periodically. The receiver is on again when it returns.
+        Call when the interrupt line is high, or periodically. The receiver is on again afterwards.
         """
         return self._call("poll")
 
     def check(self) -> bool:
-        """Whether the chip still has its configuration; if not it is OFF.
+        """Whether the chip still has its configuration; otherwise it is OFF.
 
-        A chip whose supply failed may lock again unnoticed and report nothing for ever, so this is to be called
-        periodically where nothing is received for long.
+        A chip whose supply failed may lock again unnoticed and never report anything, so call this periodically while
+        nothing is received.
         """
         return bool(self._call("check"))
 
@@ -323,14 +323,14 @@ class DW1000(ctypes.Structure):
         return self._call("now")
 
     def measure(self) -> bool:
-        """Measure ``temperature_cc`` and ``millivolts`` in some 1.1 ms, in which nothing is received."""
+        """Measure ``temperature_cc`` and ``millivolts`` in about 1.1 ms, during which nothing is received."""
         return bool(self._call("measure"))
 
 
 OVERDUE_TICKS: Final = from_seconds(1e-3)
 """A frame whose end is not reported within this time after its RMARKER is cancelled."""
 CHECK_S: Final = 1.0
-"""A chip from which nothing came for this time is asked whether it still has its settings."""
+"""A chip silent for this time is asked whether it still has its settings."""
 
 SPI_LEAD_S: Final = 1.5e-3
 """The preamble, seven transfers of up to 0.1 ms, a reception that is served before, and a host's timers
@@ -340,7 +340,7 @@ _FAILURES: Final = {FAILED: "rx-error", CLOCK_SLIPPED: "clock-slipped"}
 
 
 class ChipSession:
-    """One chip from its start until it is lost. No I/O but the driver's bus, no clock."""
+    """One chip from start to loss. Its only I/O is the driver's bus; no clock."""
 
     def __init__(
         self,
@@ -351,13 +351,13 @@ class ChipSession:
         *,
         phases: bool = False,
     ) -> None:
-        """``phases``: receptions have the phase of their carrier."""
+        """``phases``: receptions include carrier phases."""
         self.driver = DW1000(bus)
         self.driver.reads_phases = phases
         self._delays, self._listener, self._counters = delays, listener, counters
         self._pending: int | None = None
         self.idle = False
-        """Whether the chip had no event when it was last served."""
+        """Whether the chip had no event when last served."""
 
     def start(self) -> None:
         """Reset and configure the chip, and listen.
@@ -375,11 +375,11 @@ class ChipSession:
 
     @property
     def overdue_ticks(self) -> int | None:
-        """Reading of the counter at which to call ``cancel_overdue``; None while no frame waits."""
+        """Counter reading at which to call ``cancel_overdue``; None if no frame is queued."""
         return None if self._pending is None else wrap(self._pending + OVERDUE_TICKS)
 
     def transmit(self, transmission: Transmission, host_s: float | None = None) -> None:
-        """Have a frame sent at its tick; a frame that has just been received is read first."""
+        """Queue a frame for its tick; a frame just received is read first."""
         self.serve(host_s)
         dx_ticks = wrap(transmission.tx_ticks - self._delays.tx_ticks)
         if self.driver.transmit_at(dx_ticks, transmission.frame) == QUEUED:
@@ -564,7 +564,7 @@ class Dw1000Radio:
         self._listener(Restarted())
 
     def serve(self) -> bool:
-        """Process the chip's events, False if there were none; start a chip again that has lost its settings.
+        """Process the chip's events. Returns False if there were none. Restarts a chip that has lost its settings.
 
         Raises OSError and ChipError.
         """
@@ -577,7 +577,7 @@ class Dw1000Radio:
         return session is not None and not session.idle
 
     def report_fault(self, counter: str, text: str) -> None:
-        """Count a fault of the wiring, and report it once."""
+        """Count a wiring fault, and report it once."""
         self.counters[counter] += 1
         if counter not in self._hinted:
             self._hinted.add(counter)

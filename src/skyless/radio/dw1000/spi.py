@@ -13,21 +13,21 @@ from skyless.machine import extra_module
 from skyless.radio.dw1000.radio import ChipError, Dw1000Radio
 
 START_HZ: Final = 2_000_000
-"""Below the 3 MHz that the chip accepts before its PLL has lock."""
+"""Below the 3 MHz that the chip accepts before its PLL is locked."""
 DEFAULT_FAST_HZ: Final = 8_000_000
 MAX_FAST_HZ: Final = 20_000_000
-"""Wires of 10 cm carry some 8 MHz; the chip accepts 20."""
+"""Wires of 10 cm carry about 8 MHz; the chip accepts 20."""
 DEFAULT_CHIP: Final = "/dev/gpiochip0"
 
 _NEEDED_FOR: Final = "a DW1000 on SPI"
 
 REOPEN_S: Final = 1.0
 CHIP_POLL_S: Final = 0.5e-3
-"""Interval at which a chip without an interrupt line is served."""
+"""Interval for serving a chip without an interrupt line."""
 _LINE_CHECK_S: Final = 0.02
-"""Interval at which a chip with an interrupt line is served, in case an edge was missed."""
+"""Interval for serving a chip with an interrupt line, in case an edge was missed."""
 MAX_VAIN_INTERRUPTS: Final = 8
-"""Number of interrupts in a row without an event after which the chip is polled instead."""
+"""Consecutive interrupts without an event after which the chip is polled instead."""
 
 _VAIN: Final = (
     "rises though the chip has no event: is irq= the right pin, the wire sound? "
@@ -35,13 +35,13 @@ _VAIN: Final = (
 )
 _RESET_S: Final = 0.001
 _MAX_EDGE_READS: Final = 8
-"""Each reads all that the kernel keeps; a line that rises faster than it is read is not waited for."""
+"""Each read empties the kernel's queue; a line that rises faster than it is read is not waited for."""
 
 
 class SpiBus:
     """One chip's SPI device and lines (``skyless.radio.dw1000.radio.Bus``).
 
-    Transfers raise OSError where the kernel refuses them.
+    Transfers raise OSError if the kernel refuses them.
     """
 
     def __init__(
@@ -111,7 +111,7 @@ class SpiBus:
         return bytes(self._spi.xfer2(list(out)))
 
     def set_spi_fast(self, fast: bool) -> None:
-        """The configured speed, or 2 MHz, from the next transfer on."""
+        """Use the configured speed, or 2 MHz, from the next transfer on."""
         self._spi.max_speed_hz = self._fast_hz if fast else START_HZ
 
     def reset_chip(self) -> None:
@@ -126,15 +126,15 @@ class SpiBus:
         time.sleep(microseconds * 1e-6)
 
     def fileno(self) -> int | None:
-        """What becomes readable when the interrupt line rises; None without one."""
+        """File descriptor that becomes readable when the interrupt line rises; None without a line."""
         return None if self._irq is None else self._irq.fd
 
     def is_raised(self) -> bool:
-        """Whether the interrupt line is high; without one always, so that the chip is asked."""
+        """Whether the interrupt line is high; always True without one, so that the chip is polled."""
         return self._irq is None or bool(self._irq.get_value(self._irq.offsets[0]).value)
 
     def forget_edges(self) -> None:
-        """Make ``fileno`` unreadable until the line rises again; look at ``is_raised`` after it."""
+        """Make ``fileno`` unreadable until the line rises again; check ``is_raised`` afterwards."""
         for _ in range(_MAX_EDGE_READS):
             if self._irq is None or not self._irq.wait_edge_events(0):
                 return
@@ -159,7 +159,7 @@ class SpiPort:
         self._name, self._open_bus = name, open_bus
 
     async def run(self, radio: Dw1000Radio) -> None:
-        """Serve the chip, and look for it again when it does not answer, until cancelled."""
+        """Serve the chip until cancelled, and search for it again when it does not answer."""
         while True:
             try:
                 bus = self._open_bus()
@@ -190,7 +190,7 @@ class SpiPort:
             loop.remove_reader(line)
 
     async def _serve_line(self, bus: SpiBus, radio: Dw1000Radio, risen: asyncio.Event) -> None:
-        """Serve the chip when its line has risen and until it is low; a line without events is polled instead."""
+        """Serve the chip while its line is high after a rise; a line without events is polled instead."""
         vain = 0
         while True:
             is_high = await _is_set(risen, _LINE_CHECK_S)
@@ -209,7 +209,7 @@ class SpiPort:
 
 
 async def _is_set(event: asyncio.Event, seconds: float) -> bool:
-    """Whether it was set within that time."""
+    """Whether the event is set within this time."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await event.wait()
@@ -217,12 +217,12 @@ async def _is_set(event: asyncio.Event, seconds: float) -> bool:
 
 
 def check_spi(spec: str, bus: int, device: int, gpio_chip: str | None) -> None:
-    """Check that packages and device files exist and may be used; a later failure may pass by itself.
+    """Check that packages and device files exist and are accessible; later failures may be temporary.
 
-    ``gpio_chip`` is None where no lines are wanted.
+    ``gpio_chip`` is None if no lines are used.
 
     Raises:
-        SkylessError: naming what a person has to change before this can work.
+        SkylessError: naming what a person has to change.
     """
     try:
         for package in ("spidev",) if gpio_chip is None else ("spidev", "gpiod", "gpiod.line"):

@@ -20,19 +20,19 @@ from skyless.radio.interface import Gone, Late, RadioEvent, Restarted, ignore
 from skyless.radio.serial.serial_port import BoardClock, SerialPort, line_advice
 
 ASK_BINARY: Final = b"b"
-"""What makes a sniffer change from text to binary; one that cannot stays with text."""
+"""Makes a sniffer change from text to binary; one that cannot stays with text."""
 
 UNDECIDED_BYTES: Final = 4096
-"""Number of bytes without a packet after which the format is determined again."""
+"""The format is detected again after this many bytes without a packet."""
 
 _Event = TypeVar("_Event")
 
 
 class _ListeningBoard(ABC, Generic[_Event]):
-    """What all have in common: a serial port from which they read events."""
+    """Common base: a serial port from which events are read."""
 
     firmware = ""
-    """What runs on the board, in messages."""
+    """The board's firmware, for messages."""
 
     def __init__(self, path: str, baud: int, name: str) -> None:
         self.name = name
@@ -41,24 +41,24 @@ class _ListeningBoard(ABC, Generic[_Event]):
         self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
         self._listener: Callable[[_Event | Restarted | Gone], None] = ignore
         self._silent = True
-        """Whether no byte has come since the last event."""
+        """Whether no byte has arrived since the last event."""
 
     async def run(self, listener: Callable[[_Event | Restarted | Gone], None]) -> None:
-        """Receive until cancelled; a board that is unplugged is looked for."""
+        """Receive until cancelled; an unplugged board is searched for."""
         self._listener = listener
         await self._port.run(self)
 
     def advice(self) -> str:
-        """Where to look when nothing comes: the line, or what is at its other end."""
+        """Where to look if nothing is received: the line, or what is at its other end."""
         return line_advice(self._port.path, self._port.baud, self.firmware, silent=self._silent)
 
     @abstractmethod
     def _start(self, send: Callable[[bytes], None]) -> None:
-        """Prepare for the stream of a port that has been opened."""
+        """Prepare for the stream of a newly opened port."""
 
     @abstractmethod
     def _events(self, data: bytes, host_s: float) -> Iterator[_Event]:
-        """What is complete with this piece of the stream."""
+        """Events completed by this piece of the stream."""
 
     # What the port calls
 
@@ -91,14 +91,14 @@ class ListenerRadio(_ListeningBoard[RadioEvent]):
         self._clock = BoardClock()
         self._lines = LineCutter(self.counters)
         self._is_whole = False
-        """Whether the next line is whole: the first one may be the end of a line."""
+        """Whether the next line is complete: the first may be the end of one."""
 
     def now_ticks(self) -> int | None:
         """The board's counter, extrapolated from its newest stamps; None before the first."""
         return self._clock.read(time.monotonic())
 
     def transmit(self, transmission: Transmission) -> None:
-        """It cannot: every frame is late."""
+        """Report the frame as late, as the board cannot send."""
         self._listener(Late(transmission.tx_ticks))
 
     def _start(self, send: Callable[[bytes], None]) -> None:  # noqa: ARG002 - it takes no commands
@@ -123,7 +123,7 @@ class ListenerRadio(_ListeningBoard[RadioEvent]):
 class SnifferRadio(_ListeningBoard[Packet]):
     """A Bitcraze sniffer: packets of TDoA2 and TDoA3 systems, binary or text. It receives no beacons.
 
-    Packets carry the host's monotonic time of their arrival.
+    Packets carry the host's monotonic time of arrival.
     """
 
     firmware = "a Bitcraze sniffer"
@@ -142,16 +142,16 @@ class SnifferRadio(_ListeningBoard[Packet]):
 
 
 class UciRadio(_ListeningBoard[Packet]):
-    """A FiRa board whose session as a DT-tag goes on: its notifications of DL-TDoA measurements, as packets.
+    """A FiRa board in a running session as a DT-tag: its DL-TDoA measurements, as packets.
 
-    Packets carry the host's monotonic time of their arrival. It is sent nothing: whoever has started the session set
-    it up.
+    Packets carry the host's monotonic time of arrival. Nothing is sent to the board: whoever started the session set it
+    up.
     """
 
     firmware = "FiRa's UCI with a DL-TDoA session that goes on"
 
     def __init__(self, path: str, baud: int, name: str, anchors_m: Mapping[int, Point], frame: AnchorFrame) -> None:
-        """``anchors_m``: positions that replace all that anchors state; ``frame``: of those, which tags share."""
+        """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these, shared by tags."""
         super().__init__(path, baud, name)
         self._anchors_m, self.frame = anchors_m, frame
         self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, anchors_m, frame)
@@ -165,7 +165,7 @@ class UciRadio(_ListeningBoard[Packet]):
 
 
 class SnifferStream:
-    """Packets of a sniffer's stream, whose format is determined, and again when it changes."""
+    """Packets of a sniffer's stream, whose format is detected, and again when it changes."""
 
     def __init__(self, drops: Counter[str]) -> None:
         self._drops = drops
@@ -177,7 +177,7 @@ class SnifferStream:
         self._is_text: bool | None = None
 
     def feed(self, data: bytes) -> Iterator[Packet]:
-        """Packets that are complete with this piece."""
+        """Packets completed by this piece."""
         if self._is_text is None:
             data = self._determine(data)
         else:
@@ -189,7 +189,7 @@ class SnifferStream:
             self._is_text, self._unused_bytes = None, 0
 
     def _determine(self, data: bytes) -> bytes:
-        """All bytes that are to be read in the format found, or none while none is found."""
+        """The bytes to read in the detected format, or none until it is detected."""
         self._head += data
         text, binary = recognise_text(self._head), recognise_binary(self._head)
         if text or binary:
@@ -219,7 +219,7 @@ class SnifferStream:
 
 
 class _Line(msgspec.Struct):
-    """What a line must hold; further keys are of no interest."""
+    """Required keys of a line; others are ignored."""
 
     ts: int
     dlen: int
@@ -231,7 +231,7 @@ _decode: Final = msgspec.json.Decoder(_Line).decode
 
 
 def reception_of(line: bytes, host_s: float, drops: Drops) -> Reception | None:
-    """Reception of a line that arrived then; None, and a count, for what is none."""
+    """The reception of a line that arrived at ``host_s``; None, counted, if it is none."""
     if not line:
         return None
     try:

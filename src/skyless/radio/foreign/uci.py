@@ -52,10 +52,10 @@ MAX_SEGMENT_BYTES: Final = 255
 """Longest payload of a control packet."""
 
 MAX_UCI_PAYLOAD_BYTES: Final = 1 << 16
-"""A longer payload in segments is dropped."""
+"""A longer segmented payload is dropped."""
 
 MAX_DATA_BYTES: Final = 4096
-"""A data packet that would be longer is none."""
+"""Longest data packet; a longer length field is none."""
 
 CONTROL_HEADER_BYTES: Final = 4
 
@@ -63,7 +63,7 @@ _GROUPS: Final = frozenset((0, 1, 2, 3, 9, 10, 11, 12, 13, 14, 15))
 
 
 class UciType(IntEnum):
-    """What a packet is."""
+    """Kinds of packets."""
 
     DATA = 0
     COMMAND = 1
@@ -72,7 +72,7 @@ class UciType(IntEnum):
 
 
 class UciPacket(Struct, frozen=True, gc=False):
-    """One packet, its segments put together."""
+    """One packet, reassembled from its segments."""
 
     kind: UciType
     group: int
@@ -83,7 +83,7 @@ class UciPacket(Struct, frozen=True, gc=False):
 
 
 def encode_packet(packet: UciPacket) -> bytes:
-    """A control packet's bytes, in segments where it is long."""
+    """Encode a control packet, in segments if it is long."""
     payload = packet.payload
     parts = [payload[at : at + MAX_SEGMENT_BYTES] for at in range(0, len(payload), MAX_SEGMENT_BYTES)] or [b""]
     out = bytearray()
@@ -94,7 +94,7 @@ def encode_packet(packet: UciPacket) -> bytes:
 
 
 class UciReader:
-    """Cuts a stream that comes in pieces into packets; a stretch of bytes that belongs to none is counted once."""
+    """Cuts a stream that comes in pieces into packets; each stretch of other bytes is counted once."""
 
     def __init__(self, drops: Counter[str]) -> None:
         self._drops = drops
@@ -104,7 +104,7 @@ class UciReader:
         self._segments = bytearray()
 
     def feed(self, data: bytes) -> list[UciPacket]:
-        """Packets that are whole with this piece."""
+        """Packets completed by this piece."""
         buffer, at, packets = self._buffer + data, 0, []
         while len(buffer) - at >= CONTROL_HEADER_BYTES:
             size = _packet_size(buffer, at)
@@ -125,7 +125,7 @@ class UciReader:
         return packets
 
     def _join(self, segment: bytes) -> UciPacket | None:
-        """The packet that this segment completes."""
+        """The packet completed by this segment."""
         kind, opcode = segment[0] >> 5, 0 if segment[0] >> 5 == UciType.DATA else segment[1]
         key = (kind, segment[0] & 0xF, opcode)
         if self._begun is not None and self._begun != key:
@@ -147,7 +147,7 @@ class UciReader:
 
 
 def _packet_size(buffer: bytes, at: int) -> int:
-    """Size of the segment whose header is at that offset; 0 where no header can be."""
+    """Size of the segment whose header is at this offset; 0 if there can be none."""
     first, second, third, fourth = buffer[at : at + CONTROL_HEADER_BYTES]
     kind = first >> 5
     if kind == UciType.DATA:
@@ -176,7 +176,7 @@ _SHORT_STAMP, _LONG_STAMP = 5, 8
 
 
 class DtMessageType(IntEnum):
-    """Which message of a round a measurement is of."""
+    """The message of a round that a measurement refers to."""
 
     POLL = 0
     RESPONSE = 1
@@ -184,18 +184,18 @@ class DtMessageType(IntEnum):
 
 
 class DtMeasurement(Struct, frozen=True, gc=False):
-    """What a DT-tag received of one message of an anchor; fields as they are on the line, in their units."""
+    """A DT-tag's reception of one message of an anchor; fields as transmitted, in their units."""
 
     address: int
     """MAC address of the anchor, 16 or 64 bits."""
     message: int
-    """A ``DtMessageType``, or a value that is reserved."""
+    """A ``DtMessageType``, or a reserved value."""
     block: int
     """16 bits."""
     round: int
     """8 bits."""
     tx_ticks: int
-    """When the anchor sent it, in its own clock or in the common time."""
+    """Sending time in the anchor's clock or in the common time."""
     rx_ticks_tag: int
     status: int = STATUS_OK
     common_time: bool = False
@@ -204,9 +204,9 @@ class DtMeasurement(Struct, frozen=True, gc=False):
     rx_bytes: int = _SHORT_STAMP
     """Width of the stamps: 5 or 8, in version 2 up to 8."""
     initiator_reply_ticks: int = 0
-    """From when the initiator received this response to when it sent the final message; 0 if unknown."""
+    """From the initiator's reception of this response to its final message; 0 if unknown."""
     responder_reply_ticks: int = 0
-    """From when the responder received the poll to when it sent this response; 0 if unknown."""
+    """From the responder's reception of the poll to this response; 0 if unknown."""
     flight_ticks: int = 0
     """Between initiator and responder; 0 if unknown."""
     location_kind: int = NO_LOCATION
@@ -215,7 +215,7 @@ class DtMeasurement(Struct, frozen=True, gc=False):
 
 
 class SessionInfo(Struct, frozen=True, gc=False):
-    """A notification: the measurements of a round, mostly."""
+    """A notification, usually with the measurements of a round."""
 
     sequence: int
     session: int
@@ -232,14 +232,14 @@ _DL_TDOA_2: Final = 6
 _HEAD_1: Final = Layout("<BBHHB8x")
 _HEAD_2: Final = Layout("<BBHB8x")
 _TIMES: Final = Layout("<4xIIH")
-"""Without what nobody uses: NLOS, angles and RSSI, and both CFOs, which are written as zeros."""
+"""Without unused fields: NLOS, angles and RSSI, and both CFOs, which are written as zeros."""
 
 _COMMON, _LONG_TX, _LONG_RX = 1 << 0, 1 << 1, 1 << 3
 _ROUNDS_2, _LOCATION_2, _SUPERCLUSTER_2 = 1 << 1, 1 << 2, 1 << 3
 
 
 def encode_session_info(info: SessionInfo) -> UciPacket:
-    """The notification. Raises ValueError or struct.error for values that have no bytes."""
+    """Encode a notification. Raises ValueError or struct.error for values that do not fit."""
     kind = _DL_TDOA if info.version == 1 else _DL_TDOA_2
     wide, count = info.extended_addresses, len(info.measurements)
     payload = bytearray(_INFO.pack(info.sequence, info.session, kind, wide, count))
@@ -250,7 +250,7 @@ def encode_session_info(info: SessionInfo) -> UciPacket:
 
 
 def decode_session_info(packet: UciPacket) -> SessionInfo | str:
-    """Notification of a packet, or the reason why it is none of DL-TDoA measurements."""
+    """Decode a packet, or return why it is no notification of DL-TDoA measurements."""
     if (packet.kind, packet.group, packet.opcode) != (UciType.NOTIFICATION, SESSION_CONTROL, SESSION_INFO):
         return "other-packet"
     payload = packet.payload
@@ -312,7 +312,7 @@ def _encode_1(one: DtMeasurement, address: bytes) -> bytes:
 
 
 def _decode_1(payload: bytes, at: int, address_bytes: int) -> tuple[DtMeasurement, int] | None:
-    """A measurement of version 1 and where it ends; None where it does not fit."""
+    """A measurement of version 1 and its end; None if it does not fit."""
     head_at, size = at + address_bytes, len(payload)
     if head_at + _HEAD_1.size > size:
         return None
@@ -353,7 +353,7 @@ def _encode_2(one: DtMeasurement, address: bytes) -> bytes:
 
 
 def _decode_2(payload: bytes, at: int, address_bytes: int, control_bytes: int) -> tuple[DtMeasurement, int] | None:
-    """A measurement of version 2 and where its fields end; None where they do not fit."""
+    """A measurement of version 2 and the end of its fields; None if they do not fit."""
     head_at = at + 2 + address_bytes
     times_at = head_at + _HEAD_2.size
     if times_at + _TIMES.size > len(payload):
@@ -425,7 +425,7 @@ def _counted(data: bytes) -> bytes:
 
 
 def _counted_at(payload: bytes, at: int) -> tuple[bytes, int]:
-    """Bytes behind their length, and where they should end, which may be behind the payload."""
+    """Length-prefixed bytes, and where they should end, possibly beyond the payload."""
     if at >= len(payload):
         return b"", len(payload) + 1
     end = at + 1 + payload[at]
@@ -455,7 +455,7 @@ _STOREY_BYTES: Final = 6
 
 
 def location_of(measurement: DtMeasurement) -> Point | GeodeticPoint | None:
-    """Where the sender is; None where it is not stated, or in a way that is not known."""
+    """Position of the sender; None if not stated, or in an unknown form."""
     data = measurement.location
     if not data:
         return None
@@ -480,7 +480,7 @@ def _location_2(data: bytes) -> Point | GeodeticPoint | None:
 
 
 def encode_wgs84(point: GeodeticPoint) -> bytes:
-    """12 bytes. Raises ValueError for a point that they cannot hold."""
+    """Encode as 12 bytes. Raises ValueError for a point out of range."""
     height = round(point.height_m / 1000.0 * _PER_KM)
     return _pack(
         (round(point.latitude_deg * _PER_DEGREE), round(point.longitude_deg * _PER_DEGREE), height), _WGS84_BITS
@@ -488,20 +488,20 @@ def encode_wgs84(point: GeodeticPoint) -> bytes:
 
 
 def decode_wgs84(data: bytes) -> GeodeticPoint | None:
-    """Point of 12 bytes; None where it is none of the earth."""
+    """Decode 12 bytes; None if this is no point on the Earth."""
     latitude, longitude, height = _unpack(data, _WGS84_BITS)
     point = GeodeticPoint(latitude / _PER_DEGREE, longitude / _PER_DEGREE, height / _PER_KM * 1000.0)
     return point if abs(point.latitude_deg) <= 90.0 and abs(point.longitude_deg) <= 180.0 else None
 
 
 def encode_relative(position_m: Point) -> bytes:
-    """10 bytes. Raises ValueError for a position that they cannot hold."""
+    """Encode as 10 bytes. Raises ValueError for a position out of range."""
     x, y, z = (round(value * 1000.0) for value in position_m)
     return _pack((x, y, z), _RELATIVE_BITS)
 
 
 def decode_relative(data: bytes) -> Point:
-    """Position of 10 bytes."""
+    """Decode a position from 10 bytes."""
     x, y, z = _unpack(data, _RELATIVE_BITS)
     return x / 1000.0, y / 1000.0, z / 1000.0
 
@@ -541,7 +541,7 @@ def _unpack(data: bytes, widths: tuple[int, int, int]) -> tuple[int, ...]:
 
 MAX_ROUNDS_AT_ONCE: Final = 256
 MAX_ANCHORS_KEPT: Final = 256
-"""Bounds of what is kept: of rounds that go on, and of positions and responses by address; the oldest goes first."""
+"""Limits of rounds in progress, and of positions and responses by address; the oldest is dropped first."""
 
 
 class DtMessage(Struct, frozen=True, gc=False):
@@ -553,29 +553,29 @@ class DtMessage(Struct, frozen=True, gc=False):
     kind: DtMessageType
     block: int
     round: int
-    """Which of the rounds that go on at once: any number that its messages share, and those of no other."""
+    """Identifies the round among simultaneous ones: any number common to its messages only."""
     tx_ticks: int
-    """In the sender's clock, or in the initiator's time."""
+    """In the sender's clock or the initiator's time."""
     rx_ticks_tag: int
     common_time: bool
     """Whether ``tx_ticks`` is in the initiator's time."""
     responder_reply_ticks: int = 0
     initiator_reply_ticks: int = 0
     flight_ticks: float | None = None
-    """Between initiator and responder, as the responder ranged it."""
+    """Between initiator and responder, as ranged by the responder."""
     position_m: Point | None = None
 
 
 def host_time_s(stamp_ticks: int) -> float | None:
-    """Time of a stamp that shows more than a 40-bit counter, which bridges silences of any length; None for others.
+    """Time of a stamp with more than 40 bits, which bridges silences of any length; None for others.
 
-    A counter of 40 bits may be given in 64; its wraps are no jumps in time.
+    A 40-bit counter may be given in 64 bits; its wraps are not jumps in time.
     """
     return stamp_ticks * TICK_S if stamp_ticks > TICK_MASK else None
 
 
 class _Round:
-    """A round that goes on: its poll, and the responses to it."""
+    """A round in progress: its poll, and the responses."""
 
     __slots__ = ("poll", "responses")
 
@@ -586,16 +586,16 @@ class _Round:
 
 
 class DtRounds:
-    """From the messages that one tag received, in their order, to packets with relays."""
+    """Converts the messages of one tag, in order, to packets with relays."""
 
     def __init__(self, anchors_m: Mapping[int, Point] | None = None) -> None:
-        """``anchors_m``: positions that are known, where messages may state none."""
+        """``anchors_m``: known positions, if messages state none."""
         self._known_m = anchors_m or {}
         self._stated_m: dict[int, Point] = {}
         self._rounds: dict[int, _Round] = {}
 
     def on_message(self, message: DtMessage) -> Packet | str:
-        """The packet of a message, or the reason why it is of no use."""
+        """The packet of a message, or the reason why it is unusable."""
         if message.position_m is not None:
             self._stated_m.pop(message.address, None)
             if len(self._stated_m) >= MAX_ANCHORS_KEPT:
@@ -660,5 +660,5 @@ def _packet(message: DtMessage, relays: tuple[Relay, ...]) -> Packet:
 
 
 def _sequence(message: DtMessage) -> int:
-    """A number that the sender's other messages of late do not have."""
+    """A number that differs from those of the sender's other recent messages."""
     return (message.block << 8 | message.round & 0xFF) << 1 | (message.kind is DtMessageType.FINAL)

@@ -26,7 +26,7 @@ VERSION: Final = 1
 MODES: Final = ("radio", "tag")
 """A radio for its host, or a tag that computes its own position; settings have their place here."""
 OUTPUTS: Final = ("records", "nmea", "json", "none")
-"""What a tag says on its serial port."""
+"""A tag's output on its serial port."""
 ANY_SITE: Final = 0xFFFF
 
 _WORDS: Final = struct.Struct("<11I2i3I3f")
@@ -35,12 +35,12 @@ SETTINGS_BYTES: Final = _WORDS.size + 2
 
 
 class BoardSettings(Struct, frozen=True):
-    """Settings in the board's own units; the defaults are those of a new one."""
+    """Settings in the board's own units; the defaults are those of a new board."""
 
     mode: int = 0
     output: int = 0
     rate_hz: int = 10
-    """How often it says something, at most; 0 for each fix."""
+    """Highest rate of its output; 0 for every fix."""
     baud: int = 1_000_000
     bluetooth_ms: int = 0
     """Interval of the Bluetooth advertisements; 0 for none."""
@@ -52,11 +52,11 @@ class BoardSettings(Struct, frozen=True):
     low_mm: int = 0
     high_mm: int = 0
     sleep_ms: int = 0
-    """How long it sleeps between two fixes; 0 for always on."""
+    """Sleep between two fixes; 0 for always on."""
     superframes: int = 3
-    """How many it listens to after each sleep."""
+    """Superframes that it listens to after each sleep."""
     predicts: int = 0
-    """1 where its receiver is on only when beacons are due."""
+    """1 if its receiver is on only when beacons are due."""
     qa_m2ps3: float = 0.3
     integrity_risk: float = 1e-4
     alert_limit_m: float = 0.0
@@ -64,13 +64,13 @@ class BoardSettings(Struct, frozen=True):
 
 
 def pack(settings: BoardSettings) -> bytes:
-    """The bytes of settings; words that do not fit raise struct.error."""
+    """Encode settings. Raises struct.error for values that do not fit."""
     words = _WORDS.pack(VERSION, *astuple(settings))
     return words + crc_hqx(words, 0xFFFF).to_bytes(2, "big")
 
 
 def unpack(data: bytes) -> BoardSettings | None:
-    """The settings of these bytes; None for what no board of this version has sent."""
+    """Decode settings; None for bytes that no board of this version sends."""
     if len(data) != SETTINGS_BYTES or crc_hqx(data, 0xFFFF) != 0:
         return None
     version, *words = _WORDS.unpack_from(data)
@@ -80,9 +80,9 @@ def unpack(data: bytes) -> BoardSettings | None:
 
 
 MAJOR: Final = 1
-"""Ends with different major versions cannot work together."""
+"""Ends with different major versions are incompatible."""
 MINOR: Final = 3
-"""Grows with fields that are appended and kinds that are added, which an older end ignores."""
+"""Grows with appended fields and new kinds, which older ends ignore."""
 
 # From the board
 HELLO: Final = 0x01
@@ -112,17 +112,17 @@ RX_FRAME_AT: Final = 13
 RX_PHASE_FRAME_AT: Final = 15
 TX_FRAME_AT: Final = 7
 SETTINGS_AT: Final = 3
-"""In both records of settings, after flags."""
+"""In both records of settings, after the flags."""
 MAX_FRAME_BYTES: Final = 127
 
 HELLO_BYTES: Final = 21
-"""Length in version 1.0; a later one has the reset cause behind it."""
+"""Length in version 1.0; later versions append the reset cause."""
 STATUS_BYTES: Final = 36
 CONFIG_BYTES: Final = 13
 """Lengths of whole records, kind and number included."""
 
 NOT_MEASURED: Final = -32768
-"""A measured value that the board does not have."""
+"""Marks a measurement that the board does not have."""
 NO_VOLTAGE: Final = 0xFFFF
 
 CAN_TRANSMIT: Final = 0x01
@@ -130,16 +130,16 @@ HAS_PHASES: Final = 0x02
 CAN_COMPUTE: Final = 0x04
 """Capabilities in HELLO."""
 WANTS_PHASES: Final = 0x01
-"""Flag in CONFIG: receptions with a phase are to be reported as RX_PHASE."""
+"""Flag in CONFIG: report receptions with a phase as RX_PHASE."""
 IN_FLASH: Final = 0x01
-"""Flag in the records of settings: they are to be kept in flash, or are kept there."""
+"""Flag in the records of settings: store them in flash, or they are stored there."""
 RESET_BY_PIN: Final = 0x01
 RESET_BY_WATCHDOG: Final = 0x02
 RESET_BY_SOFTWARE: Final = 0x04
 RESET_BY_LOCKUP: Final = 0x08
 RESET_BY_FAULT: Final = 0x80
-"""Bits of the reset cause in HELLO: the first four are those of the nRF52832's RESETREAS; a fault is one that the
-firmware noticed. None: power on, or a supply that was too low."""
+"""Bits of the reset cause in HELLO: the first four are those of the nRF52832's RESETREAS; a fault is one noticed by
+the firmware. None set: power-on or undervoltage."""
 IS_CONFIGURED: Final = 0x01
 IS_RECEIVING: Final = 0x02
 HAS_FRAME_WAITING: Final = 0x04
@@ -149,7 +149,7 @@ IS_POLLED: Final = 0x08
 LATE_FOR_RADIO: Final = 1
 LATE_BUSY: Final = 2
 LATE_NOT_READY: Final = 3
-"""Why a frame was not sent: it was too late, another one waits, or the radio is not configured."""
+"""Why a frame was not sent: too late, another one queued, or the radio not configured."""
 
 REFUSED_SETTING: Final = 1
 REFUSED_MALFORMED: Final = 2
@@ -162,18 +162,18 @@ COUNT_MASK: Final = 0x3FFF_FFFF
 """Counts in STATUS wrap at 30 bits."""
 
 MAX_RECORD_BYTES: Final = 250
-"""With its check: one block of COBS, with space for later versions."""
+"""Including its check: one block of COBS, with room for later versions."""
 MAX_STUFFED_BYTES: Final = MAX_RECORD_BYTES + 2
-"""Length of what may stand before a 0; a record needs one less."""
+"""Longest stretch before a 0; a record needs one byte less."""
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/IBM-3740: x¹⁶ + x¹² + x⁵ + 1 from 0xFFFF; 0 over what ends with its own, high byte first."""
+    """CRC-16/IBM-3740: x¹⁶ + x¹² + x⁵ + 1 from 0xFFFF; 0 over data that ends with its own CRC, high byte first."""
     return crc_hqx(data, 0xFFFF)
 
 
 def stuff(record: bytes) -> bytes:
-    """A record without zeros (COBS: Cheshire and Baker, 1999), and a 0 after it.
+    """A record without zeros (COBS: Cheshire and Baker, 1999), followed by a 0.
 
     Raises:
         ValueError: 255 bytes without a zero; no record is that long.
@@ -182,7 +182,7 @@ def stuff(record: bytes) -> bytes:
 
 
 def unstuff(line: bytes) -> bytes | None:
-    """Inverse of ``stuff`` for at most ``MAX_STUFFED_BYTES`` without zeros; None where a block lacks its end."""
+    """Inverse of ``stuff`` for at most ``MAX_STUFFED_BYTES`` without zeros; None if a block is incomplete."""
     blocks, at = [], 0
     while at < len(line):
         end = at + line[at]
@@ -194,17 +194,17 @@ def unstuff(line: bytes) -> bytes | None:
 
 
 class Writer:
-    """Makes records, with numbers that count up; each method returns a line, ready to be sent.
+    """Encodes records with consecutive numbers; each method returns a line ready to send.
 
-    Records of one or two bytes are made by ``record``.
-    Ticks are numbers from 0 to 2**40 - 1. What does not fit into its field raises struct.error or OverflowError.
+    Records of one or two bytes are made by ``record``. Ticks are from 0 to 2**40 - 1. Values that do not fit raise
+    struct.error or OverflowError.
     """
 
     def __init__(self) -> None:
         self._number = 0
 
     def record(self, kind: int, body: bytes = b"") -> bytes:
-        """A record of any kind."""
+        """Encode a record of any kind."""
         record = bytes((kind, self._number)) + body
         self._number = (self._number + 1) & 0xFF
         return stuff(record + crc16(record).to_bytes(2, "big"))
@@ -250,7 +250,7 @@ class Writer:
         return self.record(STATUS, _stamp(ticks) + struct.pack("<B6IhH", state, *wrapped, temperature_cc, millivolts))
 
     def ask_hello(self) -> bytes:
-        """Ask the board who it is; states our version."""
+        """Ask for the board's identity; states our version."""
         return self.record(ASK_HELLO, bytes((MAJOR, MINOR)))
 
     def config(self, tx_delay_ticks: int, rx_delay_ticks: int, flags: int = 0) -> bytes:
@@ -262,7 +262,7 @@ class Writer:
         return self.record(TX_AT, _stamp(dx_ticks) + frame)
 
     def set_tag_config(self, settings: BoardSettings, *, keep: bool) -> bytes:
-        """Work with these settings from now on; ``keep``: in flash, too."""
+        """Use these settings from now on; ``keep``: store them in flash."""
         return self.record(SET_TAG_CONFIG, bytes((keep * IN_FLASH,)) + pack(settings))
 
 
@@ -271,9 +271,9 @@ def _stamp(ticks: int) -> bytes:
 
 
 class Reader:
-    """Finds the records in a stream of bytes that may hold anything.
+    """Finds the records in an arbitrary stream of bytes.
 
-    ``garbled`` counts stretches between two zeros that are no record, ``overlong`` those that no record can be.
+    ``garbled`` counts stretches between two zeros that are no record, ``overlong`` those too long for any.
     """
 
     def __init__(self) -> None:
@@ -303,7 +303,7 @@ class Reader:
             self._skipping, self._line = True, b""
 
     def _finish(self) -> bytes | None:
-        """The record that the bytes before a zero are, if they are one."""
+        """The record in the bytes before a zero, if they are one."""
         line, self._line = self._line, b""
         if self._skipping:
             self._skipping = False
@@ -326,7 +326,7 @@ _TURN: Final = 1 << 16
 
 
 class Hello(Struct, frozen=True):
-    """The board's version and abilities."""
+    """The board's version and capabilities."""
 
     major: int
     minor: int
@@ -336,7 +336,7 @@ class Hello(Struct, frozen=True):
     counter_bits: int
     can_transmit: bool
     reset_cause: int | None
-    """Why it has started, as bits (``RESET_BY_PIN`` …); None for a board of version 1.0."""
+    """Cause of its start as bits (``RESET_BY_PIN`` …); None for a board of version 1.0."""
     has_phases: bool = False
     can_compute: bool = False
 
@@ -390,7 +390,7 @@ class NotDone(Struct, frozen=True):
 
 
 class TagConfig(Struct, frozen=True):
-    """The settings in use, and whether flash holds them."""
+    """The settings in use, and whether they are in flash."""
 
     settings: BoardSettings
     in_flash: bool
@@ -400,7 +400,7 @@ Record = Hello | Heard | Done | TooLate | Status | NotDone | TagConfig | TagRepo
 
 
 def decode(record: bytes) -> Record | str:
-    """Value of a record from a board (without its CRC), or why there is none."""
+    """Decode a board's record (without its CRC), or return why it is invalid."""
     if record[0] not in _DECODERS:
         return "unknown-record"
     try:
@@ -418,19 +418,19 @@ def to_steps(measured: Diagnostics) -> tuple[int, int, int]:
 
 
 def from_steps(rx_power: int, first_path: int, offset: int) -> Diagnostics:
-    """The measured values of a record in the link's units."""
+    """Measured values from the link's units."""
     return Diagnostics(
         *(_value(n, per_unit) for n, per_unit in zip((rx_power, first_path, offset), _STEPS, strict=True))
     )
 
 
 def to_turn(phase_cycles: float) -> int:
-    """A phase rounded to the link's unit, 2**-16 turns."""
+    """A phase in the link's unit, 2**-16 turns, rounded."""
     return round(phase_cycles * _TURN) % _TURN
 
 
 def cycles(phase: int) -> float:
-    """A phase in the link's unit in cycles; exact."""
+    """A phase in cycles from the link's unit; exact."""
     return phase / _TURN
 
 
@@ -443,7 +443,7 @@ def _ticks(record: bytes, at: int = BODY_AT) -> int:
 
 
 def _hello(record: bytes) -> Hello:
-    """Only the version is known where its major number is another."""
+    """Decode HELLO; only the version if the major number differs."""
     major, minor = record[2], record[3]
     if major != MAJOR:
         return Hello(major, minor, (0, 0, 0), b"", 0, 0, can_transmit=False, reset_cause=None)

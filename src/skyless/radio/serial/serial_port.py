@@ -1,4 +1,4 @@
-"""A serial port that is opened again whenever it was unplugged, and the clock of the board behind it."""
+"""A serial port that is reopened whenever it was unplugged, and the clock of the board behind it."""
 
 import asyncio
 import contextlib
@@ -18,14 +18,14 @@ from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
 _REOPEN_S: Final = 0.2
 
 MAX_BOARD_DRIFT: Final = 100e-6
-"""Two crystals drift apart by less; the estimate loses as much between stamps with a short delay."""
+"""Bound on the relative drift of two crystals; the estimate decays by it between stamps with a short delay."""
 
 JUMP_TICKS: Final = round(TICK_RATE_HZ)
-"""A stamp that is wrong by more than a second means that the counter has restarted."""
+"""A stamp off by more than a second means that the counter has restarted."""
 
 
 class PortUser(Protocol):
-    """What the port calls."""
+    """Callbacks of the port."""
 
     def on_open(self, send: Callable[[bytes], None]) -> None:
         """The port is open."""
@@ -41,7 +41,7 @@ class SerialPort:
     """One port, by its path."""
 
     def __init__(self, path: str, baud: int, gone: Callable[[str], None]) -> None:
-        """``gone`` is called with why there is no port, once for equal reasons in a row."""
+        """``gone`` is called with the reason why there is no port, once for equal consecutive reasons."""
         self.path, self.baud = path, baud
         self._gone = gone
         self._reported = ""
@@ -78,11 +78,11 @@ class SerialPort:
         return transport, connection
 
     def waiting_bytes(self) -> int:
-        """What the port has not accepted yet; 0 while it is not open."""
+        """Bytes not accepted by the port yet; 0 while it is closed."""
         return 0 if self._connection is None else self._connection.waiting_bytes()
 
     def reopen(self, reason: str) -> None:
-        """Close the port, if it is open, and open it again."""
+        """Close the port, if open, and open it again."""
         if self._connection is not None:
             self._connection.end(reason)
 
@@ -98,7 +98,7 @@ class SerialPort:
 
 
 class _Connection(asyncio.Protocol):
-    """The port from its opening until it ends; ``ended`` gives the reason, empty where it is unknown."""
+    """The port from opening to closing; ``ended`` gives the reason, empty if unknown."""
 
     def __init__(self, user: PortUser) -> None:
         self._user = user
@@ -128,17 +128,17 @@ class _Connection(asyncio.Protocol):
 
 
 def line_advice(path: str, baud: int, sender: str, *, silent: bool) -> str:
-    """Where to look when nothing usable comes from ``sender`` on a port that is open."""
+    """Where to look if nothing usable comes from ``sender`` on an open port."""
     if silent:
         return f"nothing at all comes from {path} at {baud} baud: nothing on the air, another port, or not {sender}?"
     return f"what comes from {path} at {baud} baud is not from {sender}: another rate or other firmware?"
 
 
 def check_path(spec: str, path: str) -> None:
-    """Check that a path could be a serial port; one that does not exist yet may appear later.
+    """Check that a path could be a serial port; a missing one may appear later.
 
     Raises:
-        SkylessError: it never will be one.
+        SkylessError: it can never be one.
     """
     if "://" in path:
         raise SkylessError(
@@ -173,7 +173,7 @@ def _trouble(path: str, error: Exception) -> str:
 
 
 class BoardClock:
-    """A board's 40-bit counter, estimated from stamps that arrive late by an unknown time.
+    """A board's 40-bit counter, estimated from stamps that arrive with unknown delays.
 
     It uses the stamp with the shortest delay, so it lags by the shortest transfer.
     """
@@ -183,13 +183,13 @@ class BoardClock:
         self._host_s = 0.0
 
     def update(self, ticks: int, host_s: float) -> None:
-        """Add a stamp of the counter that arrived at a moment of the host's monotonic clock."""
+        """Add a stamp of the counter that arrived at ``host_s`` of the host's monotonic clock."""
         known = self.read(host_s, MAX_BOARD_DRIFT)
         if known is None or difference(ticks, known) >= 0 or difference(ticks, known) < -JUMP_TICKS:
             self._ticks, self._host_s = ticks, host_s
 
     def read(self, host_s: float, drift: float = 0.0) -> int | None:
-        """The 40-bit counter at a moment of the host's clock; None before the first stamp."""
+        """The 40-bit counter at a time of the host's clock; None before the first stamp."""
         if self._ticks is None:
             return None
         return wrap(self._ticks + round((host_s - self._host_s) * (1.0 - drift) * TICK_RATE_HZ))
@@ -202,14 +202,14 @@ class BoardClock:
 # A pseudo-terminal in place of a device on a serial port.
 
 HELD_BYTES: Final = 1 << 15
-"""Bytes that nobody reads are held up to here, then dropped with those in the system: a UART keeps nothing either."""
+"""Unread bytes kept; beyond it they are dropped with those in the system: a UART keeps nothing either."""
 
 
 class Pty:
-    """A pseudo-terminal in place of a board's serial port; programs open ``path``, or the symbolic link to it."""
+    """A pseudo-terminal in place of a board's serial port; programs open ``path`` or the symbolic link to it."""
 
     def __init__(self, link: Path | None = None, held_bytes: int = HELD_BYTES, asked: str = "--link is") -> None:
-        """Open a pseudo-terminal. ``asked`` begins the message about a link that cannot be made.
+        """Open a pseudo-terminal. ``asked`` begins the message about a link that cannot be created.
 
         Raises:
             SkylessError: the system has none, or another file is in the way of the link.
@@ -224,18 +224,18 @@ class Pty:
         self.link = link
         self._held_bytes = held_bytes
         self.overruns = 0
-        """How often bytes that nobody read were dropped."""
+        """Number of times unread bytes were dropped."""
         self._waiting = bytearray()
         if link is not None:
             _make_link(link, self.path, asked)
 
     @property
     def name(self) -> str:
-        """The path that programs open: the link's, where there is one."""
+        """The path that programs open: the link's, if there is one."""
         return self.path if self.link is None else str(self.link)
 
     def start(self, on_data: Callable[[bytes], None]) -> None:
-        """Call ``on_data`` with what programs write, from the running event loop."""
+        """Call ``on_data`` with programs' output, from the running event loop."""
         asyncio.get_running_loop().add_reader(self._board, self._read, on_data)
 
     def _read(self, on_data: Callable[[bytes], None]) -> None:
@@ -243,7 +243,7 @@ class Pty:
             on_data(os.read(self._board, 4096))
 
     def send(self, data: bytes) -> bool:
-        """Write, at once or soon; False if this and all that waited was dropped because nobody reads."""
+        """Write, at once or soon. Returns False if this and all waiting bytes were dropped because nobody reads."""
         if self._waiting:
             if len(self._waiting) + len(data) > self._held_bytes:
                 self._drop()
@@ -280,7 +280,7 @@ class Pty:
 
 
 def _make_link(link: Path, path: str, asked: str) -> None:
-    """Make the link, replacing an older one in one step."""
+    """Create the link, replacing an older one atomically."""
     if link.exists() and not link.is_symlink():
         raise SkylessError(f"{asked} {str(link)!r}; it should be a free name, and this path exists")
     scratch = link.with_name(f".{link.name}.{os.getpid()}")

@@ -32,19 +32,19 @@ from skyless.radio.serial.serial_port import BoardClock, SerialPort
 from skyless.radio.tag_reports import Reported
 
 STATUS_S: Final = 0.5
-"""Interval at which a board is asked for its state."""
+"""Interval for requesting a board's state."""
 BOARD_SILENCE_S: Final = 3.0
-"""A board that has sent nothing for this time has gone."""
+"""A board silent for this time has gone."""
 MAX_PENDING_FRAMES: Final = 16
-"""Frames whose end the board has not reported; a board holds one, so of older ones the answer was lost on the line."""
+"""Frames whose end the board has not reported; it holds one, so answers about older ones were lost on the line."""
 
 _HELLO_ANSWER_S: Final = 1.0
-"""A HELLO that comes later than this after ASK_HELLO is no answer to it: the board has started."""
+"""A HELLO later than this after ASK_HELLO is no answer to it: the board has started."""
 _IDLE_S: Final = 5.0
-"""A board that has been configured for this time and does not receive will not."""
+"""A board that does not receive this long after its configuration will not."""
 _MAX_STARTS: Final = 3
 _MAX_STARTS_S: Final = 60.0
-"""A board that starts so often within this time does not start because somebody wants it to."""
+"""A board that starts as often within this time does so unintentionally."""
 
 _LEAD_S: Final = 5.0e-3
 """A command of 112 bytes on the line (1.1 ms), the lag of the estimate of the board's counter, which is the shortest
@@ -66,16 +66,16 @@ _RESET_CAUSES: Final = {
 
 
 class Computing(Struct, frozen=True):
-    """How a host has a board work that is a tag by itself."""
+    """How a host configures a board that is a tag by itself."""
 
     changes: Mapping[str, Any]
-    """Settings that it should have, by name; the others stay."""
+    """Settings to change, by name; the others stay."""
     keeps: bool
-    """Whether flash is to hold them."""
+    """Whether to store them in flash."""
 
 
 UNTIL_NEXT_START: Final = Computing({"mode": MODES.index("tag"), "output": OUTPUTS.index("records")}, keeps=False)
-"""A tag that sends records to its host."""
+"""A tag that sends records to its host, until its next start."""
 
 
 class LinkSession:
@@ -93,9 +93,9 @@ class LinkSession:
         phases: bool = False,
         computing: Computing | None = None,
     ) -> None:
-        """``port`` is its name in messages; ``transmits``: refuse a board that only listens.
+        """``port``: its name in messages; ``transmits``: refuse a board that only listens.
 
-        ``phases``: ask a board that can for the phases of carriers; ``computing``: it is a tag by itself.
+        ``phases``: request carrier phases from a board that has them; ``computing``: the board is a tag by itself.
         """
         self.clock = BoardClock()
         self.ready = False
@@ -103,7 +103,7 @@ class LinkSession:
         self.status: Status | None = None
         """The newest one."""
         self.tag_config: TagConfig | None = None
-        """The settings of a board that computes, as it last said."""
+        """The last stated settings of a board that computes."""
         self.counters = counters
         self._port, self._delays, self._send, self._listener = port, delays, send, listener
         self._transmits, self._phases, self._computing = transmits, phases, computing
@@ -120,13 +120,13 @@ class LinkSession:
         self._idle_polls = 0
 
     def begin(self, host_s: float) -> None:
-        """Ask the board for its HELLO."""
+        """Request the board's HELLO."""
         self._heard_s = host_s
         self._send(b"\0")
         self._ask_hello(host_s)
 
     def poll(self, host_s: float) -> str | None:
-        """To be called every ``STATUS_S``; the reason to reopen the port, None while there is none."""
+        """Call every ``STATUS_S``. Returns the reason to reopen the port, or None."""
         if host_s - self._heard_s > BOARD_SILENCE_S:
             return self._reason_of_silence()
         if self.hello is None or self._refused:
@@ -158,7 +158,7 @@ class LinkSession:
         return f"no board answers at {self._port}"
 
     def transmit(self, transmission: Transmission) -> None:
-        """Have a frame sent; without a board that is ready it is late."""
+        """Send a frame; it is late if no board is ready."""
         if not self.ready:
             self._listener(Late(transmission.tx_ticks))
             return
@@ -192,7 +192,7 @@ class LinkSession:
         self._process(record, host_s)
 
     def _is_next(self, number: int) -> bool:
-        """Count what is missing before a record; False for a copy of the one before."""
+        """Count records missing before this one. Returns False for a copy of the previous one."""
         missing = 0 if self._expected is None else (number - self._expected) & 0xFF
         if missing == 0xFF:
             self.counters["copied-record"] += 1
@@ -269,9 +269,9 @@ class LinkSession:
                 self._configure()
 
     def _count_start(self, host_s: float, cause: int | None) -> None:
-        """Count that the board has restarted, and report once that it does so repeatedly.
+        """Count a restart, and report once if they are frequent.
 
-        ``cause`` is what the board said of it, None where it said nothing.
+        ``cause``: as stated by the board, None if it stated none.
         """
         self.counters["board-restart"] += 1
         self._idle_polls = 0
@@ -286,7 +286,7 @@ class LinkSession:
             self._listener(Hint(f"the board at {self._port} {often}: is its supply good, does its firmware fail?"))
 
     def _refuse(self, reason: str) -> None:
-        """Each reason is reported once until the board is ready, because a board that is asked again refuses again."""
+        """Report a reason once until the board is ready, as a board that is asked again refuses again."""
         self._reset()
         self._refused = reason
         if reason != self._reported:
@@ -294,7 +294,7 @@ class LinkSession:
             self._listener(Gone(reason))
 
     def _on_refusal(self, refusal: NotDone) -> None:
-        """A board that refuses its configuration cannot be used; other refusals are counted."""
+        """A board that refuses its configuration is unusable; other refusals are counted."""
         if refusal.command in (link.CONFIG, link.SET_TAG_CONFIG):
             why = _REASONS.get(refusal.reason, f"reason {refusal.reason}")
             self._refuse(f"the board at {self._port} refuses its configuration: {why}")
@@ -313,7 +313,7 @@ class LinkSession:
         self._send(self._writer.record(link.RX_ON))
 
     def _on_tag_config(self, config: TagConfig, computing: Computing) -> None:
-        """Ask once for what is to be changed; with the answer to that the board is ready."""
+        """Request the changes once; the answer makes the board ready."""
         is_answer, self.tag_config = self.tag_config is not None, config
         wanted = replace(config.settings, **computing.changes)
         is_same = pack(wanted) == pack(config.settings) and config.in_flash >= computing.keeps
@@ -349,7 +349,7 @@ class LinkSession:
             self._begin_to_report()
 
     def _check_line(self, status: Status, *, was_polled: bool) -> None:
-        """Count when the board begins to poll its radio, and report it once."""
+        """Count when the board starts to poll its radio, and report it once."""
         if not status.polled or was_polled:
             return
         self.counters["interrupt-line-stuck"] += 1
@@ -369,7 +369,7 @@ class LinkSession:
 
 
 def _last_cause(cause: int | None) -> str:
-    """Why a board has started, for a message; empty where it did not say."""
+    """Cause of a board's start, for a message; empty if not stated."""
     if cause is None:
         return ""
     words = [text for bit, text in _RESET_CAUSES.items() if cause & bit]
@@ -404,16 +404,16 @@ class SerialRadio:
 
     @property
     def hello(self) -> Hello | None:
-        """What the board has said of itself; None while none has answered."""
+        """The board's HELLO; None before one has answered."""
         return None if self._session is None else self._session.hello
 
     @property
     def tag_config(self) -> TagConfig | None:
-        """The settings of a board that computes; None while it has not said them."""
+        """Settings of a board that computes; None before it has stated them."""
         return None if self._session is None else self._session.tag_config
 
     async def run(self, listener: Listener) -> None:
-        """Receive until cancelled; a board that is unplugged is looked for."""
+        """Receive until cancelled; an unplugged board is searched for."""
         self._listener = listener
         poll = asyncio.ensure_future(self._poll())
         try:
@@ -423,7 +423,7 @@ class SerialRadio:
             await asyncio.gather(poll, return_exceptions=True)
 
     def advice(self) -> str:
-        """Where to look when nothing comes though the board answers."""
+        """Where to look if the board answers but receives nothing."""
         path = self._port.path
         return f"the board at {path} answers, but receives no frame: are anchors on the air, is its antenna free?"
 
@@ -481,14 +481,14 @@ class SerialRadio:
 # Asks a board for its settings and changes them, at whatever rate its port works.
 
 _ANSWER_S: Final = 1.5
-"""A board answers in milliseconds, also one that has to erase a page of its flash."""
+"""A board answers within milliseconds, even if it has to erase a page of its flash."""
 
 
 async def set_up(path: str, bauds: Sequence[int], computing: Computing) -> TagConfig:
-    """The settings of the board at a port, after the changes that are asked for, if any.
+    """Return the settings of the board at a port, after the requested changes, if any.
 
     Raises:
-        SkylessError: the port cannot be opened, no board answers, or it is none that computes, or refuses.
+        SkylessError: the port cannot be opened, no board answers, or it computes no positions or refuses.
     """
     for baud in bauds:
         radio, events = SerialRadio(path, baud, "", computing=computing), asyncio.Queue[RadioEvent]()
