@@ -2,25 +2,18 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from msgspec.structs import replace
 
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import Site
+from skyless.research.calibration.options import SurveyOptions
 from skyless.site.survey.facts import Facts, Gauge, Point
 from skyless.site.tables import read_heights
 
-if TYPE_CHECKING:
-    from skyless.core.site import Site
-from skyless.research.calibration.options import SurveyOptions
-
 _SKETCH_STD_M: Final = 0.3
-
-
 _FOREIGN_DELAY_STD_M: Final = 0.03
-
-
 _FOREIGN_COMMON_DELAY_STD_M: Final = 1.0
 """For recordings of other systems: boards of one kind without calibration are nearly alike, but nothing is known of
 what they share."""

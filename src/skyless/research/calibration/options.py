@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping, Sequence
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from msgspec import Struct
 
@@ -25,9 +25,6 @@ from skyless.core.errors import SkylessError
 from skyless.core.site import Site
 from skyless.research.replays.options import RecordingOptions
 from skyless.site.survey.facts import Tape
-
-if TYPE_CHECKING:
-    from skyless.core.site import Site
 
 _MAX_STD_M: Final = 100.0
 _Std = Annotated[float, number(above=0.0, most=_MAX_STD_M)]

@@ -19,23 +19,13 @@ from skyless.core.geometry import GUESSED_STD_M, plane_height_m
 from skyless.core.site import Site
 from skyless.research.foreign.formats import format_of
 from skyless.research.masterless.smoothing import Height
+from skyless.research.replays.options import BAROMETER, RECORDED, RecordingOptions, ReplayOptions
 from skyless.sim.evaluation.figures import FLIGHT_M, antenna_truth, flies, shifted
 from skyless.site.file.load import site_of
 from skyless.site.tables import HEIGHT_STD_M, Truth, read_anchors, read_height_readings, read_truth
 
 if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from skyless.core.site import Site
-from skyless.research.replays.options import BAROMETER, RECORDED, RecordingOptions, ReplayOptions
-
-Anchors = Mapping[int, tuple[float, float, float]] | str | Path
-"""Positions by identifier in metres, or the path of a table."""
-
-
-AnyTruth = ArrayLike | str | Path
-"""Rows of time and position, shape (n, 4), or the path of a table."""
-
+    from skyless.research.replays.options import Anchors
 
 TOO_FLAT = "the anchors' mean: they lie too flat to determine the height"
 """Source of a height that nobody gave."""
@@ -44,7 +34,7 @@ TOO_FLAT = "the anchors' mean: they lie too flat to determine the height"
 YAML_SUFFIXES: Final = frozenset({".yaml", ".yml"})
 
 
-def known_anchors(anchors: Anchors | None, site: Site | str | Path | None) -> tuple[dict[int, Point], float | None]:
+def known_anchors(anchors: "Anchors | None", site: Site | str | Path | None) -> tuple[dict[int, Point], float | None]:
     """Positions of the anchors, and the tags' height if a site states it. Raises SkylessError."""
     if anchors is not None and site is not None:
         raise SkylessError("give either --anchors or --site, not both")

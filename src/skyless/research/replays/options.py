@@ -31,14 +31,17 @@ from skyless.core.site import Site
 from skyless.sim.evaluation.request import IntegrityRisk, ProtectionOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Mapping
 
     from numpy.typing import ArrayLike
 
     from skyless.core.integrity import IntegrityRequirement
-    from skyless.core.site import Site
     from skyless.research.masterless.smoothing import OwnEstimator
-    from skyless.research.replays.inputs import Anchors, AnyTruth
+
+    Anchors = Mapping[int, tuple[float, float, float]] | str | Path
+    """Positions by identifier in metres, or the path of a table."""
+    AnyTruth = ArrayLike | str | Path
+    """Rows of time and position, shape (n, 4), or the path of a table."""
 
 
 PACKETS, DIFFERENCES_MADE = "packets", "differences"
