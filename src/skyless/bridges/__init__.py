@@ -1,1 +1,1 @@
-"""A site's fixes for programs and devices of other kinds: each as its own bytes, over what it reads from."""
+"""Bridges: a site's fixes for other programs and devices, each in its own format and over its own transport."""

@@ -1,7 +1,7 @@
-"""Messages about alarms on their way to one receiver: each is tried until it is accepted, refused or too old.
+"""Deliver messages about alarms to one receiver: each is tried until it is accepted, refused or too old.
 
-Attempts block and run in a thread of their own, one at a time. A receiver that hangs, refuses or is slow delays nothing
-but its own messages.
+Attempts block, so they run in a thread, one at a time. A receiver that hangs, refuses or is slow delays only its own
+messages.
 """
 
 import asyncio
@@ -24,7 +24,7 @@ from skyless.run.mqtt.messages import AlarmMessage
 from skyless.run.web import BRIDGES as LIMITS
 
 TIMEOUT_S: Final = 10.0
-"""For each attempt, all of it."""
+"""Time limit of a whole attempt."""
 
 FIRST_PAUSE_S: Final = 1.0
 LONGEST_PAUSE_S: Final = 300.0
@@ -32,7 +32,7 @@ KEPT_S: Final = 86_400.0
 """A message that has not been delivered for this long is dropped."""
 
 LAST_S: Final = 3.0
-"""For all that waits when the bridge stops."""
+"""Time limit for all waiting messages when the bridge stops."""
 
 _MAX_KNOWN: Final = 10_000
 _MAX_SECRET_BYTES: Final = 4096
@@ -46,7 +46,7 @@ class RefusedError(Exception):
 
 
 class Delivery(Struct, eq=False):
-    """What has become of an alarm, until it is delivered."""
+    """A message about a change of an alarm, until it is delivered."""
 
     what: What
     alarm: AlarmMessage
@@ -54,23 +54,23 @@ class Delivery(Struct, eq=False):
     due_s: float
     pause_s: float
     reached: set[str] = set()
-    """Who has accepted a mail to several people, and does not get it again."""
+    """Recipients that have accepted a mail to several people, and do not get it again."""
 
     @property
     def key(self) -> str:
-        """The same for each attempt, also of another run of the bridge."""
+        """Identifies the message in all attempts, also those of another run of the bridge."""
         return f"{self.alarm.id}/{self.what}"
 
 
 Open = Callable[[socket.socket | None], None]
-"""To be called with the socket of an attempt, which is closed when its time is over."""
+"""To be called with an attempt's socket, which is then shut down when the attempt ends or its time is over."""
 
 
 class AlarmTarget(Target):
-    """Base of targets that get what becomes of alarms. ``attempt`` is called in a thread."""
+    """Base of targets for alarms and their changes. ``attempt`` is called in a thread."""
 
     def __init__(self, text: str, log: Callable[[str], None], kinds: frozenset[What]) -> None:
-        """``kinds`` are those that are delivered."""
+        """``kinds`` are the changes to deliver."""
         super().__init__(text)
         self.site: BridgedSite | None = None
         self.delivered = 0
@@ -82,14 +82,14 @@ class AlarmTarget(Target):
         self._wake = asyncio.Event()
 
     def attempt(self, delivery: Delivery, on_open: Open) -> None:
-        """Deliver. Raises RefusedError where it makes no sense to try again, and OSError where it does."""
+        """Deliver one message. Raises RefusedError if trying again makes no sense, and OSError if it does."""
         raise NotImplementedError
 
     def on_site(self, site: BridgedSite) -> None:
         self.site = site
 
     def on_alarm(self, alarm: AlarmMessage) -> None:
-        """An alarm as it is now. Of those from before the start, only active ones that nobody has seen are new."""
+        """Queue the changes of an alarm. From before the start, only active and unacknowledged alarms are delivered."""
         states = _states(alarm)
         known = self._known.pop(alarm.id, None)
         self._known[alarm.id] = states
@@ -107,7 +107,7 @@ class AlarmTarget(Target):
         self._wake.set()
 
     async def run(self) -> None:
-        """Deliver until cancelled; what waits then is tried once more."""
+        """Deliver until cancelled; then try the waiting messages once more."""
         try:
             await self._deliver()
         except asyncio.CancelledError:
@@ -142,7 +142,7 @@ class AlarmTarget(Target):
             self._log(f"{self.text}: stopped; messages that were not delivered: {len(self._waiting)}")
 
     def _next(self) -> Delivery | None:
-        """The message whose turn comes first. Those about one alarm keep their order."""
+        """The waiting message that is due first. Messages about one alarm keep their order."""
         firsts: dict[str, Delivery] = {}
         for one in self._waiting:
             firsts.setdefault(one.alarm.id, one)
@@ -154,7 +154,7 @@ class AlarmTarget(Target):
         except RefusedError as error:
             self.dropped["refused"] += 1
             self._report(f"refused: {error}")
-        except Exception as error:  # noqa: BLE001 - whatever it is, it is tried again
+        except Exception as error:  # noqa: BLE001 - whatever it is, try again
             self._report(f"cannot be reached: {error or type(error).__name__}")
             one.due_s = time.monotonic() + one.pause_s * random.uniform(0.5, 1.0)
             one.pause_s = min(2.0 * one.pause_s, LONGEST_PAUSE_S)
@@ -166,14 +166,14 @@ class AlarmTarget(Target):
             self._waiting.remove(one)
 
     def _report(self, trouble: str) -> None:
-        """Log a trouble when it begins and when it is over."""
+        """Log a problem when it begins and when it is over."""
         if trouble != self._trouble:
             self._trouble = trouble
             self._log(f"{self.text}: {trouble[:240] or 'delivered again'}")
 
 
 def _states(alarm: AlarmMessage) -> list[What]:
-    """What has become of an alarm so far."""
+    """The changes of an alarm so far."""
     states: list[What] = ["raised"]
     if alarm.acknowledged_unix_s is not None:
         states.append("acknowledged")
@@ -183,7 +183,7 @@ def _states(alarm: AlarmMessage) -> list[What]:
 
 
 async def _in_thread(work: Callable[[Open], None]) -> None:
-    """Run what blocks in a thread that the end of the program does not wait for, for at most ``TIMEOUT_S``."""
+    """Run blocking work for at most ``TIMEOUT_S``, in a thread for which the program's end does not wait."""
     done: Future[None] = Future()
     done.set_running_or_notify_cancel()
     sockets: list[socket.socket | None] = []
@@ -205,11 +205,11 @@ async def _in_thread(work: Callable[[Open], None]) -> None:
     finally:
         for one in filter(None, sockets):
             with contextlib.suppress(OSError):
-                one.shutdown(socket.SHUT_RDWR)  # which ends the thread
+                one.shutdown(socket.SHUT_RDWR)  # this ends the thread
 
 
 def read_secret(text: str, key: str, name: str) -> str:
-    """The first line of a file that only its owner may read. Raises SkylessError."""
+    """Read the first line of a file that only its owner may access. Raises SkylessError."""
     path = Path(name)
     try:
         with path.open("rb") as file:

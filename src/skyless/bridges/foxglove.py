@@ -1,4 +1,4 @@
-"""``foxglove://``: a server that Foxglove, Lichtblick and other clients of its WebSocket protocol, version 1, open.
+"""``foxglove://``: a server for Foxglove, Lichtblick and other clients of its WebSocket protocol, version 1.
 
 Source: https://github.com/foxglove/ws-protocol/blob/main/docs/spec.md
 """
@@ -41,10 +41,10 @@ from skyless.run.web import BRIDGES as LIMITS
 from skyless.run.web import is_local_origin, is_own_host, own_names, same_origin
 
 SUBPROTOCOLS: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""Names of the protocol, the newer first; what they share is all that is used here."""
+"""Names of the protocol, the newer first; only their common part is used here."""
 
 _APPLICATIONS: Final = ("https://app.foxglove.dev", "file://")
-"""Origins of Foxglove's own application, in a browser and on the desktop."""
+"""Origins of Foxglove's application, in a browser and on the desktop."""
 
 _ORIGIN: Final = re.compile(r"[a-z+-]+://[^/\s,]*")
 
@@ -63,7 +63,7 @@ Identifier = Annotated[int, Meta(ge=0, le=0xFFFFFFFF)]
 
 
 class Channel(Struct, frozen=True, rename="camel"):
-    """A topic that clients can subscribe."""
+    """A topic to which clients can subscribe."""
 
     id: int
     topic: str
@@ -74,20 +74,20 @@ class Channel(Struct, frozen=True, rename="camel"):
 
 
 class Subscription(Struct, frozen=True, rename="camel"):
-    """A client's own number for a channel that it wants."""
+    """A client's request for a channel, with the number that the client chose for it."""
 
     id: Identifier
     channel_id: Identifier
 
 
 class Subscribe(Struct, frozen=True, tag_field="op", tag="subscribe"):
-    """The client wants these channels."""
+    """A request to begin subscriptions."""
 
     subscriptions: Annotated[tuple[Subscription, ...], Meta(max_length=_MAX_IDS)]
 
 
 class Unsubscribe(Struct, frozen=True, tag_field="op", tag="unsubscribe", rename="camel"):
-    """The client does not want these any more."""
+    """A request to end subscriptions."""
 
     subscription_ids: Annotated[tuple[Identifier, ...], Meta(max_length=_MAX_IDS)]
 
@@ -98,7 +98,7 @@ _decoder: Final[msgspec.json.Decoder[Subscribe | Unsubscribe]] = msgspec.json.De
 
 
 def decode_request(data: str | bytes) -> Request | None:
-    """What a client asks for; None for anything that this server does not offer or understand."""
+    """Decode a client's request; None for anything that this server does not offer or understand."""
     if isinstance(data, bytes):  # published data and calls of services
         return None
     try:
@@ -108,7 +108,7 @@ def decode_request(data: str | bytes) -> Request | None:
 
 
 def server_info(name: str, session: str) -> str:
-    """The first message to a client; with another ``session`` it forgets what it had from this server."""
+    """Return the first message to a client. If ``session`` is new to it, it discards its data from this server."""
     return _text(
         {
             "op": "serverInfo",
@@ -122,17 +122,17 @@ def server_info(name: str, session: str) -> str:
 
 
 def advertise(channels: Sequence[Channel]) -> str:
-    """These channels are there."""
+    """Return the message that announces channels."""
     return _text({"op": "advertise", "channels": channels})
 
 
 def status(level: int, message: str) -> str:
-    """A line for the person who uses the client."""
+    """Return the message that shows a line to the client's user."""
     return _text({"op": "status", "level": level, "message": message})
 
 
 def message_data(subscription: int, unix_s: float, payload: bytes) -> bytes:
-    """A message of a subscribed channel. Raises ValueError or OverflowError: the time cannot be stated."""
+    """Return a message of a subscribed channel. Raises ValueError or OverflowError if the time cannot be stated."""
     time_ns = round(unix_s * 1e9)
     if not 0 <= time_ns <= _LAST_NS:
         raise OverflowError("the time is before 1970, or after what 64 bits can state")
@@ -144,37 +144,37 @@ def _text(value: dict[str, Any]) -> str:
 
 
 STUCK_S: Final = 10.0
-"""A client that has accepted nothing for so long, while its messages were being dropped, is disconnected."""
+"""A client that has accepted nothing for this long, while its messages were being dropped, is disconnected."""
 
 _MAX_TEXTS: Final = 2000
-"""Texts for one client, which are never dropped; a client with more of them waiting is disconnected."""
+"""Largest number of texts waiting for one client. They are never dropped: a client with more is disconnected."""
 
 
 class Session:
-    """One client. Nothing here waits, but ``run``."""
+    """One client. Only ``run`` waits."""
 
     def __init__(self, connection: ServerConnection) -> None:
         self._connection = connection
         self._numbers: dict[int, int] = {}
-        """The client's numbers of its subscriptions, by channel."""
+        """The client's subscription numbers, by channel."""
         self._texts: deque[str] = deque()
         self._data: deque[bytes] = deque(maxlen=LIMITS.waiting_messages)
         self._ready = asyncio.Event()
         self._sent_s = asyncio.get_running_loop().time()
 
     def wants(self, channel: int) -> bool:
-        """Whether it has subscribed a channel."""
+        """Whether the client has subscribed to a channel."""
         return channel in self._numbers
 
     def send_text(self, text: str) -> None:
-        """Send what must not be dropped."""
+        """Send a text, which must not be dropped."""
         self._texts.append(text)
         self._ready.set()
         if len(self._texts) > _MAX_TEXTS:
             self.end()
 
     def send_data(self, channel: int, unix_s: float, payload: bytes) -> bool:
-        """Send a message of a channel that it wants; whether nothing was dropped for that."""
+        """Send a message of a subscribed channel. Returns False if an older message was dropped for it."""
         full = len(self._data) == self._data.maxlen
         if not self._data and not self._texts:
             self._sent_s = asyncio.get_running_loop().time()
@@ -185,7 +185,7 @@ class Session:
         return not full
 
     def on_request(self, data: str | bytes, channels: dict[int, Channel]) -> tuple[tuple[int, ...], int]:
-        """Do what the client asks for: which channels it has now subscribed, and how much could not be done."""
+        """Process a request. Returns the channels newly subscribed, and the number of parts that were refused."""
         request = decode_request(data)
         if request is None:
             self.send_text(status(WARNING, "skyless bridge offers subscriptions only; this request does nothing"))
@@ -207,7 +207,7 @@ class Session:
         return tuple(added), wrong
 
     async def run(self) -> None:
-        """Send what waits until the connection closes."""
+        """Send waiting messages until the connection closes."""
         loop = asyncio.get_running_loop()
         while True:
             await self._ready.wait()
@@ -217,25 +217,25 @@ class Session:
                 self._sent_s = loop.time()
 
     def end(self) -> None:
-        """Close the connection at once; what waits is dropped."""
+        """Close the connection at once; waiting messages are dropped."""
         self._connection.transport.abort()
 
 
 _PORT: Final = 8765
 _SEND_BUFFER_BYTES: Final = 1 << 16
-"""In the system, for each client: what is there is sent before anything newer."""
+"""Size of the system's send buffer for each client; small, as its contents are sent before anything newer."""
 
 _GOODBYE_S: Final = 0.5
-"""For clients to close their connections when the program ends."""
+"""Time for clients to close their connections when the program ends."""
 
 _quiet = logging.getLogger("skyless.bridges.foxglove")
 _quiet.addHandler(logging.NullHandler())
 _quiet.propagate = False
-"""Clients that speak another protocol are no news."""
+"""Clients with another protocol are not worth a log line."""
 
 
 class FoxgloveTarget(Target):
-    """Serves one site to any number of clients. A channel costs nothing while nobody has subscribed it."""
+    """Serves one site to several clients. A channel costs nothing while nobody has subscribed to it."""
 
     def __init__(
         self,
@@ -245,32 +245,32 @@ class FoxgloveTarget(Target):
         origins: Collection[str] = (),
         unix_time: Callable[[], float] = time.time,
     ) -> None:
-        """``origins`` are those of web applications that may connect, besides Foxglove's and those of this computer."""
+        """``origins`` are further web applications that may connect, besides Foxglove's and those on this computer."""
         super().__init__(text)
         self._origins = {*_APPLICATIONS, *origins}
         self.port = port
-        """The one that is used, where 0 was asked for and the server runs."""
+        """The port in use while the server runs, also if 0 was given."""
         self._host, self._unix_time = host, unix_time
         self._run = secrets.token_hex(4)
         self._site: BridgedSite | None = None
         self._channels: dict[int, Channel] = {}
         self._numbers: dict[str, int] = {}
-        """Numbers of channels, by topic."""
+        """Channel numbers by topic."""
         self._sessions: set[Session] = set()
 
     def on_site(self, site: BridgedSite) -> None:
-        """Show its anchors, walls and zones."""
+        """Send the site's anchors, walls and zones as a scene."""
         self._site = site
         self._give(SCENE_TOPIC, foxglove_schema("foxglove.SceneUpdate"), self._unix_time(), self._scene)
 
     def on_fix(self, fix: FixMessage) -> None:
-        """Give a fix in each of the forms that somebody has subscribed."""
+        """Send a fix on each of its channels that has subscribers."""
         site = self._site
         if site is None:
             return
         shown = msgspec.structs.replace(fix, covariance_m2=floored(fix.covariance_m2))
         topic = f"/tag/{fix.tag}"
-        self._give_fix(f"{topic}/fix", schema_of(FixMessage), fix, msgspec.json.encode)
+        self._give(f"{topic}/fix", schema_of(FixMessage), fix.unix_s, lambda: msgspec.json.encode(fix))
         self._give_foxglove("/tf", "foxglove.FrameTransform", fix, frame_transform)
         self._give_foxglove(f"{topic}/pose", "foxglove.PoseInFrame", fix, lambda fix: pose_in_frame(fix, facing=False))
         self._give_foxglove(f"{topic}/ellipse", "foxglove.SceneUpdate", shown, ellipse)
@@ -281,13 +281,13 @@ class FoxgloveTarget(Target):
             )
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
-        """Give a tag's state, for its rates and reasons."""
+        """Send a tag's state, for its rates and reasons."""
         if isinstance(health, TagHealth):
             topic = f"/tag/{health.tag}/health"
             self._give(topic, schema_of(TagHealth), health.unix_s, lambda: msgspec.json.encode(health))
 
     async def run(self) -> None:
-        """Serve until cancelled. Raises SkylessError: it cannot listen there."""
+        """Serve until cancelled. Raises SkylessError if it cannot listen."""
         try:
             server = await serve(
                 self._serve,
@@ -308,7 +308,7 @@ class FoxgloveTarget(Target):
             await server.serve_forever()
 
     def _refusal(self, connection: ServerConnection, request: HttpRequest) -> Response | None:
-        """The answer to a page of another site; None where the client may connect."""
+        """Return the answer that refuses a page of another site; None if the client may connect."""
         host, origin = request.headers.get("Host", ""), request.headers.get("Origin")
         if not is_own_host(host, own_names(self._host), remote=not is_loopback(self._host)):
             self.dropped["host"] += 1
@@ -320,7 +320,7 @@ class FoxgloveTarget(Target):
         return connection.respond(HTTPStatus.FORBIDDEN, text)
 
     async def _serve(self, connection: ServerConnection) -> None:
-        """Serve one client until it goes."""
+        """Serve one client until it disconnects."""
         if len(self._sessions) >= LIMITS.clients:
             self.dropped["too-many-clients"] += 1
             return
@@ -348,7 +348,7 @@ class FoxgloveTarget(Target):
         if wrong:
             self.dropped["request-not-understood"] += wrong
         scene_channel = self._numbers.get(SCENE_TOPIC)
-        if scene_channel in added and scene_channel is not None:  # it does not change by itself
+        if scene_channel in added and scene_channel is not None:  # the next one may not come for long
             session.send_data(scene_channel, self._unix_time(), self._scene())
 
     def _scene(self) -> bytes:
@@ -357,15 +357,10 @@ class FoxgloveTarget(Target):
         return scene(self._unix_time(), site.anchors_m, site.master, site.walls, site.zones)
 
     def _give_foxglove(self, topic: str, schema: str, fix: FixMessage, encode: Callable[[FixMessage], bytes]) -> None:
-        self._give_fix(topic, foxglove_schema(schema), fix, encode)
-
-    def _give_fix(
-        self, topic: str, schema: tuple[str, bytes], fix: FixMessage, encode: Callable[[FixMessage], bytes]
-    ) -> None:
-        self._give(topic, schema, fix.unix_s, lambda: encode(fix))
+        self._give(topic, foxglove_schema(schema), fix.unix_s, lambda: encode(fix))
 
     def _give(self, topic: str, schema: tuple[str, bytes], unix_s: float, encode: Callable[[], bytes]) -> None:
-        """Send a message to all who want its channel, which is advertised with its first message."""
+        """Send a message to all subscribers of its channel, which is advertised with its first message."""
         channel = self._numbers.get(topic)
         if channel is None:
             self._advertise(topic, schema)
@@ -378,7 +373,7 @@ class FoxgloveTarget(Target):
             for session in wanting:
                 if not session.send_data(channel, unix_s, payload):
                     self.dropped["slow-client"] += 1
-        except (ValueError, ArithmeticError):  # figures that no tag publishes
+        except (ValueError, ArithmeticError):  # values that no tag publishes
             self.dropped["out-of-range"] += 1
 
     def _advertise(self, topic: str, schema: tuple[str, bytes]) -> None:
@@ -394,7 +389,7 @@ class FoxgloveTarget(Target):
 
 
 def make_target(url: TargetUrl, _context: BridgeContext) -> FoxgloveTarget:
-    """The target of ``foxglove://HOST:PORT``; ``origins=`` has web applications that may connect, with commas."""
+    """Create the target for ``foxglove://HOST:PORT``; ``origins=`` lists web applications that may connect."""
     origins = tuple(filter(None, url.text_option("origins").split(",")))
     for origin in origins:
         if not _ORIGIN.fullmatch(origin):

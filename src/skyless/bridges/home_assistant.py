@@ -1,8 +1,8 @@
-"""``homeassistant:``: tags as devices of Home Assistant over MQTT, with the room that each is in.
+"""``homeassistant:``: tags as devices of Home Assistant over MQTT, each with its room.
 
-Documents by which it learns of a tag: https://www.home-assistant.io/integrations/mqtt/#device-discovery-payload, since
-2024.11. Everything is retained, so that Home Assistant has it all when it starts. Its recorder keeps each change: rooms
-are sent when they change, positions and accuracies at most once a second, and only when they have changed by much.
+Discovery documents of tags: https://www.home-assistant.io/integrations/mqtt/#device-discovery-payload, since 2024.11.
+All messages are retained, so that Home Assistant has them when it starts. Its recorder stores every change, so rooms
+are sent only when they change, and positions and accuracies at most once a second and only after substantial changes.
 """
 
 import asyncio
@@ -44,29 +44,29 @@ Component = dict[str, object]
 
 
 def device_id(site: int, tag: str) -> str:
-    """What identifies a tag for ever; the ids of its entities begin with it."""
+    """Permanent identifier of a tag; the ids of its entities begin with it."""
     return f"skyless_{site}_{tag}"
 
 
 def config_topic(prefix: str, site: int, tag: str) -> str:
-    """Retained document of a tag; an empty one removes the tag."""
+    """Topic of a tag's retained document; an empty document removes the tag."""
     return f"{prefix}/device/{device_id(site, tag)}/config"
 
 
 def birth_topic(prefix: str) -> str:
-    """``online`` when Home Assistant has started."""
+    """Topic on which Home Assistant publishes ``online`` when it has started."""
     return f"{prefix}/status"
 
 
 def document(site: BridgedSite, tag: str, status_topic: str, removed: Mapping[str, str]) -> bytes:
-    """The document of a tag.
+    """Return the discovery document of a tag.
 
-    It has the sensor Accuracy; where there are zones, the sensor Room and a binary sensor for each of them; a tracker
-    where the site is georeferenced. A tag with an asset has its name, and the asset's group as identifier of the model:
-    a group is no place, so no area is suggested.
+    Its components are the sensor Accuracy; if there are zones, the sensor Room and a binary sensor for each zone; and a
+    tracker if the site is georeferenced. A tag with an asset gets the asset's name, and the asset's group as model
+    identifier: a group is not a place, so no area is suggested. All components are unavailable while the bridge is
+    offline or the tag has no usable fix.
 
-    All are unavailable while the bridge is offline or the tag has no usable fix.
-    ``status_topic`` is the bridge's; ``removed`` has the platforms of components that an earlier document had, by key.
+    ``status_topic`` is the bridge's; ``removed`` has the platforms of components of earlier documents, by key.
     """
     components = _components(site, tag)
     for key, component in components.items():
@@ -129,7 +129,7 @@ def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
 
 
 def zone_key(zone: Zone) -> str:
-    """Key of a zone's component: of its id, so that another name changes nothing."""
+    """Key of a zone's component; it has the zone's id, so that renaming the zone changes nothing."""
     return f"zone_{zone.id}"
 
 
@@ -144,7 +144,7 @@ def _occupancy(zone: Zone, topic: str) -> Component:
 
 
 def platforms(kept: bytes) -> dict[str, str]:
-    """The platforms of a document's components by key, without those that it removes. Empty for anything else."""
+    """Platforms of a document's components by key, without those that it removes. Empty if it is not a document."""
     try:
         components = msgspec.json.decode(kept, type=_Document).components
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
@@ -162,38 +162,38 @@ class _Document(msgspec.Struct, frozen=True):
 
 
 NODE_KIND: Final = "homeassistant"
-"""Kind of the status on MQTT."""
+"""Kind of the bridge's status on MQTT."""
 
 STALE_S: Final = 5
-"""A tag that this bridge had before it was started again must have a fix within this time."""
+"""A tag that this bridge had before a restart counts as unavailable without a fix within this time."""
 
 MAX_ANNOUNCED: Final = 500
-"""Further ones are not announced."""
+"""Largest number of tags that are announced."""
 
 _STD_CHANGE: Final = 1.25
-"""An accuracy that has changed by less than this factor counts as the same."""
+"""An accuracy that has changed by at most this factor counts as the same."""
 
 
 class _Tag(Struct):
-    """What was sent of a tag, and its newest fix."""
+    """The messages sent about a tag, and its newest fix."""
 
     name: str
     document: bytes = b""
     was_kept: bool = False
-    """Whether a document of it that the broker had, or another bridge's, has been read."""
+    """Whether another document of the tag, kept by the broker or from another bridge, has been read."""
     removed: dict[str, str] = {}
-    """Platforms of components that it had before, by key."""
+    """Platforms of its earlier components, by key."""
     zones: TagZones | None = None
     fix: FixMessage | None = None
-    """None while it has no usable one."""
+    """None while there is no usable fix."""
     position: TagPosition | None = None
 
 
 class Announcer:
-    """The tags of one site, as one Home Assistant gets them."""
+    """Announces the tags of one site to one Home Assistant."""
 
     def __init__(self, link: Link, site: BridgedSite, name: str, prefix: str, move_m: float) -> None:
-        """``name`` is the bridge's on MQTT, ``prefix`` Home Assistant's for discovery.
+        """``name`` is the bridge's on MQTT; ``prefix`` is Home Assistant's for discovery.
 
         A position is sent again when the tag has moved by ``move_m``.
         """
@@ -203,12 +203,12 @@ class Announcer:
         self._monitor = ZoneMonitor()
         self._monitor.set_zones(site.zones, 0.0)
         self._kept: dict[str, int] = {}
-        """Tags that this bridge had before, by what the broker has kept, and for how many seconds to wait for them."""
+        """Tags that this bridge had before a restart, from retained messages, and the seconds left to wait for each."""
         link.subscribe(birth_topic(prefix), self._on_birth)
         link.subscribe(tag_zones_topic(site.id, "+"), self._on_kept_zones, 1)
 
     def on_site(self, site: BridgedSite) -> None:
-        """Another place, other zones: announce all tags again."""
+        """Announce all tags again, as the site's name, zones or georeference may have changed."""
         self._site = site
         self._monitor.set_zones(site.zones, 0.0)
         for tag in self._tags.values():
@@ -217,7 +217,7 @@ class Announcer:
             self._remove(tag, before)
 
     def on_fix(self, fix: FixMessage) -> None:
-        """A usable fix."""
+        """Process a usable fix."""
         tag = self._tags.get(fix.tag) or self._add(fix.tag)
         if tag is None:
             return
@@ -228,7 +228,7 @@ class Announcer:
             self._send_position(tag, fix)
 
     def on_no_fix(self, name: str, unix_s: float) -> None:
-        """A tag has no usable fix any more."""
+        """Make a tag unavailable, as it has no usable fix any more."""
         self._monitor.remove_tag(name, unix_s)
         tag = self._tags.get(name)
         if tag is not None:
@@ -236,12 +236,12 @@ class Announcer:
             self._send_zones(tag, unix_s)
 
     def on_site_left(self, unix_s: float) -> None:
-        """No tag has a fix of this site any more."""
+        """Make all tags unavailable, as none has a fix at this site any more."""
         for name in self._tags:
             self.on_no_fix(name, unix_s)
 
     def on_second(self, unix_s: float) -> None:
-        """Send what has changed by much; once a second."""
+        """Send positions that have changed substantially; call this once a second."""
         for tag in self._tags.values():
             if tag.fix is not None and self._has_changed(tag, tag.fix):
                 self._send_position(tag, tag.fix)
@@ -257,7 +257,7 @@ class Announcer:
             self.dropped["tag-name" if len(self._tags) < MAX_ANNOUNCED else "too-many-tags"] += 1
             return None
         tag = self._tags[name] = _Tag(name)
-        # Before it is announced: what the broker has kept comes only as long as nothing has replaced it.
+        # Before it is announced: the broker's retained document comes only until another one replaces it.
         self._link.subscribe(self._config_topic(name), lambda _, kept: self._on_kept(name, kept))
         self._announce(tag)
         return tag
@@ -271,7 +271,7 @@ class Announcer:
         self._publish(self._config_topic(tag.name), tag.document)
 
     def _remove(self, tag: _Tag, before: dict[str, str]) -> None:
-        """Let Home Assistant remove components that an earlier document had."""
+        """Let Home Assistant remove components that only an earlier document had."""
         now = platforms(tag.document)
         tag.removed = {key: platform for key, platform in (tag.removed | before).items() if key not in now}
         if not before.keys() <= now.keys():
@@ -321,10 +321,10 @@ class Announcer:
     def _publish(self, topic: str, message: Struct | bytes) -> None:
         self._link.publish(topic, message, qos=1, retain=True)
 
-    # What comes from the broker
+    # Messages from the broker
 
     def _on_birth(self, _topic: str, payload: bytes) -> None:
-        """Home Assistant has started: say all of the tags that are there again."""
+        """Send everything about the present tags again, as Home Assistant has started."""
         if payload != b"online":
             return
         for tag in self._tags.values():
@@ -338,9 +338,9 @@ class Announcer:
                         self._publish(topic, message)
 
     def _on_kept(self, name: str, kept: bytes) -> None:
-        """A document of a tag: an empty one has removed it; an older one may have components that are no more.
+        """Process a tag's document: an empty one removes the tag; an older one may have obsolete components.
 
-        Only one is read: two bridges that know different zones would answer each other without end.
+        Only one is read: two bridges that know different zones would answer each other endlessly.
         """
         tag = self._tags.get(name)
         if tag is None or kept == tag.document:
@@ -356,7 +356,7 @@ class Announcer:
             self._remove(tag, platforms(kept))
 
     def _on_kept_zones(self, _topic: str, payload: bytes) -> None:
-        """What this bridge said before it was started again: it must not stay where the tag has gone meanwhile."""
+        """Note a tag of this bridge from before a restart: its state must not stay if the tag has left meanwhile."""
         try:
             kept = msgspec.json.decode(payload, type=TagZones)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
@@ -371,7 +371,7 @@ def _are_alike(a: float, b: float) -> bool:
 
 
 def _stds_m(fix: FixMessage) -> tuple[float, float]:
-    """Radial standard deviations in space and on the floor."""
+    """Radial standard deviations in m, in space and in the horizontal plane."""
     variances = floored(fix.covariance_m2)[::4]
     return round(sqrt(sum(variances)), 3), round(sqrt(sum(variances[:2])), 3)
 
@@ -384,17 +384,17 @@ def _rounded(position: Vector) -> Vector:
 _PREFIX: Final = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
 
 _LIMITS: Final = Limits(topics=4 * MAX_ANNOUNCED + 1, topic_bytes=64_000_000)
-"""Three topics of each tag, one of each that was there before, and the status; 100 zones make a document of 50 kB."""
+"""Three topics of each tag, one of each earlier tag, and the status; 100 zones make a document of 50 kB."""
 
 SETTLE_S: Final = 3
-"""The site is known for so long before tags are announced, as its zones come after it: Home Assistant would forget what
-a user has set for sensors of zones that are missing."""
+"""The site must be known for this long before tags are announced, as its zones come after it: Home Assistant would
+forget a user's settings for sensors of zones that are missing."""
 
 
 class HomeAssistant(Target):
-    """Connects when the first tag has a fix, and the site has been known for ``SETTLE_S``.
+    """Announces tags to Home Assistant, once a tag has a fix and the site has been known for ``SETTLE_S``.
 
-    The bridge's name on MQTT has that tag's name in it, so that bridges on one computer are distinct.
+    Its name on MQTT contains the first tag's name, so that bridges on one computer are distinct.
     """
 
     def __init__(self, context: BridgeContext, text: str, address: MqttAddress, prefix: str, move_m: float) -> None:
@@ -409,7 +409,7 @@ class HomeAssistant(Target):
         """For how many seconds the site has been known."""
 
     def on_site(self, site: BridgedSite) -> None:
-        """Announce what has changed. Raises SkylessError: it is another site."""
+        """Announce the changes of the site. Raises SkylessError if it is another site."""
         if self._site is not None and site.id != self._site.id:
             if self._announcer is not None:
                 self._announcer.on_site_left(time.time())
@@ -424,30 +424,30 @@ class HomeAssistant(Target):
             self._announcer.on_site(site)
 
     def on_fix(self, fix: FixMessage) -> None:
-        """Its rooms and its position."""
+        """Send a tag's rooms and position."""
         if self._announcer is None and self._site is not None and self._known_s >= SETTLE_S:
             self._begin(self._site, fix.tag)
         if self._announcer is not None:
             self._announcer.on_fix(fix)
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:  # noqa: ARG002 - Home Assistant has no field for it
-        """It becomes unavailable."""
+        """Make the tag unavailable."""
         if self._announcer is not None:
             self._announcer.on_no_fix(tag, unix_s)
 
     def on_second(self, unix_s: float) -> None:
-        """Positions that have changed."""
+        """Send the positions that have changed."""
         self._known_s += self._site is not None
         if self._announcer is not None:
             self._announcer.on_second(unix_s)
 
     def on_status(self, status: StatusMessage) -> None:
-        """A tag that has gone becomes unavailable at once."""
+        """Make a tag that goes offline unavailable at once."""
         if self._announcer is not None and status.kind == "tag" and not status.online:
             self._announcer.on_no_fix(status.name, time.time())  # a last will has no time
 
     async def run(self) -> None:
-        """Keep the link from the first fix until cancelled."""
+        """Run the link from the first fix until cancelled."""
         await self._begun.wait()
         assert self._link is not None
         await self._link.run()
@@ -461,10 +461,9 @@ class HomeAssistant(Target):
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> HomeAssistant:
-    """``homeassistant:`` or ``homeassistant://[USER[:PASSWORD]@]HOST[:PORT]``.
+    """Create the target for ``homeassistant:`` or ``homeassistant://[USER[:PASSWORD]@]HOST[:PORT]``.
 
-    Keys: ``tls=yes|no`` of a broker that the address names, ``prefix`` of discovery, ``move_m``.
-    Raises SkylessError.
+    Keys: ``tls=yes|no`` for a broker in the address, ``prefix`` of discovery, ``move_m``. Raises SkylessError.
     """
     tls = url.choice("tls", ("no", "yes"), "no") == "yes"
     prefix = url.text_option("prefix", "homeassistant")

@@ -1,6 +1,6 @@
-"""JSON lines: one object to a line over TCP, or to a datagram over UDP; SI units, the site's own frame.
+"""JSON lines: one object per line over TCP, or per datagram over UDP; SI units, in the site's frame.
 
-``type`` says which: ``site``, ``fix`` (the fields of a fix on MQTT, ``docs/mqtt.md``) or ``no_fix``.
+``type`` is ``site``, ``fix`` (with the fields of a fix on MQTT, ``docs/mqtt.md``) or ``no_fix``.
 """
 
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ _encode: Final = msgspec.json.Encoder().encode
 
 
 class SiteLine(Struct, frozen=True, tag="site"):
-    """The site: first for each new reader, and whenever it changes."""
+    """The site, sent first to each new reader, and whenever it changes."""
 
     id: int
     name: str
@@ -27,39 +27,39 @@ class SiteLine(Struct, frozen=True, tag="site"):
 
 
 class NoFixLine(Struct, frozen=True, tag="no_fix"):
-    """A tag that runs, or ran, has no usable fix: once a second while that lasts."""
+    """A tag that runs, or ran, has no usable fix; sent once a second meanwhile."""
 
     tag: str
     unix_s: float
     reason: str
     name: str | UnsetType = UNSET
-    """Of the tag's asset, where it has one, as is the group."""
     group: str | UnsetType = UNSET
+    """Name and group of the tag's asset, if it has one."""
 
 
 class JsonLines(Encoder):
-    """Encodes all that there is."""
+    """Encodes a site and the fixes of all tags."""
 
     def __init__(self) -> None:
         self._site = b""
         self._assets: Mapping[str, Asset] = {}
 
     def greeting(self) -> list[bytes]:
-        """The site, once it is known."""
+        """Return the site, once it is known."""
         return [self._site] if self._site else []
 
     def on_site(self, site: BridgedSite) -> list[bytes]:
-        """The site."""
+        """Encode the site."""
         self._assets = site.assets
         self._site = _line(SiteLine(site.id, site.name, site.simulated, site.anchors_m, site.georeference))
         return [self._site]
 
     def on_fix(self, fix: FixMessage) -> list[bytes]:
-        """A fix, with its type and its asset's name first."""
+        """Encode a fix, with its type and its asset's name first."""
         return [_encode({"type": "fix", **self._names(fix.tag)})[:-1] + b"," + _line(fix)[1:]]
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:
-        """That there is none."""
+        """Encode the statement that a tag has no fix."""
         return [_line(NoFixLine(tag, unix_s, reason, **self._names(tag)))]
 
     def _names(self, tag: str) -> dict[str, str]:
@@ -72,5 +72,5 @@ def _line(value: Struct) -> bytes:
 
 
 def make_encoder(_url: TargetUrl, _context: BridgeContext) -> JsonLines:
-    """Lines have no settings."""
+    """Create the encoder, which has no settings."""
     return JsonLines()

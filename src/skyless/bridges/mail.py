@@ -1,4 +1,4 @@
-"""``smtp://[USER@]HOST:PORT?to=…&from=…`` and ``smtps:``: a mail when an alarm is raised, and one when it has ended."""
+"""``smtp://[USER@]HOST:PORT?to=…&from=…`` and ``smtps:``: a mail when an alarm is raised, and one when it ends."""
 
 import re
 import smtplib
@@ -18,7 +18,7 @@ _ADDRESS: Final = re.compile(r"[^\s@,<>]+@[^\s@,<>]+")
 
 
 class Mail(AlarmTarget):
-    """Sends mails to one or more people over one server."""
+    """Sends mails to one or more people through one server."""
 
     def __init__(self, url: TargetUrl, context: BridgeContext) -> None:
         super().__init__(url.text, context.log, frozenset({"raised", "ended"}))
@@ -43,14 +43,14 @@ class Mail(AlarmTarget):
         self._user, self._password = user, read_secret(url.text, "password_file", name) if name else ""
 
     def attempt(self, delivery: Delivery, on_open: Open) -> None:
-        """Send once."""
+        """Send one mail. Raises RefusedError, OSError."""
         server = self._connect(self._host, self._port, timeout=TIMEOUT_S)
         try:
             with server:
                 on_open(server.sock)
                 if self._starts_tls:
                     server.starttls(context=self._tls)
-                    on_open(server.sock)  # it is another one now
+                    on_open(server.sock)  # TLS has replaced the socket
                 if self._user:
                     server.login(self._user, self._password)
                 waiting = [address for address in self._to if address not in delivery.reached]
@@ -89,7 +89,7 @@ class Mail(AlarmTarget):
 
 
 def _header(text: str) -> str:
-    """A text as the value of a header. A name ``=?utf-8?q?=0D=0ABcc:…?=`` adds a header in Python before 3.11.10."""
+    """Make a text safe as a header: ``=?utf-8?q?=0D=0ABcc:…?=`` would add one in Python before 3.11.10."""
     return " ".join("".join(one if one.isprintable() else " " for one in text).replace("=?", "= ?").split())
 
 
@@ -101,5 +101,5 @@ def _time(unix_s: float) -> str:
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Mail:
-    """The target of an address. Raises SkylessError."""
+    """Create the target for an address. Raises SkylessError."""
     return Mail(url, context)

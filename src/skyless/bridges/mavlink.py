@@ -1,4 +1,4 @@
-"""MAVLink for autopilots, without I/O: its frames, what each profile sends of a fix, and answers to the vehicle."""
+"""MAVLink for autopilots, without I/O: frames, the messages of each profile for a fix, and answers to the vehicle."""
 
 import struct
 from collections import Counter
@@ -19,8 +19,8 @@ from skyless.run.mqtt.messages import FixMessage, Matrix, Vector
 #
 # A frame of version 2 is ``0xFD | length | incompatible | compatible | sequence | system | component | number (24
 # bits) | payload | CRC``, one of version 1 ``0xFE | length | sequence | system | component | number (8 bits) |
-# payload | CRC``. Fields of messages are in the order of their bytes; a byte of the check, ``CRC_EXTRA``, stands for
-# the definition. Sources: https://mavlink.io/en/guide/serialization.html and
+# payload | CRC``. The fields of messages are here in the order of their bytes. The CRC also covers a byte,
+# ``CRC_EXTRA``, that stands for the message's definition. Sources: https://mavlink.io/en/guide/serialization.html and
 # https://mavlink.io/en/messages/common.html.
 
 MAGIC_1: Final = 0xFE
@@ -30,7 +30,7 @@ HEADER_BYTES_2: Final = 10
 CHECK_BYTES: Final = 2
 SIGNATURE_BYTES: Final = 13
 IS_SIGNED: Final = 0x01
-"""The only incompatible flag that is defined: a signature follows the checksum."""
+"""The only incompatibility flag defined: a signature follows the checksum."""
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -47,7 +47,7 @@ _CRC: Final = _crc_table()
 
 
 def crc(data: bytes, crc_extra: int) -> int:
-    """CRC-16/MCRF4XX of ``data`` and then of the byte that stands for a message's definition."""
+    """CRC-16/MCRF4XX of ``data`` followed by the byte ``crc_extra``."""
     value = 0xFFFF
     for byte in data:
         value = (value >> 8) ^ _CRC[(value ^ byte) & 0xFF]
@@ -55,38 +55,38 @@ def crc(data: bytes, crc_extra: int) -> int:
 
 
 class Frame(Struct, frozen=True):
-    """A received frame whose check is right."""
+    """A received frame with a correct checksum."""
 
     number: int
-    """Number of the message."""
+    """Number of the message type."""
     system: int
     component: int
     payload: bytes
-    """Without the zeros that its sender has cut off."""
+    """Payload without trailing zeros that its sender has cut off."""
 
 
 def frame(number: int, crc_extra: int, payload: bytes, *, sequence: int, system: int, component: int) -> bytes:
-    """A frame of version 2, unsigned; zeros at the payload's end are cut off, but for its first byte."""
+    """Make an unsigned frame of version 2; trailing zeros of the payload are cut off, except its first byte."""
     payload = payload.rstrip(b"\0") or payload[:1]
     body = bytes([len(payload), 0, 0, sequence & 0xFF, system, component]) + number.to_bytes(3, "little") + payload
     return bytes([MAGIC_2]) + body + crc(body, crc_extra).to_bytes(CHECK_BYTES, "little")
 
 
 class FrameReader:
-    """Finds frames of both versions in a stream of bytes; only those of messages in ``crc_extras`` are given.
+    """Finds frames of both versions in a stream of bytes, of the message types in ``crc_extras`` only.
 
     Signatures are skipped, not checked.
     """
 
     def __init__(self, crc_extras: Mapping[int, int]) -> None:
-        """``crc_extras``: for each number of a message the byte that stands for its definition."""
+        """``crc_extras``: ``CRC_EXTRA`` by message number."""
         self._crc_extras = crc_extras
         self._buffer = bytearray()
         self.damaged = 0
-        """How often something that began like a frame was none."""
+        """How often bytes that began like a frame were no frame."""
 
     def frames(self, data: bytes) -> Iterator[Frame]:
-        """The frames that end in ``data``, which continues what was given before."""
+        """Yield the frames that end in ``data``, the next piece of the stream."""
         self._buffer += data
         while self._find_magic():
             length = self._length()
@@ -118,7 +118,7 @@ class FrameReader:
         return HEADER_BYTES_2 + self._buffer[1] + CHECK_BYTES + signature
 
     def _checked(self, length: int) -> Frame | None:
-        """The whole frame at the start, None if it is damaged. That of an unknown message cannot be checked."""
+        """The whole frame at the start; None if it is damaged. Frames of unknown messages cannot be checked."""
         data = bytes(self._buffer[:length])
         payload_bytes = data[1]
         if data[0] == MAGIC_1:
@@ -143,12 +143,12 @@ UNKNOWN_21: Final = (NAN,) * 21
 ONBOARD_CONTROLLER: Final = 18
 NO_AUTOPILOT: Final = 8
 ACTIVE: Final = 4
-"""Type, autopilot and state in our heartbeat."""
+"""Type, autopilot and state in the heartbeat sent."""
 ARMED: Final = 0x80
 """Flag in a vehicle's ``base_mode``."""
 
 LOCAL_NED: Final = 1
-"""MAV_FRAME: north, east, down of an origin that rests on the Earth."""
+"""MAV_FRAME: north, east, down from an origin fixed to the Earth."""
 ESTIMATOR_VISION: Final = 2
 """MAV_ESTIMATOR_TYPE."""
 
@@ -191,7 +191,7 @@ class GpsGlobalOrigin(Struct, frozen=True):
 
 
 class Timesync(Struct, frozen=True):
-    """TIMESYNC: a request has ``answered_ns`` 0, and its answer the request's ``asked_ns`` again."""
+    """TIMESYNC: a request has ``answered_ns`` 0; its answer repeats the request's ``asked_ns``."""
 
     answered_ns: int
     asked_ns: int
@@ -210,7 +210,7 @@ class VisionPositionEstimate(Struct, frozen=True):
 
 
 class Odometry(Struct, frozen=True):
-    """ODOMETRY: m, m/s, rad/s; both covariances as in ``VisionPositionEstimate``; NaN where something is unknown."""
+    """ODOMETRY: m, m/s, rad/s; both covariances as in ``VisionPositionEstimate``; NaN means unknown."""
 
     time_us: int
     position: tuple[float, float, float]
@@ -227,7 +227,7 @@ class Odometry(Struct, frozen=True):
 
 
 class GpsInput(Struct, frozen=True):
-    """GPS_INPUT; by default of a receiver without a fix, nothing of which is to be used."""
+    """GPS_INPUT; the defaults are those of a receiver without a fix, with all fields to be ignored."""
 
     time_us: int
     time_week_ms: int
@@ -248,7 +248,7 @@ class GpsInput(Struct, frozen=True):
     fix_type: int = NO_FIX
     satellites_visible: int = 0
     yaw_cdeg: int = 0
-    """0: not known."""
+    """0 means unknown."""
 
 
 Message = Heartbeat | SetGpsGlobalOrigin | GpsGlobalOrigin | Timesync | VisionPositionEstimate | Odometry | GpsInput
@@ -273,11 +273,11 @@ _LAYOUTS: Final[dict[type[Message], _Layout]] = {
 _READ: Final[tuple[type[Heartbeat | Timesync | GpsGlobalOrigin], ...]] = (Heartbeat, Timesync, GpsGlobalOrigin)
 _READ_BY_NUMBER: Final = {_LAYOUTS[kind].number: kind for kind in _READ}
 CRC_EXTRAS: Final = {_LAYOUTS[kind].number: _LAYOUTS[kind].crc_extra for kind in _READ}
-"""CRC_EXTRA of the messages that are read here, by number."""
+"""``CRC_EXTRA`` of the messages that are read, by number."""
 
 
 def encoded(message: Message, *, sequence: int, system: int, component: int) -> bytes:
-    """The message as a frame of MAVLink 2.
+    """Encode a message as a frame of MAVLink 2.
 
     Raises:
         struct.error, OverflowError: a value does not fit its field.
@@ -291,16 +291,16 @@ def encoded(message: Message, *, sequence: int, system: int, component: int) -> 
 
 
 def decoded(received: Frame) -> Heartbeat | Timesync | GpsGlobalOrigin:
-    """The message of a frame whose number is in ``CRC_EXTRAS``; fields that are missing at its end are 0."""
+    """Decode the message of a frame whose number is in ``CRC_EXTRAS``; fields missing at its end are 0."""
     kind = _READ_BY_NUMBER[received.number]
     fields = _LAYOUTS[kind].fields
     return kind(*fields.unpack(received.payload.ljust(fields.size, b"\0")[: fields.size]))
 
 
-# What an autopilot gets of a fix, by profile: ``ardupilot``, ``px4`` or ``gps``.
+# Messages to an autopilot about a fix, by profile: ``ardupilot``, ``px4`` or ``gps``.
 #
-# A tag has no attitude, so that none is given: the vehicle's own compass keeps its heading. Positions are north, east
-# and down of the site's origin.
+# A tag does not know its attitude, so none is sent: the vehicle's compass keeps its heading. Positions are north, east
+# and down from the site's origin.
 
 Profile = Literal["ardupilot", "px4", "gps"]
 MAVLINK_PROFILES: Final = ("ardupilot", "px4", "gps")
@@ -308,14 +308,14 @@ MAVLINK_PROFILES: Final = ("ardupilot", "px4", "gps")
 GPS_EPOCH_UNIX_S: Final = 315_964_800
 """6 January 1980, when GPS time began."""
 LEAP_S: Final = 18
-"""GPS time less UTC, since 2017."""
+"""GPS time minus UTC, since 2017."""
 WEEK_MS: Final = 604_800_000
 
 UNKNOWN_ANGLE_RAD2: Final = pi**2
-"""Variance of an angle of which nothing is known, for ArduPilot, which does not check for NaN."""
+"""Variance of an unknown angle, for ArduPilot, which does not check for NaN."""
 UNKNOWN_HEIGHT_STD_M: Final = 100.0
 UNKNOWN_CLIMB_STD_MPS: Final = 100.0
-"""Standard deviations of a height that the site assumes (``height_known``) without measuring it, and of its change."""
+"""Standard deviations of a height that is assumed and not measured (``height_known``), and of its rate."""
 
 IGNORE_HDOP: Final = 2
 IGNORE_VDOP: Final = 4
@@ -326,19 +326,19 @@ _IGNORE_VELOCITY: Final = IGNORE_HORIZONTAL_VELOCITY | IGNORE_VERTICAL_VELOCITY 
 """GPS_INPUT_IGNORE_FLAGS."""
 
 MAX_SATELLITES: Final = 254
-"""255 states that the count is not known."""
+"""255 would mean that the count is unknown."""
 
 
 def micros(unix_s: float) -> int:
-    """As a stamp of a message; 0, which states that there is none, before 1970 or for what is not a number."""
+    """Convert a time to a message's stamp in µs; 0, which means none, before 1970 or if it is not finite."""
     return round(unix_s * 1e6) if isfinite(unix_s) and unix_s > 0.0 else 0
 
 
 def vision_position_estimate(fix: FixMessage, heading_deg: float, reset_counter: int) -> VisionPositionEstimate:
-    """For ArduPilot: every number is finite, angles are 0 with a variance that states that nothing is known.
+    """Convert a fix for ArduPilot: every number is finite; angles are 0 with the variance of an unknown angle.
 
-    A height that is not measured goes out as it is: ArduPilot makes one number of the three variances, so that a wide
-    one for the height would cost the vehicle its horizontal position as well.
+    The variance of a height that is not measured is left as it is: ArduPilot combines the three variances into one
+    number, so a large one for the height would cost the vehicle its horizontal position, too.
     """
     return VisionPositionEstimate(
         time_us=micros(fix.unix_s),
@@ -352,7 +352,7 @@ def vision_position_estimate(fix: FixMessage, heading_deg: float, reset_counter:
 
 
 def odometry(fix: FixMessage, heading_deg: float, reset_counter: int) -> Odometry:
-    """For PX4: attitude, rates and an unknown velocity are NaN; a height that is not measured has a wide variance."""
+    """Convert a fix for PX4: attitude, rates and an unknown velocity are NaN; an unmeasured height is uncertain."""
     covariance_m2 = _covariance_ned(fix.covariance_m2, heading_deg)
     if fix.height_known:
         covariance_m2 = _flat(covariance_m2, UNKNOWN_HEIGHT_STD_M)
@@ -383,7 +383,7 @@ def odometry(fix: FixMessage, heading_deg: float, reset_counter: int) -> Odometr
 
 
 def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None = None) -> GpsInput:
-    """A position on the Earth as a GPS receiver would give it; ``satellites`` is by default the number of anchors."""
+    """Convert a fix to a GPS receiver's global position; ``satellites`` is by default the number of anchors."""
     latitude_deg, longitude_deg, height_m = geodetic(fix.position_m, origin)
     covariance_m2 = _covariance_ned(fix.covariance_m2, origin.heading_deg)
     hdop, vdop = _dilution(fix.hdop), _dilution(fix.vdop)
@@ -420,13 +420,13 @@ def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None 
 
 
 def no_gps_fix(unix_s: float) -> GpsInput:
-    """A receiver that has no fix: nothing in it is to be used."""
+    """Return the message of a GPS receiver without a fix, with all fields to be ignored."""
     week, week_ms = gps_time(unix_s)
     return GpsInput(time_us=micros(unix_s), time_week_ms=week_ms, time_week=week)
 
 
 def global_origin(origin: GeoreferenceSite, target_system: int, unix_s: float) -> SetGpsGlobalOrigin:
-    """Where the site's origin is, which becomes the vehicle's."""
+    """Return the message that makes the site's origin the vehicle's."""
     return SetGpsGlobalOrigin(
         latitude_1e7=round(origin.latitude_deg * 1e7),
         longitude_1e7=round(origin.longitude_deg * 1e7),
@@ -437,9 +437,9 @@ def global_origin(origin: GeoreferenceSite, target_system: int, unix_s: float) -
 
 
 def gps_time(unix_s: float) -> tuple[int, int]:
-    """Week of GPS time and the milliseconds in it; (0, 0) before 1980 or after week 65535.
+    """GPS week and milliseconds in it; (0, 0) before 1980 or after week 65535.
 
-    Stamps before 2017 come out late, by the leap seconds added since.
+    Results for times before 2017 are too late by the leap seconds added since.
     """
     since_ms = (unix_s - GPS_EPOCH_UNIX_S + LEAP_S) * 1e3 if isfinite(unix_s) else -inf
     if not 0.0 <= since_ms < 65536.0 * WEEK_MS:
@@ -449,12 +449,12 @@ def gps_time(unix_s: float) -> tuple[int, int]:
 
 
 def _dilution(value: float | None) -> float:
-    """Dilution of precision as a GPS receiver states it; 0 if it is not known."""
+    """Dilution of precision as a GPS receiver states it; 0 if unknown."""
     return value if value is not None and isfinite(value) else 0.0
 
 
 def _velocity(fix: FixMessage) -> tuple[Vector, Matrix] | None:
-    """Velocity and its covariance, where both are known."""
+    """Velocity and its covariance; None unless both are known."""
     velocity, covariance = fix.velocity_mps, fix.velocity_covariance
     if velocity is None or covariance is None or not all(map(isfinite, (*velocity, *covariance))):
         return None
@@ -471,13 +471,13 @@ def _covariance_ned(covariance_m2: Matrix, heading_deg: float) -> Matrix:
 
 
 def _swapped(covariance: Matrix) -> Matrix:
-    """From east, north, up to north, east, down."""
+    """Convert a covariance from east, north, up to north, east, down."""
     ee, en, eu, ne, nn, nu, ue, un, uu = covariance
     return nn, ne, -nu, en, ee, -eu, -un, -ue, uu
 
 
 def _flat(covariance: Matrix, down_std: float) -> Matrix:
-    """The covariance where nothing is known of the vertical axis."""
+    """Replace the vertical part of a covariance by that of an unknown quantity."""
     nn, ne, _, en, ee, _, _, _, _ = covariance
     return nn, ne, 0.0, en, ee, 0.0, 0.0, 0.0, down_std**2
 
@@ -492,19 +492,18 @@ def _pose_covariance(covariance: Matrix, between: float, angle: float) -> tuple[
 AUTOPILOT: Final = 1
 """Component of a vehicle's flight controller."""
 VISUAL_POSITIONING: Final = 197
-"""Ours, MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""
+"""The own component, MAV_COMP_ID_VISUAL_INERTIAL_ODOMETRY."""
 
 _GONE_S: Final = 3
-"""A vehicle that was silent for this long, in seconds, may have been restarted, and has no origin then."""
+"""A vehicle that has been silent for this long, in seconds, may have been restarted, and then has no origin."""
 
 _NEAR_1E7: Final = 10
-"""Difference of a degree's 10⁷th parts by which an origin is still the same: 11 cm."""
-
 _NEAR_MM: Final = 100
+"""Largest differences of latitude and longitude (1e-7 °, here 11 cm) and height between equal origins."""
 
 
 class MavlinkEncoder(Encoder):
-    """Messages for one vehicle about one tag."""
+    """Encodes messages for one vehicle about one tag."""
 
     one_tag = True
 
@@ -519,10 +518,10 @@ class MavlinkEncoder(Encoder):
         heading_deg: float | None = None,
         log: Callable[[str], None] = lambda _line: None,
     ) -> None:
-        """``system`` is the vehicle's, which is ours as well; ``text`` names the target in messages.
+        """``system`` is the vehicle's and our own; ``text`` names the target in messages.
 
-        ``satellites`` is what profile ``gps`` states instead of the number of anchors, and ``heading_deg`` the azimuth
-        of the y axis of a site that does not know where it is on the Earth. ``log`` shows a line to a person.
+        ``satellites`` is stated by profile ``gps`` instead of the number of anchors. ``heading_deg`` is the azimuth of
+        the y axis of a site without a georeference. ``log`` shows a line to a person.
         """
         self._profile = profile
         self._text = text
@@ -538,15 +537,15 @@ class MavlinkEncoder(Encoder):
         self._armed = False
         self._log = log
         self._logged: set[str] = set()
-        """What it has logged already."""
+        """Subjects of lines that were logged."""
         self._silent_s = 0
         """Seconds since the vehicle's last message."""
         self._vehicle_origin: GpsGlobalOrigin | None = None
-        """As the vehicle states it."""
+        """The vehicle's origin, as the vehicle states it."""
         self.dropped = Counter()
 
     def on_site(self, site: BridgedSite) -> list[bytes]:
-        """Raises SkylessError: profile ``gps`` needs a georeference, and a site that has one a heading of its own."""
+        """Keep the site. Raises SkylessError without a georeference for ``gps``, or with one and a given heading."""
         if self._profile == "gps":
             require_georeference(site, self._text)
         if site.georeference is not None and self._given_heading_deg is not None:
@@ -563,11 +562,11 @@ class MavlinkEncoder(Encoder):
         return []
 
     def on_fix(self, fix: FixMessage) -> list[bytes]:
-        """One message, of the kind that the profile has."""
+        """Encode the profile's message for a fix."""
         if self._site is None:
             return []
         if self._last_serial is not None and fix.serial <= self._last_serial:
-            self._reset_counter += 1  # the receiver has started again
+            self._reset_counter += 1  # the receiver was restarted
         self._last_serial = fix.serial
         self._log_assumptions(fix)
         try:
@@ -578,15 +577,15 @@ class MavlinkEncoder(Encoder):
             origin = require_georeference(self._site, self._text)
             return self._frames([gps_input(fix, origin, self._satellites)])
         except (struct.error, OverflowError, ValueError):
-            self.dropped["mavlink-value"] += 1  # finite, and still beyond what a field can hold
+            self.dropped["mavlink-value"] += 1  # finite, but too large for its field
             return []
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:  # noqa: ARG002 - the vehicle has no use
-        """A GPS receiver without a fix; the other profiles are silent, by which an autopilot notices it."""
+        """Encode a GPS receiver without a fix. The other profiles send nothing, by which an autopilot notices it."""
         return self._frames([no_gps_fix(unix_s)]) if self._profile == "gps" else []
 
     def on_second(self, unix_s: float) -> list[bytes]:
-        """The heartbeat; and the site's origin, until the vehicle has one or is armed."""
+        """Encode the heartbeat, and the site's origin until the vehicle has one or is armed."""
         self._silent_s += 1
         if self._silent_s >= _GONE_S:
             self._vehicle_origin = None
@@ -597,7 +596,7 @@ class MavlinkEncoder(Encoder):
         return self._frames(messages)
 
     def on_bytes(self, data: bytes, unix_ns: int) -> list[bytes]:
-        """What the vehicle has sent, received at ``unix_ns``: it may ask for the time."""
+        """Process data from the vehicle, received at ``unix_ns``, and answer requests for the time."""
         answers: list[Message] = []
         damaged = self._reader.damaged
         for frame in self._reader.frames(data):
@@ -617,13 +616,13 @@ class MavlinkEncoder(Encoder):
         return self._frames(answers)
 
     def _origin(self, unix_s: float) -> SetGpsGlobalOrigin | None:
-        """None where the site does not know it, or the vehicle finds it by GPS_INPUT."""
+        """The site's origin for the vehicle; None if the site has none, or if the vehicle finds it from GPS_INPUT."""
         if self._site is None or self._site.georeference is None or self._profile == "gps":
             return None
         return global_origin(self._site.georeference, self._system, unix_s)
 
     def _compare_origin(self, vehicle: GpsGlobalOrigin, unix_ns: int) -> None:
-        """Log that the vehicle's origin is not the site's, if so."""
+        """Log if the vehicle's origin is not the site's."""
         site = self._origin(unix_ns * 1e-9)
         if site is None or (
             abs(vehicle.latitude_1e7 - site.latitude_1e7) <= _NEAR_1E7
@@ -638,7 +637,7 @@ class MavlinkEncoder(Encoder):
         )
 
     def _log_assumptions(self, fix: FixMessage) -> None:
-        """Log what a vehicle takes for known that is not."""
+        """Log assumptions about north and height that the vehicle takes for facts."""
         site = self._site
         if site is not None and site.georeference is None and self._given_heading_deg is None:
             self._log_once(
@@ -667,7 +666,7 @@ class MavlinkEncoder(Encoder):
 
 
 def _has_moved(before: BridgedSite, after: BridgedSite) -> bool:
-    """Whether positions are in another frame than before; a tag may only have learned of more anchors."""
+    """Whether positions are in another frame than before. Additional anchors, as a tag learns of them, do not count."""
     return before.georeference != after.georeference or any(
         after.anchors_m.get(anchor, position_m) != position_m for anchor, position_m in before.anchors_m.items()
     )
@@ -678,10 +677,9 @@ def _words(origin: GpsGlobalOrigin | SetGpsGlobalOrigin) -> str:
 
 
 def make_encoder(url: TargetUrl, context: BridgeContext) -> MavlinkEncoder:
-    """Keys: ``profile``, which has no default; ``system`` and ``component``; ``satellites``; ``heading``.
+    """Create the encoder. Raises SkylessError.
 
-    Raises:
-        SkylessError: one of them is not right.
+    Keys: ``profile``, which has no default; ``system`` and ``component``; ``satellites``; ``heading``.
     """
     return MavlinkEncoder(
         cast(Profile, url.choice("profile", MAVLINK_PROFILES, "")),

@@ -1,4 +1,4 @@
-"""NMEA 0183: fixes as a satellite receiver writes them, for gpsd, QGIS, OpenCPN, autopilots.
+"""NMEA 0183: fixes in the format of satellite receivers, for gpsd, QGIS, OpenCPN and autopilots.
 
 One epoch is one write of five sentences: RMC, GGA, GST, GBS, GSA. Formats: E. S. Raymond, NMEA Revealed
 (https://gpsd.gitlab.io/gpsd/NMEA.html); u-blox, M8 interface description, UBX-13003221, chapter 31.
@@ -21,50 +21,50 @@ MINUTE_UNITS: Final = 10_000_000
 """Minutes of arc have seven decimals: 0.2 mm. Six would lose 2 mm."""
 
 SLOT_COUNT: Final = 12
-"""Satellites that GSA has fields for; further anchors are only counted, in GGA."""
+"""Number of satellites for which GSA has fields; further anchors are only counted, in GGA."""
 
 COURSE_SIGMAS: Final = 2.0
-"""A course is given where the speed exceeds this many of its standard deviations."""
+"""A course is stated only if the speed exceeds this many of its standard deviations."""
 
 _LARGEST_DOP: Final = 99.99
-"""As receivers write it."""
+"""Largest dilution of precision that receivers write."""
 
 _LARGEST_ANCHOR: Final = 999
 """GSA has room for three digits; anchors with larger numbers are only counted, in GGA."""
 
 _FARTHEST_M: Final = 1e5
-"""Coordinates, heights and standard deviations beyond it are no measurement; the sentences have no room for them."""
+"""Larger coordinates, heights and standard deviations are no measurements; the sentences have no room for them."""
 
 _CENTURY_S: Final = (946_684_800.0, 4_102_444_799.0)
-"""Moments that RMC's two digits of the year can state: 2000 to 2099."""
+"""Times that RMC's two-digit year can state: 2000 to 2099."""
 
 _QUALITIES: Final = {"gps": (1, "A"), "rtk": (4, "R"), "simulator": (8, "S")}
-"""What GGA states of a fix, and RMC's mode."""
+"""GGA's quality and RMC's mode, by the name of a quality."""
 
 
 class NmeaEncoder(Encoder):
-    """The fixes of one tag as NMEA 0183."""
+    """Encodes the fixes of one tag as NMEA 0183."""
 
     one_tag = True
 
     def __init__(self, quality: str = "auto", geoid_m: float = 0.0) -> None:
         """``quality``: a name of GGA's quality, or ``auto``: simulator at a simulated site, RTK at a real one.
 
-        ``geoid_m``: height of the sea level above the ellipsoid at the site; 0 where the site file's height is above
-        sea level.
+        ``geoid_m``: height of the sea level above the ellipsoid at the site; 0 if the site file's height is above sea
+        level.
         """
         self._quality, self._geoid_m = quality, geoid_m
         self.dropped: Counter[str] = Counter()
         self._site: BridgedSite | None = None
 
     def on_site(self, site: BridgedSite) -> list[bytes]:
-        """Raises SkylessError where the site has no georeference."""
+        """Keep the site. Raises SkylessError if it has no georeference."""
         require_georeference(site, "nmea")
         self._site = site
         return []
 
     def on_fix(self, fix: FixMessage) -> list[bytes]:
-        """One epoch with a position."""
+        """Encode an epoch with a position."""
         if self._site is None or self._site.georeference is None:
             return []
         quality = self._quality
@@ -77,13 +77,16 @@ class NmeaEncoder(Encoder):
         return [] if sentences is None else [sentences]
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:  # noqa: ARG002 (NMEA has no reasons)
-        """One epoch that states that there is no position."""
+        """Encode an epoch that states that there is no position."""
         sentences = epoch_without_fix(unix_s)
         return [] if sentences is None else [sentences]
 
 
 def make_encoder(url: TargetUrl, _context: BridgeContext) -> Encoder:
-    """The encoder of ``nmea+tcp``, ``nmea+udp``, ``nmea+pty``, ``nmea+serial``; keys ``quality`` and ``geoid_m``."""
+    """Create the encoder for ``nmea+tcp``, ``nmea+udp``, ``nmea+pty`` and ``nmea+serial``. Raises SkylessError.
+
+    Keys: ``quality`` and ``geoid_m``.
+    """
     return NmeaEncoder(
         quality=url.choice("quality", ("auto", *_QUALITIES), "auto"),
         geoid_m=url.number("geoid_m", 0.0, -120.0, 100.0),
@@ -91,10 +94,10 @@ def make_encoder(url: TargetUrl, _context: BridgeContext) -> Encoder:
 
 
 def epoch(fix: FixMessage, origin: GeoreferenceSite, quality: str, geoid_m: float = 0.0) -> bytes | None:
-    """Five sentences of one fix; None where a value is beyond what the sentences can state.
+    """Encode a fix as five sentences; None if a value is beyond what the sentences can state.
 
-    Standard deviations are towards north, east, up, each at least 1 cm. Heights are above sea level, ``geoid_m``
-    less than the ellipsoid's. A course is given only where the tag moves (``COURSE_SIGMAS``).
+    Standard deviations are towards north, east and up, each at least 1 cm. Heights are above sea level: ``geoid_m``
+    less than above the ellipsoid. A course is stated only if the tag moves (``COURSE_SIGMAS``).
     """
     moment = _moment(fix.unix_s)
     if moment is None or not all(abs(value) < _FARTHEST_M for value in fix.position_m):
@@ -127,9 +130,9 @@ def epoch(fix: FixMessage, origin: GeoreferenceSite, quality: str, geoid_m: floa
 
 
 def epoch_without_fix(unix_s: float) -> bytes | None:
-    """Four sentences that state the time, and that no position is known; None for a time that RMC cannot state.
+    """Encode four sentences that state the time and that there is no position; None if RMC cannot state the time.
 
-    GBS is empty: it ends the epoch, and gpsd reports an epoch when it sees the sentence that ended the ones before.
+    GBS is empty. It ends the epoch: gpsd reports an epoch when it sees the sentence that ended the previous ones.
     """
     moment = _moment(unix_s)
     if moment is None:
@@ -146,13 +149,13 @@ def epoch_without_fix(unix_s: float) -> bytes | None:
 
 
 def sentence(body: str) -> bytes:
-    """A sentence with its checksum: the exclusive or of all bytes between ``$`` and ``*``."""
+    """Add ``$`` and the checksum, the exclusive or of all bytes between ``$`` and ``*``, to a sentence."""
     data = body.encode("ascii")
     return b"$%b*%02X\r\n" % (data, reduce(xor, data, 0))
 
 
 def _moment(unix_s: float) -> tuple[str, str] | None:
-    """Time of day ``hhmmss.ss`` and date ``ddmmyy`` in UTC, rounded together: midnight changes both."""
+    """Time of day ``hhmmss.ss`` and date ``ddmmyy`` in UTC, rounded together, as midnight changes both."""
     if not isfinite(unix_s) or not _CENTURY_S[0] <= unix_s < _CENTURY_S[1]:
         return None
     seconds, hundredths = divmod(round(unix_s * 100.0), 100)
@@ -161,14 +164,14 @@ def _moment(unix_s: float) -> tuple[str, str] | None:
 
 
 def _angle(angle_deg: float, hemispheres: str, digits: int) -> str:
-    """``dddmm.mmmmmmm,H``. Rounded as an integer, as otherwise 59.99999999 minutes would be written as 60."""
+    """Format as ``dddmm.mmmmmmm,H``. Rounded as an integer: otherwise 59.99999999 minutes would be written as 60."""
     whole, rest = divmod(round(abs(angle_deg) * 60 * MINUTE_UNITS), 60 * MINUTE_UNITS)
     minutes, fraction = divmod(rest, MINUTE_UNITS)
     return f"{whole:0{digits}d}{minutes:02d}.{fraction:07d},{hemispheres[angle_deg < 0.0]}"
 
 
 def _motion(fix: FixMessage, heading_deg: float) -> tuple[str, str]:
-    """Speed over ground in knots, and the course where there is one; empty where the method knows no velocity."""
+    """Speed over ground in knots, and course if there is one; both empty without a velocity."""
     if fix.velocity_mps is None or fix.velocity_covariance is None:
         return "", ""
     east, north, _ = east_north_up(fix.velocity_mps, heading_deg)

@@ -1,7 +1,7 @@
 """``omlox+ws://HOST/v2/ws/socket``: sends each fix as a location to an omlox hub, Hub 2.0.
 
 Names and types of fields: https://omlox.com/fileadmin/api/omlox_Hub_API_2.0.0.json. Coordinates are longitude and
-latitude where the site says where it is on the Earth, else metres of the site's frame.
+latitude if the site is georeferenced, else metres in the site's frame.
 """
 
 import asyncio
@@ -32,10 +32,10 @@ from skyless.run.zones import floor_at
 Object = dict[str, Any]
 
 MAX_BATCH: Final = 100
-"""Locations in one message."""
+"""Largest number of locations in one message."""
 
 MAX_WAITING: Final = 10_000
-"""Locations that wait for the hub. Beyond it the oldest is dropped."""
+"""Largest number of locations waiting for the hub; beyond it the oldest is dropped."""
 
 _GATHER_S: Final = 0.05
 _PAUSE_S: Final = 2.0
@@ -44,14 +44,14 @@ _UUID: Final = re.compile(r"[0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12}")
 
 
 def _foreign_id(site: BridgedSite) -> str:
-    """The name of a site among a hub's zones."""
+    """Foreign id of a site's zone at a hub."""
     return f"skyless-{site.id}"
 
 
 def location(fix: FixMessage, site: BridgedSite, source: str) -> Object:
-    """Where a tag was at the time of a usable fix; ``source`` is the id or foreign id of the hub's zone.
+    """Convert a usable fix to a location; ``source`` is the id or foreign id of the hub's zone.
 
-    The accuracy is one horizontal standard deviation in the worst direction. Local heights count from the floor.
+    The accuracy is one horizontal standard deviation in the worst direction. Local heights are above the floor.
     """
     earth, (x_m, y_m, z_m) = site.georeference, fix.position_m
     floor = None if fix.height_known else floor_at(site.floors, z_m, 0.0, None)
@@ -84,12 +84,12 @@ def location(fix: FixMessage, site: BridgedSite, source: str) -> Object:
 
 
 def _known(**fields: object) -> Object:
-    """The fields that have a value."""
+    """Return the fields that have a value."""
     return {key: value for key, value in fields.items() if value is not None}
 
 
 class OmloxPush(Target):
-    """Sends to one hub."""
+    """Sends locations to one hub."""
 
     def __init__(self, url: TargetUrl, log: Callable[[str], None]) -> None:
         """Raises SkylessError."""
@@ -110,11 +110,11 @@ class OmloxPush(Target):
         self._waiting: deque[Object] = deque()
 
     def on_site(self, site: BridgedSite) -> None:
-        """Keep it."""
+        """Keep the site."""
         self._site = site
 
     def on_fix(self, fix: FixMessage) -> None:
-        """Let it wait for the hub."""
+        """Queue the fix for the hub."""
         assert self._site is not None
         self._waiting.append(location(fix, self._site, self._zone or _foreign_id(self._site)))
         if len(self._waiting) > MAX_WAITING:
@@ -122,7 +122,7 @@ class OmloxPush(Target):
             self.dropped["not-sent"] += 1
 
     async def run(self) -> None:
-        """Send until cancelled. A hub that is away is tried again for ever."""
+        """Send until cancelled. If there is no connection, try again forever."""
         while True:
             try:
                 async with connect(self._address) as hub:
@@ -164,5 +164,5 @@ class OmloxPush(Target):
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> OmloxPush:
-    """The target of an address. Raises SkylessError."""
+    """Create the target for an address. Raises SkylessError."""
     return OmloxPush(url, context.log)

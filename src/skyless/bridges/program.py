@@ -1,6 +1,6 @@
-"""``skyless bridge`` and ``skyless tag --to``: fixes for programs and devices of other kinds.
+"""``skyless bridge`` and ``skyless tag --to``: fixes for other programs and devices.
 
-A bridge gets a site's fixes from its broker, a tag's program gives its own without a broker.
+A bridge gets a site's fixes from its broker; a tag's program passes on its own fixes without a broker.
 """
 
 import asyncio
@@ -47,22 +47,22 @@ from skyless.run.zones import read_zones, zones_of
 if TYPE_CHECKING:  # it compiles kernels, which a bridge of a broker does not need
     from skyless.core.tag.receiver import SiteListener
 
-_SILENT_S: Final = 5.0  # after so long without a fix a line says where to look
+_SILENT_S: Final = 5.0  # after this long without a fix a line says where to look
 
 _GEOREFERENCE_S: Final = 5.0
-"""Where a site sends its georeference, a tag has it this long after the rest: pages come in turn, and some are lost."""
+"""If a site sends its georeference, a tag has it at most this long after the rest: pages take turns, some are lost."""
 
 
 class BridgeState(Struct, frozen=True):
-    """What a bridge has done so far."""
+    """Progress of a bridge."""
 
     seconds: float
     fixes: int
     """Usable fixes of all tags."""
     dropped: dict[str, dict[str, int]]
-    """By target and reason: what its readers missed."""
+    """Number of messages that readers missed, by target and reason."""
     malformed: int
-    """Messages of the broker that could not be read."""
+    """Messages from the broker that could not be read."""
 
 
 class BridgeNode:
@@ -96,13 +96,13 @@ class BridgeNode:
         self.link.subscribe(alarm_topic(site, "+", "+"), alarms, qos=1)
 
     async def run(self) -> None:
-        """Serve until cancelled. Raises SkylessError: a target cannot begin, or the site lacks what they need."""
+        """Serve until cancelled. Raises SkylessError if a target cannot begin, or none can serve the site."""
         self._refused = asyncio.get_running_loop().create_future()
         targets = (run_route(route, self._log) for route in self.hub.routes)
         await together(keep(self.link, self._log), self._refused, *targets, every(SILENCE_CHECK_S, self._on_tick))
 
     def state(self) -> BridgeState:
-        """What it has done so far."""
+        """Return the progress so far."""
         return BridgeState(
             seconds=time.monotonic() - self._started_s,
             fixes=self.hub.fixes,
@@ -148,7 +148,7 @@ class BridgeNode:
         now_s = time.monotonic()
         self.hub.on_tick(now_s, time.time())
         if not self.link.connected:
-            self._last_fix_s = now_s  # tags, too, need a moment to find a broker that is back
+            self._last_fix_s = now_s  # tags, too, need a moment to find a broker that has come back
         if not self._is_silent and now_s - self._last_fix_s > _SILENT_S:
             self._is_silent = True
             known = "no tag publishes fixes" if self._site is not None else "the site itself is not on the broker"
@@ -156,16 +156,16 @@ class BridgeNode:
 
 
 def _name(hub: Hub) -> str:
-    """The bridge's name on MQTT: always the same for its targets, as the broker keeps the status of each name."""
+    """The bridge's name on MQTT, always the same for the same targets, as the broker keeps each name's status."""
     targets = " ".join(route.target.text for route in hub.routes).encode()
     return f"{re.sub(r'[^A-Za-z0-9_-]', '-', platform.node())}-{crc32(targets):08x}"
 
 
 async def run_route(route: Route, log: Log) -> None:
-    """Run a route's target until cancelled. A fault in it is logged, and costs neither a fix nor another target.
+    """Run a route's target until cancelled. A fault in it is logged, and affects neither fixes nor other targets.
 
     Raises:
-        SkylessError: it cannot begin.
+        SkylessError: the target cannot begin.
     """
     try:
         while True:
@@ -181,21 +181,21 @@ async def run_route(route: Route, log: Log) -> None:
 
 
 class TagBridge:
-    """What the tags of one process give away."""
+    """Passes fixes and states of one process's tags to targets, without a broker."""
 
     def __init__(self, hub: Hub, is_simulated: Callable[[], bool], log: Log) -> None:
         self._hub, self._is_simulated, self._log = hub, is_simulated, log
         self._sites: dict[str, _HeardSite] = {}
         self._receivers: dict[str, SiteListener] = {}
-        self._refusal = ""  # why no target can serve the site, as it was logged
+        self._refusal = ""  # why no target can serve the site, as logged
 
     def on_fix(self, fix: FixMessage) -> None:
-        """A fix of one of them. It is dropped if the tag is at another site than the one known to the targets."""
+        """Process a fix. It is dropped if the tag is at another site than the one known to the targets."""
         if self._is_here(fix.tag):
             self._hub.on_fix(fix, time.monotonic())
 
     def on_health(self, health: TagHealth, receiver: "SiteListener") -> None:
-        """State of one of them, once a second, and what it has learned of the site."""
+        """Process the state of a tag, once a second, and the site as the tag has received it."""
         now_s = time.monotonic()
         self._receivers[health.tag] = receiver
         heard = self._sites.setdefault(health.tag, _HeardSite())
@@ -205,11 +205,11 @@ class TagBridge:
         self._hub.on_health(health, now_s)
 
     def on_system_health(self, health: TagHealth) -> None:
-        """State of a tag of another system, whose anchors are configured."""
+        """Process the state of a tag of another system, whose anchors are configured."""
         self._hub.on_health(health, time.monotonic())
 
     def on_site(self, site: BridgedSite) -> None:
-        """The site as one of them knows it: in a large one no tag receives all anchors."""
+        """Process the site as one tag knows it. Anchors of all tags are joined: at a large site no tag receives all."""
         known = self._hub.site
         if known is not None and known.id == site.id:
             anchors_m, georeference = known.anchors_m | site.anchors_m, site.georeference or known.georeference
@@ -227,20 +227,20 @@ class TagBridge:
         return receiver is None or known is None or receiver.site == known.id
 
     async def run(self) -> None:
-        """Serve until cancelled. Raises SkylessError: a target cannot begin."""
+        """Serve until cancelled. Raises SkylessError if a target cannot begin."""
         targets = (run_route(route, self._log) for route in self._hub.routes)
         await together(*targets, every(SILENCE_CHECK_S, lambda: self._hub.on_tick(time.monotonic(), time.time())))
 
 
 class _HeardSite:
-    """The site of a receiver, once all of it is known."""
+    """The site of a receiver, once it is complete."""
 
     def __init__(self) -> None:
         self._number: int | None = None
-        self._complete_s: float | None = None  # since when the rest is known
+        self._complete_s: float | None = None  # since when all but the georeference is known
 
     def update(self, receiver: "SiteListener", now_s: float, *, simulated: bool) -> BridgedSite | None:
-        """The site, or None while it is not complete. ``now_s`` is the host's monotonic clock."""
+        """Return the site; None while it is not complete. ``now_s`` is the host's monotonic clock."""
         number, heard = receiver.site, receiver.heard_site
         if number != self._number:
             self._number, self._complete_s = number, None
@@ -257,7 +257,7 @@ class _HeardSite:
 def heard_site(
     number: int, anchors_m: Mapping[int, Point], page: GeoreferencePage | None = None, *, simulated: bool
 ) -> BridgedSite:
-    """A site whose name is not on the air."""
+    """Make a site from received anchors and georeference; its name is not on the air."""
     earth = None
     if page is not None:
         earth = GeoreferenceSite(page.latitude_deg, page.longitude_deg, page.height_m, page.heading_deg)

@@ -1,7 +1,7 @@
-"""``prometheus:``: serves the figures of a site at ``/metrics``, in Prometheus's text format, version 0.0.4.
+"""``prometheus:``: serves metrics of a site at ``/metrics``, in Prometheus's text format, version 0.0.4.
 
-Counters only rise, also where a tag or an anchor has been started again. Ages are those of the moment of the scrape.
-Other gauges are given while their source is fresh, so that nothing old looks present.
+Counters only rise, even if a tag or an anchor is restarted. Ages are those at the moment of the scrape. Other gauges
+are included only while their source is fresh, so that old values do not look current.
 Format: https://prometheus.io/docs/instrumenting/exposition_formats/#text-based-format.
 """
 
@@ -25,21 +25,21 @@ CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
 
 Labels = Mapping[str, str]
 Sample = tuple[Labels, float]
-"""Its labels by name, and its value."""
+"""Labels by name, and the value."""
 
 GAUGE_AGE_S: Final = 5.0
-"""Gauges of an older fix or an older health are not given."""
+"""Gauges from a fix or health message older than this are left out."""
 
 LATENCY_BOUNDS_S: Final = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 
 _MAX_NAMES: Final = 2000
 _MAX_REASONS: Final = 50
-"""Reasons of dropped frames that are counted for one node."""
+"""Largest number of reasons for dropped frames that are counted for one node."""
 
 _FIXES: Final = "skyless_tag_fixes_total"
 _PORT: Final = 9464
 
-# What is given as it stands in a message: the metric's name, the message's field, and a line of help.
+# Metrics whose values are fields of a message: the metric's name, the message's field, and a line of help.
 
 _Plain = tuple[tuple[str, str, str], ...]
 _TAG_COUNTERS: Final[_Plain] = (
@@ -96,7 +96,7 @@ _ESCAPES: Final = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n"})
 
 
 def family(name: str, kind: Literal["counter", "gauge"], text: str, samples: Iterable[Sample]) -> list[str]:
-    """The lines of one metric; none where it has no samples. ``text`` is one line of help."""
+    """Return the lines of one metric; none if it has no samples. ``text`` is one line of help."""
     lines = [_sample(name, labels, value) for labels, value in samples]
     return [*_header(name, kind, text), *lines] if lines else []
 
@@ -104,9 +104,9 @@ def family(name: str, kind: Literal["counter", "gauge"], text: str, samples: Ite
 def histograms(
     name: str, text: str, bounds: Sequence[float], samples: Iterable[tuple[Labels, Sequence[int], float]]
 ) -> list[str]:
-    """The lines of a histogram: of each sample its labels, how many values each bucket got, and their sum.
+    """Return the lines of a histogram. A sample has labels, the number of values in each bucket, and their sum.
 
-    ``bounds`` are the upper ends of the buckets, rising; one more count is of values above them all.
+    ``bounds`` are the upper ends of the buckets in rising order; the last bucket, which has no bound, is added.
     """
     lines = []
     for labels, counts, total in samples:
@@ -136,43 +136,43 @@ def _number(value: float) -> str:
 
 
 class Rising:
-    """A counter of a node that begins at 0 whenever the node is started."""
+    """The total of a node's counter, which begins at 0 whenever the node is started."""
 
     def __init__(self) -> None:
         self._before = self._now = 0
 
     @property
     def total(self) -> int:
-        """Over all of the node's runs."""
+        """The sum over all of the node's runs."""
         return self._before + self._now
 
     def update(self, value: int, *, restarted: bool = False) -> None:
-        """Its value in the node's present run; a lower one than before, without a restart, is a late message's."""
+        """Set the value in the node's present run. Without a restart a lower value, from a late message, is ignored."""
         if restarted:
             self._before, self._now = self.total, 0
         self._now = max(self._now, value)
 
 
 class _Node:
-    """What is known of a tag or an anchor."""
+    """State and counters of a tag or an anchor."""
 
     def __init__(self) -> None:
         self.online: bool | None = None
-        """None as long as nobody has said."""
+        """None while unknown."""
         self.health: TagHealth | AnchorHealth | None = None
         self.health_s = 0.0
-        """When its last health came."""
+        """When its last health message arrived."""
         self.counters: dict[str, Rising] = {}
-        """By the metric's name."""
+        """Counters by the metric's name."""
         self.dropped: dict[str, Rising] = {}
         self.fix: FixMessage | None = None
         self.fix_s = 0.0
-        """When the last fix ended, by the clock of arrivals."""
+        """When the last fix's last frame ended, by the clock of arrivals."""
         self.latency_counts = [0] * (len(LATENCY_BOUNDS_S) + 1)
         self.latency_sum_s = 0.0
 
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
-        """Process the counters of its health."""
+        """Process a health message and its counters."""
         restarted = self.health is not None and health.uptime_s < self.health.uptime_s
         self.health, self.health_s = health, now_s
         counters = _TAG_COUNTERS if isinstance(health, TagHealth) else _ANCHOR_COUNTERS
@@ -189,19 +189,19 @@ _Nodes = list[tuple[Labels, _Node]]
 
 
 class SiteMetrics:
-    """Gathers the figures of one site. It does no I/O; the time is passed in."""
+    """Collects the metrics of one site. No I/O; the time is passed in."""
 
     def __init__(self, *, positions: bool = False) -> None:
-        """``positions``: whether to give where tags are."""
+        """``positions``: whether to include the tags' positions."""
         self.dropped: Counter[str] = Counter()
-        """Messages of nodes that are not counted, by reason."""
+        """Messages that were ignored, by reason."""
         self.site: BridgedSite | None = None
         self._positions = positions
         self._tags: dict[str, _Node] = {}
         self._anchors: dict[str, _Node] = {}
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
-        """A usable fix, which comes at ``now_s`` of the clock of ``text``."""
+        """Process a usable fix that arrived at ``now_s``, on the clock of ``text``."""
         tag = self._known(self._tags, fix.tag)
         if tag is None:
             return
@@ -212,7 +212,7 @@ class SiteMetrics:
         tag.latency_sum_s += latency_s
 
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
-        """State of a tag or an anchor."""
+        """Process the state of a tag or an anchor."""
         is_tag = isinstance(health, TagHealth)
         name = health.tag if isinstance(health, TagHealth) else str(health.anchor)
         node = self._known(self._tags if is_tag else self._anchors, name)
@@ -220,14 +220,14 @@ class SiteMetrics:
             node.on_health(health, now_s)
 
     def on_status(self, status: StatusMessage) -> None:
-        """A tag or an anchor has come or gone."""
+        """Process a tag or an anchor going online or offline."""
         nodes = {"tag": self._tags, "anchor": self._anchors}.get(status.kind)
         node = None if nodes is None else self._known(nodes, status.name)
         if node is not None:
             node.online = status.online
 
     def _known(self, nodes: dict[str, _Node], name: str) -> _Node | None:
-        """The node of a name, a new one where there is none; None for what is no name, and where there are too many."""
+        """Return the node of a name, created if missing; None if the name is invalid or there are too many."""
         if name not in nodes:
             if not TAG_NAME.fullmatch(name):
                 self.dropped["name"] += 1
@@ -238,7 +238,7 @@ class SiteMetrics:
         return nodes.get(name)
 
     def text(self, now_s: float) -> str:
-        """All of it in Prometheus's format."""
+        """Return all metrics in Prometheus's format."""
         tags: _Nodes = [({"tag": name}, tag) for name, tag in sorted(self._tags.items())]
         anchors: _Nodes = [({"anchor": name}, anchor) for name, anchor in sorted(self._anchors.items())]
         groups = (("tag", self._tags), ("anchor", self._anchors))
@@ -325,7 +325,7 @@ def _fresh(nodes: _Nodes, now_s: float) -> list[tuple[Labels, TagHealth | Anchor
 def _trust_lines(
     trusting: Sequence[tuple[Labels, TagHealth]], fresh: Iterable[tuple[Labels, FixMessage]]
 ) -> Iterator[str]:
-    """Figures of tags with the site's public key."""
+    """Lines of metrics of tags that have the site's public key."""
     names = {labels["tag"] for labels, _ in trusting}
     yield from _gauges(_KEY_GAUGES, trusting)
     text = "Share of the last second's beacons that were verified when the tag's last fix was made."
@@ -336,7 +336,7 @@ def _trust_lines(
 
 
 def _faults(nodes: Iterable[tuple[Labels, Mapping[str, str]]]) -> list[tuple[Labels, float]]:
-    """The number of anchors for each fault that a node states."""
+    """Number of anchors with each fault, by node."""
     return [
         ({**labels, "reason": fault}, count)
         for labels, faults in nodes
@@ -375,40 +375,40 @@ def _dropped(nodes: _Nodes) -> list[Sample]:
 class Prometheus(Target):
     """An HTTP server with one page; each connection carries one request.
 
-    Made by hand, as the servers of libraries wait for ever for the end of a request: here each connection has a limit
-    of time and of bytes, and where there are too many the oldest is ended, so that none keeps a scrape out.
+    It uses no library, as servers of libraries wait forever for the end of a request. Here each connection has limits
+    of time and bytes, and if there are too many, the oldest is closed, so that none keeps a scrape out.
     """
 
     def __init__(self, text: str, host: str, port: int, names: Collection[str] = (), *, positions: bool) -> None:
-        """``names`` are those by which others reach it, besides the computer's own and its addresses."""
+        """``names`` are further host names by which clients reach it, besides this computer's names and addresses."""
         super().__init__(text)
         self._names = {*own_names(host), *names}
         self.metrics = SiteMetrics(positions=positions)
         self.dropped = self.metrics.dropped
         self.port = port
-        """The one that is used, where 0 was asked for and the server runs."""
+        """The port in use while the server runs, also if 0 was given."""
         self._host = host
         self._open: dict[asyncio.StreamWriter, None] = {}
-        """The oldest first."""
+        """Open connections, the oldest first."""
 
     def on_site(self, site: BridgedSite) -> None:
-        """The site is known, or has changed."""
+        """Keep the site."""
         self.metrics.site = site
 
     def on_fix(self, fix: FixMessage) -> None:
-        """Count it."""
+        """Count a fix."""
         self.metrics.on_fix(fix, time.monotonic())
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
-        """Keep its figures."""
+        """Keep a tag's or anchor's state."""
         self.metrics.on_health(health, time.monotonic())
 
     def on_status(self, status: StatusMessage) -> None:
-        """A tag or an anchor has come or gone."""
+        """Keep whether a tag or an anchor is online."""
         self.metrics.on_status(status)
 
     async def run(self) -> None:
-        """Serve until cancelled. Raises SkylessError: it cannot listen there."""
+        """Serve until cancelled. Raises SkylessError if it cannot listen."""
         try:
             server = await asyncio.start_server(self._serve, self._host, self.port, limit=LIMITS.head_bytes)
         except OSError as error:
@@ -468,9 +468,9 @@ def _response(status: str, text: str, content_type: str = "text/plain; charset=u
 
 
 def make_target(url: TargetUrl, _context: BridgeContext) -> Prometheus:
-    """``prometheus://[HOST][:PORT]``; with ``position=yes`` it gives where tags are. Raises SkylessError.
+    """Create the target for ``prometheus://[HOST][:PORT]``. Raises SkylessError.
 
-    ``hosts=`` has names by which others reach it, with commas.
+    ``position=yes`` includes the tags' positions; ``hosts=`` lists further host names of this server, with commas.
     """
     names = [name.lower() for name in url.text_option("hosts").split(",") if name]
     positions = url.choice("position", ("no", "yes"), "no") == "yes"

@@ -1,10 +1,10 @@
-"""The target ``ros2://``: a site's fixes as topics of ROS 2 over Cyclone DDS, where ROS itself need not be installed.
+"""The target ``ros2://``: a site's fixes as ROS 2 topics over Cyclone DDS, without ROS being installed.
 
     ros2://?domain=0&frame=site&namespace=skyless&tf=no
 
-Names and qualities of service: https://design.ros2.org/articles/topic_and_service_names.html and REP 2011 (hashes of
-types). The definitions of the types come from rosbags. A thread writes, because DDS may wait and a tag's program must
-not. What it cannot keep up with is dropped, the oldest first.
+Names and qualities of service: https://design.ros2.org/articles/topic_and_service_names.html and REP 2011 (type
+hashes). The type definitions come from rosbags. A thread writes, because DDS may block and a tag's program must not. If
+the thread cannot keep up, the oldest messages are dropped.
 """
 
 import asyncio
@@ -26,30 +26,29 @@ from skyless.core.errors import SkylessError
 from skyless.machine import what_to_install
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, Matrix, TagHealth, Vector
 
-# From fixes to messages of ROS 2: names of topics, types, and the bytes of each message.
+# From fixes to ROS 2 messages: topic names, types, and the bytes of each message.
 #
-# Definitions of the messages and the meaning of their fields: the packages ``common_interfaces`` and ``geometry2`` of
-# ROS 2; names of topics: REP 144 and https://design.ros2.org/articles/topic_and_service_names.html. The bytes are
-# little endian CDR (OMG DDSI-RTPS 2.5, section 10; DDS-XTypes 1.3, section 7.4.1, XCDR version 1 of final types), the
-# same in DDS and in a bag.
+# Message definitions and the meaning of their fields: ROS 2's packages ``common_interfaces`` and ``geometry2``; topic
+# names: REP 144 and https://design.ros2.org/articles/topic_and_service_names.html. The bytes are little-endian CDR (OMG
+# DDSI-RTPS 2.5, section 10; DDS-XTypes 1.3, section 7.4.1, XCDR version 1 of final types), the same in DDS and bags.
 
 SITE_FRAME: Final = "site"
 NAMESPACE: Final = "skyless"
 
 FRAME_NAME: Final = re.compile(r"[A-Za-z0-9_-][A-Za-z0-9_/-]{0,63}")
-"""What users may call the site's frame; tf2 refuses names that begin with a /."""
+"""Allowed names of the site's frame; tf2 refuses names that begin with a /."""
 
 FRAME_RULE: Final = "a frame's name: letters, digits, _, - and /, not a / first"
-"""In words, for messages."""
+"""``FRAME_NAME`` in words, for messages."""
 
 UNKNOWN_VARIANCE: Final = 1e6
-"""Variance of each angle [rad²] and of its rate: a tag does not know its orientation."""
+"""Variance of each angle [rad²] and angular rate: a tag does not know its orientation."""
 
 _NO_TURN: Final = (0.0, 0.0, 0.0, 1.0)
 _ANGLES: Final = 3
 _STATUS_NO_FIX, _STATUS_FIX = -1, 0
 _SERVICE_UNKNOWN: Final = 0
-"""No satellite system: a figure that ROS gave a name after Humble."""
+"""No satellite system; ROS named this value after Humble."""
 
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 _OK, _WARN, _ERROR = 0, 1, 2
@@ -57,8 +56,7 @@ _CUBE, _TEXT_VIEW_FACING = 1, 9
 _ANCHOR_SIZE_M: Final = 0.15
 _LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
 
-
-# Types of messages, ``package/msg/Name``.
+# Message types, ``package/msg/Name``.
 POSE: Final = "geometry_msgs/msg/PoseWithCovarianceStamped"
 TRUE_POSE: Final = "geometry_msgs/msg/PoseStamped"
 TWIST: Final = "geometry_msgs/msg/TwistWithCovarianceStamped"
@@ -69,28 +67,28 @@ MARKERS: Final = "visualization_msgs/msg/MarkerArray"
 
 
 class RosMessage(Struct, frozen=True):
-    """One message on its topic."""
+    """One message with its topic."""
 
     topic: str
     type: str
     data: bytes
     """CDR with its header of four bytes."""
     lasting: bool = False
-    """Whether a subscriber that comes later gets it, too (transient local)."""
+    """Whether later subscribers get it, too (transient local)."""
 
 
 class RosSettings(Struct, frozen=True):
-    """What a user may choose."""
+    """Settings that a user may choose."""
 
     frame: str = SITE_FRAME
-    """``frame_id`` of poses and velocities: the site's frame, x, y, z as in the site file."""
+    """``frame_id`` of poses and velocities: the site's frame, with x, y, z as in the site file."""
     namespace: str = NAMESPACE
     transforms: bool = False
-    """Whether ``/tf`` gets a transform from the site's frame to each tag's."""
+    """Whether to publish on ``/tf`` a transform from the site's frame to each tag's."""
 
 
 class RosEncoder:
-    """Makes the messages of a site; does no I/O and reads no clock."""
+    """Makes ROS 2 messages about a site. No I/O and no clock."""
 
     def __init__(self, settings: RosSettings) -> None:
         self._settings = settings
@@ -98,7 +96,7 @@ class RosEncoder:
         self._names: dict[str, str] = {}
 
     def on_site(self, site: BridgedSite) -> list[RosMessage]:
-        """The anchors, as RViz draws them; at the stamp 0, which means at any time. Nothing if they are known."""
+        """Return the anchors as RViz draws them, with stamp 0, which means any time; empty if the site is unchanged."""
         if site == self._site:
             return []
         self._site = site
@@ -106,7 +104,7 @@ class RosEncoder:
         return [RosMessage(topic, MARKERS, _markers(site, self._settings.frame), lasting=True)]
 
     def on_fix(self, fix: FixMessage) -> list[RosMessage]:
-        """Pose, velocity, and position on the Earth, of a usable fix."""
+        """Return pose, velocity, global position and transform of a usable fix, as far as known and chosen."""
         frame = self._settings.frame
         covariance_m2 = floored(fix.covariance_m2)
         found = [RosMessage(self._topic(fix.tag, "pose"), POSE, _pose(fix, covariance_m2, frame))]
@@ -123,17 +121,17 @@ class RosEncoder:
         return found
 
     def on_no_fix(self, tag: str, unix_s: float) -> list[RosMessage]:
-        """That there is none, on the topic whose type can say so."""
+        """Return the statement that there is no fix, for the topic whose type has one."""
         if self._site is None or self._site.georeference is None:
             return []
         return [RosMessage(self._topic(tag, "fix"), NAV_SAT_FIX, _nav_sat_fix(self._name(tag), unix_s, None, None))]
 
     def on_health(self, health: TagHealth | AnchorHealth) -> list[RosMessage]:
-        """The state of a tag or an anchor."""
+        """Return diagnostics of a tag or an anchor."""
         return [RosMessage("/diagnostics", DIAGNOSTICS, _diagnostics(health))]
 
     def on_truth(self, tag: str, unix_s: float, position_m: Vector) -> list[RosMessage]:
-        """Where a simulated tag truly was."""
+        """Return the true position of a simulated tag."""
         writer = _stamped(unix_s, self._settings.frame)
         writer.add("d", *position_m, *_NO_TURN)
         return [RosMessage(self._topic(tag, "truth"), TRUE_POSE, writer.message())]
@@ -142,7 +140,7 @@ class RosEncoder:
         return f"/{self._settings.namespace}/{self._name(tag)}/{what}"
 
     def _name(self, tag: str) -> str:
-        """A tag's name as ROS allows it; tags whose names become equal are numbered as they come."""
+        """A tag's name as ROS allows it; tags whose names become equal are numbered in order of appearance."""
         if tag not in self._names:
             plain = ros_name(tag)
             taken, number = set(self._names.values()), 2
@@ -154,13 +152,13 @@ class RosEncoder:
 
 
 def ros_name(text: str) -> str:
-    """Text as one part of a topic's name: letters, digits and single _, a letter first."""
+    """Convert a text to one part of a topic's name: letters, digits and single _, a letter first."""
     plain = re.sub(r"[^A-Za-z0-9]+", "_", text).strip("_")
     return plain if plain[:1].isalpha() else f"tag_{plain}".strip("_")
 
 
 def stamp_of(unix_s: float) -> tuple[int, int]:
-    """``builtin_interfaces/Time``: whole seconds and nanoseconds, to the nearest; 0 for what it cannot hold."""
+    """``builtin_interfaces/Time``: whole seconds and nanoseconds, rounded; 0 for a time that it cannot hold."""
     if not isfinite(unix_s) or not 0.0 <= unix_s < 2**31 - 1:
         return 0, 0
     seconds = floor(unix_s)
@@ -169,30 +167,30 @@ def stamp_of(unix_s: float) -> tuple[int, int]:
 
 
 class CdrWriter:
-    """Gathers the fields of one message in their order, each at a multiple of its own size after the header."""
+    """Collects the fields of one message in order, each aligned to its own size after the header."""
 
     def __init__(self) -> None:
         self._data = bytearray()
 
     def add(self, code: str, *values: float) -> None:
-        """Numbers of one of ``struct``'s types: ``B b H h I i f d``; ``?`` for flags. Raises struct.error."""
+        """Add numbers of one of ``struct``'s types: ``B b H h I i f d``; ``?`` for flags. Raises struct.error."""
         size = struct.calcsize(f"<{code}")
         self._data += bytes(-len(self._data) % size)
         self._data += struct.pack(f"<{len(values)}{code}", *values)
 
     def add_text(self, text: str) -> None:
-        """A string: its length with the NUL that ends it, then both. Other NULs are left out."""
+        """Add a string: its length including the final NUL, the text, and the NUL. Other NULs are left out."""
         data = text.replace("\0", "").encode() + b"\0"
         self.add("I", len(data))
         self._data += data
 
     def message(self) -> bytes:
-        """The whole message with its header."""
+        """Return the whole message with its header."""
         return _LITTLE_ENDIAN + bytes(self._data)
 
 
 def _stamped(unix_s: float, frame: str) -> CdrWriter:
-    """A message that begins with ``std_msgs/Header``."""
+    """Begin a message with ``std_msgs/Header``."""
     writer = CdrWriter()
     _add_header(writer, unix_s, frame)
     return writer
@@ -214,7 +212,7 @@ def _pose(fix: FixMessage, covariance_m2: Matrix, frame: str) -> bytes:
 
 
 def _velocity(fix: FixMessage, frame: str) -> bytes | None:
-    """``geometry_msgs/TwistWithCovarianceStamped`` in the site's frame; None where it is not known."""
+    """``geometry_msgs/TwistWithCovarianceStamped`` in the site's frame; None if the velocity is unknown."""
     if fix.velocity_mps is None or fix.velocity_covariance is None:
         return None
     if not all(map(isfinite, (*fix.velocity_mps, *fix.velocity_covariance))):
@@ -226,7 +224,7 @@ def _velocity(fix: FixMessage, frame: str) -> bytes | None:
 
 
 def _with_angles(covariance: Matrix) -> list[float]:
-    """Six by six, row by row: the given three and unknown angles."""
+    """Extend a 3 × 3 covariance to 6 × 6, row by row, with unknown angles."""
     rows = [[*covariance[3 * row : 3 * row + 3], *(0.0,) * _ANGLES] for row in range(3)]
     angles = [[UNKNOWN_VARIANCE * (row == column) for column in range(3, 6)] for row in range(3, 6)]
     return [value for row in (*rows, *([0.0, 0.0, 0.0, *angle] for angle in angles)) for value in row]
@@ -235,7 +233,7 @@ def _with_angles(covariance: Matrix) -> list[float]:
 def _nav_sat_fix(frame: str, unix_s: float, earth: Vector | None, covariance_m2: Matrix | None) -> bytes:
     """``sensor_msgs/NavSatFix``: latitude, longitude, height on WGS 84; covariance towards east, north, up.
 
-    Without a position: status no fix, NaN, and a covariance that is not known.
+    Without a position: status no fix, NaN, and an unknown covariance.
     """
     writer = _stamped(unix_s, frame)
     writer.add("b", _STATUS_NO_FIX if earth is None else _STATUS_FIX)
@@ -289,7 +287,7 @@ def _diagnostics(health: TagHealth | AnchorHealth) -> bytes:
 
 
 def _markers(site: BridgedSite, frame: str) -> bytes:
-    """``visualization_msgs/MarkerArray``: a cube and its number for each anchor."""
+    """``visualization_msgs/MarkerArray``: a cube and a number for each anchor."""
     writer = CdrWriter()
     writer.add("I", 2 * len(site.anchors_m))
     for number, (x, y, z) in sorted(site.anchors_m.items()):
@@ -308,25 +306,25 @@ def _add_marker(
     writer.add("d", *position_m, *_NO_TURN)
     writer.add("d", *(_ANCHOR_SIZE_M,) * 3)
     writer.add("f", 1.0, 0.6, 0.0, 1.0)
-    writer.add("i", 0)  # lifetime: for ever
+    writer.add("i", 0)  # lifetime: forever
     writer.add("I", 0)
     writer.add("?", True)  # follows its frame
     writer.add("I", 0)  # points
     writer.add("I", 0)  # colours
-    writer.add_text("")  # texture: name, and an image of none
+    writer.add_text("")  # texture: name, and an empty image
     _add_header(writer, 0.0, "")
     writer.add_text("")
     writer.add("I", 0)
     writer.add("I", 0)  # texture coordinates
     writer.add_text(text)
-    writer.add_text("")  # mesh: name, and a file of none
+    writer.add_text("")  # mesh: name, and an empty file
     writer.add_text("")
     writer.add("I", 0)
     writer.add("?", False)
 
 
 DEPTH: Final = 10
-"""Messages of a topic that are kept for readers that have not confirmed them."""
+"""Messages kept on each topic for readers that have not confirmed them."""
 
 _MAX_BLOCKING_NS: Final = 10_000_000
 
@@ -334,12 +332,12 @@ _SETTINGS: Final = (
     "<CycloneDDS><Domain Id='any'><Compatibility><IgnoreTypeInformation>1.15</IgnoreTypeInformation></Compatibility>"
     "</Domain></CycloneDDS>"
 )
-"""1.15 is Fast DDS's number among vendors, whose descriptions of types Cyclone DDS cannot read: without this, its
-subscribers see the topics and get nothing."""
+"""1.15 is the vendor number of Fast DDS, whose type descriptions Cyclone DDS cannot read: without this setting, Fast
+DDS's subscribers see the topics but get nothing."""
 
 
 class DdsTypes:
-    """Types of ROS 2's messages as Cyclone DDS announces them. Raises ImportError where a package is missing."""
+    """Types of ROS 2 messages as Cyclone DDS announces them. Raises ImportError if a package is missing."""
 
     def __init__(self) -> None:
         self._idl: Any = import_module("cyclonedds.idl")
@@ -350,11 +348,11 @@ class DdsTypes:
         self._made: dict[str, Any] = {}
 
     def hash(self, name: str) -> str:
-        """What ROS since Iron compares to see that both ends mean the same (REP 2011)."""
+        """Hash of a type, by which ROS since Iron checks that both ends use the same type (REP 2011)."""
         return str(self._store.hash_rihs01(name))
 
     def type(self, name: str) -> Any:  # noqa: ANN401 - a class whose fields only DDS sees
-        """The type ``package/msg/Name``, which DDS knows as ``package::msg::dds_::Name_``."""
+        """Return the type ``package/msg/Name``, which DDS knows as ``package::msg::dds_::Name_``."""
         if name not in self._made:
             fields = {field: self._field(*given) for field, given in self._store.get_msgdef(name).fields}
             package, kind, last = name.split("/")
@@ -372,7 +370,7 @@ class DdsTypes:
 
 
 class DdsPublisher:
-    """A participant of a DDS domain; its methods may wait, for some milliseconds."""
+    """A participant of a DDS domain; its methods may block for some milliseconds."""
 
     def __init__(self, text: str, domain: int) -> None:
         """``text`` is the target's address. Raises SkylessError: DDS is not installed, or cannot start."""
@@ -396,16 +394,16 @@ class DdsPublisher:
         self._writers: dict[str, Any] = {}
 
     def write(self, message: RosMessage) -> None:
-        """Publish one. Lets the errors of DDS through."""
+        """Publish a message. Errors of DDS are raised as they are."""
         writer = self._writers.get(message.topic)
         if writer is None:
             writer = self._writers[message.topic] = self._writer(message)
         writer.write(writer.data_type.deserialize(message.data))
 
     def close(self) -> None:
-        """Leave the domain, so that subscribers need not wait until they miss us. Nothing can be written any more."""
+        """Leave the domain, so that subscribers notice at once. Nothing can be written afterwards."""
         self._writers.clear()
-        del self._participant  # Cyclone's objects end when nothing refers to them
+        del self._participant  # Cyclone DDS closes objects that nothing refers to
 
     def _writer(self, message: RosMessage) -> Any:  # noqa: ANN401 - a DataWriter, where the package is
         policy = self._dds.qos.Policy
@@ -425,12 +423,12 @@ class DdsPublisher:
 
 @cache
 def _domain(number: int, given: str) -> Any:  # noqa: ANN401 - a Domain, where the package is
-    """A domain with our settings, then those of CYCLONEDDS_URI. The cache keeps it: its settings would go with it."""
+    """Create a domain with our settings, then those of CYCLONEDDS_URI. The cache keeps it and so its settings."""
     return import_module("cyclonedds.domain").Domain(number, f"{_SETTINGS},{given}" if given else _SETTINGS)
 
 
 _MAX_DOMAIN: Final = 232
-"""Beyond it, ports would exceed 65535."""
+"""With a larger number ports would exceed 65535."""
 
 _MAX_WAITING: Final = 500
 _CLOSE_S: Final = 1.0
@@ -438,7 +436,7 @@ _NAMESPACE: Final = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,31}(/[A-Za-z][A-Za-z0-9_
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Target:
-    """The target of an address. Raises SkylessError."""
+    """Create the target for an address. Raises SkylessError."""
     frame, namespace = url.text_option("frame", SITE_FRAME), url.text_option("namespace", NAMESPACE)
     if not FRAME_NAME.fullmatch(frame):
         raise url.wrong(f"with frame= {FRAME_RULE}")
@@ -454,7 +452,7 @@ def make_target(url: TargetUrl, context: BridgeContext) -> Target:
 
 
 def _usual_domain(target: str) -> int:
-    """As programs of ROS choose it. Raises SkylessError."""
+    """Return the domain that programs of ROS use by default. Raises SkylessError."""
     text = os.environ.get("ROS_DOMAIN_ID") or "0"
     if not text.isdecimal() or int(text) > _MAX_DOMAIN:
         raise SkylessError(
@@ -465,7 +463,7 @@ def _usual_domain(target: str) -> int:
 
 
 class Ros2Target(Target):
-    """Publishes poses, velocities, positions on the Earth, anchors and diagnostics."""
+    """Publishes poses, velocities, global positions, anchors and diagnostics."""
 
     def __init__(self, text: str, publisher: DdsPublisher, settings: RosSettings, context: BridgeContext) -> None:
         super().__init__(text)
@@ -473,25 +471,25 @@ class Ros2Target(Target):
         self._waiting: queue.Queue[list[RosMessage] | None] = queue.Queue(_MAX_WAITING)
         self._troubles: set[str] = set()
         self._knows_no_earth = False
-        """Whether it was logged that the site does not know where it is."""
+        """Whether it was logged that the site has no georeference."""
 
     def on_site(self, site: BridgedSite) -> None:
-        """Publish its anchors."""
+        """Publish the site's anchors."""
         if site.georeference is None and not self._knows_no_earth:
             self._knows_no_earth = True
             self._log(f"{self.text}: no topic fix (NavSatFix), as the site file has no [georeference]")
         self._give(self._encoder.on_site(site))
 
     def on_fix(self, fix: FixMessage) -> None:
-        """Publish it."""
+        """Publish a fix."""
         self._give(self._encoder.on_fix(fix))
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:  # noqa: ARG002 - NavSatFix has no text
-        """Publish that there is none; the reason is in the diagnostics."""
+        """Publish that there is no fix; the reason is in the diagnostics."""
         self._give(self._encoder.on_no_fix(tag, unix_s))
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
-        """Publish it as diagnostics."""
+        """Publish a tag's or anchor's state as diagnostics."""
         self._give(self._encoder.on_health(health))
 
     async def run(self) -> None:
@@ -505,7 +503,7 @@ class Ros2Target(Target):
             await asyncio.to_thread(thread.join, _CLOSE_S)
 
     def _give(self, messages: list[RosMessage] | None) -> None:
-        """Let the thread write them; where too many wait, the oldest are dropped."""
+        """Queue messages for the thread, dropping the oldest if the queue is full. None ends the thread."""
         while True:
             try:
                 self._waiting.put_nowait(messages)
@@ -522,7 +520,7 @@ class Ros2Target(Target):
             for message in messages:
                 try:
                     self._publisher.write(message)
-                except Exception as error:  # noqa: BLE001 - whatever it is, later messages may go
+                except Exception as error:  # noqa: BLE001 - whatever it is, later messages may succeed
                     self.dropped["not-sent"] += 1
                     if message.topic not in self._troubles:
                         self._troubles.add(message.topic)

@@ -1,6 +1,6 @@
-"""A recording of a running site as a bag of ROS 2: a folder with an MCAP of CDR messages and ``metadata.yaml``.
+"""Convert a recording to a ROS 2 bag: a folder with an MCAP of CDR messages and ``metadata.yaml``.
 
-The messages are those that the target ``ros2://`` publishes while a site runs, and the truth where it is known.
+The messages are those that the target ``ros2://`` publishes while a site runs, and the truth if it is known.
 """
 
 import importlib
@@ -32,27 +32,27 @@ BagVersion = Literal[8, 9]
 
 _KINDS: Final = {"site", "fix", "health", "truth"}
 _KEPT: Final = 10
-"""Depth of the queues that ``ros2 bag play`` then makes, as ``ros2://`` does."""
+"""Queue depth with which ``ros2 bag play`` then publishes, as ``ros2://`` does."""
 
 
 class Bag(Struct, frozen=True):
-    """What was written."""
+    """Contents of a bag that was written."""
 
     path: str
     start_s: float
     end_s: float
     """Unix times of the first and last message."""
     topics: dict[str, int]
-    """Messages on each."""
+    """Number of messages on each topic."""
     types: dict[str, str]
     """Type of each topic."""
     fixes: int
     unusable: int
-    """Fixes that were left out because an alert forbids their use, or they are not finite."""
+    """Fixes left out because an alert forbids their use, or because they are not finite."""
     drops: dict[str, int]
-    """What of the recording could not be read."""
+    """Unreadable parts of the recording, by reason."""
     finished: bool
-    """False where the recording was cut off, or is still being written."""
+    """False if the recording was cut off, or is still being written."""
 
 
 def write_bag(
@@ -62,11 +62,11 @@ def write_bag(
     tag: str | None = None,
     version: BagVersion = 9,
 ) -> Bag:
-    """Write a recording of ``skyless record`` as a bag: the whole folder or nothing. ``tag``: only this one.
+    """Write a recording of ``skyless record`` as a bag, the whole folder or nothing. ``tag`` selects one tag.
 
     Raises:
         ConfigurationError: the recording cannot be read, or the folder exists.
-        SkylessError: there is no site in it; the folder cannot be written; the package rosbags is missing.
+        SkylessError: the recording has no site; the folder cannot be written; the package rosbags is missing.
     """
     with McapRecording(recording) as source:
         site = source.site
@@ -104,7 +104,7 @@ def _copy(
 
 
 def _messages_of(found: Recorded, encoder: RosEncoder, tag: str | None) -> list[RosMessage]:
-    """What one recorded message becomes."""
+    """Convert one recorded message."""
     message = found.message
     if isinstance(message, SiteMessage):
         return encoder.on_site(bridged_site(message.site, simulated=message.simulated))
@@ -113,28 +113,27 @@ def _messages_of(found: Recorded, encoder: RosEncoder, tag: str | None) -> list[
     if isinstance(message, AnchorHealth) or (isinstance(message, TagHealth) and tag in (None, message.tag)):
         return encoder.on_health(message)
     if isinstance(message, TruthMessage):
-        wanted = {name: motion for name, motion in message.tags.items() if tag in (None, name)}
-        motions = wanted.items()
-        return [one for name, motion in motions for one in encoder.on_truth(name, message.unix_s, motion.position_m)]
+        wanted = [(name, motion) for name, motion in message.tags.items() if tag in (None, name)]
+        return [one for name, motion in wanted for one in encoder.on_truth(name, message.unix_s, motion.position_m)]
     return []
 
 
 @contextmanager
 def _new_folder(folder: Path) -> Iterator[Path]:
-    """A folder to be made in the block, which gets its name if the block ends without an error."""
+    """Provide a path at which the block creates a folder; it is renamed to ``folder`` if no error occurs."""
     if folder.exists():
         raise ConfigurationError(folder, "", None, "a new folder; this one exists and is not overwritten")
     outer = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}")
     try:
         outer.mkdir(parents=True)
-        yield outer / folder.name  # the bag's file is called as its folder
+        yield outer / folder.name  # the bag's file is named after its folder
         (outer / folder.name).rename(folder)
     finally:
         shutil.rmtree(outer, ignore_errors=True)
 
 
 class _BagWriter:
-    """Writes messages into a bag; a topic begins with its first one."""
+    """Writes messages to a bag; a topic is created with its first message."""
 
     def __init__(self, folder: Path, version: BagVersion) -> None:
         """Raises SkylessError: the package that writes bags is missing."""
@@ -167,7 +166,7 @@ class _BagWriter:
         self._writer.write(topic, round(time_s * NS), message.data)
 
     def counts(self) -> dict[str, int]:
-        """Messages on each topic."""
+        """Number of messages on each topic."""
         return {name: self._writer.counts[topic.id] for name, topic in sorted(self._topics.items())}
 
     def types(self) -> dict[str, str]:
@@ -176,7 +175,7 @@ class _BagWriter:
 
 
 def _quality(*, lasting: bool) -> "Qos":
-    """How ``ros2 bag play`` publishes a topic: as ``ros2://`` does."""
+    """Quality of service with which ``ros2 bag play`` publishes a topic, as ``ros2://`` does."""
     of = importlib.import_module("rosbags.interfaces")
     never = of.QosTime(0, 0)
     return cast(

@@ -1,4 +1,4 @@
-"""What a target is: a program or device of another kind that gets a site's fixes, named by an address.
+"""Targets: other programs or devices that get a site's fixes, each named by an address; the hub that feeds them.
 
 An address is ``SCHEME://HOST:PORT?KEY=VALUE`` or ``SCHEME:PATH?KEY=VALUE``. A target whose readers get bytes consists
 of an ``Encoder``, which does no I/O, and a sender (``targets.py``).
@@ -32,36 +32,36 @@ from skyless.run.mqtt.messages import (
 from skyless.run.process import RateLimit
 
 MIN_STD_M: Final = 0.01
-"""Least standard deviation of an axis that leaves: the gates of other programs reject fixes with honest millimetres."""
+"""Least standard deviation of an axis sent to targets: gates of other programs reject fixes with honest millimetres."""
 
 _FORBIDDING: Final = (Alert.NOT_EXCLUDED, Alert.LIMIT)
 """Alerts of fixes that nobody should navigate with."""
 
 
 class BridgedSite(Struct, frozen=True):
-    """What a bridge knows of the site."""
+    """A site as known to a bridge."""
 
     id: int
     name: str
     simulated: bool
-    """True where its radios are emulated."""
+    """True if its radios are emulated."""
     anchors_m: dict[int, Vector]
-    """Positions of those that are known, in the site's frame."""
+    """Positions of the known anchors, in the site's frame."""
     georeference: GeoreferenceSite | None = None
     zones: tuple[Zone, ...] = ()
     master: int | None = None
-    """The anchor that is the master by the site file; None where there is none, or it is not known."""
+    """The master by the site file; None if there is none, or if it is unknown."""
     walls: tuple[WallSite, ...] = ()
-    """A tag by itself knows none."""
+    """Empty in a tag's program without a broker."""
     assets: Mapping[str, Asset] = {}
-    """What tags are attached to, by tag."""
+    """Assets by tag."""
     floors: tuple[FloorSite, ...] = ()
 
 
 def bridged_site(
     site: Site, zones: tuple[Zone, ...] = (), *, simulated: bool, assets: Mapping[str, Asset] | None = None
 ) -> BridgedSite:
-    """The same of a whole site, as MQTT has it."""
+    """Convert a whole site, as on MQTT."""
     anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
     earth = site.georeference
     return BridgedSite(
@@ -70,22 +70,22 @@ def bridged_site(
 
 
 def is_usable(fix: FixMessage) -> bool:
-    """Whether its position may be given: it is finite, and no alert forbids its use."""
+    """Whether a fix's position may be passed on: it is finite, and no alert forbids its use."""
     return fix.alert not in _FORBIDDING and all(map(isfinite, (*fix.position_m, *fix.covariance_m2)))
 
 
 def floored(covariance_m2: Matrix) -> Matrix:
-    """The covariance of a position with a variance of at least ``MIN_STD_M`` squared in each axis."""
+    """Raise the variance of each axis in a position's covariance to at least ``MIN_STD_M`` squared."""
     xx, xy, xz, yx, yy, yz, zx, zy, zz = covariance_m2
     least = MIN_STD_M**2
     return max(xx, least), xy, xz, yx, max(yy, least), yz, zx, zy, max(zz, least)
 
 
 def require_georeference(site: BridgedSite, target: str) -> GeoreferenceSite:
-    """Where the site is on the Earth, for a target whose positions are global.
+    """Return the site's georeference, for a target whose positions are global.
 
     Raises:
-        SkylessError: the site does not know it.
+        SkylessError: the site has none.
     """
     if site.georeference is None:
         raise SkylessError(
@@ -96,96 +96,96 @@ def require_georeference(site: BridgedSite, target: str) -> GeoreferenceSite:
 
 
 class BridgeContext(Struct, frozen=True):
-    """What a target may need of the program that it runs in."""
+    """Parts of the surrounding program that a target may need."""
 
     log: Callable[[str], None]
     """Shows a line to a person."""
     mqtt: MqttAddress | None = None
-    """The site's broker, where there is one."""
+    """The site's broker, if there is one."""
 
 
 class Target:
-    """Base of all targets: does nothing with what it gets. The hub calls it from the event loop, and never waits."""
+    """Base of all targets, which ignores everything. The hub calls it from the event loop: it must not block."""
 
     one_tag = False
     """Whether its readers cannot distinguish tags."""
 
     def __init__(self, text: str) -> None:
         self.text = text
-        """Its address, for messages."""
+        """The target's address, for messages."""
         self.dropped: Counter[str] = Counter()
-        """What readers missed, by reason."""
+        """Number of messages that readers missed, by reason."""
 
     def on_site(self, site: BridgedSite) -> None:
-        """The site is known, or has changed. Raises SkylessError where it lacks what this target needs."""
+        """Process a site that has become known or has changed. Raises SkylessError if the target cannot serve it."""
 
     def on_fix(self, fix: FixMessage) -> None:
-        """A usable fix, no more often than the target's ``hz``; not before the site is known."""
+        """Process a usable fix. Called at most ``hz`` times a second for each tag, not before the site is known."""
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
-        """A known tag has had no usable fix for a second: now, and each further second."""
+        """Process a known tag without a usable fix. Called after about a second, and each further second."""
 
     def on_second(self, unix_s: float) -> None:
-        """Another second has gone by."""
+        """Do periodic work. Called once a second."""
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
-        """State of a tag or an anchor, once a second."""
+        """Process the state of a tag or an anchor. Called once a second."""
 
     def on_status(self, status: StatusMessage) -> None:
-        """A program of the site has come or gone."""
+        """Process a program of the site going online or offline."""
 
     def on_alarm(self, alarm: AlarmMessage) -> None:
-        """An alarm as it is now: raised, ended, acknowledged, or kept by the broker from before."""
+        """Process an alarm that was raised, ended or acknowledged, or that the broker has kept from before."""
 
     async def run(self) -> None:
         """Serve until cancelled."""
 
 
 class Encoder:
-    """Base of what makes bytes for readers: each element of a result is one datagram, or one write.
+    """Base of encoders, which make bytes for readers: each element of a result is one datagram, or one write.
 
-    Does no I/O and reads no clock.
+    No I/O and no clock.
     """
 
     one_tag = False
-    """As of a ``Target``."""
+    """As in ``Target``."""
 
     dropped: Counter[str]
-    """As of its ``Target``: what it could not encode, by reason."""
+    """As in ``Target``; counts values that could not be encoded, by reason."""
 
     def greeting(self) -> list[bytes]:
-        """For a reader that has just connected."""
+        """Return the first messages for a new reader."""
         return []
 
     def on_site(self, site: BridgedSite) -> list[bytes]:  # noqa: ARG002 - most only keep it
-        """As of a ``Target``."""
+        """As in ``Target``."""
         return []
 
     def on_fix(self, fix: FixMessage) -> list[bytes]:  # noqa: ARG002 - see above
-        """As of a ``Target``."""
+        """As in ``Target``."""
         return []
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:  # noqa: ARG002 - see above
-        """As of a ``Target``."""
+        """As in ``Target``."""
         return []
 
     def on_second(self, unix_s: float) -> list[bytes]:  # noqa: ARG002 - see above
-        """As of a ``Target``."""
+        """As in ``Target``."""
         return []
 
     def on_bytes(self, data: bytes, unix_ns: int) -> list[bytes]:  # noqa: ARG002 - see above
-        """What a reader has sent, over UDP or a serial port, and when it came; the result answers it."""
+        """Process data that a reader sent, by UDP or a serial port, at ``unix_ns``. Returns the answers."""
         return []
 
 
 def cannot_listen(text: str, host: str, port: int, error: OSError) -> SkylessError:
-    """What a server raises that cannot begin; asyncio's own words are longer and name the same."""
+    """Return the error of a server that cannot listen; asyncio's own text is longer and says no more."""
     reason = os.strerror(error.errno) if error.errno is not None and error.errno > 0 else error
     return SkylessError(f"the target {text!r} cannot listen on {host}:{port}: {reason}")
 
 
 TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
-"""Names that tags may have."""
+"""Allowed names of tags."""
 
 _HOST: Final = "//HOST:PORT"
 _USER: Final = "USER@"
@@ -194,12 +194,12 @@ _PATH: Final = "PATH"
 
 
 class TargetUrl:
-    """One address; each part is checked when it is read, and ``check_all_read`` refuses what nobody reads."""
+    """A target's address. Each part is checked when it is read; ``check_all_read`` refuses parts that nobody reads."""
 
     def __init__(self, text: str) -> None:
         """Raises SkylessError."""
         self.text = hide_password(text)
-        """As it was given, for messages: without a password."""
+        """The address as given, but without a password, for messages."""
         scheme, colon, _ = text.partition(":")
         try:
             parts = urlsplit(text)
@@ -219,20 +219,21 @@ class TargetUrl:
         if len(self._options) < len(pairs):
             raise self.wrong("each key once")
         self._parts: set[str] = set()
-        """That have been read, and which keys."""
+        """Parts that have been read."""
         self._read: set[str] = set()
+        """Keys that have been read."""
 
     def host(self, default: str = "127.0.0.1") -> str:
-        """The host, ``default`` where none is given."""
+        """The host; ``default`` if none is given."""
         self._parts.add(_HOST)
         return self._host or default
 
     def port(self, default: int) -> int:
-        """The port, ``default`` where none is given."""
+        """The port; ``default`` if none is given."""
         return self._port or default
 
     def netloc(self) -> str:
-        """``USER:PASSWORD@HOST:PORT``, as it was given; empty where there is none."""
+        """``USER:PASSWORD@HOST:PORT`` as given; empty if there is none."""
         self._parts |= {_HOST, _USER}
         return self._netloc
 
@@ -242,12 +243,12 @@ class TargetUrl:
         return self._path
 
     def text_option(self, key: str, default: str = "") -> str:
-        """The value of a key, as it is."""
+        """The value of a key as text."""
         self._read.add(key)
         return self._options.get(key, default)
 
     def number(self, key: str, default: float, least: float, most: float) -> float:
-        """A number within limits. Raises SkylessError."""
+        """The number that a key gives, within limits. Raises SkylessError."""
         text = self.text_option(key)
         try:
             value = float(text) if key in self._options else default
@@ -258,7 +259,7 @@ class TargetUrl:
         return value
 
     def whole_number(self, key: str, default: int, least: int, most: int) -> int:
-        """A number without a fraction, within limits. Raises SkylessError."""
+        """The whole number that a key gives, within limits. Raises SkylessError."""
         value = self.number(key, default, least, most)
         if value % 1:
             raise self._wrong_value(key, f"a whole number from {least} to {most}")
@@ -270,14 +271,14 @@ class TargetUrl:
         return key in self._options
 
     def choice(self, key: str, names: Sequence[str], default: str) -> str:
-        """One of several words. Raises SkylessError."""
+        """The word that a key gives, one of ``names``. Raises SkylessError."""
         value = self.text_option(key, default)
         if value not in names:
             raise self._wrong_value(key, f"{', '.join(names[:-1])} or {names[-1]}")
         return value
 
     def tag(self) -> str | None:
-        """The only tag that is wanted; None for all. Raises SkylessError."""
+        """The tag to which the target is limited; None for all tags. Raises SkylessError."""
         name = self.text_option("tag")
         if "tag" in self._options and not TAG_NAME.fullmatch(name):
             raise self._wrong_value("tag", "a tag's name: 1 to 32 letters, digits, - or _")
@@ -298,7 +299,7 @@ class TargetUrl:
                 raise SkylessError(f"the target {self.text!r} has {key!r}; its keys are {known}")
 
     def wrong(self, expected: str) -> SkylessError:
-        """What to raise where the address cannot be used."""
+        """Return the error for an address that cannot be used."""
         return SkylessError(f"the target is {self.text!r}; it should be {expected}")
 
     def _wrong_value(self, key: str, expected: str) -> SkylessError:
@@ -306,63 +307,63 @@ class TargetUrl:
         return SkylessError(f"the target {self.text!r} has {given}; it should be {expected}")
 
 
-# Gives the fixes of a site to targets: usable ones at each target's rate, and that there is none.
+# Pass the fixes of a site to targets: usable ones at each target's rate, and the statement that there is none.
 #
 # No I/O, and the time is passed in.
 
 NO_FIX_S: Final = 1.0
-"""A tag has no fix once its last usable one is older, ..."""
+"""A tag has no fix once its last usable fix is older than this, ..."""
 
 _MISSED: Final = 2.5
-"""... where its fixes are rarer, once it is older than this number of their intervals, ..."""
+"""... or, if its fixes are rarer, older than this number of their intervals, ..."""
 
 _LONGEST_S: Final = 10.0
-"""... but than this in any case."""
+"""... but in any case once it is older than this."""
 
 SILENCE_CHECK_S: Final = 0.25
-"""Interval in which ``on_tick`` is to be called."""
+"""Interval at which to call ``on_tick``."""
 
 _SECOND_S: Final = 1.0 - 0.1 * SILENCE_CHECK_S
-"""After so long a second has gone by: ticks come late now and then."""
+"""After this time a second counts as over, as ticks may be late."""
 
 _FORGET_S: Final = 3600.0
-"""A tag without a fix for so long is not spoken of any more."""
+"""A tag without a fix for this long is forgotten."""
 
 
 class Route(Struct):
-    """A target, and what the user wants it to get."""
+    """A target, and the user's settings for it."""
 
     target: Target
     tag: str | None
-    """The only tag; None for all, or for the first where the target carries one."""
+    """The only tag; None means all, or the first one if the target carries only one."""
     hz: float
     rates: dict[str, RateLimit] = {}
     """Rate limit of each tag."""
     others: bool = False
-    """Whether it needs no line that there are more tags than the target carries: there was one, or the user chose."""
+    """Whether not to log that there are more tags than the target carries: it was logged, or the user chose the tag."""
     refused: str = ""
-    """What the site lacks that the target needs, so that it gets nothing; empty where it serves the site."""
+    """Why the target cannot serve the site and so gets nothing; empty if it can."""
     has_ended: bool = False
-    """Whether it has been closed: a broker's link still receives while it takes leave."""
+    """Whether it has been closed: a broker's link still receives while it disconnects."""
     faults: int = 0
     """How often it failed."""
 
 
 class _Tag(Struct):
-    """What is known of one tag."""
+    """State of one tag."""
 
     usable_s: float
-    """When its last usable fix came, or when it was first heard of."""
+    """When its last usable fix arrived, or when the tag was first heard."""
     reason: str
-    """Why there is none."""
+    """Why there is no fix."""
     intervals_s: tuple[float, float] = (0.0, 0.0)
-    """Between its last three usable fixes: a single long one is an outage, two are its rate."""
+    """Intervals between its last three usable fixes: one long interval is an outage, two are the tag's rate."""
     reported_s: float = -inf
-    """When targets were informed that it has none."""
+    """When targets were last informed that it has no fix."""
 
 
 class Hub:
-    """Distributes what comes from one site."""
+    """Distributes the messages of one site to targets."""
 
     def __init__(self, routes: Sequence[Route], log: Callable[[str], None]) -> None:
         self.routes = tuple(routes)
@@ -371,13 +372,13 @@ class Hub:
         self._log = log
         self._tags: dict[str, _Tag] = {}
         self._second_s = -inf
-        """When the last second began."""
+        """When the present second began."""
 
     def on_site(self, site: BridgedSite) -> None:
-        """The site is known, or has changed.
+        """Process a site that has become known or has changed.
 
         Raises:
-            SkylessError: it lacks what each of the targets needs; where it lacks what some need, that is logged.
+            SkylessError: none of the targets can serve it. If only some cannot, that is logged.
         """
         if site == self.site:
             return
@@ -393,7 +394,7 @@ class Hub:
             self._log(reason)
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
-        """A tag's fix; ``now_s`` is the host's monotonic clock. One before the site is known is not given."""
+        """Process a fix; ``now_s`` is the host's monotonic clock. Before the site is known it is not passed on."""
         tag = self._tags.setdefault(fix.tag, _Tag(now_s, "no fix yet"))
         if not is_usable(fix):
             tag.reason = fix.alert or "position is not finite"
@@ -404,11 +405,13 @@ class Hub:
             return
         self.fixes += 1
         for route in self.routes:
-            if self._carries(route, fix.tag) and self._is_due(route, fix.tag, now_s):
-                self._guard(route, lambda target: target.on_fix(fix))
+            if self._carries(route, fix.tag):
+                rate = route.rates.setdefault(fix.tag, RateLimit(route.hz))
+                if rate.is_due(now_s):
+                    self._guard(route, lambda target: target.on_fix(fix))
 
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
-        """State of a tag or an anchor."""
+        """Process the state of a tag or an anchor."""
         if isinstance(health, TagHealth):
             tag = self._tags.setdefault(health.tag, _Tag(now_s, "no fix yet"))
             if health.reason is not None:
@@ -418,19 +421,19 @@ class Hub:
                 self._guard(route, lambda target: target.on_health(health))
 
     def on_status(self, status: StatusMessage) -> None:
-        """A program of the site has come or gone."""
+        """Process a program of the site going online or offline."""
         for route in self.routes:
             if status.kind != "tag" or route.tag in (None, status.name):
                 self._guard(route, lambda target: target.on_status(status))
 
     def on_alarm(self, alarm: AlarmMessage) -> None:
-        """An alarm as it is now. A target of one tag gets those that concern it."""
+        """Process an alarm that has changed. A target limited to one tag gets only alarms about that tag."""
         for route in self.routes:
             if route.tag is None or route.tag in alarm.tags:
                 self._guard(route, lambda target: target.on_alarm(alarm))
 
     def on_tick(self, now_s: float, unix_s: float) -> None:
-        """To be called every ``SILENCE_CHECK_S``."""
+        """Report tags without fixes, and full seconds; call this every ``SILENCE_CHECK_S``."""
         for name, tag in tuple(self._tags.items()):
             age_s = now_s - tag.usable_s
             if age_s > _FORGET_S:
@@ -450,11 +453,11 @@ class Hub:
 
     def _give_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
         for route in self.routes:
-            if route.tag in (None, tag):  # one that carries a single tag waits for a tag that has fixes
+            if route.tag in (None, tag):  # a target that carries one tag waits for a tag that has fixes
                 self._guard(route, lambda target: target.on_no_fix(tag, unix_s, reason))
 
     def _guard(self, route: Route, call: Callable[[Target], None]) -> None:
-        """Call a target; a fault in it costs neither a fix nor another target."""
+        """Call a target. A fault in it is logged once, and affects neither fixes nor other targets."""
         if route.refused or route.has_ended:
             return
         try:
@@ -464,14 +467,8 @@ class Hub:
             if route.faults == 1:
                 self._log(f"{route.target.text} failed ({error!r}); it is logged once")
 
-    @staticmethod
-    def _is_due(route: Route, tag: str, now_s: float) -> bool:
-        if tag not in route.rates:
-            route.rates[tag] = RateLimit(route.hz)
-        return route.rates[tag].is_due(now_s)
-
     def _carries(self, route: Route, tag: str) -> bool:
-        """Whether a target gets the fixes of a tag; one that carries a single one keeps to the first that has any."""
+        """Whether a target gets a tag's fixes. A target that carries one tag keeps to the first that has a fix."""
         if route.tag is None and route.target.one_tag:
             route.tag = tag
         if route.tag in (None, tag):
@@ -483,7 +480,7 @@ class Hub:
 
 
 def open_hub(routes: Sequence[Route], log: Callable[[str], None]) -> Hub:
-    """The hub of routes. Raises SkylessError: two of them have the same address."""
+    """Create a hub for routes. Raises SkylessError if two of them have the same address."""
     texts = [route.target.text for route in routes]
     for text in texts:
         if texts.count(text) > 1:
@@ -492,7 +489,7 @@ def open_hub(routes: Sequence[Route], log: Callable[[str], None]) -> Hub:
 
 
 def _refusal(target: Target, site: BridgedSite) -> str:
-    """Why a target cannot serve a site; empty where it can."""
+    """Pass a site to a target. Returns why the target cannot serve it; empty if it can."""
     try:
         target.on_site(site)
     except SkylessError as error:
@@ -501,5 +498,5 @@ def _refusal(target: Target, site: BridgedSite) -> str:
 
 
 def _silence_s(intervals_s: tuple[float, float]) -> float:
-    """How long a tag whose last fixes came at these intervals must be silent to have none."""
+    """Time after which a tag whose last fixes came at these intervals counts as having none."""
     return min(max(NO_FIX_S, _MISSED * min(intervals_s)), _LONGEST_S)

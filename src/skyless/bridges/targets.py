@@ -1,4 +1,4 @@
-"""The table of targets, how one is opened by its address, and the senders that carry bytes to readers."""
+"""The table of targets, opening a target by its address, and the senders that carry bytes to readers."""
 
 import asyncio
 import contextlib
@@ -20,37 +20,37 @@ from skyless.radio.serial.serial_port import Pty, SerialPort
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.web import BRIDGES as LIMITS
 
-# How bytes get to readers: over TCP, UDP, a pseudo-terminal or a serial port.
+# Senders of bytes over TCP, UDP, a pseudo-terminal or a serial port.
 #
-# Nothing waits for a reader: what it does not accept in time is dropped and counted, so that no fix comes late
-# because of one. What waits for it in this process and in the system stays, with its own stamps, and is what it reads
+# No sender waits for a reader: data that a reader does not accept in time are dropped and counted, so that it delays no
+# fix for others. Data already in the buffers of this process and the system stay, with their own stamps, and are read
 # first.
 
 _WAITING_BYTES: Final = 1 << 15
-"""Bytes that may wait for one reader in this process, or a single longer message; and as many in the system."""
+"""Bytes that may wait for one reader in this process (or a single longer message), and again in the system."""
 
 _MAX_DATAGRAM_BYTES: Final = 1 << 16
 
 _STUCK_S: Final = 5.0
-"""A TCP reader that has taken nothing for so long is disconnected."""
+"""A TCP reader that has accepted nothing for this long is disconnected."""
 
 _ANY_PROGRAM: Final = 0o666
-"""Mode of a pseudo-terminal: gpsd, for one, gives up its rights before it opens its devices."""
+"""Mode of a pseudo-terminal, for programs that drop their privileges before they open it, such as gpsd."""
 
 
 class TcpServer:
     """Sends the same bytes to all programs that connect."""
 
     def __init__(self, text: str, host: str, port: int, greeting: Callable[[], list[bytes]]) -> None:
-        """``greeting`` gives what a new reader gets first."""
+        """``greeting`` returns the first messages for a new reader."""
         self.dropped: Counter[str] = Counter()
         self.port = port
-        """The one that is used, where 0 was asked for and the server runs."""
+        """The port in use while the server runs, also if 0 was given."""
         self._text, self._host, self._greeting = text, host, greeting
         self._readers: set[_TcpReader] = set()
 
     def send(self, data: bytes) -> None:
-        """Send to all readers; one whose buffers are full misses it."""
+        """Send to all readers except those whose buffers are full."""
         for reader in tuple(self._readers):
             if not reader.send(data):
                 self.dropped["slow-reader"] += 1
@@ -74,7 +74,7 @@ class TcpServer:
 
 
 class _TcpReader(asyncio.Protocol):
-    """One connection; what it sends is not read."""
+    """One connection; data from it are ignored."""
 
     def __init__(self, readers: "set[_TcpReader]", greeting: Callable[[], list[bytes]], dropped: Counter[str]) -> None:
         self._readers, self._greeting, self._dropped = readers, greeting, dropped
@@ -82,7 +82,7 @@ class _TcpReader(asyncio.Protocol):
         self._stuck_since_s: float | None = None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Greet it, if there are not too many."""
+        """Send the greeting, or close the connection if there are too many readers."""
         assert isinstance(transport, asyncio.Transport)
         if len(self._readers) >= LIMITS.readers:
             self._dropped["too-many-readers"] += 1
@@ -95,11 +95,11 @@ class _TcpReader(asyncio.Protocol):
             self.send(message)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason makes no difference
-        """It has gone."""
+        """Forget the reader."""
         self._readers.discard(self)
 
     def send(self, data: bytes) -> bool:
-        """Whether the connection accepts it, which it does where nothing waits; one that accepts nothing is ended."""
+        """Send data if there is room; return whether they were accepted. A stuck connection is closed."""
         if self._transport is None or self._transport.is_closing():
             return False
         waiting = self._transport.get_write_buffer_size()
@@ -115,7 +115,7 @@ class _TcpReader(asyncio.Protocol):
         return False
 
     def end(self) -> None:
-        """Close it; what waits is dropped."""
+        """Close the connection; waiting data are dropped."""
         if self._transport is not None:
             self._transport.abort()
 
@@ -127,7 +127,7 @@ class UdpSender:
         """Raises SkylessError: there is no such host."""
         self.dropped: Counter[str] = Counter()
         self.received: Callable[[bytes], None] | None = None
-        """Called with each datagram that comes back, while it runs."""
+        """Called with each datagram received while ``run`` runs; set it before."""
         self._text, self._log, self._trouble = text, log, ""
         try:
             family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -163,7 +163,7 @@ class UdpSender:
                 loop.remove_reader(self._socket)
 
     def _read(self, received: Callable[[bytes], None]) -> None:
-        with contextlib.suppress(OSError):  # nothing to read after all, or what was sent found nobody
+        with contextlib.suppress(OSError):  # nothing to read after all, or a datagram sent earlier found no receiver
             received(self._socket.recv(_MAX_DATAGRAM_BYTES))
 
 
@@ -171,22 +171,22 @@ class PtySender:
     """Sends to the program that opens a pseudo-terminal, by its path or by a link to it."""
 
     def __init__(self, text: str, link: str, log: Callable[[str], None]) -> None:
-        """``link`` is where the user wants it; empty for none."""
+        """``link`` is the path of the link to it; empty for none."""
         self.dropped: Counter[str] = Counter()
         self._text, self._link, self._log = text, Path(link) if link else None, log
         self._pty: Pty | None = None
         """Exists while it runs: a link left behind would lead to the terminal that the system opens next."""
 
     def send(self, data: bytes) -> None:
-        """Write; where nobody reads, this and what nobody has read is dropped."""
+        """Write data; if no program reads, these and any unread data are dropped."""
         if self._pty is None or not self._pty.send(data):
             self.dropped["not-read"] += 1
 
     async def run(self) -> None:
-        """Keep it until cancelled; what programs write is not read. Raises SkylessError: it cannot be made."""
+        """Keep the terminal open until cancelled; its input is ignored. Raises SkylessError if it cannot be made."""
         pty = Pty(self._link, held_bytes=0, asked=f"the target {self._text!r} has the path")
         try:
-            os.chmod(pty.path, _ANY_PROGRAM)  # noqa: PTH101 - a device, not a file of ours
+            os.chmod(pty.path, _ANY_PROGRAM)  # noqa: PTH101 - a device, not one of our files
             which = "" if self._link is None else f", which is {pty.path}"
             self._log(f"{self._text}: programs read {pty.name}{which}")
             pty.start(lambda _data: None)
@@ -198,20 +198,20 @@ class PtySender:
 
 
 class SerialSender:
-    """Sends on a serial port of this computer, which is opened again whenever it was unplugged."""
+    """Sends on a serial port of this computer, which is opened again after it was unplugged."""
 
     def __init__(self, text: str, path: str, baud: int, log: Callable[[str], None]) -> None:
         self.dropped: Counter[str] = Counter()
         self.received: Callable[[bytes], None] | None = None
-        """Called with what comes."""
+        """Called with received data."""
         self._port = SerialPort(path, baud, lambda reason: log(f"{text}: {reason}"))
         self._write: Callable[[bytes], None] | None = None
 
     def send(self, data: bytes) -> None:
-        """Write, or drop where there is no port or it does not keep up."""
+        """Write data; drop them if there is no port, or if it does not keep up."""
         if self._write is None:
             self.dropped["no-port"] += 1
-        elif self._port.waiting_bytes() > self._port.baud // 40:  # what it carries in a quarter of a second
+        elif self._port.waiting_bytes() > self._port.baud // 40:  # as many as it carries in a quarter of a second
             self.dropped["slow-port"] += 1
         else:
             self._write(data)
@@ -220,25 +220,24 @@ class SerialSender:
         """Keep the port open until cancelled."""
         await self._port.run(self)
 
-    # What the port calls
+    # Called by the port
 
     def on_open(self, send: Callable[[bytes], None]) -> None:
-        """The port is open."""
+        """Note that the port is open."""
         self._write = send
         self._port.clear_report()
 
     def on_data(self, data: bytes) -> None:
-        """Bytes have come."""
+        """Pass on received bytes."""
         if self.received is not None:
             self.received(data)
 
     def on_close(self) -> None:
-        """The port is closed."""
+        """Note that the port is closed."""
         self._write = None
 
 
 MAX_HZ: Final = 1000.0
-
 
 Sender = TcpServer | UdpSender | PtySender | SerialSender
 
@@ -247,13 +246,13 @@ class Kind(Struct, frozen=True):
     """A scheme of addresses."""
 
     module: str
-    """Below ``skyless.bridges``; imported when it is used. A stream's has ``make_encoder``, others ``make_target``."""
+    """Module in ``skyless.bridges``, imported when used, with ``make_encoder`` for a stream, else ``make_target``."""
     hz: float
-    """Usual rate of fixes for each tag."""
+    """Default rate of fixes for each tag."""
     max_hz: float
     summary: str
     port: int = 0
-    """Usual port of a stream; other targets know their own."""
+    """Default port of a stream; other targets know their own."""
 
 
 TARGET_KINDS: Final = {
@@ -283,7 +282,7 @@ TARGET_KINDS: Final = {
 
 
 class _StreamTarget(Target):
-    """Bytes of an encoder, carried by a sender."""
+    """A target whose encoder makes bytes for a sender."""
 
     def __init__(self, text: str, encoder: Encoder, sender: Sender) -> None:
         super().__init__(text)
@@ -315,7 +314,7 @@ class _StreamTarget(Target):
 
 
 def open_route(text: str, context: BridgeContext) -> Route:
-    """The target of an address, with its tag and its rate. Raises SkylessError: there is none."""
+    """Create the target for an address, with its tag and rate. Raises SkylessError."""
     url = TargetUrl(text)
     kind = TARGET_KINDS.get(url.scheme)
     if kind is None:
@@ -338,7 +337,7 @@ def open_route(text: str, context: BridgeContext) -> Route:
 
 
 def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext) -> _StreamTarget:
-    """An encoder and the sender that the scheme names after ``+``."""
+    """Connect an encoder to the sender that the scheme names after ``+``."""
     sender: Sender
     match url.scheme.partition("+")[2]:
         case "tcp":

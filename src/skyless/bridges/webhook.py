@@ -1,4 +1,4 @@
-"""``webhook+https://HOST/PATH``: posts what becomes of alarms as JSON, signed where a secret is given.
+"""``webhook+https://HOST/PATH``: posts alarms and their changes as JSON, signed if a secret is given.
 
 The signature is HMAC-SHA256 of the timestamp, a dot and the body (docs/howto/alarms.md).
 """
@@ -26,7 +26,7 @@ _TRY_AGAIN: Final = frozenset({408, 425, 429})
 
 
 class Webhook(AlarmTarget):
-    """Posts to one address."""
+    """Posts alarms to one address."""
 
     def __init__(self, url: TargetUrl, context: BridgeContext) -> None:
         super().__init__(url.text, context.log, frozenset({"raised", "ended", "acknowledged"}))
@@ -44,7 +44,7 @@ class Webhook(AlarmTarget):
             context.log(f"{url.text}: alarms leave this computer unencrypted; webhook+https: encrypts")
 
     def attempt(self, delivery: Delivery, on_open: Open) -> None:
-        """Post once."""
+        """Post one message. Raises RefusedError, OSError."""
         site = self.site
         where = None if site is None else {"id": site.id, "name": site.name, "simulated": site.simulated}
         body = msgspec.json.encode({"type": delivery.what, "alarm": delivery.alarm, "site": where})
@@ -74,5 +74,5 @@ class Webhook(AlarmTarget):
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Webhook:
-    """The target of an address. Raises SkylessError."""
+    """Create the target for an address. Raises SkylessError."""
     return Webhook(url, context)
