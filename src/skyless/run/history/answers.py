@@ -73,7 +73,7 @@ class Dwell(Struct, frozen=True):
 
 
 class Occupancy(Struct, frozen=True):
-    """How many tags were in a zone within one step of time."""
+    """How many tags were in a zone during one time step."""
 
     zone: str
     zone_name: str
@@ -115,7 +115,7 @@ _AT_AN_HOUR: Final = re.compile(r"\bat (\d{1,2})$")
 
 
 def span_of(from_text: str, to_text: str | None, now_unix_s: float) -> Span:
-    """Parse the range between two times, in this machine's time zone where they name none.
+    """Parse the range between two times, in this machine's time zone if they name none.
 
     A time without a date is today's; at the end of the range it is on the day on which the range begins. A day without
     a time means its beginning. Without ``to_text`` the range ends now.

@@ -269,7 +269,6 @@ _ALARMS: Final = """
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-_Ints = NDArray[np.int64]
 _Floats = NDArray[np.float64]
 
 
@@ -418,10 +417,10 @@ class History:
 
     @_asked
     def contacts(self, tag: str, span: Span, distance_m: float = 2.0) -> tuple[Contact, ...]:
-        """Return when other tags were within a distance in the plane of this tag's first fix of a second.
+        """Return when other tags were within a horizontal distance of this tag. Raises SkylessError.
 
-        The others' fixes of the same second are compared; in a range with thinned days, of ten seconds. Raises
-        SkylessError.
+        The others' fixes in each second are compared with this tag's first fix in it; in a range with thinned days, in
+        each ten seconds.
         """
         check_number("the distance", distance_m, least=0.01, most=LIMITS.contact_m)
         ((tag, own),) = self._tags((tag,)).items()

@@ -96,7 +96,7 @@ class FixMessage(Struct, frozen=True):
     latency_s: float
     """From the end of the last frame to the computed fix."""
     hpl_m: float | None = None
-    """Horizontal protection level; None where there is no guarantee, or the method has none."""
+    """Horizontal protection level; None if there is no guarantee, or if the method has none."""
     vpl_m: float | None = None
     integrity_risk: float | None = None
     """Probability, for each fix, that the error exceeds its level."""
@@ -142,7 +142,7 @@ class TagHealth(Struct, frozen=True):
     updates_per_s: float
     """Fixes in the last second."""
     reason: str | None
-    """Why there is no fix; None where there is one."""
+    """Why there is no fix; None if there is one."""
     first_fix_s: float | None
     """From the start to the first fix."""
     latency_p50_s: float | None
