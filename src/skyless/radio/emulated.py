@@ -18,7 +18,7 @@ from skyless.core.air.frame import Diagnostics, Reception, Transmission
 from skyless.core.ticks import TICK_RATE_HZ, wrap
 from skyless.radio.interface import Gone, Late, Listener, RadioEvent, Restarted, Sent, ignore
 
-# Messages between processes and the emulated air over TCP: msgpack, each message after its length (u32, LE).
+# Messages between processes and the emulated air over TCP: msgpack, each message preceded by its length (u32, LE).
 
 DEFAULT_PORT: Final = 7784
 MAX_MESSAGE_BYTES: Final = 1 << 20
@@ -26,20 +26,20 @@ _LENGTH: Final = struct.Struct("<I")
 
 
 class WireError(ValueError):
-    """The other side does not use this protocol; the connection is to be closed."""
+    """The peer does not use this protocol; the connection should be closed."""
 
 
 class Join(Struct, frozen=True, tag="join"):
-    """A process puts its nodes on the air; later messages number them in this order, from 0."""
+    """A process's request to put its nodes on the air; later messages number them in this order, from 0."""
 
     kind: Literal["anchor", "tag"]
     names: tuple[str, ...]
     tx_delays_ticks: tuple[int, ...] = ()
-    """TX antenna delays that the process sets in its radios, one a node; empty: those of the ether's site."""
+    """TX antenna delays that the process sets in its radios, one per node; empty means those of the ether's site."""
 
 
 class Send(Struct, frozen=True, tag="send", gc=False):
-    """A node wants to transmit."""
+    """A node's request to transmit a frame."""
 
     node: int
     tx_ticks: int
@@ -47,17 +47,17 @@ class Send(Struct, frozen=True, tag="send", gc=False):
 
 
 class Joined(Struct, frozen=True, tag="joined"):
-    """The nodes are on the air, with new counters."""
+    """All nodes of a process have joined the medium, with fresh counters."""
 
     machine: str
-    """Which machine's clock ``host_s`` is of."""
+    """The machine of whose clock ``host_s`` is."""
     host_s: float
     ticks: tuple[int, ...]
     """The nodes' 40-bit counters at ``host_s``."""
 
 
 class Refused(Struct, frozen=True, tag="refused"):
-    """The nodes are not on the air."""
+    """The ether does not accept the process."""
 
     reason: str
 
@@ -70,7 +70,7 @@ class Clocks(Struct, frozen=True, tag="clocks"):
 
 
 class HeardRow(Struct, frozen=True, array_like=True, gc=False):
-    """A frame at one node that heard it."""
+    """Reception of a frame by one node."""
 
     node: int
     rx_ticks: int
@@ -105,7 +105,7 @@ _encoder: Final = msgspec.msgpack.Encoder()
 
 
 def pack(message: Struct) -> bytes:
-    """Bytes of a message, its length before it."""
+    """Encode a message, preceded by its length."""
     body = _encoder.encode(message)
     return _LENGTH.pack(len(body)) + body
 
@@ -117,10 +117,10 @@ class Unpacker:
         self._buffer = bytearray()
 
     def feed(self, data: bytes) -> Iterator[bytes]:
-        """Bodies that are complete with this piece of the stream.
+        """Yield the bodies that this piece of the stream completes.
 
         Raises:
-            WireError: a message is longer than any of this protocol.
+            WireError: a message is longer than any in this protocol.
         """
         buffer = self._buffer
         buffer += data
@@ -138,7 +138,7 @@ class Unpacker:
 
 
 def this_machine() -> str:
-    """Identifier of this machine's present run; processes with an equal one share the monotonic clock."""
+    """Identifier of this machine since its last boot; processes with the same one share the monotonic clock."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
@@ -149,10 +149,10 @@ _RECONNECT_S: Final = 0.2
 _SHIFT_S: Final = 15.0
 """The shift to another machine's clock is measured again after this: clocks of computers drift by 0.1 ms a second."""
 _RECEIVE_BUFFER_BYTES: Final = 1 << 16
-"""A radio keeps few frames for a host that does not fetch them; so does this one, 0.2 s of them."""
+"""Like a real radio, this one keeps few frames for a host that does not fetch them: those of 0.2 s."""
 
 _LEAD_S: Final = 1.8e-3
-"""The preamble, the transfer to the ether, and a host's timers."""
+"""Time for the preamble, the transfer to the ether, and the inaccuracy of a host's timers."""
 
 
 class EmulatedRadio:
@@ -169,12 +169,12 @@ class EmulatedRadio:
         self._ticks_s = 0.0
 
     async def run(self, listener: Listener) -> None:
-        """Receive until cancelled; an ether that goes away is looked for."""
+        """Receive until cancelled; reconnect when the ether is lost."""
         self._listener = listener
         await self._connection.run()
 
     def advice(self) -> str:
-        """Where to look when nothing comes."""
+        """Return a hint for when nothing is received."""
         return "no frame on the emulated air: are anchors running?"
 
     def now_ticks(self) -> int | None:
@@ -184,7 +184,7 @@ class EmulatedRadio:
         return wrap(self._ticks + round((time.monotonic() - self._ticks_s) * TICK_RATE_HZ))
 
     def transmit(self, transmission: Transmission) -> None:
-        """Send a frame; without an ether it is late."""
+        """Send a frame; without an ether it is reported as late."""
         if not self._connection.send(Send(self._node, transmission.tx_ticks, transmission.frame)):
             self.notify(Late(transmission.tx_ticks))
 
@@ -193,12 +193,12 @@ class EmulatedRadio:
         self._listener(event)
 
     def set_clock(self, ticks: int | None, host_s: float) -> None:
-        """What the counter was at a moment of the host's monotonic clock."""
+        """Set the counter's reading at a time of the host's monotonic clock; None if there is none."""
         self._ticks, self._ticks_s = ticks, host_s
 
 
 class EtherConnection:
-    """The connection of one process; it is made again by itself."""
+    """The connection of one process, restored whenever it is lost."""
 
     def __init__(self, host: str, port: int, join: Join) -> None:
         self._host, self._port, self._join = host, port, join
@@ -208,7 +208,7 @@ class EtherConnection:
         self._users = 0
 
     async def run(self) -> None:
-        """Stay connected until cancelled; all radios share one connection, which ends with the last of them."""
+        """Stay connected until cancelled. All radios share one connection, which ends with the last of them."""
         self._users += 1
         if self._task is None:
             self._task = asyncio.create_task(self._keep_connected())
@@ -222,7 +222,7 @@ class EtherConnection:
                 task.cancel()
 
     def send(self, message: Send) -> bool:
-        """Whether the message could be handed to the connection."""
+        """Send a message. Returns False without a connection."""
         if self._transport is None:
             return False
         self._transport.write(pack(message))
@@ -243,22 +243,19 @@ class EtherConnection:
                     reason = await protocol.ended
                 finally:
                     transport.abort()
-                    self._on_lost()
+                    self._transport = None
+                    for radio in self.radios:
+                        radio.set_clock(None, 0.0)
             if reason != reported:
                 reported = reason
                 self._notify_all(Gone(reason))
             await asyncio.sleep(_RECONNECT_S)
 
     def on_joined(self, message: Joined, shift_s: float, transport: asyncio.Transport) -> None:
-        """The nodes are on the air."""
+        """Note that the nodes are on the air."""
         self._transport = transport
         self._set_clocks(message.host_s + shift_s, message.ticks)
         self._notify_all(Restarted())
-
-    def _on_lost(self) -> None:
-        self._transport = None
-        for radio in self.radios:
-            radio.set_clock(None, 0.0)
 
     def _notify_all(self, event: RadioEvent) -> None:
         for radio in self.radios:
@@ -285,7 +282,7 @@ class EtherConnection:
 
 
 class ClockShift:
-    """What to add to another machine's clock to get this one's, from messages with the time when they were sent.
+    """Estimates the offset of this machine's clock from another's, from messages that state when they were sent.
 
     The quickest message of the last half minute or so decides: the clocks drift apart, and some messages are slow.
     """
@@ -296,7 +293,7 @@ class ClockShift:
         self._begun_s: float | None = None
 
     def note(self, sent_s: float, now_s: float) -> None:
-        """A message has come that was sent at a time of the other's clock."""
+        """Add a message that arrived at ``now_s`` and was sent at ``sent_s`` of the other machine's clock."""
         if self._begun_s is None or now_s - self._begun_s > _SHIFT_S:
             self._begun_s, self._least_before_s, self._least_s = now_s, self._least_s, math.inf
         self._least_s = min(self._least_s, now_s - sent_s)
@@ -304,14 +301,14 @@ class ClockShift:
 
 
 class _Stream(asyncio.Protocol):
-    """The connection from its beginning until it ends; ``ended`` gives the reason."""
+    """One connection from its beginning to its end; ``ended`` resolves to the reason."""
 
     def __init__(self, connection: EtherConnection) -> None:
         self._connection = connection
         self._unpacker = Unpacker()
         self._transport: asyncio.Transport | None = None
         self._shift: ClockShift | None = None
-        """Only of an ether on another machine."""
+        """None for an ether on this machine."""
         self.ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
@@ -354,13 +351,13 @@ class _Stream(asyncio.Protocol):
 
 
 def _why(error: OSError) -> str:
-    """The cause in words; asyncio's message repeats the address and leaves the cause out."""
+    """Return the cause in words: asyncio's message repeats the address and leaves the cause out."""
     known = error.errno is not None and error.errno > 0
     return os.strerror(error.errno) if known else error.strerror or str(error)  # type: ignore[arg-type]
 
 
 async def _connect(host: str, port: int) -> socket.socket:
-    """A connected socket with a small receive buffer, which can only be set before it connects."""
+    """Return a connected socket with a small receive buffer, which can only be set before connecting."""
     loop = asyncio.get_running_loop()
     family, kind, protocol, _, address = (await loop.getaddrinfo(host, port, type=socket.SOCK_STREAM))[0]
     endpoint = socket.socket(family, kind, protocol)

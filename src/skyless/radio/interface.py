@@ -12,36 +12,36 @@ from skyless.radio.tag_reports import Reported
 
 
 class AntennaDelays(Struct, frozen=True):
-    """What a radio subtracts from its stamps, in ticks."""
+    """Antenna delays for which a radio corrects its stamps, in ticks."""
 
     tx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
     rx_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
 
 
 class Sent(Struct, frozen=True, gc=False):
-    """The frame has left the antenna."""
+    """A frame has left the antenna."""
 
     tx_ticks: int
 
 
 class Late(Struct, frozen=True, gc=False):
-    """The frame came too late for its time, and was not sent."""
+    """A frame was not sent, because it reached the radio too late."""
 
     tx_ticks: int
 
 
 class Restarted(Struct, frozen=True, gc=False):
-    """The radio is ready, with a counter that has nothing to do with what it counted before."""
+    """The radio is ready; its counter has no relation to earlier readings."""
 
 
 class Gone(Struct, frozen=True, gc=False):
-    """The radio does not answer; it looks for it by itself."""
+    """The radio does not answer; attempts to reach it continue."""
 
     reason: str
 
 
 class Hint(Struct, frozen=True):
-    """The radio goes on, but a person should look at something."""
+    """The radio still works, but a person should check something."""
 
     text: str
 
@@ -52,32 +52,32 @@ Listener = Callable[[RadioEvent], None]
 
 
 def ignore(_event: object) -> None:
-    """The listener of a radio that does not run yet."""
+    """Do nothing; the listener of a radio that does not run yet."""
 
 
 class Radio(Protocol):
-    """One radio. It is used from one event loop."""
+    """One radio, used from one event loop."""
 
     @property
     def name(self) -> str:
-        """Its name in messages."""
+        """The radio's name in messages."""
 
     @property
     def counters(self) -> Counter[str]:
-        """What was lost or could not be used on the way from the radio, by reason."""
+        """Counts of data that were lost or unusable on the way from the radio, by reason."""
 
     @property
     def lead_s(self) -> float:
-        """How long before its RMARKER a frame should be handed to ``transmit``, at first; 0 where it cannot send."""
+        """How long before its RMARKER to hand a frame to ``transmit``, at first; 0 if the radio cannot send."""
 
     async def run(self, listener: Listener) -> None:
-        """Configure the radio and receive until cancelled; a radio that has gone is looked for by itself."""
+        """Configure the radio and receive until cancelled; reconnect if it is lost."""
 
     def advice(self) -> str:
-        """Where to look when nothing has come from it for some seconds; without numbers that change."""
+        """Return a hint for when nothing was received for some seconds; it must not contain changing numbers."""
 
     def now_ticks(self) -> int | None:
         """The radio's 40-bit counter now, to about 0.1 ms; None while the radio is not ready."""
 
     def transmit(self, transmission: Transmission) -> None:
-        """Send a frame so that its RMARKER leaves at ``tx_ticks``; answered by ``Sent`` or ``Late``."""
+        """Send a frame so that its RMARKER leaves at ``tx_ticks``; the listener then gets ``Sent`` or ``Late``."""

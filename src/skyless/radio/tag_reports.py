@@ -1,6 +1,6 @@
-"""What a board says that computes its own position: fixes, its state, anchors, the site's place on the Earth.
+"""Reports of a board that computes its own position: fixes, its state, anchor positions, the site's georeference.
 
-The bytes are those of structs in ``firmware/source/fix.h``; records hold them from ``BODY_AT`` on.
+The bytes are those of the structs in ``firmware/source/fix.h``; in records they begin at ``BODY_AT``.
 """
 
 import struct
@@ -19,7 +19,7 @@ from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.ticks import TICK_RATE_HZ
 
 BODY_AT: Final = 2
-"""Where a record's body begins, after kind and number."""
+"""Offset of a record's body, after kind and number."""
 
 _FIX: Final = struct.Struct("<2qQ7I6i16fI2fI")
 _STATUS: Final = struct.Struct("<8I")
@@ -28,19 +28,19 @@ _EARTH: Final = struct.Struct("<3iI")
 _NO_SITE: Final = 0xFFFF
 _ROWS: Final = struct.Struct("<30d")
 _SQUARE: Final = (0, 1, 2, 1, 3, 4, 2, 4, 5)
-"""A covariance row by row out of xx, xy, xz, yy, yz, zz."""
+"""Indices of a covariance, row by row, in xx, xy, xz, yy, yz, zz."""
 _UPPER: Final = (0, 1, 2, 4, 5, 8)
-"""The inverse."""
+"""Indices of xx, xy, xz, yy, yz, zz in a covariance, row by row."""
 _REASONS: Final = (None, *NoFixReason)
 
 
 class BoardFix(Struct, frozen=True):
-    """A fix that the board has computed, without the anchors' positions."""
+    """A fix computed by the board, without the anchors' positions."""
 
     fix: Fix
     site: int
     latency_s: float
-    """From the end of its last frame until the board had it."""
+    """From the end of its last frame until the board had computed it."""
 
 
 class BoardStatus(Struct, frozen=True):
@@ -48,13 +48,13 @@ class BoardStatus(Struct, frozen=True):
 
     site: int | None
     reason: NoFixReason | None
-    """Why there is no fix; None where there is one."""
+    """Why there is no fix; None if there is one."""
     counters: dict[str, int]
-    """Frames by what became of them, and fixes, since the board's start."""
+    """Numbers of frames by their fate, and of fixes, since the board's start."""
 
 
 class AnchorPlace(Struct, frozen=True):
-    """Where an anchor is that the board uses."""
+    """Position of an anchor that the board uses."""
 
     anchor: int
     position_m: tuple[float, float, float]
@@ -64,17 +64,17 @@ TagReport = BoardFix | BoardStatus | AnchorPlace | GeoreferencePage
 
 
 class Reported(Struct, frozen=True, gc=False):
-    """What a board has said, and when it came by the host's monotonic clock."""
+    """A report of a board, and when it arrived by the host's monotonic clock."""
 
     report: TagReport
     host_s: float
 
 
-# Values of records; one that is too short raises struct.error
+# From records to values; a record that is too short raises struct.error
 
 
 def board_fix(record: bytes) -> BoardFix | None:
-    """The fix of a record; None where there is none."""
+    """Decode a FIX record; None if it is malformed."""
     ticks, _, _, latency_us, _, reason, site, _, height, verified, *rest, count = _FIX.unpack_from(record, BODY_AT)
     place, velocity, covariance, velocity_covariance = rest[:3], rest[3:6], rest[6:12], rest[12:18]
     chi2, mean_square_m2, hpl_m, vpl_m, levels, risk, limit_m = rest[18:]
@@ -107,7 +107,7 @@ def board_fix(record: bytes) -> BoardFix | None:
 
 
 def board_status(record: bytes) -> BoardStatus | None:
-    """The state of a record; None where there is none."""
+    """Decode a TAG_STATUS record; None if it is malformed."""
     site, reason, _, *counts = _STATUS.unpack_from(record, BODY_AT)
     if reason >= len(_REASONS):
         return None
@@ -116,22 +116,22 @@ def board_status(record: bytes) -> BoardStatus | None:
 
 
 def anchor_place(record: bytes) -> AnchorPlace:
-    """The anchor of a record."""
+    """Decode an ANCHOR_PLACE record."""
     anchor, x_mm, y_mm, z_mm = _PLACE.unpack_from(record, BODY_AT)
     return AnchorPlace(anchor, (x_mm / 1000, y_mm / 1000, z_mm / 1000))
 
 
 def georeference(record: bytes) -> GeoreferencePage:
-    """The place on the Earth of a record, as on the air."""
+    """Decode a GEOREFERENCE record, to the page as on the air."""
     latitude, longitude, height_mm, heading = _EARTH.unpack_from(record, BODY_AT)
     return GeoreferencePage(latitude / 1e7, longitude / 1e7, height_mm / 1000, heading / 1e7)
 
 
-# What an emulated board sends: the inverses
+# From values to bodies of records, for emulated boards
 
 
 def fix_body(fix: Fix, unix_s: float, rx_ticks: int, latency_s: float, serial: int, site: int, tag: int) -> bytes:
-    """The body of FIX; ``serial`` is the number of the fix, ``tag`` that of the tag."""
+    """Encode the body of FIX; ``serial`` is the number of the fix, ``tag`` that of the tag."""
     rows, required = _ROWS.unpack(fix.rows), fix.requirement or IntegrityRequirement()
     fixed = _FIX.pack(
         *(round(fix.time_s * TICK_RATE_HZ), round(1e6 * unix_s), rx_ticks, round(1e6 * latency_s), serial, 0),
@@ -145,17 +145,17 @@ def fix_body(fix: Fix, unix_s: float, rx_ticks: int, latency_s: float, serial: i
 
 
 def status_body(site: int | None, reason: NoFixReason | None, counts: Sequence[int], receiver_on_s: float) -> bytes:
-    """The body of TAG_STATUS, of a tag that does not sleep; ``counts`` are in the order of the record."""
+    """Encode the body of TAG_STATUS for a tag that does not sleep; ``counts`` are in the order of the record."""
     number = _NO_SITE if site is None else site
     return _STATUS.pack(number, _REASONS.index(reason), 0, *counts) + struct.pack("<2I", round(1000 * receiver_on_s), 0)
 
 
 def place_body(anchor: int, position_m: Sequence[float]) -> bytes:
-    """The body of ANCHOR_PLACE."""
+    """Encode the body of ANCHOR_PLACE."""
     return _PLACE.pack(anchor, *(round(1000 * value) for value in position_m))
 
 
 def georeference_body(earth: GeoreferencePage) -> bytes:
-    """The body of GEOREFERENCE."""
+    """Encode the body of GEOREFERENCE."""
     latitude, longitude, height_m, heading = astuple(earth)
     return _EARTH.pack(round(1e7 * latitude), round(1e7 * longitude), round(1000 * height_m), round(1e7 * heading))

@@ -1,4 +1,4 @@
-"""A DW1000 as a radio, driven by this process; its port says where the chip is: on SPI, or a model of one."""
+"""A DW1000 as a radio, driven by this process; a port provides the chip: on SPI, or a model of one."""
 
 import asyncio
 import ctypes
@@ -20,11 +20,11 @@ from skyless.core.ticks import TICK_S, difference, from_seconds, wrap
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
 from skyless.radio.serial.link import cycles, from_steps
 
-# The DW1000's driver, as the computer at its bus calls it: the C of the firmware in ``c/``, integers only.
+# The DW1000's driver, called by the computer at its bus: the firmware's C code in ``c/``, with integers only.
 #
-# ``c/dw1000.h`` says which states there are and what its functions do, ``docs/dw1000.md`` where each register's value
-# is from. It has never run on a chip. The machine's C compiler (``CC``, or ``cc``) makes a library of it at the first
-# use, in the user's cache folder.
+# ``c/dw1000.h`` describes states and functions, ``docs/dw1000.md`` the source of each register's value. The driver has
+# never run on a chip. At the first use the machine's C compiler (``CC``, or ``cc``) makes a library of it in the user's
+# cache folder.
 
 SOURCES: Final = Path(__file__).parent
 COMPILED_WITH: Final = ("-std=c11", "-O2", "-fPIC", "-shared")
@@ -42,22 +42,22 @@ FAILED: Final = 4
 CLOCK_SLIPPED: Final = 8
 LOST: Final = 16
 NOTHING: Final = 32
-"""Results of ``poll``: a frame was received, ours was sent; a reception failed; the clock's PLL was losing lock (stamps
-around that time are unreliable); the chip does not answer or was reset; no frame came in the window."""
+"""Results of ``poll``: a frame was received; our frame was sent; a reception failed; the clock's PLL was losing lock
+(stamps around that time are unreliable); the chip does not answer or was reset; no frame came in the window."""
 
 QUEUED: Final = 0
 LATE: Final = 1
 BUSY: Final = 2
 NOT_READY: Final = 3
-"""Results of ``transmit_at`` and ``receive_at``: it will happen at its time; or not, as it was too late, the radio is
+"""Results of ``transmit_at`` and ``receive_at``: the action is planned; or not, because it was too late, the radio is
 busy, or the chip is OFF."""
 
 NOT_MEASURED: Final = -32768
-"""A measured value that is missing."""
+"""Marks a missing measured value."""
 NO_PHASE: Final = -1
 MIN_PSDU_BYTES: Final = 3
 MAX_PSDU_BYTES: Final = 127
-"""FCS included, which the chip makes and checks (UM p. 80)."""
+"""Including the FCS, which the chip makes and checks (UM p. 80)."""
 MAX_TRANSFER_BYTES: Final = 132
 _DEVICE_ID_READ: Final = 0x00
 _CPLOCK: Final = 1 << 1
@@ -73,24 +73,24 @@ class Bus(Protocol):
     """The hardware that the driver needs; each method may raise OSError."""
 
     def transfer(self, out: bytes) -> bytes:
-        """One SPI transaction (mode 0): what the chip sends while it receives ``out``, as many octets."""
+        """Do one SPI transaction (mode 0). Returns the octets that the chip sends meanwhile, as many as ``out``."""
 
     def set_spi_fast(self, fast: bool) -> None:
-        """Clock at most 20 MHz from now on, or at most 3 MHz: the chip's PLL has no lock (UM 2.3.2)."""
+        """Set the clock to at most 20 MHz, or to at most 3 MHz while the chip's PLL has no lock (UM 2.3.2)."""
 
     def reset_chip(self) -> None:
-        """Pull RSTn low for a moment and let go (never drive it high), where it is wired."""
+        """Pull RSTn low for a moment, then let it float (never drive it high), if it is wired."""
 
     def pause_us(self, microseconds: int) -> None:
-        """Wait at least that long."""
+        """Wait for at least this time."""
 
 
 @cache
 def library() -> ctypes.CDLL:
-    """The driver in C, compiled if this is its first use.
+    """Load the driver in C, compiling it at the first use.
 
     Raises:
-        SkylessError: there is no compiler, or no folder for its result.
+        SkylessError: there is no compiler, or no folder for the library.
     """
     loaded = ctypes.CDLL(str(_compiled()))
     declare(loaded)
@@ -98,7 +98,7 @@ def library() -> ctypes.CDLL:
 
 
 def declare(loaded: ctypes.CDLL) -> None:
-    """State the types of the driver's functions in a library that contains them."""
+    """Declare the types of the driver's functions in a library that contains them."""
     for name in ("log10", "accumulated", "power_cdbm", "first_path_cdbm", "carrier_offset_ppb", "micros_until"):
         getattr(loaded, f"dw1000_{name}").restype = ctypes.c_int32
     loaded.dw1000_angle.restype = ctypes.c_uint32
@@ -111,7 +111,7 @@ def declare(loaded: ctypes.CDLL) -> None:
 
 
 def _compiled() -> Path:
-    """The library of exactly these sources and this compiler, in the user's cache folder."""
+    """Return the library of exactly these sources and this compiler in the user's cache folder, made if missing."""
     command = [*shlex.split(os.environ.get("CC", "cc")), *COMPILED_WITH, str(SOURCES / "dw1000.c"), "-o"]
     digest = hashlib.sha256(" ".join(command).encode())
     for path in sorted(SOURCES.glob("*.[ch]")):
@@ -143,9 +143,9 @@ def _compiled() -> Path:
 
 
 class Hardware(ctypes.Structure):
-    """The first functions of ``struct hardware`` (``c/hardware.h``), all that the driver calls, on a Python object.
+    """The first members of ``struct hardware`` (``c/hardware.h``), all that the driver calls, for a Python object.
 
-    C knows no exceptions: the first is kept in ``failure``, and from then on nothing is called and C reads zeros.
+    C has no exceptions: the first one is kept in ``failure``, and from then on no function is called and C reads zeros.
     """
 
     _fields_ = (
@@ -171,35 +171,35 @@ class Hardware(ctypes.Structure):
         )
 
     def connect(self, **functions: Callable[..., object]) -> None:
-        """Set members of the structure, and keep what they call: ctypes forgets some where a structure has a base."""
+        """Set members of the structure, and keep the callbacks: ctypes loses some if the structure has a base class."""
         kinds = dict(field[:2] for kind in type(self).__mro__ for field in vars(kind).get("_fields_", ()))
         for name, function in functions.items():
             self._kept[name] = kinds[name](function)
             setattr(self, name, self._kept[name])
 
     def call(self, function: Callable[..., Value], *values: object) -> Value | int:
-        """Call it for C; 0 after a failure."""
+        """Call a function for C. Returns 0 after a failure."""
         if self.failure is None:
             try:
                 return function(*values)
-            except BaseException as error:  # noqa: BLE001 - raised when C has returned
+            except BaseException as error:  # noqa: BLE001 - raised again when C has returned
                 self.failure = error
         return 0
 
     def raise_failure(self) -> None:
-        """Raise what a function has raised while C was running."""
+        """Raise the exception that a function raised while C was running, if any."""
         failure, self.failure = self.failure, None
         if failure is not None:
             raise failure
 
 
 class DW1000(ctypes.Structure):
-    """``struct dw1000`` of ``c/dw1000.h``: one chip. A bus that fails leaves it OFF.
+    """``struct dw1000`` of ``c/dw1000.h``: one chip. It is OFF after a failure of the bus.
 
-    Until the next ``poll``, what was received is in ``rx_ticks``, ``frame``, ``rx_power_cdbm``, ``first_path_cdbm``,
+    Until the next ``poll``, the last reception is in ``rx_ticks``, ``frame``, ``rx_power_cdbm``, ``first_path_cdbm``,
     ``offset_ppb`` and ``phase``: that of the carrier in 2**-16 turns if ``reads_phases`` is set, or NO_PHASE. The stamp
-    of what was SENT is in ``tx_ticks``. ``errors`` are failed receptions of any kind. ``uses_both_buffers``, set before
-    the start of a radio that only listens, has the receiver on while a frame is read.
+    of the frame SENT is in ``tx_ticks``. ``errors`` counts failed receptions of any kind. ``uses_both_buffers``, to be
+    set before the start of a radio that only listens, keeps the receiver on while a frame is read.
     """
 
     state: int
@@ -241,7 +241,7 @@ class DW1000(ctypes.Structure):
 
     @property
     def frame(self) -> bytes:
-        """The frame that was received last."""
+        """The last frame received."""
         return ctypes.string_at(self._frame, self._frame_bytes)
 
     def _call(self, name: str, *values: object) -> int:
@@ -252,7 +252,7 @@ class DW1000(ctypes.Structure):
         return result
 
     def start(self, tx_delay_ticks: int, rx_delay_ticks: int) -> None:
-        """Reset and configure the chip; antenna delays of 16 bits.
+        """Reset and configure the chip. Antenna delays have 16 bits.
 
         Raises:
             ChipError: no DW1000 answers, or its clock does not lock.
@@ -267,30 +267,31 @@ class DW1000(ctypes.Structure):
         raise ChipError(f"no DW1000{when}: its identifier is DECA0130, read was {found}")
 
     def receive(self) -> None:
-        """Listen from now on; a frame that waits to be sent is sent before."""
+        """Listen from now on; a waiting frame is sent before."""
         self._call("receive")
 
     def idle(self) -> None:
-        """Turn the receiver off; a frame that waits to be sent is sent before."""
+        """Turn the receiver off; a waiting frame is sent before."""
         self._call("idle")
 
     def receive_at(self, ticks: int, window: int) -> int:
-        """Listen for one frame from ``ticks`` of the counter on, for ``window`` · 65536 ticks; QUEUED, or why not."""
+        """Listen for one frame from counter ``ticks`` on, for ``window`` · 65536 ticks. Returns QUEUED or why not."""
         return self._call("receive_at", ticks, window)
 
     def sleep(self) -> None:
-        """Let the chip sleep: it is OFF until ``wake``."""
+        """Put the chip to sleep: it is OFF until ``wake``."""
         self._call("sleep")
 
     def wake(self, tx_delay_ticks: int, rx_delay_ticks: int) -> bool:
-        """Wake and configure a chip that sleeps; False where none answers."""
+        """Wake and configure a sleeping chip. Returns False if none answers."""
         return bool(self._call("wake", tx_delay_ticks, rx_delay_ticks))
 
     def transmit_at(self, dx_ticks: int, frame: bytes) -> int:
-        """Send a PSDU when the counter is at ``dx_ticks``; QUEUED, or why not.
+        """Send a PSDU when the counter is at ``dx_ticks``. Returns QUEUED or why not.
 
-        Its low nine bits are ignored (UM p. 26). The stamp will be that + the TX antenna delay. The last two bytes of
-        the frame are replaced by the FCS, which the chip makes. Poll before, or a frame that has just come is lost.
+        The low nine bits of ``dx_ticks`` are ignored (UM p. 26). The stamp will be the rest plus the TX antenna delay.
+        The chip replaces the last two bytes of the frame by the FCS. Call ``poll`` before, or a frame that has just
+        been received is lost.
 
         Raises:
             ValueError: no PSDU has this length.
@@ -300,47 +301,47 @@ class DW1000(ctypes.Structure):
         return self._call("transmit_at", dx_ticks, frame, len(frame))
 
     def cancel(self) -> bool:
-        """Cancel a frame that has not been sent; False where it has, which the next ``poll`` will return."""
+        """Cancel a waiting frame. Returns False if it has been sent, which the next ``poll`` reports."""
         return bool(self._call("cancel"))
 
     def poll(self) -> int:
-        """What has happened since: a sum of RECEIVED, SENT, FAILED, CLOCK_SLIPPED, LOST; 0 for nothing.
+        """Return the events since the last call: a sum of RECEIVED, SENT, FAILED, CLOCK_SLIPPED, LOST; 0 for none.
 
-        To be called when the interrupt line is high, or periodically. The receiver is on again when it returns.
+        Call this when the interrupt line is high, or periodically. The receiver is on again when it returns.
         """
         return self._call("poll")
 
     def check(self) -> bool:
-        """Whether the chip still has its configuration; if not it is OFF.
+        """Whether the chip still has its configuration; if not, it is OFF.
 
-        A chip whose supply failed may lock again unnoticed and report nothing for ever, so this is to be called
-        periodically where nothing is received for long.
+        A chip whose supply failed may lock again unnoticed and then never report anything, so call this periodically
+        while nothing is received.
         """
         return bool(self._call("check"))
 
     def now(self) -> int:
-        """The counter now, in steps of 512 ticks (UM 7.2.8)."""
+        """Read the counter, in steps of 512 ticks (UM 7.2.8)."""
         return self._call("now")
 
     def measure(self) -> bool:
-        """Measure ``temperature_cc`` and ``millivolts`` in some 1.1 ms, in which nothing is received."""
+        """Measure ``temperature_cc`` and ``millivolts``, in about 1.1 ms during which nothing is received."""
         return bool(self._call("measure"))
 
 
 OVERDUE_TICKS: Final = from_seconds(1e-3)
 """A frame whose end is not reported within this time after its RMARKER is cancelled."""
 CHECK_S: Final = 1.0
-"""A chip from which nothing came for this time is asked whether it still has its settings."""
+"""A chip without an event for this time is checked for its configuration."""
 
 SPI_LEAD_S: Final = 1.5e-3
-"""The preamble, seven transfers of up to 0.1 ms, a reception that is served before, and a host's timers
-(``benchmarks/host_latency.py``)."""
+"""Time for the preamble, seven transfers of up to 0.1 ms, a reception that is served before, and the inaccuracy of a
+host's timers (``benchmarks/host_latency.py``)."""
 
 _FAILURES: Final = {FAILED: "rx-error", CLOCK_SLIPPED: "clock-slipped"}
 
 
 class ChipSession:
-    """One chip from its start until it is lost. No I/O but the driver's bus, no clock."""
+    """One chip from its start until it is lost. No I/O except on the driver's bus, and no clock."""
 
     def __init__(
         self,
@@ -351,7 +352,7 @@ class ChipSession:
         *,
         phases: bool = False,
     ) -> None:
-        """``phases``: receptions have the phase of their carrier."""
+        """``phases``: whether to measure the carrier phase of receptions."""
         self.driver = DW1000(bus)
         self.driver.reads_phases = phases
         self._delays, self._listener, self._counters = delays, listener, counters
@@ -370,16 +371,16 @@ class ChipSession:
         self.driver.receive()
 
     def read_ticks(self) -> int | None:
-        """The chip's counter, read over the bus; None for a chip that is off."""
+        """Read the chip's counter over the bus; None if the chip is off."""
         return None if self.driver.state == OFF else self.driver.now()
 
     @property
     def overdue_ticks(self) -> int | None:
-        """Reading of the counter at which to call ``cancel_overdue``; None while no frame waits."""
+        """Counter value at which to call ``cancel_overdue``; None while no frame waits."""
         return None if self._pending is None else wrap(self._pending + OVERDUE_TICKS)
 
     def transmit(self, transmission: Transmission, host_s: float | None = None) -> None:
-        """Have a frame sent at its tick; a frame that has just been received is read first."""
+        """Have a frame sent at its tick, after reading one that has just been received."""
         self.serve(host_s)
         dx_ticks = wrap(transmission.tx_ticks - self._delays.tx_ticks)
         if self.driver.transmit_at(dx_ticks, transmission.frame) == QUEUED:
@@ -388,9 +389,9 @@ class ChipSession:
             self._listener(Late(transmission.tx_ticks))
 
     def serve(self, host_s: float | None = None) -> bool:
-        """Process the chip's events; False when it has lost its settings and must be started again.
+        """Process the chip's events. Returns False if it has lost its configuration and must be started again.
 
-        ``host_s`` is what receptions carry as the host's time.
+        ``host_s`` is the host's time that receptions carry.
         """
         driver = self.driver
         events = driver.poll()
@@ -410,7 +411,7 @@ class ChipSession:
         return True
 
     def is_alive(self) -> bool:
-        """Ask a chip from which nothing has come whether it still has its settings."""
+        """Whether a chip without events still has its configuration."""
         alive = self.driver.check()
         self._counters["chip-lost"] += not alive
         return alive
@@ -436,19 +437,19 @@ class ChipSession:
 
 
 class Port(Protocol):
-    """Where a chip is."""
+    """Provides a chip to a radio."""
 
     async def run(self, radio: "Dw1000Radio") -> None:
-        """Find the chip, and find it again when it is lost, until cancelled; call the radio with its events."""
+        """Find the chip, and find it again when it is lost, until cancelled; call the radio's methods."""
 
 
 class Dw1000Radio:
-    """One node's chip (``skyless.radio.interface.Radio``)."""
+    """The radio of one node with a DW1000 (``skyless.radio.interface.Radio``)."""
 
     def __init__(self, port: Port, name: str, delays: AntennaDelays, *, phases: bool = False) -> None:
-        """``phases``: receptions have the phase of their carrier.
+        """``phases``: whether to measure the carrier phase of receptions.
 
-        Raises SkylessError where the driver cannot be compiled.
+        Raises SkylessError if the driver cannot be compiled.
         """
         library()
         self.name = name
@@ -466,7 +467,7 @@ class Dw1000Radio:
         self._timer: asyncio.TimerHandle | None = None
 
     async def run(self, listener: Listener) -> None:
-        """Receive until cancelled; a chip that does not answer is looked for."""
+        """Receive until cancelled; keep trying while the chip does not answer."""
         self._listener = listener
         checks = asyncio.ensure_future(self._check())
         try:
@@ -476,18 +477,18 @@ class Dw1000Radio:
             self._end_session()
 
     def advice(self) -> str:
-        """Where to look when nothing comes though the chip answers."""
+        """Return a hint for when nothing is received though the chip answers."""
         return "the DW1000 answers, but receives no frame: are anchors on the air, is its antenna free?"
 
     def now_ticks(self) -> int | None:
-        """The chip's counter, read over the bus; None while it is not ready."""
+        """Read the chip's counter over the bus; None while it is not ready."""
         try:
             return None if self._session is None else self._session.read_ticks()
         except OSError:
             return None
 
     def transmit(self, transmission: Transmission) -> None:
-        """Send a frame; without a chip it is late."""
+        """Send a frame; without a chip it is reported as late."""
         session = self._session
         if session is None:
             self._listener(Late(transmission.tx_ticks))
@@ -500,7 +501,7 @@ class Dw1000Radio:
             self._listener(Late(transmission.tx_ticks))
 
     def _set_timer(self, session: ChipSession) -> None:
-        """For a frame whose end is not reported."""
+        """Set the timer for a frame whose end is not reported."""
         overdue, now = session.overdue_ticks, session.read_ticks()
         if overdue is not None and now is not None:
             if self._timer is not None:
@@ -521,7 +522,7 @@ class Dw1000Radio:
         self._session, self._trouble = None, error
 
     async def _check(self) -> None:
-        """Check a silent chip: one whose supply failed may have started again without an event."""
+        """Check a silent chip periodically: its supply may have failed, and it may have restarted without an event."""
         while True:
             await asyncio.sleep(CHECK_S)
             session, self._active = self._session if not self._active else None, False
@@ -552,10 +553,10 @@ class Dw1000Radio:
         self._active = True
         self._listener(event)
 
-    # What the port calls
+    # Called by the port
 
     def begin(self, bus: Bus) -> None:
-        """Start the chip that has been found. Raises OSError and ChipError."""
+        """Start a chip that was found. Raises OSError and ChipError."""
         self._end_session()
         self._trouble = None
         session = ChipSession(bus, self._delays, self._on_event, self.counters, phases=self._phases)
@@ -564,9 +565,9 @@ class Dw1000Radio:
         self._listener(Restarted())
 
     def serve(self) -> bool:
-        """Process the chip's events, False if there were none; start a chip again that has lost its settings.
+        """Process the chip's events, and restart a chip that has lost its configuration.
 
-        Raises OSError and ChipError.
+        Returns False if there were no events. Raises OSError and ChipError.
         """
         trouble, self._trouble = self._trouble, None
         if trouble is not None:
@@ -577,13 +578,13 @@ class Dw1000Radio:
         return session is not None and not session.idle
 
     def report_fault(self, counter: str, text: str) -> None:
-        """Count a fault of the wiring, and report it once."""
+        """Count a wiring fault, and report it once."""
         self.counters[counter] += 1
         if counter not in self._hinted:
             self._hinted.add(counter)
             self._listener(Hint(text))
 
     def end(self, reason: str) -> None:
-        """The chip is out of reach; each reason is reported once."""
+        """Note that the chip is out of reach. A reason that repeats is reported once."""
         self._end_session()
         self._report_gone(reason)

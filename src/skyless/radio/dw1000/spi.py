@@ -35,13 +35,13 @@ _VAIN: Final = (
 )
 _RESET_S: Final = 0.001
 _MAX_EDGE_READS: Final = 8
-"""Each reads all that the kernel keeps; a line that rises faster than it is read is not waited for."""
+"""Each takes all edges that the kernel keeps. The number is limited, as a line may rise faster than it is read."""
 
 
 class SpiBus:
-    """One chip's SPI device and lines (``skyless.radio.dw1000.radio.Bus``).
+    """One chip's SPI device and GPIO lines (``skyless.radio.dw1000.radio.Bus``).
 
-    Transfers raise OSError where the kernel refuses them.
+    Transfers raise OSError if the kernel refuses them.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class SpiBus:
         gpio_chip: str = DEFAULT_CHIP,
         fast_hz: int = DEFAULT_FAST_HZ,
     ) -> None:
-        """Pins are line numbers of ``gpio_chip`` (on a Raspberry Pi the GPIO numbers).
+        """Pins are line numbers of ``gpio_chip`` (on a Raspberry Pi, GPIO numbers).
 
         Raises:
             SkylessError: a package of the extra ``pi`` is missing, a device cannot be opened, or a speed is too high.
@@ -107,11 +107,11 @@ class SpiBus:
             ) from None
 
     def transfer(self, out: bytes) -> bytes:
-        """One transaction in both directions."""
+        """Do one transaction in both directions."""
         return bytes(self._spi.xfer2(list(out)))
 
     def set_spi_fast(self, fast: bool) -> None:
-        """The configured speed, or 2 MHz, from the next transfer on."""
+        """Use the configured speed, or 2 MHz, from the next transfer on."""
         self._spi.max_speed_hz = self._fast_hz if fast else START_HZ
 
     def reset_chip(self) -> None:
@@ -126,22 +126,22 @@ class SpiBus:
         time.sleep(microseconds * 1e-6)
 
     def fileno(self) -> int | None:
-        """What becomes readable when the interrupt line rises; None without one."""
+        """File descriptor that becomes readable when the interrupt line rises; None without a line."""
         return None if self._irq is None else self._irq.fd
 
     def is_raised(self) -> bool:
-        """Whether the interrupt line is high; without one always, so that the chip is asked."""
+        """Whether the interrupt line is high; always True without a line, so that the chip is polled."""
         return self._irq is None or bool(self._irq.get_value(self._irq.offsets[0]).value)
 
     def forget_edges(self) -> None:
-        """Make ``fileno`` unreadable until the line rises again; look at ``is_raised`` after it."""
+        """Make ``fileno`` unreadable until the line rises again; check ``is_raised`` afterwards."""
         for _ in range(_MAX_EDGE_READS):
             if self._irq is None or not self._irq.wait_edge_events(0):
                 return
             self._irq.read_edge_events()
 
     def close(self) -> None:
-        """Release device and lines."""
+        """Release the device and lines."""
         for line in (self._irq, self._reset):
             if line is not None:
                 line.release()
@@ -159,7 +159,7 @@ class SpiPort:
         self._name, self._open_bus = name, open_bus
 
     async def run(self, radio: Dw1000Radio) -> None:
-        """Serve the chip, and look for it again when it does not answer, until cancelled."""
+        """Serve the chip until cancelled; open it again after each failure."""
         while True:
             try:
                 bus = self._open_bus()
@@ -175,7 +175,7 @@ class SpiPort:
             await asyncio.sleep(REOPEN_S)
 
     async def _serve(self, bus: SpiBus, radio: Dw1000Radio) -> None:
-        """Serve the chip when its interrupt line rises; without a line at short intervals."""
+        """Serve the chip when its interrupt line rises, or at short intervals without a line."""
         radio.begin(bus)
         loop, line = asyncio.get_running_loop(), bus.fileno()
         if line is None:
@@ -190,7 +190,7 @@ class SpiPort:
             loop.remove_reader(line)
 
     async def _serve_line(self, bus: SpiBus, radio: Dw1000Radio, risen: asyncio.Event) -> None:
-        """Serve the chip when its line has risen and until it is low; a line without events is polled instead."""
+        """Serve the chip from when its line rises until it is low; poll the chip if its line is high without events."""
         vain = 0
         while True:
             is_high = await _is_set(risen, _LINE_CHECK_S)
@@ -209,7 +209,7 @@ class SpiPort:
 
 
 async def _is_set(event: asyncio.Event, seconds: float) -> bool:
-    """Whether it was set within that time."""
+    """Wait for an event for at most ``seconds``. Returns whether it was set."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await event.wait()
@@ -217,12 +217,12 @@ async def _is_set(event: asyncio.Event, seconds: float) -> bool:
 
 
 def check_spi(spec: str, bus: int, device: int, gpio_chip: str | None) -> None:
-    """Check that packages and device files exist and may be used; a later failure may pass by itself.
+    """Check that packages and device files exist and may be used. Later failures may be temporary.
 
-    ``gpio_chip`` is None where no lines are wanted.
+    ``gpio_chip`` is None if no lines are used.
 
     Raises:
-        SkylessError: naming what a person has to change before this can work.
+        SkylessError: naming what a person must change before this can work.
     """
     try:
         for package in ("spidev",) if gpio_chip is None else ("spidev", "gpiod", "gpiod.line"):

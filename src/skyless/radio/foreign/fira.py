@@ -1,4 +1,4 @@
-"""UCI of a DT-tag: notifications as packets, and logs of them, binary or as text with hexadecimal packets."""
+"""UCI of a DT-tag: notifications to packets, and logs of them: binary, pcapng, or text with hexadecimal packets."""
 
 import re
 from collections import Counter
@@ -29,15 +29,15 @@ from skyless.radio.foreign.uci import (
 
 
 class AnchorFrame:
-    """The frame of one recording, or of the boards of one process."""
+    """The coordinate frame of one recording, or of the boards of one process."""
 
     def __init__(self) -> None:
         self.origin: GeodeticPoint | None = None
-        """The first point on the Earth, where positions are stated there."""
+        """The first location stated in WGS 84; None if there is none."""
         self._is_relative = False
 
     def position_m(self, location: Point | GeodeticPoint | None) -> Point | None:
-        """A location in this frame; None for one of the other kind."""
+        """Convert a location to this frame; None for a location of another kind than the first one."""
         if isinstance(location, GeodeticPoint):
             if self._is_relative:
                 return None
@@ -55,18 +55,18 @@ _MESSAGES: Final = frozenset(map(int, DtMessageType))
 
 
 class DtTag:
-    """From a tag's notifications to packets; what is of no use is counted."""
+    """Converts a tag's notifications to packets; unusable ones are counted."""
 
     def __init__(
         self, drops: Drops, anchors_m: Mapping[int, Point] | None = None, frame: AnchorFrame | None = None
     ) -> None:
-        """``anchors_m``: positions that replace all that anchors state; ``frame``: of those, where tags share it."""
+        """``anchors_m``: positions that replace all stated ones; ``frame``: of stated positions, if tags share it."""
         self._drops = drops
         self._rounds = DtRounds(anchors_m)
         self._frame = None if anchors_m else frame or AnchorFrame()
 
     def on_uci(self, packet: UciPacket, host_s: float | None = None) -> list[Packet]:
-        """Packets of a notification, in the order in which they were received; ``host_s``: when it came."""
+        """Return the packets of a notification, in order of reception; ``host_s``: when the notification arrived."""
         info = decode_session_info(packet)
         if isinstance(info, SessionInfo):
             return self.on_info(info, host_s)
@@ -74,7 +74,7 @@ class DtTag:
         return []
 
     def on_info(self, info: SessionInfo, host_s: float | None = None) -> list[Packet]:
-        """Packets of a decoded notification."""
+        """Return the packets of a decoded notification."""
         usable = []
         for one in info.measurements:
             reason = _unusable(one)
@@ -119,20 +119,20 @@ def _unusable(one: DtMeasurement) -> str | None:
     return "stamp-missing" if min(one.tx_bytes, one.rx_bytes) < _STAMP_BYTES else None
 
 
-# Logs: bytes as they came, or lines of text with a packet each.
+# Logs: bytes as received, or lines of text with a packet each.
 
 _NOTIFICATION: Final = re.compile(rb"(?i)(?<![0-9a-f])(?:0x)?[67]2(?:([ :,-]|, |)(?:0x)?[0-9a-f]{2}){3,}(?![0-9a-f])")
-"""The beginning of SESSION_INFO as text, its bytes run together or with something between them."""
+"""The beginning of SESSION_INFO as text, its bytes joined or separated."""
 _BYTE: Final = re.compile(rb"(?i)(?:0x)?([0-9a-f]{2})")
 
 
 def recognise_binary(head: bytes) -> bool:
-    """Whether a notification of DL-TDoA measurements stands near the beginning."""
+    """Whether there is a notification of DL-TDoA measurements near the beginning."""
     return _has_measurements(UciReader(Counter()).feed(head))
 
 
 def recognise_text(head: bytes) -> bool:
-    """Whether lines near the beginning hold a notification of DL-TDoA measurements."""
+    """Whether lines near the beginning contain a notification of DL-TDoA measurements."""
     reader = UciReader(Counter())
     return any(_has_measurements(reader.feed(data)) for line in head.split(b"\n") for data in _packets_of_line(line))
 
@@ -143,7 +143,7 @@ def _has_measurements(packets: list[UciPacket]) -> bool:
 
 
 def read_binary(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
-    """Yield the packets of a binary log; ``anchors_m``: positions that replace all that anchors state."""
+    """Yield the packets of a binary log; ``anchors_m``: positions that replace all stated ones."""
     reader, tag = UciReader(drops), DtTag(drops, anchors_m)
     for chunk in chunks(stream, drops):
         for packet in reader.feed(chunk):
@@ -153,13 +153,13 @@ def read_binary(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Po
 PCAPNG_MAGIC: Final = b"\x0a\x0d\x0d\x0a"
 _INTERFACE, _PACKET = 1, 6
 LINK_TYPE: Final = 299
-"""Of UCI in captures (tcpdump.org's list of link types)."""
+"""Link type of UCI in captures (tcpdump.org's list)."""
 
 _MAX_BLOCK_BYTES: Final = 1 << 20
 
 
 def recognise_pcapng(head: bytes) -> bool:
-    """Whether the file is a pcapng whose first interface has UCI on it."""
+    """Whether the file is a pcapng whose first interface carries UCI."""
     blocks = _blocks(iter((head,)), Counter())
     link_types = (int.from_bytes(body[:2], order) for kind, body, order in blocks if kind == _INTERFACE)
     return head.startswith(PCAPNG_MAGIC) and next(link_types, None) == LINK_TYPE
@@ -176,7 +176,7 @@ def read_pcapng(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Po
 
 
 def _blocks(pieces: Iterator[bytes], drops: Drops) -> Iterator[tuple[int, bytes, Literal["little", "big"]]]:
-    """Kind, body and byte order of each block of a pcapng; ends where it is none, or is cut off."""
+    """Yield kind, body and byte order of each block of a pcapng; ends at a malformed or incomplete block."""
     data = b""
     order: Literal["little", "big"] = "little"
     for piece in pieces:
@@ -197,7 +197,7 @@ def _blocks(pieces: Iterator[bytes], drops: Drops) -> Iterator[tuple[int, bytes,
 
 
 def read_text(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
-    """Yield the packets of a log of lines as of a binary one; lines without a packet are counted."""
+    """Yield the packets of a text log, as ``read_binary`` does; lines without a packet are counted."""
     reader, tag = UciReader(drops), DtTag(drops, anchors_m)
     for line in lines(stream, drops):
         found = _packets_of_line(line)
@@ -209,7 +209,7 @@ def read_text(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Poin
 
 
 def _packets_of_line(line: bytes) -> list[bytes]:
-    """Bytes of the first notification in a line whose length fits its header, whole or a segment; or none."""
+    """Bytes of the first notification, or segment of one, in a line whose length fits its header; empty if none."""
     for match in _NOTIFICATION.finditer(line):
         data = bytes.fromhex(b"".join(_BYTE.findall(match.group())).decode())
         size = CONTROL_HEADER_BYTES + data[3]

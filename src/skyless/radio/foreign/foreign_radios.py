@@ -1,4 +1,4 @@
-"""Boards with other firmware, which only listen: that of uwb-apps, the Bitcraze sniffer, and FiRa boards."""
+"""Boards with firmware of other makers, which only listen: the uwb-apps listener, Bitcraze sniffers, FiRa boards."""
 
 import time
 from abc import ABC, abstractmethod
@@ -20,7 +20,7 @@ from skyless.radio.interface import Gone, Late, RadioEvent, Restarted, ignore
 from skyless.radio.serial.serial_port import BoardClock, SerialPort, line_advice
 
 ASK_BINARY: Final = b"b"
-"""What makes a sniffer change from text to binary; one that cannot stays with text."""
+"""Makes a sniffer change from text to binary, if it can."""
 
 UNDECIDED_BYTES: Final = 4096
 """Number of bytes without a packet after which the format is determined again."""
@@ -29,10 +29,10 @@ _Event = TypeVar("_Event")
 
 
 class _ListeningBoard(ABC, Generic[_Event]):
-    """What all have in common: a serial port from which they read events."""
+    """Base of all: reads events from a serial port."""
 
     firmware = ""
-    """What runs on the board, in messages."""
+    """Name of the board's firmware in messages."""
 
     def __init__(self, path: str, baud: int, name: str) -> None:
         self.name = name
@@ -44,23 +44,23 @@ class _ListeningBoard(ABC, Generic[_Event]):
         """Whether no byte has come since the last event."""
 
     async def run(self, listener: Callable[[_Event | Restarted | Gone], None]) -> None:
-        """Receive until cancelled; a board that is unplugged is looked for."""
+        """Receive until cancelled; reconnect after the board was unplugged."""
         self._listener = listener
         await self._port.run(self)
 
     def advice(self) -> str:
-        """Where to look when nothing comes: the line, or what is at its other end."""
+        """Return a hint about the line or the device at its other end, for when nothing is received."""
         return line_advice(self._port.path, self._port.baud, self.firmware, silent=self._silent)
 
     @abstractmethod
     def _start(self, send: Callable[[bytes], None]) -> None:
-        """Prepare for the stream of a port that has been opened."""
+        """Prepare for the stream of a port that has just been opened."""
 
     @abstractmethod
     def _events(self, data: bytes, host_s: float) -> Iterator[_Event]:
-        """What is complete with this piece of the stream."""
+        """Yield the events that this piece of the stream completes."""
 
-    # What the port calls
+    # Called by the port
 
     def on_open(self, send: Callable[[bytes], None]) -> None:
         """Begin a new stream."""
@@ -78,7 +78,7 @@ class _ListeningBoard(ABC, Generic[_Event]):
             self._silent = True
 
     def on_close(self) -> None:
-        """The board has gone."""
+        """Do nothing when the port is closed."""
 
 
 class ListenerRadio(_ListeningBoard[RadioEvent]):
@@ -91,14 +91,14 @@ class ListenerRadio(_ListeningBoard[RadioEvent]):
         self._clock = BoardClock()
         self._lines = LineCutter(self.counters)
         self._is_whole = False
-        """Whether the next line is whole: the first one may be the end of a line."""
+        """Whether the next line is complete: the first one may lack its beginning."""
 
     def now_ticks(self) -> int | None:
         """The board's counter, extrapolated from its newest stamps; None before the first."""
         return self._clock.read(time.monotonic())
 
     def transmit(self, transmission: Transmission) -> None:
-        """It cannot: every frame is late."""
+        """Report the frame as late, as this board cannot transmit."""
         self._listener(Late(transmission.tx_ticks))
 
     def _start(self, send: Callable[[bytes], None]) -> None:  # noqa: ARG002 - it takes no commands
@@ -116,12 +116,12 @@ class ListenerRadio(_ListeningBoard[RadioEvent]):
                 yield reception
 
     def on_close(self) -> None:
-        """The board has gone."""
+        """Forget the board's counter."""
         self._clock.reset()
 
 
 class SnifferRadio(_ListeningBoard[Packet]):
-    """A Bitcraze sniffer: packets of TDoA2 and TDoA3 systems, binary or text. It receives no beacons.
+    """A Bitcraze sniffer: packets of TDoA2 and TDoA3 systems, binary or text, instead of beacons.
 
     Packets carry the host's monotonic time of their arrival.
     """
@@ -142,16 +142,16 @@ class SnifferRadio(_ListeningBoard[Packet]):
 
 
 class UciRadio(_ListeningBoard[Packet]):
-    """A FiRa board whose session as a DT-tag goes on: its notifications of DL-TDoA measurements, as packets.
+    """A FiRa board with a running session as a DT-tag: its notifications of DL-TDoA measurements, as packets.
 
-    Packets carry the host's monotonic time of their arrival. It is sent nothing: whoever has started the session set
-    it up.
+    Packets carry the host's monotonic time of their arrival. Nothing is sent to the board: the session must have been
+    set up and started by others.
     """
 
     firmware = "FiRa's UCI with a DL-TDoA session that goes on"
 
     def __init__(self, path: str, baud: int, name: str, anchors_m: Mapping[int, Point], frame: AnchorFrame) -> None:
-        """``anchors_m``: positions that replace all that anchors state; ``frame``: of those, which tags share."""
+        """``anchors_m``: positions that replace all stated ones; ``frame``: of stated positions, shared by tags."""
         super().__init__(path, baud, name)
         self._anchors_m, self.frame = anchors_m, frame
         self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, anchors_m, frame)
@@ -165,19 +165,19 @@ class UciRadio(_ListeningBoard[Packet]):
 
 
 class SnifferStream:
-    """Packets of a sniffer's stream, whose format is determined, and again when it changes."""
+    """Reads packets from a sniffer's stream; determines its format, and again when it changes."""
 
     def __init__(self, drops: Counter[str]) -> None:
         self._drops = drops
         self._head = b""
         self._unused_bytes = 0
-        """Since the last packet."""
+        """Number of bytes since the last packet."""
         self._lines = LineCutter(drops)
         self._binary = BinaryCutter(drops)
         self._is_text: bool | None = None
 
     def feed(self, data: bytes) -> Iterator[Packet]:
-        """Packets that are complete with this piece."""
+        """Yield the packets that this piece completes."""
         if self._is_text is None:
             data = self._determine(data)
         else:
@@ -189,7 +189,7 @@ class SnifferStream:
             self._is_text, self._unused_bytes = None, 0
 
     def _determine(self, data: bytes) -> bytes:
-        """All bytes that are to be read in the format found, or none while none is found."""
+        """Return all bytes so far once the format is found; none before."""
         self._head += data
         text, binary = recognise_text(self._head), recognise_binary(self._head)
         if text or binary:
@@ -213,13 +213,13 @@ class SnifferStream:
                 yield packet
 
 
-# Lines of the uwb-apps listener (Mynewt): one JSON object for each frame, as it was received.
+# Lines of the uwb-apps listener (Mynewt): one JSON object for each received frame.
 #
 # Used keys: ``ts`` (RX stamp), ``rssi`` (dBm), ``d`` (the whole PSDU, hexadecimal) and ``dlen``, its length.
 
 
 class _Line(msgspec.Struct):
-    """What a line must hold; further keys are of no interest."""
+    """The required contents of a line; further keys are ignored."""
 
     ts: int
     dlen: int
@@ -231,7 +231,7 @@ _decode: Final = msgspec.json.Decoder(_Line).decode
 
 
 def reception_of(line: bytes, host_s: float, drops: Drops) -> Reception | None:
-    """Reception of a line that arrived then; None, and a count, for what is none."""
+    """Decode a line that arrived at ``host_s`` to a reception; None, counted in ``drops``, if it is none."""
     if not line:
         return None
     try:

@@ -1,18 +1,18 @@
-"""UCI of FiRa radios: packets of a byte stream, notifications of DL-TDoA measurements in them, and anchors' locations.
+"""UCI of FiRa radios: packets of a byte stream, their notifications of DL-TDoA measurements, and anchors' locations.
 
 A control packet is ``type 3 bits, boundary 1, group 4 | 2 reserved, opcode 6 | reserved u8 | length u8 | payload``, a
 data packet ``type, boundary, format | reserved u8 | length u16 | payload``. A set boundary bit means that the payload
-goes on in the next packet of the same kind. There is no checksum: only what the header reserves shows that bytes are
-none.
+continues in the next packet of the same kind. There is no checksum: only reserved bits of the header show that bytes
+are not a packet.
 
 A notification SESSION_INFO (group 2, opcode 0) is, little-endian,
 
     sequence u32 | session u32 | reserved u8 | interval in ms u32 | measurement type u8 | reserved u8 |
     extended addresses u8 | reserved 8 bytes | number of measurements u8 | measurements
 
-DL-TDoA measurements are of version 1 (FiRa 2.0) or 2 (FiRa 4.0). Version 1 has type 2, version 2 type 6 at Qorvo's
-stack; at Android's both have type 2, and which it is has been agreed with the radio before. So type 2 is version 1
-where that fits the length, else version 2.
+DL-TDoA measurements are of version 1 (FiRa 2.0) or 2 (FiRa 4.0). In Qorvo's stack version 1 has type 2, version 2 has
+type 6; in Android's both have type 2, and the version is agreed with the radio before. So type 2 is taken as version 1
+if that fits the length, else as version 2.
 
     version 1: address u16 or u64 | status u8 | message u8 | control u16 | block u16 | round u8 | NLOS u8 |
         azimuth i16, its FoM u8 | elevation i16, its FoM u8 | RSSI u8 | TX stamp 5 or 8 bytes | RX stamp 5 or 8 |
@@ -23,17 +23,17 @@ where that fits the length, else version 2.
     version 2: size u16 | address | status | message | block | round | NLOS | angles | RSSI | both CFOs | replies |
         flight | length u8, RX stamp | control u32 | length u8, TX stamp | length u8, active rounds, if b1 |
         length u8, location, if b2 | supercluster u8, if b3
-        (Qorvo's stack reads a control of 16 bits, which is accepted where the size shows it.)
+        (Qorvo's stack reads a control of 16 bits, which is accepted if the size shows it.)
 
-A location is in WGS 84 or relative to some point. The coordinates follow each other as one string of bits, each from
-its lowest byte on; of the bits that fill no byte, which are its highest, those come first that count most. WGS 84:
+A location is in WGS 84 or relative to some point. The coordinates follow each other as one string of bits, each with
+its lowest byte first; its highest bits, which do not fill a byte, come last, the most significant one first. WGS 84:
 latitude and longitude of 33 bits in 2⁻²⁴ degrees, altitude of 30 bits in 2⁻²¹ kilometres. Relative: x and y of 28 bits,
 z of 24 bits, in millimetres. In version 2 of the measurements a location begins with its kind; Android's stack expects
-that kind once more in the byte after it (b0 set, kind in b1-3), Qorvo's does not. Kinds 2, 3 and 5 end with 6 bytes
-about the storey.
+the kind again in the next byte (b0 set, kind in b1-3), Qorvo's does not. Kinds 2, 3 and 5 end with 6 bytes about the
+storey.
 
-Read off, as facts: AOSP ``external/uwb`` (uci_packets.pdl, the parsers next to it, ``UwbAnchorLocation``), whose tests'
-bytes serve our tests, and Qorvo's client for QM35. The specification itself is for members of FiRa only.
+Sources, for facts only: AOSP ``external/uwb`` (uci_packets.pdl, the parsers next to it, ``UwbAnchorLocation``), whose
+tests' bytes serve our tests, and Qorvo's client for QM35. The specification itself is for members of FiRa only.
 """
 
 from collections import Counter
@@ -52,10 +52,10 @@ MAX_SEGMENT_BYTES: Final = 255
 """Longest payload of a control packet."""
 
 MAX_UCI_PAYLOAD_BYTES: Final = 1 << 16
-"""A longer payload in segments is dropped."""
+"""Payloads whose segments are longer in total are dropped."""
 
 MAX_DATA_BYTES: Final = 4096
-"""A data packet that would be longer is none."""
+"""Bytes that announce a longer data packet are not taken for one."""
 
 CONTROL_HEADER_BYTES: Final = 4
 
@@ -63,7 +63,7 @@ _GROUPS: Final = frozenset((0, 1, 2, 3, 9, 10, 11, 12, 13, 14, 15))
 
 
 class UciType(IntEnum):
-    """What a packet is."""
+    """Type of a packet."""
 
     DATA = 0
     COMMAND = 1
@@ -72,7 +72,7 @@ class UciType(IntEnum):
 
 
 class UciPacket(Struct, frozen=True, gc=False):
-    """One packet, its segments put together."""
+    """One packet, with its segments joined."""
 
     kind: UciType
     group: int
@@ -83,7 +83,7 @@ class UciPacket(Struct, frozen=True, gc=False):
 
 
 def encode_packet(packet: UciPacket) -> bytes:
-    """A control packet's bytes, in segments where it is long."""
+    """Encode a control packet, in segments if it is long."""
     payload = packet.payload
     parts = [payload[at : at + MAX_SEGMENT_BYTES] for at in range(0, len(payload), MAX_SEGMENT_BYTES)] or [b""]
     out = bytearray()
@@ -94,7 +94,7 @@ def encode_packet(packet: UciPacket) -> bytes:
 
 
 class UciReader:
-    """Cuts a stream that comes in pieces into packets; a stretch of bytes that belongs to none is counted once."""
+    """Cuts a stream that arrives in pieces into packets; each stretch of bytes without a packet is counted once."""
 
     def __init__(self, drops: Counter[str]) -> None:
         self._drops = drops
@@ -104,7 +104,7 @@ class UciReader:
         self._segments = bytearray()
 
     def feed(self, data: bytes) -> list[UciPacket]:
-        """Packets that are whole with this piece."""
+        """Return the packets that this piece completes."""
         buffer, at, packets = self._buffer + data, 0, []
         while len(buffer) - at >= CONTROL_HEADER_BYTES:
             size = _packet_size(buffer, at)
@@ -125,7 +125,7 @@ class UciReader:
         return packets
 
     def _join(self, segment: bytes) -> UciPacket | None:
-        """The packet that this segment completes."""
+        """Add a segment; return the packet that it completes, if any."""
         kind, opcode = segment[0] >> 5, 0 if segment[0] >> 5 == UciType.DATA else segment[1]
         key = (kind, segment[0] & 0xF, opcode)
         if self._begun is not None and self._begun != key:
@@ -147,7 +147,7 @@ class UciReader:
 
 
 def _packet_size(buffer: bytes, at: int) -> int:
-    """Size of the segment whose header is at that offset; 0 where no header can be."""
+    """Size of the segment whose header is at an offset; 0 if there is no valid header."""
     first, second, third, fourth = buffer[at : at + CONTROL_HEADER_BYTES]
     kind = first >> 5
     if kind == UciType.DATA:
@@ -170,13 +170,13 @@ NO_LOCATION, WGS84_LOCATION, RELATIVE_LOCATION = range(3)
 """Kinds of location in version 1."""
 
 LOCATION_BYTES: Final = (0, 12, 10)
-"""Length of each kind."""
+"""Length of each kind of location."""
 
 _SHORT_STAMP, _LONG_STAMP = 5, 8
 
 
 class DtMessageType(IntEnum):
-    """Which message of a round a measurement is of."""
+    """The message of a round to which a measurement belongs."""
 
     POLL = 0
     RESPONSE = 1
@@ -184,18 +184,18 @@ class DtMessageType(IntEnum):
 
 
 class DtMeasurement(Struct, frozen=True, gc=False):
-    """What a DT-tag received of one message of an anchor; fields as they are on the line, in their units."""
+    """A DT-tag's reception of one message of an anchor; fields as on the line, in their units."""
 
     address: int
     """MAC address of the anchor, 16 or 64 bits."""
     message: int
-    """A ``DtMessageType``, or a value that is reserved."""
+    """A ``DtMessageType``, or a reserved value."""
     block: int
     """16 bits."""
     round: int
     """8 bits."""
     tx_ticks: int
-    """When the anchor sent it, in its own clock or in the common time."""
+    """When the anchor sent the message, in its own clock or in the common time."""
     rx_ticks_tag: int
     status: int = STATUS_OK
     common_time: bool = False
@@ -204,18 +204,18 @@ class DtMeasurement(Struct, frozen=True, gc=False):
     rx_bytes: int = _SHORT_STAMP
     """Width of the stamps: 5 or 8, in version 2 up to 8."""
     initiator_reply_ticks: int = 0
-    """From when the initiator received this response to when it sent the final message; 0 if unknown."""
+    """From the initiator's reception of this response to its final message; 0 if unknown."""
     responder_reply_ticks: int = 0
-    """From when the responder received the poll to when it sent this response; 0 if unknown."""
+    """From the responder's reception of the poll to this response; 0 if unknown."""
     flight_ticks: int = 0
-    """Between initiator and responder; 0 if unknown."""
+    """Time of flight between initiator and responder; 0 if unknown."""
     location_kind: int = NO_LOCATION
-    """In version 1; in version 2 the location begins with its kind."""
+    """Used in version 1 only; in version 2 the location begins with its kind."""
     location: bytes = b""
 
 
 class SessionInfo(Struct, frozen=True, gc=False):
-    """A notification: the measurements of a round, mostly."""
+    """A notification; its measurements are usually those of one round."""
 
     sequence: int
     session: int
@@ -232,14 +232,14 @@ _DL_TDOA_2: Final = 6
 _HEAD_1: Final = Layout("<BBHHB8x")
 _HEAD_2: Final = Layout("<BBHB8x")
 _TIMES: Final = Layout("<4xIIH")
-"""Without what nobody uses: NLOS, angles and RSSI, and both CFOs, which are written as zeros."""
+"""The formats skip unused fields, which are written as zeros: NLOS, angles and RSSI, and both CFOs."""
 
 _COMMON, _LONG_TX, _LONG_RX = 1 << 0, 1 << 1, 1 << 3
 _ROUNDS_2, _LOCATION_2, _SUPERCLUSTER_2 = 1 << 1, 1 << 2, 1 << 3
 
 
 def encode_session_info(info: SessionInfo) -> UciPacket:
-    """The notification. Raises ValueError or struct.error for values that have no bytes."""
+    """Encode a notification. Raises ValueError or struct.error for values that do not fit."""
     kind = _DL_TDOA if info.version == 1 else _DL_TDOA_2
     wide, count = info.extended_addresses, len(info.measurements)
     payload = bytearray(_INFO.pack(info.sequence, info.session, kind, wide, count))
@@ -250,7 +250,7 @@ def encode_session_info(info: SessionInfo) -> UciPacket:
 
 
 def decode_session_info(packet: UciPacket) -> SessionInfo | str:
-    """Notification of a packet, or the reason why it is none of DL-TDoA measurements."""
+    """Decode a notification of DL-TDoA measurements, or return the reason why the packet is none."""
     if (packet.kind, packet.group, packet.opcode) != (UciType.NOTIFICATION, SESSION_CONTROL, SESSION_INFO):
         return "other-packet"
     payload = packet.payload
@@ -273,7 +273,7 @@ def decode_session_info(packet: UciPacket) -> SessionInfo | str:
 
 
 def _decode_all_1(payload: bytes, address_bytes: int, count: int) -> tuple[tuple[DtMeasurement, ...] | None, bool]:
-    """Measurements of version 1, and whether they end where the notification does."""
+    """Decode measurements of version 1 (None if they do not fit); whether they end where the notification does."""
     at, found = _INFO.size, []
     for _ in range(count):
         one = _decode_1(payload, at, address_bytes)
@@ -292,7 +292,7 @@ def _decode_all_2(payload: bytes, address_bytes: int, count: int) -> tuple[tuple
         if one is None or one[1] != at + size:
             other = _decode_2(payload, at, address_bytes, 2)
             one = other if other is not None and (one is None or other[1] == at + size) else one
-        if one is None or size < 2 or at + size > len(payload):  # published measurements end behind their size
+        if one is None or size < 2 or at + size > len(payload):  # published measurements extend beyond their size
             return None, False
         found.append(one[0])
         at += size
@@ -312,7 +312,7 @@ def _encode_1(one: DtMeasurement, address: bytes) -> bytes:
 
 
 def _decode_1(payload: bytes, at: int, address_bytes: int) -> tuple[DtMeasurement, int] | None:
-    """A measurement of version 1 and where it ends; None where it does not fit."""
+    """Decode a measurement of version 1; also returns its end. None if it does not fit."""
     head_at, size = at + address_bytes, len(payload)
     if head_at + _HEAD_1.size > size:
         return None
@@ -353,7 +353,7 @@ def _encode_2(one: DtMeasurement, address: bytes) -> bytes:
 
 
 def _decode_2(payload: bytes, at: int, address_bytes: int, control_bytes: int) -> tuple[DtMeasurement, int] | None:
-    """A measurement of version 2 and where its fields end; None where they do not fit."""
+    """Decode a measurement of version 2; also returns the end of its fields. None if they do not fit."""
     head_at = at + 2 + address_bytes
     times_at = head_at + _HEAD_2.size
     if times_at + _TIMES.size > len(payload):
@@ -425,7 +425,7 @@ def _counted(data: bytes) -> bytes:
 
 
 def _counted_at(payload: bytes, at: int) -> tuple[bytes, int]:
-    """Bytes behind their length, and where they should end, which may be behind the payload."""
+    """Return bytes preceded by their length, and where they should end, which may be beyond the payload."""
     if at >= len(payload):
         return b"", len(payload) + 1
     end = at + 1 + payload[at]
@@ -455,7 +455,7 @@ _STOREY_BYTES: Final = 6
 
 
 def location_of(measurement: DtMeasurement) -> Point | GeodeticPoint | None:
-    """Where the sender is; None where it is not stated, or in a way that is not known."""
+    """Location of the sender; None if it is not stated, or in an unknown format."""
     data = measurement.location
     if not data:
         return None
@@ -480,7 +480,7 @@ def _location_2(data: bytes) -> Point | GeodeticPoint | None:
 
 
 def encode_wgs84(point: GeodeticPoint) -> bytes:
-    """12 bytes. Raises ValueError for a point that they cannot hold."""
+    """Encode a point as 12 bytes. Raises ValueError if it does not fit."""
     height = round(point.height_m / 1000.0 * _PER_KM)
     return _pack(
         (round(point.latitude_deg * _PER_DEGREE), round(point.longitude_deg * _PER_DEGREE), height), _WGS84_BITS
@@ -488,20 +488,20 @@ def encode_wgs84(point: GeodeticPoint) -> bytes:
 
 
 def decode_wgs84(data: bytes) -> GeodeticPoint | None:
-    """Point of 12 bytes; None where it is none of the earth."""
+    """Decode 12 bytes to a point; None if its angles are impossible."""
     latitude, longitude, height = _unpack(data, _WGS84_BITS)
     point = GeodeticPoint(latitude / _PER_DEGREE, longitude / _PER_DEGREE, height / _PER_KM * 1000.0)
     return point if abs(point.latitude_deg) <= 90.0 and abs(point.longitude_deg) <= 180.0 else None
 
 
 def encode_relative(position_m: Point) -> bytes:
-    """10 bytes. Raises ValueError for a position that they cannot hold."""
+    """Encode a position as 10 bytes. Raises ValueError if it does not fit."""
     x, y, z = (round(value * 1000.0) for value in position_m)
     return _pack((x, y, z), _RELATIVE_BITS)
 
 
 def decode_relative(data: bytes) -> Point:
-    """Position of 10 bytes."""
+    """Decode 10 bytes to a position."""
     x, y, z = _unpack(data, _RELATIVE_BITS)
     return x / 1000.0, y / 1000.0, z / 1000.0
 
@@ -531,21 +531,21 @@ def _unpack(data: bytes, widths: tuple[int, int, int]) -> tuple[int, ...]:
 
 # FiRa's downlink TDoA as packets of a system without a master.
 #
-# In a round an initiator sends a poll, responders answer it one after the other, and mostly the initiator sends a
-# final message. A response says how long after the poll it left, in its sender's clock: so its sender received the
-# poll that much before. That is what packets of a system without a master relay (``masterless_packets``), and
-# positions are estimated from both alike. The final message relays the responses in the same way.
+# In a round an initiator sends a poll, responders answer it one after the other, and usually the initiator sends a
+# final message. A response states how long after the poll it left, in its sender's clock, and thereby when its sender
+# received the poll. Packets of a system without a master relay the same (``masterless_packets``), so positions are
+# estimated in the same way. The final message relays the responses likewise.
 #
-# Where anchors stamp in the initiator's time instead of their own clocks, the poll reached a responder one flight
-# after it left, in that time.
+# If anchors stamp in the initiator's time instead of their own clocks, the poll reached a responder, in that time, one
+# time of flight after it left.
 
 MAX_ROUNDS_AT_ONCE: Final = 256
 MAX_ANCHORS_KEPT: Final = 256
-"""Bounds of what is kept: of rounds that go on, and of positions and responses by address; the oldest goes first."""
+"""Limits for unfinished rounds, and for positions and responses by address."""
 
 
 class DtMessage(Struct, frozen=True, gc=False):
-    """One message of a round as a tag received it; stamps have 40 bits."""
+    """One message of a round, as received by a tag; stamps have 40 bits."""
 
     host_s: float | None
     address: int
@@ -553,7 +553,7 @@ class DtMessage(Struct, frozen=True, gc=False):
     kind: DtMessageType
     block: int
     round: int
-    """Which of the rounds that go on at once: any number that its messages share, and those of no other."""
+    """Any number that the messages of this round share, and those of simultaneous rounds do not."""
     tx_ticks: int
     """In the sender's clock, or in the initiator's time."""
     rx_ticks_tag: int
@@ -562,40 +562,40 @@ class DtMessage(Struct, frozen=True, gc=False):
     responder_reply_ticks: int = 0
     initiator_reply_ticks: int = 0
     flight_ticks: float | None = None
-    """Between initiator and responder, as the responder ranged it."""
+    """Time of flight between initiator and responder, as the responder ranged it."""
     position_m: Point | None = None
 
 
 def host_time_s(stamp_ticks: int) -> float | None:
-    """Time of a stamp that shows more than a 40-bit counter, which bridges silences of any length; None for others.
+    """Time of a stamp of more than 40 bits, which bridges silences of any length; None for others.
 
-    A counter of 40 bits may be given in 64; its wraps are no jumps in time.
+    A 40-bit counter may be stated in 64 bits; its wraps are not jumps in time.
     """
     return stamp_ticks * TICK_S if stamp_ticks > TICK_MASK else None
 
 
 class _Round:
-    """A round that goes on: its poll, and the responses to it."""
+    """An unfinished round: its poll, and the responses to it."""
 
     __slots__ = ("poll", "responses")
 
     def __init__(self, poll: DtMessage) -> None:
         self.poll = poll
         self.responses: dict[int, DtMessage] = {}
-        """By their senders, so that one that is reported twice counts once."""
+        """Responses by sender, so that one that is reported twice counts once."""
 
 
 class DtRounds:
-    """From the messages that one tag received, in their order, to packets with relays."""
+    """Converts the messages that one tag received, in order, to packets with relays."""
 
     def __init__(self, anchors_m: Mapping[int, Point] | None = None) -> None:
-        """``anchors_m``: positions that are known, where messages may state none."""
+        """``anchors_m``: known positions, which take precedence over stated ones."""
         self._known_m = anchors_m or {}
         self._stated_m: dict[int, Point] = {}
         self._rounds: dict[int, _Round] = {}
 
     def on_message(self, message: DtMessage) -> Packet | str:
-        """The packet of a message, or the reason why it is of no use."""
+        """Convert a message to a packet, or return the reason why it is unusable."""
         if message.position_m is not None:
             self._stated_m.pop(message.address, None)
             if len(self._stated_m) >= MAX_ANCHORS_KEPT:
@@ -660,5 +660,5 @@ def _packet(message: DtMessage, relays: tuple[Relay, ...]) -> Packet:
 
 
 def _sequence(message: DtMessage) -> int:
-    """A number that the sender's other messages of late do not have."""
+    """A number that no other recent message of the sender has."""
     return (message.block << 8 | message.round & 0xFF) << 1 | (message.kind is DtMessageType.FINAL)

@@ -1,8 +1,8 @@
-"""The serial link, to the byte (``docs/serial.md``): framing, check, records and their values.
+"""The serial link, to the byte (``docs/serial.md``): framing, checksum, records and their values.
 
 A record is ``kind | number | body | CRC-16``, made free of zeros (COBS) and ended by a 0 byte. The board's end is in C
-(``firmware/source/link.c``), with the same names for the same numbers. Both ends are here, for emulated boards write
-what real ones do. Ticks are numbers of 40 bits.
+(``firmware/source/link.c``), with the same names for the same numbers. Both ends are here, as emulated boards write
+the same bytes as real ones. Ticks are numbers of 40 bits.
 """
 
 import struct
@@ -18,15 +18,15 @@ from skyless.core.air.frame import Diagnostics
 from skyless.core.ticks import DEFAULT_ANTENNA_DELAY_TICKS
 from skyless.radio.tag_reports import BODY_AT, TagReport, anchor_place, board_fix, board_status, georeference
 
-# How a tag on a board works, to the byte: kept in its flash, and sent over the serial link.
+# Settings of a tag on a board, to the byte: kept in its flash, and sent over the serial link.
 #
 # The board's end is ``firmware/source/settings.c``, with the same names; a test compares both.
 
 VERSION: Final = 1
 MODES: Final = ("radio", "tag")
-"""A radio for its host, or a tag that computes its own position; settings have their place here."""
+"""A radio for its host, or a tag that computes its own position; a setting is an index here."""
 OUTPUTS: Final = ("records", "nmea", "json", "none")
-"""What a tag says on its serial port."""
+"""Output of a tag on its serial port; a setting is an index here."""
 ANY_SITE: Final = 0xFFFF
 
 _WORDS: Final = struct.Struct("<11I2i3I3f")
@@ -35,15 +35,15 @@ SETTINGS_BYTES: Final = _WORDS.size + 2
 
 
 class BoardSettings(Struct, frozen=True):
-    """Settings in the board's own units; the defaults are those of a new one."""
+    """Settings in the board's own units; the defaults are those of a new board."""
 
     mode: int = 0
     output: int = 0
     rate_hz: int = 10
-    """How often it says something, at most; 0 for each fix."""
+    """Largest rate of reported fixes; 0 means every fix."""
     baud: int = 1_000_000
     bluetooth_ms: int = 0
-    """Interval of the Bluetooth advertisements; 0 for none."""
+    """Interval of Bluetooth advertisements; 0 for none."""
     site: int = ANY_SITE
     tag: int = 1
     tx_delay_ticks: int = DEFAULT_ANTENNA_DELAY_TICKS
@@ -52,11 +52,11 @@ class BoardSettings(Struct, frozen=True):
     low_mm: int = 0
     high_mm: int = 0
     sleep_ms: int = 0
-    """How long it sleeps between two fixes; 0 for always on."""
+    """How long the board sleeps between two fixes; 0 for always on."""
     superframes: int = 3
-    """How many it listens to after each sleep."""
+    """Number of superframes for which it listens after each sleep."""
     predicts: int = 0
-    """1 where its receiver is on only when beacons are due."""
+    """1 if its receiver is on only when beacons are due."""
     qa_m2ps3: float = 0.3
     integrity_risk: float = 1e-4
     alert_limit_m: float = 0.0
@@ -64,13 +64,13 @@ class BoardSettings(Struct, frozen=True):
 
 
 def pack(settings: BoardSettings) -> bytes:
-    """The bytes of settings; words that do not fit raise struct.error."""
+    """Encode settings. Raises struct.error if a value does not fit."""
     words = _WORDS.pack(VERSION, *astuple(settings))
     return words + crc_hqx(words, 0xFFFF).to_bytes(2, "big")
 
 
 def unpack(data: bytes) -> BoardSettings | None:
-    """The settings of these bytes; None for what no board of this version has sent."""
+    """Decode settings; None for bytes that no board of this version sends."""
     if len(data) != SETTINGS_BYTES or crc_hqx(data, 0xFFFF) != 0:
         return None
     version, *words = _WORDS.unpack_from(data)
@@ -82,7 +82,7 @@ def unpack(data: bytes) -> BoardSettings | None:
 MAJOR: Final = 1
 """Ends with different major versions cannot work together."""
 MINOR: Final = 3
-"""Grows with fields that are appended and kinds that are added, which an older end ignores."""
+"""Grows with appended fields and added kinds, which an older end ignores."""
 
 # From the board
 HELLO: Final = 0x01
@@ -112,17 +112,17 @@ RX_FRAME_AT: Final = 13
 RX_PHASE_FRAME_AT: Final = 15
 TX_FRAME_AT: Final = 7
 SETTINGS_AT: Final = 3
-"""In both records of settings, after flags."""
+"""In both records with settings, after flags."""
 MAX_FRAME_BYTES: Final = 127
 
 HELLO_BYTES: Final = 21
-"""Length in version 1.0; a later one has the reset cause behind it."""
+"""Length in version 1.0; later versions append the reset cause."""
 STATUS_BYTES: Final = 36
 CONFIG_BYTES: Final = 13
 """Lengths of whole records, kind and number included."""
 
 NOT_MEASURED: Final = -32768
-"""A measured value that the board does not have."""
+"""Marks a missing measured value."""
 NO_VOLTAGE: Final = 0xFFFF
 
 CAN_TRANSMIT: Final = 0x01
@@ -130,16 +130,16 @@ HAS_PHASES: Final = 0x02
 CAN_COMPUTE: Final = 0x04
 """Capabilities in HELLO."""
 WANTS_PHASES: Final = 0x01
-"""Flag in CONFIG: receptions with a phase are to be reported as RX_PHASE."""
+"""Flag in CONFIG: report receptions with a phase as RX_PHASE."""
 IN_FLASH: Final = 0x01
-"""Flag in the records of settings: they are to be kept in flash, or are kept there."""
+"""Flag in records with settings: store them in flash, or they are stored there."""
 RESET_BY_PIN: Final = 0x01
 RESET_BY_WATCHDOG: Final = 0x02
 RESET_BY_SOFTWARE: Final = 0x04
 RESET_BY_LOCKUP: Final = 0x08
 RESET_BY_FAULT: Final = 0x80
 """Bits of the reset cause in HELLO: the first four are those of the nRF52832's RESETREAS; a fault is one that the
-firmware noticed. None: power on, or a supply that was too low."""
+firmware noticed. No bit: power on, or a supply that was too low."""
 IS_CONFIGURED: Final = 0x01
 IS_RECEIVING: Final = 0x02
 HAS_FRAME_WAITING: Final = 0x04
@@ -149,7 +149,7 @@ IS_POLLED: Final = 0x08
 LATE_FOR_RADIO: Final = 1
 LATE_BUSY: Final = 2
 LATE_NOT_READY: Final = 3
-"""Why a frame was not sent: it was too late, another one waits, or the radio is not configured."""
+"""Why a frame was not sent: it was too late, another frame waits, or the radio is not configured."""
 
 REFUSED_SETTING: Final = 1
 REFUSED_MALFORMED: Final = 2
@@ -162,27 +162,27 @@ COUNT_MASK: Final = 0x3FFF_FFFF
 """Counts in STATUS wrap at 30 bits."""
 
 MAX_RECORD_BYTES: Final = 250
-"""With its check: one block of COBS, with space for later versions."""
+"""Including the checksum: one block of COBS, with space for later versions."""
 MAX_STUFFED_BYTES: Final = MAX_RECORD_BYTES + 2
-"""Length of what may stand before a 0; a record needs one less."""
+"""Largest number of bytes before a 0; a record needs one less."""
 
 
 def crc16(data: bytes) -> int:
-    """CRC-16/IBM-3740: x¹⁶ + x¹² + x⁵ + 1 from 0xFFFF; 0 over what ends with its own, high byte first."""
+    """CRC-16/IBM-3740: x¹⁶ + x¹² + x⁵ + 1 from 0xFFFF; 0 over data that end with their own CRC, high byte first."""
     return crc_hqx(data, 0xFFFF)
 
 
 def stuff(record: bytes) -> bytes:
-    """A record without zeros (COBS: Cheshire and Baker, 1999), and a 0 after it.
+    """Encode a record without zeros (COBS: Cheshire and Baker, 1999), followed by a 0.
 
     Raises:
-        ValueError: 255 bytes without a zero; no record is that long.
+        ValueError: 255 bytes without a zero, which no record has.
     """
     return b"".join([bytes((len(block) + 1,)) + block for block in record.split(b"\0")]) + b"\0"
 
 
 def unstuff(line: bytes) -> bytes | None:
-    """Inverse of ``stuff`` for at most ``MAX_STUFFED_BYTES`` without zeros; None where a block lacks its end."""
+    """Inverse of ``stuff`` for at most ``MAX_STUFFED_BYTES`` without zeros; None if a block is incomplete."""
     blocks, at = [], 0
     while at < len(line):
         end = at + line[at]
@@ -194,17 +194,17 @@ def unstuff(line: bytes) -> bytes | None:
 
 
 class Writer:
-    """Makes records, with numbers that count up; each method returns a line, ready to be sent.
+    """Makes records with rising numbers; each method returns a line ready to send.
 
-    Records of one or two bytes are made by ``record``.
-    Ticks are numbers from 0 to 2**40 - 1. What does not fit into its field raises struct.error or OverflowError.
+    ``record`` makes the kinds without a method of their own. Ticks are from 0 to 2**40 - 1. A value that does not fit
+    its field raises struct.error or OverflowError.
     """
 
     def __init__(self) -> None:
         self._number = 0
 
     def record(self, kind: int, body: bytes = b"") -> bytes:
-        """A record of any kind."""
+        """Make a record of any kind."""
         record = bytes((kind, self._number)) + body
         self._number = (self._number + 1) & 0xFF
         return stuff(record + crc16(record).to_bytes(2, "big"))
@@ -223,7 +223,7 @@ class Writer:
         frame: bytes,
         phase: int | None = None,
     ) -> bytes:
-        """A frame, its stamp, powers in 0.01 dBm, the sender's carrier offset in 1e-9, and, in RX_PHASE, its phase."""
+        """A frame, its stamp, powers in 0.01 dBm, carrier offset of the sender in 1e-9, and, in RX_PHASE, its phase."""
         fixed = _stamp(rx_ticks) + struct.pack("<3h", rx_power_cdbm, first_path_cdbm, offset_ppb)
         if phase is None:
             return self.record(RX, fixed + frame)
@@ -250,7 +250,7 @@ class Writer:
         return self.record(STATUS, _stamp(ticks) + struct.pack("<B6IhH", state, *wrapped, temperature_cc, millivolts))
 
     def ask_hello(self) -> bytes:
-        """Ask the board who it is; states our version."""
+        """Ask the board for its identity; states our version."""
         return self.record(ASK_HELLO, bytes((MAJOR, MINOR)))
 
     def config(self, tx_delay_ticks: int, rx_delay_ticks: int, flags: int = 0) -> bytes:
@@ -262,7 +262,7 @@ class Writer:
         return self.record(TX_AT, _stamp(dx_ticks) + frame)
 
     def set_tag_config(self, settings: BoardSettings, *, keep: bool) -> bytes:
-        """Work with these settings from now on; ``keep``: in flash, too."""
+        """Use these settings from now on; ``keep``: store them in flash, too."""
         return self.record(SET_TAG_CONFIG, bytes((keep * IN_FLASH,)) + pack(settings))
 
 
@@ -271,9 +271,9 @@ def _stamp(ticks: int) -> bytes:
 
 
 class Reader:
-    """Finds the records in a stream of bytes that may hold anything.
+    """Finds records in a stream of arbitrary bytes.
 
-    ``garbled`` counts stretches between two zeros that are no record, ``overlong`` those that no record can be.
+    ``garbled`` counts stretches between two zeros that are not a record, ``overlong`` those that are too long for one.
     """
 
     def __init__(self) -> None:
@@ -283,7 +283,7 @@ class Reader:
         self._skipping = False
 
     def read(self, data: bytes) -> list[bytes]:
-        """The records that end in ``data``, without their checks: kind at 0, body from ``BODY_AT``."""
+        """Return the records that end in ``data``, without checksums: kind at 0, body from ``BODY_AT``."""
         *ended, rest = data.split(b"\0")
         records = []
         for piece in ended:
@@ -303,7 +303,7 @@ class Reader:
             self._skipping, self._line = True, b""
 
     def _finish(self) -> bytes | None:
-        """The record that the bytes before a zero are, if they are one."""
+        """Decode the bytes before a zero to a record; None if they are none."""
         line, self._line = self._line, b""
         if self._skipping:
             self._skipping = False
@@ -336,7 +336,7 @@ class Hello(Struct, frozen=True):
     counter_bits: int
     can_transmit: bool
     reset_cause: int | None
-    """Why it has started, as bits (``RESET_BY_PIN`` …); None for a board of version 1.0."""
+    """Why the board has started, as bits (``RESET_BY_PIN`` …); None for a board of version 1.0."""
     has_phases: bool = False
     can_compute: bool = False
 
@@ -400,7 +400,7 @@ Record = Hello | Heard | Done | TooLate | Status | NotDone | TagConfig | TagRepo
 
 
 def decode(record: bytes) -> Record | str:
-    """Value of a record from a board (without its CRC), or why there is none."""
+    """Decode a record from a board (without its CRC), or return the reason why this is impossible."""
     if record[0] not in _DECODERS:
         return "unknown-record"
     try:
@@ -410,7 +410,7 @@ def decode(record: bytes) -> Record | str:
 
 
 def to_steps(measured: Diagnostics) -> tuple[int, int, int]:
-    """Received and first-path power and carrier offset, rounded to the link's units."""
+    """Round received power, first-path power and carrier offset to the link's units."""
     values = (measured.rx_power_dbm, measured.first_path_power_dbm, measured.carrier_offset_ppm)
     whole = [None if value is None else round(value * per_unit) for value, per_unit in zip(values, _STEPS, strict=True)]
     rx_power, first_path, offset = (NOT_MEASURED if n is None or abs(n) > _GREATEST else n for n in whole)
@@ -418,19 +418,19 @@ def to_steps(measured: Diagnostics) -> tuple[int, int, int]:
 
 
 def from_steps(rx_power: int, first_path: int, offset: int) -> Diagnostics:
-    """The measured values of a record in the link's units."""
+    """Convert measured values from the link's units."""
     return Diagnostics(
         *(_value(n, per_unit) for n, per_unit in zip((rx_power, first_path, offset), _STEPS, strict=True))
     )
 
 
 def to_turn(phase_cycles: float) -> int:
-    """A phase rounded to the link's unit, 2**-16 turns."""
+    """Round a phase to the link's unit, 2**-16 turns."""
     return round(phase_cycles * _TURN) % _TURN
 
 
 def cycles(phase: int) -> float:
-    """A phase in the link's unit in cycles; exact."""
+    """Convert a phase from the link's unit to cycles; exact."""
     return phase / _TURN
 
 
@@ -443,7 +443,7 @@ def _ticks(record: bytes, at: int = BODY_AT) -> int:
 
 
 def _hello(record: bytes) -> Hello:
-    """Only the version is known where its major number is another."""
+    """Decode HELLO; only the version if its major number differs from ours."""
     major, minor = record[2], record[3]
     if major != MAJOR:
         return Hello(major, minor, (0, 0, 0), b"", 0, 0, can_transmit=False, reset_cause=None)
@@ -470,10 +470,6 @@ def _heard_with_phase(record: bytes) -> Heard | None:
     return Heard(_ticks(record), from_steps(*measured), record[RX_PHASE_FRAME_AT:], cycles(phase))
 
 
-def _done(record: bytes) -> Done | None:
-    return Done(_ticks(record), _ticks(record, 7)) if len(record) >= 12 else None
-
-
 def _status(record: bytes) -> Status:
     state, received, errors, sent, late, garbled, unsent, centidegrees, millivolts = struct.unpack_from(
         "<B6IhH", record, 7
@@ -498,7 +494,7 @@ def _tag_config(record: bytes) -> TagConfig | None:
 _DECODERS: Final[dict[int, Callable[[bytes], Record | None]]] = {
     HELLO: _hello,
     RX: _heard,
-    TX_DONE: _done,
+    TX_DONE: lambda record: Done(_ticks(record), _ticks(record, 7)) if len(record) >= 12 else None,
     TX_LATE: lambda record: TooLate(_ticks(record), record[7]),
     STATUS: _status,
     REFUSED: lambda record: NotDone(record[2], record[3]),

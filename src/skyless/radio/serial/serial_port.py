@@ -1,4 +1,4 @@
-"""A serial port that is opened again whenever it was unplugged, and the clock of the board behind it."""
+"""A serial port that is opened again after it was unplugged, the clock of the board behind it, pseudo-terminals."""
 
 import asyncio
 import contextlib
@@ -18,37 +18,37 @@ from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
 _REOPEN_S: Final = 0.2
 
 MAX_BOARD_DRIFT: Final = 100e-6
-"""Two crystals drift apart by less; the estimate loses as much between stamps with a short delay."""
+"""Two crystals drift apart by less than this; the estimate loses as much between stamps with a short delay."""
 
 JUMP_TICKS: Final = round(TICK_RATE_HZ)
-"""A stamp that is wrong by more than a second means that the counter has restarted."""
+"""A stamp that is behind by more than a second means that the counter has restarted."""
 
 
 class PortUser(Protocol):
-    """What the port calls."""
+    """Callbacks from a port."""
 
     def on_open(self, send: Callable[[bytes], None]) -> None:
-        """The port is open."""
+        """Called when the port has been opened; ``send`` writes to it."""
 
     def on_data(self, data: bytes) -> None:
-        """Bytes have come."""
+        """Called with received bytes."""
 
     def on_close(self) -> None:
-        """The port is closed."""
+        """Called when the port has been closed."""
 
 
 class SerialPort:
-    """One port, by its path."""
+    """One serial port, by its path."""
 
     def __init__(self, path: str, baud: int, gone: Callable[[str], None]) -> None:
-        """``gone`` is called with why there is no port, once for equal reasons in a row."""
+        """``gone`` is called with the reason why there is no port, once for equal reasons in a row."""
         self.path, self.baud = path, baud
         self._gone = gone
         self._reported = ""
         self._connection: _Connection | None = None
 
     async def run(self, user: PortUser) -> None:
-        """Stay open until cancelled."""
+        """Keep the port open until cancelled."""
         while True:
             try:
                 transport, connection = await self._open(user)
@@ -78,7 +78,7 @@ class SerialPort:
         return transport, connection
 
     def waiting_bytes(self) -> int:
-        """What the port has not accepted yet; 0 while it is not open."""
+        """Number of bytes that the port has not accepted yet; 0 while it is not open."""
         return 0 if self._connection is None else self._connection.waiting_bytes()
 
     def reopen(self, reason: str) -> None:
@@ -93,12 +93,12 @@ class SerialPort:
             self._gone(reason)
 
     def clear_report(self) -> None:
-        """The board works: report the next reason in any case."""
+        """Report the next reason in any case, as the board works now."""
         self._reported = ""
 
 
 class _Connection(asyncio.Protocol):
-    """The port from its opening until it ends; ``ended`` gives the reason, empty where it is unknown."""
+    """The port from its opening to its end; ``ended`` resolves to the reason, empty if unknown."""
 
     def __init__(self, user: PortUser) -> None:
         self._user = user
@@ -128,17 +128,17 @@ class _Connection(asyncio.Protocol):
 
 
 def line_advice(path: str, baud: int, sender: str, *, silent: bool) -> str:
-    """Where to look when nothing usable comes from ``sender`` on a port that is open."""
+    """Return a hint for when nothing usable is received from ``sender`` on an open port."""
     if silent:
         return f"nothing at all comes from {path} at {baud} baud: nothing on the air, another port, or not {sender}?"
     return f"what comes from {path} at {baud} baud is not from {sender}: another rate or other firmware?"
 
 
 def check_path(spec: str, path: str) -> None:
-    """Check that a path could be a serial port; one that does not exist yet may appear later.
+    """Check that a path may be a serial port, now or later.
 
     Raises:
-        SkylessError: it never will be one.
+        SkylessError: it cannot become one.
     """
     if "://" in path:
         raise SkylessError(
@@ -155,7 +155,7 @@ def check_path(spec: str, path: str) -> None:
 
 
 def _trouble(path: str, error: Exception) -> str:
-    """Why a port cannot be opened, and what to do."""
+    """Describe why a port cannot be opened, and what to do."""
     number = error.errno if isinstance(error, OSError) else error.args[0] if error.args else None
     if number == errno.ENOENT:
         there = ", ".join(
@@ -183,26 +183,26 @@ class BoardClock:
         self._host_s = 0.0
 
     def update(self, ticks: int, host_s: float) -> None:
-        """Add a stamp of the counter that arrived at a moment of the host's monotonic clock."""
+        """Add a stamp of the counter that arrived at a time of the host's monotonic clock."""
         known = self.read(host_s, MAX_BOARD_DRIFT)
         if known is None or difference(ticks, known) >= 0 or difference(ticks, known) < -JUMP_TICKS:
             self._ticks, self._host_s = ticks, host_s
 
     def read(self, host_s: float, drift: float = 0.0) -> int | None:
-        """The 40-bit counter at a moment of the host's clock; None before the first stamp."""
+        """The 40-bit counter at a time of the host's clock; None before the first stamp."""
         if self._ticks is None:
             return None
         return wrap(self._ticks + round((host_s - self._host_s) * (1.0 - drift) * TICK_RATE_HZ))
 
     def reset(self) -> None:
-        """Forget all stamps: the board has gone."""
+        """Forget all stamps, because the board is lost."""
         self._ticks = None
 
 
 # A pseudo-terminal in place of a device on a serial port.
 
 HELD_BYTES: Final = 1 << 15
-"""Bytes that nobody reads are held up to here, then dropped with those in the system: a UART keeps nothing either."""
+"""Up to this many unread bytes are held, then all are dropped with those in the system, as a UART keeps none either."""
 
 
 class Pty:
@@ -224,18 +224,18 @@ class Pty:
         self.link = link
         self._held_bytes = held_bytes
         self.overruns = 0
-        """How often bytes that nobody read were dropped."""
+        """How often unread bytes were dropped."""
         self._waiting = bytearray()
         if link is not None:
             _make_link(link, self.path, asked)
 
     @property
     def name(self) -> str:
-        """The path that programs open: the link's, where there is one."""
+        """The path that programs open: that of the link if there is one."""
         return self.path if self.link is None else str(self.link)
 
     def start(self, on_data: Callable[[bytes], None]) -> None:
-        """Call ``on_data`` with what programs write, from the running event loop."""
+        """Call ``on_data`` from the running event loop with data that programs write."""
         asyncio.get_running_loop().add_reader(self._board, self._read, on_data)
 
     def _read(self, on_data: Callable[[bytes], None]) -> None:
@@ -243,7 +243,7 @@ class Pty:
             on_data(os.read(self._board, 4096))
 
     def send(self, data: bytes) -> bool:
-        """Write, at once or soon; False if this and all that waited was dropped because nobody reads."""
+        """Write data, at once or soon. Returns False if they and all waiting data were dropped because nobody reads."""
         if self._waiting:
             if len(self._waiting) + len(data) > self._held_bytes:
                 self._drop()
@@ -280,7 +280,7 @@ class Pty:
 
 
 def _make_link(link: Path, path: str, asked: str) -> None:
-    """Make the link, replacing an older one in one step."""
+    """Make a link, atomically replacing an older one."""
     if link.exists() and not link.is_symlink():
         raise SkylessError(f"{asked} {str(link)!r}; it should be a free name, and this path exists")
     scratch = link.with_name(f".{link.name}.{os.getpid()}")

@@ -1,4 +1,4 @@
-"""A radio on a board that is connected by the serial link (``docs/serial.md``)."""
+"""A radio on a board connected by the serial link (``docs/serial.md``)."""
 
 import asyncio
 import time
@@ -34,22 +34,22 @@ from skyless.radio.tag_reports import Reported
 STATUS_S: Final = 0.5
 """Interval at which a board is asked for its state."""
 BOARD_SILENCE_S: Final = 3.0
-"""A board that has sent nothing for this time has gone."""
+"""A board that has sent nothing for this time counts as lost."""
 MAX_PENDING_FRAMES: Final = 16
-"""Frames whose end the board has not reported; a board holds one, so of older ones the answer was lost on the line."""
+"""Largest number of frames whose end is not reported yet. A board holds one: answers for older ones were lost."""
 
 _HELLO_ANSWER_S: Final = 1.0
-"""A HELLO that comes later than this after ASK_HELLO is no answer to it: the board has started."""
+"""A HELLO later than this after ASK_HELLO is not an answer: the board has started."""
 _IDLE_S: Final = 5.0
-"""A board that has been configured for this time and does not receive will not."""
+"""A board that does not receive this long after it was configured is reported."""
 _MAX_STARTS: Final = 3
 _MAX_STARTS_S: Final = 60.0
-"""A board that starts so often within this time does not start because somebody wants it to."""
+"""A board that starts this often within this time is reported: nobody restarts it on purpose so often."""
 
 _LEAD_S: Final = 5.0e-3
-"""A command of 112 bytes on the line (1.1 ms), the lag of the estimate of the board's counter, which is the shortest
-transfer of a record (1.2 ms), the board (0.3 ms), and a USB bridge that passes on 64 bytes in a millisecond; without
-such a bridge 2.5 ms would do (``benchmarks/firmware.py site``)."""
+"""Time for a command of 112 bytes on the line (1.1 ms), the lag of the estimate of the board's counter, which is the
+shortest transfer of a record (1.2 ms), the board (0.3 ms), and a USB bridge that passes on 64 bytes per millisecond;
+without such a bridge 2.5 ms would do (``benchmarks/firmware.py site``)."""
 
 _REASONS: Final = {
     link.REFUSED_SETTING: "it has not these settings",
@@ -66,16 +66,16 @@ _RESET_CAUSES: Final = {
 
 
 class Computing(Struct, frozen=True):
-    """How a host has a board work that is a tag by itself."""
+    """Settings that a host wants for a board that is a tag by itself."""
 
     changes: Mapping[str, Any]
-    """Settings that it should have, by name; the others stay."""
+    """Settings to change, by name; the others stay."""
     keeps: bool
-    """Whether flash is to hold them."""
+    """Whether to store them in flash."""
 
 
 UNTIL_NEXT_START: Final = Computing({"mode": MODES.index("tag"), "output": OUTPUTS.index("records")}, keeps=False)
-"""A tag that sends records to its host."""
+"""Settings of a tag that sends records to its host."""
 
 
 class LinkSession:
@@ -93,17 +93,17 @@ class LinkSession:
         phases: bool = False,
         computing: Computing | None = None,
     ) -> None:
-        """``port`` is its name in messages; ``transmits``: refuse a board that only listens.
+        """``port`` is the port's name in messages; ``transmits``: refuse a board that only listens.
 
-        ``phases``: ask a board that can for the phases of carriers; ``computing``: it is a tag by itself.
+        ``phases``: request carrier phases if the board measures them; ``computing``: the board is a tag by itself.
         """
         self.clock = BoardClock()
         self.ready = False
         self.hello: Hello | None = None
         self.status: Status | None = None
-        """The newest one."""
+        """The board's newest status."""
         self.tag_config: TagConfig | None = None
-        """The settings of a board that computes, as it last said."""
+        """The settings that a board that computes stated last."""
         self.counters = counters
         self._port, self._delays, self._send, self._listener = port, delays, send, listener
         self._transmits, self._phases, self._computing = transmits, phases, computing
@@ -126,7 +126,7 @@ class LinkSession:
         self._ask_hello(host_s)
 
     def poll(self, host_s: float) -> str | None:
-        """To be called every ``STATUS_S``; the reason to reopen the port, None while there is none."""
+        """Send requests that are due; call this every ``STATUS_S``. Returns why to reopen the port, None if not."""
         if host_s - self._heard_s > BOARD_SILENCE_S:
             return self._reason_of_silence()
         if self.hello is None or self._refused:
@@ -158,7 +158,7 @@ class LinkSession:
         return f"no board answers at {self._port}"
 
     def transmit(self, transmission: Transmission) -> None:
-        """Have a frame sent; without a board that is ready it is late."""
+        """Have a frame sent; it is reported as late if the board is not ready."""
         if not self.ready:
             self._listener(Late(transmission.tx_ticks))
             return
@@ -192,7 +192,7 @@ class LinkSession:
         self._process(record, host_s)
 
     def _is_next(self, number: int) -> bool:
-        """Count what is missing before a record; False for a copy of the one before."""
+        """Count the records missing before this one. Returns False for a copy of the previous one."""
         missing = 0 if self._expected is None else (number - self._expected) & 0xFF
         if missing == 0xFF:
             self.counters["copied-record"] += 1
@@ -225,7 +225,7 @@ class LinkSession:
         elif isinstance(record, NotDone):
             self._on_refusal(record)
         elif self._computing is None:
-            pass  # of a tag
+            pass  # a tag's record, not expected here
         elif isinstance(record, TagConfig):
             self._on_tag_config(record, self._computing)
         elif self.ready:
@@ -240,10 +240,10 @@ class LinkSession:
         self._listener(Sent(tx_ticks))
 
     def _on_hello(self, hello: Hello, host_s: float) -> None:
-        """Configure a board of this version; after a repeated HELLO its status shows whether it has restarted."""
+        """Configure a board that can be used. After a repeated HELLO its status shows whether it has restarted."""
         if self.hello is not None and host_s - self._asked_s > _HELLO_ANSWER_S:
             self._count_start(host_s, hello.reset_cause)
-            self.ready = self.ready and self._computing is None  # others say by their status that they have restarted
+            self.ready = self.ready and self._computing is None  # other boards show a restart by their status
         is_repeated, self.hello = self.hello is not None and not self._refused, hello
         if hello.major != link.MAJOR:
             self._refuse(
@@ -269,9 +269,9 @@ class LinkSession:
                 self._configure()
 
     def _count_start(self, host_s: float, cause: int | None) -> None:
-        """Count that the board has restarted, and report once that it does so repeatedly.
+        """Count a restart of the board, and report once if it restarts repeatedly.
 
-        ``cause`` is what the board said of it, None where it said nothing.
+        ``cause`` is the reset cause that the board stated; None if it stated none.
         """
         self.counters["board-restart"] += 1
         self._idle_polls = 0
@@ -286,7 +286,7 @@ class LinkSession:
             self._listener(Hint(f"the board at {self._port} {often}: is its supply good, does its firmware fail?"))
 
     def _refuse(self, reason: str) -> None:
-        """Each reason is reported once until the board is ready, because a board that is asked again refuses again."""
+        """Report why the board cannot be used, once until it is ready: a board that is asked again refuses again."""
         self._reset()
         self._refused = reason
         if reason != self._reported:
@@ -294,7 +294,7 @@ class LinkSession:
             self._listener(Gone(reason))
 
     def _on_refusal(self, refusal: NotDone) -> None:
-        """A board that refuses its configuration cannot be used; other refusals are counted."""
+        """Process a refusal: a board that refuses its configuration cannot be used; other refusals are counted."""
         if refusal.command in (link.CONFIG, link.SET_TAG_CONFIG):
             why = _REASONS.get(refusal.reason, f"reason {refusal.reason}")
             self._refuse(f"the board at {self._port} refuses its configuration: {why}")
@@ -313,7 +313,7 @@ class LinkSession:
         self._send(self._writer.record(link.RX_ON))
 
     def _on_tag_config(self, config: TagConfig, computing: Computing) -> None:
-        """Ask once for what is to be changed; with the answer to that the board is ready."""
+        """Request the changes of settings once; when the board has answered, it is ready."""
         is_answer, self.tag_config = self.tag_config is not None, config
         wanted = replace(config.settings, **computing.changes)
         is_same = pack(wanted) == pack(config.settings) and config.in_flash >= computing.keeps
@@ -332,11 +332,11 @@ class LinkSession:
             self._count("rx-error", max(status.errors - self.status.errors, 0))
         self._check_line(status, was_polled=self.status is not None and self.status.polled)
         self.status = status
-        if self._refused or self._computing is not None:  # which may sleep between its fixes
+        if self._refused or self._computing is not None:  # a board that computes may sleep between its fixes
             return
         if not status.receiving:
             if self.ready:  # it has restarted
-                # count it, unless its HELLO did
+                # count the restart, unless its HELLO did
                 if not self._starts or host_s - self._starts[-1] > _HELLO_ANSWER_S:
                     self._count_start(host_s, None)
                 self._reset()
@@ -349,7 +349,7 @@ class LinkSession:
             self._begin_to_report()
 
     def _check_line(self, status: Status, *, was_polled: bool) -> None:
-        """Count when the board begins to poll its radio, and report it once."""
+        """Count that the board has begun to poll its radio, and report it once."""
         if not status.polled or was_polled:
             return
         self.counters["interrupt-line-stuck"] += 1
@@ -369,7 +369,7 @@ class LinkSession:
 
 
 def _last_cause(cause: int | None) -> str:
-    """Why a board has started, for a message; empty where it did not say."""
+    """Describe for a message why a board has started; empty if it did not state it."""
     if cause is None:
         return ""
     words = [text for bit, text in _RESET_CAUSES.items() if cause & bit]
@@ -379,7 +379,7 @@ def _last_cause(cause: int | None) -> str:
 
 
 class SerialRadio:
-    """One node's board (``skyless.radio.interface.Radio``)."""
+    """The radio of one node on a board (``skyless.radio.interface.Radio``)."""
 
     def __init__(
         self,
@@ -404,16 +404,16 @@ class SerialRadio:
 
     @property
     def hello(self) -> Hello | None:
-        """What the board has said of itself; None while none has answered."""
+        """The board's version and abilities; None while none has answered."""
         return None if self._session is None else self._session.hello
 
     @property
     def tag_config(self) -> TagConfig | None:
-        """The settings of a board that computes; None while it has not said them."""
+        """The settings of a board that computes; None while it has not stated them."""
         return None if self._session is None else self._session.tag_config
 
     async def run(self, listener: Listener) -> None:
-        """Receive until cancelled; a board that is unplugged is looked for."""
+        """Receive until cancelled; reconnect after the board was unplugged."""
         self._listener = listener
         poll = asyncio.ensure_future(self._poll())
         try:
@@ -423,7 +423,7 @@ class SerialRadio:
             await asyncio.gather(poll, return_exceptions=True)
 
     def advice(self) -> str:
-        """Where to look when nothing comes though the board answers."""
+        """Return a hint for when nothing is received though the board answers."""
         path = self._port.path
         return f"the board at {path} answers, but receives no frame: are anchors on the air, is its antenna free?"
 
@@ -433,7 +433,7 @@ class SerialRadio:
         return session.clock.read(time.monotonic()) if session is not None and session.ready else None
 
     def transmit(self, transmission: Transmission) -> None:
-        """Send a frame; without a board it is late."""
+        """Send a frame; without a board it is reported as late."""
         if self._session is None:
             self._listener(Late(transmission.tx_ticks))
         else:
@@ -452,7 +452,7 @@ class SerialRadio:
                 if reason is not None:
                     self._port.reopen(reason)
 
-    # What the port calls
+    # Called by the port
 
     def on_open(self, send: Callable[[bytes], None]) -> None:
         """Begin a session with the board."""
@@ -474,21 +474,21 @@ class SerialRadio:
             self._session.on_data(data, time.monotonic())
 
     def on_close(self) -> None:
-        """The board has gone."""
+        """End the session with the board."""
         self._session = None
 
 
-# Asks a board for its settings and changes them, at whatever rate its port works.
+# Read and change the settings of a board, at whichever rate its port works.
 
 _ANSWER_S: Final = 1.5
-"""A board answers in milliseconds, also one that has to erase a page of its flash."""
+"""A board answers in milliseconds, even if it has to erase a page of its flash."""
 
 
 async def set_up(path: str, bauds: Sequence[int], computing: Computing) -> TagConfig:
-    """The settings of the board at a port, after the changes that are asked for, if any.
+    """Make the requested changes to the settings of the board at a port, if any, and return the settings.
 
     Raises:
-        SkylessError: the port cannot be opened, no board answers, or it is none that computes, or refuses.
+        SkylessError: the port cannot be opened, no board answers, or the board cannot compute or refuses.
     """
     for baud in bauds:
         radio, events = SerialRadio(path, baud, "", computing=computing), asyncio.Queue[RadioEvent]()
