@@ -204,9 +204,9 @@ def reader(
 
 
 class SitePublisher:
-    """Publishes a site, retained: when it has changed, or whether its radios are simulated, and at intervals.
+    """Publishes a site, retained: when it or ``simulated`` has changed, and at intervals.
 
-    It is repeated because a bridged broker may have missed or lost it.
+    The repetitions are for bridged brokers, which may have missed or lost it.
     """
 
     def __init__(

@@ -161,7 +161,10 @@ def _own_name(site: int) -> tuple[str, IO[str]]:
         SkylessError: there is no folder for temporary files, or too many recorders run.
     """
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname())
-    folder = _temporary_folder()
+    try:
+        folder = Path(tempfile.gettempdir())
+    except OSError as error:
+        raise SkylessError(f"a recorder needs a folder for temporary files: {error.strerror}") from None
     for number in range(1, _MAX_RECORDERS + 1):
         with contextlib.suppress(OSError):
             return f"{host}-{number}", locked(folder / f"skyless-record-{site}-{number}.lock")
@@ -181,10 +184,3 @@ def _client_key() -> str:
             return kept
         replace_files({file: key.encode()}, secret=(file,))
     return key
-
-
-def _temporary_folder() -> Path:
-    try:
-        return Path(tempfile.gettempdir())
-    except OSError as error:
-        raise SkylessError(f"a recorder needs a folder for temporary files: {error.strerror}") from None

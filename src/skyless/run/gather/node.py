@@ -104,7 +104,7 @@ class SiteCondition:
         self._dropped: deque[tuple[float, int]] = deque()
 
     def on_message(self, kind: str, name: str, payload: bytes) -> None:
-        """Process a message with the site or a program's status. An unreadable status counts as offline."""
+        """Process a message with the site or a program's status. An unreadable status makes the program unknown."""
         with contextlib.suppress(WrongMessageError):
             if kind == "site":
                 self.site = read_message(payload, SiteMessage)
