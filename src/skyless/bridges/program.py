@@ -216,7 +216,7 @@ class TagBridge:
             site = structs.replace(site, anchors_m=anchors_m, georeference=georeference)
         try:
             self._hub.on_site(site)
-        except SkylessError as error:  # positioning goes on
+        except SkylessError as error:  # logged, as positioning goes on
             if str(error) != self._refusal:
                 self._refusal = str(error)
                 self._log(self._refusal)

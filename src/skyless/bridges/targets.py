@@ -211,7 +211,7 @@ class SerialSender:
         """Write data; drop them if there is no port, or if it does not keep up."""
         if self._write is None:
             self.dropped["no-port"] += 1
-        elif self._port.waiting_bytes() > self._port.baud // 40:  # as many as it carries in a quarter of a second
+        elif self._port.waiting_bytes() > self._port.baud // 40:  # a quarter of a second's worth
             self.dropped["slow-port"] += 1
         else:
             self._write(data)

@@ -246,7 +246,7 @@ class AlarmEngine:
             self._tags[name].seen_s = now_s
 
     def on_zone_events(self, events: Iterable[ZoneEvent], now_s: float) -> None:
-        """Process tags' entering and leaving of zones."""
+        """Process events of tags entering or leaving zones."""
         for event in events:
             members = self._members[event.zone]
             (members.add if event.kind == "enter" else members.discard)(event.tag)
@@ -308,7 +308,7 @@ class AlarmEngine:
     def tick(self, now_s: float, unix_s: float, *, blind: bool = False) -> list[Change]:
         """Evaluate conditions if due; call this several times a second. ``blind``: messages may be missing."""
         self._unix_offset_s = unix_s - now_s
-        if blind or self._blind_s == -math.inf:  # before the first tick it was blind
+        if blind or self._blind_s == -math.inf:  # before the first tick messages were missed
             self._blind_s = now_s
         if now_s - self._evaluated_s >= EVALUATION_S:
             self._evaluated_s = now_s

@@ -21,7 +21,7 @@ from skyless.run.mqtt.topics import EVERY_NODE, EVERY_SITE, site_topic, status_t
 
 _KEEPALIVE_S: Final = 10
 _RETRY_S: Final = 0.5
-_GATHER_S: Final = 0.25  # retained messages come one after the other: after this time without any, all have come
+_GATHER_S: Final = 0.25  # retained messages come one after the other: if none comes for this time, all have come
 
 _LONGEST_GATHER_S: Final = 3.0  # sites whose programs come and go all the time are reported after this time
 

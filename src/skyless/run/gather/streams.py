@@ -78,7 +78,7 @@ async def make_stream(stream: "JetStreamContext", config: StreamConfig) -> None:
             await stream.add_stream(config)
         except APIError:
             with contextlib.suppress(NotFoundError):
-                await stream.update_stream(config)  # another gather has made it at this moment
+                await stream.update_stream(config)  # another gather has just made it
                 return
             raise
 

@@ -94,7 +94,7 @@ def largest_files(folder: Path) -> tuple[Path, ...]:
     found = [(rows[0], -rows[1], file) for file in folder.glob("day=*/*.parquet") if (rows := rows_of(file))]
     kept: list[Path] = []
     end = -1
-    for _, minus_last, file in sorted(found):  # of those that begin together, the longest first
+    for _, minus_last, file in sorted(found):  # of files with the same first row, the longest comes first
         if -minus_last > end:
             kept.append(file)
             end = -minus_last

@@ -87,7 +87,7 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
         corner = corner or [int(np.median(one)) - _SIDE // 2 for one in places]
         column, row = ((one - first).view(np.uint32) for one, first in zip(places, corner, strict=True))
         cell = (row * np.uint32(_SIDE) + column).astype(np.intp)
-        if column.max() >= _SIDE or row.max() >= _SIDE:  # a negative one is large, too
+        if column.max() >= _SIDE or row.max() >= _SIDE:  # negative ones are large as unsigned numbers
             cell[(column >= _SIDE) | (row >= _SIDE)] = _OUTSIDE
         changes = np.flatnonzero(tag[1:] != tag[:-1])
         ms = np.minimum(t[1:] - t[:-1], gap_ms)
@@ -175,7 +175,7 @@ def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -
             whole = parquet.ParquetFile(file, memory_map=True, pre_buffer=False)
             if not {*wanted} <= {*whole.schema_arrow} or len({*whole.schema_arrow.names}) < len(whole.schema_arrow):
                 raise ValueError(f"its columns are {', '.join(whole.schema_arrow.names)}")
-        except ValueError as error:  # ArrowInvalid is one
+        except ValueError as error:  # includes ArrowInvalid
             raise SkylessError(f"{file} cannot be read; it should be a Parquet file of fixes: {error}") from None
         gap_ms = round(1000.0 * (THINNED_GAP_S if THINNED in (whole.schema_arrow.metadata or {}) else GAP_S))
         for group in range(whole.num_row_groups):
@@ -198,7 +198,7 @@ def limits(metadata: parquet.FileMetaData, group: int, column: str) -> tuple[int
     known = metadata.row_group(group).column(metadata.schema.names.index(column)).statistics
     if known is None or not isinstance(known.max_raw, int):
         raise ValueError(f"its column {column} has no whole numbers, or no statistics of them")
-    return known.min_raw, known.max_raw  # others make dates, for which Pandas would be imported
+    return known.min_raw, known.max_raw  # min and max would be dates, and import Pandas
 
 
 EXPORT_SUFFIXES: Final = (".csv", ".parquet", ".geojsonl")
@@ -591,7 +591,7 @@ class _Way:
 @contextlib.contextmanager
 def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
     """Open DuckDB with temporary files only, and without the network."""
-    spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # made where it is needed
+    spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # created only if needed
     options: dict[str, Any] = {"memory_limit": f"{LIMITS.memory_mb}MB", "temp_directory": spill}
     # One thread takes less processor time in total, and leaves the other cores to the site.
     options |= {"autoinstall_known_extensions": "false", "threads": 1}

@@ -27,7 +27,7 @@ PRESENT_S: Final = 10.0
 ADOPTION_S: Final = 2.0
 """Stamps within this time after a placement are ignored, as anchors adopt it one after the other."""
 
-_RESULTS_KEPT: Final = 64  # a user saves the result that is on the page, while newer ones are made
+_RESULTS_KEPT: Final = 64  # a user may save the result on the page while newer ones are computed
 
 _MAX_BACKLOG_S: Final = 60.0
 """A message that seems delayed by more than this, compared with others of its sender, shows that a clock was set."""
@@ -57,7 +57,7 @@ class LiveSurvey:
         self.saved_serial: int | None = None
         self.saved_unix_s: float | None = None
         self.missed = 0  # stamps that anchors had to drop
-        self.begun = 0  # how often ranges have begun again: a result of ranges from before does not count
+        self.begun = 0  # how often ranging was restarted: results of earlier ranges do not count
         self._shown: tuple[PairRanges, float] | None = None  # the ranges in messages, and when they were made
         self._watch: _Watched | None = None
         self._results: dict[int, tuple[Survey, PairRanges]] = {}

@@ -64,12 +64,12 @@ LEASE_S: Final = 15.0
 _REQUEST_S: Final = 5.0  # each request for stamps is repeated at this interval, before its lease ends
 
 _UPDATE_S: Final = 1.0
-_PAIRS_PER_S: Final = 400  # pairs that are published a second: larger sites publish less often
+_PAIRS_PER_S: Final = 400  # pairs published per second: larger sites publish less often
 
-_COST: Final = 5.0  # the next result is not begun before this many times the time that the last one took
+_COST: Final = 5.0  # the next result begins after at least this multiple of the time that the last one took
 
 _SETTLED_S: Final = 60.0
-_SETTLED_UPDATE_S: Final = 5.0  # after a minute of data results change little, and are made less often
+_SETTLED_UPDATE_S: Final = 5.0  # after a minute of data results change little, and are computed less often
 
 _EARLIER_KEPT: Final = 32  # earlier sites that a placement names
 
