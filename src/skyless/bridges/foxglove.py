@@ -270,7 +270,7 @@ class FoxgloveTarget(Target):
             return
         shown = msgspec.structs.replace(fix, covariance_m2=floored(fix.covariance_m2))
         topic = f"/tag/{fix.tag}"
-        self._give_fix(f"{topic}/fix", schema_of(FixMessage), fix, msgspec.json.encode)
+        self._give(f"{topic}/fix", schema_of(FixMessage), fix.unix_s, lambda: msgspec.json.encode(fix))
         self._give_foxglove("/tf", "foxglove.FrameTransform", fix, frame_transform)
         self._give_foxglove(f"{topic}/pose", "foxglove.PoseInFrame", fix, lambda fix: pose_in_frame(fix, facing=False))
         self._give_foxglove(f"{topic}/ellipse", "foxglove.SceneUpdate", shown, ellipse)
@@ -357,12 +357,7 @@ class FoxgloveTarget(Target):
         return scene(self._unix_time(), site.anchors_m, site.master, site.walls, site.zones)
 
     def _give_foxglove(self, topic: str, schema: str, fix: FixMessage, encode: Callable[[FixMessage], bytes]) -> None:
-        self._give_fix(topic, foxglove_schema(schema), fix, encode)
-
-    def _give_fix(
-        self, topic: str, schema: tuple[str, bytes], fix: FixMessage, encode: Callable[[FixMessage], bytes]
-    ) -> None:
-        self._give(topic, schema, fix.unix_s, lambda: encode(fix))
+        self._give(topic, foxglove_schema(schema), fix.unix_s, lambda: encode(fix))
 
     def _give(self, topic: str, schema: tuple[str, bytes], unix_s: float, encode: Callable[[], bytes]) -> None:
         """Send a message to all subscribers of its channel, which is advertised with its first message."""

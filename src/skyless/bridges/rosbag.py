@@ -113,9 +113,8 @@ def _messages_of(found: Recorded, encoder: RosEncoder, tag: str | None) -> list[
     if isinstance(message, AnchorHealth) or (isinstance(message, TagHealth) and tag in (None, message.tag)):
         return encoder.on_health(message)
     if isinstance(message, TruthMessage):
-        wanted = {name: motion for name, motion in message.tags.items() if tag in (None, name)}
-        motions = wanted.items()
-        return [one for name, motion in motions for one in encoder.on_truth(name, message.unix_s, motion.position_m)]
+        wanted = [(name, motion) for name, motion in message.tags.items() if tag in (None, name)]
+        return [one for name, motion in wanted for one in encoder.on_truth(name, message.unix_s, motion.position_m)]
     return []
 
 

@@ -1,1 +1,1 @@
-"""Radios: boards on a serial port, DW1000 chips on SPI, the emulated air, and devices of other makers."""
+"""Radios: boards on serial ports, DW1000 chips on SPI, the emulated air, and devices of other makers."""

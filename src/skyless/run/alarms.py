@@ -1,16 +1,17 @@
-"""Raises and ends alarms by a site's rules. No I/O: what happens and the time are passed in.
+"""Raise and end alarms by a site's rules. No I/O: messages, events and the time are passed in.
 
 1. A rule and a subject (a tag, a pair of tags, a zone or an anchor) have one alarm at a time.
 2. An alarm is raised when its condition has held for ``after_s``, and ends when it has not held for ``clear_after_s``.
-3. Outside a rule's hours nothing is raised, and an active alarm ends with them. ``after_s`` counts from their begin.
-4. An alarm is kept until it has ended and somebody has acknowledged it. Another occurrence replaces one that has ended.
-5. What is not known changes nothing: silence while messages cannot arrive, a tag outside of a zone that goes silent, an
-   anchor that the watch no longer judges. What was not seen again since messages may have been lost raises nothing.
-6. An alarm says the worst value so far, at most once a second while it lasts, and keeps it when it has ended.
-7. Of several engines at a site, all are given what happens, and one that leads raises alarms. Another one, or one that
-   was started again, goes on from the kept alarms (``resume``).
+3. Outside a rule's hours nothing is raised, and active alarms end. ``after_s`` counts from the beginning of the hours.
+4. An alarm is kept until it has ended and somebody has acknowledged it. A new occurrence replaces one that has ended.
+5. A condition that is unknown changes nothing: silence while messages cannot arrive, a tag outside of a zone that goes
+   silent, an anchor that the watch no longer judges. After messages may have been lost, a condition must be seen again
+   before it raises an alarm.
+6. An alarm states the worst value so far, updated at most once a second, and keeps it when it has ended.
+7. All engines at a site get the same input; only the leading one raises alarms. An engine that takes over, or was
+   restarted, continues from the kept alarms (``resume``).
 
-Conditions are evaluated five times a second, and of zones with each event as well, as a tag may cross one in less.
+Conditions are evaluated five times a second, those on zones also with each zone event: a tag may cross a zone faster.
 """
 
 import math
@@ -86,30 +87,30 @@ UPDATE_S: Final = 1.0
 """Interval between updates of the sentences of active alarms."""
 
 _LONGER: Final = 1.1
-"""A duration is updated when it has grown by this factor, so that a long stay is not a message each second."""
+"""A duration is updated when it has grown by this factor, so that a long stay does not send a message each second."""
 
 _LASTING: Final = frozenset({"inside", "outside", "silent", "anchor-offline"})
-"""Kinds of rules whose worst value is how long the condition has held."""
+"""Kinds of rules whose worst value is the time for which the condition has held."""
 
 What = Literal["raised", "updated", "ended", "acknowledged", "dropped"]
 Change = tuple[What, AlarmMessage]
-"""What has happened to an alarm. "updated": the worst value is worse; "dropped": there are too many alarms."""
+"""A change of an alarm. "updated": the worst value is worse; "dropped": there are too many alarms."""
 Key = tuple[str, str]
 """Rule and subject."""
 
 
 class _Tag(Struct):
-    """What is known about a tag."""
+    """State of a tag."""
 
     first_s: float
     """Time of the first fix since the last gap."""
     fixes: int = 0
-    """Number of fixes since then."""
+    """Number of fixes since ``first_s``."""
     fix: FixMessage | None = None
     seen_s: float = -math.inf
     """Time of the newest fix."""
     gone: bool = False
-    """Whether its program has ended since."""
+    """Whether the tag's program has ended since the newest fix."""
     battery: float | None = None
 
     def is_fresh(self, now_s: float) -> bool:
@@ -121,7 +122,7 @@ class _Tag(Struct):
 
 
 _UNHEARD: Final = _Tag(math.inf)
-"""A tag of which nothing has been heard."""
+"""State of a tag that has never been heard."""
 
 
 class _Case(Struct):
@@ -134,10 +135,10 @@ class _Case(Struct):
     begin_s: float | None = None
     """When the condition first held; pauses too short to end the alarm do not change it."""
     worst: float | None = None
-    """As of ``AlarmMessage``."""
+    """As in ``AlarmMessage``."""
 
     def add(self, kind: RuleKind, value: float | None) -> None:
-        """Include a value in the worst one; None where it is not known."""
+        """Include a value in the worst one; None means unknown."""
         if value is not None:
             worse = min if kind in ("near", "battery") else max
             self.worst = value if self.worst is None else worse(self.worst, value)
@@ -166,7 +167,7 @@ class _Rule:
         self.distances_m: dict[str, float] = {}
         """Distances of near pairs, by subject."""
         self.cases: dict[str, _Case] = {}
-        self.is_on: bool | None = None  # not known before the first evaluation
+        self.is_on: bool | None = None  # unknown before the first evaluation
         self.on_since_s = -math.inf
         if before is not None and before.condition == self.condition:
             self.cases, self.is_on, self.on_since_s = before.cases, before.is_on, before.on_since_s
@@ -182,7 +183,7 @@ class AlarmEngine:
     def __init__(self, monitor: ZoneMonitor, local_time: Callable[[float], time.struct_time] = time.localtime) -> None:
         """``monitor`` gets the same fixes; its events are passed in. ``local_time`` converts from Unix time."""
         self.messages: dict[Key, AlarmMessage] = {}
-        """The alarms that are kept; those of another engine while that one leads."""
+        """The alarms kept; another engine's while it leads."""
         self.leading = False
         """Whether this engine raises alarms; true from ``resume`` on."""
         self._monitor, self._local_time = monitor, local_time
@@ -199,7 +200,7 @@ class AlarmEngine:
         self._blind_s = self._evaluated_s = self._updated_s = -math.inf
         self._unix_offset_s = 0.0
 
-    # What the site is
+    # The site
 
     @property
     def rules(self) -> tuple[AlarmRule, ...]:
@@ -207,7 +208,7 @@ class AlarmEngine:
         return tuple(own.rule for own in self._rules.values())
 
     def set_rules(self, rules: Iterable[AlarmRule]) -> None:
-        """Replace the rules. Alarms go on where the rule has the same identifier, kind and zone; the others end."""
+        """Replace the rules. Alarms continue if the rule keeps its identifier, kind and zone; the others end."""
         self._rules = {rule.id: _Rule(rule, self._assets, self._rules.get(rule.id)) for rule in rules}
         self._evaluate_all()
 
@@ -218,7 +219,7 @@ class AlarmEngine:
             self.set_rules(self.rules)
 
     def set_zones(self, zones: Iterable[Zone], now_s: float) -> None:
-        """Take the zones that the monitor has now. Pass in the monitor's events of this change first."""
+        """Set the zones that the monitor has now. Pass in the monitor's events of this change first."""
         self._zones = {zone.id: zone for zone in zones}
         for tag in self._tags.values():
             tag.first_s, tag.fixes = now_s, 0
@@ -228,10 +229,10 @@ class AlarmEngine:
         self._changed = dict.fromkeys(self._tags)
         self._evaluated_s = -math.inf
 
-    # What happens
+    # Input
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
-        """Process a fix of a tag. Call this before ``on_zone_events`` with the events that the monitor finds for it."""
+        """Process a fix of a tag. Call this before ``on_zone_events`` with the monitor's events for the same fix."""
         tag = self._tags.setdefault(fix.tag, _Tag(now_s))
         if not tag.is_fresh(now_s):
             tag.first_s, tag.fixes = now_s, 0
@@ -245,7 +246,7 @@ class AlarmEngine:
             self._tags[name].seen_s = now_s
 
     def on_zone_events(self, events: Iterable[ZoneEvent], now_s: float) -> None:
-        """Process events of tags that have entered or left zones."""
+        """Process events of tags entering or leaving zones."""
         for event in events:
             members = self._members[event.zone]
             (members.add if event.kind == "enter" else members.discard)(event.tag)
@@ -259,23 +260,23 @@ class AlarmEngine:
             self._tags[name].gone = True
 
     def on_health(self, health: TagHealth, now_s: float) -> None:
-        """Process a tag's health, which states the charge of its battery."""
+        """Process the battery charge in a tag's health message."""
         if health.battery_share is not None:
             self._tags.setdefault(health.tag, _Tag(now_s)).battery = health.battery_share
             self._changed[health.tag] = None
 
     def on_anchors(self, offline: Iterable[str] | None, watch: WatchMessage | None) -> None:
-        """Take the anchors that are offline (None if unknown) and the findings of the watch."""
+        """Process the list of offline anchors (None if unknown) and the findings of the watch."""
         if offline is not None:
             self._anchors["anchor-offline"] = {f"anchor-{name}": "" for name in sorted(offline)}
         if watch is not None and watch.state == "watching":
             moved = [one for one in watch.findings if one.kind == "moved"]
             self._anchors["anchor-moved"] = {f"anchor-{name}": one.sentence for one in moved for name in one.anchors}
 
-    # Leading, and what people do
+    # Leading, and acknowledgement
 
     def resume(self, messages: Iterable[AlarmMessage], now_s: float, unix_s: float) -> None:
-        """Start to lead, continuing with the retained alarms."""
+        """Start leading, continuing with the retained alarms."""
         self.messages = {(one.rule, one.subject): one for one in messages if not is_over(one)}
         self.leading, self._unix_offset_s = True, unix_s - now_s
         for message in self.messages.values():
@@ -305,9 +306,9 @@ class AlarmEngine:
         return True
 
     def tick(self, now_s: float, unix_s: float, *, blind: bool = False) -> list[Change]:
-        """Evaluate what is due, several times a second. ``blind``: messages may be missing, so silence is ignored."""
+        """Evaluate conditions if due; call this several times a second. ``blind``: messages may be missing."""
         self._unix_offset_s = unix_s - now_s
-        if blind or self._blind_s == -math.inf:  # before the first tick it was blind
+        if blind or self._blind_s == -math.inf:  # before the first tick messages were missed
             self._blind_s = now_s
         if now_s - self._evaluated_s >= EVALUATION_S:
             self._evaluated_s = now_s
@@ -324,7 +325,7 @@ class AlarmEngine:
             is_on = own.hours.contain(local.tm_wday, 60 * local.tm_hour + local.tm_min)
             if is_on and own.is_on is False:
                 own.on_since_s = now_s
-                for case in own.cases.values():  # what was outside the rule's hours counts for nothing
+                for case in own.cases.values():  # values from outside the rule's hours do not count
                     case.begin_s = case.worst = None
             own.is_on = is_on
             for subject in dict.fromkeys((*self._subjects(own, changed, now_s), *own.cases)):
@@ -361,7 +362,7 @@ class AlarmEngine:
     def _holds(  # noqa: PLR0911, PLR0912 - some for each kind
         self, own: _Rule, subject: str, now_s: float, *, held: bool
     ) -> bool | None:
-        """Whether the condition holds; None if that is unknown, so that the case stays as it was."""
+        """Whether the condition holds; None if unknown, so that the case stays unchanged."""
         rule, tag, inside = own.rule, self._tag(subject), self._members[own.rule.zone or ""]
         limit, hysteresis = rule.limit or 0.0, rule.hysteresis if held else 0.0
         if rule.zone is not None and rule.zone not in self._zones:
@@ -422,7 +423,7 @@ class AlarmEngine:
     # From conditions to alarms
 
     def _check(self, own: _Rule, subject: str, now_s: float) -> None:
-        """Evaluate a condition, and raise or end its alarm when that is due."""
+        """Evaluate a condition, and raise or end its alarm if due."""
         rule, case = own.rule, own.cases.get(subject)
         holds = self._holds(own, subject, now_s, held=case is not None and case.holds)
         if case is None:
@@ -488,7 +489,7 @@ class AlarmEngine:
                 self._keep(replace(message, sentence=sentence, worst=worst), "updated")
 
     def _value(self, own: _Rule, subject: str, held_s: float) -> float | None:
-        """The value that an alarm reports, as in ``AlarmMessage.worst``; None if it is unknown."""
+        """The value to report as ``AlarmMessage.worst``; None if it is unknown."""
         match own.rule.kind:
             case "near":
                 return own.distances_m.get(subject)
@@ -513,7 +514,7 @@ class AlarmEngine:
         return bool(ended)
 
     def _keep(self, message: AlarmMessage, what: What) -> None:
-        """While another engine leads, that one says so as well; if it does not, this one does when it leads."""
+        """Store an alarm, and report the change if leading; otherwise the leading engine reports it."""
         self.messages[message.rule, message.subject] = message
         if self.leading:
             self._changes.append((what, message))
@@ -523,7 +524,7 @@ class AlarmEngine:
     def _end(self, message: AlarmMessage, now_s: float) -> None:
         self._keep(replace(message, ended_unix_s=now_s + self._unix_offset_s), "ended")
 
-    # Words
+    # Sentences
 
     def _who(self, tag: str) -> str:
         name = self._assets[tag].name if tag in self._assets else ""
@@ -537,7 +538,7 @@ class AlarmEngine:
         return ", ".join(names) or ("" if fix is None else "at x {:.1f}, y {:.1f} m".format(*fix.position_m))
 
     def _sentence(self, own: _Rule, subject: str, worst: float | None, what: What) -> str:
-        """The sentence of an alarm; empty if nothing is known any more."""
+        """The sentence of an alarm; empty if its value is no longer known."""
         rule, limit, zone = own.rule, own.rule.limit or 0.0, self._zone_name(own.rule.zone)
         if worst is None and what != "raised" and rule.kind != "anchor-moved":
             return ""
@@ -570,7 +571,7 @@ def is_over(message: AlarmMessage) -> bool:
 
 
 def _level_m(tag: _Tag) -> float | None:
-    """Horizontal protection level; infinite if none can be given, None if the method has none."""
+    """Horizontal protection level in m; infinite if none can be computed, None if the method has none."""
     fix = tag.fix
     if fix is None or fix.hpl_m is not None:
         return None if fix is None else fix.hpl_m

@@ -39,15 +39,14 @@ from skyless.run.process import HEALTH_S, Log, SitePublisher, every, keep, link_
 from skyless.site.file.check import check_site
 
 MAX_MOVE_M: Final = 0.5
-"""How far a survey may move an anchor with keys from its place in the site file, as its codes vouch for the new place.
-"""
+"""How far a survey may move an anchor with keys from its place in the site file: its codes vouch for the place."""
 
 MAX_LEAD_S: Final = 8e-3
 LEAD_GAIN: Final = 1.25
 LEAD_LOSS: Final = 0.998
-"""Frames are first handed over as long before their RMARKERs as the radio asks for. The lead grows by the gain with
-each late frame, up to the maximum, and shrinks by this factor with each frame sent. A longer lead makes relayed stamps
-older.
+"""The lead is the time between handing over a frame and its RMARKER. It begins with the radio's ``lead_s``, grows by
+the gain with each late frame, up to the maximum, and shrinks by the loss with each frame sent. A longer lead makes
+relayed stamps older.
 """
 
 ASK_AGAIN_S: Final = 5e-3
@@ -58,10 +57,10 @@ STAMPS_S: Final = 0.05
 """Interval at which stamps are checked for a message that is due."""
 
 STAMPS_INTERVAL_S: Final = 0.2
-"""Length of time whose stamps go into one message."""
+"""Stamps of this period go into one message."""
 
 MAX_PENDING_STAMPS: Final = 4096
-"""Largest number of uncollected stamps; the oldest are dropped and counted beyond it."""
+"""Largest number of uncollected stamps; beyond it the oldest are dropped and counted."""
 
 _ROLES: Final[dict[Role, Literal["master", "anchor", "listening"]]] = {
     Role.MASTER: "master",
@@ -89,7 +88,7 @@ class AnchorNode:
         """
         self.site, self.id, self.radio = site, anchor_id, radio
         self._radio_site, self._log = site, log
-        """The radio is configured with this site's antenna delays, and keeps them."""
+        """The site whose antenna delays the radio is configured with, and keeps."""
         self._may_move = keys is None or allow_placement
         self._keys, self._report = keys, AnchorReport(anchor_id, log)
         self.authentication: BeaconAuthentication | None = None
@@ -116,7 +115,7 @@ class AnchorNode:
         return machine
 
     def place(self, message: PlacementMessage) -> bool:
-        """Adopt a survey's positions and delays, unless they are for another site. Returns whether it changed."""
+        """Adopt a survey's positions and delays, unless they are for another site. Returns whether they were new."""
         present, offered = site_digest(self.site), site_digest(message.site)
         if offered == present:
             return False
@@ -151,7 +150,7 @@ class AnchorNode:
         self.stamps.request(message, time.monotonic())
 
     def refuse(self, reason: str) -> None:
-        """Count a message on MQTT that could not be used."""
+        """Count an unusable MQTT message."""
         self.refused[reason] += 1
 
     async def run(self) -> None:
@@ -201,7 +200,7 @@ class AnchorNode:
             self._report.update(self.authentication, self._keys.present(unix_s), accepted_s, unix_s, now_s)
 
     def with_codes(self, health: AnchorHealth) -> AnchorHealth:
-        """Add the state of key chains and codes to an anchor's health."""
+        """Add the state of key chains and codes to the health message."""
         keys, authentication = self._keys, self.authentication
         if keys is None or authentication is None:
             return health
@@ -230,7 +229,7 @@ class AnchorNode:
         self._timer = None if seconds is None else asyncio.get_running_loop().call_later(seconds, then)
 
     def _schedule(self) -> None:
-        """Ask the machine for its next transmission."""
+        """Ask the machine for its next transmission, and plan to hand it over."""
         now_ticks = self.radio.now_ticks()
         if now_ticks is not None and self.authentication is not None:
             self.authentication.set_time(now_ticks, time.time())
@@ -249,7 +248,7 @@ class AnchorNode:
 
 
 class StampLog:
-    """What an anchor has received from the others, kept while somebody requests it.
+    """An anchor's stamps of frames from other anchors, kept while somebody requests them.
 
     No I/O and no clock: times are passed in, by any monotonic clock.
     """
@@ -263,7 +262,7 @@ class StampLog:
         self._sent_s = 0.0
 
     def request(self, message: RequestMessage, now_s: float) -> None:
-        """Process a request. One without ``stamps`` ends its sender's lease."""
+        """Process a request. A request without ``stamps`` ends its sender's lease."""
         if message.stamps:
             self._leases.grant(message.by, message.lease_s, now_s)
         else:
@@ -281,11 +280,11 @@ class StampLog:
         if len(self._pending) >= MAX_PENDING_STAMPS:
             self._pending.popleft()
             self._missed += 1
-        rounded = None if phase_cycles is None else round(phase_cycles, 4) % 1.0  # as text it is short
+        rounded = None if phase_cycles is None else round(phase_cycles, 4) % 1.0  # short as text
         self._pending.append(Stamp(anchor, tx_ticks, rx_ticks, rounded))
 
     def collect(self, now_s: float, unix_s: float) -> StampsMessage | None:
-        """Return the next message if it is due. It may be empty, if an anchor that is asked receives nobody."""
+        """Return the next message if due. It is empty if the anchor has received no other anchor."""
         self._leases.expire(now_s)
         if not self._leases.are_held:
             self._pending.clear()
@@ -301,7 +300,7 @@ class StampLog:
 
 
 class TransmissionCount:
-    """Counts an anchor's transmissions that were sent and missed, including skipped slots."""
+    """Counts an anchor's transmissions that were sent, and those missed, including skipped slots."""
 
     def __init__(self, interval_ticks: float) -> None:
         self.sent = self.missed = 0
@@ -310,7 +309,7 @@ class TransmissionCount:
         self._planned_ticks: int | None = None
 
     def plan(self, tx_ticks: int | None) -> None:
-        """Note the next planned transmission, which may not be known yet. Skipped slots count as missed."""
+        """Note the next planned transmission; None if it is unknown. Skipped slots count as missed."""
         before, self._planned_ticks = self._planned_ticks, tx_ticks
         if tx_ticks is not None and before is not None and self._interval_ticks:
             self.missed += max(0, round(difference(tx_ticks, before) / self._interval_ticks) - 1)
@@ -395,7 +394,7 @@ class Anchors:
         ]
 
     def _publish_health(self) -> None:
-        """Publish the health of all anchors, and the site where one of them is responsible for it (``leads``)."""
+        """Publish the health of all anchors, and the site by the anchor that is responsible for it (``leads``)."""
         unix_s, now_s = time.time(), time.monotonic()
         self._site_publisher.update(sum(node.monitor.restarts for node in self.nodes))
         for node, link in zip(self.nodes, self._links, strict=True):
@@ -404,7 +403,7 @@ class Anchors:
             if link is not None:
                 if leads(node.machine, is_first=node is self.nodes[0]):
                     self._site_publisher.publish(link)
-                else:  # another one does; what this one knows may become old
+                else:  # another anchor publishes it, and this one's copy may become outdated
                     link.forget(site_topic(self._site.id))
                 health = health_of(node, link.counters, unix_s, now_s)
                 link.publish(health_topic(self._site.id, "anchor", node.id), health)

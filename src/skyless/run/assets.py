@@ -1,4 +1,4 @@
-"""What tags are attached to: validation of lists of assets, and their form as CSV for spreadsheets."""
+"""Assets, to which tags are attached: validation of lists, and conversion from and to CSV for spreadsheets."""
 
 import csv
 import io
@@ -15,7 +15,7 @@ MAX_BYTES: Final = 4_000_000
 """Size limit of a list in JSON or CSV; brokers take messages of 8 MB."""
 
 COLUMNS: Final = Asset.__struct_fields__
-"""Header of a CSV table as written."""
+"""Header of CSV tables that are written."""
 
 _TAG: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _FORMULA: Final = ("=", "+", "-", "@", "'")
@@ -47,7 +47,7 @@ def check_assets(assets: tuple[Asset, ...]) -> None:
 
 
 def _fault(asset: Asset) -> str:
-    """What is wrong with an asset; empty if nothing is."""
+    """Describe the fault of an asset; empty if there is none."""
     if not _TAG.fullmatch(asset.tag):
         return f"tag is {asset.tag[:40]!r}; it should be 1 to 64 letters, digits, dots, dashes and underscores"
     for key, most in _MAX_LENGTHS.items():

@@ -50,8 +50,8 @@ from skyless.radio.tag_reports import (
 from skyless.run.fix_log import Lateness
 from skyless.run.process import HEALTH_S, Log, RateLimit, every, together
 
-# A board that is a tag by itself. It computes with ``Receiver`` as the firmware does (``firmware/source/tag.c``), uses
-# this computer's clock, and neither sleeps nor advertises.
+# A board that is a tag by itself. Like the firmware (``firmware/source/tag.c``), it computes with ``Receiver``, but it
+# uses this computer's clock, and neither sleeps nor advertises.
 
 _REPEAT_S: Final = 10.0
 """Interval at which anchor positions and the georeference are repeated."""
@@ -61,13 +61,13 @@ class BoardTag:
     """The tag on a board. ``settings`` are in use; ``flash`` holds those used after a restart."""
 
     def __init__(self, report: Callable[[int, bytes], None], clock_s: Callable[[], float] = time.monotonic) -> None:
-        """``report`` sends a record of a kind; ``clock_s()`` is the host's time, on the clock of the receptions."""
+        """``report(kind, body)`` sends a record; ``clock_s()`` is the host's time, on the clock of the receptions."""
         self._report, self._clock_s = report, clock_s
         self.flash = BoardSettings()
         self.begin(self.flash)
 
     def begin(self, settings: BoardSettings) -> None:
-        """Start with these settings, and no receptions."""
+        """Start afresh with these settings."""
         self._receiver = Receiver(
             site=None if settings.site == ANY_SITE else settings.site,
             qa=settings.qa_m2ps3,
@@ -83,11 +83,11 @@ class BoardTag:
 
     @property
     def is_on(self) -> bool:
-        """Whether the board computes its position; otherwise it is a radio for its host."""
+        """Whether the board computes its position; otherwise it is only a radio for its host."""
         return MODES[self.settings.mode] == "tag"
 
     def execute(self, record: bytes) -> None:
-        """Execute a command about settings; the time must already be known."""
+        """Execute a command about the settings or the time; the time is ignored, as it is known here."""
         if record[0] == link.SET_TAG_CONFIG:
             settings = unpack(record[link.SETTINGS_AT :])
             if settings is None or OUTPUTS[settings.output] != "records":
@@ -101,7 +101,7 @@ class BoardTag:
             self._report(link.TAG_CONFIG, bytes((in_flash,)) + pack(self.settings))
 
     def hear(self, reception: Reception) -> None:
-        """Process a frame, and report the position if that is due."""
+        """Process a frame, and report the position if due."""
         now_s = self._clock_s()
         ended_s = now_s if reception.host_s is None else reception.host_s
         if not self._lateness.admits(ended_s, now_s) or (fix := self._receiver.hear(reception)) is None:
@@ -139,8 +139,7 @@ _MAX_FLIGHT_TICKS: Final = 0xFFFF
 _MAX_REPLY_TICKS: Final = 0xFFFF_FFFF
 _MAX_MEASUREMENTS: Final = 0xFF
 _RELATIVE_2: Final = bytes((1, 1 | 1 << 1))
-"""How a relative location begins in version 2."""
-
+"""Prefix of a relative location in version 2."""
 
 BoardFormat = Literal["link", "sniffer", "sniffer-text", "listener", "uci", "uci-2"]
 RADIO_OF: Final[dict[BoardFormat, str]] = {
@@ -151,14 +150,14 @@ RADIO_OF: Final[dict[BoardFormat, str]] = {
     "uci": "uci",
     "uci-2": "uci",
 }
-"""Name of a board of each format in ``--radio``."""
+"""Type of radio in ``--radio`` for a board of each format."""
 
 
 class BoardProtocol(Protocol):
-    """What a board sends and accepts on its serial line."""
+    """The protocol of a board's serial line."""
 
     def on_radio_event(self, event: RadioEvent) -> None:
-        """Report an event on the air to the host."""
+        """Report an event of the radio to the host."""
 
     def on_host_data(self, data: bytes) -> None:
         """Process bytes from the host."""
@@ -170,7 +169,7 @@ class LinkProtocol:
     def __init__(
         self, radio: Radio, send: Send, *, can_transmit: bool, clock_s: Callable[[], float] = time.monotonic
     ) -> None:
-        """A board that only listens can be a tag by itself; ``clock_s()`` is its host's time."""
+        """A board that only listens can also be a tag by itself; ``clock_s()`` is its host's time."""
         self._radio, self._send, self._can_transmit = radio, send, can_transmit
         self.tag = None if can_transmit else BoardTag(self.report, clock_s)
         self._reader, self._writer = link.Reader(), link.Writer()
@@ -320,7 +319,7 @@ class ListenerProtocol:
 
 
 class _BeaconTranslator:
-    """What emulated boards of other systems share: they report beacons as messages of their own system."""
+    """Base of emulated boards of other systems, which report beacons as messages of their own systems."""
 
     def __init__(self, send: Send) -> None:
         self._send = send
@@ -330,7 +329,7 @@ class _BeaconTranslator:
         self.drops: Counter[str] = Counter()
 
     def _beacon(self, event: RadioEvent, greatest_anchor: int = 0xFFFF) -> SiteBeacon | None:
-        """The beacon of a reception; None for other events and for frames without a translation."""
+        """Decode the beacon of a reception; None for other events and for frames that cannot be translated."""
         if not isinstance(event, Reception):
             return None
         beacon = decode_any(event.frame)
@@ -380,7 +379,7 @@ class SnifferProtocol(_BeaconTranslator):
         self._binary = self._binary or (self._knows_binary and b"b" in data)
 
     def _payload(self, beacon: SiteBeacon) -> bytes:
-        """Payload of a packet: type, sequence, TX time, times of reception of other anchors, and times of flight."""
+        """Payload of a packet: type, sequence, TX time, other anchors' times of reception, and times of flight."""
         heard = [entry for entry in beacon.relayed if entry.anchor <= _LAST_ID]
         payload = struct.pack("<BBIB", TDOA3, beacon.sequence & 0x7F, beacon.tx_ticks & 0xFFFFFFFF, len(heard))
         for entry in heard:
@@ -399,8 +398,8 @@ class UciProtocol(_BeaconTranslator):
     the master's second one is the final message, stating when it received the responses; later frames belong to no
     round.
 
-    A round is sent as soon as it has all messages of the one before, or with the next poll. Messages that come after
-    that are sent in notifications of their own.
+    A round is sent as soon as it has all messages that the previous round had, or with the next poll. Messages that
+    come later are sent in notifications of their own.
     """
 
     def __init__(self, send: Send, version: Literal[1, 2]) -> None:
@@ -409,7 +408,7 @@ class UciProtocol(_BeaconTranslator):
         self._heard: set[tuple[int, DtMessageType]] = set()
         """Messages of this round."""
         self._usual: set[tuple[int, DtMessageType]] = set()
-        """Messages of the round before."""
+        """Messages of the previous round."""
         self._waiting: list[tuple[Beacon, DtMeasurement]] = []
         self._poll: Beacon | None = None
         self._sequence = 0
@@ -441,7 +440,7 @@ class UciProtocol(_BeaconTranslator):
         """Ignore the data: the session runs from the start."""
 
     def _measurement(self, beacon: Beacon, reception: Reception) -> DtMeasurement | None:
-        """The measurement that the board reports for a beacon; None if it answers no poll of this round."""
+        """Return the measurement to report for a beacon; None if the beacon does not belong to this round."""
         poll, heard = self._poll, beacon.master_heard
         if poll is None or (poll.anchor, DtMessageType.FINAL) in self._heard:
             return None
@@ -493,7 +492,7 @@ class UciProtocol(_BeaconTranslator):
 
 
 def _answered(one: DtMeasurement, sent: Beacon, final: Beacon) -> DtMeasurement:
-    """A response with the reply time of the final message, if the initiator received it."""
+    """Add to a response the initiator's reply time, from the final message; unchanged if it was not received."""
     heard = next((entry for entry in final.heard if entry.anchor == one.address), None)
     if one.message != DtMessageType.RESPONSE or heard is None or heard.sequence != sent.sequence:
         return one
@@ -541,7 +540,7 @@ class Board:
 
 
 class BoardReceiver:
-    """A tag whose board computes; stands in for a receiver (``skyless.core.tag.receiver.SiteListener``)."""
+    """Stands in for the receiver of a tag whose board computes (``skyless.core.tag.receiver.SiteListener``)."""
 
     def __init__(self) -> None:
         self.counters: Counter[str] = Counter()
@@ -554,7 +553,7 @@ class BoardReceiver:
 
     @property
     def heard_site(self) -> HeardSite | None:
-        """The anchors that the board has used."""
+        """The anchors that the board has used, and the georeference; None before any."""
         earth = self._georeference
         return HeardSite(self._anchors_m, earth, is_complete=earth is not None) if self._anchors_m else None
 

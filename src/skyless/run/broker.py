@@ -1,7 +1,7 @@
 """``skyless broker``: runs nats-server, which speaks MQTT 3.1.1, as a child process.
 
-While it runs, a file in a folder private to the user states its address for programs without ``--mqtt``. The file stays
-locked for that time, so that one left behind by a killed program is recognised.
+While it runs, a file in a folder private to the user states its address, for programs without ``--mqtt``. The file is
+locked meanwhile, so that a file left behind by a killed program is recognised.
 """
 
 import asyncio
@@ -38,12 +38,12 @@ from skyless.run.process import data_folder, end, end_with_parent, is_free, lock
 FIRST_PORT: Final = 1883
 _PORTS_TO_TRY: Final = 100
 
-_TEMPORARY: Final = "skyless-broker-"  # how the name of a temporary folder begins
+_TEMPORARY: Final = "skyless-broker-"  # prefix of temporary folders' names
 
 _NATS_HOST: Final = "127.0.0.1"
 _SEND_AGAIN: Final = "3s"  # when a message that a dying subscriber has not acknowledged is sent again; 30 s by default
 
-_ABANDONED_S: Final = 10.0  # a temporary folder of this age that no broker has locked was left by one that was killed
+_ABANDONED_S: Final = 10.0  # a temporary folder of this age that is not locked was left by a killed broker
 
 _START_S: Final = 20.0
 _POLL_S: Final = 0.02
@@ -87,14 +87,14 @@ class BrokerSettings(Struct, frozen=True):
     strangers_read: bool = False
     """Whether clients without user and password have the stranger's role; otherwise they are refused."""
     temporary: bool = False
-    """Whether the data are deleted at the end, being in a temporary folder."""
+    """Whether the data are in a temporary folder, which is deleted at the end."""
     gathered_bytes: int | None = None
     """Disk limit of a gather's streams; None without a gather, for which the NATS port is unused."""
     hub: Leaf | None = None
     """The site's connection to a hub."""
 
     def check(self) -> None:
-        """Check the options for access.
+        """Check the options for access control.
 
         Raises:
             SkylessError: naming the missing option.
@@ -132,7 +132,7 @@ class BrokerSettings(Struct, frozen=True):
 
 
 def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAddress | None = None) -> str:
-    """The configuration file of nats-server, whose format accepts JSON. ``nats`` is the address for a gather."""
+    """Return nats-server's configuration file; its format accepts JSON. ``nats`` is the address for a gather."""
     host = f"[{settings.listen}]" if ":" in settings.listen else settings.listen
     mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": _SEND_AGAIN}
     if settings.certificate is not None:
@@ -192,7 +192,7 @@ def _permission(filters: tuple[str, ...]) -> dict[str, list[str]]:
 
 
 def _locked_folder(settings: BrokerSettings) -> tuple[Path, IO[str]]:
-    """Lock the private folder of the broker's data. Without ``data``, use a temporary one if the usual fails."""
+    """Lock the private folder for the data. Without ``data``, use a temporary one if the usual one fails."""
     if settings.data is not None:
         try:
             return settings.data, _lock(settings.data)
@@ -213,7 +213,7 @@ def _remove_abandoned() -> None:
     """Delete the temporary folders of brokers that were killed together with their parents."""
     for folder in Path(tempfile.gettempdir()).glob(f"{_TEMPORARY}*"):
         with contextlib.suppress(OSError):
-            if time.time() - folder.stat().st_mtime > _ABANDONED_S:  # another may be about to lock its own
+            if time.time() - folder.stat().st_mtime > _ABANDONED_S:  # else a new broker may be about to lock it
                 with locked(folder / "lock"):
                     shutil.rmtree(folder)
 
@@ -263,8 +263,8 @@ class Broker:
         reservation: socket.socket,
         nats: NatsAddress | None,
     ) -> None:
-        self.address = address  # its address for clients on this machine, credentials included
-        self.nats = nats  # the same for its gather, None without one
+        self.address = address  # for clients on this machine, with credentials
+        self.nats = nats  # for the broker's gather; None without one
         self.data = data
         self._process, self._lock, self._reservation = process, lock, reservation
         self._stated = None if address.tls else StatedAddress(address, nats)  # its certificate is for other names
@@ -275,7 +275,7 @@ class Broker:
         return self._process.pid
 
     async def wait(self) -> int:
-        """Wait until it ends, and return its exit code."""
+        """Wait until nats-server ends, and return its exit code."""
         return await self._process.wait()
 
     async def stop(self, *, to_restart: bool = False) -> None:
@@ -284,7 +284,7 @@ class Broker:
             self._stated.withdraw()
         await end(self._process)
         if to_restart:
-            os.utime(self.data)  # it is not abandoned
+            os.utime(self.data)  # so that it does not count as abandoned
         self._reservation.close()
         _release(self.data, self._lock, keep=to_restart)
 
@@ -384,7 +384,7 @@ async def _until_ready(process: asyncio.subprocess.Process, address: MqttAddress
 
 
 async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception:
-    """Find out from its log why nats-server ended at its start."""
+    """Return an exception that says why nats-server ended at its start, from its log."""
     lines = (await process.stderr.read()).decode(errors="replace").splitlines() if process.stderr else []
     with contextlib.suppress(OSError):
         log = (data / "nats-server.log").read_text(encoding="utf-8", errors="replace")
@@ -396,7 +396,7 @@ async def _failure(process: asyncio.subprocess.Process, data: Path) -> Exception
 
 
 def _release(data: Path, lock: IO[str], *, keep: bool = False) -> None:
-    """Unlock the folder for the next broker. Delete a temporary one unless it is to be kept."""
+    """Unlock the folder for the next broker; delete a temporary one unless ``keep``."""
     if not keep and data.name.startswith(_TEMPORARY):
         shutil.rmtree(data, ignore_errors=True)
     lock.close()
@@ -425,7 +425,7 @@ def _unverified() -> ssl.SSLContext:
 class StatedAddress:
     """A broker's address, published until ``withdraw``. Nothing is published if no file can be written.
 
-    The second line of the file is its NATS address, if it has a gather.
+    The second line of the file is the broker's NATS address, if it has a gather.
     """
 
     def __init__(self, address: MqttAddress, nats: NatsAddress | None = None) -> None:
@@ -468,7 +468,7 @@ def running_broker() -> MqttAddress | None:
 
 
 def nats_of(broker: MqttAddress) -> NatsAddress | None:
-    """NATS address, with the broker's user, of a broker on this machine with a gather."""
+    """NATS address, with the broker's user, of a broker on this machine; None if it has no gather."""
     for mqtt, nats in _stated():
         if nats and (mqtt.host, mqtt.port) == (broker.host, broker.port):
             return NatsAddress(nats, broker.user, broker.password)
@@ -486,7 +486,7 @@ def _stated() -> Iterator[tuple[MqttAddress, str]]:
 
 
 def _addresses_in(file: Path) -> tuple[MqttAddress, str] | None:
-    """The addresses in a file, or None if its broker has ended. The file stays, as a broker may be about to lock it."""
+    """Read the addresses in a file; None if its broker has ended. The file stays: a broker may be about to lock it."""
     try:
         with file.open(encoding="utf-8") as stated:
             try:
@@ -494,13 +494,13 @@ def _addresses_in(file: Path) -> tuple[MqttAddress, str] | None:
             except BlockingIOError:
                 mqtt, _, nats = stated.read().partition("\n")
                 return mqtt_address(mqtt), nats
-    except (OSError, SkylessError, UnicodeError):  # it has just ended, or begins at this moment
+    except (OSError, SkylessError, UnicodeError):  # the broker has just ended, or is just starting
         pass
     return None
 
 
 def _session_folder() -> Path:
-    """The user's folder for files that last no longer than a session.
+    """Return the user's folder for files that last no longer than a session, created if missing.
 
     Raises:
         OSError: there is none private to the user.

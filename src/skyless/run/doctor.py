@@ -1,4 +1,4 @@
-"""What ``skyless doctor`` checks of a host, its boards and their clocks."""
+"""The checks of ``skyless doctor``: a host, its boards and their clocks."""
 
 import ctypes
 import getpass
@@ -36,16 +36,16 @@ class Check(Struct, frozen=True):
     finding: str
     """One sentence."""
     advice: str = ""
-    """What to do next; empty if nothing is needed."""
+    """Next step; empty if none is needed."""
 
 
 def sentence(words: str) -> str:
-    """Capitalise words and end them with a full stop."""
+    """Capitalise the first letter and add a full stop."""
     return f"{words[0].upper()}{words[1:]}."
 
 
 def judged(name: str, value: float, warn: float, fail: float, finding: str, advice: str) -> Check:
-    """Judge a value that is better the smaller it is."""
+    """Judge a value of which less is better; ``warn`` and ``fail`` are its limits."""
     result: Result = "failed" if value > fail else "warning" if value > warn else "ok"
     return Check(name, result, finding, "" if result == "ok" else advice)
 
@@ -58,27 +58,29 @@ def residuals_check(name: str, words: str, fixes: Collection[FixMessage]) -> Che
     return judged(name, ratio, 2.0, 10.0, finding, advice)
 
 
-# Stability of counters, from stamps of the same frames by two of them: a check of the site's noise figures.
+# Stability of counters, from two counters' stamps of the same frames: a check of the site's noise figures.
 
 _TIMES_S: Final = (0.5, 4.0)
 _MIN_SAMPLES: Final = 30
 _STEP_TICKS: Final = round(0.05 / TICK_S)
-"""Shortest interval between stamps of a pair that are used."""
+"""Shortest interval between a pair's stamps; others are ignored."""
 _MAX_PAIRS: Final = 1000
 _MAX_GAP_S: Final = 8.0  # half a turn of the counters
 _TOO_NOISY: Final = 1.5
-"""Measured over assumed. Pairs share counters, so that six anchors and 25 s give a ratio with a deviation of 0.15."""
+"""Limit for measured over assumed deviation. As pairs share counters, six anchors and 25 s give this ratio a standard
+deviation of 0.15.
+"""
 
 
 class CounterPairs:
-    """Stamps of frames by the counters of sender and receiver, for each pair."""
+    """Stamps of frames by the counters of sender and receiver, for each pair of them."""
 
     def __init__(self) -> None:
         self._pairs: dict[tuple[str, int], list[tuple[int, int]]] = {}
         self._added_s: dict[tuple[str, int], float] = {}
 
     def add(self, receiver: str, sender: int, tx_ticks: int, rx_ticks: int, now_s: float) -> None:
-        """Add a frame, in order. A pair starts again after a restart of either counter or a long gap."""
+        """Add a frame, in order of time. A pair starts again after a long gap or a restart of either counter."""
         pair = receiver, sender
         if pair not in self._pairs and len(self._pairs) >= _MAX_PAIRS:
             return
@@ -117,7 +119,7 @@ class CounterPairs:
 
 
 def assumed_deviation(noise: NoiseSite, tau_s: float) -> float:
-    """The same for two counters as the site's filters assume them, including stamps: 2·(w²/τ + r²·τ/3) + 3·s²/τ²."""
+    """Allan deviation of two counters that the site's filters assume, with stamps: σ² = 2·(w²/τ + r²·τ/3) + 3·s²/τ²."""
     stamp2 = (noise.tx_stamp_ps**2 + noise.rx_stamp_ps**2) * 1e-24
     crystals = noise.white_fm**2 / tau_s + noise.random_walk_fm**2 * tau_s / 3.0
     return math.sqrt(2.0 * crystals + 3.0 * stamp2 / tau_s**2)
@@ -148,7 +150,7 @@ class BoardProbe:
     def __init__(self, radio: SerialRadio, site: int | None) -> None:
         """``site`` is the number of the site to listen to; None for the first that is heard."""
         self.radio = radio
-        self._troubles: dict[str, None] = {}  # without those that have been before
+        self._troubles: dict[str, None] = {}  # each once, in order
         self._hello: Hello | None = None
         self._heard: Counter[int] = Counter()
         self._fixes: list[FixMessage] = []

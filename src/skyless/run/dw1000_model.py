@@ -12,9 +12,7 @@ from skyless.sim.dw1000.chip import Chip, ModelBus
 from skyless.sim.dw1000.transceiver import PREAMBLE_TICKS
 
 ETHER_LEAD_TICKS: Final = PREAMBLE_TICKS + from_seconds(0.3e-3)
-"""How long before its RMARKER a frame must reach the emulated air, including the transfer to it."""
-
-
+"""How long before its RMARKER a frame must be handed over, to reach the emulated air in time."""
 _SHORTEST_SLEEP_S: Final = 100e-6
 
 

@@ -1,4 +1,4 @@
-"""``skyless ether``: the emulated air of a site as a server, in real time, for anchors and tags in other processes."""
+"""``skyless ether``: a server that emulates a site's air in real time, for anchors and tags in other processes."""
 
 import asyncio
 import socket
@@ -25,15 +25,14 @@ from skyless.sim.trajectory import Trajectory
 
 _CLOCKS_S: Final = 0.1
 _TRUTH_S: Final = 0.05
-"""Interval at which counters are sent to each process, and the truth to MQTT."""
+"""Intervals at which counters are sent to each process, and the truth to MQTT."""
 
 _SEND_BUFFER_BYTES: Final = 1 << 16
 _OVERRUN_BYTES: Final = 1 << 16
 """Frames beyond this are lost if a process does not read them, as with a radio whose host is asleep."""
 
-
 _OTHER_FILES: Final = 192
-"""Files other than connections of processes: the broker's, the libraries', and connections accepted in one turn."""
+"""Open files besides processes' connections: the broker's, the libraries', and connections accepted in one turn."""
 
 
 class Session:
@@ -62,7 +61,7 @@ class Client(asyncio.Protocol):
         self._is_counted = False
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Keep the buffers small, so that no old data pile up in them."""
+        """Set up the connection, with small buffers so that no old data pile up; refuse it if there is no room."""
         assert isinstance(transport, asyncio.Transport)
         self._transport = transport
         endpoint = transport.get_extra_info("socket")
@@ -148,7 +147,7 @@ class Ether:
         self._missed = 0
         """Transmissions whose time had passed before this process handled them."""
         self._reported = 0, 0
-        """Sent and missed transmissions at the last health message."""
+        """Transmissions sent and missed by the last health message."""
         self.machine = wire.this_machine()
 
     async def serve(self, host: str, port: int, log: Log = ignore) -> asyncio.Server:
@@ -226,7 +225,7 @@ class Ether:
         return f"all {most} connections of the ether are in use"
 
     def join(self, client: Client, message: wire.Join) -> Session | str:
-        """Put a process's nodes on the air; return the reason if that is not possible."""
+        """Put a process's nodes on the air. Returns the reason if that is not possible."""
         nodes = [self._nodes.get((message.kind, name)) for name in message.names]
         for name, node in zip(message.names, nodes, strict=True):
             if node is None:
@@ -263,7 +262,7 @@ class Ether:
         """Plan a transmission, unless it is too late or the node's radio already has one waiting.
 
         Raises:
-            WireError: no anchor's radio sends that.
+            WireError: the frame is not one that an anchor's radio sends.
         """
         node = session.nodes[message.node]
         if node >= len(self.site.anchors) or len(message.frame) > MAX_FRAME_BYTES:
@@ -291,7 +290,7 @@ class Ether:
             if not session.send(wire.Arrival(flight.frame, host_s, tuple(heard_rows))):
                 self.overruns += len(heard_rows)
         if flight.boot != self.medium.boots[flight.sender]:
-            return  # the process that sent it has gone meanwhile
+            return  # the process that sent it has left meanwhile
         sender = self._owners.get(flight.sender)
         tx_ticks = self._flying.pop(flight.sender, None)
         if sender is not None and tx_ticks is not None:
@@ -300,7 +299,7 @@ class Ether:
     # Truth and health
 
     def truth(self, unix_less_host_s: float) -> TruthMessage:
-        """True positions of the tags on the air; ``unix_less_host_s`` is Unix time less the host's."""
+        """Return the true motion of the tags on the air. ``unix_less_host_s`` is Unix time minus the host's."""
         now_s, unix_s = self.medium.now_s, self.now_host_s + unix_less_host_s
         motions = {}
         for name, trajectory in self._tags.items():
@@ -310,7 +309,7 @@ class Ether:
         return TruthMessage(unix_s, motions)
 
     def health(self, unix_s: float) -> EtherHealth:
-        """What the air has carried so far; call this once a second."""
+        """Return the counts so far; call this once a second."""
         tally = self.medium.tally
         missed = tally.late_transmissions + self._missed
         sent_before, missed_before = self._reported
@@ -336,7 +335,7 @@ def _vector(values: object) -> Vector:
 
 
 class EtherNode:
-    """An ether at its address, with its MQTT connection for truth and health."""
+    """An ether listening at an address, with an MQTT connection for truth and health."""
 
     def __init__(self, ether: Ether, host: str, port: int, address: MqttAddress | None, log: Log) -> None:
         self._ether, self._host, self._port, self._log = ether, host, port, log

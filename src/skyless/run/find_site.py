@@ -1,4 +1,4 @@
-"""The sites on a broker, and how many of their programs are online, for choosing one where none is named.
+"""Find the sites on a broker, and how many of their programs are online; choose one if none is named.
 
 A broker keeps the last state of every site that ever ran on it. A site counts as alive while an anchor, a tag or the
 emulated air of its own states that it is online. Programs that only observe a site do not count.
@@ -21,7 +21,7 @@ from skyless.run.mqtt.topics import EVERY_NODE, EVERY_SITE, site_topic, status_t
 
 _KEEPALIVE_S: Final = 10
 _RETRY_S: Final = 0.5
-_GATHER_S: Final = 0.25  # retained messages come one after the other: after this time without any, all have come
+_GATHER_S: Final = 0.25  # retained messages come one after the other: if none comes for this time, all have come
 
 _LONGEST_GATHER_S: Final = 3.0  # sites whose programs come and go all the time are reported after this time
 
@@ -39,7 +39,7 @@ class SiteOnBroker(Struct, frozen=True):
     online: int
     """Number of its programs that are online."""
     versions: dict[str, int] = {}
-    """Number of them of each version."""
+    """Number of online programs by version."""
 
 
 class KnownSites:
@@ -48,7 +48,7 @@ class KnownSites:
     def __init__(self) -> None:
         self._names: dict[int, str] = {}
         self._online: dict[int, dict[str, str]] = {}
-        """Topics of programs that are online, with their versions, by site."""
+        """Status topics and versions of programs that are online, by site."""
 
     def add(self, topic: str, payload: bytes) -> None:
         """Process a message of a site or a program's status. Unreadable ones are ignored."""
@@ -136,8 +136,8 @@ async def watch_sites(
 ) -> None:
     """Call ``on_sites`` with the sites whenever they change, until cancelled.
 
-    ``on_state`` is called with whether the broker is connected. A ``Link`` needs its site from the start, for its last
-    will, so this function has a connection of its own.
+    ``on_state`` is called with True when the broker is connected, and with False when it is lost. A ``Link`` needs its
+    site from the start, for its last will, so this function has a connection of its own.
     """
     logged = ""
     while True:

@@ -39,7 +39,7 @@ standard deviation of z, protection level and velocity.
 """
 
 FIELDS: Final = struct.Struct("<IHBBQiiifffHHhh")
-"""The same as plain numbers."""
+"""The same record, for ``struct``."""
 
 MAX_RECORDS: Final = 1000
 NONE_U16: Final = 65535
@@ -82,7 +82,7 @@ class Batch(Struct, frozen=True):
 
     @property
     def id(self) -> str:
-        """ID of the message; streams drop a second message with the same one."""
+        """Message ID: streams drop a second message with the same ID."""
         return f"{self.run}-{self.sequence}"
 
 
@@ -119,7 +119,7 @@ def records_of(fixes: Sequence[tuple[int, FixMessage]], *, simulated: bool) -> R
 
 def _row(number: int, fix: FixMessage, *, simulated: bool) -> tuple[Any, ...]:
     flags = SIMULATED if simulated else 0
-    flags |= _ALERT_NUMBERS.get(fix.alert, _ALERT_NUMBERS[Alert.UNAVAILABLE])  # one of a later version promises nothing
+    flags |= _ALERT_NUMBERS.get(fix.alert, _ALERT_NUMBERS[Alert.UNAVAILABLE])  # also for alerts of later versions
     flags |= HEIGHT_GIVEN if fix.height_known else 0
     flags |= VERIFIED if fix.verified_until_s is not None else 0
     velocity = (0, 0)
@@ -175,6 +175,6 @@ def _scaled(value: float, scale: float, most: int) -> int:
 
 
 def _counted(value: float, scale: float) -> int:
-    """Scale and clip a non-negative value to stay below the mark for none."""
+    """Scale a non-negative value, and clip it to stay below ``NONE_U16``."""
     scaled = scale * value
     return min(max(round(scaled), 0), NONE_U16 - 1) if math.isfinite(scaled) else NONE_U16

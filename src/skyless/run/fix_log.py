@@ -1,7 +1,7 @@
 """Counts, latencies and Unix times of a tag's fixes, and the decision which receptions and fixes are too old.
 
-Old fixes are worthless, and receptions waiting before a slow program delay all those behind them. So a reception that
-is too old at its turn is dropped with all that wait at that moment; positioning continues with the next ones.
+Old fixes are worthless, and receptions queued in a slow program delay all those behind them. So a reception that is
+too old when its turn comes is dropped with all that are queued then; positioning continues with the next ones.
 """
 
 import time
@@ -18,15 +18,14 @@ from skyless.run.process import HEALTH_S, RateLimit
 FixListener = Callable[[FixMessage], None]
 
 MAX_AGE_S: Final = 0.1
-"""Largest age of a fix, after the end of its last frame, at which it may reach a subscriber, as far as the sender
-controls it.
+"""Largest age of a fix, after the end of its last frame, when it reaches a subscriber, as far as the sender can ensure.
 """
 
 FIX_LEAVES_S: Final = 0.6 * MAX_AGE_S
-"""Largest age of a fix to be published; the rest is for the broker and the subscriber on a busy computer."""
+"""Largest age of a fix to publish; the rest of the time is for the broker and the subscriber on a busy computer."""
 
 MAX_RECEPTION_AGE_S: Final = 0.5 * MAX_AGE_S
-"""Largest age of a reception at its turn; older ones are dropped, so that time is left for the fix."""
+"""Largest age of a reception when its turn comes; older ones are dropped, so that time is left for the fix."""
 
 _MAX_LATENCIES: Final = 4096
 _MAX_PHASES: Final = 64
@@ -90,9 +89,10 @@ class FixLog:
         phases: tuple[Phase, ...] = (),
         late_in_link: int = 0,
     ) -> TagHealth:
-        """The tag's state since the last call. ``reason`` says why there is no fix, if there is none.
+        """Return the tag's state; some figures cover the time since the last call.
 
-        ``late_in_link``: fixes that became too old while they waited for the broker.
+        ``reason``: why there is no fix, if there is none. ``late_in_link``: fixes that became too old while waiting for
+        the broker.
         """
         now_s = self._clock()
         median_s, late_s, _ = self.latencies.drain()
@@ -125,10 +125,10 @@ class Lateness:
     """Ages of one tag's receptions and fixes. Times are of the host's monotonic clock, in s."""
 
     def __init__(self) -> None:
-        self.dropped = 0  # receptions that were too old at their turn
-        self.withheld = 0  # fixes that were too old to be given
+        self.dropped = 0  # receptions that were too old when their turn came
+        self.withheld = 0  # fixes that were too old to be published
         self._largest_s = 0.0
-        self._present_s = float("-inf")  # when the newest backlog was noticed: what had ended by then is dropped
+        self._present_s = float("-inf")  # when the newest backlog was noticed: frames that ended before are dropped
 
     def admits(self, ended_s: float, now_s: float) -> bool:
         """Whether to process a reception whose frame ended at ``ended_s``; count it if not."""
@@ -150,7 +150,7 @@ class Lateness:
 
     @property
     def drops(self) -> Counter[str]:
-        """The dropped receptions and fixes, by reason."""
+        """The number of dropped receptions, by reason."""
         return +Counter({"late-reception": self.dropped})
 
     def drain(self) -> float:
@@ -169,7 +169,7 @@ class Latencies:
         self._values: deque[float] = deque(maxlen=_MAX_LATENCIES)
 
     def add(self, latency_s: float) -> None:
-        """Add one fix."""
+        """Add the latency of one fix."""
         self._values.append(latency_s)
 
     def drain(self) -> tuple[float | None, float | None, int]:
@@ -182,7 +182,7 @@ class Latencies:
 
 
 class PhaseLog:
-    """When the frames of the current superframe and of the last complete one ended and were processed."""
+    """Records when the frames of the current superframe, and of the last complete one, ended and were processed."""
 
     def __init__(self) -> None:
         self._superframe: int | None = None
@@ -191,7 +191,7 @@ class PhaseLog:
         self.last: tuple[Phase, ...] = ()
 
     def add(self, frame: bytes, ended_s: float, done_s: float, *, made_fix: bool) -> None:
-        """Add a frame: when it ended and when it had been processed, by the host's monotonic clock.
+        """Add a frame, with the host's monotonic times of its end and of the end of its processing.
 
         Frames without slots, from anchors that send at random instants, are ignored.
         """

@@ -23,11 +23,7 @@ from skyless.run.gather import subjects
 from skyless.run.gather.leaf import Leaf, StuckLineError
 from skyless.run.gather.node import Summary
 from skyless.run.gather.streams import EVENT_BYTES, KEEP_EVENTS_S, KEEP_S, NEWEST_OF_EACH, follow, make_stream
-from skyless.run.gather.subjects import (
-    NatsAddress,
-    connect,
-    rarely,
-)
+from skyless.run.gather.subjects import NatsAddress, connect, rarely
 from skyless.run.hub_files import Hub
 from skyless.run.mqtt.link import Handler, Subscriptions
 from skyless.run.process import Log, together
@@ -40,7 +36,7 @@ SILENT_S: Final = 5.0
 """A site counts as disconnected when its gather has not been heard for this long."""
 _CHECK_S: Final = 0.5
 _KEPT: Final = (*subjects.STATE, *subjects.EVENTS, subjects.JSON_FIXES)
-"""What is read from streams; fixes as batches."""
+"""Subjects in streams, which are not read live; fixes come as batches."""
 
 _log = logging.getLogger("skyless.run.hub")
 
@@ -48,8 +44,8 @@ _log = logging.getLogger("skyless.run.hub")
 class HubLink:
     """Stands in for ``Link`` at a hub: handlers get one site's messages by their MQTT topics.
 
-    Retained messages and events come from the hub's streams, and so are complete after every disconnection; healths and
-    the like come while the site is connected. Fixes come only in batches, not here. Published messages are dropped,
+    Retained messages and events come from the hub's streams, so they are complete after every disconnection; healths
+    and the like come while the site is connected. Fixes come in batches, not here. Published messages are dropped,
     because a site can only be changed at the site.
     """
 
@@ -68,7 +64,7 @@ class HubLink:
         self._say = rarely(_log.warning)
 
     def subscribe(self, topic_filter: str, handler: Handler, qos: int = 0) -> None:
-        """Call ``handler`` with every message of a filter. All handlers must be set before ``run``."""
+        """Call ``handler`` with every message that matches a filter. All handlers must be set before ``run``."""
         self._subscriptions.add(topic_filter, handler, qos)
 
     def publish(
@@ -77,7 +73,7 @@ class HubLink:
         """Drop a message."""
 
     def forget(self, topic: str) -> None:
-        """Do nothing, as nothing is repeated."""
+        """Do nothing: no message is repeated."""
 
     async def run(self) -> None:
         """Read until cancelled."""
@@ -97,7 +93,7 @@ class HubLink:
             self._set_state("stopped")
 
     def _is_live(self, topic_filter: str) -> bool:
-        """Whether a filter's messages are in no stream."""
+        """Whether a filter's messages come only live, because no stream has them."""
         levels = subjects.subject_of(topic_filter).split(".")
         for subject in _KEPT:
             kept = subjects.at(subject, self.site).split(".")
@@ -107,12 +103,11 @@ class HubLink:
 
     async def _follow(self, client: "Client", pattern: str) -> None:
         name, own = subjects.at(pattern, self.site), f"skyless.v1.{self.site}.>"
-        found = follow(client.jetstream(), name, own, self._say, newest_of_each=True)
-        async for message in found:
+        async for message in follow(client.jetstream(), name, own, self._say, newest_of_each=True):
             await self._on_message(message)
 
     async def _watch(self, client: "Client") -> None:
-        """Update whether the site is heard."""
+        """Update ``connected`` and ``trouble`` until cancelled."""
         while True:
             if not client.is_connected:
                 self._set_state(f"the hub {self.address} cannot be reached")
@@ -157,7 +152,7 @@ async def watch_line(leaf: Leaf, broker: Broker, log: Log) -> None:
         before, newest = newest, found[-1] if found else newest
         newest_lines = found[-3:]
         faults = [line for line in newest_lines if "[ERR]" in line]
-        if not faults and unsteady >= _SILENT_CHECKS:  # the hub takes connections, and nothing comes back
+        if not faults and unsteady >= _SILENT_CHECKS:  # the hub accepts connections, but does not answer
             faults = [line for line in newest_lines if _UP not in line]
         is_up = _UP in newest
         unsteady = 0 if is_up and newest == before else unsteady + 1
@@ -166,7 +161,7 @@ async def watch_line(leaf: Leaf, broker: Broker, log: Log) -> None:
             state = f"the line to the hub is up, as site {leaf.site} of {leaf.tenant}"
         elif faults:
             state = f"no line to the hub; the site works on without it: {faults[-1].partition('] ')[2]}"
-        kind = re.sub(r"\d+", "", state.rpartition(": ")[2])  # the same at every try
+        kind = re.sub(r"\d+", "", state.rpartition(": ")[2])  # the same for each attempt
         if state and kind != said:
             said = kind
             log(state)
@@ -193,16 +188,15 @@ async def refuse_second(leaf: Leaf, address: NatsAddress, log: Log) -> None:
                     )
 
 
-# The streams of a hub, which copy the sites' own streams. Each site has its own, so that none can displace another's
-# messages. A source asks for its site's subjects, but the site's server may ignore that, so readers filter by those
-# subjects again.
+# The streams of a hub, which copy the sites' own streams. Each site has its own ones, so that none can displace
+# another's messages. A source requests its site's subjects, but the site's server may ignore that, so readers filter by
+# those subjects again.
 
 _READY_S: Final = 60.0
 _RETRY_S: Final = 1.0
-_LISTEN_S: Final = 2.5
 _NAMES_BYTES: Final = 30_000_000
 _STATE_BYTES: Final = 100_000_000
-"""Most that a site can store: names of 200,000 tags, floor plans, and statuses of as many programs."""
+"""Limits for each site: enough for the names of 200,000 tags, floor plans, and statuses of as many programs."""
 _OF_ALL_SITES: Final = ("FIXES", "NAMES", "STATE", "EVENTS")
 """Streams of earlier hubs, in which each site could write under another's number."""
 
@@ -221,7 +215,7 @@ async def make_hub_streams(client: "Client", hub: Hub, tenant: str) -> None:
         (2, subjects.FIX_STREAM, {"max_age": KEEP_S, "max_bytes": round(1e9 * hub.fixes_gb * share)}),
     )
     there = await sites_at(client)
-    for site in sorted(sites, key=lambda site: site not in there):  # those that are there make room first
+    for site in sorted(sites, key=lambda site: site not in there):  # existing streams make room first
         api, deliver = f"$JS.{subjects.at(subjects.DOMAIN, site)}.API", subjects.at(subjects.SOURCED, site)
         for version, pattern, limits in of_each:
             name, own = subjects.at(pattern, site), f"skyless.v{version}.{site}.>"
@@ -264,7 +258,7 @@ async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary 
         raise SkylessError(f"the hub {address} is not ready, or has no room for --fixes-gb {hub.fixes_gb:g}") from None
     async with client:
         heard = await client.subscribe(subjects.at(subjects.SUMMARY, subjects.EVERY))
-        await asyncio.sleep(_LISTEN_S)
+        await asyncio.sleep(LISTEN_S)
         messages = [await heard.next_msg() for _ in range(heard.pending_msgs)]
     found = dict[int | None, Summary]()
     for one in messages:
@@ -276,27 +270,27 @@ async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary 
 # Sites at a hub: names from retained messages, conditions from the summaries that gathers send every second.
 
 LISTEN_S: Final = 2.5
-"""By this time every connected site has been heard."""
+"""After this time every connected site has been heard."""
 LIST_S: Final = 5.0
 """Interval at which the hub is asked for its sites."""
 _ORDER: Final = ("bad", "cut", "degraded", "unknown", "good")
 
 
 class HubSite(Struct, frozen=True):
-    """State of a site as known at a hub. Unknown values of a site that is not heard are None."""
+    """State of a site as known at a hub. Values that are unknown, because the site is not heard, are None."""
 
     number: int
     name: str
     condition: Literal["bad", "cut", "degraded", "unknown", "good"]
     """``cut``: not heard. ``unknown``: not heard yet, or not stated."""
     reason: str
-    """The first reason; empty if all is well."""
+    """The first reason for the condition; empty if it is good."""
     tags_heard: int | None = None
     anchors_online: int | None = None
     versions: dict[str, int] | None = None
     """Programs that are online, by version."""
     heard_unix_s: float | None = None
-    """When this program last heard it."""
+    """When this program last heard the site."""
 
 
 class HubSites:
@@ -307,7 +301,7 @@ class HubSites:
         self._began_s = now_s
         self._known = KnownSites()
         self._heard: dict[int, tuple[float, float, Summary]] = {}
-        """Newest summary of each site, and when it came by both clocks."""
+        """Newest summary of each site, and when it arrived, by the monotonic and the Unix clock."""
         self._client: Client | None = None
 
     @property
@@ -321,7 +315,7 @@ class HubSites:
         return self._client is not None
 
     def add_site(self, topic: str, payload: bytes) -> None:
-        """Process the message with which a site publishes itself."""
+        """Process a site's message about itself."""
         self._known.add(topic, payload)
 
     def add_summary(self, number: int, payload: bytes, now_s: float, unix_s: float) -> None:
@@ -359,7 +353,7 @@ class HubSites:
 
     async def run(self, name: str) -> None:
         """Listen until cancelled. ``name`` identifies this program at the hub."""
-        say = rarely(logging.getLogger("skyless.run.hub").warning)
+        say = rarely(_log.warning)
         client = self._client = await connect(self.address, name, say, Counter())
 
         async def on_summary(message: "Msg") -> None:
@@ -372,7 +366,7 @@ class HubSites:
                 try:
                     for number in await sites_at(client) - {site for site, name in self.names().items() if name}:
                         subject = subjects.at(subjects.SITES, number)
-                        with contextlib.suppress(NotFoundError):  # it has not come to the hub yet
+                        with contextlib.suppress(NotFoundError):  # the message has not reached the hub yet
                             name = subjects.at(subjects.STATE_STREAM, number)
                             found = await client.jetstream().get_last_msg(name, subject, direct=True)
                             self.add_site(subjects.topic_of(subject), found.data or b"")

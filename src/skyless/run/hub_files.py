@@ -7,7 +7,7 @@ import re
 import secrets
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 from msgspec import Struct
@@ -16,43 +16,17 @@ from msgspec.structs import replace
 from skyless.core.errors import SkylessError, writing
 from skyless.files import replace_files
 from skyless.run.gather.leaf import PING_INTERVAL, Leaf
-from skyless.run.gather.subjects import (
-    DOMAIN,
-    FIRST_PORT,
-    MAX_PAYLOAD,
-    SOURCED,
-    SUMMARY,
-    NatsAddress,
-    at,
-)
+from skyless.run.gather.subjects import DOMAIN, FIRST_PORT, MAX_PAYLOAD, SOURCED, SUMMARY, NatsAddress, at
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, is_loopback
 
-if TYPE_CHECKING:
-    pass
-
-
 CLUSTER_PORT: Final = 2000
-
-
 LEAF_PORT: Final = 3200
-
-
 MONITOR_PORT: Final = 4000
 """Offsets from a node's port: for other servers of the hub, for sites, and for monitoring on the node itself."""
-
-
 PLAN: Final = "hub.json"
-
-
 _NODE: Final = re.compile(r"([A-Za-z0-9][A-Za-z0-9.-]*)(?::(\d{1,5}))?")
-
-
 _CLUSTER: Final = "hub.node"
-
-
 _ADMIN: Final = "hub.admin"
-
-
 _SITE: Final = "{}.site{}"
 """User name of a site; names of tenants have no dot."""
 
@@ -83,7 +57,7 @@ class Hub(Struct, frozen=True):
 
     nodes: tuple[Node, ...]
     fixes_gb: float = 50.0
-    """Size in GB of the fixes that each server keeps of each tenant."""
+    """GB of fixes that each server keeps for each tenant."""
     data: str = "/var/lib/skyless-hub"
     certificates: str = "/etc/skyless-hub"
     sites: dict[str, list[int]] = {}
@@ -103,7 +77,7 @@ class Hub(Struct, frozen=True):
         return NatsAddress(url, user, self.passwords[user], ca)
 
     def leaf(self, tenant: str, site: int) -> Leaf:
-        """What a site needs to connect."""
+        """Return the settings with which a site connects."""
         user = _SITE.format(tenant, site)
         urls = self.address(user, LEAF_PORT).servers
         return Leaf(site=site, tenant=tenant, urls=urls, user=user, password=self.passwords[user], ca=self.ca)
@@ -136,7 +110,7 @@ def write_files(hub: Hub, folder: Path) -> list[Path]:
 
 
 def _server(hub: Hub, node: Node) -> dict[str, Any]:
-    """Configuration of nats-server, whose format accepts JSON."""
+    """nats-server's configuration; its format accepts JSON."""
     host, tls, folder = node.host, {}, hub.certificates
     if hub.ca is not None:
         files = {"cert_file": f"{folder}/cert.pem", "key_file": f"{folder}/key.pem", "ca_file": hub.ca}

@@ -1,4 +1,4 @@
-"""A site's keys on disk, and as an anchor's or tag's program follows them while they change.
+"""A site's keys: their files, and how the programs of anchors and tags follow changes in them.
 
 ``site.private`` (PEM) stays with the operator, who makes chains with it. ``site.public`` (TOML) goes to tags and to the
 hosts of anchors; ``chain-N.public`` and ``chain-N.seed`` go to the hosts of anchors. A seed may come from the
@@ -55,7 +55,7 @@ SEEDS_VARIABLE: Final = "SKYLESS_CHAIN_SEEDS"
 
 MAX_SERIAL: Final = 0xFFFF
 _MAX_BYTES: Final = 1 << 26
-"""Largest size of any of the files, because devices never end. Ten years take 25 MB."""
+"""Size limit of each file, because devices never end. Ten years of keys take 25 MB."""
 
 _CHAIN_FILE: Final = re.compile(r"chain-([1-9]\d{0,4})\.public")
 _MAGIC: Final = b"skyless chain 1\n"
@@ -75,13 +75,13 @@ class SitePublic(Struct, frozen=True):
 
     @property
     def fingerprint(self) -> str:
-        """A few digits for comparison by two people."""
+        """A few digits, for two people to compare."""
         digits = sha256(self.public).hexdigest()[:16]
         return " ".join(digits[at : at + 4] for at in range(0, 16, 4))
 
 
 class SiteKeys(Struct, frozen=True):
-    """Keys of an anchor's host."""
+    """The keys on an anchor's host."""
 
     public: SitePublic
     chains: tuple[Chain, ...]
@@ -174,7 +174,7 @@ def read_site_public(file: Path) -> SitePublic:
 
 
 def read_private(folder: Path, public: SitePublic) -> "Ed25519PrivateKey":
-    """Read the site's private key. Raises SkylessError, also if it does not belong to the public key."""
+    """Read the site's private key. Raises SkylessError, also if it does not match the public key."""
     from cryptography.exceptions import UnsupportedAlgorithm  # noqa: PLC0415 - loads OpenSSL
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey  # noqa: PLC0415
     from cryptography.hazmat.primitives.serialization import load_pem_private_key  # noqa: PLC0415
@@ -224,12 +224,12 @@ def read_chain_public(folder: Path, serial: int, site: int) -> Chain:
 
 
 def read_keys(folder: Path, site: int, seeds: Mapping[int, bytes]) -> SiteKeys:
-    """Read what an anchor's host needs: the chains with their seeds, from the folder or from ``seeds``.
+    """Read the keys of an anchor's host: the chains, with seeds from the folder or from ``seeds``.
 
     The first section of each chain is used to verify that seed, signatures and public key belong together.
 
     Raises:
-        SkylessError: something is missing, damaged, of another site, or a secret that others can read.
+        SkylessError: a file is missing, damaged, of another site, or a secret that others can read.
     """
     public = read_folder_public(folder, site)
     chains, without = [], []
@@ -266,7 +266,7 @@ def read_folder_public(folder: Path, site: int) -> SitePublic:
 
 
 def parse_seeds(text: str) -> dict[int, bytes]:
-    """Parse seeds from the environment, by serial number. Raises SkylessError, whose message does not show them."""
+    """Parse seeds by serial number from the environment. Raises SkylessError, whose message does not show them."""
     seeds = {}
     for number, entry in enumerate(text.split(), start=1):
         match = _ENTRY.fullmatch(entry)
@@ -301,14 +301,15 @@ def _read_seed(file: Path) -> bytes | None:
 
 
 def _read_secret(file: Path) -> bytes:
-    """Read a file that only its owner may read. Raises SkylessError."""
+    """Read a file that only its owner may access. Raises SkylessError."""
     return _read(file, is_secret=True)
 
 
 def _read(file: Path, *, is_secret: bool = False) -> bytes:
     """Read a file. Raises SkylessError."""
     try:
-        with open(file, "rb", opener=_open_at_once) as opened:
+        # O_NONBLOCK: do not wait for a writer if it is a pipe
+        with open(file, "rb", opener=lambda path, flags: os.open(path, flags | os.O_NONBLOCK)) as opened:
             status = os.fstat(opened.fileno())
             if not stat.S_ISREG(status.st_mode):
                 raise SkylessError(f"{file} is no file")
@@ -324,27 +325,22 @@ def _read(file: Path, *, is_secret: bool = False) -> bytes:
     return data
 
 
-def _open_at_once(path: str, flags: int) -> int:
-    """Open without waiting for a writer if the name is that of a pipe."""
-    return os.open(path, flags | os.O_NONBLOCK)
-
-
 # Keys in the programs: an anchor's chains, a tag's memory of them, and log lines about codes.
 
 KEYS_S: Final = 3.0
 """Interval at which files are checked for changes."""
 
 RECENT_S: Final = 2.0
-"""Older faults are ignored."""
+"""Faults older than this are ignored."""
 
 LASTING_S: Final = 4.0
-"""Faults shorter than this, as after a start, are not logged."""
+"""Faults that last for less than this, as after a start, are not logged."""
 
 CALM_S: Final = 30.0
 """An anchor counts as accepted again after this time without a fault."""
 
 MAX_NAMED: Final = 8
-"""Largest number of anchors named at a time, as forged frames can name any."""
+"""Largest number of anchors with faults at a time, as forged frames can name any."""
 
 UNVERIFIED_S: Final = 10.0
 """After this time without verified beacons the cause is logged; a certificate comes every second or so."""
@@ -444,7 +440,7 @@ class AnchorKeys:
         self._log(f"keys: the last key chain {what}: skyless site keys rotate makes another one")
 
     def _state(self) -> tuple[tuple[str, int, int, int], ...]:
-        """File attributes that reveal a change."""
+        """Attributes of the files that reveal a change."""
         try:
             with os.scandir(self._folder) as entries:
                 known = [(entry.name, entry.stat()) for entry in entries if entry.name.endswith((".public", ".seed"))]
@@ -480,7 +476,7 @@ class AnchorReport:
 
     def _on_own(self, fault: Fault | None, serial: int | None) -> None:
         if fault is Fault.NO_TIME:
-            return  # that is so for a moment after each start
+            return  # normal for a moment after each start
         line = (
             f"beacons carry codes of key chain {serial}"
             if fault is None
@@ -492,7 +488,7 @@ class AnchorReport:
 
 
 def recent_faults(authentication: BeaconAuthentication, unix_s: float) -> dict[int, Fault]:
-    """Other anchors with a fault within the last seconds."""
+    """Faults of other anchors within the last seconds."""
     faults = authentication.faults.items()
     return {anchor: fault for anchor, (fault, when_s) in faults if abs(unix_s - when_s) <= RECENT_S}
 
@@ -501,7 +497,7 @@ def recent_faults(authentication: BeaconAuthentication, unix_s: float) -> dict[i
 
 
 class Remembered(Struct, frozen=True):
-    """What a tag remembers of a site's keys for its next start. Signatures are checked again when it is used."""
+    """A tag's knowledge of a site's keys, stored for its next start, which checks the signatures again."""
 
     serial: int = 0
     """Key chains with lower serial numbers have been revoked."""
@@ -509,7 +505,7 @@ class Remembered(Struct, frozen=True):
 
 
 class TagMemory:
-    """The memory file for one site and public key. A damaged or unwritable one is ignored."""
+    """The memory file for one site and public key. A damaged or unwritable file is ignored."""
 
     def __init__(self, trust: SiteTrust, folder: Path) -> None:
         """``folder``: the user's data folder of Skyless."""
@@ -518,7 +514,7 @@ class TagMemory:
         self.remembered = self._read()
 
     def keep(self, serial: int, certificates: Iterable[bytes]) -> None:
-        """Store the present knowledge if it has changed. The serial number never decreases."""
+        """Store the keys known now if they have changed. The serial number never decreases."""
         known = Remembered(serial, tuple(certificates))
         if known == self.remembered:
             return

@@ -1,4 +1,4 @@
-"""Radios by their names in ``--radio``, and what is said of each while it runs."""
+"""Open radios by their names in ``--radio``, and log how each one works."""
 
 import os
 from collections import Counter
@@ -65,9 +65,9 @@ def open_radios(
 ) -> tuple[Radio, ...]:
     """Create radios for the nodes of one process, in the order of their names, without connecting them.
 
-    ``delays`` are the nodes' antenna delays, which their radios are set to. ``phases``: whether receptions should
-    include the carrier phase, if the radio can measure it; None for radios of tags. ``computes``: whether boards on
-    serial ports compute their own positions.
+    ``delays`` are the antenna delays to which the nodes' radios are set. ``phases``: whether receptions should include
+    the carrier phase, if the radio can measure it; None means only for tags. ``computes``: whether boards on serial
+    ports compute their own positions.
 
     Raises:
         SkylessError: there is no such radio; the message says what would be right.
@@ -178,17 +178,16 @@ def host_and_port(spec: str, where: str, default_port: int) -> tuple[str, int]:
     """Parse HOST[:PORT] of a radio's name; the host defaults to 127.0.0.1. Raises SkylessError."""
     host, colon, digits = where.rpartition(":") if where.count(":") != 0 else (where, "", "")
     port = int(digits) if digits.isdecimal() and len(digits) < 6 else 0
+    driver = spec.partition(":")[0]
     if colon and not 0 < port < 65_536:
-        driver = spec.partition(":")[0]
         raise SkylessError(f"--radio is {spec!r}; it should be {driver}:HOST[:PORT] with a port from 1 to 65535")
     if "/" in host:
-        driver = spec.partition(":")[0]
         raise SkylessError(f"--radio is {spec!r}; it should be {driver}:HOST[:PORT], and {host} is no host")
     return host.strip("[]") or "127.0.0.1", port or default_port
 
 
 UNUSABLE_S: Final = 5.0
-"""A node that has received nothing usable for this long logs it."""
+"""It is logged if a node has received nothing usable for this long."""
 REPEAT_S: Final = 60.0
 """The same line is not logged again within this time, however often reception changes."""
 
@@ -218,10 +217,10 @@ class _Counts(Struct, frozen=True):
 
 
 class RadioMonitor:
-    """Watches the radio of one node. ``advice`` gives the radio's hint for when nothing at all was received."""
+    """Watches the radio of one node. ``advice`` returns the radio's hint in case nothing at all was received."""
 
     def __init__(self, name: str, ready: str, log: Log, advice: Callable[[], str]) -> None:
-        """``ready`` says in words what the node does once its radio has started."""
+        """``ready``: words for what the node does once its radio has started."""
         self.restarts = 0
         self._name, self._ready, self._log, self._advice = name, ready, log, advice
         self._present = False

@@ -67,7 +67,7 @@ def run(main: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
     gc.collect()
     gc.freeze()
     if callable(signal.getsignal(signal.SIGINT)) and threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # the only one that asyncio's own takes the place of
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # the only one that asyncio replaces by its own
     with asyncio.Runner(loop_factory=_new_loop) as runner, contextlib.suppress(asyncio.CancelledError):
         runner.run(_until_terminated(main))
 
@@ -204,20 +204,20 @@ def reader(
 
 
 class SitePublisher:
-    """Publishes a site, retained: repeatedly, and when its radios turn out to be simulated or not.
+    """Publishes a site, retained: when it or ``simulated`` has changed, and at intervals.
 
-    A bridged broker may have missed or lost it.
+    The repetitions are for bridged brokers, which may have missed or lost it.
     """
 
     def __init__(
         self, site: Site, is_simulated: Callable[[], bool], plans: Mapping[int | None, Path] | None = None
     ) -> None:
-        """``plans`` are the images of the floors by number; None is the key for that of the whole site."""
+        """``plans`` are the images of the floors by number, or of the whole site by None."""
         self._site, self._is_simulated, self._plans = site, is_simulated, dict(plans or {})
         self._restarts: int | None = None
         self._simulated = False
         self._published: SiteMessage | None = None
-        self._repeat_s = 0.0  # when it is published again, by the host's monotonic clock
+        self._repeat_s = 0.0  # when to publish it again, by the host's monotonic clock
 
     def place(self, site: Site) -> None:
         """Publish a survey's site from now on."""
@@ -294,7 +294,7 @@ def is_free(host: str, port: int) -> bool:
     """Whether a program could listen on the port.
 
     Raises:
-        OSError: none could: not an address of this machine, or a privileged port.
+        OSError: no program could: not an address of this machine, or a privileged port.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -321,7 +321,7 @@ def reserve(host: str, port: int) -> socket.socket | None:
 
 
 def reserve_next(host: str, first: int) -> tuple[int, socket.socket]:
-    """The first free, unreserved port from this one on, and the socket that reserves it."""
+    """Return the first free, unreserved port from ``first`` on, and the socket that reserves it."""
     port = first
     while True:
         held = reserve(host, port)
@@ -333,14 +333,14 @@ def reserve_next(host: str, first: int) -> tuple[int, socket.socket]:
 
 
 def hold_any(host: str) -> tuple[int, socket.socket]:
-    """A free port and its socket: while that is open, the system does not assign the port to other programs."""
+    """Return a free port and its socket; while that is open, the system assigns the port to no other program."""
     held = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
     held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     held.bind((host, 0))
     return int(held.getsockname()[1]), held
 
 
-# Use of the machine
+# Resource usage
 
 
 def most_files() -> int:
@@ -420,8 +420,8 @@ class Program(Struct, frozen=True):
     name: str
     arguments: tuple[str, ...]
     new_file: int | None = None
-    """Index among the arguments of a file that must not exist: later starts get another name. The program is not
-    restarted if it ends by itself (a full disk, its limit reached).
+    """Index of an argument that names a file to create: later starts get another name. The program is not restarted if
+    it ends by itself (a full disk, its limit reached).
     """
     start_after_s: float = 0.0
     """Delay of its first start."""
@@ -431,7 +431,7 @@ class Program(Struct, frozen=True):
     """Variables in addition to those of this program."""
 
     def start(self, number: int) -> tuple[str, ...]:
-        """Arguments of its first, second ... start."""
+        """Arguments of the start with this number, counted from 1."""
         if self.new_file is None or number == 1:
             return self.arguments
         path = Path(self.arguments[self.new_file])
@@ -452,7 +452,7 @@ class Child:
         self._line = b""
 
     def restart(self) -> None:
-        """Restart it now without logging, because what it read at its start has changed."""
+        """Restart it now without logging, because the input that it read at its start has changed."""
         if self.pid is not None:
             self._is_asked = True
             with contextlib.suppress(ProcessLookupError):  # it has just ended by itself
@@ -512,7 +512,7 @@ class Child:
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=stderr,
                 env={**os.environ, **self.program.environment},
-                start_new_session=True,  # Ctrl-C in a terminal is for its parent
+                start_new_session=True,  # Ctrl-C in a terminal reaches only the parent
                 preexec_fn=end_with_parent(),
             )
         finally:
@@ -531,7 +531,7 @@ class Child:
             asyncio.get_running_loop().remove_reader(pipe)
 
     def _last_message(self) -> str:
-        """The last line that it wrote, which need not explain its end: a killed program cannot say so."""
+        """Describe its last line, which need not explain its end: a killed program cannot say why."""
         if begun := self._line.decode(errors="replace").strip():
             return f'its last message, unfinished: "{begun}"'
         line = next((line for line in reversed(self._last_lines) if line), None)

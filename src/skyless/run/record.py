@@ -1,4 +1,4 @@
-"""``skyless record``: requests receptions of a site's tags and writes all of the site's messages into a file."""
+"""``skyless record``: request receptions from a site's tags, and write all of the site's messages to a file."""
 
 import asyncio
 import contextlib
@@ -25,11 +25,11 @@ from skyless.run.recordings.recorder import McapFile, McapRecorder
 _LEASE_S: Final = 15.0
 _REQUEST_S: Final = 5.0  # each request for receptions is repeated at this interval, before its lease ends
 
-_FLUSH_S: Final = 0.8  # a recorder that is killed loses what came since: less than a second with the delay of a message
+_FLUSH_S: Final = 0.8  # so that a recorder that is killed loses less than a second, the delay of messages included
 
 _MAX_RECORDERS: Final = 1000
 
-_NEW_RUN_S: Final = 1.0  # after a loss; not more often than this, as each new run begins with a checkpoint
+_NEW_RUN_S: Final = 1.0  # shortest time between new runs after losses, as each begins with a checkpoint
 
 
 class RecorderState(Struct, frozen=True):
@@ -55,7 +55,7 @@ class RecorderNode:
         self.file = file
         self.recorder = McapRecorder(file)
         self._name, self._lock = _own_name(site)
-        # the broker keeps this name's messages during its restart, so that nothing is lost
+        # persistent, so that the broker keeps messages while this recorder is restarted
         self.link = Link(address, self._name, site=site, kind="recorder", persistent=True, client_key=_client_key())
         self.receptions = 0
         self._site = site
@@ -110,7 +110,7 @@ class RecorderNode:
             self._request()
 
     def _begin_new_run(self) -> None:
-        """Request under another name after a loss, so that the tags begin another run with its checkpoint."""
+        """Request under another name after a loss, so that the tags begin new segments with checkpoints."""
         now_s = time.monotonic()
         if now_s - self._new_run_s >= _NEW_RUN_S:
             self._new_run_s = now_s
@@ -125,7 +125,7 @@ class RecorderNode:
             self._request()
 
     def _check_sequence(self, message: ReceptionsMessage) -> None:
-        """Check that no reception is missing. A message may come twice after a broken connection."""
+        """Count a gap if receptions are missing. A message may come twice after a broken connection."""
         self.receptions += len(message.receptions)
         segment, following = self._next.get(message.tag, ("", 0))
         end = message.first + len(message.receptions)
@@ -140,7 +140,7 @@ class RecorderNode:
             self._begin_new_run()
 
     async def _write(self) -> None:
-        """Close chunks at intervals and sync them to the disk, until nothing more can be written."""
+        """Close chunks at intervals and sync them to the disk, until the file has ended."""
         while True:
             await asyncio.sleep(_FLUSH_S)
             self.file.flush()
@@ -152,16 +152,19 @@ class RecorderNode:
 
 
 def _own_name(site: int) -> tuple[str, IO[str]]:
-    """Choose and lock an MQTT name that no other running recorder of this machine has.
+    """Choose and lock an MQTT name that no other running recorder on this machine has.
 
-    A killed recorder leaves a session that the broker fills; the next one takes it over and ends it. A lock of another
-    user cannot be opened, and its name is skipped.
+    A killed recorder leaves a session that the broker fills; the next recorder takes it over and ends it. Another
+    user's lock cannot be opened, so its name is skipped.
 
     Raises:
         SkylessError: there is no folder for temporary files, or too many recorders run.
     """
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname())
-    folder = _temporary_folder()
+    try:
+        folder = Path(tempfile.gettempdir())
+    except OSError as error:
+        raise SkylessError(f"a recorder needs a folder for temporary files: {error.strerror}") from None
     for number in range(1, _MAX_RECORDERS + 1):
         with contextlib.suppress(OSError):
             return f"{host}-{number}", locked(folder / f"skyless-record-{site}-{number}.lock")
@@ -169,7 +172,7 @@ def _own_name(site: int) -> tuple[str, IO[str]]:
 
 
 def _client_key() -> str:
-    """A random key shared by all of this user's recorders on this machine, so that a later one has the same session.
+    """Random key shared by all of this user's recorders on this machine, so that a later one gets the same session.
 
     If it cannot be stored, it is new each time, and the session of a killed recorder stays at the broker.
     """
@@ -181,10 +184,3 @@ def _client_key() -> str:
             return kept
         replace_files({file: key.encode()}, secret=(file,))
     return key
-
-
-def _temporary_folder() -> Path:
-    try:
-        return Path(tempfile.gettempdir())
-    except OSError as error:
-        raise SkylessError(f"a recorder needs a folder for temporary files: {error.strerror}") from None

@@ -30,7 +30,7 @@ from skyless.run.process import HEALTH_S, Log, Usage, data_folder, every, keep, 
 from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings
 
 RECEPTIONS_S: Final = 0.05
-"""Interval of the messages with raw receptions."""
+"""Interval at which raw receptions are checked for messages that are due."""
 
 VERIFIED_S: Final = 2.0
 """Beacons received longer ago than this no longer count as verified."""
@@ -71,7 +71,7 @@ class TagNode:
         """``before`` is called before each reception with receiver, reception and number of fixes.
 
         ``clock`` gives the host's monotonic time in s, as ``host_s`` of the receptions; None for ``time.monotonic``.
-        ``memory``: what is known of the site's keys from earlier runs.
+        ``memory``: the site's keys known from earlier runs.
         """
         self.settings, self.radio = settings, radio
         self._before, self._clock = before, time.monotonic if clock is None else clock
@@ -83,7 +83,7 @@ class TagNode:
         self._report = None if settings.trust is None else TagReport(radio.name, settings.trust.site, log)
         self._log, self._has_logged_multipath = log, False
         self._heard_s = 0.0  # when the last reception was processed
-        self.receptions = 0  # including those that were too old at their turn
+        self.receptions = 0  # including those that were too old when their turn came
         self.fix_log = FixLog(self.name, publish, settings.publish_hz, self._clock)
         self.phases = PhaseLog()
         self.monitor = RadioMonitor(f"tag {self.name}", "listening", log, radio.advice)
@@ -99,7 +99,7 @@ class TagNode:
         return Receiver(site=asked.site, qa=asked.qa, integrity=asked.integrity)
 
     def _new_trusted(self) -> TrustedReceiver | None:
-        """Create the verifier of beacons, with the remembered keys of the site; None without a public key."""
+        """Create the receiver that verifies beacons, with the site's remembered keys; None without a public key."""
         trust = self.settings.trust
         if trust is None:
             return None
@@ -132,7 +132,7 @@ class TagNode:
         return (trust_reason(trusted) if trusted and needs_trust else None) or str(self.receiver.reason)
 
     def complete(self, health: TagHealth) -> TagHealth:
-        """Add phases, multipath and verification to a tag's state."""
+        """Add phases, multipath and verification to the health message."""
         trusted, phases = self._trusted, self.receiver.phase_anchors
         health = replace(health, carrier_phase_anchors=phases, on_board=self._board is not None)
         if (multipath := self.receiver.multipath_m) is not None:
@@ -160,7 +160,7 @@ class TagNode:
         return trusted.is_verified and self._clock() - self._heard_s < VERIFIED_S
 
     def check_reception(self, now_s: float) -> None:
-        """Log likely causes if nothing usable comes and, once, ranges that vary more than the site file states.
+        """Log likely causes if nothing usable is received and, once, if ranges vary more than the site file states.
 
         ``now_s`` is the host's monotonic clock.
         """
@@ -212,7 +212,7 @@ class TagNode:
             self.fix_log.add(fix, event.host_s - report.latency_s, event.host_s)
 
     def _fixes_of(self, reception: Reception) -> list[GivenFix]:
-        """Return the fixes that a reception makes possible."""
+        """Process a reception, and return the fixes that it makes possible."""
         if self._trusted is not None:
             host_s = reception.host_s
             unix_s = time.time() if host_s is None else host_s + self.fix_log.unix_less_host_s
@@ -222,7 +222,7 @@ class TagNode:
 
 
 class Tag:
-    """A tag and its link, which is made once the tag's site is known, and again in another site."""
+    """A tag and its link, which is made when the tag's site is known, and again at another site."""
 
     def __init__(
         self,
@@ -233,7 +233,7 @@ class Tag:
         on_fix: FixListener | None = None,
         on_health: HealthListener | None = None,
     ) -> None:
-        """``on_fix`` and ``on_health`` are called with all that is to be published, with or without a broker."""
+        """``on_fix`` and ``on_health`` are called with all fixes and states to publish, with or without a broker."""
         self._address, self._log, self._on_fix, self._on_health = address, log, on_fix, on_health
         self.link: Link | None = None
         self._site: int | None = None
@@ -267,7 +267,7 @@ class Tag:
         if self._address is None or site is None or site == self._site:
             return
         for task in self._link_tasks:
-            task.cancel()  # it publishes its end to the site that was left
+            task.cancel()  # the link then publishes at the former site that the tag is offline
         self._link_tasks = [task for task in self._link_tasks if not task.done()]
         self._site = site
         self._late_before += 0 if self.link is None else self.link.late

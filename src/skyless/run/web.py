@@ -1,4 +1,4 @@
-"""Servers of this machine: who may ask them, and their limits.
+"""Servers on this machine: who may send them requests, and the limits of servers and programs.
 
 A page of another site can reach a server on the same computer or network in two ways. It requests the server's address,
 and the browser sends that site as ``Origin``; or its own name resolves to this address (DNS rebinding), and the browser
@@ -59,7 +59,7 @@ def is_local_origin(origin: str) -> bool:
         return False
 
 
-# What servers and programs take at most (``docs/limits.md``); the broker's limits are in ``broker.py``.
+# Limits of servers and programs (``docs/limits.md``); the broker's are in ``broker.py``.
 
 
 class PageLimits(Struct, frozen=True):

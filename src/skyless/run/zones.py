@@ -1,4 +1,4 @@
-"""Zones: their list, and when tags enter and leave them.
+"""Zones: validation of their list, and detection of tags that enter and leave them.
 
 No I/O; the time is passed in. Noise at an edge must not cause a series of events: a tag has crossed the edge when its
 fix is beyond it by the margin, or by half of the margin in every fix for a while. Otherwise it stays on its side.
@@ -36,8 +36,7 @@ _MAX_CORNERS: Final = 100
 _MAX_CORNER_M: Final = 1e5
 
 MAX_OTHER_SITES: Final = 20
-"""Largest number of other sites with the same number whose zones are kept; the ones not seen for longest are dropped.
-"""
+"""Other sites with the same number whose zones are kept; beyond this the ones not seen for longest are dropped."""
 
 _ID: Final = re.compile(r"[A-Za-z0-9_.-]{1,64}")
 _COLOUR: Final = re.compile(r"#[0-9A-Fa-f]{3,8}|[A-Za-z]{1,32}")
@@ -54,7 +53,7 @@ def signed_area_m2(polygon: Polygon) -> float:
 
 
 def perimeter_m(polygon: Polygon) -> float:
-    """Length of all sides."""
+    """Total length of the sides."""
     return sum(math.dist(a, b) for a, b in sides(polygon))
 
 
@@ -96,7 +95,7 @@ def _touch(a: Point, b: Point, c: Point, d: Point) -> bool:
 
 
 def _turn(a: Point, b: Point, c: Point) -> float:
-    """Positive where a–b–c turns left, 0 where the three are in one line."""
+    """Positive if a–b–c turns left, 0 if the three are in one line."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])
 
 
@@ -109,9 +108,9 @@ def read_zones(payload: bytes) -> ZonesMessage:
 
 
 def zones_of(message: ZonesMessage, site: str) -> ZonesMessage:
-    """Select the zones of the site of this name, keeping those of other sites apart.
+    """Select the zones of the site with this name, and keep those of other sites in ``others``.
 
-    Zones of an unknown site become this one's; an empty name is a site that is not known yet.
+    Zones without a site's name become this site's. An empty ``site`` is not known yet and changes nothing.
     """
     if message.site in ("", site) or not site:
         return ZonesMessage(message.zones, message.site or site, message.others)
@@ -174,7 +173,7 @@ class _MonitoredZone:
         self.max_margin_m = area_m2(zone.polygon_m) / perimeter_m(zone.polygon_m)
 
     def beyond_m(self, tag: "_TagState") -> float:
-        """How far a tag is beyond the edge, seen from the side where it was; negative if it is not."""
+        """Distance in m by which a tag is beyond the edge, seen from the side where it was; else negative."""
         x1, y1, x2, y2 = self.box
         x, y, _ = tag.position_m
         was_inside = self.zone.id in tag.inside
@@ -188,13 +187,13 @@ class _MonitoredZone:
 
 
 class _TagState(Struct):
-    """The last fix of a tag and the zones that it is in."""
+    """The last fix of a tag, and its zones."""
 
     updated_s: float = 0.0
     position_m: Vector = (0.0, 0.0, 0.0)
     inside: set[str] = set()
     floor: int | None = None
-    """Number of its floor; None if its height or the floors are unknown."""
+    """Number of the tag's floor; None if its height or the floors are unknown."""
     beyond_since_s: dict[str, float] = {}
     """Since when every fix was beyond the edge by half of the margin, by zone."""
 
@@ -205,7 +204,7 @@ class ZoneMonitor:
     def __init__(self) -> None:
         self.zones: tuple[Zone, ...] = ()
         self.floors: tuple[FloorSite, ...] = ()
-        """The site's floors. A tag of known height is only in zones of its floor, and in those over all floors."""
+        """The site's floors. A tag of known height can only be in zones of its floor, or of all floors."""
         self._monitored: dict[str, _MonitoredZone] = {}
         self._tags: dict[str, _TagState] = {}
 
@@ -286,7 +285,7 @@ def _crossed(tag: _TagState, zone: _MonitoredZone, fix: FixMessage) -> bool:
     if beyond_m < 0.5 * margin_m:
         tag.beyond_since_s.pop(zone_id, None)
         return False
-    since_s = min(tag.beyond_since_s.get(zone_id, unix_s), unix_s)  # its host may set its clock back
+    since_s = min(tag.beyond_since_s.get(zone_id, unix_s), unix_s)  # the host's clock may be set back
     tag.beyond_since_s[zone_id] = since_s
     if beyond_m < margin_m and unix_s - since_s < CROSSING_S:
         return False

@@ -1,1 +1,1 @@
-"""A DW1000 on SPI: the driver in C and its use from Python."""
+"""DW1000 chips on SPI: the driver in C, and its use from Python."""

@@ -1,1 +1,1 @@
-"""What devices of other makers send: Bitcraze's anchors and sniffers, and FiRa's UCI."""
+"""Formats of devices of other makers: Bitcraze's anchors and sniffers, and FiRa's UCI."""

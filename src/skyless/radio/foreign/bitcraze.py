@@ -1,4 +1,4 @@
-"""Bitcraze's loco positioning system: what its anchors send, and how sniffers and captures hold it."""
+"""Bitcraze's loco positioning system: payloads of its anchors, and streams of its sniffers."""
 
 import re
 from collections.abc import Iterator
@@ -14,20 +14,20 @@ from skyless.files import Drops, chunks, lines
 # Payloads of Bitcraze's loco positioning anchors, TDoA2 and TDoA3, to packets.
 #
 # Both are little-endian and hold the low 32 bits of all stamps. Distances are times of flight in ticks that include
-# the antenna delays. A short LPP packet with the anchor's position may come after either.
+# the antenna delays. Either may be followed by a short LPP packet with the anchor's position.
 #
 # TDoA2, type 0x22: sequence u8 × 8 | stamp u32 × 8 | distance u16 × 8, indexed by anchor. The sender's own stamp is the
-# TX time, the others are when it last heard that anchor, 0 for never.
+# TX time; the others are when it last heard that anchor, 0 for never.
 #
 # TDoA3, type 0x30: sequence (7 bits) | TX time u32 | count, then count times: anchor | sequence (7 bits) with the high
-# bit set if a distance comes after it | RX time u32 | distance u16, if any.
+# bit set if a distance follows | RX time u32 | distance u16, if any.
 
 TDOA2: Final = 0x22
 TDOA3: Final = 0x30
 STAMP_BITS: Final = 32
 
 ANTENNA_DELAYS_TICKS: Final = round(154.6 / TICK_M)
-"""Antenna delays of a sender and a receiver together, which the stamps include: 154.6 m in Crazyflies' firmware."""
+"""Sum of a sender's and a receiver's antenna delays, which stamps include: 154.6 m in the Crazyflies' firmware."""
 
 _TDOA2: Final = Layout("<B8B8I8H")
 _TDOA3_HEAD: Final = Layout("<BBIB")
@@ -41,7 +41,7 @@ _FARTHEST_M: Final = 1e5
 
 
 def decode_payload(payload: bytes, host_s: float | None, sender: int, rx_ticks: int) -> Packet | str:
-    """Packet of a payload, or the reason why it is none."""
+    """Decode a payload to a packet, or return the reason why it is none."""
     if not payload:
         return "empty-payload"
     if payload[0] == TDOA3:
@@ -59,18 +59,13 @@ def _tdoa3(payload: bytes, host_s: float | None, sender: int, rx_ticks: int) -> 
     at = _TDOA3_HEAD.size
     relays = []
     for _ in range(count):
-        if at + 6 > size:
+        has_distance = at + 1 < size and payload[at + 1] & _HAS_DISTANCE
+        layout = _TDOA3_RANGED if has_distance else _TDOA3_RELAY
+        if at + layout.size > size:
             return "short-payload"
-        if payload[at + 1] & _HAS_DISTANCE:
-            if at + 8 > size:
-                return "short-payload"
-            anchor, flags, stamp, distance = _TDOA3_RANGED.unpack_from(payload, at)
-            relays.append(Relay(anchor, flags & 0x7F, stamp, distance or None))
-            at += 8
-        else:
-            anchor, flags, stamp = _TDOA3_RELAY.unpack_from(payload, at)
-            relays.append(Relay(anchor, flags, stamp, None))
-            at += 6
+        anchor, flags, stamp, *distance = layout.unpack_from(payload, at)
+        relays.append(Relay(anchor, flags & 0x7F, stamp, distance[0] or None if distance else None))
+        at += layout.size
     position_m = _position(payload, at) if at < size else None
     return Packet(host_s, sender, sequence & 0x7F, tx_ticks, rx_ticks, tuple(relays), position_m)
 
@@ -92,7 +87,7 @@ def _tdoa2(payload: bytes, host_s: float | None, sender: int, rx_ticks: int) -> 
 
 
 def _position(payload: bytes, at: int) -> Point | None:
-    """Position of the LPP packet at that offset, None where there is none or where it makes no sense."""
+    """Position of the LPP packet at an offset; None if there is none, or if it is implausible."""
     if at + _POSITION.size > len(payload):
         return None
     short, kind, x_m, y_m, z_m = _POSITION.unpack_from(payload, at)
@@ -108,7 +103,7 @@ _LINE: Final = re.compile(rb"From ([0-9a-f]{2}) to [0-9a-f]{2} @([0-9a-f]{10}): 
 
 
 def recognise_text(head: bytes) -> bool:
-    """Whether a line of the sniffer's text stands near the beginning."""
+    """Whether there is a line of the sniffer's text near the beginning."""
     return _LINE.search(head) is not None
 
 
@@ -121,7 +116,7 @@ def read_text(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
 
 
 def packet_of_line(line: bytes, drops: Drops) -> Packet | None:
-    """Packet of a line; None, and a count, for what is none."""
+    """Decode a line to a packet; None, counted in ``drops``, if it is none."""
     if not line:
         return None
     match = _LINE.fullmatch(line)
@@ -136,13 +131,13 @@ def packet_of_line(line: bytes, drops: Drops) -> Packet | None:
     return None
 
 
-# Binary stream of Bitcraze's sniffer (after it was sent ``b``), found again after garbage.
+# Binary stream of Bitcraze's sniffer (after ``b`` was sent to it); reading resumes after garbage.
 #
 # A record is ``BC | RX stamp 5 bytes | from u8 | to u8 | length u16 | payload | length u16``, little-endian. There is
-# no checksum: the length, which stands there twice, is all that marks a record.
+# no checksum: only the length, which is there twice, marks a record.
 
 MAX_PAYLOAD_BYTES: Final = 1014
-"""Payload of a long DW1000 frame, less the MAC header of at least 7 bytes and the check sequence."""
+"""Payload of a long DW1000 frame, minus the MAC header of at least 7 bytes and the check sequence."""
 
 _MARK: Final = 0xBC
 _HEADER_BYTES: Final = 10
@@ -150,7 +145,7 @@ _TRAILER_BYTES: Final = 2
 
 
 def recognise_binary(head: bytes) -> bool:
-    """Whether a whole record of a known payload stands near the beginning."""
+    """Whether there is a whole record with a known payload near the beginning."""
     at = head.find(_MARK)
     while at >= 0:
         if _record_size(head, at) and head[at + _HEADER_BYTES] in (TDOA2, TDOA3):
@@ -168,7 +163,7 @@ def read_binary(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
 
 
 class BinaryCutter:
-    """Cuts a stream that comes in pieces into packets, each as soon as it is whole."""
+    """Cuts a stream that arrives in pieces into packets, each as soon as it is complete."""
 
     def __init__(self, drops: Drops) -> None:
         self._drops = drops
@@ -176,11 +171,11 @@ class BinaryCutter:
         self._lost = False
 
     def feed(self, chunk: bytes) -> Iterator[Packet]:
-        """Packets that are whole with this piece."""
+        """Yield the packets that this piece completes."""
         return self._packets(chunk, ended=False)
 
     def finish(self) -> Iterator[Packet]:
-        """Packets behind a false start that promised more than came."""
+        """Yield the packets after a false start whose length exceeds the rest of the stream."""
         return self._packets(b"", ended=True)
 
     def _packets(self, chunk: bytes, *, ended: bool) -> Iterator[Packet]:
@@ -211,7 +206,7 @@ class BinaryCutter:
 
 
 def _may_grow(buffer: bytes, at: int) -> bool:
-    """Whether the bytes there may be a record of which more is to come."""
+    """Whether the bytes at an offset may be the beginning of an incomplete record."""
     if buffer[at] != _MARK:
         return False
     left = len(buffer) - at
@@ -222,7 +217,7 @@ def _may_grow(buffer: bytes, at: int) -> bool:
 
 
 def _record_size(buffer: bytes, at: int) -> int:
-    """Size of the whole record at that offset, 0 where there is none."""
+    """Size of the whole record at an offset; 0 if there is none."""
     left = len(buffer) - at
     if left <= _HEADER_BYTES + _TRAILER_BYTES or buffer[at] != _MARK:
         return 0

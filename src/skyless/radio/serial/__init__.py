@@ -1,1 +1,1 @@
-"""Boards on a serial port."""
+"""Boards on serial ports."""

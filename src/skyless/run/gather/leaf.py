@@ -10,9 +10,8 @@ from skyless.core.errors import SkylessError
 
 Kind = TypeVar("Kind")
 
-
 PING_INTERVAL: Final = "10s"
-"""nats-server gives up a connection after two unanswered pings, by default of 2 minutes each."""
+"""nats-server gives up a connection after two unanswered pings; by default they are 2 minutes apart."""
 
 
 class StuckLineError(Exception):
@@ -20,13 +19,13 @@ class StuckLineError(Exception):
 
 
 class Leaf(Struct, frozen=True, kw_only=True):
-    """What nats-server of a site needs to reach the hub."""
+    """Settings with which a site's nats-server reaches the hub."""
 
     version: Literal[1] = 1
     site: Annotated[int, Meta(ge=0, le=0xFFFD)]
     tenant: str
     urls: Annotated[list[str], Meta(min_length=1)]
-    """The port for sites of each node, nats://HOST:PORT or tls://HOST:PORT."""
+    """Each hub node's port for sites, as nats://HOST:PORT or tls://HOST:PORT."""
     user: str
     password: str
     ca: str | None

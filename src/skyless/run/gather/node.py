@@ -1,4 +1,4 @@
-"""The gather of a site: takes fixes from MQTT's subjects, and puts them into the site's stream in batches."""
+"""The gather of a site: takes single fixes from MQTT's subjects, and publishes them to the site's stream in batches."""
 
 import asyncio
 import contextlib
@@ -64,7 +64,7 @@ class Packer:
         self._waiting.append(fix)
 
     def next_tags(self) -> list[str]:
-        """The tag of each fix of the next batch, oldest first. These tags need numbers first."""
+        """Tags of the fixes in the next batch, oldest first. They must get numbers before ``next_batch``."""
         if not self._next:
             self._next = [self._waiting.popleft() for _ in range(min(len(self._waiting), MAX_RECORDS))]
         return [fix.tag for fix in self._next]
@@ -81,8 +81,8 @@ class Packer:
         return Batch(self._run, next(self._sequences), round(1e6 * now_unix_s), issue, records)
 
 
-# Condition of a site in one word with reasons, from what passes a gather. It is coarser than the page's, for lists of
-# sites.
+# Condition of a site in one word, with reasons, from the messages that pass a gather. Coarser than the page's, for
+# lists of sites.
 
 HEARD_S: Final = 10.0
 """A tag without a fix for this long is not heard."""
@@ -104,7 +104,7 @@ class SiteCondition:
         self._dropped: deque[tuple[float, int]] = deque()
 
     def on_message(self, kind: str, name: str, payload: bytes) -> None:
-        """Process a site or a program's status. Unreadable ones are ignored, or count as offline."""
+        """Process a message with the site or a program's status. An unreadable status makes the program unknown."""
         with contextlib.suppress(WrongMessageError):
             if kind == "site":
                 self.site = read_message(payload, SiteMessage)
@@ -130,7 +130,7 @@ class SiteCondition:
         return len(self._heard_s)
 
     def reasons(self, drops: Mapping[str, int], waiting: int, now_s: float) -> tuple[ConditionWord, list[str]]:
-        """The condition, and why it is not good. ``drops`` are the gather's since its start."""
+        """Return the condition, and why it is not good. ``drops`` are the gather's since its start."""
         self._dropped.append((now_s, sum(drops.values())))
         while now_s - self._dropped[0][0] > _DROPS_S:
             self._dropped.popleft()
@@ -163,7 +163,7 @@ _QUEUE: Final = "gather"
 
 
 class Summary(Struct, frozen=True, kw_only=True):
-    """What a gather has done since its start, published once a second. A gather of an older version lacks some."""
+    """A gather's counts since its start, published once a second. Older versions lack the fields with defaults."""
 
     unix_s: float
     host: str
@@ -172,9 +172,9 @@ class Summary(Struct, frozen=True, kw_only=True):
     """Name of the site; empty until it was published."""
     simulated: bool
     since: str = ""
-    """When the site's streams were made, in ISO 8601: of two sites with one number, each has another."""
+    """When the site's streams were made, in ISO 8601; tells apart two sites with the same number."""
     condition: str = ""
-    """A ``ConditionWord``; empty of an older version, which states none, and another word of a newer one perhaps."""
+    """A ``ConditionWord``; empty from older versions. Newer versions may send other words."""
     reasons: list[str] = []
     """Why the condition is not good."""
     tags_heard: int = 0
@@ -184,7 +184,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     online: dict[str, int]
     """Programs that are online, by kind."""
     versions: dict[str, int] = {}
-    """The same by their versions."""
+    """Programs that are online, by version."""
     fixes: int
     """Fixes taken from JSON."""
     batches: int
@@ -194,7 +194,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     drops: dict[str, int]
     """Messages and fixes that were dropped, by reason."""
     cuts: int
-    """How often the connection was made again; the server ends that of a reader which is too slow."""
+    """Reconnections to the server, which disconnects readers that are too slow."""
 
 
 class Gather:
@@ -203,7 +203,7 @@ class Gather:
     def __init__(
         self, address: NatsAddress, site: int | None, keep_bytes: int, log: Log, broker: MqttAddress | None = None
     ) -> None:
-        """``site`` None: the first site that is heard. ``broker`` is the same server's MQTT address."""
+        """``site`` None means the first site heard. ``broker`` is the same server's MQTT address."""
         self.site = site
         self._address, self._keep_bytes, self._log, self._broker = address, keep_bytes, log, broker
         self._say = rarely(log)
@@ -218,7 +218,7 @@ class Gather:
 
     @property
     def summary(self) -> Summary:
-        """What it has done since its start."""
+        """The counts since the start, and the site's condition."""
         now_s, site = time.monotonic(), self._condition.site
         waiting = self._packer.waiting + (0 if self._ready is None else len(self._ready.records))
         condition, reasons = self._condition.reasons(self._packer.drops, waiting, now_s)
@@ -319,7 +319,7 @@ class Gather:
             return
         for topic, payload in kept.items():
             if (subject := subjects.subject_of(topic)) not in known:
-                with contextlib.suppress(APIError):  # it has come at this moment
+                with contextlib.suppress(APIError):  # it has arrived meanwhile
                     await stream.publish(subject, payload, headers=dict(NEVER_WRITTEN))
 
     async def _send_waiting(self, stream: JetStreamContext, site: int, names: Names) -> None:

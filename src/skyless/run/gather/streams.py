@@ -1,4 +1,4 @@
-"""The streams of a site at its NATS server, and the names of its tags there."""
+"""A site's streams at its NATS server, and the stream with the names of its tags."""
 
 import asyncio
 import contextlib
@@ -38,7 +38,7 @@ EVENT_BYTES: Final = 500_000_000
 NEWEST_OF_EACH: Final[dict[str, Any]] = {"max_msgs_per_subject": 1, "allow_direct": True}
 """Limits of a stream that keeps the newest message of each subject for direct requests."""
 
-_NO_ROOM: Final = 10047  # JetStream's code of an error
+_NO_ROOM: Final = 10047  # JetStream error code
 _DUPLICATES_S: Final = 120.0
 _READ_S: Final = 10.0
 _IDLE_S: Final = 2.0
@@ -47,7 +47,7 @@ _RETRY_S: Final = 1.0
 
 
 async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -> None:
-    """Make the streams of a site, or update the limits of existing ones; a hub copies from them.
+    """Make the streams of a site, or update the limits of existing ones. A hub copies from them.
 
     Raises:
         SkylessError: the server has no room for these bytes.
@@ -70,7 +70,7 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
 
 
 async def make_stream(stream: "JetStreamContext", config: StreamConfig) -> None:
-    """Make a stream, or change an existing one, as adding it again would reserve its bytes twice."""
+    """Make a stream, or update an existing one: adding it again would reserve its bytes twice."""
     try:
         await stream.update_stream(config)
     except NotFoundError:
@@ -78,7 +78,7 @@ async def make_stream(stream: "JetStreamContext", config: StreamConfig) -> None:
             await stream.add_stream(config)
         except APIError:
             with contextlib.suppress(NotFoundError):
-                await stream.update_stream(config)  # another gather has made it at this moment
+                await stream.update_stream(config)  # another gather has just made it
                 return
             raise
 
@@ -148,15 +148,15 @@ async def _next(reading: "JetStreamContext.PushSubscription", place: int) -> "Ms
                 raise Error("messages were lost with a connection") from None
 
 
-# The numbers of a site's tags, as its stream of names has them.
+# Numbers of a site's tags, in its stream of names.
 
 MAX_NAMES: Final = 200_000
-_TAKEN: Final = 10071  # JetStream's code of an error
+_TAKEN: Final = 10071  # JetStream error code
 NEVER_WRITTEN: Final = {"Nats-Expected-Last-Subject-Sequence": "0"}
 
 
 class TagName(Struct, frozen=True):
-    """Name for a tag's number. A number is never reused."""
+    """Name of the tag with a number. A number is never reused."""
 
     name: str
     host: str
@@ -165,7 +165,7 @@ class TagName(Struct, frozen=True):
 
 
 async def name_of(stream: "JetStreamContext", site: int, number: int) -> str:
-    """Look up the name for a tag's number; empty if there is none. Raises nats.errors.Error."""
+    """Look up the name of the tag with a number; empty if there is none. Raises nats.errors.Error."""
     names, subject = at(NAMES_STREAM, site), at(NAMES, site, number)
     try:
         message = await stream.get_last_msg(names, subject, direct=True)
@@ -175,7 +175,7 @@ async def name_of(stream: "JetStreamContext", site: int, number: int) -> str:
 
 
 class Names:
-    """Numbers and names of a site's tags; every program that packs fixes assigns numbers in this way."""
+    """Numbers and names of a site's tags. Every program that packs fixes uses it to assign numbers."""
 
     def __init__(self, stream: "JetStreamContext", site: int) -> None:
         self.tags: dict[int, TagName] = {}
@@ -195,10 +195,10 @@ class Names:
                 self._add(number, msgspec.json.decode(message.data, type=TagName))
 
     async def give(self, names: Iterable[str], host: str, now_unix_s: float) -> None:
-        """Assign numbers to the names without one; none if the table is full. Raises nats.errors.Error.
+        """Assign numbers to the names without one, until the table is full. Raises nats.errors.Error.
 
-        Several programs may do so. The stream takes each number once, and a program assigns a number only when it knows
-        the names of all smaller ones, so no name gets two.
+        Several programs may do so at once. The stream takes each number once, and a program assigns a number only when
+        it knows the names of all smaller ones, so no name gets two.
         """
         for name in dict.fromkeys(names):
             while name not in self.numbers and len(self.numbers) < MAX_NAMES:

@@ -1,6 +1,6 @@
-"""Subjects and streams of NATS (``docs/batches.md``). ``{}`` is the site's number, or ``*`` for all sites.
+"""NATS subjects and streams (``docs/batches.md``). ``{}`` is the site's number, or ``*`` for all sites.
 
-MQTT topics are subjects with dots instead of slashes. nats-server writes a dot within a level of a topic as ``//``.
+An MQTT topic is a subject with dots instead of slashes; nats-server writes a dot within a level of a topic as ``//``.
 """
 
 import os
@@ -25,24 +25,13 @@ if TYPE_CHECKING:
 
 
 JSON_FIXES: Final = "skyless.v1.{}.tag.*.fix"
-
-
 STATUSES: Final = "skyless.v1.{}.*.*.status"
-
-
 SITES: Final = "skyless.v1.{}.site"
-
-
 FIXES: Final = "skyless.v2.{}.fixes.*"
 """Batches; the last level is the sender's host."""
-
-
 NAMES: Final = "skyless.v2.{}.names.*"
 """``TagName``; the last level is the tag's number."""
-
-
 SUMMARY: Final = "skyless.v2.{}.summary"
-
 
 STATE: Final = (
     "skyless.v1.{}.site",
@@ -56,54 +45,35 @@ STATE: Final = (
     "skyless.v1.{}.survey.placement",
     "skyless.v1.{}.survey.watch",
 )
-"""Retained messages of MQTT of which only the newest matters."""
-
-
+"""Retained MQTT messages, of which only the newest matters."""
 EVENTS: Final = ("skyless.v1.{}.zone.*.event", "skyless.v1.{}.alarm.*.*.state")
-"""Messages of MQTT each of which is an event."""
+"""MQTT messages, each of which is an event."""
 
-
+# Streams of a site at its own server. A hub's have the same names; readers there ask for the site's subjects.
 FIX_STREAM: Final = "FIX_{}"
-
-
 NAMES_STREAM: Final = "NAMES_{}"
-
-
 STATE_STREAM: Final = "STATE_{}"
-
-
 EVENT_STREAM: Final = "EVENTS_{}"
-
-"""Streams of a site at its own server. A hub's have the same names; readers there ask for the site's subjects."""
-
 
 SOURCED: Final = "sourced.{}"
 """Prefix of the subjects under which a site's messages reach a hub's streams."""
-
-
 DOMAIN: Final = "site{}"
 """JetStream domain of a site."""
-
-
 NAME_REQUESTS: Final = "$JS.API.DIRECT.GET.*.skyless.v2.*.names.*"
-"""Where to ask the server for the name for one number."""
-
-
+"""Subject of requests to the server for the name of one tag."""
 PAGE_INBOX: Final = "_INBOX_PAGE"
-"""Prefix of the subjects of answers to pages."""
-
-
+"""Prefix of the reply subjects of pages."""
 EVERY: Final = "*"
 
 
 def at(pattern: str, site: int | str, last: int | str = "") -> str:
-    """A subject or stream of a site, with its last level filled in if the pattern has one."""
+    """Subject or stream of a site; ``last`` replaces the ``*`` at the pattern's end."""
     subject = pattern.format(site)
     return f"{subject[:-1]}{last}" if last else subject
 
 
 def own_host() -> str:
-    """Name of this computer as one level of a subject."""
+    """Name of this computer, usable as one level of a subject."""
     return re.sub(r"[^A-Za-z0-9_-]", "-", platform.node()) or "host"
 
 
@@ -130,22 +100,12 @@ def site_in(subject: str) -> int | None:
 
 
 FIRST_PORT: Final = 4222
-
-
 MAX_PAYLOAD: Final = 8 * 1024 * 1024
 """Largest message in bytes, such as a floor plan, that a site's server and a hub take."""
-
-
 _FIND_AGAIN_S: Final = 0.5
-
-
 _CONNECT_S: Final = 2
-
-
 _PING_S: Final = 5
 """After two unanswered pings another server is tried."""
-
-
 _SAME_TROUBLE_S: Final = 30.0
 
 
@@ -205,7 +165,7 @@ def nats_address(url: str, option: str = "--nats", ca: Path | None = None) -> Na
 
 
 def rarely(log: Log) -> Log:
-    """Log each problem once, and again every half minute while it lasts."""
+    """Wrap ``log``: each text is passed on once, and again every half minute while it recurs."""
     said_s: dict[str, float] = {}
 
     def say(trouble: str) -> None:
@@ -218,10 +178,10 @@ def rarely(log: Log) -> Log:
 
 
 async def connect(address: NatsAddress, name: str, say: Log, drops: Counter[str], inbox: str = "_INBOX") -> "Client":
-    """Connect, reconnecting whenever the connection is lost; wait for a server that is not there yet.
+    """Connect, waiting for a server that is not there yet; reconnect whenever the connection is lost.
 
-    ``inbox`` is the prefix of the subjects of answers. Messages that arrive faster than they are read are counted under
-    ``unread``. Raises SkylessError without nats-py.
+    ``inbox`` is the prefix of reply subjects. Messages that arrive faster than they are read are counted in ``drops``
+    as ``unread``. Raises SkylessError without nats-py.
     """
     nats = extra_module("nats", "NATS")
 

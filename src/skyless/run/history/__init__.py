@@ -1,1 +1,1 @@
-"""The history of a site: fixes and events in Parquet files, and what is asked of them."""
+"""The history of a site: fixes and events in Parquet files, and queries on them."""

@@ -1,4 +1,4 @@
-"""What is asked of a history, and the answers: the command line, the HTTP interface and the page give the same."""
+"""Time ranges and results of queries on a history, shared by the command line, the HTTP interface and the page."""
 
 import contextlib
 import math
@@ -35,15 +35,15 @@ class TrackPoint(Struct, frozen=True, array_like=True):
 
 
 class Track(Struct, frozen=True):
-    """The way of one tag."""
+    """The track of one tag."""
 
     tag: str
     points: tuple[TrackPoint, ...]
     fixes: int
-    """How many fixes there are in the range; more than points where the way was thinned."""
+    """Number of fixes in the range; more than points if the track was thinned."""
     length_m: float
-    """Of the way through all fixes in the plane, without gaps of more than ``GAP_S`` (``THINNED_GAP_S``). Moves of less
-    than a quarter of a metre, or three standard deviations, count when they add up to that: they may be noise."""
+    """Length in the plane through all fixes, without gaps of more than ``GAP_S`` (``THINNED_GAP_S``). Moves of less
+    than a quarter of a metre, or three standard deviations, may be noise: they count only once they add up to that."""
 
 
 class Heatmap(Struct, frozen=True):
@@ -73,7 +73,7 @@ class Dwell(Struct, frozen=True):
 
 
 class Occupancy(Struct, frozen=True):
-    """How many tags were in a zone within one step of time."""
+    """How many tags were in a zone during one time step."""
 
     zone: str
     zone_name: str
@@ -83,7 +83,7 @@ class Occupancy(Struct, frozen=True):
 
 
 class Contact(Struct, frozen=True):
-    """Two tags were near each other."""
+    """A period in which two tags were near each other."""
 
     tag: str
     other: str
@@ -115,7 +115,7 @@ _AT_AN_HOUR: Final = re.compile(r"\bat (\d{1,2})$")
 
 
 def span_of(from_text: str, to_text: str | None, now_unix_s: float) -> Span:
-    """Parse the range between two times, in this machine's time zone where they name none.
+    """Parse the range between two times, in this machine's time zone if they name none.
 
     A time without a date is today's; at the end of the range it is on the day on which the range begins. A day without
     a time means its beginning. Without ``to_text`` the range ends now.
@@ -166,7 +166,7 @@ def _read(text: str, now: datetime, day: date) -> datetime:
     found = parser.get_date_data(_AT_AN_HOUR.sub(r"\1:00", text))
     when: datetime | None = found.date_obj
     if when is None or not (found.period in {"time", "day"} or text.endswith("ago")):
-        raise ValueError  # a month or a year is no time
+        raise ValueError  # a month or a year is not a time
     return when if found.period == "time" else when.replace(hour=0, minute=0, second=0, microsecond=0)
 
 

@@ -1,14 +1,14 @@
-"""Where the history of a site lies, and what its files hold (``docs/history.md``).
+"""Folders, files and columns of a site's history (``docs/history.md``).
 
     FOLDER/site=<n>/day=<yyyy-mm-dd>/<first>-<last>.parquet           fixes; numbers of the first and last row
     FOLDER/site=<n>/events/day=<yyyy-mm-dd>/<first>-<last>.parquet    events
     FOLDER/site=<n>/names.parquet                                     the tags' numbers and names
-    FOLDER/site=<n>/assets.parquet                                    the tags' names and what people call them
+    FOLDER/site=<n>/assets.parquet                                    the tags' names and their assets' names
     FOLDER/site=<n>/zones.parquet                                     the zones' identifiers, names and corners
-    FOLDER/site=<n>/journal.sqlite                                    what is not in Parquet yet
+    FOLDER/site=<n>/journal.sqlite                                    rows not in Parquet yet
 
 The day is that of arrival, in UTC. Any engine that reads Parquet can read and join them. A file whose numbers lie
-within those of another has been joined into it, and is about to be removed.
+within those of another has been joined into it and will be removed.
 """
 
 from pathlib import Path
@@ -90,11 +90,11 @@ def current_events(folder: Path, site: int) -> tuple[Path, ...]:
 
 
 def largest_files(folder: Path) -> tuple[Path, ...]:
-    """Files in a folder's days whose rows are not all in another file."""
+    """Files in a folder's days, without those whose rows are all in another file."""
     found = [(rows[0], -rows[1], file) for file in folder.glob("day=*/*.parquet") if (rows := rows_of(file))]
     kept: list[Path] = []
     end = -1
-    for _, minus_last, file in sorted(found):  # of those that begin together, the longest first
+    for _, minus_last, file in sorted(found):  # of files with the same first row, the longest comes first
         if -minus_last > end:
             kept.append(file)
             end = -minus_last

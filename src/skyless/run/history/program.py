@@ -1,4 +1,4 @@
-"""``skyless history run``: messages of a site, batches of a large one, and recordings, into the history."""
+"""``skyless history run``: write a site's messages, a large site's batches, or recordings to a history."""
 
 import asyncio
 import platform
@@ -60,7 +60,7 @@ _STREAM_RETRY_S: Final = 2.0
 _MAX_WAITING: Final = 100_000
 """While more rows than this wait for the disk, further ones are left in the stream."""
 _NAMES_S: Final = 60.0
-"""How much later than a batch its names may come: a hub's streams catch up one after the other."""
+"""How much later than a batch its tags' names may come: a hub's streams catch up one after the other."""
 _MAX_SENDERS: Final = 1000
 
 
@@ -75,7 +75,7 @@ class BatchTaker:
         """Largest number whose name did not come in time."""
 
     async def take(self, message: "Msg") -> None:
-        """Take the batch of a message, unless it is already known.
+        """Add the batch of a message to the history, unless it is already known.
 
         Waits for the disk, and for the names of its tags.
         """
@@ -96,7 +96,7 @@ class BatchTaker:
         self._writer.fixes.add(self._renumbered(batch.records, now_s), now_s, place)
 
     def _is_next(self, batch: Batch) -> bool:
-        """Whether a batch is new. Earlier ones that the stream no longer has are counted as lost."""
+        """Whether a batch is new. Batches missing since the sender's last one are counted as lost."""
         before = self._sequences.pop(batch.run, None)
         self._sequences[batch.run] = max(batch.sequence, before or 0)
         if len(self._sequences) > _MAX_SENDERS:
@@ -121,7 +121,7 @@ class BatchTaker:
                 await asyncio.sleep(_PERIOD_S)
 
     def _renumbered(self, records: Records, now_s: float) -> Records:
-        """Return the records to keep, with this history's numbers for their tags; count the others."""
+        """Return the records to keep, with this history's numbers for their tags. The others are counted."""
         writer = self._writer
         given, rows = np.unique(records["tag"], return_inverse=True)
         tags = (self._names.tags.get(int(number)) for number in given)
@@ -161,7 +161,7 @@ async def take_batches(stream: "JetStreamContext", writer: Writer, say: Log) -> 
 
 
 async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:
-    """Take the batches over a connection of its own."""
+    """Run ``take_batches`` over a connection of its own."""
     say = rarely(log)
     client = await connect(address, "skyless history", say, writer.drops)
     try:
@@ -200,17 +200,15 @@ class HistoryState(Struct, frozen=True):
 
 
 class SiteHistory:
-    """Keeps the history of one site, from any source of its messages."""
+    """Keeps the history of one site, whatever the source of its messages."""
 
     def __init__(self, writer: Writer, keep: Keep, log: Log) -> None:
         """Raises SkylessError if the past events cannot be read."""
-        self.trouble: str | None = None
-        """Why there are no messages."""
         self.event_place = 0
         """Place in the source of the next event, if the source has places."""
         self._writer, self._keep, self._log = writer, keep, log
         self._trouble: dict[str, str] = {}
-        self._try("files", writer.write)  # so that all events of the past are in files
+        self._try("files", writer.write)  # so that all past events are in files
         remembered = pc.field("kind").isin(REMEMBERED_KINDS)
         self._events = EventLog(read_events(current_events(writer.root, writer.site), remembered))
         self._fixes: list[tuple[int, FixMessage]] = []
@@ -218,7 +216,7 @@ class SiteHistory:
         self._started_s = time.monotonic()
 
     def attach(self, subscribe: Callable[[str, Handler, int], None], *, fixes: bool) -> None:
-        """Subscribe to what is kept, with topic filters of MQTT. ``fixes`` includes single fixes."""
+        """Call ``subscribe`` with the MQTT topic filters of the messages to keep. ``fixes`` includes single fixes."""
         site = self._writer.site
 
         def on_wrong() -> None:
@@ -260,7 +258,7 @@ class SiteHistory:
             waiting=self._writer.unwritten + sum(intake.waiting for intake in intakes),
             lost=sum(intake.lost for intake in intakes),
             drops=dict(self._writer.drops),
-            trouble=self.trouble,
+            trouble=None,
             disk=next(iter(self._trouble.values()), None),
         )
 
@@ -323,7 +321,7 @@ class HistoryNode:
     def __init__(
         self, writer: Writer, address: MqttAddress, keep: Keep, log: Log, nats: NatsAddress | None = None
     ) -> None:
-        """``nats`` is the server of a site with a gather, whose stream then delivers the fixes.
+        """``nats`` is the server of a site with a gather; the fixes then come from its stream.
 
         Raises SkylessError if the past events cannot be read.
         """
@@ -342,15 +340,15 @@ class HistoryNode:
         await self._history.run(*sources)
 
     def state(self) -> HistoryState:
-        """Progress so far."""
+        """Return the progress so far."""
         return replace(self._history.state(), trouble=self.link.trouble)
 
 
-# The history of a hub's sites: fixes, events and the rest from its streams.
+# The histories of a hub's sites, from the hub's streams.
 
 
 class _Site:
-    """One site that is kept, from its own streams only; their messages under another site's subjects are ignored."""
+    """Keeps the history of one site of a hub. Messages in its streams under another site's subjects are ignored."""
 
     def __init__(self, stream: "JetStreamContext", writer: Writer, keep: Keep, log: Log) -> None:
         self.writer, self.history = writer, SiteHistory(writer, keep, log)
@@ -360,10 +358,8 @@ class _Site:
 
     async def run(self) -> None:
         """Keep the site's history until cancelled."""
-        await self.history.run(self._take_state(), self._take_events(), self._take_fixes())
-
-    async def _take_fixes(self) -> None:
-        await take_batches(self._stream, self.writer, self._say)
+        fixes = take_batches(self._stream, self.writer, self._say)
+        await self.history.run(self._take_state(), self._take_events(), fixes)
 
     async def _take_state(self) -> None:
         async for message in self._follow(subjects.STATE_STREAM, is_state=True):
@@ -437,7 +433,7 @@ class HubHistory:
             self._tasks.create_task(site.run())
 
     async def _find_sites(self, client: "Client") -> None:
-        """Follow the list of sites at the hub."""
+        """Follow the hub's list of sites, and keep each of them."""
         while True:
             try:
                 for number in sorted(await sites_at(client)):
@@ -447,7 +443,7 @@ class HubHistory:
             await asyncio.sleep(LIST_S)
 
 
-# Import of recordings, without what the history already has.
+# Import of recordings, without rows that the history already has.
 
 _CHUNK: Final = 100_000
 _MARGIN: Final = timedelta(days=1)
@@ -465,7 +461,7 @@ class Imported(Struct, frozen=True):
 
 
 def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[float], None]) -> Imported:
-    """Write a recording's fixes, zone events and zones. ``reach`` is called with the Unix time in s reached so far.
+    """Add a recording's fixes, zone events and zones. ``reach`` is called with the Unix time in s reached so far.
 
     A tag has at most one fix per millisecond.
 
@@ -473,7 +469,7 @@ def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[
         SkylessError: the history cannot be read.
         OSError: the disk fails; what was written stays, and importing again adds the rest.
     """
-    writer.write()  # what an earlier import, or a run, has left in the journal
+    writer.write()  # rows that an earlier import or run has left in the journal
     writer.set_zones(() if recording.zones is None else recording.zones.zones)
     simulated = recording.site is not None and recording.site.simulated
     known, known_events = _known(recording, writer)
@@ -515,7 +511,7 @@ def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[
 
 
 def _known(recording: McapRecording, writer: Writer) -> tuple[NDArray[np.int64], set[Event]]:
-    """Return the keys of the fixes, and the events, that the history has for the time of a recording."""
+    """Return what the history already has for the time of a recording: the keys of fixes, and events."""
     summary = recording.summary()
     if summary.start_s is None or summary.end_s is None:
         return np.empty(0, np.int64), set()
@@ -533,5 +529,5 @@ def _known(recording: McapRecording, writer: Writer) -> tuple[NDArray[np.int64],
 
 
 def _keys(tag: NDArray[Any], ms: NDArray[np.int64]) -> NDArray[np.int64]:
-    """A number for each tag and millisecond; times have 43 bits (``LIMITS.last_unix_s``), tags fewer than 20."""
+    """Combine tag and time into one number; times have 43 bits (``LIMITS.last_unix_s``), tags fewer than 20."""
     return (tag.astype(np.int64) << 43) | ms

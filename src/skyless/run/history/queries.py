@@ -60,8 +60,8 @@ from skyless.run.web import HISTORY as LIMITS
 # Times in cells and contacts need all rows: PyArrow and NumPy take a third of DuckDB's processor time here.
 
 _SIDE: Final = 2000
-"""Cells along each side of the grid, which is placed around the first fixes. Not a power of two, as rows would then
-share few cache lines.
+"""Cells along each side of the grid, which is centred on the first fixes. Not a power of two: rows would then share few
+cache lines.
 """
 _OUTSIDE: Final = _SIDE * _SIDE
 _WILD_SHARE: Final = 1e-3
@@ -71,15 +71,15 @@ _ScanInts = NDArray[Any]
 
 
 def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collection[int] | None) -> Heatmap:
-    """Compute the time of tags in cells; ``tags`` None means all. Raises SkylessError, OSError.
+    """Return how long tags were in each cell of a grid; ``tags`` None means all. Raises SkylessError, OSError.
 
     A fix counts until the tag's next one in the range, up to ``GAP_S``, or ``THINNED_GAP_S`` in a thinned file. The
     tag's last fix does not count.
     """
     sums_ms = np.zeros(_OUTSIDE + 1, np.int64)
     edges = [np.empty((4, 0), np.int64)]
-    """Rows: tag, time, longest time that the fix may count (0 for a tag's first row of a batch, else its last), and
-    cell.
+    """First and last fix of each tag in each batch. Rows: tag, time, longest time that the fix may count (0 for a first
+    one), cell.
     """
     corner: list[int] = []
     for (tag, t, x, y), gap_ms in read_rows(files, span, tags):
@@ -87,7 +87,7 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
         corner = corner or [int(np.median(one)) - _SIDE // 2 for one in places]
         column, row = ((one - first).view(np.uint32) for one, first in zip(places, corner, strict=True))
         cell = (row * np.uint32(_SIDE) + column).astype(np.intp)
-        if column.max() >= _SIDE or row.max() >= _SIDE:  # a negative one is large, too
+        if column.max() >= _SIDE or row.max() >= _SIDE:  # negative ones are large as unsigned numbers
             cell[(column >= _SIDE) | (row >= _SIDE)] = _OUTSIDE
         changes = np.flatnonzero(tag[1:] != tag[:-1])
         ms = np.minimum(t[1:] - t[:-1], gap_ms)
@@ -116,10 +116,10 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
 def near(
     files: Sequence[Path], span: Span, own: Collection[int], bucket_ms: int, distance_mm: int, gap: int
 ) -> NDArray[np.int64]:
-    """Find when tags were near the one with the numbers ``own``.
+    """Find when other tags were near the tag with the numbers ``own``.
 
-    Returns tag, first and last bucket of time, and least squared distance. The first fix of ``own`` in a bucket counts.
-    ``gap`` is the largest number of buckets between those of one contact. Raises OSError.
+    Returns a row each for tags, first and last buckets of time, and least squared distances. Of ``own``, the first fix
+    in a bucket is compared. ``gap`` is the largest number of buckets between those of one contact. Raises OSError.
     """
     firsts: list[tuple[_ScanInts, ...]] = []
     for (_, t, x, y), _ in read_rows(files, span, own):
@@ -167,7 +167,7 @@ def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:
 
 
 def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -> Iterator[tuple[list[_ScanInts], int]]:
-    """Yield tags, times in ms and coordinates of batches of rows, and the longest time in ms that a fix counts."""
+    """Yield batches of fixes (tags, times in ms, x and y in mm), each with the longest time in ms that a fix counts."""
     begin_ms, end_ms = (math.ceil(round(1000.0 * unix_s, 2)) for unix_s in (span.from_unix_s, span.to_unix_s))
     wanted = schema_of({name: FIX_COLUMNS[name] for name in ("tag", "t", "x_mm", "y_mm")})
     for file in files:
@@ -175,7 +175,7 @@ def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -
             whole = parquet.ParquetFile(file, memory_map=True, pre_buffer=False)
             if not {*wanted} <= {*whole.schema_arrow} or len({*whole.schema_arrow.names}) < len(whole.schema_arrow):
                 raise ValueError(f"its columns are {', '.join(whole.schema_arrow.names)}")
-        except ValueError as error:  # ArrowInvalid is one
+        except ValueError as error:  # includes ArrowInvalid
             raise SkylessError(f"{file} cannot be read; it should be a Parquet file of fixes: {error}") from None
         gap_ms = round(1000.0 * (THINNED_GAP_S if THINNED in (whole.schema_arrow.metadata or {}) else GAP_S))
         for group in range(whole.num_row_groups):
@@ -198,7 +198,7 @@ def limits(metadata: parquet.FileMetaData, group: int, column: str) -> tuple[int
     known = metadata.row_group(group).column(metadata.schema.names.index(column)).statistics
     if known is None or not isinstance(known.max_raw, int):
         raise ValueError(f"its column {column} has no whole numbers, or no statistics of them")
-    return known.min_raw, known.max_raw  # others make dates, for which Pandas would be imported
+    return known.min_raw, known.max_raw  # min and max would be dates, and import Pandas
 
 
 EXPORT_SUFFIXES: Final = (".csv", ".parquet", ".geojsonl")
@@ -269,7 +269,6 @@ _ALARMS: Final = """
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-_Ints = NDArray[np.int64]
 _Floats = NDArray[np.float64]
 
 
@@ -280,7 +279,7 @@ def sites_in(folder: Path) -> tuple[int, ...]:
 
 
 def _asked(question: Callable[_P, _R]) -> Callable[_P, _R]:
-    """Repeat a query if a file has vanished, because it was replaced by a larger one meanwhile."""
+    """Wrap a query: repeat it if a file was replaced by a larger one meanwhile; raise SkylessError if unreadable."""
 
     @wraps(question)
     def ask(*args: _P.args, **kwargs: _P.kwargs) -> _R:
@@ -297,7 +296,7 @@ def _asked(question: Callable[_P, _R]) -> Callable[_P, _R]:
 
 
 def _damaged(history: object) -> Path | None:
-    """Return the first unreadable file of a history, which not every error names."""
+    """Return the first unreadable file of a history: not every error names it."""
     if isinstance(history, History):
         for file in (*current_files(history.folder, history.site), *current_events(history.folder, history.site)):
             try:
@@ -321,7 +320,7 @@ class History:
             held = f"it holds site {sites}" if sites else "skyless history run writes one"
             raise SkylessError(f"{folder} holds no history of site {site}; {held}")
 
-    # What there is
+    # Contents
 
     def tags(self) -> tuple[str, ...]:
         """Return the names of all tags."""
@@ -349,7 +348,7 @@ class History:
         times = [limits(one, group, "t")[1] for one in newest for group in range(one.num_row_groups)]
         return max(times) / 1000 if times else None
 
-    # Questions
+    # Queries
 
     @_asked
     def track(self, tag: str, span: Span, most_points: int = 2000) -> Track:
@@ -418,10 +417,10 @@ class History:
 
     @_asked
     def contacts(self, tag: str, span: Span, distance_m: float = 2.0) -> tuple[Contact, ...]:
-        """Return when other tags were within a distance in the plane of this tag's first fix of a second.
+        """Return when other tags were within a horizontal distance of this tag. Raises SkylessError.
 
-        The others' fixes of the same second are compared; in a range with thinned days, of ten seconds. Raises
-        SkylessError.
+        The others' fixes in each second are compared with this tag's first fix in it; in a range with thinned days, in
+        each ten seconds.
         """
         check_number("the distance", distance_m, least=0.01, most=LIMITS.contact_m)
         ((tag, own),) = self._tags((tag,)).items()
@@ -447,9 +446,9 @@ class History:
 
     @_asked
     def export(self, file: Path, span: Span, tags: Sequence[str] = (), origin: GeoreferenceSite | None = None) -> int:
-        """Write the fixes of the tags (default: all), by name and time, in the suffix's format; return their number.
+        """Write the fixes of the tags (default: all), sorted by name and time; the suffix chooses the format.
 
-        GeoJSON, one feature a line, needs the site's georeference. Raises SkylessError, OSError.
+        Returns their number. GeoJSON, one feature a line, needs the site's georeference. Raises SkylessError, OSError.
         """
         if file.suffix not in EXPORT_SUFFIXES:
             raise SkylessError(f"{file} ends with {file.suffix!r}; it should end with {' or '.join(EXPORT_SUFFIXES)}")
@@ -481,7 +480,7 @@ class History:
                     raise
                 raise SkylessError(f"{file} cannot be written: {error}") from None
 
-    # What they share
+    # Helpers
 
     def _files(self, span: Span) -> list[Path]:
         return _of_days(current_files(self.folder, self.site), span)
@@ -492,7 +491,7 @@ class History:
         return [row for row in rows if row[next(iter(columns))] is not None]
 
     def _names(self) -> dict[int, str]:
-        """Newest name for each number."""
+        """Newest name of each number."""
         rows = self._table("names.parquet", NAME_COLUMNS | {"since": "int64"})
         return {row["tag"]: row["name"] for row in sorted(rows, key=lambda row: row["since"] or 0) if row["name"]}
 
@@ -543,14 +542,14 @@ def counts(begins: _Floats, ends: _Floats, edges: _Floats) -> tuple[list[float],
 
 
 def _ramp(times: _Floats, at: _Floats) -> _Floats:
-    """The sum, over the sorted times, of the time passed since each at ``at``."""
+    """Sum, at each of ``at``, of the time elapsed since each of the earlier ``times``, which are sorted."""
     passed = np.searchsorted(times, at)
     ramp: _Floats = passed * at - np.append(0.0, np.cumsum(times))[passed]
     return ramp
 
 
 class _Way:
-    """Fixes of a tag in order of time: their length, and which of them to keep."""
+    """A tag's track, built from its fixes in order of time: its length, and which fixes to keep."""
 
     def __init__(self, count: int, most: int, gap_ms: int) -> None:
         """Keep at most ``most`` of ``count`` fixes."""
@@ -592,7 +591,7 @@ class _Way:
 @contextlib.contextmanager
 def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
     """Open DuckDB with temporary files only, and without the network."""
-    spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # made where it is needed
+    spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # created only if needed
     options: dict[str, Any] = {"memory_limit": f"{LIMITS.memory_mb}MB", "temp_directory": spill}
     # One thread takes less processor time in total, and leaves the other cores to the site.
     options |= {"autoinstall_known_extensions": "false", "threads": 1}
@@ -611,7 +610,7 @@ def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iter
 
 
 def _table(found: Iterator[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-    """Return the rows of a result that is a table. Raises SkylessError."""
+    """Return all rows of a result. Raises SkylessError if there are too many."""
     rows = list(islice(found, LIMITS.rows + 1))
     if len(rows) > LIMITS.rows:
         raise SkylessError(f"the answer has more than {LIMITS.rows} rows; choose a shorter range, a tag or a zone")
@@ -660,7 +659,7 @@ def _some(known: Iterable[str], kind: str) -> str:
 def _write_features(file: Path, found: duckdb.DuckDBPyConnection, origin: GeoreferenceSite) -> int:
     names, count = [column[0] for column in found.description], 0
     with file.open("wb") as out:
-        while rows := found.fetchmany(10_000):
+        while rows := found.fetchmany(_FETCHED):
             for row in rows:
                 facts = dict(zip(names, row, strict=True))
                 at = coordinates((facts.pop("x_m"), facts.pop("y_m"), facts.pop("z_m")), origin)

@@ -1,4 +1,4 @@
-"""The history's rows as tables, and reading and writing of complete files."""
+"""Tables of a history's rows, and reading and writing of whole files."""
 
 import contextlib
 import os
@@ -22,13 +22,11 @@ from skyless.run.mqtt.messages import AlarmMessage, StatusMessage, ZoneEvent
 from skyless.run.web import HISTORY as LIMITS
 
 ROW_GROUP: Final = 131_072
-
-
 _TIME: Final = pa.timestamp("ms", tz="UTC")
 
 
 class Event(Struct, frozen=True):
-    """One row of the events, with ``EVENT_COLUMNS``."""
+    """One event; the fields are ``EVENT_COLUMNS``."""
 
     t: datetime
     kind: EventKind
@@ -40,14 +38,14 @@ class Event(Struct, frozen=True):
 
 
 def schema_of(columns: dict[str, str]) -> pa.Schema:
-    """The schema of columns as defined in ``layout.py``."""
+    """Arrow schema of columns that ``layout.py`` defines."""
     return pa.schema(
         [(name, _TIME if kind.startswith("timestamp") else pa.type_for_alias(kind)) for name, kind in columns.items()]
     )
 
 
 def fix_table(records: Records) -> pa.Table:
-    """Convert records (``run/fix_batch.py``) to a table, by tag and time.
+    """Convert records (``run/fix_batch.py``) to a table sorted by tag and time.
 
     ``std_mm`` is the root of the covariance's trace, as ``FixMessage.std_m``; the correlation of x and y is dropped.
     """
@@ -69,16 +67,16 @@ def unix_ms(records: Records) -> NDArray[np.int64]:
 
 
 def event_table(events: Sequence[Event]) -> pa.Table:
-    """Convert events to a table, by time."""
+    """Convert events to a table sorted by time."""
     rows = [msgspec.structs.asdict(event) for event in sorted(events, key=lambda event: event.t)]
     return pa.Table.from_pylist(rows, schema_of(EVENT_COLUMNS))
 
 
 def read_table(file: Path, columns: dict[str, str], wanted: pc.Expression | None = None) -> pa.Table:
-    """Read columns of the wanted rows of a file. Raises SkylessError if it cannot be read, or lacks one."""
+    """Read columns of the wanted rows of a file. Raises SkylessError if it cannot be read or lacks a column."""
     try:
         table = parquet.ParquetFile(file).read(columns=list(columns)).cast(schema_of(columns))
-        table.validate(full=True)  # texts are UTF-8
+        table.validate(full=True)  # among others, that texts are UTF-8
     except (OSError, ValueError, pa.ArrowException) as error:
         should = f"it should be a Parquet file with {', '.join(columns)}"
         raise SkylessError(f"{file} cannot be read; {should}: {error}") from None
@@ -112,7 +110,7 @@ def write_table(table: pa.Table, file: Path) -> None:
         with contextlib.suppress(OSError):
             scratch.unlink()
         raise
-    handle = os.open(file.parent, os.O_RDONLY)  # its name, too, is to be on the disk
+    handle = os.open(file.parent, os.O_RDONLY)  # make the file's name durable, too
     try:
         os.fsync(handle)
     finally:
@@ -130,12 +128,12 @@ class EventLog:
         """``past``: the events in the history, in order."""
         self._alarms: set[tuple[EventKind, str]] = set()
         self._last: dict[tuple[str | None, ...], tuple[EventKind, datetime | None]] = {}
-        """The last event of each node, or of a tag in a zone, with its time of arrival if it is offline."""
+        """Last event of each node, or of a tag in a zone, and its time; of an offline node, when it came online."""
         for event in past:
             self._remember(event)
 
     def of(self, message: ZoneEvent | AlarmMessage | StatusMessage, now_unix_s: float) -> list[Event]:
-        """Return the new events in a message: of tags in zones, alarms, and tags and anchors that came or went."""
+        """Return the new events in a message: zone crossings, alarms, and nodes that went online or offline."""
         if isinstance(message, ZoneEvent):
             text = f"{message.tag} {'entered' if message.kind == 'enter' else 'left'} {message.name}"
             return self._new(message.unix_s, message.kind, tag=message.tag, zone=message.zone, text=text)
@@ -159,13 +157,13 @@ class EventLog:
         return [event] if self._is_new(event) else []
 
     def _is_new(self, event: Event) -> bool:
-        """Remember an event. Return False for a copy, or for one that states what is known already."""
+        """Remember an event. Return False for a copy, or one that states what is already known."""
         if event.alarm:
             is_new = (event.kind, event.alarm) not in self._alarms
         else:
             before, since = self._last.get(_about(event), (None, None))
             if event.kind != "offline" and event.t == since and event.kind in ("online", before):
-                return False  # of "online" perhaps a late copy, which was sent before the node went offline
+                return False  # "online" may be a late copy, sent before the node went offline
             is_new = not (event.kind == before and event.kind in ("online", "offline"))
         self._remember(event)
         return is_new

@@ -1,4 +1,4 @@
-"""Writing of one site's history: rows wait in memory, then in a journal (SQLite), and end in Parquet.
+"""Write one site's history: rows wait in memory, then in a journal (SQLite), and end in Parquet.
 
 Rows are numbered. A row whose number is within a file's name is in Parquet, whatever the journal says, so no row is
 lost or written twice if a program is killed. Only one process at a time writes a site.
@@ -67,7 +67,7 @@ class Intake:
         self._encode, self._table = encode, table
         self._batches: list[tuple[Records | Sequence[Event], float]] = []
         self.position = 0
-        """Place in the source of the newest rows, if it has places."""
+        """Place of the newest rows in the source, if it has places."""
         files = [rows for file in largest_files(folder) if (rows := rows_of(file))]
         self.last = max((last for _, last in files), default=0)
         """Number of the last row in a file."""
@@ -75,14 +75,13 @@ class Intake:
             sql.execute(f"CREATE TABLE IF NOT EXISTS {kind} (first INTEGER PRIMARY KEY, rows, unix_s, data)")
             (end,) = sql.execute(f"SELECT max(first + rows) FROM {kind}").fetchone()
             sql.execute("CREATE TABLE IF NOT EXISTS positions (kind PRIMARY KEY, position)")
-        with journal.transaction() as sql:
             for (position,) in sql.execute("SELECT position FROM positions WHERE kind = ?", (self._place,)):
                 self.position = position
         self.next = max(self.last + 1, end or 1)
         """Number of the next row to enter the journal."""
 
     def add(self, rows: Records | Sequence[Event], arrived_unix_s: float, position: int = 0) -> None:
-        """Take rows. ``store`` brings them into the journal, together with their place in the source."""
+        """Take rows. ``store`` moves them to the journal, together with their place in the source."""
         if len(rows):
             self._batches.append((rows, arrived_unix_s))
         self.taken += len(rows)
@@ -94,7 +93,7 @@ class Intake:
         return sum(len(rows) for rows, _ in self._batches)
 
     def store(self) -> None:
-        """Bring all rows into the journal.
+        """Move all waiting rows to the journal.
 
         Raises OSError: none is stored, and the oldest beyond the limit are dropped.
         """
@@ -116,7 +115,7 @@ class Intake:
         self.next = number
 
     def write(self) -> None:
-        """Write the rows now in the journal to files. Raises OSError: the rest stays."""
+        """Move the rows now in the journal to files. Raises OSError: the rest stays."""
         end = self.next
         while self.last + 1 < end:
             day, last, batches = self._next_file(end)
@@ -206,8 +205,8 @@ class Writer:
     def __init__(self, folder: Path, site: int, source: str = "") -> None:
         """``source`` names streams whose places are stored; a history of another source is refused.
 
-        Raises SkylessError: it cannot be written, another program is writing it, it is damaged, or has rows from
-        elsewhere.
+        Raises SkylessError: the history cannot be written, is being written by another program, is damaged, or has rows
+        from elsewhere.
         """
         self.root, self.site, self.folder = folder, site, site_folder(folder, site)
         self.drops: Counter[str] = Counter()
@@ -245,14 +244,14 @@ class Writer:
         return sum(intake.next - 1 - intake.last for intake in (self.fixes, self.events))
 
     def number(self, fix: FixMessage, unix_s: float) -> int | None:
-        """Return the unique number for a fix's tag; None for a fix that is not kept, which is counted."""
+        """Return the number of a fix's tag; None for a fix not to be kept, which is counted in ``drops``."""
         if not LIMITS.first_unix_s <= fix.unix_s <= LIMITS.last_unix_s:
             self.drops["wrong-time"] += 1
             return None
         return self.tag_number(fix.tag, unix_s)
 
     def tag_number(self, name: str, unix_s: float) -> int | None:
-        """Return the number for a tag; None if there are too many tags, which is counted."""
+        """Return the unique number of a tag; None if there are too many tags, which is counted in ``drops``."""
         if name not in self.names.rows:
             if len(self.names.rows) >= LIMITS.tags:
                 self.drops["too-many-tags"] += 1
@@ -272,8 +271,8 @@ class Writer:
             self.assets.set(tag, name)
 
     def store(self) -> None:
-        """Bring everything added into the journal. Raises OSError: the rest waits."""
-        for table in (self.names, self.assets, self.zones):  # the journal uses the numbers
+        """Move everything added to the journal. Raises OSError: the rest waits."""
+        for table in (self.names, self.assets, self.zones):  # first: the journal refers to the tags' numbers
             table.save()
         self.fixes.store()
         self.events.store()
@@ -381,12 +380,12 @@ def thinned(table: pa.Table) -> pa.Table:
 
 
 def _begins(tag: NDArray[Any], part: NDArray[Any]) -> NDArray[np.bool_]:
-    """Mark rows at which another tag, or another part of its time, begins."""
+    """Mark the rows where the tag, or the part of its time, differs from the row before."""
     return np.append(True, (np.diff(tag) != 0) | (np.diff(part) != 0))
 
 
 def _remove(files: Iterable[Path]) -> None:
     for file in files:
         file.unlink()
-        with contextlib.suppress(OSError):  # other files are there
+        with contextlib.suppress(OSError):  # not empty
             file.parent.rmdir()

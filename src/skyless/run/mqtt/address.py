@@ -1,4 +1,4 @@
-"""Address of one or several MQTT brokers, with user, password and certificates."""
+"""Address of one or several MQTT brokers, with user, password and certificates; roles at the broker."""
 
 import os
 import re
@@ -25,7 +25,7 @@ _LOOPBACK: Final = re.compile(r"localhost|127(\.\d{1,3}){3}|::1")
 _PASSWORD: Final = re.compile(
     r"^((?>(?:[^:/?#]*://)?)(?>\[[\da-fA-F:.]+\]|[^:/?#@]*)):(?!\d{1,5}(?:/[^?#@]*)?\?\w+(?:[=&]|$)).*@"
 )
-"""The text after a colon behind user or host, up to the last ``@``; not a port and a query such as ``?to=a@b``."""
+"""The text between a colon after user or host and the last ``@``; not a port with a query such as ``?to=a@b``."""
 
 
 class MqttAddress(Struct, frozen=True):
@@ -128,7 +128,7 @@ def _credentials(url: str, parts: SplitResult) -> tuple[str | None, str | None]:
 
 
 def _is_host(host: str | None) -> bool:
-    """Whether a host can be resolved: labels of 1 … 63 characters, without blanks."""
+    """Whether a host name is well-formed: labels of 1 … 63 characters, without blanks."""
     if not host or re.search(r"[\s\x00-\x1f]", host):
         return False
     return all(0 < len(label) <= 63 for label in host.removesuffix(".").split("."))
@@ -149,11 +149,11 @@ def is_loopback(host: str) -> bool:
 
 
 # Roles at the broker (``docs/mqtt.md``, Roles): permitted topics, and passwords. A private folder has one file for each
-# role, ``<role>.env``, in the form of systemd, Docker and the shell; each is copied only to the machines of its role.
+# role, ``<role>.env``, which systemd, Docker and the shell can read; each is copied only to the machines of its role.
 
 
 class Role(StrEnum):
-    """Purpose of a client; except for the stranger's, also its user name."""
+    """Purpose of a client, and its user name; a stranger has none."""
 
     ANCHORS = "anchors"
     """Anchors, and the emulated air."""
@@ -169,7 +169,7 @@ class Role(StrEnum):
 
 
 class Access(Struct, frozen=True):
-    """Topic filters of a role."""
+    """Topic filters permitted to a role."""
 
     publish: tuple[str, ...]
     subscribe: tuple[str, ...]
@@ -253,7 +253,7 @@ ACCESS: Final = {
 
 
 def may_subscribe(user: str | None, topic_filter: str) -> bool | None:
-    """Whether the roles let a user subscribe to a filter; None if unknown, as without roles."""
+    """Whether the roles let a user subscribe to a filter; None if unknown, as at a broker without roles."""
     if user is not None and user not in ACCESS:
         return None
     granted = any(topic_matches_sub(one, topic_filter) for one in ACCESS[Role(user or Role.STRANGER)].subscribe)

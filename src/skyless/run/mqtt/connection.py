@@ -1,4 +1,4 @@
-"""A single connection to a broker until it breaks: paho's client, driven by our event loop."""
+"""A single connection to a broker until it breaks: paho's client, driven by our event loop. The queue of messages."""
 
 import asyncio
 import contextlib
@@ -29,14 +29,14 @@ _KEPT_S: Final = 0.5
 _LONGEST_KEPT: Final = 20
 
 _SEND_BUFFER: Final = 262_144
-"""Send buffer in the kernel, and as large a one in the process; small, so that few outdated fixes wait in them."""
+"""Size of the send buffers in the kernel and in the process; small, so that few outdated fixes wait in them."""
 
 _MAX_PACKETS: Final = 100
 """Packets read at once, before the event loop continues with other work."""
 
 _QUICK_ACK: Final = getattr(socket, "TCP_QUICKACK", None)
-"""Linux resets it after each use. Without it TCP delays acknowledgements by 40 ms, and mosquitto holds messages back
-until the one before is acknowledged.
+"""Without this option TCP delays acknowledgements by 40 ms, and mosquitto holds messages back until the one before is
+acknowledged. Linux resets it after each use.
 """
 
 _REFUSALS: Final = {
@@ -48,21 +48,21 @@ _log = logging.getLogger("skyless.run.mqtt")
 
 
 class Will(Struct, frozen=True):
-    """What the broker publishes, retained and at QoS 1, if the client vanishes without disconnecting."""
+    """The message that the broker publishes, retained and at QoS 1, if the client vanishes without disconnecting."""
 
     topic: str
     payload: bytes
 
 
 class Introduction(Struct, frozen=True):
-    """What a client sends the broker about itself."""
+    """What a client tells the broker about itself."""
 
     client: str
-    """Client name; a new one if it is empty."""
+    """Client identifier; a random one if it is empty."""
     keepalive_s: int
     """The connection is given up when the broker has been silent for this long."""
     persistent: bool = False
-    """Whether the broker keeps subscriptions, and messages of QoS 1, for this name."""
+    """Whether the broker keeps subscriptions, and messages of QoS 1, for this identifier."""
     will: Will | None = None
 
 
@@ -71,11 +71,11 @@ class Reactions(Struct, frozen=True):
 
     message: Callable[[str, bytes], None] = lambda _topic, _payload: None
     acknowledged: Callable[[int], None] = lambda _number: None
-    """The broker has the message of QoS 1 that ``publish`` gave this number."""
+    """The broker has acknowledged the message of QoS 1 with this number, which ``publish`` returned."""
     writable: Callable[[], None] = lambda: None
     """The connection accepts more data again."""
     subscribed: Callable[[str, bool], None] = lambda _filter, _granted: None
-    """The broker has granted a subscription, or has refused it."""
+    """The broker has granted or refused a subscription."""
 
 
 class RefusedError(Exception):
@@ -83,20 +83,20 @@ class RefusedError(Exception):
 
 
 class Connection:
-    """A paho client for one connection: a broken one is discarded, and nothing waits here for the next one.
+    """A paho client for one connection. It is discarded when it breaks; no data wait here for the next connection.
 
-    paho writes at once, because it has no ``on_socket_register_write``. What the socket does not accept waits in paho
-    until the socket is writable, and what is published while paho reads, until it has read.
+    paho writes at once, because it has no ``on_socket_register_write``. Data that the socket does not accept wait in
+    paho until the socket is writable; data published while paho reads wait until it has read.
     """
 
     def __init__(self, address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions) -> None:
         self.writable = False
-        """Whether the connection accepts more; false while a slow broker's buffers are full, and once it is lost."""
+        """Whether the connection accepts more data; false while a slow broker's buffers are full, and once lost."""
         self.lost = asyncio.Event()
         self.reason = "the broker has closed the connection"
         """Why the connection was lost."""
         self.unread_since_s: float | None = None
-        """Since when messages of the broker have waited to be read, by the loop's clock; None if none do."""
+        """Since when, by the loop's clock, messages from the broker have waited to be read; None if none wait."""
         self._address = address
         self._keepalive_s = who.keepalive_s
         self._react = react
@@ -134,9 +134,9 @@ class Connection:
         self._keep_alive()
 
     def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> int:
-        """Send a message, or queue it for the socket; never blocks. Returns its number until it is acknowledged."""
+        """Send a message, or queue it for the socket; never blocks. Returns its number for ``acknowledged``."""
         info = self._client.publish(topic, payload, qos, retain)
-        while info.rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:  # its number is still in use, 65 535 messages later
+        while info.rc == MQTTErrorCode.MQTT_ERR_QUEUE_SIZE:  # the number is still in use, 65 535 messages later
             info = self._client.publish(topic, payload, qos, retain)
         if qos and not info.rc:
             self._flying[info.mid] = info
@@ -169,7 +169,7 @@ class Connection:
             sock.close()
 
     async def leave(self) -> None:
-        """Disconnect, and close once all is sent, or after a second."""
+        """Disconnect, and close once everything is sent, or after a second."""
         self.writable = False
         if not self.lost.is_set():
             self._client.disconnect()
@@ -179,10 +179,10 @@ class Connection:
                 await self.lost.wait()
         self.abort("left")
 
-    # What the event loop calls
+    # Called by the event loop
 
     def _begin(self) -> None:
-        """Keep buffers small, so that no old data pile up in them, and watch the socket."""
+        """Set the socket's options and paho's callbacks, and watch the socket. Raises ConnectionError if it is gone."""
         self._socket = cast(socket.socket | None, self._client.socket())
         if self._socket is None:
             raise ConnectionError(self.reason)
@@ -205,7 +205,8 @@ class Connection:
             self._client.loop_read()
             left -= 1
             # The socket does not signal data that TLS has already decrypted.
-            if not _decrypted(self._socket) and (left <= 0 or self._messages == seen):
+            decrypted = self._socket.pending() if isinstance(self._socket, ssl.SSLSocket) else 0
+            if not decrypted and (left <= 0 or self._messages == seen):
                 break
         self._reading = False
         if left > 0:
@@ -221,7 +222,7 @@ class Connection:
         self._write()
 
     def _write(self) -> None:
-        """Write waiting data, and accept more once nothing waits."""
+        """Write waiting data; once none are left, accept more."""
         if self._client.want_write():
             self._client.loop_write()
         if not self._client.want_write():
@@ -265,7 +266,7 @@ class Connection:
             self._accepted.exception()  # retrieved, in case nothing awaits it
         self.lost.set()
 
-    # What paho calls
+    # Called by paho
 
     def _on_connect(self, _client: object, _data: object, _flags: object, code: ReasonCode, _more: object) -> None:
         if self._accepted.done():
@@ -301,15 +302,10 @@ class Connection:
             self._react.subscribed(name, not code.is_failure)
 
 
-def _decrypted(sock: socket.socket) -> int:
-    """Number of bytes waiting in TLS."""
-    return sock.pending() if isinstance(sock, ssl.SSLSocket) else 0
-
-
 async def open_connection(
     address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions | None = None
 ) -> Connection:
-    """Open a connection; of several brokers, to the first that accepts.
+    """Open a connection, to the first of several brokers that accepts.
 
     Raises:
         RefusedError: the broker, or the last of several, refuses this client.
@@ -344,9 +340,9 @@ async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) 
 
 
 async def kept_messages(address: MqttAddress, filters: Iterable[str]) -> dict[str, bytes]:
-    """Return the retained messages of some filters by topic, including any that arrive meanwhile.
+    """Return the retained messages that match the filters, by topic, and any others that arrive meanwhile.
 
-    Nothing marks the last one; reading ends after half a second without any. Raises OSError and RefusedError.
+    Nothing marks the last one: reading ends after half a second without any. Raises OSError and RefusedError.
     """
     found: dict[str, bytes] = {}
     react = Reactions(message=found.__setitem__)
@@ -365,7 +361,7 @@ async def kept_messages(address: MqttAddress, filters: Iterable[str]) -> dict[st
 
 
 def trouble_with(address: MqttAddress, error: OSError | RefusedError) -> str:
-    """Describe in one line for a person why a connection cannot be made."""
+    """Describe in one line, for a person, why a connection failed."""
     if isinstance(error, RefusedError):
         hint = ""
         if "user" in str(error):
@@ -382,7 +378,7 @@ def trouble_with(address: MqttAddress, error: OSError | RefusedError) -> str:
 
 
 def _make_client(address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, timeout_s: float) -> paho.Client:
-    """Make a client that neither bounds the messages in flight nor reconnects; a link does both."""
+    """Make a paho client that neither limits the messages in flight nor reconnects: a link does both."""
     client = paho.Client(
         CallbackAPIVersion.VERSION2,
         who.client or f"skyless-{secrets.token_hex(4)}",
@@ -396,12 +392,12 @@ def _make_client(address: MqttAddress, tls: ssl.SSLContext | None, who: Introduc
         client.will_set(who.will.topic, who.will.payload, qos=1, retain=True)
     if tls is not None:
         client.tls_set_context(tls)
-        client.tls_insecure_set(not tls.check_hostname)  # else paho compares the names itself
+        client.tls_insecure_set(not tls.check_hostname)  # otherwise paho compares the names itself
     return client
 
 
 async def _connect(client: paho.Client, address: MqttAddress, keepalive_s: int) -> None:
-    """Let paho connect, which blocks, in a daemon thread for which not even the program's end waits.
+    """Let paho connect, which blocks, in a daemon thread: not even the program's end waits for it.
 
     Raises:
         OSError: the broker cannot be reached.
@@ -421,7 +417,7 @@ async def _connect(client: paho.Client, address: MqttAddress, keepalive_s: int) 
         error: BaseException | None = None
         try:
             client.connect(address.host, address.port, keepalive_s)
-        except Exception as caught:  # noqa: BLE001 - raised where it is awaited
+        except Exception as caught:  # noqa: BLE001 - raised where the future is awaited
             error = caught
         try:
             loop.call_soon_threadsafe(finish, error)
@@ -443,25 +439,25 @@ def _close(client: paho.Client) -> None:
         sock.close()
 
 
-# Messages waiting for a broker: bounded, so that a slow or absent one costs limited memory.
+# Messages waiting for a broker. Their number is limited, so that a slow or absent broker costs limited memory.
 
 _TOPIC: Final = re.compile(r"[^\s+#\x00-\x1f\x7f]{1,250}")
-"""Topics that every broker accepts; nats-server accepts no blanks."""
+"""Topics that every broker accepts; nats-server refuses blanks."""
 
 
 class Limits(Struct, frozen=True):
     """Limits on waiting messages. Payloads in bytes."""
 
     topics: int = 1000
-    """Topics of QoS 0, each with its newest message, and as many retained ones."""
+    """Topics of QoS 0, each with its newest message; the same number again of retained topics."""
     topic_bytes: int = 16_000_000
     messages: int = 20_000
     """Messages of QoS 1."""
     bytes: int = 64_000_000
     window: int = 64
-    """Messages of QoS 1 that may be sent and not yet acknowledged."""
+    """Messages of QoS 1 that may be in flight: sent, but not yet acknowledged."""
     payload: int = 8_000_000
-    """The largest message; the embedded broker takes no larger one."""
+    """The largest payload; the embedded broker takes no larger one."""
 
 
 class Waiting(Struct, frozen=True, gc=False):
@@ -472,15 +468,15 @@ class Waiting(Struct, frozen=True, gc=False):
     qos: int
     retain: bool
     until_s: float = math.inf
-    """A message of QoS 0 is not sent after this time, by its sender's clock."""
+    """A message of QoS 0 is not sent after this time, by the clock of ``next_message``."""
 
 
 class Outbox:
     """Messages not yet sent, and those of QoS 1 not yet acknowledged.
 
-    Of QoS 0 only the newest message of a topic is kept, and the oldest topics are dropped when there are too many. Of
-    QoS 1 all are kept in order, and the oldest that is not in flight is dropped when there are too many. Of retained
-    messages the newest of each topic is kept, to be sent again after each reconnect.
+    QoS 0: only the newest message of a topic is kept; if there are too many topics, the oldest is dropped. QoS 1: all
+    messages are kept in order; if there are too many, the oldest that is not in flight is dropped. Retained: the newest
+    message of each topic is kept, and sent again after each reconnect.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -501,9 +497,9 @@ class Outbox:
         """Messages of QoS 0 given to the connection, and messages of QoS 1 acknowledged."""
 
     def add(self, topic: str, payload: bytes, qos: int, *, retain: bool, until_s: float = math.inf) -> str | None:
-        """Add a message; return the fault of one that no broker would accept.
+        """Add a message. Returns its fault if brokers would not accept it.
 
-        One of QoS 0 that has not been taken by ``until_s``, on the clock of ``next_message``, is dropped.
+        A message of QoS 0 that has not been taken by ``until_s``, on the clock of ``next_message``, is dropped.
         """
         fault = self._fault(topic, payload)
         if fault is not None:
@@ -539,14 +535,14 @@ class Outbox:
         return None
 
     def mark_sent(self, message: Waiting, number: int) -> None:
-        """Note that the connection has the message, under this number."""
+        """Note that a message was given to the connection, under this number."""
         if message.qos:
             self._flying[number] = message
         else:
             self.sent += 1
 
     def acknowledge(self, number: int) -> None:
-        """Note that the broker has the message of QoS 1 with this number."""
+        """Note that the broker has acknowledged the message of QoS 1 with this number."""
         message = self._flying.pop(number, None)
         if message is None:
             return
@@ -555,7 +551,7 @@ class Outbox:
             self._queue_bytes -= len(message.payload)
 
     def restart(self) -> None:
-        """Prepare for a new connection: resend what was not acknowledged, and what the broker should have retained."""
+        """Prepare for a new connection: resend unacknowledged messages and all retained ones."""
         self._again.extendleft(message for message in reversed(self._flying.values()) if not message.retain)
         self._flying.clear()
         self._to_retain = dict(self._retained)
@@ -598,7 +594,7 @@ class Outbox:
             self.dropped += 1
 
     def _retain(self, message: Waiting) -> None:
-        """Replace the retained message of a topic."""
+        """Replace the retained message of a topic; drop it if there is no room."""
         self.forget(message.topic)
         more = len(self._retained) >= self._limits.topics
         if more or self._retained_bytes + len(message.payload) > self._limits.topic_bytes:

@@ -1,4 +1,4 @@
-"""A link to an MQTT broker that never delays its owner."""
+"""A link to an MQTT broker, which never delays its owner."""
 
 import asyncio
 import logging
@@ -39,8 +39,9 @@ Handler = Callable[[str, bytes], None]
 
 READER_KEEPALIVE_S: Final = 20
 NODE_KEEPALIVE_S: Final = 10
-"""How long a broker may be silent. A link sends a ping after half of that time, and the broker disconnects a client
-that has been silent for three quarters; a busy event loop may delay a ping by a quarter. With 10 s bridges lost it.
+"""How long a broker may be silent. A link sends a ping after half of this time, and the broker disconnects a client
+that has been silent for three quarters of it; so a busy event loop may delay a ping by a quarter. With 10 s, bridges
+lost their connections.
 """
 
 _MAX_TOPICS: Final = 10_000
@@ -54,13 +55,13 @@ _ECHO_S: Final = 5.0
 RESEND_S: Final = 30.0
 """Longest time between repetitions of a status or a site, which a bridged broker may have missed or lost."""
 _QUICK_START_S: Final = 0.5
-"""A first connection that is made within this time is not logged."""
+"""A first connection made within this time is not logged."""
 
 
 class Link:
     """A node's MQTT connection, restored whenever it is lost while ``run`` runs.
 
-    If a broker of its address refuses it or does not answer, it tries the next. It publishes the node's status,
+    If one of the address's brokers refuses or does not answer, it tries the next. It publishes the node's status,
     retained and with a last will. Messages wait in an ``Outbox`` while the broker is slow or away. Everything runs in
     one event loop. Subscribers may get a message of QoS 1 twice if a connection breaks.
     """
@@ -79,8 +80,8 @@ class Link:
     ) -> None:
         """``persistent`` lets the broker keep messages of QoS 1 for this name until the link is stopped.
 
-        Two persistent links of one name would end each other's connection, and so could a stranger who knows it.
-        Therefore the secret ``client_key`` becomes part of the client identifier.
+        Two persistent links with one client identifier would end each other's connection, and a stranger who knows the
+        identifier could do so. Therefore the secret ``client_key`` becomes part of it.
 
         Raises:
             SkylessError: the address names a file of certificates that cannot be used.
@@ -127,7 +128,7 @@ class Link:
 
     @property
     def unread_s(self) -> float:
-        """For how long messages of the broker have continuously waited to be read; 0 if none do."""
+        """For how long messages from the broker have continuously waited to be read; 0 if none wait."""
         since_s = None if self._connection is None else self._connection.unread_since_s
         return 0.0 if since_s is None else asyncio.get_running_loop().time() - since_s
 
@@ -145,9 +146,9 @@ class Link:
         retain: bool = False,
         until_s: float = math.inf,
     ) -> None:
-        """Queue a message; returns at once, even if the broker does not answer. A struct becomes JSON.
+        """Queue a message, and return at once. A struct becomes JSON.
 
-        One of QoS 0 that cannot be sent before ``until_s``, by the host's monotonic clock, is dropped.
+        A message of QoS 0 that cannot be sent before ``until_s``, by the host's monotonic clock, is dropped.
         """
         payload = message if isinstance(message, bytes) else _encode(message)
         fault = self._outbox.add(topic, payload, qos, retain=retain, until_s=until_s)
@@ -161,17 +162,17 @@ class Link:
         self._outbox.forget(topic)
 
     def subscribe(self, topic_filter: str, handler: Handler, qos: int = 0) -> None:
-        """Call ``handler`` with every message of a filter, also after reconnects.
+        """Call ``handler`` with every message that matches a filter, also after reconnects.
 
         A second handler for the same filter replaces the first. If filters of one link overlap, some brokers send a
-        message once for each, and all matching handlers are called as often.
+        message once for each of them; all matching handlers are then called each time.
         """
         self._subscriptions.add(topic_filter, handler, qos)
         if self._connection is not None:
             self._connection.subscribe({topic_filter: qos})
 
     async def run(self) -> None:
-        """Stay connected until cancelled; then send what waits, for at most a second, and disconnect."""
+        """Stay connected until cancelled; then send waiting messages, for at most a second, and disconnect."""
         failures = 0
         try:
             while True:
@@ -188,7 +189,7 @@ class Link:
                 _log.warning("stopped; the broker %s has not accepted %d messages", self.address, self.unacknowledged)
 
     async def _one_connection(self) -> bool:
-        """Connect once, and return when the connection is lost. Returns whether it was made."""
+        """Connect once, and wait until the connection is lost. Returns False if none was made."""
         broker = self._brokers[0]
         try:
             connection = await open_connection(broker, self._tls, self._introduction(), self._reactions)
@@ -210,7 +211,7 @@ class Link:
         return Introduction(self._client, self._keepalive_s, self._persistent, will)
 
     def _up(self, connection: Connection) -> None:
-        connection.subscribe(self._subscriptions.filters)  # first, so that what is kept comes before it is replaced
+        connection.subscribe(self._subscriptions.filters)  # first: retained messages come before they are replaced
         self._connection = connection
         self._stopping = False
         self._reconnects += 1
@@ -248,7 +249,7 @@ class Link:
         self.publish(self._status_topic, self._online, qos=1, retain=True)
 
     def _repeat_later(self, connection: Connection) -> None:
-        """Repeat the status during a connection, at random times because many links connect at the same moment."""
+        """Schedule a repetition of the status, at a random time because many links connect at the same moment."""
         wait_s = RESEND_S * random.uniform(0.5, 1.0)
         asyncio.get_running_loop().call_later(wait_s, self._repeat_status, connection)
 
@@ -267,7 +268,7 @@ class Link:
             self._publish_online()
 
     def _check_echo(self, connection: Connection) -> None:
-        """Warn if the broker drops what it acknowledges: MQTT 3.1.1 has no other answer to a missing permission."""
+        """Warn if the broker drops acknowledged messages: MQTT 3.1.1 has no other answer to a missing permission."""
         if self._connection is connection and not self._has_echo and not self.unacknowledged:
             _log.warning(
                 "the broker %s has not returned %s: its user may not publish it, or not read it",
@@ -338,7 +339,7 @@ class Link:
 
 
 class Subscriptions:
-    """The handlers of one link: a tree of the levels of their filters, and a cache for the newest topics."""
+    """The handlers of one link, in a tree of the levels of their filters; matches are cached by topic."""
 
     def __init__(self) -> None:
         self.filters: dict[str, int] = {}
@@ -355,16 +356,11 @@ class Subscriptions:
         """Call all handlers whose filters match."""
         handlers = self._found.get(topic)
         if handlers is None:
-            handlers = self._find(topic)
+            if len(self._found) >= _MAX_TOPICS:
+                self._found.clear()
+            handlers = self._found[topic] = tuple(self._handlers.iter_match(topic))  # type: ignore[no-untyped-call]
         for handler in handlers:
             try:
                 handler(topic, payload)
             except Exception:  # noqa: BLE001 - one bad handler must not cost the others the connection
                 _log.exception("a message of %s could not be handled", topic)
-
-    def _find(self, topic: str) -> tuple[Handler, ...]:
-        if len(self._found) >= _MAX_TOPICS:
-            self._found.clear()
-        found: tuple[Handler, ...] = tuple(self._handlers.iter_match(topic))  # type: ignore[no-untyped-call]
-        self._found[topic] = found
-        return found

@@ -27,10 +27,10 @@ MAX_LEASE_S: Final = 60.0
 
 
 class SiteMessage(Struct, frozen=True):
-    """The site as in its file, retained, so that a new tag or page has it at once."""
+    """The site as in its file, retained so that a new tag or page has it at once."""
 
     site: Site
-    """Without its outline, floors and rules of alarms, which earlier versions refuse in it."""
+    """Without outline, floors and alarm rules, which earlier versions refuse here."""
     simulated: bool
     """True when its radios are emulated."""
     unix_s: float
@@ -39,7 +39,7 @@ class SiteMessage(Struct, frozen=True):
     floors: tuple[FloorSite, ...] | UnsetType = UNSET
     """The storeys, where the site's file has them."""
     alarms: tuple[AlarmRule, ...] = ()
-    """The rules of alarms that the site's file has."""
+    """The alarm rules in the site's file."""
 
     @property
     def whole_site(self) -> Site:
@@ -48,14 +48,14 @@ class SiteMessage(Struct, frozen=True):
 
 
 def site_message(site: Site, *, simulated: bool, unix_s: float) -> SiteMessage:
-    """Make the message of a site, with its outline, floors and rules of alarms in fields of their own."""
+    """Make the message of a site, with outline, floors and alarm rules in their own fields."""
     inner = replace(site, outline_m=UNSET, floors=UNSET, alarms=UNSET)
     alarms = () if site.alarms is UNSET else site.alarms
     return SiteMessage(inner, simulated, unix_s, site.outline_m, site.floors, alarms)
 
 
 class StatusMessage(Struct, frozen=True):
-    """Whether a node is online; retained, and the broker itself publishes ``online: false`` as its last will."""
+    """Whether a node is online, retained. As its last will, the broker itself publishes ``online: false``."""
 
     online: bool
     kind: str
@@ -68,7 +68,7 @@ class StatusMessage(Struct, frozen=True):
 
 
 class FixMessage(Struct, frozen=True):
-    """One fix of one tag. A tag publishes at its configured rate; ``serial`` counts all fixes that it made."""
+    """One fix of one tag. A tag publishes at its configured rate; ``serial`` counts all its fixes."""
 
     tag: str
     serial: int
@@ -96,14 +96,14 @@ class FixMessage(Struct, frozen=True):
     latency_s: float
     """From the end of the last frame to the computed fix."""
     hpl_m: float | None = None
-    """Horizontal protection level; None where there is no guarantee, or the method has none."""
+    """Horizontal protection level; None if there is no guarantee, or if the method has none."""
     vpl_m: float | None = None
     integrity_risk: float | None = None
     """Probability, for each fix, that the error exceeds its level."""
     alert: str | None = None
     """A value of ``skyless.core.alert.Alert``."""
     verified_until_s: float | None = None
-    """Up to this time, on the scale of ``time_s``, all beacons that count are verified; None where none is."""
+    """Up to this time, on the scale of ``time_s``, all beacons that count are verified; None if none is verified."""
     unverified: float = 1.0
     """Share of the beacons of the last second that are not verified, or not yet."""
 
@@ -118,7 +118,7 @@ class Counters(Struct, frozen=True):
 
 
 class Phase(Struct, frozen=True, array_like=True):
-    """One message of a tag's last superframe, times in s since that superframe's first message was heard."""
+    """One message of a tag's last superframe. Times are in s since the superframe's first message was heard."""
 
     superframe: int
     slot: int
@@ -142,7 +142,7 @@ class TagHealth(Struct, frozen=True):
     updates_per_s: float
     """Fixes in the last second."""
     reason: str | None
-    """Why there is no fix; None where there is one."""
+    """Why there is no fix; None if there is one."""
     first_fix_s: float | None
     """From the start to the first fix."""
     latency_p50_s: float | None
@@ -152,39 +152,39 @@ class TagHealth(Struct, frozen=True):
     """Dropped frames by reason."""
     mqtt: Counters
     cpu: float
-    """Share of a core that the process uses; a process with several tags divides it among them."""
+    """Share of a core that the process uses, divided among its tags if it has several."""
     memory_bytes: int
     """Resident memory of the process."""
     phases: tuple[Phase, ...]
     """The messages of the last whole superframe."""
     late: int = 0
-    """Receptions dropped because they were too old at their turn, and fixes not given because they were: ``counters``
-    has them as ``late-reception`` and ``late-fix``."""
+    """Receptions dropped because they were too old when their turn came, and fixes withheld for the same reason;
+    ``counters`` has them as ``late-reception`` and ``late-fix``."""
     lateness_s: float = 0.0
-    """Largest age of a reception at its turn, or of a fix when it was made, in the last second."""
+    """Largest age in the last second of a reception when its turn came, or of a fix when it was made."""
     trust: Literal["open", "verified"] | None = None
-    """Which fixes a tag gives that verifies beacons; None for one without the site's public key."""
+    """Which fixes a tag that verifies beacons outputs; None for a tag without the site's public key."""
     is_verified: bool = False
     """Whether beacons have been verified within the last seconds."""
     faults: dict[str, str] = {}
-    """Anchors whose beacons, or beacons in whose name, were not accepted within the last seconds, and why
+    """Anchors whose beacons, genuine or forged, were rejected within the last seconds, and why
     (``skyless.core.keys.fault.Fault``)."""
     clock_error_s: float | None = None
-    """How far the host's clock is ahead of the site's where that is more than the bound; None where all is well."""
+    """How far the host's clock is ahead of the site's, if by more than the bound; None otherwise."""
     multipath_std_m: float | None = None
-    """Standard deviation by which ranges change as the tag moves, where that is more than the site file states."""
+    """Standard deviation by which ranges change as the tag moves, if it exceeds the site file's."""
     multipath_distance_m: float | None = None
-    """The distance walked within which they do."""
+    """Distance walked within which ranges change by ``multipath_std_m``."""
     carrier_phase_anchors: tuple[int, ...] = ()
-    """Identifiers of the anchors the phases of whose carriers are in use."""
+    """Identifiers of the anchors whose carrier phases are in use."""
     on_board: bool = False
-    """Whether the tag's board computes, and its program only passes on what that says."""
+    """Whether the tag's board computes the fixes, and its program only passes them on."""
     battery_share: float | None = None
-    """What is left in the tag's battery, from 0 to 1; None where it is not known."""
+    """Remaining charge of the tag's battery, from 0 to 1; None if unknown."""
 
 
 NOT_DROPS: Final = frozenset({"heard", "sent", "takeover"})
-"""Counters of anchors that count something else than dropped frames."""
+"""Counters of anchors that do not count dropped frames."""
 
 
 class AnchorHealth(Struct, frozen=True):
@@ -201,9 +201,9 @@ class AnchorHealth(Struct, frozen=True):
     synchronised: bool
     """Whether it may send; always in mode free."""
     offset_s: float | None
-    """Own counter less the master's scale, modulo the wrap, in (-8.6, 8.6]; None in mode free."""
+    """Own counter minus the master's scale, modulo the wrap, in (-8.6, 8.6]; None in mode free."""
     rate_ppm: float | None
-    """Own rate against the same."""
+    """Own rate relative to the master's."""
     offset_std_m: float | None
     sent: int
     late: int
@@ -217,19 +217,19 @@ class AnchorHealth(Struct, frozen=True):
     mode: Literal["master", "free"] = "master"
     """Mode of the site's schedule."""
     missed_share: float = 0.0
-    """Share of its transmissions of the last second that came too late."""
+    """Share of the last second's transmissions that came too late."""
     chain: int | None = None
-    """Serial number of the key chain that it uses; None for an anchor without keys."""
+    """Serial number of the key chain in use; None for an anchor without keys."""
     chain_ends_unix_s: float | None = None
     """When the last of its key chains ends."""
     code_fault: str | None = None
-    """Why an anchor with keys sends without codes (``skyless.core.keys.fault.Fault``); None where it has them."""
+    """Why an anchor with keys sends without codes (``skyless.core.keys.fault.Fault``); None if it sends them."""
     faults: dict[str, str] = {}
-    """Other anchors whose beacons, or beacons in whose name, were not accepted within the last seconds, and why."""
+    """Other anchors whose beacons, genuine or forged, were rejected within the last seconds, and why."""
 
 
 class EtherHealth(Struct, frozen=True):
-    """What the emulated air has carried."""
+    """Counts of the emulated air."""
 
     unix_s: float
     simulated_s: float
@@ -260,18 +260,18 @@ class TruthMessage(Struct, frozen=True):
 
 
 class RequestMessage(Struct, frozen=True):
-    """A request for raw receptions; to be repeated before the lease ends."""
+    """A request for raw receptions; must be repeated before the lease ends."""
 
     by: str
     receptions: tuple[str, ...]
     """Names of tags; ``*`` means all of them. Empty ends the request."""
     lease_s: float
     stamps: bool = False
-    """Whether anchors are to publish their stamps (``StampsMessage``)."""
+    """Whether anchors should publish their stamps (``StampsMessage``)."""
 
 
 class Leases:
-    """Who has requested something that costs work or bandwidth, and until when. Times are passed in."""
+    """Leases on something that costs work or bandwidth: who holds one, and until when. Times are passed in."""
 
     def __init__(self) -> None:
         self._until_s: dict[str, float] = {}
@@ -304,7 +304,7 @@ class Leases:
 
 
 class RawReception(Struct, frozen=True, array_like=True):
-    """One reception as the radio gave it; bytes as base64 in JSON."""
+    """One reception as the radio reported it; bytes are base64 in JSON."""
 
     frame: bytes
     rx_ticks: int
@@ -320,7 +320,7 @@ class ReceptionsMessage(Struct, frozen=True):
 
     tag: str
     segment: str
-    """Another one begins when a run is interrupted; each begins with ``start``."""
+    """A new segment begins when the run is interrupted; its first message has ``start``."""
     first: int
     """Number of the first reception within the segment; the next message continues where this one ends."""
     unix_less_host_s: float
@@ -338,7 +338,7 @@ class SegmentStart(Struct, frozen=True):
     settings: dict[str, str | float | int | None]
     """Arguments of the receiver."""
     state: bytes | None
-    """Its state (``skyless.run.recordings.recorder``); None for a receiver that had heard nothing yet."""
+    """The receiver's state (``skyless.run.recordings.reception_log``); None if it could not be saved."""
 
 
 class Zone(Struct, frozen=True):
@@ -349,7 +349,7 @@ class Zone(Struct, frozen=True):
     polygon_m: tuple[tuple[float, float], ...]
     colour: str | None = None
     floor: int | None = None
-    """Number of the floor that it lies on; None: it reaches over all floors."""
+    """Number of the zone's floor; None means all floors."""
 
 
 class SiteZones(Struct, frozen=True):
@@ -365,9 +365,9 @@ class ZonesMessage(Struct, frozen=True):
 
     zones: tuple[Zone, ...]
     site: str = ""
-    """Name of the site that they were drawn at: another site may have the same number. Empty: not known."""
+    """Name of the site for which they were drawn, as another site may have the same number; empty if unknown."""
     others: tuple[SiteZones, ...] = ()
-    """Zones of other sites that had this number before, kept until those return."""
+    """Zones of other sites that had this number before, kept in case these sites return."""
 
 
 class ZoneEvent(Struct, frozen=True):
@@ -382,25 +382,25 @@ class ZoneEvent(Struct, frozen=True):
 
 
 class TagZones(Struct, frozen=True):
-    """The zones that a tag is in at present; retained, by what announces tags to Home Assistant."""
+    """The zones that a tag is in now, retained; published by the bridge that announces tags to Home Assistant."""
 
     tag: str
     unix_s: float
-    """Time of the fix with which this became so."""
+    """Time of the fix that led to this state."""
     usable: bool
-    """Whether the tag has fixes that may be used; without, it is in no zone."""
+    """Whether the tag has usable fixes; if not, it is in no zone."""
     zone: str | None = None
-    """The id of the smallest of them."""
+    """The id of the smallest zone."""
     name: str | None = None
-    """Its name."""
+    """The name of the smallest zone."""
     zones: tuple[str, ...] = ()
-    """The ids of all, the smallest first."""
+    """The ids of all zones, the smallest first."""
     by: str = ""
-    """Name of the bridge that says so."""
+    """Name of the publishing bridge."""
 
 
 class TagPosition(Struct, frozen=True):
-    """Where a tag is, at most once a second and only when that has changed; retained, for programs that keep each."""
+    """A tag's position, retained; at most once a second and only if it has changed, for programs that store each."""
 
     tag: str
     unix_s: float
@@ -409,9 +409,9 @@ class TagPosition(Struct, frozen=True):
     std_m: float
     """One-sigma radial error, at least 1 cm in each axis."""
     horizontal_std_m: float
-    """The same on the floor."""
+    """The same in the horizontal plane."""
     latitude_deg: float | None = None
-    """WGS 84; None where the site does not say where it is."""
+    """WGS 84; None without a georeference of the site."""
     longitude_deg: float | None = None
     height_m: float | None = None
     """Above the ellipsoid."""
@@ -421,45 +421,45 @@ class Stamp(Struct, frozen=True, array_like=True):
     """One reception of an anchor by another."""
 
     anchor: int
-    """Which was received."""
+    """The anchor that was received."""
     tx_ticks: int
-    """Its TX stamp, as its frame states it, 40 bits."""
+    """The sender's TX stamp, as its frame states it, 40 bits."""
     rx_ticks: int
     """The publishing anchor's RX stamp, 40 bits."""
     carrier_phase_cycles: float | None = None
-    """Phase of the carrier at this reception, in [0, 1), where it was measured."""
+    """Phase of the carrier at this reception, in [0, 1), if it was measured."""
 
 
 class StampsMessage(Struct, frozen=True):
-    """What an anchor has received of the others since its last message, in order."""
+    """An anchor's receptions of other anchors since its last message, in order."""
 
     anchor: int
     run: str
-    """Changes when its counter has restarted."""
+    """Changes when the anchor's counter has restarted."""
     unix_s: float
     stamps: tuple[Stamp, ...]
     missed: int = 0
-    """Stamps that were dropped before these, as nobody collected them in time."""
+    """Stamps dropped before these because nobody collected them in time."""
 
 
 class SurveyFactsMessage(Struct, frozen=True):
-    """What a user knows of a site; replaces what was given before."""
+    """Facts about a site from a user; they replace all earlier ones."""
 
     facts: Facts
     floor_plan: FloorPlanSite | None = None
-    """Where the image of the floor lies; ``image`` is empty for the one on MQTT."""
+    """Placement of the floor's image; ``image`` is empty for the image on MQTT."""
     by: str = ""
 
 
 class SurveySaveMessage(Struct, frozen=True):
-    """Use the result of this number: write the site file, and let the anchors adopt it."""
+    """A request to use the result with this number: write the site file, and let the anchors adopt it."""
 
     by: str
     serial: int
 
 
 class SurveyProgress(Struct, frozen=True):
-    """Progress of one pair of anchors."""
+    """Ranging progress of one pair of anchors."""
 
     a: int
     b: int
@@ -475,9 +475,9 @@ class SurveyMessage(Struct, frozen=True):
     serial: int
     """Number of the result; ``SurveySaveMessage`` names it."""
     anchors: tuple[int, ...]
-    """Those that have been received."""
+    """Anchors that are received."""
     missing: tuple[int, ...]
-    """Those of the site file that have not."""
+    """Anchors of the site file that are not received."""
     duration_s: float
     pairs: tuple[SurveyProgress, ...]
     facts: Facts
@@ -488,28 +488,28 @@ class SurveyMessage(Struct, frozen=True):
     saved_serial: int | None = None
     """Number of the result that this run of the program saved last."""
     saved_unix_s: float | None = None
-    """When that was."""
+    """When that result was saved."""
     file: str | None = None
-    """The site file that it writes."""
+    """The site file that the program writes."""
     state: Literal["collecting", "surveyed", "no data"] = "collecting"
-    """``no data``: no stamps have come for 5 s, so that ``survey``, if there is one, is an earlier result."""
+    """``no data``: no stamps have come for 5 s, so ``survey``, if present, is an earlier result."""
     by: str = ""
-    """Names this run of the program: two of them at one site notice each other."""
+    """Name of this run of the program, by which two programs at one site notice each other."""
 
 
 class PlacementMessage(Struct, frozen=True):
-    """The site after a survey. An anchor adopts it if its own site is the one before, and ignores it otherwise."""
+    """The site after a survey. An anchor adopts it if its own site is that before the survey, else ignores it."""
 
     unix_s: float
     before: str
     """Digest of the site before the survey (``site/digest.py``)."""
     site: Site
     earlier: tuple[str, ...] = ()
-    """Digests of the sites before that, the newest first: an anchor with an older file adopts it, too."""
+    """Digests of still earlier sites, the newest first: an anchor with an older file adopts the new site, too."""
 
 
 class WatchFinding(Struct, frozen=True):
-    """Something at the anchors has changed since the survey."""
+    """A change at the anchors since the survey."""
 
     kind: Literal["moved", "delay", "link", "check"]
     """An anchor has moved; its delay has changed; one link is blocked; something has changed, unclear what."""
@@ -522,7 +522,7 @@ class WatchFinding(Struct, frozen=True):
 
 
 class WatchMessage(Struct, frozen=True):
-    """What the watch of the anchors sees at present."""
+    """The present findings of the watch over the anchors."""
 
     unix_s: float
     state: Literal["learning", "watching", "no data"]
@@ -532,17 +532,17 @@ class WatchMessage(Struct, frozen=True):
 
 
 class Asset(Struct, frozen=True):
-    """What a tag is attached to."""
+    """The thing or person that a tag is attached to."""
 
     tag: str
     """The tag's name."""
     name: str = ""
-    """What people call it; empty: the tag's name is shown."""
+    """The asset's name; if empty, the tag's name is shown."""
     group: str = ""
     icon: str = ""
     """A few characters, such as an emoji."""
     colour: str = ""
-    """``#rrggbb``; empty: the group's colour."""
+    """``#rrggbb``; if empty, the group's colour."""
     owner: str = ""
     notes: str = ""
 
@@ -552,53 +552,53 @@ class AssetsMessage(Struct, frozen=True):
 
     assets: tuple[Asset, ...]
     site: str = ""
-    """Name of the site: another one may have the same number."""
+    """Name of the site, as another one may have the same number."""
 
 
 class AlarmRulesMessage(Struct, frozen=True):
-    """The rules that were made on the page, retained; those of the site's file are in ``SiteMessage``."""
+    """The alarm rules made on the page, retained; those of the site's file are in ``SiteMessage``."""
 
     rules: tuple[AlarmRule, ...]
     site: str = ""
-    """As of ``AssetsMessage``."""
+    """Name of the site, as in ``AssetsMessage``."""
 
 
 class AlarmMessage(Struct, frozen=True):
-    """One alarm. Its topic names the rule and the subject, which have one alarm at a time."""
+    """One alarm. Its topic names rule and subject, which together have one alarm at a time."""
 
     id: str
-    """Of this occurrence: the rule, the subject and the time in milliseconds."""
+    """Identifies this occurrence: the rule, the subject and the time in milliseconds."""
     rule: str
     name: str
-    """The rule's."""
+    """The rule's name."""
     kind: RuleKind
     severity: Severity
     subject: str
-    """What it is about: ``<tag>``, ``<tag>~<tag>``, ``zone-<id>`` or ``anchor-<id>``."""
+    """``<tag>``, ``<tag>~<tag>``, ``zone-<id>`` or ``anchor-<id>``."""
     since_unix_s: float
     """When the condition began to hold."""
     unix_s: float
     """When the alarm was raised."""
     sentence: str
-    """For people: who, where, what; with the worst value so far, updated at most once a second."""
+    """Text for people: who, where, what; with the worst value so far, updated at most once a second."""
     tags: tuple[str, ...] = ()
     zone: str | None = None
     place: str = ""
-    """Names of the zones that the tag is in, or its coordinates."""
+    """Names of the tag's zones, or its coordinates."""
     position_m: Vector | None = None
     ended_unix_s: float | None = None
     acknowledged_unix_s: float | None = None
     acknowledged_by: str = ""
     worst: float | None = None
     """The worst value so far in the unit of the rule's limit, or for how many seconds the condition has held; None
-    where there is none, and of a protection level that cannot be given."""
+    if there is no value, or if it is a protection level that cannot be computed."""
 
 
 class AcknowledgeMessage(Struct, frozen=True):
     """Somebody has seen an alarm."""
 
     id: str
-    """Of the occurrence that was seen; another one is not acknowledged by it."""
+    """``id`` of the occurrence that was seen; others stay unacknowledged."""
     by: str
     unix_s: float
 
@@ -616,7 +616,7 @@ def read_message(payload: bytes, kind: type[_T]) -> _T:
 
 
 def fix_message(tag: str, serial: int, fix: "Fix", unix_s: float, latency_s: float) -> FixMessage:
-    """Make the message of a fix; ``unix_s`` is the end of its last frame."""
+    """Make the message of a fix; ``unix_s`` is the time at which its last frame ended."""
     dops = fix.dops
     moving = fix.velocity_mps is not None and fix.velocity_covariance is not None
     return FixMessage(
@@ -668,13 +668,13 @@ _MAX_MESSAGES: Final = 64
 
 
 class TruthBuffer:
-    """The newest messages of an ether."""
+    """Keeps the newest truth messages of an emulated air."""
 
     def __init__(self) -> None:
         self._truths: deque[TruthMessage] = deque(maxlen=_MAX_MESSAGES)
 
     def add(self, truth: TruthMessage) -> None:
-        """Add a message; one older than the last (after an ether's restart) replaces all before it."""
+        """Add a message. If it is older than the last one, as after the ether's restart, it replaces all."""
         if self._truths and truth.unix_s < self._truths[-1].unix_s:
             self._truths.clear()
         self._truths.append(truth)

@@ -38,10 +38,7 @@ def tag_position_topic(site: int | str, tag: str) -> str:
 
 
 def status_topic(site: int | str, kind: str, name: int | str) -> str:
-    """Retained ``StatusMessage`` of a ``tag``, ``anchor``, ``ether``, ``dashboard``, ``recorder`` or another kind.
-
-    It is the node's last will, too.
-    """
+    """Retained ``StatusMessage``, and last will, of a ``tag``, ``anchor``, ``ether``, ``recorder`` or another kind."""
     return f"{ROOT}/{site}/{kind}/{name}/status"
 
 
@@ -81,17 +78,17 @@ def stamps_topic(site: int | str, anchor: int | str) -> str:
 
 
 def survey_topic(site: int | str) -> str:
-    """Retained ``SurveyMessage``: what the survey program has found, and what it asks for."""
+    """Retained ``SurveyMessage``: the survey program's state and newest result."""
     return f"{ROOT}/{site}/survey/state"
 
 
 def survey_facts_topic(site: int | str) -> str:
-    """``SurveyFactsMessage``: what a user knows, for the survey program."""
+    """``SurveyFactsMessage``: facts from a user, for the survey program."""
     return f"{ROOT}/{site}/survey/facts"
 
 
 def survey_save_topic(site: int | str) -> str:
-    """``SurveySaveMessage``: use the present result."""
+    """``SurveySaveMessage``: a request to use a result."""
     return f"{ROOT}/{site}/survey/save"
 
 
@@ -111,7 +108,7 @@ def assets_topic(site: int | str) -> str:
 
 
 def alarm_rules_topic(site: int | str) -> str:
-    """Retained ``AlarmRulesMessage``: the rules that were made on the page."""
+    """Retained ``AlarmRulesMessage``: the rules made on the page."""
     return f"{ROOT}/{site}/alarm_rules"
 
 

@@ -1,1 +1,1 @@
-"""Own recordings in MCAP."""
+"""Recordings of running sites, in MCAP."""

@@ -18,19 +18,11 @@ from skyless.core.any_receiver import AnyReceiver, AnyReceiverState
 from skyless.core.arrays import Array
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.tag.receiver import ReceiverState, TagReceiver
-from skyless.run.mqtt.messages import (
-    Leases,
-    RawReception,
-    ReceptionsMessage,
-    RequestMessage,
-    SegmentStart,
-)
+from skyless.run.mqtt.messages import Leases, RawReception, ReceptionsMessage, RequestMessage, SegmentStart
 
 _FORMAT: Final = 21
-
-
 _MAX_BYTES: Final = 1 << 23
-"""Size limit, enough for an estimator of a hundred anchors."""
+"""Size limit of a checkpoint; enough for an estimator of a hundred anchors."""
 
 
 class _Header(Struct, frozen=True):
@@ -45,7 +37,7 @@ class _Checkpoint(_Header, frozen=True):
 
 
 class RefusedError(Exception):
-    """A checkpoint cannot be used; ``reason`` is the name under which it is counted."""
+    """A checkpoint cannot be used. ``reason`` is the key under which it is counted."""
 
     def __init__(self, reason: str) -> None:
         super().__init__(reason)
@@ -88,21 +80,13 @@ def _decode_array(_: type, data: object) -> Array:
 
 
 _ENCODER: Final = msgspec.msgpack.Encoder(enc_hook=_encode_array)
-
-
 _DECODER: Final = msgspec.msgpack.Decoder(_Checkpoint, dec_hook=_decode_array)
 
-
 EVERY_TAG: Final = "*"
-
-
 INTERVAL_S: Final = 0.1
-"""Length of time whose receptions go into one message."""
-
-
+"""Receptions of this period go into one message."""
 MAX_PENDING_RECEPTIONS: Final = 4096
-"""Largest number of uncollected receptions; the segment ends beyond it."""
-
+"""Largest number of uncollected receptions; beyond it the segment ends."""
 
 Settings = dict[str, str | float | int | None]
 
@@ -182,7 +166,7 @@ class ReceptionLog:
         self._first = 0
         try:
             state = save(receiver)
-        except TypeError:  # a fault of the program, which costs the replay its beginning and the tag nothing
+        except TypeError:  # a bug: the replay lacks its beginning, but the tag goes on
             self.counters["no-checkpoint"] += 1
             state = None
         self._start = SegmentStart(serial, self._settings, state)
@@ -218,15 +202,19 @@ def receiver_settings(
     z_bounds_m: tuple[float, float] | None = None,
     integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
 ) -> Settings:
-    """The receiver's arguments as stated in a segment."""
+    """The receiver's arguments as a segment states them."""
     low_m, high_m = (None, None) if z_bounds_m is None else z_bounds_m
-    asked = {
+    return {
+        "method": method,
+        "site": site,
+        "qa": qa,
+        "z_low_m": low_m,
+        "z_high_m": high_m,
         "integrity_risk": integrity.risk,
         "alert_limit_m": integrity.alert_limit_m,
         "max_acceleration_mps2": integrity.max_acceleration_mps2,
         "height_std_m": integrity.height_std_m,
     }
-    return {"method": method, "site": site, "qa": qa, "z_low_m": low_m, "z_high_m": high_m, **asked}
 
 
 def raw(reception: Reception) -> RawReception:

@@ -1,4 +1,4 @@
-"""Writing of recordings of a running site: the file, and which MQTT messages go into it."""
+"""Write recordings of a running site: the file, and which MQTT messages go into it."""
 
 import contextlib
 import os
@@ -17,10 +17,7 @@ from skyless.core.site import GeoreferenceSite
 from skyless.core.version import installed_version
 from skyless.files import Drops
 from skyless.run.foxglove import SCENE_TOPIC, ellipse, foxglove_schema, location_fix, pose_in_frame, scene, schema_of
-from skyless.run.mqtt.messages import (
-    FixMessage,
-    SiteMessage,
-)
+from skyless.run.mqtt.messages import FixMessage, SiteMessage
 from skyless.run.recordings.recording import (
     FLOOR_PLAN,
     JSON,
@@ -40,20 +37,20 @@ _CHUNK_BYTES: Final = 1 << 22
 
 
 class _Unwritten(IOBase):
-    """A file object that collects what the MCAP writer has written since the last flush."""
+    """A file object that collects the MCAP writer's output since the last flush."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
         self._length = 0
 
     def write(self, data: bytes, /) -> int:
-        """Store a piece."""
+        """Collect a piece."""
         self._parts.append(bytes(data))
         self._length += len(data)
         return len(data)
 
     def seek(self, _offset: int, _whence: int = 0, /) -> int:
-        """Length of the file so far; the writer asks for nothing else."""
+        """Return the file's length so far; the writer seeks only to learn it."""
         return self._length
 
     def drain(self) -> bytes:
@@ -112,7 +109,7 @@ class McapFile:
             self._writer.add_attachment(log_ns, log_ns, name, media_type, data)
 
     def flush(self) -> None:
-        """Close the chunk and hand it to the system."""
+        """Close the chunk and write it to the file."""
         if self.ended is not None:
             return
         self._writer.flush()  # type: ignore[no-untyped-call]
@@ -155,7 +152,7 @@ class McapFile:
         return channel
 
     def _write(self, data: bytes) -> bool:
-        """Write all of the data, or if the disk fails, as far as possible none."""
+        """Write all of the data. If the disk fails, undo what was written if possible, and return False."""
         view = memoryview(data)
         try:
             while view:
@@ -175,7 +172,7 @@ class McapFile:
             os.ftruncate(self._handle, self.written_bytes)
 
 
-# From MQTT messages to a recording: what is kept, and what is added so that Foxglove shows it.
+# From MQTT messages to a recording: which ones are kept, and what is added for Foxglove to show.
 
 SHOWN_HZ: Final = 20.0
 """Largest rate of poses of a tag added for Foxglove; the fixes themselves are all kept."""
@@ -197,7 +194,10 @@ class McapRecorder:
         self._georeference: GeoreferenceSite | None = None
 
     def add(self, topic: str, payload: bytes, unix_s: float) -> Struct | None:
-        """Add a message that arrived at a time, and return it; those of other versions are counted and dropped."""
+        """Add a message that arrived at ``unix_s`` and return it decoded.
+
+        Returns None for an image, for a repetition, and for a message that is dropped and counted.
+        """
         channel = channel_of(topic)
         if channel is None:
             self.drops["unknown-topic"] += 1
@@ -239,7 +239,7 @@ class McapRecorder:
             self._add(SCENE_TOPIC, "foxglove.SceneUpdate", shown, log_ns)
 
     def _show(self, fix: FixMessage, log_ns: int) -> None:
-        """Add Foxglove's messages, no more often than a person can see."""
+        """Add Foxglove's messages for a fix, at most ``SHOWN_HZ`` a second for each tag."""
         if abs(fix.unix_s - self._shown_s.get(fix.tag, -1.0)) < 1.0 / SHOWN_HZ:
             return
         self._shown_s[fix.tag] = fix.unix_s

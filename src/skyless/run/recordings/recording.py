@@ -1,4 +1,4 @@
-"""Reading of recordings of a running site, including unfinished and truncated ones.
+"""Read recordings of a running site, including unfinished and truncated ones.
 
 A recording holds MQTT topics and payloads, with their schemas.
 """
@@ -24,13 +24,7 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.ticks import TICK_S, Unwrapper
 from skyless.files import Drops
 from skyless.run.mqtt import messages
-from skyless.run.mqtt.messages import (
-    FixMessage,
-    ReceptionsMessage,
-    SiteMessage,
-    TruthMessage,
-    ZonesMessage,
-)
+from skyless.run.mqtt.messages import FixMessage, ReceptionsMessage, SiteMessage, TruthMessage, ZonesMessage
 from skyless.run.mqtt.topics import ROOT
 
 PROFILE: Final = "skyless"
@@ -60,7 +54,7 @@ FLOOR_PLAN: Final = "floor_plan"
 """An image, which has no schema and is kept as an attachment."""
 
 RETAINED_KINDS: Final = frozenset({"site", "zones", "status", "watch", FLOOR_PLAN})
-"""Kinds that are retained: a repetition adds nothing."""
+"""Kinds of retained messages, of which repetitions are not recorded."""
 
 
 class Channel(Struct, frozen=True):
@@ -76,7 +70,7 @@ class Channel(Struct, frozen=True):
 
 @lru_cache(maxsize=10_000)
 def channel_of(topic: str) -> Channel | None:
-    """Meaning of a topic; None if it is not of version 1."""
+    """Parse a topic; None if it is not one of version 1."""
     if not topic.startswith(f"{ROOT}/"):
         return None
     site, _, rest = topic.removeprefix(f"{ROOT}/").partition("/")
@@ -94,12 +88,12 @@ def channel_of(topic: str) -> Channel | None:
 
 @lru_cache(maxsize=64)
 def decoder_of(payload: type[Struct]) -> msgspec.json.Decoder[Struct]:
-    """Decoder of a payload."""
+    """JSON decoder of a payload's type."""
     return msgspec.json.Decoder(payload)
 
 
-# Chunks of an MCAP file (https://mcap.dev/spec), found by walking over its records, without needing an index or an end.
-# Files that were cut off, or are being written, give all of their complete chunks.
+# Chunks of an MCAP file (https://mcap.dev/spec), found by walking over its records; neither index nor end is needed.
+# A file that was cut off, or is being written, yields all its complete chunks.
 
 MAGIC: Final = b"\x89MCAP0\r\n"
 MAX_CHUNK_BYTES: Final = 1 << 28
@@ -107,7 +101,7 @@ MAX_CHUNK_BYTES: Final = 1 << 28
 
 MAX_ATTACHMENT_BYTES: Final = 1 << 26
 
-_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _ATTACHMENT = 3, 4, 5, 6, 7, 9
+_CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _ATTACHMENT = 4, 5, 6, 7, 9
 _DATA_END: Final = 15
 _RECORD: Final = struct.Struct("<BQ")
 _CHUNK_HEAD: Final = struct.Struct("<QQQI")
@@ -117,7 +111,7 @@ _INDEX_ENTRY_BYTES: Final = 16
 
 
 def is_mcap(path: str | PathLike[str]) -> bool:
-    """Whether a file's content is MCAP; False if it cannot be opened, or if reading would consume it."""
+    """Whether a file is MCAP by its content; False if it cannot be opened, or if reading would consume it."""
     try:
         file = Path(path)
         if file.is_fifo():
@@ -132,18 +126,18 @@ class ChunkIndex(Struct):
     """Position of a chunk in the file, and its index."""
 
     offset: int
-    """Offset of its content in the file."""
+    """Offset of the chunk's content in the file."""
     length: int
     start_ns: int
     end_ns: int
     counts: dict[int, int]
-    """Messages of each channel, as far as its index was found."""
+    """Messages per channel, as far as index records were found."""
     indexed: bool = False
     """Whether the counts are complete."""
 
 
 class McapScan:
-    """Walks over a file; ``walk`` continues where it stopped, for files that grow."""
+    """Index of a file's chunks, attachments and topics. ``walk`` continues where it stopped, for files that grow."""
 
     def __init__(self, path: str | PathLike[str]) -> None:
         """Open the file. Raises ConfigurationError if it cannot be opened, or is not MCAP."""
@@ -153,7 +147,7 @@ class McapScan:
         self.attachments: dict[str, tuple[int, int]] = {}
         """Offset and length of each attachment's record."""
         self.topics: dict[int, str] = {}
-        """Topics of channels, by number."""
+        """Topics by channel number."""
         self.finished = False
         self._next = len(MAGIC)
         try:
@@ -169,7 +163,7 @@ class McapScan:
         self.walk()
 
     def walk(self) -> None:
-        """Read what has been written since the last call."""
+        """Index what has been written since the last call."""
         size = self._file.seek(0, 2)
         while not self.finished and self._next + _RECORD.size <= size:
             self._file.seek(self._next)
@@ -220,21 +214,18 @@ class McapScan:
         self.attachments[head[20 : 20 + name_bytes].decode("utf-8", "replace")] = (content, length)
 
     def attachment(self, name: str) -> bytes | None:
-        """Content of the last attachment of that name."""
+        """Content of the last attachment of that name; None if it is missing or damaged."""
         offset, length = self.attachments.get(name, (0, 0))
         if not 0 < length <= MAX_ATTACHMENT_BYTES:
             return None
         self._file.seek(offset)
         record = self._file.read(length)
-        try:
-            at = 16
-            for _ in range(2):  # name and media type
-                at += 4 + int.from_bytes(record[at : at + 4], "little")
-            size = int.from_bytes(record[at : at + 8], "little")
-        except IndexError:
-            size, at = -1, 0
+        at = 16
+        for _ in range(2):  # name and media type
+            at += 4 + int.from_bytes(record[at : at + 4], "little")
+        size = int.from_bytes(record[at : at + 8], "little")
         data = record[at + 8 : at + 8 + size]
-        if size < 0 or len(data) != size:
+        if len(data) != size:
             self.drops["damaged-attachment"] += 1
             return None
         return data
@@ -291,13 +282,13 @@ def _decompressed(name: bytes, data: bytes, size: int) -> bytes | None:
     return None if name else data
 
 
-# ``McapRecording``: a recording by kind and time, also while it is being written.
+# ``McapRecording``: access by kind and time, also while the file is being written.
 
 NS: Final = 1_000_000_000
 
 
 class RecordingSummary(Struct, frozen=True):
-    """Contents of a recording. Times are Unix seconds by the recorder's clock, None while nothing is in it."""
+    """Contents of a recording. Times are Unix seconds by the recorder's clock; None while it is empty."""
 
     path: str
     site: int | None
@@ -306,15 +297,15 @@ class RecordingSummary(Struct, frozen=True):
     start_s: float | None
     end_s: float | None
     finished: bool
-    """False for one that is being written, or was never closed."""
+    """False if it is being written, or was never closed."""
     unread_bytes: int
-    """Bytes of a last chunk that is not whole."""
+    """Bytes of an incomplete record at the end."""
     tags: tuple[str, ...]
     """Tags with fixes or receptions."""
     raw_tags: tuple[str, ...]
     """Tags with raw receptions, which can be replayed."""
     messages: dict[str, int]
-    """By kind."""
+    """Number of messages by kind."""
     drops: dict[str, int]
 
 
@@ -330,7 +321,7 @@ def tags_to_replay(summary: RecordingSummary) -> tuple[str, ...]:
 
 
 class Recorded(Struct, frozen=True):
-    """One message: when it was recorded, on which topic, and its contents."""
+    """One recorded message, with its time of recording and its topic."""
 
     time_s: float
     channel: Channel
@@ -434,7 +425,7 @@ class McapRecording:
                 yield from self._of(chunk, kinds, from_s, to_s)
 
     def spans(self, kinds: set[str], gap_s: float) -> list[tuple[float, float]]:
-        """Periods with messages of these kinds: sorted begins and ends in Unix time, by the times of chunks.
+        """Return the periods with messages of these kinds: sorted pairs of begin and end in Unix time.
 
         Gaps of up to ``gap_s`` are bridged. Only indexes are read, so a period may be a chunk too long at each end.
         """
@@ -469,14 +460,14 @@ class McapRecording:
             yield Recorded(time_s, channel, topic, message)
 
     def _may_hold(self, chunk: ChunkIndex, kinds: set[str]) -> bool:
-        """Whether the index does not rule such messages out."""
+        """Whether a chunk may hold messages of these kinds: its index does not rule them out."""
         if not chunk.indexed:
             return True
         channels = (channel_of(self._scan.topics.get(number, "")) for number in chunk.counts)
         return any(channel is not None and channel.kind in kinds for channel in channels)
 
     def _last(self, kind: str) -> Struct | None:
-        """The newest message of a retained kind."""
+        """Newest message of kind ``site`` or ``zones``; reads the chunks added since the last call."""
         chunks = self._scan.chunks
         kinds = {"site", "zones"}
         for chunk in chunks[self._lasting_chunks :]:
@@ -495,8 +486,8 @@ class McapRecording:
         return counts
 
 
-# Unix time of receptions by the tag's counter, tied to its host's clock by the least delayed ones, as hosts see frames
-# with varying delays. The clocks jump against each other when the emulated air stalls, a clock is set or a radio
+# Unix times of receptions: the tag's counter, tied to its host's clock by the least delayed receptions, as hosts see
+# frames with varying delays. The clocks jump against each other when the emulated air stalls, a clock is set or a radio
 # restarts. Receptions that are suddenly late are held back for a second, until it is clear whether the host was merely
 # busy.
 
@@ -507,7 +498,7 @@ _SUDDEN_S: Final = 0.1
 """Receptions that are later than this are held back until it is clear why."""
 
 _STEADY_S: Final = 1.0
-"""A host that is continuously late for this long has another clock, or the tag's counter stood still."""
+"""If a host is late continuously for this long, its clock was changed or the tag's counter stood still."""
 
 _MAX_HELD: Final = 10_000
 """Limit against forged recordings, which could hold back any number."""
@@ -516,18 +507,18 @@ _T = TypeVar("_T")
 
 
 class HostClock(Generic[_T]):
-    """Unix times of one tag's receptions, and of what is carried with each."""
+    """Computes the Unix times of one tag's receptions; each carries an object of the caller."""
 
     def __init__(self) -> None:
         self._ticks = Unwrapper()
         self._less_counter_s = math.inf
-        """Unix time less the counter, by the least delayed reception."""
+        """Unix time minus counter, by the least delayed reception."""
         self._last_s = 0.0
         self._held: list[tuple[_T, float, float, float]] = []
-        """Carried object, counter, host time less counter, and host time."""
+        """Carried object, counter, host time minus counter, and host time."""
 
     def add(self, reception: Reception, unix_less_host_s: float, carried: _T) -> list[tuple[_T, float]]:
-        """Add a reception. Returns what is carried by those whose Unix time is known now, in order, with that time."""
+        """Add a reception. Returns the objects of receptions whose Unix time is now known, in order, with that time."""
         counter_s = self._ticks.unwrap(reception.rx_ticks, reception.host_s) * TICK_S
         least_s = self._less_counter_s + _HOST_DRIFT * max(counter_s - self._last_s, 0.0)
         self._last_s = counter_s
@@ -545,10 +536,10 @@ class HostClock(Generic[_T]):
         return self._released()
 
     def rest(self) -> list[tuple[_T, float]]:
-        """Return what is still held back at the end."""
+        """Return the objects of receptions still held back, with their times; call this at the end."""
         if len(self._held) > 1:
             (_, first_s, _, begun_s), (_, last_s, _, ended_s) = self._held[0], self._held[-1]
-            if ended_s - begun_s >= 0.5 * (last_s - first_s):  # no backlog, which is processed at once
+            if ended_s - begun_s >= 0.5 * (last_s - first_s):  # not a backlog, which would be processed at once
                 self._tie_again()
         return self._released()
 

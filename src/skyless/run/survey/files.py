@@ -1,4 +1,4 @@
-"""Writing of a survey to the files of a site: the site file, the record next to it, and the image of the floor."""
+"""Write a survey to a site's files: the site file, the record next to it, and the image of the floor."""
 
 from collections.abc import Iterator
 from math import dist
@@ -14,31 +14,19 @@ from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import SkylessError, writing
 from skyless.core.site import FloorPlanSite, Site
 from skyless.files import replace_files
-from skyless.run.mqtt.messages import (
-    SurveyFactsMessage,
-)
+from skyless.run.mqtt.messages import SurveyFactsMessage
 from skyless.run.process import Log
 from skyless.site.file.check import Limits, check_site, image_size
 from skyless.site.file.load import load_site, with_values
-from skyless.site.survey.facts import (
-    Facts,
-    PairRanges,
-    Survey,
-    SurveyRecord,
-    encode_record,
-    read_record,
-    record_path,
-)
+from skyless.site.survey.facts import PairRanges, Survey, SurveyRecord, encode_record, read_record, record_path
 from skyless.site.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text
 
 _NEAR_M: Final = 1e-3
-
-
 _ENDINGS: Final = {b"\x89PNG": ".png"}
 
 
 class FloorImage(Struct, frozen=True):
-    """Placement of the image of the floor, and its bytes; None for the image of the site file."""
+    """Placement of the floor's image, and its bytes; None means the image of the site file."""
 
     plan: FloorPlanSite
     image: bytes | None
@@ -53,7 +41,7 @@ class Saved(Struct, frozen=True):
 
 
 def saved_without_file(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> Saved:
-    """The site after a survey if there is no file to write.
+    """Return the site after a survey where there is no file to write.
 
     Raises:
         SkylessError: the result is not a valid site.
@@ -120,7 +108,7 @@ def _record(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> Su
 
 
 def kept_path(file: Path) -> Path:
-    """Path for the file before a survey: ``NAME.before-survey-1.toml``, or with the next free number."""
+    """Path under which to keep the previous site file: ``NAME.before-survey-1.toml``, with the first free number."""
     number = 1
     while (kept := file.with_name(f"{file.stem}.before-survey-{number}{file.suffix}")).exists():
         number += 1
@@ -128,7 +116,7 @@ def kept_path(file: Path) -> Path:
 
 
 def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None, dict[Path, bytes]]:
-    """Name of the image in the site file, None without one, and the file to write if the image is new."""
+    """Name of the image in the site file (None without one), and the file to write if the image is new."""
     present = None if site.floor_plan is None else site.floor_plan.image
     if floor.image is None or image_size(floor.image) is None:
         return present, {}
@@ -143,16 +131,9 @@ def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None,
 MAX_FACTS: Final = 10_000
 """Limit for each of heights, tapes, points and so on."""
 
-
 _COORDINATE: Final = Limits(-MAX_COORDINATE_M, MAX_COORDINATE_M, "metres")
-
-
 _LENGTH: Final = Limits(0, MAX_COORDINATE_M, "metres", above=True)
-
-
 _STD: Final = Limits(0, 100, "metres")
-
-
 _POSITIVE_STD: Final = Limits(0, 100, "metres", above=True)
 
 
@@ -183,7 +164,7 @@ def check_facts(message: SurveyFactsMessage) -> None:
 
 
 def _limited(message: SurveyFactsMessage) -> Iterator[tuple[str, float, Limits]]:
-    """Yield every number of metres: its path, its value, and its limits."""
+    """Yield each number in metres: path, value and limits."""
     facts, plan = message.facts, message.floor_plan
     for anchor, height_m in facts.heights_m.items():
         yield f"facts.heights_m of anchor {anchor}", height_m, _COORDINATE
@@ -198,15 +179,11 @@ def _limited(message: SurveyFactsMessage) -> Iterator[tuple[str, float, Limits]]
     for index, delay in enumerate(facts.delays):
         yield f"facts.delays[{index}].delay_m", delay.delay_m, _COORDINATE
         yield f"facts.delays[{index}].std_m", delay.std_m, _POSITIVE_STD
-    yield from _stds(facts)
-    if plan is not None:
-        yield "floor_plan.width_m", plan.width_m, _LENGTH
-        yield "floor_plan.x_m", plan.x_m, _COORDINATE
-        yield "floor_plan.y_m", plan.y_m, _COORDINATE
-
-
-def _stds(facts: Facts) -> Iterator[tuple[str, float, Limits]]:
     for name in ("height_std_m", "point_std_m", "sketch_std_m"):
         yield f"facts.{name}", getattr(facts, name), _POSITIVE_STD
     for name in ("delay_std_m", "common_delay_std_m", "pair_std_m"):
         yield f"facts.{name}", getattr(facts, name), _STD
+    if plan is not None:
+        yield "floor_plan.width_m", plan.width_m, _LENGTH
+        yield "floor_plan.x_m", plan.x_m, _COORDINATE
+        yield "floor_plan.y_m", plan.y_m, _COORDINATE

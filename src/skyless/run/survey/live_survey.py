@@ -1,4 +1,4 @@
-"""A survey while stamps come in: what is known so far, its newest results, and the watch once the site is surveyed.
+"""A survey in progress: the ranges so far, the newest results, and the watch over anchors with positions.
 
 No I/O and no clock: times are passed in, ``now_s`` by one monotonic clock.
 """
@@ -11,28 +11,15 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.site import Site
-from skyless.run.mqtt.messages import (
-    StampsMessage,
-    SurveyMessage,
-    SurveyProgress,
-    WatchFinding,
-    WatchMessage,
-)
+from skyless.run.mqtt.messages import StampsMessage, SurveyMessage, SurveyProgress, WatchFinding, WatchMessage
 from skyless.site.survey.explain import Finding, PhaseWatch
-from skyless.site.survey.facts import (
-    Facts,
-    PairBlock,
-    PairRanges,
-    Survey,
-    SurveyRecord,
-    baseline,
-)
+from skyless.site.survey.facts import Facts, PairBlock, PairRanges, Survey, SurveyRecord, baseline
 from skyless.site.survey.legs import AnchorLeg
 from skyless.site.survey.pair_ranger import PairRanger, StepTable
 from skyless.site.survey.watch import AnchorWatch, Change, with_changes
 
 NO_DATA_S: Final = 5.0
-"""Time without stamps after which a result is outdated."""
+"""Time without stamps after which the state is "no data"."""
 
 PRESENT_S: Final = 10.0
 """An anchor that has not been received for longer is missing."""
@@ -40,21 +27,21 @@ PRESENT_S: Final = 10.0
 ADOPTION_S: Final = 2.0
 """Stamps within this time after a placement are ignored, as anchors adopt it one after the other."""
 
-_RESULTS_KEPT: Final = 64  # a user saves the result that is on the page, while newer ones are made
+_RESULTS_KEPT: Final = 64  # a user may save the result on the page while newer ones are computed
 
 _MAX_BACKLOG_S: Final = 60.0
-"""A message that seems later than this against others of its sender shows that a clock was set, not that it waited."""
+"""A message that seems delayed by more than this, compared with others of its sender, shows that a clock was set."""
 
 _SHOWN_PAIRS_PER_S: Final = 200
 
 _LAG_S: Final = 30.0
-"""The quickest message counts for up to twice this time, after which a host's clock that was set back is noticed."""
+"""The quickest message counts for up to twice this time; then a host's clock that was set back is noticed."""
 
 _MAX_WAITING_BLOCKS: Final = 100_000  # a minute of a site with 50 anchors
 _MAX_WAITING_LEGS: Final = 100_000
 
 FactsOf = Callable[[Site], Facts]
-"""Gives what is known of a site without a user's help."""
+"""Returns the facts about a site that are known without a user's help."""
 
 State = Literal["collecting", "surveyed", "no data"]
 
@@ -70,7 +57,7 @@ class LiveSurvey:
         self.saved_serial: int | None = None
         self.saved_unix_s: float | None = None
         self.missed = 0  # stamps that anchors had to drop
-        self.begun = 0  # how often ranges have begun again: a result of ranges from before does not count
+        self.begun = 0  # how often ranging was restarted: results of earlier ranges do not count
         self._shown: tuple[PairRanges, float] | None = None  # the ranges in messages, and when they were made
         self._watch: _Watched | None = None
         self._results: dict[int, tuple[Survey, PairRanges]] = {}
@@ -83,10 +70,10 @@ class LiveSurvey:
         self.restart_ranges()
         self._begin_watch(record)
 
-    # What comes in
+    # Input
 
     def add_stamps(self, message: StampsMessage, now_s: float) -> None:
-        """Process what an anchor has received from others. Stamps of anchors not in the site are dropped."""
+        """Process an anchor's stamps of other anchors' frames. Anchors that are not in the site are ignored."""
         if message.anchor not in self._known or now_s < self._pause_until_s:
             return
         self.missed += message.missed
@@ -143,14 +130,14 @@ class LiveSurvey:
         self._results.clear()
 
     def add_result(self, survey: Survey, ranges: PairRanges) -> None:
-        """Keep a result of the present ranges, dropping the oldest of many."""
+        """Keep a result of the present ranges; the oldest beyond a limit is dropped."""
         self.serial += 1
         self._results[self.serial] = (with_changes(survey, self._changes, ranges.duration_s), ranges)
         if len(self._results) > _RESULTS_KEPT:
             del self._results[next(iter(self._results))]
 
     def result(self, serial: int) -> tuple[Survey, PairRanges] | None:
-        """A result by its number, with the ranges that it was made of, or None if it is no longer kept."""
+        """Return a result by its number, with the ranges it was computed from; None if it is no longer kept."""
         return self._results.get(serial)
 
     def place(self, site: Site, record: SurveyRecord, serial: int, now_s: float, unix_s: float) -> None:
@@ -163,7 +150,7 @@ class LiveSurvey:
         self.restart_ranges()
         self._begin_watch(record)
 
-    # What goes out
+    # Output
 
     def state(self, now_s: float) -> State:
         """Whether stamps come, and whether there is a result."""
@@ -172,7 +159,7 @@ class LiveSurvey:
         return "surveyed" if self._results else "collecting"
 
     def message(self, now_s: float, unix_s: float, file: str | None) -> SurveyMessage:
-        """Make the message that states all of this."""
+        """Return the state of the survey as a message."""
         newest, state = self._results.get(self.serial), self.state(now_s)
         present = {anchor for anchor, heard_s in self._heard_s.items() if now_s - heard_s <= PRESENT_S}
         ranges = self._shown_ranges(now_s)
@@ -197,7 +184,7 @@ class LiveSurvey:
         )
 
     def watch_message(self, now_s: float, unix_s: float) -> WatchMessage | None:
-        """What the watch saw when it last advanced; None if too few anchors have positions for a watch."""
+        """Return what the watch saw when it last advanced; None if too few anchors have positions for a watch."""
         watched = self._watch
         if watched is None:
             return None
@@ -210,9 +197,9 @@ class LiveSurvey:
         return WatchMessage(unix_s, state if has_data else "no data", findings, pairs)
 
     def advance_watch(self, now_s: float) -> None:
-        """Let the watch process new ranges. A conspicuous window of a large site takes a second.
+        """Let the watch process new ranges; this takes a second for a conspicuous window of a large site.
 
-        It may run in a thread parallel to everything else, but not twice at once.
+        May run in a thread parallel to everything else, but not twice at once.
         """
         if self._watch is not None:
             self._watch.advance(now_s)
@@ -226,10 +213,10 @@ class LiveSurvey:
         self._changes = ()
         self._results.clear()
 
-    # Within
+    # Helpers
 
     def _shown_ranges(self, now_s: float) -> PairRanges:
-        """Ranges for a message. Those of 1225 pairs take half a second, so they are made only every six."""
+        """Ranges for a message. Those of 1225 pairs take half a second, so they are renewed only every six seconds."""
         if self._shown is None or not 0.0 <= now_s - self._shown[1] < len(self._shown[0].pairs) / _SHOWN_PAIRS_PER_S:
             self._shown = self._ranger.ranges(), now_s
         return self._shown[0]
@@ -241,7 +228,7 @@ class LiveSurvey:
             self._watch.waiting_legs.append(leg)
 
     def _sent_s(self, anchor: int, unix_s: float, now_s: float) -> float:
-        """When a message was sent by its sender's clock, corrected for that clock's offset.
+        """Time at which a message was sent, by the sender's clock corrected for its offset.
 
         The offset is that of the sender's quickest message: messages may wait, and hosts' clocks differ.
         """
@@ -272,9 +259,9 @@ class _Lag(Struct):
 
     begun_s: float
     newest_s: float
-    """Least difference since then."""
+    """Least difference since ``begun_s``."""
     least_s: float
-    """Least difference in the time before."""
+    """Least difference in the period before."""
 
 
 class _Watched:
@@ -295,6 +282,6 @@ class _Watched:
         while self.waiting_legs:
             self._phases.add(self.waiting_legs.popleft())
         found = watch.findings
-        named = {anchor for one in found if one.kind != "link" for anchor in one.anchors}  # what stamps show is enough
+        named = {anchor for one in found if one.kind != "link" for anchor in one.anchors}  # their finding is enough
         found += tuple(one for one in self._phases.findings if not named & set(one.anchors))
         self.seen = watch.state, found, watch.pairs

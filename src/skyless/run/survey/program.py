@@ -58,20 +58,20 @@ from skyless.site.survey.surveyed_site import delay_differences_m
 from skyless.site.survey.watch import change_of
 
 NAME: Final = "survey"
-"""Its name on MQTT: one site has one survey program."""
+"""The program's name on MQTT: a site has one survey program."""
 
 LEASE_S: Final = 15.0
 _REQUEST_S: Final = 5.0  # each request for stamps is repeated at this interval, before its lease ends
 
 _UPDATE_S: Final = 1.0
-_PAIRS_PER_S: Final = 400  # pairs that are published a second: larger sites publish less often
+_PAIRS_PER_S: Final = 400  # pairs published per second: larger sites publish less often
 
-_COST: Final = 5.0  # the next result is not begun before this many times the time that the last one took
+_COST: Final = 5.0  # the next result begins after at least this multiple of the time that the last one took
 
 _SETTLED_S: Final = 60.0
-_SETTLED_UPDATE_S: Final = 5.0  # after a minute of data results change little, and are made less often
+_SETTLED_UPDATE_S: Final = 5.0  # after a minute of data results change little, and are computed less often
 
-_EARLIER_KEPT: Final = 32  # sites before the present one that a placement names
+_EARLIER_KEPT: Final = 32  # earlier sites that a placement names
 
 _MAX_LOGGED: Final = 100
 
@@ -94,8 +94,8 @@ class SurveySettings(Struct, frozen=True):
     file: Path | None = None
     """The site's file, which is written on request."""
     serves: bool = True
-    """Whether it serves the site; otherwise it only collects beside one that does, and computes, publishes and saves
-    nothing.
+    """Whether it serves the site. Otherwise it only collects, beside a program that serves: it computes, publishes and
+    saves nothing.
     """
 
 
@@ -111,7 +111,7 @@ class SurveyNode:
         log: Log,
         radio: Radio | None = None,
     ) -> None:
-        """``facts_of``: what is known of a site without a user's help. ``solve``: ``survey.solve.run_survey``."""
+        """``facts_of``: facts about a site known without a user's help. ``solve``: ``survey.solve.run_survey``."""
         self.live: LiveSurvey | None = None  # None before the site is known
         self.problems = 0  # messages that could not be read
         self.saved: Saved | None = None
@@ -145,7 +145,7 @@ class SurveyNode:
         if self.link is None:
             await self._work()
         else:
-            await outlasting(keep(self.link, self._log), self._work())  # what is withdrawn is still sent
+            await outlasting(keep(self.link, self._log), self._work())  # the last messages are still sent
 
     async def _work(self) -> None:
         parts = [every(_UPDATE_S, self.update), every(_REQUEST_S, self._request)]
@@ -160,7 +160,7 @@ class SurveyNode:
             self._withdraw()
 
     def _withdraw(self) -> None:
-        """End the lease, and clear what is retained only while this program runs."""
+        """End the lease, and clear the topics that are retained only while this program runs."""
         link, site_id = self.link, self._settings.site_id
         if link is None:
             return
@@ -169,7 +169,7 @@ class SurveyNode:
             for topic in (survey_topic(site_id), watch_topic(site_id)):
                 link.publish(topic, b"", qos=1, retain=True)
 
-    # What comes in
+    # Input
 
     def _subscribe(self, link: Link) -> None:
         site_id = self._settings.site_id
@@ -260,17 +260,17 @@ class SurveyNode:
         self._placement = message
 
     def _forget(self, *topics: Callable[[int], str]) -> None:
-        """Stop repeating what another program now publishes."""
+        """Stop repeating the own messages on topics that another program now publishes."""
         if self.link is not None:
             for topic in topics:
                 self.link.forget(topic(self._settings.site_id))
 
     def _begin(self, site: Site) -> None:
-        """Start to survey a site."""
+        """Start surveying a site."""
         record = record_of(self._settings.file, site, self._log)
         try:
             facts = self._facts_of(site) if self._given is None else self._given.facts
-        except SkylessError as error:  # options name anchors that the site on MQTT has not
+        except SkylessError as error:  # options name anchors that are not in the site on MQTT
             self._log(f"survey: {error}")
             facts = Facts()
         self.live = LiveSurvey(site, facts, record)
@@ -280,7 +280,7 @@ class SurveyNode:
     # Results
 
     def final_ranges(self) -> PairRanges:
-        """The final ranges, computed with the antenna delays of the site to be surveyed.
+        """Return the final ranges, computed with the antenna delays of the site to be surveyed.
 
         The anchors may run with other delays. Call this only once the site is known.
         """
@@ -292,7 +292,7 @@ class SurveyNode:
         return ranges.without_delays(delay_differences_m(self._running, self.live.site))
 
     def update(self) -> None:
-        """Start to compute another result if it is time, and publish what is due."""
+        """Start computing another result if one is due, and publish what is due."""
         live, now_s, unix_s = self.live, time.monotonic(), time.time()
         if self._monitor is not None and self._radio is not None:
             self._monitor.check(now_s, self._received, self._legs.counters["legs"], self._legs.counters)
@@ -311,7 +311,7 @@ class SurveyNode:
             self._publish(self.link, live, now_s, unix_s, watch)
 
     async def _make_result(self, live: LiveSurvey) -> None:
-        """Compute one result, in a thread so that the loop goes on."""
+        """Compute one result, in a thread so that the event loop goes on."""
         self._facts_changed = False
         ranges, facts, begun = live.ranges(), live.facts, live.begun
         if not ranges.pairs:
@@ -327,7 +327,7 @@ class SurveyNode:
         except SkylessError as error:
             live.error = str(error)
             return
-        except Exception as error:  # noqa: BLE001 - whatever it is, the next result may be one
+        except Exception as error:  # noqa: BLE001 - whatever it is, the next attempt may succeed
             live.error = f"no result: {error!r}"
             self._log(live.error)
             return
@@ -341,7 +341,7 @@ class SurveyNode:
             live.add_result(survey, ranges)
 
     async def _advance_watch(self, live: LiveSurvey) -> None:
-        """Let the watch process new ranges, in a thread so that the loop goes on."""
+        """Let the watch process new ranges, in a thread so that the event loop goes on."""
         try:
             await asyncio.to_thread(live.advance_watch, time.monotonic())
         except Exception as error:  # noqa: BLE001 - whatever it is, the survey goes on
@@ -503,6 +503,6 @@ class FindingsLog:
 
 
 def _content(message: WatchMessage) -> object:
-    """Contents of a watch message without its times."""
+    """Contents of a watch message that are compared: all but its times and sizes."""
     findings = [(one.kind, one.anchors, one.sentence) for one in message.findings]
     return message.state, message.pairs, findings
