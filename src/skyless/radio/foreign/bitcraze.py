@@ -64,7 +64,7 @@ def _tdoa3(payload: bytes, host_s: float | None, sender: int, rx_ticks: int) -> 
         if at + layout.size > size:
             return "short-payload"
         anchor, flags, stamp, *distance = layout.unpack_from(payload, at)
-        relays.append(Relay(anchor, flags & 0x7F, stamp, distance[0] or None if distance else None))
+        relays.append(Relay(anchor, flags & 0x7F, stamp, distance[0] if any(distance) else None))
         at += layout.size
     position_m = _position(payload, at) if at < size else None
     return Packet(host_s, sender, sequence & 0x7F, tx_ticks, rx_ticks, tuple(relays), position_m)
