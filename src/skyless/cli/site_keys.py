@@ -28,7 +28,6 @@ from skyless.core.keys.chain import (
     USUAL_TIMING,
     Chain,
     ChainRing,
-    ChainTiming,
     section_signatures,
 )
 from skyless.core.site import Site
@@ -317,7 +316,6 @@ def new_chain(
     ends_s: float,
     private: bytes,
     reached: Callable[[float], None],
-    timing: ChainTiming = USUAL_TIMING,
 ) -> Chain:
     """Make a chain with a new seed between two Unix times, the end rounded up to whole sections (14 minutes).
 
@@ -325,8 +323,8 @@ def new_chain(
     ends all processes.
     """
     seed = secrets.token_bytes(SEED_BYTES)
-    first = timing.interval_at(starts_s)
-    begin, end = first >> SECTION_BITS, (timing.interval_at(ends_s) >> SECTION_BITS) + 1
+    first = USUAL_TIMING.interval_at(starts_s)
+    begin, end = first >> SECTION_BITS, (USUAL_TIMING.interval_at(ends_s) >> SECTION_BITS) + 1
     pieces = [range(at, min(at + _PIECE, end)) for at in range(begin, end, _PIECE)]
     signatures = bytearray()
 
@@ -334,7 +332,7 @@ def new_chain(
         signatures.extend(piece)
         reached(len(signatures) / CERTIFICATE_SIGNATURE_BYTES / (end - begin))
 
-    work = (repeat(seed), repeat(site), repeat(serial), repeat(timing), repeat(first), pieces, repeat(private))
+    work = (repeat(seed), repeat(site), repeat(serial), repeat(first), pieces, repeat(private))
     if end - begin <= _FEW:
         for piece in map(_signatures, *work):
             add(piece)
@@ -347,16 +345,12 @@ def new_chain(
             except BaseException:
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
-    return Chain(site, serial, timing, first, bytes(signatures), seed)
+    return Chain(site, serial, USUAL_TIMING, first, bytes(signatures), seed)
 
 
-def _signatures(
-    seed: bytes, site: int, serial: int, timing: ChainTiming, first: int, sections: range, private: bytes
-) -> bytes:
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
+def _signatures(seed: bytes, site: int, serial: int, first: int, sections: range, private: bytes) -> bytes:
     key = Ed25519PrivateKey.from_private_bytes(private)
-    return section_signatures(seed, site, serial, timing, first, sections, key)
+    return section_signatures(seed, site, serial, USUAL_TIMING, first, sections, key)
 
 
 def _start_worker() -> None:

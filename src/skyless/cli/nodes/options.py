@@ -76,7 +76,7 @@ class SiteOptions(MqttOptions, frozen=True, kw_only=True):
 
 
 class GatherOptions(Options, frozen=True, kw_only=True):
-    """What is gathered of a site with thousands of tags."""
+    """Options for gathering a site with thousands of tags."""
 
     site_id: SiteId | None = None
     """Number of the site that is gathered; by default the first one of which anything is heard."""

@@ -327,7 +327,7 @@ class Search:
         return site_with(self._site, anchors_m, master)
 
     def _sigma(self, site: Site, sample: tuple[Matrix, Vector]) -> tuple[float, float, float]:
-        """Mean and worst standard deviation over the points, capped and for points without a fix, and their share."""
+        """Mean and worst standard deviation over the points, capped, as without a fix; and the share with a fix."""
         self.evaluations += 1
         rows = Predictor(site, self._settings).at(sample[0])
         covered = rows[:, FIX_SHARE] >= 0.5

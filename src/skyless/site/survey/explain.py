@@ -164,7 +164,7 @@ def _scalar(along: Array, information: Array) -> tuple[Array, Mask]:
 
 
 def thresholds(dof: Integers, probability: float) -> Array:
-    """Drops of chi-squared that chance exceeds in any cause with this probability; infinite without a freedom."""
+    """Chi-squared that chance exceeds in any cause with this probability; infinite without a degree of freedom."""
     found = np.full(len(dof), np.inf)
     seen = dof > 0
     found[seen] = chdtri(dof[seen], probability / max(int(seen.sum()), 1))

@@ -622,8 +622,7 @@ def find_ambiguities(fit: RobustFit) -> tuple[OtherFit, ...]:
             motion_m = np.linalg.norm(position_m - fit.solution.position_m, axis=1)
             elsewhere = np.flatnonzero((motion_m > _MOVED_M) & (motion_m > _MOVED_STDS * std_m))
             if elsewhere.size:
-                used = minima.used[index]
-                other = OtherFit(position_m, used, tuple(elsewhere.tolist()))
+                other = OtherFit(position_m, minima.used[index], tuple(elsewhere.tolist()))
                 others.append((float(minima.cost[index]), other))
     others.sort(key=lambda item: item[0])
     kept: list[OtherFit] = []

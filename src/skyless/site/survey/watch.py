@@ -70,12 +70,9 @@ class RangeHistory:
 
     def add_pair(self, given_m: float | None = None) -> int:
         """Add a pair and return its number. ``given_m``: its range by the survey."""
+        first_m, used = (np.nan, 0) if given_m is None else (given_m, _GIVEN_WINDOWS)
         row = np.full((1, _USUAL_WINDOWS), np.nan)
-        used = 0
-        if given_m is not None:
-            used = _GIVEN_WINDOWS
-            row[0, :used] = given_m
-        first_m = np.nan if given_m is None else given_m
+        row[0, :used] = first_m
         self._usual = np.concatenate([self._usual, row])
         self._used = np.append(self._used, used)
         self._values = np.concatenate([self._values, np.full((1, _DRIFT_WINDOWS), np.nan)])
