@@ -1,4 +1,4 @@
-"""What commands share: options, JSON and text on standard output, and progress on a terminal."""
+"""Common parts of commands: options, JSON and text on standard output, and progress on a terminal."""
 
 import inspect
 import os
@@ -26,13 +26,13 @@ NO_FIX: Final = 1
 """Exit code of a simulation, a replay or an export without any fix."""
 
 USER_ERROR: Final = 2
-"""Exit code of a command that was asked for what is not possible."""
+"""Exit code for a user's error."""
 
 
 def print_json(value: object) -> None:
-    """Write a struct or mapping as one line of JSON on standard output; NaN and infinities become null.
+    """Print a struct or mapping as one line of JSON; NaN and infinities become null.
 
-    The first key is the version of Skyless, to which the names of the others belong (``CHANGELOG.md``).
+    The first key is the version of Skyless, which determines the names of the others (``CHANGELOG.md``).
     """
     from skyless.core.version import installed_version
 
@@ -40,12 +40,12 @@ def print_json(value: object) -> None:
 
 
 def to_json(value: object) -> str:
-    """Write a tree of structs, dataclasses, containers, NumPy values and paths as one line of JSON."""
+    """Encode a tree of structs, dataclasses, containers, NumPy values and paths as one line of JSON."""
     return msgspec.json.encode(value, enc_hook=json_form).decode()
 
 
 def json_form(value: object) -> object:
-    """What msgspec does not know: NumPy's scalars and arrays (which need not be imported for this), paths."""
+    """Convert types unknown to msgspec: paths, and NumPy's scalars and arrays (without importing NumPy)."""
     if hasattr(value, "tolist"):
         return value.tolist()
     if isinstance(value, os.PathLike):
@@ -54,14 +54,14 @@ def json_form(value: object) -> object:
 
 
 def console() -> "Console":
-    """Where tables for people go: standard output, without colour when it is not a terminal."""
+    """Console for tables for people: standard output, without colour if it is not a terminal."""
     from rich.console import Console
 
     return Console(file=sys.stdout, highlight=False)
 
 
 def print_facts(title: str, facts: Iterable[tuple[str, str]]) -> None:
-    """Show a table of names and values."""
+    """Print a table of names and values."""
     from rich.markup import escape
     from rich.table import Table
     from rich.text import Text
@@ -73,7 +73,7 @@ def print_facts(title: str, facts: Iterable[tuple[str, str]]) -> None:
 
 
 _COLUMNS: Final = 100
-"""Width of a table that goes to a file or a program."""
+"""Width of a table that is written to a file or a program."""
 
 _FRAME: Final = 3
 """Characters between two columns."""
@@ -82,11 +82,11 @@ _FRAME: Final = 3
 def print_table(
     title: str, heads: Iterable[str], rows: Iterable[Iterable[str]], *, figures: bool = False, caption: str = ""
 ) -> None:
-    """Show a table that fits the screen, with a caption below it.
+    """Print a table that fits the screen, with a caption below it.
 
-    ``figures``: it is of numbers, which are never wrapped and stand on the right, but for the first column and columns
-    without a name, which hold words or belong to the one before. What is too wide is continued in further tables, which
-    begin with the first column.
+    ``figures``: the cells are numbers, which are right-aligned and never wrapped, except the first column and columns
+    without a name, which are words or belong to the column before. A table that is too wide is split into several,
+    which all begin with the first column.
     """
     from rich.markup import escape
     from rich.table import Table
@@ -112,7 +112,7 @@ def print_table(
 
 
 def _parts(heads: list[str], widths: list[int], most: int) -> Iterator[list[int]]:
-    """The columns of each part of a table that is ``most`` wide; those without a name stay with the one before."""
+    """Split columns into parts of a table up to ``most`` wide; columns without a name stay with the one before."""
     starts = [0, *(column for column, head in enumerate(heads) if head and column), len(heads)]
     first, *others = (list(range(*ends)) for ends in pairwise(starts))
     part = first
@@ -125,7 +125,7 @@ def _parts(heads: list[str], widths: list[int], most: int) -> Iterator[list[int]
 
 
 def print_warnings(warnings: Iterable[str]) -> None:
-    """Show warnings, one a line."""
+    """Print warnings, one per line."""
     from rich.text import Text
 
     for warning in warnings:
@@ -133,31 +133,31 @@ def print_warnings(warnings: Iterable[str]) -> None:
 
 
 def dropped(drops: Mapping[str, int]) -> str:
-    """The most frequent reasons for which something was dropped."""
+    """The three most frequent reasons for drops, in words."""
     most = sorted(drops.items(), key=lambda item: -item[1])[:3]
     return f"dropped: {', '.join(f'{count} × {name}' for name, count in most)}"
 
 
 def number(value: float | None, form: str = "{:.3f}", scale: float = 1.0) -> str:
-    """A number for people; a dash where there is none."""
+    """Format a number for people; a dash for None."""
     return "–" if value is None else form.format(scale * value)
 
 
 def cm(value_m: float | None) -> str:
-    """A length in centimetres for people; a dash where there is none."""
+    """Format a length in centimetres for people; a dash for None."""
     return number(value_m, "{:.2f} cm", 100.0)
 
 
 def plain(text: str, keep: str = "") -> str:
-    """A text from the network without characters that would control the terminal, but for those to be kept."""
+    """Replace characters of a text from the network that would control the terminal, except those in ``keep``."""
     return "".join(one if one.isprintable() or one in keep else "\N{REPLACEMENT CHARACTER}" for one in text)
 
 
 @contextmanager
 def new_table(path: Path) -> Iterator[TextIO]:
-    """A table to be written row by row, which replaces an old one when the block ends: whole or not at all.
+    """Open a table for writing; it replaces an old one when the block ends, whole or not at all.
 
-    Ctrl-C ends it, too: what is written by then is kept.
+    After Ctrl-C, the rows written so far are kept.
 
     Raises:
         SkylessError: the file cannot be written.
@@ -174,13 +174,13 @@ def new_table(path: Path) -> Iterator[TextIO]:
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all. Raises SkylessError when it cannot be written."""
+    """Write a file whole or not at all. Raises SkylessError if it cannot be written."""
     with writing(path):
         write_whole(path, data)
 
 
 def write_picture(path: Path, figure: "Figure") -> None:
-    """Write a figure in the format of the file's ending, and say so. Raises SkylessError when it cannot be written."""
+    """Write a figure in the format of the file's ending, and say so. Raises SkylessError if it cannot be written."""
     from skyless.site.report import picture
 
     write_file(path, picture(figure, path.suffix.removeprefix(".")))
@@ -188,24 +188,25 @@ def write_picture(path: Path, figure: "Figure") -> None:
 
 
 def say_written(path: Path) -> None:
-    """Name a file that was written, on standard error."""
+    """Print the name of a written file on standard error."""
     print(f"wrote {path}", file=sys.stderr)
 
 
-# Command lines made of structs of options (``skyless.arguments``), and checks of files that commands write.
+# Command lines from structs of options (``skyless.arguments``), and checks of files that commands write.
 
 
 class JsonOptions(Options, frozen=True, kw_only=True):
-    """What every command has."""
+    """Options of every command."""
 
     json: bool = False
     """Write one JSON object instead of text."""
 
 
 def command(run: Callable[..., int | None]) -> Callable[..., int | None]:
-    """A function as cyclopts calls it: the fields of each parameter that is a struct of options are options.
+    """Adapt a function to cyclopts: the fields of each parameter that is a struct of options become options.
 
-    Fields without a default are arguments without a name. Other parameters obey the rules that they are annotated with.
+    Fields without a default become positional arguments. Other parameters are checked by the rules in their
+    annotations.
     """
     hints, own = get_type_hints(run, include_extras=True), inspect.signature(run)
     structs = {name: kind for name, kind in hints.items() if isinstance(kind, type) and issubclass(kind, Options)}
@@ -256,7 +257,7 @@ def _token(field: OptionField) -> Any:  # noqa: ANN401 - a type
 
 
 def _made(struct: type[Options], values: dict[str, Any]) -> Options:
-    """The struct out of what the command line gave. Raises SkylessError, which names options."""
+    """Build the struct from values of the command line. Raises SkylessError, which names options."""
     found = {}
     for name, field in option_fields(struct).items():
         value = values.pop(name, None)
@@ -274,10 +275,10 @@ def _made(struct: type[Options], values: dict[str, Any]) -> Options:
 
 
 def check_output(option: str, output: Path | None, *inputs: Path | None) -> None:
-    """See that an output is none of the other files of the command: opening it would empty them.
+    """Check that an output is not another file of the command, which would be destroyed.
 
     Raises:
-        SkylessError: it is one of them, even if by another name.
+        SkylessError: it is one of them, even by another name.
     """
     if output is None:
         return
@@ -287,13 +288,13 @@ def check_output(option: str, output: Path | None, *inputs: Path | None) -> None
 
 
 def check_folder(option: str, output: Path) -> None:
-    """See that an output is no folder itself, and in one that exists. Raises SkylessError."""
+    """Check that an output is not a folder, and is in an existing one. Raises SkylessError."""
     if output.is_dir() or not output.parent.is_dir():
         raise SkylessError(f"{option} is {str(output)!r}; it should be a file in a folder that exists")
 
 
 def make_folder(option: str, folder: Path) -> None:
-    """Make a folder for files that come later, unless it is there. Raises SkylessError."""
+    """Make a folder unless it exists. Raises SkylessError."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -301,7 +302,7 @@ def make_folder(option: str, folder: Path) -> None:
 
 
 def _same(a: Path, b: Path) -> bool:
-    """Whether two paths lead to one file, through links of either kind, existing or not."""
+    """Whether two paths lead to the same file, possibly through links, even if it does not exist."""
     try:
         return a.samefile(b)
     except OSError:
@@ -309,7 +310,7 @@ def _same(a: Path, b: Path) -> bool:
 
 
 def check_picture(plot: Path | None) -> None:
-    """See that --plot can be written, before the long work instead of after it. Raises SkylessError."""
+    """Check before long work that --plot can be written. Raises SkylessError."""
     if plot is None:
         return
     endings = (".png", ".svg", ".pdf")
@@ -318,7 +319,7 @@ def check_picture(plot: Path | None) -> None:
     check_folder("--plot", plot)
 
 
-# Progress of long work, never of short work: a bar for people, a line now and then for a pipe or a file.
+# Progress of long work only: a bar on a terminal, a line now and then for a pipe or a file.
 
 _HIDDEN_S: Final = 1.5
 _REDRAW_S: Final = 0.1
@@ -328,9 +329,9 @@ _LINE_S: Final = 5.0
 
 @contextmanager
 def progress_bar(description: str, total: float = 1.0) -> Iterator[Callable[[float], None]]:
-    """A bar on standard error, which appears when the work in the block turns out to be long; in a pipe lines.
+    """Show a bar on standard error if the work in the block turns out to be long; in a pipe print lines.
 
-    What it gives says how much of the total is done; it is cheap enough to be called for every chunk of work.
+    Yields a function to be called with the amount done, cheap enough for every chunk of work.
     """
     if sys.stderr is None or not sys.stderr.isatty():
         yield _lines(description, total)
@@ -357,7 +358,7 @@ def progress_bar(description: str, total: float = 1.0) -> Iterator[Callable[[flo
 
 
 def _lines(description: str, total: float) -> Callable[[float], None]:
-    """Write a line on standard error every few seconds."""
+    """Progress function that prints a line on standard error every few seconds."""
     next_s = time.monotonic() + _LINE_S
 
     def reach(done: float) -> None:
@@ -371,7 +372,7 @@ def _lines(description: str, total: float) -> Callable[[float], None]:
 
 @contextmanager
 def status(description: str) -> Iterator[Callable[[str], None]]:
-    """A spinner for work whose length is not known, on a terminal only. What it gives changes the description."""
+    """Show a spinner for work of unknown length, on a terminal only. Yields a function to change the description."""
     if sys.stderr is None or not sys.stderr.isatty():
         yield lambda _: None
         return
@@ -383,7 +384,7 @@ def status(description: str) -> Iterator[Callable[[str], None]]:
 
 
 async def with_status(work: Coroutine[Any, Any, None], words: Callable[[], str]) -> None:
-    """Do work; meanwhile a line on a terminal says ``words``, which are asked for twice a second."""
+    """Run ``work``, showing ``words()`` on the terminal, refreshed twice a second."""
     from skyless.run.process import every, outlasting
 
     with status("") as show:

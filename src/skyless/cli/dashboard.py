@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from skyless.run.mqtt.messages import SiteMessage
 
     _Served = tuple[str, Services, Coroutine[Any, Any, None]]
-    """The address of the broker or hub, what the server serves, and what keeps the sites connected."""
+    """Address of the broker or hub, the server's services, and the coroutine that keeps the sites connected."""
 
 _SHORTEST_TOKEN = 12
 
@@ -127,7 +127,7 @@ def _at_broker(
     assets: Path | None,
     nats: str | None,
 ) -> "_Served":
-    """The sites of a broker. Raises SkylessError."""
+    """Services for the sites of a broker. Raises SkylessError."""
     from skyless.page.site_assets import AssetsFile
     from skyless.page.sites import LiveSites
 
@@ -144,7 +144,7 @@ def _at_broker(
 
 
 def _at_hub(make: "partial[LiveSite]", serves: "partial[Services]", hub: str, ca: Path | None) -> "_Served":
-    """The sites at a hub. Raises SkylessError."""
+    """Services for the sites at a hub. Raises SkylessError."""
     address = hub_address(hub, ca)
     from skyless.page.gathered import Gathered
     from skyless.page.hub import ShownSites
@@ -154,7 +154,7 @@ def _at_hub(make: "partial[LiveSite]", serves: "partial[Services]", hub: str, ca
 
 
 def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":
-    """The batches of a gather; None without a gather, of which nothing is loaded then. Raises SkylessError."""
+    """The batches of a gather; without one None, and no module of it is loaded. Raises SkylessError."""
     from skyless.run.broker import nats_of
     from skyless.run.gather.subjects import nats_address
 
@@ -168,7 +168,7 @@ def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":
 
 
 def _client_name(port: int) -> str:
-    """The dashboard's client name on MQTT: the same after a restart, so that no old sessions accumulate."""
+    """The dashboard's MQTT client name, the same after a restart so that old sessions do not accumulate."""
     import re
     import socket
 
@@ -176,7 +176,7 @@ def _client_name(port: int) -> str:
 
 
 def _load(name: str) -> "tuple[SiteMessage, dict[int | None, bytes]]":
-    """The site, and the images of its floors by their numbers. Raises SkylessError."""
+    """Load a site, and the images of its floors by number. Raises SkylessError."""
     import time
 
     from skyless.run.mqtt.messages import site_message
@@ -188,7 +188,7 @@ def _load(name: str) -> "tuple[SiteMessage, dict[int | None, bytes]]":
 
 
 def _listening(listen: str | None) -> "ListenAddress":
-    """Where to listen. Raises SkylessError."""
+    """The address to listen at. Raises SkylessError."""
     from skyless.page.app import PORT, ListenAddress
 
     if listen is None:
@@ -199,7 +199,7 @@ def _listening(listen: str | None) -> "ListenAddress":
 def _rules(
     bound: str, host: str, port: int, token: str | None, reader_token: str | None = None, *, read_only: bool = False
 ) -> "AccessRules":
-    """Who may connect, by the address that the socket is bound to. Raises SkylessError."""
+    """Access rules, by the address that the socket is bound to. Raises SkylessError."""
     import ipaddress
     import secrets
     import socket
@@ -223,7 +223,7 @@ def _rules(
 
 
 def _address(host: str, port: int, rules: "AccessRules") -> str:
-    """The page's address, as others reach it, with its token."""
+    """The page's address as others reach it, with its token."""
     from urllib.parse import quote
 
     shown = _own_address(host) if host in {"0.0.0.0", "::"} else host
@@ -232,7 +232,7 @@ def _address(host: str, port: int, rules: "AccessRules") -> str:
 
 
 def _own_address(host: str) -> str:
-    """The address by which this machine reaches others; nothing is sent to find it."""
+    """Address of this machine towards others, found without sending anything."""
     import socket
 
     family, other = (socket.AF_INET6, "2001:db8::1") if ":" in host else (socket.AF_INET, "192.0.2.1")

@@ -1,4 +1,4 @@
-"""``skyless history``: what happened at a site, kept in Parquet files."""
+"""``skyless history``: keep a site's fixes and events in Parquet files, and query them."""
 
 import asyncio
 import contextlib
@@ -30,7 +30,7 @@ from skyless.core.errors import SkylessError
 from skyless.machine import extra_module
 
 if TYPE_CHECKING:
-    from collections.abc import Awaitable, Callable
+    from collections.abc import Awaitable
 
     from skyless.run.gather.subjects import NatsAddress
     from skyless.run.history.answers import Span
@@ -45,9 +45,9 @@ if TYPE_CHECKING:
 # ``skyless history track``, ``heatmap``, ``dwell``, ``occupancy``, ``contacts``, ``alarms`` and ``export``.
 
 _LONGEST_TABLE = 40
-"""Rows that are shown; --json gives all."""
+"""Rows that a table shows; --json gives all."""
 _LONGEST_LIST = 10
-"""Cells of a heat map that are shown."""
+"""Cells of a heat map that a table shows."""
 
 _HEADINGS = {"subject_name": "of", "acknowledged_unix_s": "seen", "acknowledged_by": "by", "seconds": "duration"}
 _OF_TAGS = ("tag", "other", "subject")
@@ -69,7 +69,7 @@ class _Asked(Options, frozen=True, kw_only=True):
     """Write one JSON object instead of the table."""
 
     def opened(self) -> "tuple[History, Span]":
-        """The history and the range that are asked for. Raises SkylessError."""
+        """Open the history, and parse the time range. Raises SkylessError."""
         from skyless.run.history.answers import span_of
         from skyless.run.history.queries import History, sites_in
         from skyless.run.process import data_folder
@@ -92,11 +92,11 @@ class _Drawn(_Asked, frozen=True, kw_only=True):
     """Draw the answer into this file (PNG, SVG or PDF)."""
 
     def check(self) -> None:
-        """See that the picture can be written."""
+        """Check that the picture can be written."""
         check_picture(self.plot)
 
     def answer(self, name: str, ask: "Callable[[History, Span], Struct | Sequence[Struct]]") -> int:
-        """Ask, and write the answer as JSON or a table, and as the picture that ``history_pictures`` has for it."""
+        """Query the history, and write the answer as JSON or a table, and as a picture of ``history_pictures``."""
         history, span = self.opened()
         found = ask(history, span)
         assets = history.assets()
@@ -114,7 +114,7 @@ class _Drawn(_Asked, frozen=True, kw_only=True):
 
 
 def _named(answer: Struct, assets: Mapping[str, str]) -> _Row:
-    """The fields of an answer; what names tags is followed by what people call them."""
+    """The fields of an answer; a field that names tags is followed by their assets' names."""
     row = {}
     for key, value in asdict(answer).items():
         row[key] = value
@@ -146,7 +146,7 @@ _ROWS: Mapping[str, Callable[[Any], list[_Row]]] = {
     "heatmap": _heatmap_rows,
     "occupancy": lambda found: [row for row in found if row["most"]],
 }
-"""The rows of the tables that do not show the answer as it is."""
+"""Functions that convert an answer to table rows, for commands that do not show the answer itself."""
 
 
 @questions.command(help_epilogue="Example: skyless history track tag7 --from 8:00 --to 16:00 --plot way.png")
@@ -269,7 +269,7 @@ def _print(history: "History", span: "Span", answer: dict[str, Any]) -> None:
 
 
 def _table(title: str, rows: Sequence[_Row]) -> None:
-    """A table whose columns are the fields of its rows, by name."""
+    """Print a table with a column for each field of its rows."""
     from rich.table import Table
     from rich.text import Text
 
@@ -402,7 +402,7 @@ async def _of_hub(folder: Path, hub: "NatsAddress", site_id: int | None, keep: "
 
 
 async def _keep(opening: "Callable[[], Awaitable[_History]]", found: "list[_History]") -> None:
-    """Keep a history until cancelled; ``found`` gets it."""
+    """Run a history until cancelled, and append it to ``found``."""
     node = await opening()
     found.append(node)
     screen = asyncio.ensure_future(_status(node)) if sys.stderr.isatty() else None
@@ -415,7 +415,7 @@ async def _keep(opening: "Callable[[], Awaitable[_History]]", found: "list[_Hist
 
 
 async def _status(node: "_History") -> None:
-    """One line on a terminal, kept up to date."""
+    """Keep a status line on the terminal up to date."""
     while True:
         await asyncio.sleep(_STATUS_S)
         now = node.state()

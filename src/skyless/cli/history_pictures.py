@@ -4,7 +4,7 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,29 +14,17 @@ from matplotlib.figure import Figure
 from skyless.run.history.answers import THINNED_GAP_S
 from skyless.site.report import BLUE, MAP, MUTED, panel, report_style
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from skyless.run.history.program import HistoryNode, HubHistory
-
-    _History = HistoryNode | HubHistory
-
-
 _BARS: Final = 30
-
-
 _LINES: Final = 8
-
 
 _Zones = Mapping[str, tuple[str, tuple[tuple[float, float], ...]]]
 
-
 _Answer = Mapping[str, Any]
-"""An answer (``run/history/answers.py``) by its fields, with names beside identifiers."""
+"""The fields of an answer (``run/history/answers.py``), with names beside identifiers."""
 
 
 def track_figure(track: _Answer, zones: _Zones, title: str) -> Figure:
-    """The way over the zones, interrupted at gaps."""
+    """Draw the track over the zones, interrupted at gaps."""
     with report_style():
         figure, axes = panel(f"{track['tag_name']}, {title}", 4.2)
         rows = np.array([(point.unix_s, point.x_m, point.y_m) for point in track["points"]]).reshape(-1, 3)
@@ -49,7 +37,7 @@ def track_figure(track: _Answer, zones: _Zones, title: str) -> Figure:
 
 
 def heatmap_figure(heatmap: _Answer, zones: _Zones, title: str) -> Figure:
-    """The time in each cell over the zones, in colours by its logarithm."""
+    """Draw the time in each cell over the zones, in logarithmic colours."""
     with report_style():
         figure, axes = panel(title, 4.2)
         seconds = np.array(heatmap["seconds"]).reshape(heatmap["rows"], heatmap["columns"])
@@ -64,7 +52,7 @@ def heatmap_figure(heatmap: _Answer, zones: _Zones, title: str) -> Figure:
 
 
 def dwell_figure(dwell: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
-    """The longest times as bars."""
+    """Draw the longest times as bars."""
     longest = sorted(dwell, key=lambda one: -one["seconds"])[:_BARS][::-1]
     with report_style():
         figure, axes = panel(title, 1.2 + 0.2 * max(len(longest), 3))
@@ -75,7 +63,7 @@ def dwell_figure(dwell: Sequence[_Answer], _zones: _Zones, title: str) -> Figure
 
 
 def occupancy_figure(occupancy: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
-    """The mean number of tags over time, of the fullest zones."""
+    """Draw the mean number of tags over time in the fullest zones."""
     zones: dict[str, list[_Answer]] = defaultdict(list)
     for one in occupancy:
         zones[one["zone"]].append(one)
@@ -93,19 +81,19 @@ def occupancy_figure(occupancy: Sequence[_Answer], _zones: _Zones, title: str) -
 
 
 def contacts_figure(contacts: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
-    """When each other tag was near."""
+    """Draw when each other tag was near."""
     return _times_figure([(one["other_name"], one["begin_unix_s"], one["end_unix_s"]) for one in contacts], title)
 
 
 def alarms_figure(alarms: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
-    """From when to when each rule's alarms lasted; those that have not ended, until now."""
+    """Draw the duration of each rule's alarms; alarms that have not ended last until now."""
     times = [(one["raised_unix_s"], one["ended_unix_s"] or time.time()) for one in alarms]
     names = [f"{one['rule']}, {one['subject_name']}" for one in alarms]
     return _times_figure([(name, *span) for name, span in zip(names, times, strict=True)], title)
 
 
 def _times_figure(times: Sequence[tuple[str, float, float]], title: str) -> Figure:
-    """A line of bars for each of the first names, from the one Unix time to the other."""
+    """Draw a row of bars for each of the first names, between Unix times."""
     names = list(dict.fromkeys(name for name, _, _ in times))[:_BARS][::-1]
     with report_style():
         figure, axes = panel(title, 1.2 + 0.2 * max(len(names), 3))
@@ -134,4 +122,4 @@ FIGURES: Final[Mapping[str, Callable[[Any, _Zones, str], Figure]]] = {
     "contacts": contacts_figure,
     "alarms": alarms_figure,
 }
-"""What draws the answer to a question, by the question's name."""
+"""Functions that draw the answer to a question, by the question's name."""

@@ -1,4 +1,4 @@
-"""The program ``skyless``: its table of commands, and what all of them share at their start and end."""
+"""The program ``skyless``: its table of commands, and their common start and end."""
 
 import os
 import re
@@ -83,7 +83,7 @@ _TRY_AGAIN_S: Final = 0.02
 
 
 class _Help(DefaultFormatter):
-    """Cyclopts's own format; line breaks of the source within a help text become spaces."""
+    """Cyclopts's format, with line breaks of the source within help texts replaced by spaces."""
 
     def __call__(self, console: "Console", options: "ConsoleOptions", panel: "HelpPanel") -> None:
         from rich.text import Text
@@ -96,7 +96,7 @@ class _Help(DefaultFormatter):
 
 
 def program() -> App:
-    """The program with all its commands, none of them imported yet."""
+    """The program with all its commands, which are imported only when called."""
     app = App(
         name="skyless",
         help="GPS without a sky: fixed UWB anchors broadcast, tags only listen and compute their own position.",
@@ -127,7 +127,7 @@ def program() -> App:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return the exit code: 0, 2 for a user's error, 130 after Ctrl-C, 143 after SIGTERM.
 
-    A command's own exit code is what it returns, None meaning 0.
+    A command returns its own exit code, or None for 0.
     """
     _write_any_character()
     interrupted = [_INTERRUPTED]
@@ -152,7 +152,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _line_for_the_user(error: Exception) -> str | None:
-    """What is wrong and what to do about it; None for a defect of the program."""
+    """Say what is wrong and what to do about it; None for a defect of the program."""
     if isinstance(error, OSError):
         return _trouble(error)
     if isinstance(error, ModuleNotFoundError):
@@ -161,7 +161,7 @@ def _line_for_the_user(error: Exception) -> str | None:
 
 
 def _meant(error: CycloptsError) -> str:
-    """The commands that do, by their summaries, what an unknown command is called."""
+    """Suggest commands whose summaries contain the name of an unknown command."""
     if not isinstance(error, UnknownCommandError) or "Did you mean" in str(error) or not error.unused_tokens:
         return ""
     word = error.unused_tokens[0].lower()
@@ -172,7 +172,7 @@ def _meant(error: CycloptsError) -> str:
 
 @contextmanager
 def _interrupts_between_imports() -> Iterator[None]:
-    """Let Ctrl-C wait for the end of an import, in which Python itself and the modules of NumPy can drop it."""
+    """Delay Ctrl-C until the end of an import, as Python itself and NumPy's modules can drop it there."""
     if threading.current_thread() is not threading.main_thread() or not callable(signal.getsignal(signal.SIGINT)):
         yield
         return
@@ -197,10 +197,10 @@ def _interrupts_between_imports() -> Iterator[None]:
 
 @contextmanager
 def _ended_by_sigterm(note: Callable[[], None]) -> Iterator[None]:
-    """Let SIGTERM end the command in the block as Ctrl-C does, after ``note``, unless the signal is handled already.
+    """Let SIGTERM end the command in the block like Ctrl-C, after ``note()``, unless the signal is already handled.
 
-    An event loop turns Ctrl-C into the cancellation of its task; an exception raised in the middle of it, as it starts
-    a process, could leave it waiting for ever.
+    An event loop turns Ctrl-C into the cancellation of its task; an exception raised inside the loop, for instance
+    while it starts a process, could leave it waiting for ever.
     """
     if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
         yield
@@ -219,7 +219,7 @@ def _ended_by_sigterm(note: Callable[[], None]) -> Iterator[None]:
 
 
 def _trouble(error: OSError) -> str:
-    """What to say of a file or of standard output that cannot be used; anything else is a fault of the program."""
+    """Message for a file or standard output that cannot be used; other errors are raised as defects."""
     if error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     if error.errno not in _CANNOT_WRITE:
@@ -229,14 +229,14 @@ def _trouble(error: OSError) -> str:
 
 
 def _write_any_character() -> None:
-    """A terminal or pipe that cannot show a character gets its code instead of ending the program."""
+    """Let terminals and pipes that cannot show a character print its code instead of failing."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
 
 
 def _drop_output() -> None:
-    """Standard output takes no more; the interpreter must not complain when it flushes the rest at exit."""
+    """Redirect a broken standard output, so that the interpreter does not complain when it flushes at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 

@@ -1,4 +1,4 @@
-"""``skyless plan``: what a site will give before anything is mounted, and where its anchors should hang."""
+"""``skyless plan``: predict a site's errors before anything is mounted, and optimise its anchors' positions."""
 
 import os
 from pathlib import Path
@@ -88,7 +88,7 @@ def plan(asked: PlanOptions, output: _Output) -> None:
 
 
 def _load(file: Path, output: _Output) -> "Site":
-    """Read the site and its image, and see that no output is an input or another output. Raises SkylessError."""
+    """Load the site, and check its image and that all outputs are files of their own. Raises SkylessError."""
     from skyless.site.file.load import load_site
 
     site = load_site(file)
@@ -108,7 +108,7 @@ def _load(file: Path, output: _Output) -> "Site":
 
 
 def _check_image(file: Path, site: "Site", image: Path) -> None:
-    """See that the whole image can be read, not only its size."""
+    """Check that the whole image can be read, not only its size."""
     from matplotlib.image import imread
 
     try:
@@ -120,7 +120,7 @@ def _check_image(file: Path, site: "Site", image: Path) -> None:
 
 
 def _page(plan: "PlanResult", background: "Background") -> str:
-    """The plan as one HTML page: numbers in a table, warnings, pictures, and what is assumed."""
+    """The plan as one HTML page: a table of figures, warnings, pictures and assumptions."""
     from html import escape
 
     from skyless.site import report
@@ -146,9 +146,9 @@ def _page(plan: "PlanResult", background: "Background") -> str:
 
 
 def _write_site(out: Path, site: "Site", source: Path) -> None:
-    """Write an optimised site, made from ``source``, with the path of its image relative to the new file.
+    """Write an optimised site, derived from ``source``, with the path of its image relative to the new file.
 
-    Raises SkylessError when it cannot be written.
+    Raises SkylessError if it cannot be written.
     """
     from skyless.site.file.check import check_site
     from skyless.site.file.template import site_template
@@ -161,7 +161,7 @@ def _write_site(out: Path, site: "Site", source: Path) -> None:
 
 
 def _write_files(plan: "PlanResult", output: _Output) -> None:
-    """Write table and page, where they were asked for. Raises SkylessError when one cannot be written."""
+    """Write the requested table and page. Raises SkylessError if one cannot be written."""
     if (grid := output.grid) is not None:
         from skyless.site.planning.maps import csv_lines, geojson_lines
 

@@ -1,4 +1,4 @@
-"""``skyless replay``: a recording becomes fixes, and is judged against the truth where there is one."""
+"""``skyless replay``: turn a recording into fixes, judged against the truth if there is one."""
 
 import csv
 import sys
@@ -40,13 +40,13 @@ FIXES_COLUMNS: Final = (
     *("anchors", "anchor_ids", "chi2", "residual_rms_m"),
     *("hpl_m", "vpl_m", "integrity_risk", "alert"),
 )
-"""Columns of the file that --fixes-csv writes; of a recording of skyless record ``tag`` is one more."""
+"""Columns of the file that --fixes-csv writes; for a recording of skyless record ``tag`` is added."""
 
 _MANY_UNKNOWN: Final = 0.5
-"""Share of a recording from unknown anchors that is warned of."""
+"""Warn if at least this share of a recording is from unknown anchors."""
 
 _FEW_MEMBERS: Final = 0.8
-"""Mean number of a snapshot's anchors over the largest, below which it is warned of."""
+"""Warn if the mean number of anchors in a snapshot is below this share of the largest."""
 
 app = App(
     name="replay",
@@ -104,7 +104,7 @@ def replay(asked: ReplayOptions, *more: Path, output: _Output) -> int:
 
 
 def _replayed(asked: ReplayOptions, output: _Output, name: str = "") -> tuple[int, dict[str, Any]]:
-    """Replay one recording, whose ``name`` stands before what is reported: exit code, and what --json writes."""
+    """Replay one recording; ``name`` prefixes its reports. Returns the exit code, and the object for --json."""
     inputs = [path for path in (asked.file, asked.anchors, asked.site, asked.truth) if isinstance(path, Path)]
     check_output("fixes-csv", output.fixes_csv, *inputs)
     check_output("plot", output.plot, *inputs, output.fixes_csv)
@@ -151,11 +151,11 @@ _REASONS: Final = {
     "residuals-too-large": "the receptions contradict the anchors' positions; is the table right?",
     "acquiring": "the recording is too short, or its receptions contradict the anchors' positions; is the table right?",
 }
-"""Why a recording gives no fix, by the reason that the filter gave last."""
+"""Why a recording gives no fix, by the filter's last reason."""
 
 
 def _warn_of_unknown(name: str, report: "ReplayReport") -> None:
-    """Warn where fixes are of the lesser part of a recording."""
+    """Warn if much of a recording is from unknown anchors."""
     unknown = report.drops.get("unknown-anchor", 0)
     if report.fixes and unknown >= _MANY_UNKNOWN * report.receptions:
         share = f"{unknown} of {report.receptions} receptions ({unknown / report.receptions:.0%})"
@@ -165,7 +165,7 @@ def _warn_of_unknown(name: str, report: "ReplayReport") -> None:
 
 
 def _warn_of_few_members(tag: str, report: "ReplayReport") -> None:
-    """Warn where a method that needs whole superframes was given parts of them."""
+    """Warn if a method that needs whole superframes got only parts of them."""
     if report.method not in SNAPSHOTS:
         return
     from skyless.research.replays.site import TagReport

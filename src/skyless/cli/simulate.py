@@ -1,4 +1,4 @@
-"""``skyless simulate``: a site in the simulated world, judged against the truth."""
+"""``skyless simulate``: simulate a site, and judge its fixes against the truth."""
 
 import csv
 import sys

@@ -1,4 +1,4 @@
-"""``skyless site``: write and check site files; its keys are in ``site_keys``."""
+"""``skyless site``: write and check site files; for their keys see ``site_keys``."""
 
 import secrets
 import time
@@ -43,7 +43,7 @@ _GRID_HEIGHT_M: Final = 4.0
 _TAGS_BELOW_A_GRID_M: Final = 1.2
 _PAPER_SLOT_S: Final = 2.5e-3
 _LONGEST_TABLE: Final = 40
-"""Anchors that are shown one a row; of more only a summary."""
+"""Most anchors to show one per row; for more there is only a summary."""
 _Count = Annotated[int, whole(1, 255)]
 
 app = App(name="site", help_epilogue="Example: skyless site check site.toml")
@@ -102,7 +102,7 @@ def new(asked: NewOptions) -> None:
 
 
 def _new_site(asked: NewOptions) -> Site:
-    """The site that is asked for, but for name and number. Raises SkylessError."""
+    """Create the requested site, without its name and number. Raises SkylessError."""
     width, depth, spacing, unplaced = asked.width, asked.depth, asked.spacing, asked.unplaced
     if asked.paper and (unplaced is not None or spacing is not None):
         raise SkylessError("--paper is for one room; its anchors need positions, and all receive one master")
@@ -143,7 +143,7 @@ def _check_free(file: Path, *, force: bool) -> None:
 
 
 def _tag_height(text: str | None, spacing_m: float | None) -> float | None:
-    """The tags' height in metres, None where it is estimated. Raises SkylessError."""
+    """The tags' height in metres, None if it is estimated. Raises SkylessError."""
     if text is None:
         return None if spacing_m is None else _TAGS_BELOW_A_GRID_M
     height_m = read_height("--tag-height", text, ("free",))
@@ -297,7 +297,7 @@ def _row(anchor: dict[str, Any], report: dict[str, Any]) -> list[str]:
 
 
 def _summary(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Many anchors in a few lines."""
+    """Summary of many anchors in a few lines."""
     anchors, unplaced = report["anchors"], report["unplaced"]
     yield "anchors", str(len(anchors) + len(unplaced))
     if unplaced:
@@ -311,7 +311,7 @@ def _summary(report: dict[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _schedule_lines(report: dict[str, Any]) -> str:
-    """Who sends how often, and how much of the air that takes."""
+    """Describe the schedule: rates, and occupancy of the air."""
     frame = f"the longest frame takes {report['longest_frame_s'] * 1e6:.0f} µs"
     rate = f"each anchor sends {report['beacons_per_s_of_each_anchor']:.1f} beacons/s"
     if report["mode"] == "free":

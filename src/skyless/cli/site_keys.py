@@ -28,7 +28,6 @@ from skyless.core.keys.chain import (
     USUAL_TIMING,
     Chain,
     ChainRing,
-    ChainTiming,
     section_signatures,
 )
 from skyless.core.site import Site
@@ -54,11 +53,11 @@ from skyless.run.keys import (
 _DAY_S: Final = 86_400.0
 _YEAR_S: Final = 365.25 * _DAY_S
 _LATEST_S: Final = 20.0 * _YEAR_S
-"""A chain may begin this long from now at most."""
+"""Latest begin of a chain, from now."""
 
 _LITTLE_LEFT_S: Final = 60.0 * _DAY_S
 _OVERLAP_S: Final = 5.0
-"""A chain that counts at once begins this long ago, as clocks of hosts differ."""
+"""A chain that starts at once begins this long ago, as the clocks of hosts differ."""
 
 
 app = App(
@@ -76,7 +75,7 @@ class _KeysOptions(JsonOptions, frozen=True, kw_only=True):
 
     @property
     def plan(self) -> Site:
-        """The site, whose beacons can carry codes. Raises SkylessError."""
+        """The site, of a mode whose beacons can carry codes. Raises SkylessError."""
         plan = site_named(self.site)
         if plan.schedule.needs_master:
             raise SkylessError(
@@ -196,7 +195,7 @@ def show(asked: _KeysOptions) -> None:
 
 
 def _report_new(asked: _KeysOptions, chain: Chain, next_steps: str, warnings: Sequence[str] = ()) -> None:
-    """What was made, and what is to be done next; as JSON the report of ``show`` on what is there now."""
+    """Print what was made and the next steps, or as JSON the same report as ``show``."""
     if asked.json:
         report = _report(asked.folder, *_present(asked), time.time())
         print_json({**report, "warnings": [*warnings, *report["warnings"]]})
@@ -208,7 +207,7 @@ def _report_new(asked: _KeysOptions, chain: Chain, next_steps: str, warnings: Se
 
 
 def _report(folder: Path, public: SitePublic, chains: list[Chain], now_s: float) -> dict[str, Any]:
-    """What is to be said of the chains."""
+    """Report on the key chains."""
     ring = ChainRing(chains)
     at = None if ring.timing is None else ring.at(ring.timing.interval_at(now_s))
     present = None if at is None or at.chain.serial < public.least_serial else at.chain.serial
@@ -245,7 +244,7 @@ def _report(folder: Path, public: SitePublic, chains: list[Chain], now_s: float)
 
 
 def _present(asked: _KeysOptions) -> tuple[SitePublic, list[Chain]]:
-    """Public key and chains, without their seeds, of a site that has keys. Raises SkylessError."""
+    """Read a site's public key and key chains, without their seeds. Raises SkylessError."""
     plan, folder = asked.plan, asked.folder
     public = read_folder_public(folder, plan.id)
     chains = [read_chain_public(folder, serial, plan.id) for serial in serials_in(folder)]
@@ -255,7 +254,7 @@ def _present(asked: _KeysOptions) -> tuple[SitePublic, list[Chain]]:
 
 
 def _successor(folder: Path, public: SitePublic, chains: list[Chain], starts_s: float, years: float) -> Chain:
-    """The next chain of a site. Raises SkylessError."""
+    """Make the next chain of a site. Raises SkylessError."""
     private = read_private(folder, public)
     serial = max(chains[-1].serial, public.least_serial) + 1
     if serial > MAX_SERIAL:
@@ -264,13 +263,13 @@ def _successor(folder: Path, public: SitePublic, chains: list[Chain], starts_s: 
 
 
 def _made(public: SitePublic, serial: int, starts_s: float, years: float, private: bytes) -> Chain:
-    """A new chain, with a bar while it is made."""
+    """Make a new chain, with a progress bar."""
     with progress_bar("making the key chain") as reach:
         return new_chain(public.site, serial, starts_s, starts_s + years * _YEAR_S, private, reach)
 
 
 def _write(folder: Path, chain: Chain, more: dict[Path, bytes]) -> None:
-    """Write the files of a chain and others. Raises SkylessError, and then none is there."""
+    """Write the files of a chain and others, all or none. Raises SkylessError."""
     seed, chain_public = chain_seed_file(folder, chain.serial), chain_public_file(folder, chain.serial)
     for file in (seed, chain_public):
         if file.exists():
@@ -282,7 +281,7 @@ def _write(folder: Path, chain: Chain, more: dict[Path, bytes]) -> None:
 
 
 def _planned(text: str) -> float:
-    """Unix time of a future moment. Raises SkylessError."""
+    """Parse a future date and time to Unix time. Raises SkylessError."""
     try:
         starts_s = datetime.fromisoformat(text).timestamp()
     except (ValueError, OverflowError, OSError):
@@ -304,10 +303,10 @@ def _when(unix_s: float) -> str:
 
 
 _PIECE: Final = 64
-"""Sections that a process makes at a time: 0.3 s."""
+"""Sections that a process makes at a time, which takes 0.3 s."""
 
 _FEW: Final = 128
-"""Sections that are made sooner than processes start."""
+"""Up to this number, making sections is faster than starting processes."""
 
 
 def new_chain(
@@ -317,16 +316,15 @@ def new_chain(
     ends_s: float,
     private: bytes,
     reached: Callable[[float], None],
-    timing: ChainTiming = USUAL_TIMING,
 ) -> Chain:
-    """A chain with a new seed between two Unix times, whose end is rounded up to whole sections (14 minutes).
+    """Make a chain with a new seed between two Unix times, the end rounded up to whole sections (14 minutes).
 
-    ``private``: the site's private key, 32 bytes. ``reached`` is called with the share of the work that is done.
-    An interrupt ends all processes.
+    ``private``: the site's private key, 32 bytes. ``reached`` is called with the share of the work done. An interrupt
+    ends all processes.
     """
     seed = secrets.token_bytes(SEED_BYTES)
-    first = timing.interval_at(starts_s)
-    begin, end = first >> SECTION_BITS, (timing.interval_at(ends_s) >> SECTION_BITS) + 1
+    first = USUAL_TIMING.interval_at(starts_s)
+    begin, end = first >> SECTION_BITS, (USUAL_TIMING.interval_at(ends_s) >> SECTION_BITS) + 1
     pieces = [range(at, min(at + _PIECE, end)) for at in range(begin, end, _PIECE)]
     signatures = bytearray()
 
@@ -334,7 +332,7 @@ def new_chain(
         signatures.extend(piece)
         reached(len(signatures) / CERTIFICATE_SIGNATURE_BYTES / (end - begin))
 
-    work = (repeat(seed), repeat(site), repeat(serial), repeat(timing), repeat(first), pieces, repeat(private))
+    work = (repeat(seed), repeat(site), repeat(serial), repeat(first), pieces, repeat(private))
     if end - begin <= _FEW:
         for piece in map(_signatures, *work):
             add(piece)
@@ -347,20 +345,16 @@ def new_chain(
             except BaseException:
                 pool.shutdown(wait=True, cancel_futures=True)
                 raise
-    return Chain(site, serial, timing, first, bytes(signatures), seed)
+    return Chain(site, serial, USUAL_TIMING, first, bytes(signatures), seed)
 
 
-def _signatures(
-    seed: bytes, site: int, serial: int, timing: ChainTiming, first: int, sections: range, private: bytes
-) -> bytes:
-    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-
+def _signatures(seed: bytes, site: int, serial: int, first: int, sections: range, private: bytes) -> bytes:
     key = Ed25519PrivateKey.from_private_bytes(private)
-    return section_signatures(seed, site, serial, timing, first, sections, key)
+    return section_signatures(seed, site, serial, USUAL_TIMING, first, sections, key)
 
 
 def _start_worker() -> None:
-    """An interrupt reaches all processes of a terminal; the parent alone acts on it. A worker ends with its parent."""
+    """Ignore interrupts, which reach all processes of a terminal but concern the parent, and end with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None

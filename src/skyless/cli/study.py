@@ -34,8 +34,6 @@ from skyless.files import write_whole
 from skyless.research.replays.options import check_estimator, read_estimator
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from skyless.cli.api.simulate import StudyResult
     from skyless.research.masterless.smoothing import OwnEstimator
     from skyless.research.studies.runner import Row
@@ -123,7 +121,7 @@ def study(asked: StudyOptions, output: _Output) -> None:
 
 
 def _write(result: "StudyResult", output: _Output) -> None:
-    """Write the files that were asked for, each whole or not at all. Raises SkylessError."""
+    """Write the requested files, each whole or not at all. Raises SkylessError."""
     plot, out, rows = output.plot, output.out, result.rows
     if plot is None and out is None:
         return
@@ -156,7 +154,7 @@ def _csv(rows: "Sequence[Row]") -> str:
 
 
 def print_rows(result: "StudyResult") -> None:
-    """Show the rows as a table."""
+    """Print the rows as a table."""
     cells = [[cell(row) for _, cell in _COLUMNS] for row in result.rows]
     used = [column for column in range(len(_COLUMNS)) if any(line[column] for line in cells)]
     heads = [_COLUMNS[column][0] for column in used]
@@ -167,7 +165,7 @@ def print_rows(result: "StudyResult") -> None:
 
 
 def _limit(row: "Row") -> str:
-    """Which limits were missed; or the largest ratio that is accepted, else the risk of levels, and whether it held."""
+    """Missed limits in words; or the largest accepted ratio, else the levels' risk, and whether it was held."""
     if row.limits:
         return (
             "missed: " + ", ".join(_NAMES.get(one, one.removesuffix("_m").removesuffix("_s")) for one in row.missed)
@@ -179,7 +177,7 @@ def _limit(row: "Row") -> str:
 
 
 def _rare(share: float | None) -> str:
-    """In 10⁻⁴."""
+    """Format a share in units of 10⁻⁴."""
     return "" if share is None else f"{1e4 * share:.{0 if share >= 1e-2 else 2}f}"
 
 
@@ -210,7 +208,7 @@ def _span(name: str, words: Callable[[float], str]) -> _Cell:
 
 
 def _unless_wide(cell: _Cell) -> _Cell:
-    """Left out where the table is wide enough without the columns that have no limits."""
+    """Leave the cell empty in studies whose tables are wide enough without it."""
     return lambda row: "" if row.study in {"room", "large", "survey-room"} else cell(row)
 
 
@@ -259,7 +257,7 @@ _COLUMNS: Final[tuple[tuple[str, _Cell], ...]] = (
     ("limit", _limit),
     ("CPU in µs", _unless_wide(_number("cpu_us_per_message", digits=0))),
 )
-"""Heads of the table, and what stands below them; columns that no row fills are left out."""
+"""Heads of the table's columns, and functions for their cells; columns that no row fills are left out."""
 
 _NAMES: Final = {
     "rmse_m": "RMSE",
@@ -275,7 +273,7 @@ _NAMES: Final = {
     "delay_m": "delays",
     "alarms_per_day": "alarms a day",
 }
-"""How the table names figures that missed their limits, where not by the field's own name."""
+"""Names in the table of figures that missed their limits, if different from the field's name."""
 
 
 paper_app = App(name="paper", help_epilogue="Example: skyless paper --out report --seed 1")

@@ -1,4 +1,4 @@
-"""``skyless survey``: positions and antenna delays of anchors, from what they receive of one another."""
+"""``skyless survey``: find positions and antenna delays of anchors from their receptions of one another."""
 
 import time
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ NOTHING_DETERMINED: Final = 1
 """Exit code of a survey without a position or a delay."""
 
 _WORST: Final = 8
-"""Pairs that are shown, those with the largest residuals."""
+"""Number of pairs that are shown, those with the largest residuals."""
 
 app = App(
     name="survey",
@@ -99,7 +99,7 @@ def survey(*, asked: SurveyOptions, live: LiveOptions, output: _Output) -> int:
 
 
 def _check(asked: SurveyOptions, live: LiveOptions, output: _Output) -> None:
-    """See that inputs and options fit one another and outputs can be written, before the work. Raises SkylessError."""
+    """Check before the work that inputs and options are compatible and outputs can be written. Raises SkylessError."""
     if (asked.recording is not None) + (asked.ranges is not None) + live.is_live != 1:
         raise SkylessError(
             "a survey needs a recording (--recording), or else a table of ranges (--ranges), or else a running site "
@@ -131,7 +131,7 @@ def _check(asked: SurveyOptions, live: LiveOptions, output: _Output) -> None:
 
 
 def _written(found: "SurveyResult", out: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The files that --out has written, and warnings of what is not in them. Raises SkylessError."""
+    """Write --out. Returns the written files, and warnings about anchors left out. Raises SkylessError."""
     if out.suffix.lower() == ".csv":
         return _write(out, {out: _table(found.survey).encode()}), ()
     from skyless.site.survey.facts import SurveyRecord, encode_record, record_path
@@ -148,9 +148,9 @@ def _written(found: "SurveyResult", out: Path) -> tuple[tuple[str, ...], tuple[s
 
 
 def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
-    """Write files, and what ``out`` held under another name: all of them or none.
+    """Write files, and the previous content of ``out`` under another name: all of them or none.
 
-    The last one is named first. Raises SkylessError.
+    Returns that copy, then the files in reverse order. Raises SkylessError.
     """
     from skyless.files import replace_files
     from skyless.run.survey.files import kept_path
@@ -162,7 +162,7 @@ def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
 
 
 def _table(result: "Survey") -> str:
-    """A table of anchors with their delays as ``skyless replay --anchors`` uses them."""
+    """A table of anchors with their delays, for ``skyless replay --anchors``."""
     from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
     from skyless.site.tables import new_table
 
@@ -191,7 +191,7 @@ def _report_biases(found: "BiasResult", output: _Output) -> None:
 
 
 def _show(found: "SurveyResult", written: tuple[str, ...]) -> None:
-    """Show the survey: first warnings about what is uncertain, then tables and lines of text."""
+    """Print the survey: first warnings about uncertainties, then tables and lines of text."""
     survey, screen = found.survey, console()
     print_warnings(
         [
@@ -235,7 +235,7 @@ def _print_anchors(survey: "Survey") -> None:
 
 
 def _print_pairs(checked: Sequence["SurveyedPair"]) -> None:
-    """Those whose ranges differ most from the result."""
+    """Print the pairs whose ranges differ most from the result."""
     worst = sorted(checked, key=lambda pair: -abs(pair.residual_m or 0.0))[:_WORST]
     shown = "all pairs" if len(worst) == len(checked) else f"the {len(worst)} of {len(checked)} pairs that fit worst"
     rows = []
@@ -256,7 +256,7 @@ def _checks(redundancy: int) -> str:
 
 
 def _tapes(tapes: Sequence["TapeAdvice"]) -> list[str]:
-    """Which distances to measure next, and how accurate the positions would be then."""
+    """Lines on the distances to measure next, and the resulting accuracy."""
     lines = []
     for rank, tape in enumerate(tapes):
         ask = "the tape that helps most" if rank == 0 else "then"

@@ -1,1 +1,1 @@
-"""The web page of a site: its server, and in ``browser/`` what the browser runs."""
+"""The web page of a site: its server, and in ``browser/`` the code for browsers."""

@@ -1,7 +1,7 @@
-"""The alarms of a site: what its messages mean for the rules, what is published, and what pages are sent.
+"""The alarms of a site: evaluation of its messages, publication, and the messages to pages.
 
-Of the dashboards of a site the first one online leads: it raises the alarms and publishes them. The others follow, with
-engines that have seen the same, so that the next one goes on where the first has ended.
+Of a site's dashboards the first one online leads: it raises and publishes the alarms. The others follow with engines
+that have seen the same messages, so that the next one can take over.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -27,10 +27,10 @@ from skyless.run.zones import ZoneMonitor
 from skyless.site.alarm_rules import check_rules
 
 MAX_SENT: Final = 500
-"""Alarms that a page is sent: those that nobody has acknowledged first, then the newest."""
+"""Most alarms sent to a page: unacknowledged ones first, then the newest."""
 
 KEPT_WAIT_S: Final = 2.0
-"""After a connection, the messages that the broker has kept are here by then."""
+"""Time after connecting by which the broker's retained messages have arrived."""
 
 _BROADCAST_S: Final = 0.25
 
@@ -42,7 +42,7 @@ class NoAlarmError(Exception):
 
 
 class SiteAlarms:
-    """The rules and alarms of one site. Each change is handed to ``broadcast`` for the open pages."""
+    """The rules and alarms of one site. Each change is passed to ``broadcast`` for the open pages."""
 
     def __init__(
         self,
@@ -51,28 +51,28 @@ class SiteAlarms:
         broadcast: Callable[[str, bytes], None],
         log: Callable[[str, AlarmMessage, float], None],
     ) -> None:
-        """``name`` is the dashboard's on MQTT; ``log`` is given what becomes of alarms."""
+        """``name``: of the dashboard on MQTT; ``log`` is called with changes of alarms."""
         self.engine = AlarmEngine(monitor)
         self.rules: tuple[AlarmRule, ...] = ()
-        """Those that were made on the page."""
+        """Rules made on the page."""
         self.file_rules: tuple[AlarmRule, ...] = ()
-        """Those of the site's file."""
+        """Rules of the site's file."""
         self._name, self._broadcast, self._log = name, broadcast, log
         self._link: SiteLink | None = None
         self._site_id = 0
         self._site = ""
         self._kept_rules = Kept(AlarmRulesMessage(()), read_rules)
         self._received: dict[Key, AlarmMessage] = {}
-        """Alarms as the broker has them, since the last connection."""
+        """Alarms at the broker, received since the last connection."""
         self._connected_s: float | None = None
         self._changed = False
         self._sent_s = float("-inf")
 
-    # What pages see
+    # Pages
 
     @property
     def messages(self) -> tuple[AlarmMessage, ...]:
-        """The alarms that are kept: those that nobody has acknowledged first, then the newest."""
+        """Current alarms: unacknowledged ones first, then the newest."""
         kept = self.engine.messages.values()
         return tuple(sorted(kept, key=lambda one: (one.acknowledged_unix_s is not None, -one.unix_s)))
 
@@ -87,7 +87,7 @@ class SiteAlarms:
     # MQTT
 
     def attach(self, link: SiteLink, site_id: int) -> dict[str, Handler]:
-        """What is to be subscribed to, and who handles it."""
+        """Use a site's connection. Returns the topics to subscribe to, with their handlers."""
         self._link, self._site_id = link, site_id
         self._kept_rules.attach(link, alarm_rules_topic(site_id))
         return {
@@ -97,14 +97,14 @@ class SiteAlarms:
         }
 
     def on_connection(self, connected: bool, now_s: float) -> None:
-        """The broker is connected, or is not any more."""
+        """The broker has been connected or disconnected."""
         self._connected_s = now_s if connected else None
         self._received.clear()
         if not connected:
             self._rest()
 
     def on_site(self, site: SiteMessage) -> None:
-        """The site is known, with its rules."""
+        """Use the site's name and rules."""
         self._site, self.file_rules = site.site.name, site.alarms
         self._apply_rules()
 
@@ -137,28 +137,28 @@ class SiteAlarms:
             kept[key] = _joined(kept.get(key), message)
 
     def _on_acknowledge(self, topic: str, payload: bytes) -> None:
-        """All dashboards note it, as the one that leads may end before it has published the alarm with it."""
+        """Acknowledge an alarm, even while following: the leader may end before it publishes the acknowledged alarm."""
         rule, subject = topic.split("/")[-3:-1]
         message = read_message(payload, AcknowledgeMessage)
         self._changed |= self.engine.acknowledge(rule, subject, message.id, message.by[:100], message.unix_s)
 
-    # What people do
+    # Actions of users
 
     def store_rules(self, rules: Sequence[AlarmRule], site: str = "") -> None:
-        """Store the rules of a page of this site. Raises WrongMessageError and BadAlarmRulesError."""
+        """Store rules from a page of this site. Raises WrongMessageError and BadAlarmRulesError."""
         self._kept_rules.check_store(site, self._site)
         check_rules(rules, self.file_rules)
         self._kept_rules.store(AlarmRulesMessage(tuple(rules), self._site))
         self._apply_rules()
 
     def check_is_kept(self, rule: str, subject: str, occurrence: str) -> None:
-        """Raise NoAlarmError where there is no such alarm."""
+        """Raise NoAlarmError if there is no such alarm."""
         message = self.engine.messages.get((rule, subject))
         if message is None or message.id != occurrence:
             raise NoAlarmError(f"there is no alarm {occurrence[:120]!r} of {rule[:40]!r} and {subject[:80]!r} any more")
 
     def is_acknowledged(self, rule: str, subject: str, occurrence: str) -> bool:
-        """Whether the broker has it that an alarm was acknowledged, so that no restart forgets it."""
+        """Whether the broker has stored the acknowledgement of an alarm, so that it survives a restart."""
         message = self.engine.messages.get((rule, subject))
         is_open = message is not None and message.id == occurrence and message.acknowledged_unix_s is None
         is_stored = self._link is not None and not self._link.unacknowledged and not self.engine.has_changes
@@ -167,7 +167,7 @@ class SiteAlarms:
     # Work
 
     def tick(self, now_s: float, unix_s: float, dashboards: Iterable[StatusMessage], *, blind: bool) -> None:
-        """Do what is due, 20 times a second. ``dashboards`` are those of the site; ``blind`` as of the engine."""
+        """Do due work, 20 times a second. ``dashboards``: of the site; ``blind``: see the engine."""
         ready = self._connected_s is not None and now_s - self._connected_s >= KEPT_WAIT_S and bool(self._site)
         if ready and not blind:
             first = min(((one.unix_s, one.name) for one in dashboards if one.online), default=(0.0, ""))[1]
@@ -187,7 +187,7 @@ class SiteAlarms:
             self._broadcast("alarms", self.encoded()["alarms"])
 
     def _drop_cleared(self) -> None:
-        """Keep what the broker has, as another one leads."""
+        """Drop alarms that the broker does not have, as another dashboard leads."""
         kept = self.engine.messages
         for key in kept.keys() - self._received.keys():
             del kept[key]
@@ -201,14 +201,14 @@ class SiteAlarms:
         self._broadcast("alarm_rules", self.encoded()["alarm_rules"])
 
     def _lead(self, now_s: float, unix_s: float) -> None:
-        """Go on with the alarms that are kept, and publish those that the broker does not have so."""
+        """Take over the lead: continue the known alarms, and publish those that differ at the broker."""
         for key, message in self.engine.messages.items():
             if self._received.get(key) != message:
                 self._publish(message)
         self.engine.resume(self.engine.messages.values(), now_s, unix_s)
 
     def _rest(self) -> None:
-        """Follow. What this one has published must not come back after a reconnect: another one may lead by then."""
+        """Stop leading. Own publications must not be repeated after a reconnect, when another one may lead."""
         if self.engine.leading and self._link is not None:
             for rule, subject in self.engine.messages:
                 self._link.forget(alarm_topic(self._site_id, rule, subject))
@@ -225,14 +225,14 @@ class SiteAlarms:
 
 
 def read_rules(payload: bytes) -> AlarmRulesMessage:
-    """An ``AlarmRulesMessage`` in JSON, all its rules checked. Raises WrongMessageError and BadAlarmRulesError."""
+    """Decode an ``AlarmRulesMessage`` and check its rules. Raises WrongMessageError and BadAlarmRulesError."""
     message = read_message(payload, AlarmRulesMessage)
     check_rules(message.rules)
     return message
 
 
 def _joined(mine: AlarmMessage | None, theirs: AlarmMessage) -> AlarmMessage:
-    """What is known of an alarm from a copy that was kept here and that of the broker."""
+    """Merge the local copy of an alarm with the broker's."""
     if mine is None or mine.id != theirs.id:
         return theirs if mine is None or theirs.unix_s >= mine.unix_s else mine
     if theirs.acknowledged_unix_s is None:

@@ -1,4 +1,4 @@
-"""The page's server: its addresses, and how it is started and stopped."""
+"""The page's server: its routes, its start and its shutdown."""
 
 import asyncio
 import contextlib
@@ -82,7 +82,7 @@ _STATUSES: Final[dict[type[Exception], int]] = {
 
 
 class Services(Struct, frozen=True):
-    """What the server serves."""
+    """Services of the server."""
 
     sites: Sites
     playback: Playback
@@ -93,11 +93,11 @@ class Services(Struct, frozen=True):
     gathered: "Gathered | None" = None
     """The batches of a broker with a gather."""
     hub: "ShownSites | None" = None
-    """The same as ``sites`` where these are those of a hub."""
+    """The same as ``sites`` if they are a hub's."""
 
 
 def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Starlette:
-    """The server's application."""
+    """Create the server's application."""
     mimetypes.add_type("text/javascript", ".js")  # some systems map it otherwise, and browsers refuse the modules
     mimetypes.add_type("text/javascript", ".mjs")
     mimetypes.add_type("application/wasm", ".wasm")
@@ -184,7 +184,7 @@ def _image(image: bytes | None) -> Response:
 
 
 def _image_type(image: bytes) -> str | None:
-    """Media type of a PNG or JPEG, or None for anything else, which is not served."""
+    """Media type of a PNG or JPEG; None for other files, which are not served."""
     if image.startswith(b"\x89PNG\r\n\x1a\n"):
         return "image/png"
     return "image/jpeg" if image.startswith(b"\xff\xd8\xff") else None
@@ -205,7 +205,7 @@ async def _overlay(request: Request) -> Response:
 
 
 async def _planned(request: Request, live: LiveSite) -> Site:
-    """The site as it would be with the anchors where the request's body has them; as it is where there is none."""
+    """The site with its anchors moved as in the request's body; unchanged without a body."""
     site = live.require_site().whole_site
     body = await read_bytes(request, LIMITS.body_bytes, "too many anchors")
     if not body:
@@ -217,7 +217,7 @@ async def _planned(request: Request, live: LiveSite) -> Site:
 
 
 async def _sheet(request: Request) -> Response:
-    """The installer's sheet of the site, with anchors where the request's body has them."""
+    """The installer's sheet of the site, with its anchors moved as in the request's body."""
     site = await _planned(request, _live_of(request))
     answer = await _services(request).sheets.run(replace(site, floor_plan=None))
     return Response(msgspec.json.decode(answer, type=bytes), media_type="application/pdf")
@@ -271,7 +271,7 @@ async def _recordings(request: Request) -> Response:
 
 
 def _recorded(read: Callable[[Playback, str], _T], answer: Callable[[_T], Response]) -> _Endpoint:
-    """Answers with a part of a recording, which is read in a thread."""
+    """Create an endpoint that answers with a part of a recording, read in a thread."""
 
     async def respond(request: Request) -> Response:
         return answer(await asyncio.to_thread(read, _services(request).playback, request.path_params["name"]))
@@ -308,7 +308,7 @@ async def _what_if(request: Request) -> Response:
 
 
 def _live_for(socket: WebSocket) -> LiveSite:
-    """The site that a page asks for, or another for a page that was open before the server's start, if it is gone."""
+    """The requested site; if it is gone, another one, for a page that was open before the server's start."""
     sites = _services(socket).sites
     try:
         return sites.of(socket.query_params.get("site"))
@@ -325,7 +325,7 @@ async def _live2(socket: WebSocket) -> None:
 
 async def _live(socket: WebSocket) -> None:
     live = _live_for(socket)
-    await socket.accept()  # a browser does not show a page why its socket was refused, only why it was closed
+    await socket.accept()  # browsers tell a page only why its socket was closed, not why it was refused
     try:
         address = socket.client.host if socket.client is not None else ""
         page = live.open_page(address, live2=_services(socket).gathered is not None)
@@ -362,15 +362,15 @@ _SEND_BUFFER_BYTES: Final = 262_144  # data for a slow page that waits in the ke
 
 
 class ListenAddress(Struct, frozen=True):
-    """Where the server listens."""
+    """Address at which the server listens."""
 
     host: str
     port: int | None
-    """None: 8080, or the next one that is free."""
+    """None: 8080, or the next free port."""
 
 
 def bind(listen: ListenAddress) -> socket.socket:
-    """A socket at the address, or at the next free port where none is given.
+    """Open a socket at the address, or at the next free port if none is given.
 
     Raises:
         SkylessError: the socket cannot listen there.
@@ -379,7 +379,7 @@ def bind(listen: ListenAddress) -> socket.socket:
         return _bind(listen.host, listen.port)
     for port in range(PORT, PORT + _MORE_PORTS):
         held = reserve(listen.host, port)
-        if held is None:  # a demo that has just started names this port and is about to listen there
+        if held is None:  # reserved by a demo that is starting
             continue
         with held, contextlib.suppress(_PortInUseError):
             return _bind(listen.host, port)
@@ -402,7 +402,7 @@ def _bind(host: str, port: int) -> socket.socket:
             if hasattr(socket, "TCP_USER_TIMEOUT"):  # Linux; elsewhere the system's own time-out applies
                 sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(1000 * SEND_TIMEOUT_S))
             sock.bind(address)
-            sock.listen(socket.SOMAXCONN)  # two sockets may be bound to one port, but not both listen
+            sock.listen(socket.SOMAXCONN)  # two sockets may be bound to one port, but only one can listen
         except BaseException:
             sock.close()
             raise
@@ -471,14 +471,14 @@ def _stop(server: "_Server", services: Services) -> None:
 
 
 class _Server(uvicorn.Server):
-    """A server that does not handle signals. Its owner does."""
+    """A server that leaves signals to its owner."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
 
     def drop_connections(self) -> None:
-        """Close connections that have not ended."""
+        """Close the remaining connections."""
         self.force_exit = True
         for connection in list(self.server_state.connections):
             transport = getattr(connection, "transport", None)

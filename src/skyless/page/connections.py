@@ -1,4 +1,4 @@
-"""The connections of the page's server: how many there may be, and which end because nothing is asked on them."""
+"""Connections of the page's server: their limits, time-outs, WebSockets and access control."""
 
 import asyncio
 import hmac
@@ -25,7 +25,7 @@ JSON: Final = "application/json"
 
 
 def json_answer(value: object, status: int = 200, media_type: str = JSON) -> Response:
-    """A value, or bytes that are JSON, and a newline: in a terminal the prompt then begins a line of its own."""
+    """Answer with a value, or bytes that are JSON, and a newline, so that a terminal's prompt starts a new line."""
     whole = value if isinstance(value, bytes) else msgspec.json.encode(value)
     return Response(whole + b"\n", status, media_type=media_type)
 
@@ -38,17 +38,17 @@ _RESPONSE: Final = (
 
 
 class Connection(H11Protocol):
-    """A connection of HTTP, which becomes one of a WebSocket where that is asked.
+    """An HTTP connection, which may be upgraded to a WebSocket.
 
-    Where there are too many, the one that has waited longest for the rest of a request makes room. Only where none
-    does, the new one is refused.
+    If there are too many, the one that has waited longest for the rest of a request is closed. Only if none waits is
+    the new one refused.
     """
 
     since_s = 0.0
-    """When the connection began."""
+    """Time when the connection began."""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Take the connection, if there is room."""
+        """Accept the connection if there is room."""
         super().connection_made(transport)
         self.since_s = self.loop.time()
         others: list[Any] = [one for one in self.connections if one is not self and not one.transport.is_closing()]
@@ -61,7 +61,7 @@ class Connection(H11Protocol):
     def _make_room(self, crowd: list[Any], which: bytes) -> None:
         unfinished = [one for one in crowd if is_unfinished(one)]
         if unfinished:
-            # One that has been answered and is silent, as a browser keeps it, is the last that makes room.
+            # Idle connections that have been answered, as browsers keep them, are closed last.
             min(unfinished, key=lambda one: (one.timeout_keep_alive_task is not None, one.since_s)).transport.abort()
             return
         text = _REFUSAL % (len(crowd), which)
@@ -70,7 +70,7 @@ class Connection(H11Protocol):
 
 
 def is_unfinished(connection: object) -> bool:
-    """Whether a connection waits for a request, or the rest of one. A WebSocket never does."""
+    """Whether a connection waits for a request, or the rest of one; never for a WebSocket."""
     if not isinstance(connection, Connection):
         return False
     cycle = connection.cycle
@@ -80,7 +80,7 @@ def is_unfinished(connection: object) -> bool:
 async def end_unfinished(
     connections: set[Any], timeout_s: float = LIMITS.request_s, body_timeout_s: float = LIMITS.body_s
 ) -> None:
-    """End connections that have been without a whole request for too long, until cancelled; uvicorn ends idle ones."""
+    """Until cancelled, close connections that take too long for a request; uvicorn closes idle ones."""
     since_s: dict[object, float] = {}
     while True:
         await asyncio.sleep(timeout_s / 4)
@@ -94,12 +94,12 @@ async def end_unfinished(
 
 
 class FailedAccepts(logging.Filter):
-    """Lets the event loop log failed accepts, as for want of open files, once a minute, and without a traceback."""
+    """Limits logs of failed accepts, as for lack of open files, to one a minute without a traceback."""
 
     said_s = -math.inf
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Whether a line is logged."""
+        """Whether to log a record."""
         if "accept()" not in record.getMessage():
             return True
         now_s, record.exc_info = time.monotonic(), None
@@ -108,7 +108,7 @@ class FailedAccepts(logging.Filter):
         return is_due
 
 
-# WebSockets: a reader is sent messages until it closes, or accepts none for too long.
+# WebSockets: a reader gets messages until it closes, or accepts none for too long.
 
 SEND_TIMEOUT_S: Final = 10.0
 """A reader that accepts no message for this long is disconnected."""
@@ -121,7 +121,7 @@ TRY_LATER: Final = 1013
 async def serve_socket(
     socket: WebSocket, sending: Coroutine[Any, Any, None], receive: Callable[[str], None] = lambda _text: None
 ) -> None:
-    """Send, and hand over the texts that come, until either has ended."""
+    """Run ``sending``, and pass received texts to ``receive``, until either ends."""
 
     async def read() -> None:
         while (message := await socket.receive())["type"] != "websocket.disconnect":
@@ -133,14 +133,14 @@ async def serve_socket(
         for part in done:
             part.result()
     except (WebSocketDisconnect, RuntimeError, TimeoutError):
-        pass  # it has gone, or does not respond
+        pass  # the reader has gone, or does not respond
     finally:
         for part in parts:
             part.cancel()
 
 
 async def send(socket: WebSocket, messages: Iterable[bytes], kind: str = "text") -> None:
-    """Send messages as texts, or as ``bytes``. Raises TimeoutError where they are not accepted."""
+    """Send messages as text, or with another ``kind`` as bytes. Raises TimeoutError if they are not accepted."""
     async with asyncio.timeout(SEND_TIMEOUT_S):
         for message in messages:
             await (socket.send_text(message.decode()) if kind == "text" else socket.send_bytes(message))
@@ -148,7 +148,7 @@ async def send(socket: WebSocket, messages: Iterable[bytes], kind: str = "text")
 
 # Access control: requests of other sites' pages are refused, and those of other machines need a token.
 #
-# Where the server has tokens, the reader's admits what only reads: GET, HEAD and WebSockets. All else needs the
+# If the server has tokens, the reader's admits only reading: GET, HEAD and WebSockets. Everything else needs the
 # operator's.
 
 _HEADERS: Final = {
@@ -162,16 +162,15 @@ _HEADERS: Final = {
 }
 
 _AT_HUB: Final = "this page is at a hub, which only reads; the site's own page changes it"
-_POLICY_VIOLATION: Final = 1008
 
 
 class AccessRules(Struct, frozen=True):
-    """What the guard checks."""
+    """Rules of the guard."""
 
     token: str | None = None
-    """The operator's, which requests must carry; None where only programs of this machine can reach the server."""
+    """The operator's token, which requests must carry; None if only programs of this machine can reach the server."""
     reader_token: str | None = None
-    """Carried by requests that only read; not without an operator's token."""
+    """Token of requests that only read; needs an operator's token."""
     names: frozenset[str] = frozenset()
     """Valid host names, in lower case, in addition to ``localhost``."""
     read_only: bool = False
@@ -179,13 +178,13 @@ class AccessRules(Struct, frozen=True):
     remote: bool = False
     """Whether other machines can reach the server: then any IP address is a valid host."""
     cookie: str = "skyless"
-    """Name of the cookie: browsers keep one for all ports of a machine."""
+    """Name of the cookie, different for each port, as browsers share cookies between the ports of a machine."""
 
 
 class Guard:
     """ASGI middleware: checks Host, Origin and token of every request and WebSocket, and adds security headers.
 
-    ``skyless.run.web`` says what Host and Origin are refused for.
+    For the checks of Host and Origin see ``skyless.run.web``.
     """
 
     def __init__(self, app: ASGIApp, rules: AccessRules) -> None:
@@ -204,7 +203,7 @@ class Guard:
         if fault is None:
             await self._app(scope, receive, self._with_headers(request, send))
         elif scope["type"] == "websocket":
-            await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": fault[1]})
+            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": fault[1]})
         else:
             answer = json_answer({"error": fault[1]}, fault[0])
             await answer(scope, receive, self._with_headers(request, send))
@@ -215,7 +214,7 @@ class Guard:
         if not is_own_host(host, self._rules.names, remote=self._rules.remote):
             return 421, "unknown host name: open the address that the dashboard has printed"
         origin = request.headers.get("origin")
-        # An image or a link of another site has no Origin; a link may lead to the page.
+        # Requests by another site's image or link have no Origin; a link may lead to the page itself.
         is_own = request.headers.get("sec-fetch-site", "none") in {"none", "same-origin"} or request.url.path == "/"
         if not is_own or (origin is not None and not same_origin(origin, host)):
             return 403, "requests of other sites are refused"
@@ -255,6 +254,6 @@ def _digest(token: str) -> str:
 
 
 def _tokens(request: HTTPConnection) -> list[str]:
-    """Tokens in the query or as a bearer token."""
+    """Tokens in the query or in the Authorization header."""
     kind, _, bearer = request.headers.get("authorization", "").partition(" ")
     return request.query_params.getlist("token")[:1] + ([bearer.strip()] if kind.lower() == "bearer" else [])

@@ -1,7 +1,7 @@
-"""What has happened at a site, as a list of events: from the messages of MQTT or of a recording. No I/O.
+"""Events at a site, from the messages of MQTT or of a recording. No I/O.
 
-``now_s`` is the time of the list's owner: the page server's monotonic clock, so that a clock that is set ends nothing,
-or the recording's times.
+``now_s`` is the time of the owner: the page server's monotonic clock, so that setting a clock ends nothing, or the
+recording's times.
 """
 
 from collections import deque
@@ -31,29 +31,29 @@ if TYPE_CHECKING:
     from skyless.run.hub import HubLink
 
 MAX_LOGGED: Final = 500
-"""Events that are kept. The oldest are dropped."""
+"""Most events kept; the oldest are dropped."""
 
 ALERT_END_S: Final = 1.0
-"""An alert has ended when no fix has had it for this long."""
+"""An alert ends when no fix has had it for this long."""
 
 ALERT_INTERVAL_S: Final = 10.0
 """Alerts of one tag that begin sooner than this after the last one are only counted."""
 
-_KEPT_S: Final = 5.0  # a first status that was made longer ago is one that the broker kept: nothing has happened now
+_KEPT_S: Final = 5.0  # an older first status is a retained one, and no event
 
 
 MAX_EVENTS: Final = 50
-"""Events of zones that are kept for pages."""
+"""Most zone events kept for pages."""
 
 TAKEOVER_S: Final = 1.0
-"""A dashboard waits this long for each one of a lower rank to publish an event that both have detected."""
+"""How long a dashboard waits, per dashboard of lower rank, for another one to publish an event."""
 
 _SAME_EVENT_S: Final = 2.0
 
 _SUBJECTS: Final = {"ether": "the emulated air", "dashboard": "page server", "survey": "survey program"}
 
 _BUSY: Final = frozenset({"slow", "busy", "behind"})
-"""Reasons that come and go where a computer is too slow."""
+"""Reasons that come and go when a computer is too slow."""
 
 Kind = Literal["anchor", "master", "watch", "alert", "tag", "program", "survey", "condition", "alarm"]
 Severity = Literal["good", "note", "warning", "bad"]
@@ -63,16 +63,15 @@ class Event(Struct, frozen=True):
     """One line of the list."""
 
     serial: int
-    """Number of the event, from 1. A line of several events has the number of the last."""
+    """Number of the event, from 1; of a line of several events, the last one's."""
     unix_s: float
     kind: Kind
     level: Severity
     name: str
-    """What it is about, such as ``tag/t1``, ``anchor/3`` or ``recorder/demo``, or empty for the site."""
+    """Subject, such as ``tag/t1``, ``anchor/3`` or ``recorder/demo``; empty for the site."""
     text: str
     count: int = 1
-    """Consecutive changes of the master, or of whether computers keep up, are one line, with their number and the last
-    of them."""
+    """Number of events in the line: consecutive changes of the master, or of whether computers keep up, are joined."""
     first: int = 0
     """Serial of the first event of the line."""
 
@@ -82,22 +81,22 @@ class _Alert:
 
     def __init__(self) -> None:
         self.seen_s = self.logged_s = float("-inf")
-        self.alert: str | None = None  # None where there is none now
-        self.logged = False  # whether the beginning of this one is in the list
+        self.alert: str | None = None  # the current alert
+        self.logged = False  # whether the beginning of this alert is in the list
         self.skipped = 0
 
 
 class EventLog:
-    """Gathers events."""
+    """Derives events from messages."""
 
     def __init__(self, unix_offset_s: float = 0.0, add: Callable[[Event], None] = lambda _event: None) -> None:
-        """``add`` is given each event. ``unix_offset_s``, Unix time less the owner's, is to be kept up to date."""
+        """``add`` is called with each event. ``unix_offset_s``: Unix time less ``now_s``, to be kept up to date."""
         self.unix_offset_s, self._add_to_list = unix_offset_s, add
         self.serial = 0
         self.events: deque[Event] = deque(maxlen=MAX_LOGGED)
-        """The oldest first."""
+        """Events, the oldest first."""
         self._statuses: dict[tuple[str, str], StatusMessage] = {}
-        self._reported: dict[tuple[str, str], float] = {}  # nodes whose health comes, and when it came last
+        self._reported: dict[tuple[str, str], float] = {}  # reporting nodes, with the time of the last health message
         self._silent: set[tuple[str, str]] = set()
         self._leader = LeaderTracker()
         self._alerts: dict[str, _Alert] = {}
@@ -105,12 +104,12 @@ class EventLog:
         self._saved: int | None = None
         self._surveyed_by: str | None = None
         self._condition: Condition | None = None
-        self._joins = ""  # what the last event was, if the next of the same is to be in its line
+        self._joins = ""  # key of the last event, if events with the same key are joined to its line
 
     # Nodes
 
     def on_status(self, status: StatusMessage, now_s: float) -> None:
-        """A node has come online or gone."""
+        """Process a status: a node may have come online or gone."""
         key = status.kind, status.name
         before = self._statuses.get(key)
         self._statuses[key] = status
@@ -121,19 +120,20 @@ class EventLog:
         happened = changed or (before is None and status.online and not kept)
         if not status.online:
             self._reported.pop(key, None)
-            self._end_alert(status.name, now_s) if status.kind == "tag" else None
+            if status.kind == "tag":
+                self._end_alert(status.name, now_s)
         if key in self._silent:
             if status.online and kept and not changed:
-                return  # the broker has repeated it
+                return  # repeated by the broker
             self._silent.discard(key)
-            happened = status.online  # that it is gone stands in the list already
+            happened = status.online  # its absence is already in the list
         if happened:
             was_online = status.online and before is not None and before.online
             words = "" if not was_online else "started again" if changed else "reports again"
             self._add_presence(key, status.online, now_s, words)
 
     def on_health(self, kind: str, name: str, health: Health, now_s: float) -> None:
-        """A node reports."""
+        """Process a node's health message."""
         key = kind, name
         if key in self._silent:
             self._silent.discard(key)
@@ -147,7 +147,7 @@ class EventLog:
                 self._add(now_s, "master", "warning", f"anchor/{leader}", text, joins="master")
 
     def tick(self, now_s: float) -> None:
-        """Look for what has ended. Call it once or twice a second."""
+        """Find alerts that have ended and nodes that fell silent. To be called once or twice a second."""
         for key, reported_s in list(self._reported.items()):
             if now_s - reported_s > SILENT_S:
                 del self._reported[key]
@@ -158,7 +158,7 @@ class EventLog:
                 self._end_alert(name, now_s)
 
     def pause(self, now_s: float) -> None:
-        """Instead of a tick while messages cannot arrive: silence does not mean that something has ended."""
+        """Replace ``tick`` while messages cannot arrive, when silence means nothing."""
         self._reported = dict.fromkeys(self._reported, now_s)
         for alert in self._alerts.values():
             alert.seen_s = now_s
@@ -179,7 +179,7 @@ class EventLog:
     # Fixes
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
-        """A fix, with or without an integrity alert."""
+        """Process a fix, with or without an integrity alert."""
         alert = self._alerts.get(fix.tag)
         if ALERTS.get(fix.alert, 0) == 0:
             return
@@ -210,7 +210,7 @@ class EventLog:
     # Survey and watch
 
     def on_watch(self, watch: WatchMessage | None, now_s: float) -> None:
-        """What the watch of the anchors sees now, or None when it has ended."""
+        """Process the current findings of the watch, or None when it has ended."""
         findings = () if watch is None else watch.findings
         now = {(str(finding.kind), finding.anchors): finding.sentence.rstrip(".") for finding in findings}
         before, self._findings = self._findings, now
@@ -224,7 +224,7 @@ class EventLog:
                 self._add(now_s, "watch", "good", f"anchor/{anchors[0]}" if anchors else "", text)
 
     def on_survey(self, survey: SurveyMessage | None, now_s: float) -> None:
-        """The survey program's state. A saved result is an event."""
+        """Process the survey program's state. A saved result is an event."""
         if survey is None:
             return
         same = survey.by == self._surveyed_by
@@ -236,7 +236,7 @@ class EventLog:
     # Alarms
 
     def on_alarm(self, what: str, alarm: AlarmMessage, now_s: float) -> None:
-        """An alarm was raised, has ended or was acknowledged."""
+        """Add an event for an alarm that was raised, has ended or was acknowledged."""
         level: Severity = (
             "bad" if alarm.severity == "critical" else "warning" if alarm.severity == "warning" else "note"
         )
@@ -249,7 +249,7 @@ class EventLog:
     # Condition
 
     def on_condition(self, condition: Condition, now_s: float) -> None:
-        """The condition of the site. A change of its level, or of its first reason, is an event."""
+        """Process the site's condition. A change of its level, or of its first reason, is an event."""
         before, self._condition = self._condition, condition
         if before is not None and _first(before) == _first(condition):
             return
@@ -284,16 +284,16 @@ def _first(condition: Condition) -> tuple[str, str]:
 
 
 def publisher_rank(name: str, dashboards: list[StatusMessage]) -> int:
-    """How many of the dashboards online came online before this one. The first publishes the events."""
+    """Number of online dashboards that came online before this one. The first publishes the events."""
     online = sorted((status.unix_s, status.name) for status in dashboards if status.online)
     names = [other for _, other in online]
     return names.index(name) if name in names else 0
 
 
 class EventQueue:
-    """Events of zones that wait to be published, and the last that were.
+    """Zone events that wait to be published, and the last published ones.
 
-    Of several dashboards that all detect an event one publishes it.
+    If several dashboards detect an event, only one publishes it.
     """
 
     def __init__(self) -> None:
@@ -301,11 +301,11 @@ class EventQueue:
         self._waiting: list[tuple[float, ZoneEvent]] = []
 
     def schedule(self, events: list[ZoneEvent], rank: int, now_s: float) -> None:
-        """Add events detected here, by a dashboard with this rank."""
+        """Add events detected by this dashboard, which has this rank."""
         self._waiting += [(now_s + rank * TAKEOVER_S, event) for event in events]
 
     def pop_due(self, now_s: float) -> list[ZoneEvent]:
-        """Events that no other dashboard has published in time. They count as published."""
+        """Return events that no other dashboard has published in time. They count as published."""
         due = [event for at_s, event in self._waiting if at_s <= now_s]
         if due:
             self._waiting = [(at_s, event) for at_s, event in self._waiting if at_s > now_s]
@@ -313,7 +313,7 @@ class EventQueue:
         return due
 
     def add_published(self, event: ZoneEvent) -> bool:
-        """Add an event from MQTT. False if it is the echo of an own event, or a repetition."""
+        """Add an event from MQTT. Returns False for the echo of an own event, or a repetition."""
         if event in self.recent:
             return False
         for index, (_, waiting) in enumerate(self._waiting):
@@ -328,10 +328,10 @@ def _same(a: ZoneEvent, b: ZoneEvent) -> bool:
     return (a.zone, a.tag, a.kind) == (b.zone, b.tag, b.kind) and abs(a.unix_s - b.unix_s) < _SAME_EVENT_S
 
 
-# What has happened at a site since the server's start, with a number for each event: programs read it in pages.
+# Numbered events at a site since the server's start, which programs read in pages.
 
 MAX_KEPT: Final = 2_000
-"""Events that are kept. The oldest are dropped."""
+"""Most events kept; the oldest are dropped."""
 
 
 class SiteEvent(Struct, frozen=True):
@@ -343,15 +343,15 @@ class SiteEvent(Struct, frozen=True):
     kind: Kind | Literal["zone"]
     level: Severity
     subject: str
-    """What it is about, such as ``tag/t1`` or ``anchor/3``; empty for the site."""
+    """Subject, such as ``tag/t1`` or ``anchor/3``; empty for the site."""
     text: str
     """For people."""
     zone_event: ZoneEvent | None = None
-    """Of the kind ``zone``."""
+    """Event of kind ``zone``."""
 
 
 class EventList:
-    """The newest events, and what pages are sent of each. Readers ask for what is before or since a number."""
+    """The newest events with their messages to pages. Readers ask for those before or since a number."""
 
     def __init__(self) -> None:
         self.last = 0
@@ -359,14 +359,14 @@ class EventList:
         self._events: deque[tuple[SiteEvent, bytes]] = deque(maxlen=MAX_KEPT)
 
     def add_zone_event(self, event: ZoneEvent) -> None:
-        """A tag has entered or left a zone."""
+        """Add a zone event."""
         self.last += 1
         text = f"tag {event.tag} {'entered' if event.kind == 'enter' else 'left'} {event.name or event.zone}"
         found = SiteEvent(self.last, event.unix_s, "zone", "note", f"tag/{event.tag}", text, event)
         self._events.append((found, encode("zone_event", asdict(event))))
 
     def add_logged(self, event: Event) -> None:
-        """A line of the page's list."""
+        """Add an event of the page's list."""
         self.last += 1
         found = SiteEvent(self.last, event.unix_s, event.kind, event.level, event.name, event.text)
         self._events.append((found, encode("log", {"events": [event]})))
@@ -380,35 +380,35 @@ class EventList:
         return list(takewhile(lambda kept: kept[0].id > number, reversed(self._events)))[::-1]
 
 
-# A list that pages edit and the broker keeps: zones, rules of alarms, assets.
+# Lists that pages edit and the broker retains: zones, alarm rules, assets.
 
 SiteLink: TypeAlias = "Link | HubLink"
-"""A site's connection: to its broker, or to a hub, where nothing can be stored."""
+"""A site's connection to its broker, or to a hub, where nothing can be stored."""
 
 _Message = TypeVar("_Message", bound=Struct)
 
 
 class Kept(Generic[_Message]):
-    """The message of one topic: what the broker keeps there, or what was stored here last."""
+    """The retained message of one topic: the broker's, or the one last stored here."""
 
     def __init__(self, empty: _Message, read: Callable[[bytes], _Message]) -> None:
-        """``empty`` is what a topic without a message means; ``read`` raises ValueError."""
+        """``empty``: value of a topic without a message; ``read`` decodes one, or raises ValueError."""
         self.message = empty
         self.fault: str | None = None
-        """Why what the broker keeps cannot be read."""
+        """Why the broker's message cannot be read."""
         self._empty, self._read = empty, read
         self._link: SiteLink | None = None
         self._topic = ""
         self._is_on_its_way = False  # the message was stored here and has not come back from the broker
 
     def attach(self, link: SiteLink, topic: str) -> None:
-        """The broker is known; what was stored here before goes to it."""
+        """Use a connection, and publish a message that was stored here before."""
         self._link, self._topic = link, topic
         if self._is_on_its_way:
             self.store(self.message)
 
     def receive(self, payload: bytes) -> bool:
-        """Take what comes from the broker; whether the message is another one now. Raises WrongMessageError."""
+        """Process the broker's message. Returns whether ``message`` has changed. Raises WrongMessageError."""
         try:
             message = self._read(payload) if payload else self._empty
         except ValueError as error:
@@ -419,14 +419,14 @@ class Kept(Generic[_Message]):
             self._is_on_its_way = False
             return False
         if self._is_on_its_way:
-            return False  # older than what was stored here
+            return False  # older than the message stored here
         if self._link is not None:
-            self._link.forget(self._topic)  # what was stored here must not come back after a reconnect
+            self._link.forget(self._topic)  # a message stored here must not be repeated after a reconnect
         self.message = message
         return True
 
     def check_store(self, site: str, shown: str) -> None:
-        """Check that a page of a site may replace the list of the one shown. Raises WrongMessageError."""
+        """Check that a page of ``site`` may replace the list of the site ``shown``. Raises WrongMessageError."""
         if site and site != shown:
             raise WrongMessageError(f"site is {site[:100]!r}; it should be {shown[:100]!r}, which is shown now")
         if self.fault is not None:

@@ -1,4 +1,4 @@
-"""Batches of a broker with a gather, read from NATS into columns, and the pages that see them by ``/live2``."""
+"""Batches of a broker with a gather, read from NATS into columns, and served to pages at ``/live2``."""
 
 import asyncio
 import contextlib
@@ -25,27 +25,21 @@ from skyless.run.gather.subjects import NatsAddress, connect, rarely
 from skyless.run.web import PAGE as LIMITS
 
 PERIOD_S: Final = 0.1
-
-
 _HAND_OVER_S: Final = 0.05
 
-
 _HEARD_S: Final = 1.0
-"""Interval at which a site is given the names of all tags that were heard."""
-
+"""Interval at which a site gets the names of all tags in batches."""
 
 _MAX_ASKED: Final = 200
 
-
 _ASK_AGAIN_S: Final = 2.0
-"""A name that the stream did not have yet, as a hub's after a cut, is asked for again."""
-
+"""Interval at which a missing name is asked for again, as when a hub's stream lags after a cut."""
 
 _EMPTY: Final = Columns()
 
 
 class Gathered:
-    """The columns of the sites that are shown, and the pages that see them."""
+    """The columns of the sites shown, and the pages that view them."""
 
     def __init__(self, address: NatsAddress) -> None:
         self.drops: Counter[str] = Counter()
@@ -60,7 +54,7 @@ class Gathered:
         return self._sites.get(site, _EMPTY)
 
     async def run(self, sites: Sites) -> None:
-        """Read until cancelled, and hand fixes over to the sites that are shown."""
+        """Read batches until cancelled, and pass fixes to the sites shown."""
         client = await connect(self._address, "skyless dashboard", self._say, self.drops, subjects.PAGE_INBOX)
         try:
             async with asyncio.TaskGroup() as tasks:
@@ -89,7 +83,7 @@ class Gathered:
                 await reading.unsubscribe()
 
     async def _hand_over(self, client: Client, site: int, live: LiveSite) -> None:
-        """Give a site fixes of its batches for ever, for all that its messages are for: zones, alarms, lists."""
+        """Pass fixes from batches to a site, endlessly, for zones, alarms and lists."""
         columns, heard_s = self._sites[site], 0.0
         stream, names, numbers = client.jetstream(), columns.names, dict[str, int]()
         missing_s = dict[int, float]()
@@ -114,7 +108,7 @@ class Gathered:
             for record, at_s in zip(FIELDS.iter_unpack(records.tobytes()), arrived_s.tolist(), strict=True):
                 if name := names.get(record[0]):
                     live.on_batched_fix(fix_of(name, record), at_s)
-            # At least as long as it took, so that batches are read in time, of which the newest fixes are due next.
+            # Sleep at least as long as the work took, so that batches are read in time.
             await asyncio.sleep(max(_HAND_OVER_S if len(records) < MAX_DUE else 0.0, time.monotonic() - now_s))
 
     async def _on_batch(self, message: Msg) -> None:
@@ -146,7 +140,7 @@ class Gathered:
 
 
 class _Page:
-    """One page. Messages are made when they are sent, so that a slow page gets only the newest."""
+    """One page. Messages are created when they are sent, so that a slow page gets only the newest."""
 
     def __init__(self) -> None:
         self._view: View | None = None
@@ -156,12 +150,12 @@ class _Page:
         self._conditions: dict[str, str] | None = None
 
     def ask(self, text: str) -> None:
-        """The page has another view, or asks for names."""
+        """Process a page's request: another view, or names."""
         if (view := read_request(text, View)) is not None:
             self._view, self._named = view, view.named or self._named
 
     def news(self, live: LiveSite, columns: Columns, now_s: float) -> list[bytes]:
-        """What is new to the page."""
+        """Messages with everything that is new to the page."""
         found, unix_us = [], round(1e6 * time.time())
         anchors, conditions = () if live.site is None else live.site.site.anchors, live.state.conditions
         if anchors != self._anchors:
@@ -174,7 +168,7 @@ class _Page:
             found.append(names_message(columns, self._named, unix_us))
             self._named = ()
         if self._view is not None:
-            shown = self._view, columns.serial, int(now_s)  # without a new fix each second: their ages grow
+            shown = self._view, columns.serial, int(now_s)  # each second even without new fixes, as ages grow
             if shown != self._shown:
                 self._shown = shown
                 found.append(tags_message(columns, self._view, now_s, unix_us))

@@ -1,4 +1,4 @@
-"""The sites at a hub that pages look at: each is connected while somebody looks, and let go some time later."""
+"""The sites at a hub that pages show: each is connected while somebody looks at it, and some time longer."""
 
 import asyncio
 import time
@@ -14,8 +14,7 @@ from skyless.run.gather.subjects import NatsAddress
 from skyless.run.hub import HubLink, HubSites
 
 LET_GO_S: Final = 60.0
-"""Healths of all tags cross a site's line while it is connected, so not for longer after the last look."""
-
+"""Time after the last look until a site is disconnected, as health messages of all its tags use its line."""
 
 _CHECK_S: Final = 1.0
 
@@ -27,10 +26,10 @@ class _Shown(Struct):
 
 
 class ShownSites:
-    """Takes the place of ``LiveSites`` at a hub."""
+    """Replacement of ``LiveSites`` at a hub."""
 
     def __init__(self, address: NatsAddress, name: str, make: Callable[[], LiveSite]) -> None:
-        """``name`` is shown at the hub; ``make`` returns the state of a site."""
+        """``name``: shown at the hub; ``make`` creates the state of a site."""
         self.known = HubSites(address, time.monotonic())
         self._name, self._make = name, make
         self._shown: dict[int, _Shown] = {}
@@ -38,7 +37,7 @@ class ShownSites:
 
     @property
     def all(self) -> list[LiveSite]:
-        """The sites that are connected."""
+        """The connected sites."""
         return [shown.live for shown in self._shown.values()]
 
     def has(self, asked: str | None) -> bool:
@@ -46,7 +45,7 @@ class ShownSites:
         return number_of(asked) in self.known.names()
 
     def of(self, asked: str | None) -> LiveSite:
-        """The site of a number. Raises HTTPException."""
+        """The site with a number, which is connected if need be. Raises HTTPException."""
         if not self.has(asked):
             right = "the number of a site at this hub, as in /api/sites"
             raise HTTPException(404, f"site is {(asked or '')[:20]!r}; it should be {right}")

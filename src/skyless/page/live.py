@@ -1,7 +1,7 @@
-"""The live site: messages from MQTT update its state and its zones. Open pages are sent what is new, 20 times a second.
+"""The live site: messages from MQTT update its state and zones, and open pages get what is new, 20 times a second.
 
-Everything here belongs to one event loop. From the same messages ``condition`` finds what is wrong at the site, and
-``events.py`` lists what has happened.
+Everything here belongs to one event loop. From the same messages ``condition`` finds faults of the site, and
+``events.py`` lists events.
 """
 
 import asyncio
@@ -53,33 +53,32 @@ _HEALTH_PERIOD_S: Final = 1.0
 _WATCH_FRESH_S: Final = 30.0  # the watch reports at least every 10 s
 _EVALUATION_SHARE: Final = 5.0  # evaluations take at most a sixth of the time
 
-
 _HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
 _log = logging.getLogger("skyless.page")
 
 OLDEST_S: Final = 5.0
-"""A fix that is older is not given to programs."""
+"""Fixes older than this are not given to programs."""
 
 IDLE_S: Final = 12.0
-"""A page that has sent nothing for this long makes room for another one. A visible page sends a ping every 2 s."""
+"""A page that has sent nothing for this long may be closed for another one. A visible page sends a ping every 2 s."""
 
 GONE_S: Final = 180.0
 """A page that has sent nothing for this long is disconnected. Browsers let a hidden one send once a minute."""
 
 
 class TooManyPagesError(Exception):
-    """No other page can be opened now."""
+    """No further page can be opened now."""
 
 
 class PageQueue:
     """Messages that wait for one page: the newest of each kind, so that a slow page's queue stays short."""
 
     def __init__(self, hello: bytes, events: EventList, address: str = "", now_s: float = 0.0) -> None:
-        """``address`` is its computer's. Of ``events`` it is sent those that are new."""
+        """``address``: of its computer. Of ``events`` the page gets those that are new."""
         self.closed, self.reason = False, ""
-        """Whether its connection is to be ended, and why."""
+        """Whether to close its connection, and why."""
         self.address, self.active_s = address, now_s
-        """When it last sent something."""
+        """Address of its computer, and time of the last message from it."""
         self._latest: dict[str, bytes] = {"hello": hello}
         self._events, self._event = events, events.last
         self._sent = Sent()
@@ -88,28 +87,28 @@ class PageQueue:
         self._wake.set()
 
     def replace(self, kind: str, message: bytes) -> None:
-        """Add a message. It replaces one of its kind that still waits."""
+        """Add a message, replacing a waiting one of its kind."""
         self._latest[kind] = message
         self._wake.set()
 
     def request_state(self, *, health: bool = False) -> None:
-        """Send the events and the state, or also the healths, if there is anything new."""
+        """Send new events and the state, with ``health`` also health messages."""
         self._state_due = True
         self._health_due |= health
         self._wake.set()
 
     @property
     def named(self) -> tuple[str, ...]:
-        """Tags that the page has selected or lists in sight."""
+        """Tags that the page has selected, or shows in a list."""
         return self._sent.wanted.tags
 
     def ask(self, wanted: PageRequest) -> None:
-        """Send from now on what the page asks for."""
+        """Change what the page wants to be sent."""
         self._sent.wanted = wanted
         self.request_state(health=True)
 
     def close(self, reason: str = "") -> None:
-        """End the page's connection."""
+        """Close the page's connection."""
         self.closed, self.reason = True, reason
         self._wake.set()
 
@@ -130,7 +129,7 @@ class PageQueue:
 
 
 class LiveSite:
-    """The live site: its state, its zones, and the pages that are open."""
+    """The live site: its state, its zones, and the open pages."""
 
     def __init__(
         self,
@@ -139,29 +138,28 @@ class LiveSite:
         site: SiteMessage | None = None,
         clock: Callable[[], float] = time.monotonic,
         wall_clock: Callable[[], float] = time.time,
-        host: str = platform.node(),
         used_share: Callable[[float], float | None] | None = None,
         assets_file: AssetsFile | None = None,
         has_history: bool = False,
         at_hub: bool = False,
     ) -> None:
-        """``name`` is the dashboard's on MQTT, ``broker`` its address without a password, ``host`` this computer.
+        """``name``: of the dashboard on MQTT; ``broker``: address without a password.
 
-        ``at_hub``: zone events and alarms are those of the site's own dashboards, and nothing is changed here.
+        ``at_hub``: zone events and alarms come from the site's own dashboards, and nothing is changed here.
 
-        ``used_share`` gives the share of its processors in use at a time of ``clock``: ``ProcessorUse.share``.
+        ``used_share`` gives the share of processors in use at a time of ``clock``: ``ProcessorUse.share``.
         """
         self.name, self.broker = name, broker
         self.site: SiteMessage | None = None
         self.plans: dict[int | None, bytes] = {}
-        """The images of the floors by their numbers; None is that of the whole site."""
+        """Images of the floors by number; None for the image of the whole site."""
         self.connected = False
         self.state = SiteState()
         self.monitor = ZoneMonitor()
         self.events = EventQueue()
         self.pages: set[PageQueue] = set()
         self.streams = 0
-        """How many programs read the site's stream."""
+        """Number of programs that read the site's stream."""
         self.survey = SiteSurvey(name, self._broadcast, clock, wall_clock)
         self.assets = SiteAssets(self._broadcast, assets_file)
         self.event_list = EventList()
@@ -171,11 +169,11 @@ class LiveSite:
         self._link: SiteLink | None = None
         self._site_id: int | None = None
         self._zones = Kept(ZonesMessage(()), self._read_zones)
-        """With other sites' zones of this number."""
+        """Zones, including those of other sites with the same number."""
         self._dashboards: dict[str, StatusMessage] = {}
-        self._sent_serials = 0, 0  # of the newest fix and event that pages were sent
+        self._sent_serials = 0, 0  # of the newest fix and event sent to pages
         self._health_due_s = self._condition_due_s = 0.0
-        self.evidence = Evidence(host, clock())
+        self.evidence = Evidence(platform.node(), clock())
         self.evidence.hub_trouble = "" if at_hub else None
         self.log = EventLog(wall_clock() - clock(), self.event_list.add_logged)
         self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm)
@@ -205,7 +203,7 @@ class LiveSite:
             topics.fix_topic(site_id, "+"): self._on_fix,
             topics.status_topic(site_id, "+", "+"): self._on_status,
             topics.health_topic(site_id, "+", "+"): self._on_health,
-            topics.truth_topic(site_id): self._on_truth,
+            topics.truth_topic(site_id): lambda _, payload: self.state.add_truth(read_message(payload, TruthMessage)),
             topics.zones_topic(site_id): self._on_zones,
             topics.zone_event_topic(site_id, "+"): self._on_zone_event,
             topics.assets_topic(site_id): lambda _topic, payload: self.assets.on_message(payload),
@@ -229,13 +227,13 @@ class LiveSite:
             self.evidence.set_connected(connected=connected, now_s=self._clock())
             self._evaluate(self._clock())
             self.survey.expect_kept()
-            if not self._at_hub:  # where alarms are kept and complete after every cut
+            if not self._at_hub:  # a hub keeps alarms, which are complete after every cut
                 self.alarms.on_connection(connected, self._clock())
             self.assets.on_connection(connected, self._clock())
             self._broadcast("mqtt", self._connection())
 
     def set_sites(self, sites: list[tuple[int, str, bool]]) -> None:
-        """Update which sites the broker carries: number, name, and whether programs of it are online."""
+        """Update the broker's sites: number, name, and whether programs are online."""
         message = encode("sites", {"shown": self._site_id, "sites": sites})
         if message != self._sites:
             self._sites = message
@@ -272,7 +270,7 @@ class LiveSite:
         image, floor = payload or None, _floor_of(topic)
         if image != self.plans.get(floor):
             if self._link is not None:
-                self._link.forget(topic)  # an image that was stored here must not come back after a reconnect
+                self._link.forget(topic)  # an image stored here must not be repeated after a reconnect
             self._show_floor_plan(floor, image)
 
     def _show_floor_plan(self, floor: int | None, image: bytes | None) -> None:
@@ -282,7 +280,7 @@ class LiveSite:
         self._broadcast("floor_plan", self._floor_plan_message())
 
     def _floor_plan_message(self) -> bytes:
-        """Lets pages load an image again when it is another one."""
+        """Message with digests, so that pages reload images that have changed."""
         digests = {floor: f"{zlib.crc32(image):08x}" for floor, image in self.plans.items()}
         return encode("floor_plan", {"digest": digests.pop(None, None), "floors": digests})
 
@@ -294,12 +292,12 @@ class LiveSite:
             self._take_fix(fix, now_s, self.evidence.add_fix(fix, now_s))
 
     def on_batched_fix(self, fix: FixMessage, now_s: float) -> None:
-        """A fix that has arrived in a batch at this time; ignored where the tag's messages arrive as well."""
+        """Process a fix that arrived in a batch at this time; ignored if the tag's messages also arrive."""
         if not self.evidence.sends_messages(fix.tag, now_s):
             self._take_fix(fix, now_s, self.evidence.add_batched(fix, now_s))
 
     def on_batches(self, tags: Iterable[str], now_s: float) -> None:
-        """Batches have fixes of these tags, handed over or not: they are not silent."""
+        """Note that batches have fixes of these tags, passed on or not, so that they are not silent."""
         for name in tags:
             self.evidence.hear(name, now_s)
             self.alarms.engine.hear(name, now_s)
@@ -338,12 +336,9 @@ class LiveSite:
             if isinstance(health, TagHealth):
                 self.alarms.engine.on_health(health, now_s)
 
-    def _on_truth(self, _topic: str, payload: bytes) -> None:
-        self.state.add_truth(read_message(payload, TruthMessage))
-
     def _read_zones(self, payload: bytes) -> ZonesMessage:
         message = read_zones(payload)
-        if not message.site and not message.others:  # of an older program, which knows of no other sites
+        if not message.site and not message.others:  # of an older program, which does not know other sites
             message = msgspec.structs.replace(message, others=self._zones.message.others)
         return message
 
@@ -365,7 +360,7 @@ class LiveSite:
     # Zones
 
     def store_zones(self, zones: tuple[Zone, ...], site: str = "") -> None:
-        """Store the zones of a page, which shows the site of this name. Raises WrongMessageError."""
+        """Store zones from a page that shows the site with this name. Raises WrongMessageError."""
         check_zones(zones)
         shown = self._site_name
         self._zones.check_store(site, shown)
@@ -377,11 +372,11 @@ class LiveSite:
         return "" if self.site is None else self.site.site.name
 
     def _assign_zones(self) -> None:
-        """Show the zones of the present site. Zones without a site become its own, for good."""
+        """Show the zones of the current site. Zones without a site are permanently assigned to it."""
         name, kept = self._site_name, self._zones.message
         if name and not kept.site and kept.zones and not self._at_hub:
             self._zones.store(zones_of(kept, name))
-        is_foreign = not name and kept.site  # whose they are is known, but not whether that site is shown
+        is_foreign = not name and kept.site  # the zones' site is known, but not yet the site shown
         zones = () if is_foreign else zones_of(kept, name).zones
         if zones != self.monitor.zones:
             self._schedule(self.monitor.set_zones(zones, self.wall_clock()))
@@ -389,7 +384,7 @@ class LiveSite:
             self._broadcast("zones", encode("zones", self._zone_fields()))
 
     def _zone_fields(self) -> dict[str, object]:
-        """The zones of the present site, those of others that have its number, and why they cannot be read."""
+        """Zones of the current site, zones of others with its number, and why zones cannot be read."""
         others = zones_of(self._zones.message, self._site_name).others
         return {"zones": self.monitor.zones, "other_zones": others, "zones_fault": self._zones.fault}
 
@@ -407,7 +402,7 @@ class LiveSite:
     # Alarms
 
     def acknowledge(self, rule: str, subject: str, occurrence: str, by: str) -> None:
-        """Ask the dashboard that leads to acknowledge an alarm. Raises NoAlarmError and HTTPException."""
+        """Ask the leading dashboard to acknowledge an alarm. Raises NoAlarmError and HTTPException."""
         link, site_id = self._connected()
         self.alarms.check_is_kept(rule, subject, occurrence)
         message = AcknowledgeMessage(occurrence, by[:100], self.wall_clock())
@@ -416,7 +411,7 @@ class LiveSite:
     # Survey
 
     def publish_survey(self, message: SurveyFactsMessage | SurveySaveMessage) -> None:
-        """Give the survey program facts or the request to save. Raises HTTPException."""
+        """Send facts, or the request to save, to the survey program. Raises HTTPException."""
         link, site_id = self._connected()
         if link.address.user == Role.PAGE:  # the broker would drop it without an answer
             raise HTTPException(
@@ -438,13 +433,13 @@ class LiveSite:
         return self._link, self._site_id
 
     def recent_fixes(self, after: int = 0) -> list[tuple[FixMessage, float]]:
-        """The newest fix of each tag that has one within ``OLDEST_S`` and after a serial, and when it ended."""
+        """The newest fix of each tag within ``OLDEST_S`` and after a serial, with the end time of its last frame."""
         return self.state.fixes_since(self._clock(), OLDEST_S, after)
 
     # Pages
 
     def open_page(self, address: str = "", *, live2: bool = False) -> PageQueue:
-        """The queue of a new page of a computer, with what it needs first. Raises TooManyPagesError."""
+        """Create the queue of a new page, filled with its first messages. Raises TooManyPagesError."""
         self._make_room(address)
         hello = {
             "version": installed_version(),
@@ -472,7 +467,7 @@ class LiveSite:
         return page
 
     def _make_room(self, address: str) -> None:
-        """Close the page that is idle for longest where there are too many. Raises TooManyPagesError."""
+        """If there are too many pages, close the one idle for longest. Raises TooManyPagesError."""
         mine = [page for page in self.pages if page.address == address]
         if len(mine) < LIMITS.pages_per_address and len(self.pages) < LIMITS.pages:
             return
@@ -486,7 +481,7 @@ class LiveSite:
         page.close("this page was idle")
 
     def keep_page(self, page: PageQueue) -> None:
-        """A page has sent something."""
+        """Note that a page has sent something."""
         page.active_s = self._clock()
 
     def close(self) -> None:
@@ -495,7 +490,7 @@ class LiveSite:
             page.close()
 
     def tick(self, lag_s: float = 0.0) -> None:
-        """Do what is due. Call it 20 times a second. ``lag_s`` is the delay of this call."""
+        """Do due work; to be called 20 times a second. ``lag_s``: delay of this call."""
         self._lag_s = max(self._lag_s, lag_s)
         now_s, unix_s = self._clock(), self.wall_clock()
         self.state.now_s, self.state.unix_s = now_s, unix_s
@@ -540,11 +535,11 @@ class LiveSite:
         self.log.on_condition(self.condition, now_s)
         (self.log.pause if blind else self.log.tick)(now_s)
         self._broadcast("condition", self._condition_message())
-        # Of very many tags it takes longer, and the messages are to be read as well.
+        # With very many tags this takes longer, and messages must be read, too.
         self._condition_due_s = now_s + max(EVALUATION_S, _EVALUATION_SHARE * (self._clock() - now_s))
 
     def _condition_message(self) -> bytes:
-        """Its time gives pages the server's clock where no tag moves."""
+        """Message of the condition; its time gives pages the server's clock when no tag moves."""
         return encode("condition", {"unix_s": self.wall_clock(), **msgspec.structs.asdict(self.condition)})
 
     async def run(self) -> None:
@@ -564,7 +559,7 @@ class LiveSite:
 
 
 def _floor_of(topic: str) -> int | None:
-    """The number of the floor whose plan a topic carries, or None for the whole site. Raises WrongMessageError."""
+    """Number of the floor whose plan a topic carries; None for the whole site. Raises WrongMessageError."""
     name = topic.rsplit("/", 1)[-1]
     if name == "floor_plan":
         return None
@@ -575,7 +570,7 @@ def _floor_of(topic: str) -> int | None:
 
 
 def _qos(topic: str) -> int:
-    """Messages that are sent once only must not be lost."""
+    """Quality of service of a subscription: 1 for messages that are sent only once."""
     return 1 if any(part in topic for part in ("/zone", "/survey/", "/alarm", "/assets")) else 0
 
 

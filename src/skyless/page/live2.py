@@ -14,40 +14,40 @@ from skyless.core.site import AnchorSite
 from skyless.page.state import UNHEARD_S
 from skyless.run.fix_batch import ALERT_BITS, RECORD, Records
 
-# The newest fix of every tag of a large site in NumPy arrays, by the tags' numbers. No I/O.
+# The newest fix of every tag of a large site in NumPy arrays, by tag number. No I/O.
 
 MAX_NUMBER: Final = 1_000_000
 MAX_DUE: Final = 1_000
 
 _SET_BACK_US: Final = 10_000_000
-"""A fix that is older than the newest by more than this is of a clock that was set back. Others come late."""
+"""A fix older than the newest by more than this is from a clock that was set back; other old ones are late."""
 
 _INTERVAL_S: Final = 0.5
 _DUE_PER_S: Final = 20_000
-"""The interval of ``pop_due`` is longer where more tags than this would have a turn in a second."""
+"""The interval of ``pop_due`` is longer if more tags than this would be due per second."""
 
 Array = NDArray[Any]
 
 
 class Columns:
-    """The newest record of each tag, and when it arrived."""
+    """The newest record of each tag, with its time of arrival."""
 
     def __init__(self) -> None:
         self.serial = self.dropped = 0
-        """Batches taken, and fixes whose numbers are too large."""
+        """Number of batches, and of fixes dropped because their tag numbers are too large."""
         self.names: dict[int, str] = {}
-        """Of the numbers, as far as they were asked for; empty where there is none."""
+        """Names by tag number, as far as requested; empty for tags without a name."""
         self._used = 0
-        self._newest = np.zeros(MAX_NUMBER + 1, RECORD)  # the system gives memory only for what is written
+        self._newest = np.zeros(MAX_NUMBER + 1, RECORD)  # the system allocates only pages that are written
         self._arrived_s, self._popped_s = np.zeros((2, MAX_NUMBER + 1))
 
     def update(self, records: Records, now_s: float) -> None:
-        """Take the records of a batch that has arrived."""
+        """Add the records of a batch."""
         self.serial += 1
         allowed = records["tag"] <= MAX_NUMBER
         self.dropped += int(len(records) - allowed.sum())
-        records = records.compress(allowed)  # ten times as fast as an index
-        records = records.take(np.argsort(records["unix_us"], kind="stable"))  # of several of a tag the last one stays
+        records = records.compress(allowed)  # ten times as fast as indexing
+        records = records.take(np.argsort(records["unix_us"], kind="stable"))  # so that a tag's last record is kept
         unix_us = records["unix_us"].astype(np.int64)
         before_us = self._newest["unix_us"][records["tag"]].astype(np.int64)
         records = records.compress((unix_us >= before_us) | (unix_us < before_us - _SET_BACK_US))
@@ -56,7 +56,7 @@ class Columns:
         self._arrived_s[records["tag"]] = now_s
 
     def visible(self, view: tuple[float, float, float, float], now_s: float) -> tuple[Records, Array]:
-        """The records of the tags between least x, y and largest x, y of a view in m, and for how long they are here.
+        """Records of the tags within a view (least x, y and largest x, y in m), and their ages since arrival.
 
         Tags without a fix for ``UNHEARD_S`` are left out.
         """
@@ -68,10 +68,9 @@ class Columns:
         return self._newest.take(tags), now_s - self._arrived_s.take(tags)
 
     def pop_due(self, now_s: float, first: Sequence[int] = ()) -> tuple[Records, Array]:
-        """New records, some ``MAX_DUE`` at most, for those who take single fixes, and when they arrived.
+        """Return about ``MAX_DUE`` new records at most, for consumers of single fixes, with their times of arrival.
 
-        Each tag has its turn at most once in an interval, but for those that are to be first, which never wait; of the
-        others those come first that have waited longest.
+        Each tag is due at most once per interval, the longest waiting ones first; tags in ``first`` never wait.
         """
         interval_s = max(_INTERVAL_S, self._used / _DUE_PER_S)
         arrived_s, popped_s = self._arrived_s[: self._used], self._popped_s[: self._used]
@@ -84,7 +83,7 @@ class Columns:
         return self._newest.take(tags), arrived_s.take(tags)
 
     def heard_since(self, time_s: float) -> list[int]:
-        """Numbers of the tags of which a fix has arrived since a time."""
+        """Numbers of the tags with a fix that arrived after a time."""
         numbers: list[int] = np.flatnonzero(self._arrived_s[: self._used] > time_s).tolist()
         return numbers
 
@@ -104,30 +103,30 @@ ANCHOR: Final = np.dtype(
     [("id", "<u2"), ("x_mm", "<i4"), ("y_mm", "<i4"), ("z_cm", "<i2"), ("floor", "u1"), ("zero", "u1")]
 )
 CONDITIONS: Final = {"good": 1, "warn": 2, "bad": 3}
-"""0 is unknown."""
+"""Codes of conditions; 0 is unknown."""
 
 _Edge = Annotated[float, Meta(ge=-1e6, le=1e6)]
 _Pixels = Annotated[int, Meta(ge=1, le=16_384)]
 
 
 class View(Struct, frozen=True):
-    """What a page shows."""
+    """The view of a page."""
 
     view: tuple[_Edge, _Edge, _Edge, _Edge]
     """Least x and y, and largest x and y in m."""
     px: tuple[_Pixels, _Pixels]
     named: Annotated[tuple[int, ...], Meta(max_length=_MAX_NAMED)] = ()
-    """Numbers of tags whose names it asks for."""
+    """Numbers of tags whose names are requested."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError where it has no area."""
+        """Raise ValueError if the view has no area."""
         x0, y0, x1, y1 = self.view
         if not (x0 < x1 and y0 < y1):
             raise ValueError("it has no area")
 
 
 def tags_message(columns: Columns, view: View, now_s: float, unix_us: int) -> bytes:
-    """``P``, or ``B`` where more than ``MAX_POINTS`` tags are visible."""
+    """Message ``P`` with points, or ``B`` with counts if more than ``MAX_POINTS`` tags are visible."""
     records, ages_s = columns.visible(view.view, now_s)
     x0, y0, x1, y1 = view.view
     x_m, y_m, _ = records["position_mm"].T / 1000.0
@@ -157,18 +156,18 @@ def _counts(x_share: Array, y_share: Array, px: tuple[int, int], unix_us: int) -
 
 
 def names_message(columns: Columns, numbers: Sequence[int], unix_us: int) -> bytes:
-    """``N``: the names of those numbers that have one, in JSON."""
+    """Message ``N``: names of these tag numbers in JSON, as far as known."""
     names = {number: columns.names[number] for number in numbers if columns.names.get(number)}
     return _HEAD.pack(ord("N"), 0, len(names), unix_us) + msgspec.json.encode(names)
 
 
 def anchors_message(anchors: tuple[AnchorSite, ...], unix_us: int) -> bytes:
-    """``A``: where the anchors hang."""
+    """Message ``A``: positions of the anchors."""
     rows = [(a.id, round(1e3 * a.x_m), round(1e3 * a.y_m), round(1e2 * a.z_m), a.floor & 0xFF, 0) for a in anchors]
     return _HEAD.pack(ord("A"), 0, len(rows), unix_us) + np.array(rows, ANCHOR).tobytes()
 
 
 def conditions_message(anchors: tuple[AnchorSite, ...], conditions: dict[str, str], unix_us: int) -> bytes:
-    """``H``: the condition of each anchor, in the order of ``A``."""
+    """Message ``H``: condition of each anchor, in the order of ``A``."""
     codes = bytes(CONDITIONS.get(conditions.get(str(anchor.id), ""), 0) for anchor in anchors)
     return _HEAD.pack(ord("H"), 0, len(codes), unix_us) + codes

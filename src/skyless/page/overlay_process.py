@@ -1,4 +1,4 @@
-"""The process that computes overlays of the map."""
+"""Process that computes overlays of the map."""
 
 from functools import lru_cache
 from typing import Any, Final
@@ -26,8 +26,8 @@ _MIN_FIX_SHARE: Final = 0.5
 
 
 def overlay(task: OverlayTask) -> dict[str, Any]:
-    """The answer to ``/api/overlay``. Raises SkylessError."""
-    grid, grids = _grids(msgspec.json.encode(replace(task, kind="pdop")))  # of all kinds, so for all the same
+    """Compute the answer to ``/api/overlay``. Raises SkylessError."""
+    grid, grids = _grids(msgspec.json.encode(replace(task, kind="pdop")))  # one cache entry for all kinds
     values = grids[task.kind]
     known = sorted(value for value in values if value is not None)
     scale = scale_of(known)
@@ -52,7 +52,7 @@ def overlay(task: OverlayTask) -> dict[str, Any]:
 
 @lru_cache(_MAX_CACHED)
 def _grids(task: bytes) -> tuple[Grid, dict[str, list[float | None]]]:
-    """PDOP, HDOP and predicted sigma row by row from the lowest y, None where there is no fix."""
+    """PDOP, HDOP and predicted sigma row by row from the lowest y; None where there is no fix."""
     asked = msgspec.json.decode(task, type=OverlayTask)
     count, needed = len(asked.site.anchors), 4 if asked.site.tags.height_m is None else 3
     if count > MAX_PREDICTED:
@@ -76,9 +76,9 @@ def _grids(task: bytes) -> tuple[Grid, dict[str, list[float | None]]]:
 
 
 def grid_of(site: Site, plan_px: tuple[int, int] | None, least_step_m: float) -> Grid:
-    """Cells over the floor plan, the outline and all anchors, larger ones where there would be too many.
+    """Grid over the floor plan, the outline and all anchors, with larger cells if there would be too many.
 
-    They are at the known height of the tags, or half-way up the anchors.
+    It is at the known height of the tags, or half-way between the lowest and highest anchor.
     """
     points = [(anchor.x_m, anchor.y_m) for anchor in site.anchors]
     points += () if site.outline_m is UNSET else site.outline_m

@@ -1,4 +1,4 @@
-"""Recordings for the page: the list of a folder, and the states that a live page would have been sent."""
+"""Recordings for the page: the list of a folder, and the states that a live page would have got."""
 
 import logging
 import math
@@ -34,7 +34,7 @@ from skyless.run.zones import zones_of
 
 _SUFFIX: Final = ".mcap"
 _MAX_OPEN: Final = 8
-_GAP_S: Final = 2.5  # shorter times without fixes are not shown: the recorder closes a chunk once a second
+_GAP_S: Final = 2.5  # shorter gaps without fixes are not shown, as the recorder closes a chunk once a second
 
 MAX_RECORDED_EVENTS: Final = 2000
 _TICK_S: Final = 0.5
@@ -52,14 +52,14 @@ class ListedRecording(Struct, frozen=True):
     start_unix_s: float | None
     duration_s: float
     complete: bool
-    """False while it is being written, and after it was cut off."""
+    """False while the recording is being written, or if it was cut off."""
     site: str | None
     tags: int
     fixes: int
 
 
 class PlaybackSummary(Struct, frozen=True):
-    """What a page needs before it plays a recording."""
+    """Information that a page needs before it plays a recording."""
 
     name: str
     site: SiteMessage | None
@@ -68,7 +68,7 @@ class PlaybackSummary(Struct, frozen=True):
     tags: tuple[str, ...]
     zones: tuple[Zone, ...]
     fix_spans_unix_s: tuple[tuple[float, float], ...]
-    """When there are fixes, from the first one on, to about a second. Empty without any."""
+    """Periods with fixes, from the first one on, to about a second. Empty without any."""
 
 
 class RecordedEvents(Struct, frozen=True):
@@ -76,11 +76,11 @@ class RecordedEvents(Struct, frozen=True):
 
     events: tuple[Event, ...]
     complete: bool
-    """False where there are more than ``MAX_RECORDED_EVENTS``."""
+    """False if there are more than ``MAX_RECORDED_EVENTS``."""
 
 
 class RecordingFile(Struct, frozen=True):
-    """A recording's file, open, to be read up to the size that it had then: it may be growing."""
+    """An open recording, to be read up to its current size, as it may be growing."""
 
     name: str
     size_bytes: int
@@ -96,10 +96,10 @@ class RecordingFile(Struct, frozen=True):
 
 
 class Playback:
-    """The recordings of one folder. Its methods read files, and threads may call them."""
+    """The recordings of one folder. Its methods read files, and may be called by threads."""
 
     def __init__(self, folder: Path | None) -> None:
-        """``folder`` is None where there are no recordings."""
+        """``folder``: None if there are no recordings."""
         self._folder = folder
         self._lock = threading.Lock()
         self._stopped = threading.Event()
@@ -111,7 +111,7 @@ class Playback:
         self._stopped.set()
 
     def recordings(self) -> list[ListedRecording]:
-        """All that can be read, newest first."""
+        """List all readable recordings, newest first."""
         if self._folder is None:
             return []
         with self._lock:
@@ -138,7 +138,7 @@ class Playback:
             return PlaybackSummary(name, recording.site, found.start_s, found.end_s, found.tags, zones, spans)
 
     def events(self, name: str) -> RecordedEvents:
-        """What has happened in a recording. All of it is read while others are served. Raises HTTPException."""
+        """Events of a recording, read as a whole without blocking other reads. Raises HTTPException."""
         path = self._path(name)
         try:
             return _events(path, _version(path), self._stopped)
@@ -146,7 +146,7 @@ class Playback:
             raise HTTPException(404, f"{name!r} cannot be read: {error}") from None
 
     def open_file(self, name: str) -> RecordingFile:
-        """The file, to be downloaded. Raises HTTPException."""
+        """Open a recording for download. Raises HTTPException."""
         try:
             file = self._path(name).open("rb")
         except OSError as error:
@@ -154,7 +154,7 @@ class Playback:
         return RecordingFile(name, os.fstat(file.fileno()).st_size, file)
 
     def path_and_start(self, name: str) -> tuple[str, float]:
-        """Where a recording lies, and the Unix time of its first message. Raises HTTPException."""
+        """Path of a recording, and Unix time of its first message. Raises HTTPException."""
         return str(self._path(name)), self.summary(name).start_unix_s
 
     def floor_plan(self, name: str) -> bytes | None:
@@ -163,7 +163,7 @@ class Playback:
             return self._recording(name).floor_plan
 
     def states(self, name: str, begin_s: float, end_s: float, rate_hz: float) -> list[bytes]:
-        """The ``state`` messages from ``begin_s`` on and before ``end_s``, seconds since the recording's start.
+        """The ``state`` messages from ``begin_s`` until before ``end_s``, in seconds since the recording's start.
 
         Raises HTTPException.
         """
@@ -173,7 +173,7 @@ class Playback:
             return _states(recording, start_s + begin_s, start_s + end_s, 1.0 / rate_hz, self._stopped)
 
     def _list(self, file: Path, known: dict[str, tuple[_Version, ListedRecording]]) -> None:
-        """Add a file to the list. It is read only if it has changed since the last list."""
+        """Add a file to the list, reading it only if it has changed since the last list."""
         version = _version(file)
         old = known.get(file.name)
         if old is None or old[0] != version:
@@ -185,7 +185,7 @@ class Playback:
         self._listed[file.name] = old
 
     def _recording(self, name: str) -> McapRecording:
-        """The recording, open and up to date. Raises HTTPException."""
+        """Open or refresh a recording. Raises HTTPException."""
         path = self._path(name)
         try:
             key = name, path.stat().st_ino
@@ -202,7 +202,7 @@ class Playback:
         return recording
 
     def _path(self, name: str) -> Path:
-        """A file that lies in the folder itself. Raises HTTPException."""
+        """Path of a recording directly in the folder. Raises HTTPException."""
         plain = name.endswith(_SUFFIX) and not name.startswith(".") and not {"/", "\\", "\0", os.sep} & set(name)
         if self._folder is not None and plain:
             path = self._folder / name
@@ -218,7 +218,7 @@ def _version(file: Path) -> _Version:
 
 @lru_cache(_MAX_OPEN)
 def _events(path: Path, _of: _Version, stopped: threading.Event) -> RecordedEvents:
-    """The events of the same log that the live page has, by the recording's times."""
+    """Events of a recording from the live page's log, by the recording's times."""
     events: list[Event] = []
     log = EventLog(add=events.append)
     due_s, last_s = 0.0, float("-inf")
@@ -250,7 +250,7 @@ def _log_message(log: EventLog, found: Recorded) -> None:
 
 
 def _zones(recording: McapRecording) -> tuple[Zone, ...]:
-    """The zones of the recorded site, without those of other sites of its number."""
+    """Zones of the recorded site, without those of other sites with its number."""
     if recording.zones is None:
         return ()
     name = "" if recording.site is None else recording.site.site.name
@@ -287,7 +287,7 @@ def _states(
 
 
 def _append_state(site: SiteState, sent: int, unix_s: float, states: list[bytes]) -> int:
-    """Add a state if there is anything new."""
+    """Append a state if there is anything new. Returns the state's serial."""
     if site.serial > sent:
         site.unix_s = unix_s
         states.append(site.state_since(sent))

@@ -1,4 +1,4 @@
-"""The process that draws the installer's sheet, with Matplotlib, which the server does not load."""
+"""Process that draws the installer's sheet with Matplotlib, which the server does not load."""
 
 import time
 
@@ -8,7 +8,7 @@ from skyless.site.planning.sheet import sheet
 
 
 def answer(site: Site) -> bytes:
-    """The sheet as a PDF."""
+    """Draw the sheet as a PDF."""
     return sheet(site, None, "pdf", time.strftime("%Y-%m-%d"), None)
 
 

@@ -1,4 +1,4 @@
-"""The assets of a site: kept by the broker, and in a file where the dashboard has one."""
+"""The assets of a site, retained by the broker, and kept in a file if the dashboard has one."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -16,17 +16,17 @@ _NONE: Final = AssetsMessage(())
 _log = logging.getLogger("skyless.page")
 
 SETTLE_S: Final = 3.0
-"""A broker that has sent no assets for so long after a connection has none."""
+"""A broker that has sent no assets for this long after connecting has none."""
 
 
 class AssetsFile:
-    """A table in CSV that is written again with every change."""
+    """A CSV table that is rewritten with every change."""
 
     def __init__(self, path: Path) -> None:
-        """A file that does not exist is made with the first change. Raises SkylessError: it cannot be used."""
+        """A missing file is created with the first change. Raises SkylessError if it cannot be used."""
         self.path = path
         self.assets: tuple[Asset, ...] = ()
-        """Its content."""
+        """Content of the file."""
         self._is_of_before = path.exists()
         try:
             if self._is_of_before:
@@ -39,7 +39,7 @@ class AssetsFile:
             raise SkylessError(f"{path}: {error}") from None
 
     def write(self, assets: tuple[Asset, ...]) -> None:
-        """Replace its content. What it had at the start is kept beside it as ``….old``."""
+        """Replace the content. The content at the start is kept beside it as ``….old``."""
         if assets == self.assets:
             return
         try:
@@ -54,43 +54,43 @@ class AssetsFile:
 
 
 class SiteAssets:
-    """The assets of the site that is shown. Each change is handed to ``broadcast`` for the open pages."""
+    """The assets of the site shown. Each change is passed to ``broadcast`` for the open pages."""
 
     def __init__(self, broadcast: Callable[[str, bytes], None], file: AssetsFile | None = None) -> None:
         self._broadcast, self._file = broadcast, file
         self._site = ""
         self.kept = Kept(_NONE, read_assets)
-        self._due_s: float | None = None  # when a broker that has sent none has none
+        self._due_s: float | None = None  # time when a broker that has sent no assets counts as having none
         self.by_tag: Mapping[str, Asset] = {}
-        """The assets of the site that is shown."""
+        """The assets of the site shown, by tag."""
 
     @property
     def message(self) -> AssetsMessage:
-        """The same, with the site's name."""
+        """The assets with the site's name."""
         return AssetsMessage(tuple(self.by_tag.values()), self._site)
 
     def encoded(self) -> bytes:
-        """What a page is sent."""
+        """Message for pages."""
         return encode("assets", {"assets": self.message.assets})
 
     def on_connection(self, connected: bool, now_s: float) -> None:
-        """The broker sends what it has kept soon after a connection."""
+        """The broker has been connected or disconnected; it sends retained assets soon after connecting."""
         self._due_s = now_s + SETTLE_S if connected else None
 
     def on_site(self, name: str) -> None:
-        """The name of the site that is shown is known."""
+        """Use the name of the site shown."""
         self._site = name
         self._show()
 
     def on_message(self, payload: bytes) -> None:
-        """Assets from the broker. Raises WrongMessageError."""
+        """Process assets from the broker. Raises WrongMessageError."""
         if self.kept.receive(payload):
             self._show()
         if payload:
             self._due_s = None
 
     def store(self, assets: tuple[Asset, ...], site: str = "") -> None:
-        """Replace all assets; ``site`` names the site of the page that does. Raises WrongMessageError."""
+        """Replace all assets; ``site``: name of the requesting page's site. Raises WrongMessageError."""
         check_assets(assets)
         self.kept.check_store(site, self._site)
         kept = self.kept.message
@@ -103,7 +103,7 @@ class SiteAssets:
         self._show()
 
     def tick(self, now_s: float) -> None:
-        """Give the broker the file's assets where it has none."""
+        """Give the broker the file's assets if it has none."""
         if self._due_s is not None and now_s >= self._due_s and self._site:
             self._due_s = None
             has_none = self.kept.message == _NONE and self.kept.fault is None

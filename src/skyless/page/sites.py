@@ -1,7 +1,7 @@
-"""The sites of one broker that pages show: each has its own live state, zones, survey and link to the broker.
+"""The sites of one broker that pages show, each with its own live state, zones, survey and link to the broker.
 
-A page is connected to one of them for as long as it is open, so that it cannot mix two sites. A site that nobody looks
-at is let go some time later, unless it has zones or alarm rules, which are watched here.
+A page stays connected to one of them while it is open, so that it cannot mix two sites. A site that nobody looks at is
+disconnected some time later, unless it has zones or alarm rules, which are monitored here.
 """
 
 import asyncio
@@ -23,47 +23,47 @@ from skyless.run.web import PAGE as LIMITS
 
 
 def number_of(asked: str | None) -> int:
-    """The number of a site in a request, or -1 where it is none."""
+    """Parse the number of a site in a request; -1 if it is none."""
     return int(asked) if asked and asked.isascii() and asked.isdecimal() and len(asked) < 6 else -1
 
 
 async def connected(link: SiteLink, live: LiveSite) -> None:
-    """Keep a site connected until cancelled, which may be before it has begun."""
+    """Keep a site connected until cancelled, possibly before it has begun."""
     await together(link.run(), live.run())
 
 
 class Sites(Protocol):
-    """The sites that pages are shown: of a broker, or of a hub."""
+    """The sites of a broker, or of a hub, for pages."""
 
     @property
     def all(self) -> list[LiveSite]:
-        """Those that are connected."""
+        """The connected sites."""
 
     def of(self, asked: str | None) -> LiveSite:
-        """The site of a number. Raises HTTPException."""
+        """The site with a number. Raises HTTPException."""
 
 
 class LiveSites:
-    """The sites that are shown: the named one, or any site of the broker that a page asks for."""
+    """The sites shown: the named one, or any site of the broker that a page asks for."""
 
     def __init__(self, first: LiveSite, make: Callable[[], LiveSite] | None = None) -> None:
-        """``first`` is connected to the first site, and ``make`` returns the state of another."""
+        """``first``: state of the first site; ``make`` creates the state of another."""
         self._first, self._make = first, make
         self._by_number: dict[int, LiveSite] = {}
         self._asked_s: dict[int, float] = {}
         self._work: dict[int, asyncio.Task[None] | None] = {}
-        """What keeps the sites connected but the first."""
+        """Tasks that keep the sites connected."""
         self._on_broker: dict[int, SiteOnBroker] = {}
         self._default: int | None = None
         self._connect: Callable[[LiveSite, int], asyncio.Task[None] | None] = lambda _live, _number: None
 
     @property
     def all(self) -> list[LiveSite]:
-        """The sites that are connected, and the first."""
+        """The connected sites, and the first."""
         return [self._first, *(live for live in self._by_number.values() if live is not self._first)]
 
     def of(self, asked: str | None) -> LiveSite:
-        """The site of a number, or without a number a site that is alive. Raises HTTPException."""
+        """The site with a number, or without a number an active site. Raises HTTPException."""
         if not asked:
             return self._usual()
         number = number_of(asked)
@@ -74,7 +74,7 @@ class LiveSites:
         return self._shown(number)
 
     def _usual(self) -> LiveSite:
-        """The site last shown for as long as it is alive, or no other is."""
+        """The default site, replaced by another one if only that is active."""
         if self._default is None:
             return self._first
         alive = self._alive()
@@ -97,7 +97,7 @@ class LiveSites:
         return live
 
     def let_go(self) -> None:
-        """Disconnect sites that nobody has asked for in a while. The first stays."""
+        """Disconnect sites that nobody has requested for a while, except the first."""
         now_s = time.monotonic()
         for number, live in list(self._by_number.items()):
             if live.pages or live.streams or live.monitor.zones or live.alarms.rules or live is self._first:
@@ -108,7 +108,7 @@ class LiveSites:
                     work.cancel()
 
     def on_sites(self, sites: list[SiteOnBroker]) -> None:
-        """The sites of the broker have changed. The first site that is alive is shown from now on."""
+        """Update the broker's sites. Without a default site, the first active one becomes it."""
         self._on_broker = {site.number: site for site in sites}
         if self._default is None and (alive := self._alive()):
             self._default = alive[0]
@@ -139,6 +139,6 @@ class LiveSites:
                 self._shown(site_id)
 
     def _on_broker_state(self, connected: bool) -> None:
-        """While no site is shown, no link states it."""
+        """Pass on the connection's state while no site is shown, whose link would do that."""
         if self._default is None:
             self._first.on_connection(connected)

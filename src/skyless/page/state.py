@@ -1,4 +1,4 @@
-"""The state of the site as pages show it, gathered from messages, and what of it each page is sent. No I/O."""
+"""The state of the site for pages, gathered from messages, and the parts that are new to each page. No I/O."""
 
 import math
 from collections import Counter
@@ -35,13 +35,13 @@ EXPIRY_S: Final = 600.0
 """Fixes and health messages older than this are dropped."""
 
 MAX_CLOCK_ERROR_S: Final = 0.5
-"""The time of a fix by its tag's clock is replaced where it is wrong by more than this."""
+"""The time of a fix by its tag's clock is replaced if it is wrong by more than this."""
 
 MAX_ROWS: Final = 2_000
-"""Maximum number of tags sent to a page. Beyond it, tags on its map and tags that it names or searches are sent."""
+"""Maximum number of tags sent to a page. With more, tags on its map and tags that it names or searches are sent."""
 
 MAX_HEALTHS: Final = 200
-"""Beyond this number of tags, or anchors, a page is sent only the health of those that it names."""
+"""With more tags, or anchors, a page gets only the health of those that it names."""
 
 _MAX_NAMED: Final = 200
 
@@ -60,21 +60,21 @@ SILENT_S: Final = 3.5
 
 
 class PageRequest(Struct, frozen=True):
-    """What one page shows."""
+    """A page's request: what it shows."""
 
     view: tuple[float, float, float, float] | None = None
     """The visible part of the site, least x and y and largest x and y in m. None means all of it."""
     find: Annotated[str, Meta(max_length=200)] = ""
-    """Tags with this in their names."""
+    """Searched part of tags' names."""
     tags: Annotated[tuple[str, ...], Meta(max_length=_MAX_NAMED)] = ()
-    """Selected tags and those in the visible part of a list, of which also the health is sent."""
+    """Selected tags and those in the visible part of a list, whose health is also sent."""
     anchors: Annotated[tuple[str, ...], Meta(max_length=_MAX_NAMED)] = ()
     rows: Annotated[int, Meta(ge=1)] = MAX_ROWS
-    """Tags that its browser can draw in time."""
+    """Number of tags that the browser can draw in time."""
 
 
 def read_request(text: str, kind: type[_Request]) -> _Request | None:
-    """What a page asks for, or None for a text that is nothing of this kind."""
+    """Decode a page's request; None for a text of another kind."""
     try:
         return msgspec.json.decode(text, type=kind)
     except (msgspec.MsgspecError, ValueError, RecursionError):
@@ -82,23 +82,23 @@ def read_request(text: str, kind: type[_Request]) -> _Request | None:
 
 
 class Sent:
-    """What a page has been sent of the state, so that it is sent only what is new."""
+    """The part of the state that a page already has, so that it gets only new data."""
 
     def __init__(self) -> None:
         self.wanted = PageRequest()
         self.fixes = 0  # serial of the last fix
-        self.tags: dict[str, None] | None = None  # tags that it has been sent; None: all
-        self.inside = 0  # tags in its view
-        self.chosen_s = float("-inf")  # when its tags were chosen
+        self.tags: dict[str, None] | None = None  # tags sent; None: all
+        self.inside = 0  # number of tags in its view
+        self.chosen_s = float("-inf")  # time when its tags were chosen
         self.healths: int | None = None  # serial of the last health, None before the first message
         self.named: dict[str, set[str]] = {"tags": set(), "anchors": set(), "ether": set()}
-        """By kind, the names whose health it was sent because it asked for them."""
+        """By kind, names whose health was sent on request."""
         self.statuses = 0  # serial of the last status
         self.conditions: dict[str, str] = {}  # of anchors
 
 
 class _Tag:
-    """The last fix of a tag, and its row once one was requested."""
+    """The last fix of a tag, and its row once requested."""
 
     __slots__ = ("ended_unix_s", "fix", "received_s", "row", "serial")
 
@@ -119,10 +119,10 @@ class SiteState:
     """The newest fix, health and status by name."""
 
     def __init__(self) -> None:
-        self.serial = 0  # counts fixes; a reader that has the state at one serial requests what came since
+        self.serial = 0  # counts fixes; a reader with the state at one serial requests those since
         self.statuses: dict[tuple[str, str], StatusMessage] = {}  # by kind and name
         self.now_s = self.unix_s = 0.0
-        """Times of the next messages, by the clock of ``expire`` and by Unix time. Set by the owner."""
+        """Times of the next messages, by the clock of ``expire`` and by Unix time; set by the owner."""
         self.dropped: Counter[str] = Counter()  # wrong messages by kind
         self._tags: dict[str, _Tag] = {}
         self._truths = TruthBuffer()
@@ -136,9 +136,9 @@ class SiteState:
         self._encoded: dict[tuple[int, int], bytes] = {}
 
     def add_fix(self, fix: FixMessage, now_s: float, unix_s: float) -> None:
-        """Add a fix. ``now_s`` is its time of arrival, by the clock of ``expire``.
+        """Add a fix. ``now_s``: time of arrival, by the clock of ``expire``.
 
-        ``unix_s`` is the time of the fix, the end of its last frame, by the owner's clock of the day.
+        ``unix_s``: end of the fix's last frame, by the owner's wall clock.
         """
         self.serial += 1
         self._tags[fix.tag] = _Tag(fix, self.serial, now_s, unix_s)
@@ -161,7 +161,7 @@ class SiteState:
             (self._leaders.add if health.role == "master" else self._leaders.discard)(name)
 
     def expire(self, now_s: float) -> None:
-        """Drop what is older than ``EXPIRY_S``."""
+        """Drop fixes and health messages older than ``EXPIRY_S``."""
         self._encoded.clear()
         for name in [name for name, tag in self._tags.items() if now_s - tag.received_s > EXPIRY_S]:
             del self._tags[name]
@@ -170,16 +170,16 @@ class SiteState:
                 del healths[name]
 
     def fixes_since(self, now_s: float, longest_s: float, serial: int = 0) -> list[tuple[FixMessage, float]]:
-        """The newest fix of each tag that has one after a serial and within the last ``longest_s``.
+        """The newest fix of each tag after a serial and within the last ``longest_s``.
 
-        Each is given with when it ended, by ``unix_s``.
+        Each comes with the end time of its last frame, as ``unix_s``.
         """
         newer = [tag for tag in self._tags.values() if tag.serial > serial and now_s - tag.received_s <= longest_s]
         return [(tag.fix, tag.ended_unix_s) for tag in newer]
 
     @property
     def tags(self) -> Collection[str]:
-        """Names of the tags whose newest fix is kept."""
+        """Names of the tags with a kept fix."""
         return self._tags.keys()
 
     def methods(self) -> list[str]:
@@ -189,7 +189,7 @@ class SiteState:
     # Fixes
 
     def state_since(self, serial: int) -> bytes:
-        """The ``state`` message with all tags that have a fix since. Readers at the same serial share its bytes."""
+        """The ``state`` message with all tags that have a newer fix. Readers at the same serial share its bytes."""
         key = serial, self.serial
         if key not in self._encoded:
             if len(self._encoded) >= _MAX_ENCODED:
@@ -198,7 +198,7 @@ class SiteState:
         return self._encoded[key]
 
     def rows_since(self, serial: int) -> list[list[Any]]:
-        """Rows of the ``state`` message, the fields of each in the order of ``page/tracks.js``."""
+        """Rows of the ``state`` message, with fields in the order of ``page/tracks.js``."""
         return [self._row(tag) for tag in self._tags.values() if tag.serial > serial]
 
     def _row(self, tag: _Tag) -> list[Any]:
@@ -207,10 +207,10 @@ class SiteState:
         return tag.row
 
     def new_state(self, sent: Sent) -> bytes | None:
-        """The ``state`` message with what is new to a page, or None where nothing is.
+        """The ``state`` message with what is new to a page, or None if nothing is.
 
-        Of a large site the page is sent a part of the tags; ``left`` are those that no longer belong to it, ``of`` is
-        how many there are, and ``inside`` how many are in the page's view.
+        At a large site the page gets a part of the tags; ``left`` are those that no longer belong to that part, ``of``
+        is the number of all tags, and ``inside`` the number in the page's view.
         """
         if len(self._tags) <= sent.wanted.rows:
             if sent.fixes == self.serial and sent.tags is None:
@@ -232,7 +232,7 @@ class SiteState:
         return encode("state", {"unix_s": round(self.unix_s, 3), **fields})
 
     def _choose(self, sent: Sent, before: dict[str, None]) -> dict[str, None]:
-        """The tags for a page: those that it names, that it looks for, and those in its view, first those it has."""
+        """Choose tags for a page: those that it names, searches, and has in view, first the already sent ones."""
         wanted, text = sent.wanted, sent.wanted.find.lower()
         x1, y1, x2, y2 = wanted.view or (-math.inf, -math.inf, math.inf, math.inf)
         inside = []
@@ -250,13 +250,13 @@ class SiteState:
 
     @property
     def conditions(self) -> dict[str, str]:
-        """The condition of each anchor, by its name, as of the last ``judge``."""
+        """The condition of each anchor, by name, as of the last ``judge``."""
         return self._conditions
 
     def judge(self, now_s: float, *, blind: bool) -> None:
-        """Find the condition of each anchor: ``good``, ``warn`` (not synchronised) or ``bad`` (offline).
+        """Update the condition of each anchor: ``good``, ``warn`` (not synchronised) or ``bad`` (offline).
 
-        While the owner is blind, since messages may be missing, silence does not make an anchor ``bad``.
+        While ``blind``, when messages may be missing, silence does not make an anchor ``bad``.
         """
         self._waiting = list(islice((name for name in self._healths["tags"] if name not in self._tags), MAX_HEALTHS))
         found = {}
@@ -274,8 +274,8 @@ class SiteState:
     def new_health(self, sent: Sent) -> bytes:
         """The ``health`` message with what is new to a page. The first one is ``whole``.
 
-        Of many tags or anchors it holds the health of those only that the page names, and of anchors that lead.
-        ``ages`` are since each arrived; ``waiting`` are tags that report and have no position yet.
+        With many tags or anchors it contains only the health of those that the page names, and of leading anchors.
+        ``ages``: since each arrived; ``waiting``: tags that report but have no position yet.
         """
         whole, since = sent.healths is None, sent.healths or 0
         named = {"tags": {*sent.wanted.tags}, "anchors": {*sent.wanted.anchors, *self._leaders}}
@@ -291,7 +291,7 @@ class SiteState:
         nodes = []
         if sent.statuses < self._status_serial:
             nodes = [self.statuses[key] for key, serial in self._status_serials.items() if serial > sent.statuses]
-        if len(self.statuses) > MAX_HEALTHS:  # of many, pages list the other programs
+        if len(self.statuses) > MAX_HEALTHS:  # if there are many, pages list only the other programs
             nodes = [node for node in nodes if node.kind not in {"tag", "anchor"}]
         changed = {name: kind for name, kind in self._conditions.items() if sent.conditions.get(name) != kind}
         changed |= dict.fromkeys(sent.conditions.keys() - self._conditions.keys(), "unknown")
@@ -314,18 +314,18 @@ class SiteState:
 
 
 def encode(kind: str, fields: dict[str, Any]) -> bytes:
-    """One message to the page."""
+    """Encode a message to a page."""
     return msgspec.json.encode({"type": kind, **fields})
 
 
 def error_m(fix: FixMessage, true_m: Vector) -> float:
-    """Distance from the true position in the axes that the fix estimates, so without a given height."""
+    """Distance from the true position, without the height if that was given."""
     axes = 2 if fix.height_known else 3
     return math.dist(fix.position_m[:axes], true_m[:axes])
 
 
 def _row(fix: FixMessage, true_m: Vector | None, ended_unix_s: float) -> list[Any]:
-    """One tag in a ``state``, rounded to what a page can show, which halves the bytes."""
+    """Row of one tag in a ``state``, rounded to what a page can show, which halves its size."""
     unix_s = fix.unix_s if abs(fix.unix_s - ended_unix_s) <= MAX_CLOCK_ERROR_S else ended_unix_s
     x, y, z = fix.position_m
     xx, xy, _, _, yy = fix.covariance_m2[:5]
@@ -357,19 +357,19 @@ def _row(fix: FixMessage, true_m: Vector | None, ended_unix_s: float) -> list[An
     ]
 
 
-# The survey of a site as pages see it: the newest messages of the survey program, and what pages give to it.
+# The survey of a site for pages: the newest messages of the survey program, and pages' requests to it.
 #
-# The survey program computes; here its messages are forwarded, and what a page sends is checked and published.
+# The survey program computes; its messages are forwarded here, and pages' requests are checked and published.
 
 Handler = Callable[[str, bytes], None]
 _M = TypeVar("_M", SurveyMessage, WatchMessage)
 
 
 class Newest(Generic[_M]):
-    """The newest message of a retained topic, and how old it is.
+    """The newest message of a retained topic, and its age.
 
-    The first after a connection may be old: the broker kept it, and only its own time says how long. The others are
-    new when they arrive; their sender's clock does not matter.
+    The first one after connecting may be old, and only its own time tells its age. Later ones are new on arrival,
+    whatever their sender's clock.
     """
 
     def __init__(self, name: str, kind: type[_M], clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
@@ -381,7 +381,7 @@ class Newest(Generic[_M]):
         self._made_s = 0.0
 
     def expect_kept(self) -> None:
-        """The next message may be one that the broker kept."""
+        """Expect that the next message may be a retained one."""
         self._first = True
 
     def read(self, payload: bytes) -> None:
@@ -397,12 +397,12 @@ class Newest(Generic[_M]):
         return None if self.message is None else self._clock() - self._made_s
 
     def encoded(self) -> bytes:
-        """What a page is sent."""
+        """Message for pages."""
         return encode(self.name, {self.name: self.message, "age_s": self.age_s()})
 
 
 class SiteSurvey:
-    """The newest messages of the survey program. Each change is handed to ``broadcast`` for the open pages."""
+    """The newest messages of the survey program. Each change is passed to ``broadcast`` for the open pages."""
 
     def __init__(
         self,
@@ -411,15 +411,15 @@ class SiteSurvey:
         clock: Callable[[], float],
         wall_clock: Callable[[], float],
     ) -> None:
-        """``name`` is the dashboard's on MQTT."""
+        """``name``: of the dashboard on MQTT."""
         self._name, self._broadcast = name, broadcast
         self.survey = Newest("survey", SurveyMessage, clock, wall_clock)
         """State of the survey program."""
         self.watch = Newest("watch", WatchMessage, clock, wall_clock)
-        """What the watch of the anchors has found."""
+        """Findings of the watch of the anchors."""
 
     def handlers(self, site_id: int) -> dict[str, Handler]:
-        """What is to be subscribed to, and who handles it."""
+        """Topics to subscribe to, with their handlers."""
         return {
             survey_topic(site_id): partial(self._on, self.survey),
             watch_topic(site_id): partial(self._on, self.watch),
@@ -430,12 +430,12 @@ class SiteSurvey:
         return {one.name: one.encoded() for one in (self.survey, self.watch) if one.message is not None}
 
     def expect_kept(self) -> None:
-        """The broker is connected again: it sends the messages that it kept."""
+        """Expect retained messages, as the broker is connected again."""
         self.survey.expect_kept()
         self.watch.expect_kept()
 
     def facts_message(self, body: bytes) -> SurveyFactsMessage:
-        """What a page's user knows, ready to be published. Raises BadFactsError."""
+        """Check facts from a page's user. Returns the message to publish. Raises BadFactsError."""
         try:
             message = read_message(body, SurveyFactsMessage)
         except WrongMessageError as error:
@@ -444,7 +444,7 @@ class SiteSurvey:
         return replace(message, by=self._name)
 
     def save_message(self, body: bytes) -> SurveySaveMessage:
-        """The request to save a result, ready to be published. Raises BadFactsError and HTTPException."""
+        """Check a request to save a result. Returns the message to publish. Raises BadFactsError and HTTPException."""
         try:
             serial = read_message(body, _SaveRequest).serial
         except WrongMessageError as error:

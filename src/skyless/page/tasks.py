@@ -1,4 +1,4 @@
-"""What the server has computed by processes of their own."""
+"""Tasks that the server has computed by separate processes."""
 
 import asyncio
 import os
@@ -29,7 +29,7 @@ class OverlayTask(Struct, frozen=True):
     kind: Kind
     method: str
     step_m: float
-    """The least side of its cells."""
+    """Least side of the cells."""
     plan_px: tuple[int, int] | None
     """Size of the floor plan's image."""
 
@@ -40,15 +40,15 @@ class WhatIfTask(Struct, frozen=True):
     path: str
     tag: str
     begin_unix_s: float
-    """It begins with the first fix from then on."""
+    """The packets begin with the first fix from this time on."""
     seconds: float
 
 
 class MovedAnchors(Struct, frozen=True):
-    """What a page asks about: the site as it would be with some anchors elsewhere."""
+    """A page's question about the site with some anchors moved."""
 
     anchors: tuple[AnchorSite, ...] = ()
-    """Only their positions count."""
+    """Only the positions are used."""
 
     def site_of(self, site: Site) -> Site:
         """The site with its anchors moved. Raises ConfigurationError."""
@@ -62,13 +62,13 @@ class MovedAnchors(Struct, frozen=True):
         return moved
 
 
-# A process of its own for what would delay the pages, or would load NumPy into the server: one task at a time.
+# A separate process for work that would delay the pages, or load NumPy into the server: one task at a time.
 #
 # Tasks and answers are lines of JSON.
 
 _TIMEOUT_S: Final = 120.0
 _IDLE_S: Final = 60.0
-"""A process without a task for this long is ended: it has loaded a hundred megabytes."""
+"""A process without a task for this long is ended, as it uses a hundred megabytes."""
 
 _NICE: Final = 19  # positioning on this machine has priority
 
@@ -81,10 +81,10 @@ class _Answer(Struct):
 
 
 class TaskProcess:
-    """Runs a module that does tasks, one after the other."""
+    """Runs a module in a process that does tasks, one after the other."""
 
     def __init__(self, module: str, fault: int = 422) -> None:
-        """``module`` calls ``serve_tasks`` when it is run; ``fault`` is the status of what it answers with an error."""
+        """``module`` calls ``serve_tasks`` when run; ``fault``: HTTP status for its errors."""
         self._module, self._fault = module, fault
         self._lock = asyncio.Lock()
         self._process: subprocess.Popen[bytes] | None = None
@@ -92,12 +92,12 @@ class TaskProcess:
         self._stopped = False
 
     def stop(self) -> None:
-        """Stop the task at hand. No other starts."""
+        """Stop the current task, and start no further one."""
         self._stopped = True
         self._kill()
 
     async def run(self, task: Struct) -> bytes:
-        """The answer to a task, as JSON. Raises HTTPException."""
+        """Have a task done. Returns the answer as JSON. Raises HTTPException."""
         async with self._lock:
             if self._stopped:
                 raise HTTPException(422, "the dashboard is stopping")
@@ -110,7 +110,7 @@ class TaskProcess:
                 self._kill()
                 raise HTTPException(422, f"it takes longer than {_TIMEOUT_S:g} s") from None
             except BaseException:
-                self._kill()  # what it would answer belongs to no later task
+                self._kill()  # a later answer would be taken for that of another task
                 raise
             self._idle = asyncio.get_running_loop().call_later(_IDLE_S, self._kill)
         if not line:
@@ -121,7 +121,7 @@ class TaskProcess:
         return bytes(answer.value)
 
     def _exchange(self, task: bytes) -> bytes:
-        """The process's answer, empty where it has failed."""
+        """Send a task, and return the process's answer; empty if it has failed."""
         process = self._process
         if process is None or process.poll() is not None:
             self._process = process = subprocess.Popen(
@@ -136,7 +136,7 @@ class TaskProcess:
             process.stdin.write(task + b"\n")
             process.stdin.flush()
             return process.stdout.readline()
-        except (OSError, ValueError):  # ValueError: it was killed meanwhile, and its pipes are closed
+        except (OSError, ValueError):  # ValueError: the process was killed meanwhile, and its pipes are closed
             return b""
 
     def _kill(self) -> None:
@@ -147,7 +147,7 @@ class TaskProcess:
 
 
 def serve_tasks(kind: type[_Task], answer: Callable[[_Task], object]) -> None:
-    """Answer the tasks of standard input on standard output, until it is closed. A SkylessError is an answer, too."""
+    """Answer tasks from standard input on standard output until it closes. A SkylessError is also an answer."""
     os.nice(_NICE)
     for line in sys.stdin.buffer:
         try:

@@ -1,4 +1,4 @@
-"""The process that prepares a recording for being recomputed by a page, which runs the estimator's WebAssembly."""
+"""Process that prepares a recording for recomputation by a page, which runs the estimator as WebAssembly."""
 
 import ctypes
 from collections.abc import Iterator
@@ -28,11 +28,11 @@ from skyless.run.recordings.recording import McapRecording
 
 _PAGE_BYTES: Final = 1024
 _LEAST_STD_M: Final = 0.1
-"""A filter that begins at a fix is no surer than this: its anchors may stand elsewhere now."""
+"""Least standard deviation of a filter that begins at a fix, as its anchors may be moved."""
 
 
 class WhatIfAnchor(Struct, frozen=True):
-    """An anchor of the packets, in the order of their table."""
+    """An anchor of the packets."""
 
     id: int
     position_m: tuple[float, float, float]
@@ -42,30 +42,30 @@ class WhatIf(Struct, frozen=True):
     """Tables in the memory layout of ``skyless_core.h``, for ``browser/estimator.js``."""
 
     digest: str
-    """Of the source from which the WebAssembly has to be made."""
+    """Digest of the source from which the WebAssembly must have been built."""
     begin_s: float
-    """Since ``begin_unix_s``."""
+    """Time of the first fix, since ``begin_unix_s``."""
     times_s: list[float]
-    """Of the packets, since the first."""
+    """Times of the packets, since that fix."""
     recorded: list[tuple[float, float, float, float | None] | None]
-    """What the tag made of each packet: position and horizontal protection level, or no fix."""
+    """The tag's result for each packet: position and horizontal protection level, or no fix."""
     anchors: list[WhatIfAnchor]
     layout: dict[str, int]
     """Sizes of records, and offsets of the fields that the page reads or changes."""
     state: list[tuple[int, bytes]]
-    """Where the filter's first state is not zero, and what stands there."""
+    """The non-zero parts of the filter's first state: offset and content."""
     places: bytes
     packets: bytes
     relays: bytes
 
 
 def what_if(task: WhatIfTask) -> WhatIf:
-    """The tables of one recording. Raises SkylessError where there is nothing to recompute."""
+    """Prepare the tables of one recording. Raises SkylessError if there is nothing to recompute."""
     return _Tables(task).filled()
 
 
 class _Tables:
-    """The packets of one tag from a fix on."""
+    """Collects the packets of one tag from a fix on."""
 
     def __init__(self, task: WhatIfTask) -> None:
         self._task = task
@@ -78,13 +78,13 @@ class _Tables:
         self._begin_s = 0.0
 
     def filled(self) -> WhatIf:
-        """All of them. Raises SkylessError."""
+        """Read the recording, and return the tables. Raises SkylessError."""
         task, receiver = self._task, None
         with McapRecording(task.path) as recording:
             for start, raw, unix_s in _receptions(recording, task.tag):
                 if start is not None:
                     if self._state is not None:
-                        break  # what follows a gap has another clock
+                        break  # after a gap the clock is another one
                     receiver = _receiver_of(start)
                 if receiver is not None and unix_s <= task.begin_unix_s + self._begin_s + task.seconds:
                     self._hear(receiver, _reception_of(raw), unix_s)
@@ -125,7 +125,7 @@ class _Tables:
         packet = heard.packet
         if packet.place.anchor not in self._places:
             self._places[packet.place.anchor] = Place.from_buffer_copy(packet.place)
-        if heard.relays.count == 0:  # the filter has not taken the packet
+        if heard.relays.count == 0:  # the filter has not used the packet
             take_relays(packet, heard.relays, heard.beacon.relays, heard.beacon.relay_bytes)
         self._relays += [Relay.from_buffer_copy(one) for one in first(heard.relays.rows, heard.relays.count)]
         row = BatchPacket(
@@ -144,7 +144,7 @@ class _Tables:
 
 
 def _receptions(recording: McapRecording, tag: str) -> Iterator[tuple[SegmentStart | None, RawReception, float]]:
-    """Receptions of a tag with their Unix time, the first of a segment with its beginning."""
+    """Receptions of a tag with their Unix times; the first of a segment comes with the segment's start."""
     for message in recording.receptions(tag):
         start = message.start
         for raw in message.receptions:
@@ -159,7 +159,7 @@ def _reception_of(raw: RawReception) -> Reception:
 
 
 def _receiver_of(start: SegmentStart) -> AnyReceiver:
-    """The receiver as it was, or one that knows nothing yet."""
+    """The receiver in its recorded state, or a new one."""
     if start.state is None:
         return AnyReceiver()
     try:
@@ -169,7 +169,7 @@ def _receiver_of(start: SegmentStart) -> AnyReceiver:
 
 
 def _state_at(estimator: Estimator, rx_ticks: int) -> State:
-    """A filter without anchors that begins where this one is."""
+    """State of a filter without anchors that begins at this one's position."""
     settings, dim = estimator.settings, estimator.dim
     fresh = Estimator(settings)
     covariance = covariances(estimator.state)[:dim, :dim] + _LEAST_STD_M**2 * np.eye(dim)

@@ -1,1 +1,1 @@
-"""What a site is made from: its file, its survey, and the planning of its anchors."""
+"""Setting up a site: its file, its survey, and the planning of its anchors."""

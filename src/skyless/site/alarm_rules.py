@@ -1,4 +1,4 @@
-"""Rules of alarms: what a valid one is, and the hours in which it holds."""
+"""Alarm rules: their validation, and the hours in which they apply."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -10,7 +10,7 @@ from skyless.core.site import AlarmRule
 
 MAX_RULES: Final = 200
 GROUP: Final = "group:"
-"""What stands before the name of a group of assets in ``tags`` and ``others``."""
+"""Prefix of the name of a group of assets in ``tags`` and ``others``."""
 
 _MAX_WHO: Final = 1000
 _MAX_S: Final = 30 * 86400.0
@@ -36,7 +36,7 @@ KINDS: Final = {
     "protection-level": "tags limit hysteresis",
     "battery": "tags limit hysteresis",
 }
-"""The keys that each kind of rule has in addition to those of all."""
+"""The keys of each kind of rule, in addition to those common to all."""
 
 _LIMITS: Final = {
     "near": (0.1, 1000.0, "a distance in metres from 0.1 to 1000"),
@@ -48,10 +48,10 @@ _SHORTEST_SILENCE_S: Final = 1.0
 
 
 class BadAlarmRulesError(ValueError):
-    """What is wrong with a list of rules."""
+    """A list of rules is invalid."""
 
     def __init__(self, row: int | None, rule: str, key: str, value: object, expected: str) -> None:
-        """``row`` is the rule's place in the list from 0, or None where the list as a whole is wrong."""
+        """``row``: index of the rule, or None if the list as a whole is wrong."""
         self.row, self.rule, self.key, self.value, self.expected = row, rule, key, value, expected
         where = "the rules of alarms" if row is None else f"alarm rule {rule[:40]!r}"
         found = "is missing" if value is None else f"is {str(value)[:60]!r}"
@@ -59,22 +59,22 @@ class BadAlarmRulesError(ValueError):
 
 
 class Hours(Struct, frozen=True):
-    """When a rule holds: parts of the week, in minutes since Monday, 00:00."""
+    """The parts of the week in which a rule applies, in minutes since Monday, 00:00."""
 
     parts: tuple[tuple[int, int], ...] = ()
-    """Begin and end of each; an end beyond the week goes on at its begin. Empty means always."""
+    """Begin and end of each; an end beyond the week wraps around. Empty means always."""
 
     def contain(self, weekday: int, minute: int) -> bool:
-        """Whether a time is within them; ``weekday`` counts from Monday, 0, ``minute`` from midnight."""
+        """Whether a time is within these hours; ``weekday``: 0 for Monday, ``minute``: since midnight."""
         at = weekday * _DAY_MIN + minute
         return not self.parts or any(begin <= at < end or at + _WEEK_MIN < end for begin, end in self.parts)
 
 
 def read_hours(text: str) -> Hours:
-    """The hours that a text describes. A range over midnight belongs to the day on which it begins.
+    """Parse hours. A range over midnight belongs to the day on which it begins.
 
     Raises:
-        ValueError: the text describes none; its message says what would be right.
+        ValueError: the text is invalid; the message says what would be right.
     """
     parts = []
     for piece in text.lower().split(",") if text.strip() else ():
@@ -96,7 +96,7 @@ def _minutes(text: str) -> int:
 
 
 def check_rules(rules: Sequence[AlarmRule], others: Sequence[AlarmRule] = ()) -> None:
-    """Check rules; no identifier may be one of ``others``. Raises BadAlarmRulesError."""
+    """Check rules, whose identifiers must not occur in ``others``. Raises BadAlarmRulesError."""
     if len(rules) > MAX_RULES:
         raise BadAlarmRulesError(None, "", "their number", len(rules), f"at most {MAX_RULES}")
     known = {rule.id for rule in others}
@@ -109,7 +109,7 @@ def check_rules(rules: Sequence[AlarmRule], others: Sequence[AlarmRule] = ()) ->
 
 
 def _faults(rule: AlarmRule) -> Iterator[tuple[str, object, str]]:
-    """What is wrong with a rule: key, value, and what would be right."""
+    """Faults of a rule: key, value, and what would be right."""
     if not _ID.fullmatch(rule.id):
         yield "id", rule.id, "1 to 32 letters, digits, dashes and underscores"
     if len(rule.name) > 100 or not rule.name.isprintable():
@@ -132,7 +132,7 @@ def _faults(rule: AlarmRule) -> Iterator[tuple[str, object, str]]:
 
 
 def _faults_of_kind(rule: AlarmRule) -> Iterator[tuple[str, object, str]]:
-    """Keys that its kind needs, and those that it does not have."""
+    """Faults in the keys that depend on the rule's kind."""
     keys, plain = KINDS[rule.kind].split(), AlarmRule(rule.id, rule.kind)
     for key in ("tags", "others", "hysteresis", "zone", "limit"):
         value = getattr(rule, key)

@@ -23,38 +23,38 @@ from numba.extending import register_jitable
 
 from skyless.core.arrays import Array
 
-# Where kernels are kept that Numba has compiled.
+# Folder of the kernels that Numba has compiled.
 #
-# The folder belongs to exactly these sources: the compiler notices a change of the kernel's own file but not of what
-# it calls, nor of constants from elsewhere, so a digest of all files with kernels, and of all that these import,
-# stands in its name. Folders of other sources are removed when they have not been used for long.
+# The folder belongs to exactly these sources: the compiler notices a change of the kernel's own file, but not of called
+# functions or of constants from elsewhere, so the folder's name contains a digest of all files with kernels and of all
+# that they import. Folders of other sources are removed when they have not been used for long.
 #
-# The first of these is used that can be written, or that cannot but holds kernels (an image): ``NUMBA_CACHE_DIR``,
-# next to the sources, the user's cache. Where there is none, every program compiles for itself.
+# Candidates in order: ``NUMBA_CACHE_DIR``, next to the sources, the user's cache. The first one is used that can be
+# written, or that is read-only but holds kernels (an image). Without any, every program compiles for itself.
 
 _PACKAGE: Final = Path(__file__).parents[1]
 _IMPORT: Final = re.compile(rb"from (skyless[\w.]*) import (\([^)]*\)|.*)")
 _KEPT_S: Final = 7 * 86_400.0
-"""Kernels of other sources are kept for a week after their last use: several versions may share a folder."""
+"""Kernels of other sources are kept for a week after their last use, as several versions may share a folder."""
 
 
 @cache
 def kernel_folder() -> Path | None:
-    """Where this program keeps compiled kernels; None where no folder can be written."""
+    """Folder of this program's compiled kernels; None if no folder can be used."""
     if asked := os.environ.get("NUMBA_CACHE_DIR"):
-        # absolute for the programs that this one starts, too: they may change their working folder
+        # Absolute also for child processes, which may change their working folder.
         os.environ["NUMBA_CACHE_DIR"] = str(Path(asked).absolute())
     name = f"kernels-{digest(_PACKAGE)}"
     found = choose_folder(_homes(), name)
     if found is not None:
         with suppress(OSError):
-            os.utime(found)  # its time is that of its last use
+            os.utime(found)  # the folder's time is that of its last use
             _remove_unused(found)
     return found
 
 
 def choose_folder(homes: Iterable[Path], name: str) -> Path | None:
-    """The folder in the first home where it can be written, or cannot but holds kernels; None if there is none."""
+    """The folder in the first home where it is writable, or read-only with kernels in it; None if there is none."""
     for home in homes:
         path = home / name
         with suppress(OSError):
@@ -77,7 +77,7 @@ def _homes() -> Iterable[Path]:
 
 
 def digest(package: Path) -> str:
-    """Digest of the files of the package ``skyless`` that hold kernels, and of all that these import."""
+    """Digest of the files of the package ``skyless`` that contain kernels, and of all that they import."""
     texts = {_module(file, package): file.read_bytes() for file in sorted(package.rglob("*.py"))}
     wanted = [name for name, text in texts.items() if b"skyless.site.kernels" in text or ".kernels." in name]
     used: set[str] = set()
@@ -114,32 +114,32 @@ def kernel(function: Function) -> Function:
     """Compile a scalar function over arrays that its caller owns; the result is cached on disk.
 
     ``error_model="numpy"`` makes a division by zero an infinity instead of an exception, as in NumPy.
-    Fast-math stays off: streaming and batch must give identical bits.
+    Fast-math stays off, as streaming and batch must give identical bits.
     """
     return _compile(function, {})
 
 
 def part(function: Function) -> Function:
-    """Compile a small function only as lines of its callers, and by itself only where Python calls it.
+    """Compile a small function inline into its callers, and on its own only if Python calls it.
 
-    A kernel of its own costs a twentieth of a second at the first start, however short it is, and its callers then
-    compile its instructions once more. What is long and has several callers is better a kernel.
+    A separate kernel costs a twentieth of a second at the first start, however short it is, and its callers compile its
+    instructions once more. A long function with several callers is better a kernel.
     """
     return _compile(function, {"inline": "always"})
 
 
 def jitted(function: Function) -> Function:
-    """A small function that kernels may call, and that stays plain Python elsewhere."""
+    """Let kernels call a small function, which stays plain Python elsewhere."""
     return register_jitable(function)
 
 
 def step(function: Function) -> Function:
-    """A step of kernels: compiled as part of each that calls it, and plain Python where Python calls it."""
+    """Compile a function into each kernel that calls it; it stays plain Python elsewhere."""
     return register_jitable(forceinline=True, error_model="numpy")(function)
 
 
 def threaded_kernel(function: Function) -> Function:
-    """Compile a long loop that runs without the interpreter's lock, so that threads run it side by side."""
+    """Compile a long loop that releases the interpreter's lock, so that threads run it in parallel."""
     return _compile(function, {"nogil": True})
 
 
@@ -151,7 +151,7 @@ def _compile(function: Function, options: dict[str, Any]) -> Function:
 
 
 class _Locator(UserProvidedCacheLocator):
-    """Where a kernel is kept: numba's own locators reject a folder that cannot be written, as images have them."""
+    """Locates a kernel's cache; numba's own locators reject read-only folders, as in images."""
 
     def __init__(self, function: Callable[..., Any], file: str) -> None:
         self._py_file, self._lineno = file, function.__code__.co_firstlineno
@@ -163,7 +163,7 @@ class _Locator(UserProvidedCacheLocator):
             folder.mkdir(exist_ok=True)
 
     def get_source_stamp(self) -> str:
-        """The folder's name holds a digest of the sources; times of files change on their way into an image."""
+        """The folder's name, which contains a digest of the sources: times of files change on the way into an image."""
         return self._stamp
 
     @classmethod
@@ -177,15 +177,15 @@ class _Kept(CompileResultCacheImpl):
 
 
 class _KernelCache(FunctionCache):
-    """A file that cannot be read or written costs a compilation, and is no error."""
+    """Cache for which a file that cannot be read or written is no error, but costs a compilation."""
 
     _impl_class = _Kept
 
     def load_overload(self, signature: object, context: object) -> object:
-        """See numba; None where there is no usable file."""
+        """See numba; None if there is no usable file."""
         try:
             return super().load_overload(signature, context)  # type: ignore[no-untyped-call]
-        except (OSError, EOFError, pickle.UnpicklingError):  # as a loss of power leaves them
+        except (OSError, EOFError, pickle.UnpicklingError):  # for instance after a loss of power
             with suppress(OSError):
                 self.flush()  # type: ignore[no-untyped-call]
             return None
@@ -198,18 +198,18 @@ class _KernelCache(FunctionCache):
 
 # Cholesky factors of small matrices, in place and without allocation.
 #
-# For the few unknowns of a position these beat LAPACK's call overhead, and they run in compiled loops.
+# With the few unknowns of a position they avoid LAPACK's call overhead, and they run in compiled loops.
 
 SINGULAR_PIVOT = 1e-12
-"""A pivot below this part of its diagonal element is rounding noise: the matrix is singular."""
+"""A pivot below this share of its diagonal element is rounding noise: the matrix is singular."""
 
 
 @kernel
 def factorise(matrix: Array, size: int) -> bool:
     """Replace the leading ``size`` × ``size`` block by its lower factor L, with L·Lᵀ = matrix.
 
-    Only the lower triangle is read and written. False where the matrix is not positive definite (or not
-    finite); its contents are then undefined.
+    Only the lower triangle is read and written. Returns False if the matrix is not positive definite (or not finite);
+    its contents are then undefined.
     """
     for j in range(size):
         diagonal = matrix[j, j]

@@ -1,4 +1,4 @@
-"""Reports as one HTML page that needs nothing else, and the style of its pictures."""
+"""Self-contained HTML reports, and the style of their pictures."""
 
 import base64
 import io
@@ -14,19 +14,16 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-# Figures: one style for all, with sizes for a phone's width and colours for a bright and a dark page; and their
-# files.
-#
-# Files are written whole or not at all, and without a screen.
+# Figures: one style, with sizes for a phone's width and colours for a bright and a dark page.
 
 INK: Final = "#1f2933"
 MUTED: Final = "#5f6b7a"
 GRID: Final = "#d9dee5"
 PAPER: Final = "#ffffff"
-"""These four turn on a dark page; the others can be seen on both."""
+"""These four are replaced on a dark page; the others are visible on both."""
 
 MAP_WHITE: Final = "#fdfdfd"
-"""On maps, on either page."""
+"""White of maps, the same on both pages."""
 
 BLUE: Final = "#2f86d0"
 ORANGE: Final = "#dd7a1f"
@@ -75,13 +72,13 @@ _RC: Final[dict[Any, Any]] = {
 
 @contextmanager
 def report_style() -> Iterator[None]:
-    """Everything drawn and saved in the block has the style of the reports."""
+    """Draw and save everything within the block in the style of the reports."""
     with rc_context(_RC):
         yield
 
 
 def panel(title: str, height_in: float = 3.5) -> tuple[Figure, Axes]:
-    """An empty picture of the report's width with one pair of axes."""
+    """Create an empty figure of the report's width with one pair of axes."""
     figure = Figure(figsize=(4.7, height_in), layout="constrained")
     axes = figure.subplots()
     axes.set_title(title, loc="left")
@@ -89,7 +86,7 @@ def panel(title: str, height_in: float = 3.5) -> tuple[Figure, Axes]:
 
 
 def draw_floor_plan(axes: Axes, anchors_m: list[tuple[float, float]], *, labels: bool = True) -> None:
-    """Draw the lab's walls and anchors, the first one the master, in metres."""
+    """Draw the lab's walls and anchors, of which the first is the master, in metres."""
     x, y = zip(*anchors_m, strict=True)
     left, right, low, high = min(x), max(x), min(y), max(y)
     axes.plot([left, right, right, left, left], [low, low, high, high, low], color=MUTED, linewidth=1.0, zorder=1)
@@ -116,7 +113,7 @@ def draw_floor_plan(axes: Axes, anchors_m: list[tuple[float, float]], *, labels:
 
 
 def picture(figure: Figure, kind: str, dpi: float = 130.0) -> bytes:
-    """A figure as the bytes of a file of that kind; the same figure gives the same bytes at any time.
+    """Render a figure to a file of this kind; the same figure always gives the same bytes.
 
     Raises:
         ValueError: there is no such kind.
@@ -170,7 +167,7 @@ _THEMED: Final = {INK: "var(--ink)", MUTED: "var(--muted)", GRID: "var(--grid)",
 
 
 def page(title: str, parts: Iterable[str]) -> str:
-    """The whole page of parts that are HTML."""
+    """The whole HTML page from parts that are HTML."""
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
@@ -181,13 +178,13 @@ def page(title: str, parts: Iterable[str]) -> str:
 
 
 def text(words: str) -> str:
-    """Escaped words: true minus signs, and no line ends between a number and its unit."""
+    """Escape words for HTML, with true minus signs and no line breaks between a number and its unit."""
     words = re.sub(r"(?<![\w-])-(?=\d)", "−", words)
     return escape(re.sub(r"(?<=\d) (?=(%|mm|cm|m|ps|µs|ms|s|Hz|ppm|m/s)\b|%)", "\u00a0", words))
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table that scrolls where the page is narrow; ``heads`` may be empty."""
+    """An HTML table that scrolls on narrow pages; ``heads`` may be empty."""
     head = "".join(f"<th scope='col'>{escape(cell)}</th>" for cell in heads)
     body = "\n".join("<tr>" + "".join(f"<td>{text(cell)}</td>" for cell in row) + "</tr>" for row in rows)
     table_head = f"<thead><tr>{head}</tr></thead>\n" if head else ""
@@ -195,23 +192,23 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def bullets(entries: Iterable[str], kind: str) -> str:
-    """A list; ``kind`` is a class of the page's style."""
+    """An HTML list; ``kind``: class in the page's style."""
     return "<ul>" + "".join(f'<li class="{kind}">{text(entry)}</li>\n' for entry in entries) + "</ul>"
 
 
 def png_figure(png: bytes, description: str) -> str:
-    """A PNG file as an element of the page."""
+    """An HTML figure with an embedded PNG file."""
     data = base64.b64encode(png).decode()
     return f'<figure><img alt="{escape(description)}" src="data:image/png;base64,{data}"></figure>'
 
 
 def svg_figure(svg: bytes, name: str, caption: str) -> str:
-    """An SVG file as an element of the page, with its caption below."""
+    """An HTML figure with an SVG file and a caption below."""
     return f"<figure>\n{inline_svg(svg, name, caption)}\n<figcaption>{text(caption)}</figcaption>\n</figure>"
 
 
 def inline_svg(svg: bytes, name: str, description: str) -> str:
-    """An SVG file as an element of the page: identifiers of its own, the page's colours, no metadata."""
+    """An SVG file as inline markup, with unique identifiers, the page's colours and no metadata."""
     markup = svg.decode()
     markup = markup[markup.index("<svg") :].strip()
     markup = re.sub(r"<metadata>.*?</metadata>", "", markup, flags=re.DOTALL)

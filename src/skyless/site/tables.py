@@ -1,9 +1,9 @@
-"""Tables of comma-separated values that users bring: anchors, truth, ranges, heights. Other columns are ignored.
+"""Users' CSV tables of anchors, truth, ranges and heights. Other columns are ignored.
 
-Anchors: ``id,x_m,y_m,z_m``, perhaps with a calibration. Truth: ``t_s,x_m,y_m,z_m`` and, where measured, the attitude
-``qx,qy,qz,qw``; the positions of the listener in a table of MILUV passive ticks (``gt_L_…``) serve as well. Ranges of
-a survey: ``anchor_a,anchor_b,range_m``, one row for each range in either direction. Heights: ``id,z_m``.
-All functions raise ConfigurationError, which names file, line, column and value of what cannot be used.
+Anchors: ``id,x_m,y_m,z_m``, optionally with a calibration. Truth: ``t_s,x_m,y_m,z_m`` and, if measured, the attitude
+``qx,qy,qz,qw``; or the listener's positions in a table of MILUV passive ticks (``gt_L_…``). Ranges of a survey:
+``anchor_a,anchor_b,range_m``, one row for each range in either direction. Heights: ``id,z_m``.
+All functions raise ConfigurationError, which names file, line, column and value of the fault.
 """
 
 import csv
@@ -28,7 +28,7 @@ from skyless.site.survey.legs import mean_ranges
 
 ANCHOR_COLUMNS: Final = ("id", "x_m", "y_m", "z_m")
 BIAS, SLOPE, NOISE = CALIBRATION_COLUMNS = ("bias_m", "bias_slope_m", "noise_m")
-"""What ``skyless calibrate`` adds. A blank field means that nothing is known."""
+"""Columns added by ``skyless calibrate``. A blank field means unknown."""
 
 POSITION_COLUMNS: Final = ("t_s", "x_m", "y_m", "z_m")
 LISTENER_COLUMNS: Final = ("t_s", "gt_L_x_m", "gt_L_y_m", "gt_L_z_m")
@@ -37,14 +37,14 @@ RANGE_COLUMNS: Final = ("anchor_a", "anchor_b", "range_m")
 HEIGHT_COLUMNS: Final = ("id", "z_m")
 
 _MAX_EARTH_M: Final = 1e8
-"""Coordinates of any frame on Earth are smaller."""
+"""Limit of coordinates in any frame on Earth."""
 
 _MAX_RANGE_M: Final = 20_000.0
-"""Farther than any radio of this kind reaches. Delays that are not configured can make ranges negative."""
+"""Farther than any radio of this kind reaches. Unconfigured delays can make ranges negative."""
 
 
 class _Row(Struct, frozen=True, gc=False):
-    """A row that is not blank, with its place in the file."""
+    """A row that is not blank, with its line in the file."""
 
     path: str | PathLike[str]
     line: int
@@ -59,7 +59,7 @@ class _Row(Struct, frozen=True, gc=False):
         return value
 
     def identifier(self, column: str = "id") -> int:
-        """An anchor, decimal or hexadecimal after 0x."""
+        """An anchor's identifier, decimal or hexadecimal after 0x."""
         field = self.fields[column]
         try:
             identifier = int(field, 0) if field.lower().startswith("0x") else int(field)
@@ -74,7 +74,7 @@ class _Row(Struct, frozen=True, gc=False):
 
 
 def _rows(path: str | PathLike[str], *headers: Sequence[str]) -> Iterator[_Row]:
-    """The rows of a table that has all columns of one of the headers; of a recording those that are whole."""
+    """The rows of a table that has all columns of one of the headers; incomplete rows of a recording are skipped."""
     try:
         table = list(csv.reader(read_lines(path)))
     except csv.Error as error:
@@ -103,20 +103,20 @@ def _empty(path: str | PathLike[str], what: str) -> ConfigurationError:
 
 
 class Truth(Struct, frozen=True):
-    """Positions over time, n of them, times never decreasing."""
+    """``n`` true positions over time."""
 
     t_s: Array
-    """Shape (n,), in the time of the recording."""
+    """Shape (n,), time of the recording, not decreasing."""
     position_m: Array
     """Shape (n, 3)."""
     quaternion: Array | None
-    """Shape (n, 4), x, y, z, w, body to site; None where the table has none."""
+    """Shape (n, 4), x, y, z, w, body to site; None if the table has none."""
 
 
 def read_truth(path: str | PathLike[str], listener: str | None = None) -> Truth:
-    """Read a table of truth. Of MILUV ticks it reads the rows of one listener, by default of the first row.
+    """Read a table of truth. From MILUV ticks it reads the rows of one listener, by default that of the first row.
 
-    These are a recording: its damaged rows are left out, as the replay drops and counts them.
+    Damaged rows of such a recording are left out, as the replay drops and counts them.
     """
     values: list[list[float]] = []
     columns: tuple[str, ...] = ()
@@ -150,11 +150,11 @@ def read_truth(path: str | PathLike[str], listener: str | None = None) -> Truth:
 
 
 HEIGHT_STD_M: Final = 0.05
-"""Standard deviation of a reading of a height sensor, where its table states none."""
+"""Default standard deviation of a height sensor's reading."""
 
 
 def read_height_readings(path: str | PathLike[str]) -> Array:
-    """Readings of a height sensor: rows of time, height and standard deviation, shape (n, 3)."""
+    """Read a height sensor's table: rows of time, height and standard deviation, shape (n, 3)."""
     rows = [
         (row.number("t_s"), row.number("height_m"), row.number("std_m") if row.fields.get("std_m") else HEIGHT_STD_M)
         for row in _rows(path, ("t_s", "height_m"))
@@ -168,7 +168,7 @@ def read_height_readings(path: str | PathLike[str]) -> Array:
 
 
 def read_anchors(path: str | PathLike[str]) -> dict[int, Point]:
-    """Positions by identifier, in metres."""
+    """Read anchor positions by identifier, in metres."""
     anchors: dict[int, Point] = {}
     for row in _rows(path, ANCHOR_COLUMNS):
         identifier = row.identifier()
@@ -181,7 +181,7 @@ def read_anchors(path: str | PathLike[str]) -> dict[int, Point]:
 
 
 def read_calibration(path: str | PathLike[str]) -> DifferenceCalibration | None:
-    """Calibration that a table of anchors holds; None for a table without ``bias_m``."""
+    """Read the calibration in a table of anchors; None for a table without ``bias_m``."""
     anchors: dict[int, AnchorCalibration] = {}
     for row in _rows(path, ANCHOR_COLUMNS):
         known = {column: row.number(column) for column in CALIBRATION_COLUMNS if row.fields.get(column)}
@@ -193,7 +193,7 @@ def read_calibration(path: str | PathLike[str]) -> DifferenceCalibration | None:
 
 
 def calibrated_table(path: str | PathLike[str], calibration: DifferenceCalibration) -> str:
-    """The table with another calibration; everything else stays as it is."""
+    """The table with its calibration replaced and everything else unchanged."""
     lines = read_lines(path)
     names = [name.strip() for name in next(csv.reader(lines))]
     identifiers = {row.line: row.identifier() for row in _rows(path, ANCHOR_COLUMNS)}
@@ -211,7 +211,7 @@ def calibrated_table(path: str | PathLike[str], calibration: DifferenceCalibrati
 
 
 def new_table(anchors_m: Mapping[int, Point], calibration: DifferenceCalibration) -> str:
-    """A table of anchors that stood in none."""
+    """A new table of anchors with their calibration."""
     rows = [",".join((*ANCHOR_COLUMNS, *CALIBRATION_COLUMNS))]
     for anchor, position_m in sorted(anchors_m.items()):
         rows.append(",".join((str(anchor), *map(str, position_m), *_fields(calibration.anchors.get(anchor)))))
@@ -224,11 +224,11 @@ def _fields(known: AnchorCalibration | None) -> tuple[str, str, str]:
     return f"{known.bias_m:.4f}", f"{known.slope_m:.4f}", "" if known.noise_m is None else f"{known.noise_m:.4f}"
 
 
-# What a survey is given
+# Input of a survey
 
 
 def read_ranges(path: str | PathLike[str]) -> PairRanges:
-    """One range of each pair of anchors, from all of its rows."""
+    """Read ranges, reduced to one per pair of anchors."""
     ranges_m: dict[tuple[int, int], list[float]] = defaultdict(list)
     for row in _rows(path, RANGE_COLUMNS):
         a, b = row.identifier("anchor_a"), row.identifier("anchor_b")
@@ -241,7 +241,7 @@ def read_ranges(path: str | PathLike[str]) -> PairRanges:
 
 
 def read_heights(path: str | PathLike[str]) -> dict[int, float]:
-    """Heights by anchor, metres."""
+    """Read anchor heights by identifier, in metres."""
     heights_m: dict[int, float] = {}
     for row in _rows(path, HEIGHT_COLUMNS):
         anchor = row.identifier()

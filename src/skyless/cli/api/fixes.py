@@ -1,4 +1,4 @@
-"""Fixes of several tags as arrays, one row a fix."""
+"""Results as arrays: fixes of several tags, measurements, and maps."""
 
 from array import array
 from collections.abc import Iterator, Mapping
@@ -23,18 +23,18 @@ from skyless.site.planning.rates import RateMap
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-# What all results have: a short table in a notebook, one line elsewhere, a table for pandas.
+# Common to all results: a short table in a notebook, one line elsewhere, a table for pandas.
 
 
 class Result(Struct, frozen=True, eq=False):
-    """A result; two are equal only if they are the same one, as their arrays have no single answer."""
+    """A result; compared by identity, as its arrays have no single truth value."""
 
     def title(self) -> str:
-        """What the result is of."""
+        """Title of the result."""
         raise NotImplementedError
 
     def facts(self) -> Iterator[tuple[str, str]]:
-        """The figures that matter, each with its name and unit."""
+        """The main figures: name, and value with its unit."""
         raise NotImplementedError
 
     def __repr__(self) -> str:
@@ -51,7 +51,7 @@ class Result(Struct, frozen=True, eq=False):
 
 
 def data_frame(columns: Mapping[str, Any]) -> "DataFrame":
-    """Columns as a table of pandas. Raises SkylessError where pandas is not installed."""
+    """Columns as a pandas table. Raises SkylessError if pandas is not installed."""
     frame: DataFrame = extra_module("pandas", "to_dataframe").DataFrame(dict(columns))
     return frame
 
@@ -62,7 +62,7 @@ def axes_columns(prefix: str, values: Array, suffix: str = "") -> dict[str, Arra
 
 
 def figures(values: Any) -> Array:  # noqa: ANN401 - whatever has numbers and None
-    """Numbers as an array of floats, NaN for None."""
+    """Numbers as an array of floats, with NaN for None."""
     return np.array([np.nan if value is None else value for value in values], dtype=np.float64)
 
 
@@ -71,7 +71,7 @@ _COLUMNS: Final = 26
 
 
 class Fixes(Struct, frozen=True, eq=False):
-    """n fixes in the order in which they were made; NaN where a figure is not known."""
+    """n fixes in the order in which they were made; NaN where a figure is unknown."""
 
     tags: tuple[str, ...]
     """Names of the tags."""
@@ -87,9 +87,9 @@ class Fixes(Struct, frozen=True, eq=False):
     velocity_mps: Matrix
     """Shape (n, 3)."""
     anchor_count: Integers
-    """Shape (n,): how many anchors the fix uses."""
+    """Shape (n,): number of anchors that the fix uses."""
     chi2: Vector
-    """Shape (n,): sum of squared normalised residuals, of filters its running mean for a message."""
+    """Shape (n,): sum of squared normalised residuals; for filters its running mean per message."""
     residual_rms_m: Vector
     """Shape (n,)."""
     hpl_m: Vector
@@ -99,7 +99,7 @@ class Fixes(Struct, frozen=True, eq=False):
     alert: tuple[str, ...]
     """n words: whether the levels can be relied on (``skyless.core.alert.Alert``); empty without levels."""
     truth_m: Matrix
-    """Shape (n, 3): where the tag truly was."""
+    """Shape (n, 3): true position of the tag."""
     judged: Mask
     """Shape (n,): whether the fix counts in the summary's errors."""
 
@@ -108,7 +108,7 @@ class Fixes(Struct, frozen=True, eq=False):
 
     @property
     def std_m(self) -> Vector:
-        """Shape (n,): one-sigma radial error that each fix predicts, the root of its covariance's trace."""
+        """Shape (n,): predicted one-sigma radial error, the square root of the covariance's trace."""
         std_m: Vector = np.sqrt(np.trace(self.covariance_m2, axis1=1, axis2=2))
         return std_m
 
@@ -119,7 +119,7 @@ class Fixes(Struct, frozen=True, eq=False):
         return error_m
 
     def of_tag(self, name: str | None) -> Mask:
-        """Which fixes are of a tag, shape (n,); of the first one where None is named. Raises SkylessError."""
+        """Mask of a tag's fixes, shape (n,); by default of the first tag. Raises SkylessError."""
         if name is not None and name not in self.tags:
             raise wrong("tag", name, f"one of {', '.join(self.tags)}")
         mask: Mask = self.tag == (0 if name is None else self.tags.index(name))
@@ -132,7 +132,7 @@ class Fixes(Struct, frozen=True, eq=False):
         return np.column_stack([self.time_s[mask], self.position_m[mask], self.truth_m[mask], std_m])
 
     def to_dataframe(self) -> "DataFrame":
-        """One row a fix: ``t_s``, ``tag`` (its name), ``x_m`` … ``cov_zz_m2`` … as ``--fixes-csv`` calls them.
+        """One row per fix: ``t_s``, ``tag`` (its name), ``x_m`` … ``cov_zz_m2`` … as in ``--fixes-csv``.
 
         Raises:
             SkylessError: pandas is not installed.
@@ -161,7 +161,7 @@ class Fixes(Struct, frozen=True, eq=False):
 
 
 class FixRecorder:
-    """Gathers fixes as they are made, 220 bytes each."""
+    """Gathers fixes, 220 bytes each."""
 
     def __init__(self, tags: tuple[str, ...]) -> None:
         self._tags = tags
@@ -171,7 +171,7 @@ class FixRecorder:
     def add(
         self, tag: int, time_s: float, fix: Fix, truth_m: Array | tuple[float, ...] | None, *, judged: bool
     ) -> None:
-        """Add a fix of the tag with that number."""
+        """Add a fix; ``tag``: index of the tag."""
         velocity_mps, levels = fix.velocity_mps, fix.integrity
         self._numbers.extend((tag, time_s))
         self._numbers.extend(fix.position_m)
@@ -185,7 +185,7 @@ class FixRecorder:
         self._alerts.append("" if levels is None else str(levels.alert))
 
     def fixes(self) -> Fixes:
-        """All so far."""
+        """All fixes so far."""
         rows = np.array(self._numbers).reshape(-1, _COLUMNS)
         rows.setflags(write=False)
         return Fixes(
@@ -206,7 +206,7 @@ class FixRecorder:
         )
 
 
-# What an estimator was given of a recording as arrays, one row a reception or a time difference.
+# An estimator's input from a recording as arrays, one row per reception or time difference.
 
 _NONE: Final = -1
 _WHOLE: Final = 7
@@ -215,8 +215,8 @@ _WHOLE: Final = 7
 class Measurements(Struct, frozen=True, eq=False):
     """n measurements in the order in which the estimator got them: receptions of anchors, or time differences.
 
-    Where a measurement has no such value, there is -1, or NaN in ``tdoa_m``. What packets relay of other anchors is not
-    here; ``skyless.open_recording`` gives packets whole.
+    Missing values are -1, or NaN in ``tdoa_m``. Relays in packets are not included; ``skyless.open_recording`` gives
+    whole packets.
     """
 
     tags: tuple[str, ...]
@@ -224,28 +224,28 @@ class Measurements(Struct, frozen=True, eq=False):
     tag: Integers
     """Shape (n,): which of ``tags`` measured it."""
     time_s: Vector
-    """Shape (n,): when, on the scale of the fixes' times."""
+    """Shape (n,): time of the measurement, on the scale of the fixes' times."""
     anchor_a: Integers
-    """Shape (n,): the anchor that a time difference is counted from."""
+    """Shape (n,): first anchor of a time difference."""
     anchor_b: Integers
-    """Shape (n,): the anchor that it is counted to, or the sender of a packet."""
+    """Shape (n,): second anchor of a time difference, or the sender of a packet."""
     tdoa_m: Vector
     """Shape (n,): range to b less range to a."""
     sequence: Integers
-    """Shape (n,): number of the packet."""
+    """Shape (n,): sequence number of the packet."""
     tx_ticks: Integers
-    """Shape (n,): when it was sent, in the sender's clock."""
+    """Shape (n,): time of sending, on the sender's clock."""
     rx_ticks: Integers
-    """Shape (n,): when the tag received it, in the tag's own clock."""
+    """Shape (n,): time of reception, on the tag's own clock."""
     used: Mask
-    """Shape (n,): whether the filter took it; of an own estimator, of methods that wait for whole superframes, and with
-    ``smooth``, whether it made a fix."""
+    """Shape (n,): whether the filter used the measurement; for an own estimator, for methods that wait for whole
+    superframes, and with ``smooth``, whether it made a fix."""
 
     def __len__(self) -> int:
         return len(self.time_s)
 
     def to_dataframe(self) -> "DataFrame":
-        """One row a measurement: ``t_s``, ``tag`` (its name), and the other arrays by their names.
+        """One row per measurement: ``t_s``, ``tag`` (its name), and the other arrays by their names.
 
         Raises:
             SkylessError: pandas is not installed.
@@ -261,7 +261,7 @@ class Measurements(Struct, frozen=True, eq=False):
 
 
 class MeasurementRecorder:
-    """Gathers measurements as they come, 72 bytes each."""
+    """Gathers measurements, 72 bytes each."""
 
     def __init__(self, tags: tuple[str, ...]) -> None:
         self._tags = tags
@@ -269,7 +269,7 @@ class MeasurementRecorder:
         self._numbers = array("d")
 
     def add(self, tag: str, time_s: float, measured: Packet | PairTdoa, used: bool) -> None:
-        """Add what the estimator of a tag was given."""
+        """Add a measurement that a tag's estimator was given."""
         number = self._tags.index(tag)
         if isinstance(measured, PairTdoa):
             self._whole.extend((number, measured.anchor_a, measured.anchor_b, _NONE, _NONE, _NONE, used))
@@ -280,7 +280,7 @@ class MeasurementRecorder:
             self._numbers.extend((time_s, np.nan))
 
     def measurements(self) -> Measurements:
-        """All so far."""
+        """All measurements so far."""
         whole = np.array(self._whole, dtype=np.int64).reshape(-1, _WHOLE)
         numbers = np.array(self._numbers).reshape(-1, 2)
         for rows in (whole, numbers):
@@ -300,7 +300,7 @@ class MeasurementRecorder:
         )
 
 
-# What both kinds of plan have: a site, its floor, and a map over it.
+# Common to both kinds of plan: a site, its floor, and a map over it.
 
 FloorMap = TypeVar("FloorMap", PlanMap, RateMap)
 
@@ -309,14 +309,14 @@ class FloorResult(Result, Generic[FloorMap], frozen=True, eq=False):
     """A map over the floor of a site."""
 
     site: Site
-    """As planned: with the anchors that were placed, if that was asked for."""
+    """The site as planned, with optimised anchors if requested."""
     file: Path
     floor: Floor
     """Outline and region."""
     map: FloorMap
-    """The whole table of values."""
+    """The full table of values."""
     summary: dict[str, Any]
-    """The object that ``skyless plan --json`` writes, in SI units, but for the version."""
+    """The object that ``skyless plan --json`` writes, in SI units, without the version."""
 
     @property
     def x_m(self) -> Vector:

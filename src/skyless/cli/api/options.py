@@ -1,4 +1,4 @@
-"""What is asked of simulations, plans and studies: options of the commands and arguments of the Python functions."""
+"""Options of simulations, plans and studies, for the commands and as arguments of the Python functions."""
 
 import math
 from collections.abc import Sequence
@@ -64,11 +64,11 @@ class SimulateOptions(Conditions, frozen=True, kw_only=True):
 
     @property
     def until_s(self) -> float:
-        """When the run ends, unless it reaches its goal before; infinite where only the fixes end it."""
+        """Latest end of the run; infinite if only the number of fixes ends it."""
         return self.duration_s or (_USUAL_DURATION_S if self.fixes is None else math.inf)
 
     def check(self) -> None:
-        """See that the options fit one another. Raises SkylessError."""
+        """Check that the options are compatible. Raises SkylessError."""
         Conditions.check(self)
         if self.estimator is not None:
             names = "method", "qa", "dynamics", "silences", *ProtectionOptions.__struct_fields__
@@ -185,7 +185,7 @@ class PlanOptions(_Planned, frozen=True, kw_only=True):
     """Same seed, same random points and search."""
 
     def check(self) -> None:
-        """See that the options fit one another. Raises SkylessError."""
+        """Check that the options are compatible. Raises SkylessError."""
         process_noise(self.qa, self.dynamics)
 
 
@@ -237,7 +237,7 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
     """Keep each finished part in this folder, and compute only parts that are not there."""
 
     def check(self) -> None:
-        """See that the options fit one another. Raises SkylessError."""
+        """Check that the options are compatible. Raises SkylessError."""
         from skyless.research.studies.run import OF_EPISODES
 
         process_noise(self.qa, self.dynamics)

@@ -1,4 +1,4 @@
-"""``skyless.plan``: what a site will give before anything is mounted, and where its anchors should hang."""
+"""``skyless.plan``: predict a site's errors before anything is mounted, and optimise its anchors' positions."""
 
 import time
 from collections.abc import Iterator
@@ -42,19 +42,17 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-# The plan of a site of protocol 2 as a result: the beacons that reach tags.
-
 
 class RatePlanResult(FloorResult[RateMap], frozen=True, eq=False):
-    """Beacons that reach tags over the floor of a site without a master."""
+    """Plan of a site without a master: the beacons that reach tags over its floor."""
 
     @property
     def beacons_per_s(self) -> Array:
-        """Shape (heights, ny, nx): at one point of each cell; NaN outside the outline."""
+        """Shape (heights, ny, nx): beacons per second at one point of each cell; NaN outside the outline."""
         return self.map.beacons_per_s
 
     def to_dataframe(self) -> "DataFrame":
-        """One row a cell and height: ``x_m``, ``y_m``, ``z_m``, ``beacons_per_s``.
+        """One row per cell and height: ``x_m``, ``y_m``, ``z_m``, ``beacons_per_s``.
 
         Raises:
             SkylessError: pandas is not installed.
@@ -65,17 +63,17 @@ class RatePlanResult(FloorResult[RateMap], frozen=True, eq=False):
         return data_frame({name: values[within] for name, values in columns.items()})
 
     def plot(self) -> "Figure":
-        """The anchors over the beacons per second."""
+        """Draw the beacons per second with the anchors."""
         from skyless.site.planning.picture import draw_rates
 
         return draw_rates(self.site, self.floor, self.map, self.file, described_rates(self.summary))
 
     def title(self) -> str:
-        """What was planned."""
+        """Title of the plan."""
         return f"plan of {self.site.name}, {described_rates(self.summary)}"
 
     def facts(self) -> Iterator[tuple[str, str]]:
-        """The figures that matter, each with its name and unit."""
+        """The main figures: name, and value with its unit."""
         found, summary = self.map.reception, self.summary
         yield "anchors", f"{len(self.site.all_anchors)}"
         yield "range in the open", f"{summary['range_m']:.0f} m (path loss exponent {summary['exponent']:g})"
@@ -124,12 +122,12 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
 
     @property
     def rmse_m(self) -> Array:
-        """Shape (heights, ny, nx): the same with the delays of walls."""
+        """Shape (heights, ny, nx): predicted RMSE, including the walls' delays."""
         return self.map.column(RMSE)
 
     @property
     def anchors_in_view(self) -> Array:
-        """Shape (heights, ny, nx): number of anchors."""
+        """Shape (heights, ny, nx): number of anchors in view."""
         return self.map.column(ANCHORS_IN_VIEW)
 
     def column(self, name: str) -> Array:
@@ -138,7 +136,7 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
         return self.map.column(PLAN_COLUMNS.index(name))
 
     def to_dataframe(self) -> "DataFrame":
-        """One row a point inside the outline: ``x_m``, ``y_m``, ``z_m`` and all of ``PLAN_COLUMNS``.
+        """One row per point inside the outline: ``x_m``, ``y_m``, ``z_m`` and all of ``PLAN_COLUMNS``.
 
         Raises:
             SkylessError: pandas is not installed.
@@ -149,15 +147,14 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
         return data_frame(columns)
 
     def plot(self, column: str | None = None) -> "Figure":
-        """The map of a column, by default of the predicted error, a slice for each height.
+        """Draw the map of a column, by default of the predicted error, with a panel for each height.
 
-        ``column``: ``sigma_m``, ``rmse_m``, ``anchors``, ``hdop``, ``vdop``, ``pdop`` or ``fix_share``, where it is
-        worth drawing.
+        ``column``: ``sigma_m``, ``rmse_m``, ``anchors``, ``hdop``, ``vdop``, ``pdop`` or ``fix_share``, if it is worth
+        drawing.
 
         Raises:
-            SkylessError: there is no map of that.
+            SkylessError: there is no map of this column.
         """
-        # Matplotlib is loaded where it draws.
         from skyless.site.planning.picture import Background, draw_layer, layers_for, main_layer
 
         layers = {PLAN_COLUMNS[layer.column]: layer for layer in layers_for(self.map)}
@@ -167,11 +164,11 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
         return draw_layer(self.map, layer, Background(self.site, self.floor, self.file, described(self.summary)))
 
     def title(self) -> str:
-        """What was planned."""
+        """Title of the plan."""
         return f"plan of {self.site.name}, {described(self.summary)}"
 
     def facts(self) -> Iterator[tuple[str, str]]:
-        """The figures that matter, each with its name and unit."""
+        """The main figures: name, and value with its unit."""
         found = self.summary
         worst_at, dimensions = found["worst_at_m"], f"{found['dimensions']}-D"
         where = "" if worst_at is None else " at ({:.2f}, {:.2f}, {:.2f}) m".format(*worst_at)
@@ -228,7 +225,7 @@ def _one_more(more: OneMore) -> str:
 
 
 def _change(before_m: float, after_m: float) -> str:
-    """A change as a share only: the facts' own mean and worst are those of the map, at other points."""
+    """A relative change; absolute values would differ from the facts' mean and worst, which are of other points."""
     return f"{after_m / before_m - 1.0:+.0%}"
 
 
@@ -304,7 +301,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
 
 
 def _heights_m(asked: PlanOptions, site: Site) -> tuple[float, ...]:
-    """Heights of the tags. Raises SkylessError when they are given at a site that knows its tags' height."""
+    """Heights of the tags. Raises SkylessError if they are given although the site states its tags' height."""
     if asked.tag_heights_m is None:
         return usual_tag_heights(site) if site.anchors else (0.0,)
     if site.tags.height_m is not None:
@@ -313,7 +310,7 @@ def _heights_m(asked: PlanOptions, site: Site) -> tuple[float, ...]:
 
 
 def _floor(asked: PlanOptions, site: Site, file: Path) -> Floor:
-    """Outline and region of interest, as they are given. Raises ConfigurationError."""
+    """The floor from the given outline and region of interest. Raises ConfigurationError."""
     outline_m = None if asked.outline_m is None else np.array(asked.outline_m)
     region_m: Box | None = None
     if asked.region_m is not None:

@@ -1,4 +1,4 @@
-"""``skyless.replay``: a recording becomes fixes, judged against the truth where there is one."""
+"""``skyless.replay``: turn a recording into fixes, judged against the truth if there is one."""
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 
 _WORTH_SHIFTING_S: Final = 0.05
-"""Offsets of the truth's times up to this are those of the filter itself."""
+"""Offsets of the truth's times up to this are due to the filter itself."""
 
 
 class ReplayResult(Result, frozen=True, eq=False):
@@ -43,22 +43,22 @@ class ReplayResult(Result, frozen=True, eq=False):
     reports: dict[str, ReplayReport]
     """Figures of each tag, by its name."""
     fixes: Fixes
-    """All fixes; ``truth_m`` is NaN where it is not known."""
+    """All fixes; ``truth_m`` is NaN where unknown."""
     samples: Mapping[str, FixSamples]
     """An even sample of the fixes of each tag."""
     judged: dict[str, Judged]
     """Which fixes of each tag are judged, and against which truth."""
     measurements: Measurements
-    """What the estimator was given, and whether it used that."""
+    """The estimator's input, and whether it was used."""
     warnings: tuple[str, ...]
     height_note: str
-    """Where the tags' height is from."""
+    """Source of the tags' height."""
     summary: dict[str, Any]
-    """The object that ``skyless replay --json`` writes, in SI units, but for the version."""
+    """The object that ``skyless replay --json`` writes, in SI units, without the version."""
 
     @property
     def tags(self) -> tuple[str, ...]:
-        """Names of the tags; that of a recording with a single nameless one is ``tag``."""
+        """Names of the tags; ``tag`` for a single nameless one."""
         return self.fixes.tags
 
     def track(self, tag: str) -> Matrix:
@@ -69,7 +69,7 @@ class ReplayResult(Result, frozen=True, eq=False):
 
     @property
     def report(self) -> ReplayReport:
-        """Figures of a recording's only tag, named as those of a ``SimulationResult``; of several see ``reports``.
+        """Figures of a recording's only tag, named as those of a ``SimulationResult``; for several see ``reports``.
 
         Raises:
             SkylessError: the recording has several tags.
@@ -83,7 +83,7 @@ class ReplayResult(Result, frozen=True, eq=False):
         return self.fixes.to_dataframe()
 
     def plot(self, tag: str | None = None) -> "Figure":
-        """Track, height, errors and stated σ over time, histograms and distribution of one tag, by default the first.
+        """Draw track, height, errors and stated σ over time, and error distributions of a tag, by default the first.
 
         Raises:
             SkylessError: there is no such tag.
@@ -97,17 +97,17 @@ class ReplayResult(Result, frozen=True, eq=False):
         return track_figure(self.track(name), f"{self.path.name}, {name} ({report.format}): {report.fixes} fixes")
 
     def title(self) -> str:
-        """What was replayed."""
+        """Title of the replay."""
         return f"{self.path.name} ({self.summary['format']})"
 
     def facts(self) -> Iterator[tuple[str, str]]:
-        """The figures that matter, each with its name and unit."""
+        """The main figures: name, and value with its unit."""
         for tag in self.reports:
             for name, value in self.facts_of(tag):
                 yield f"{tag}: {name}" if len(self.reports) > 1 else name, value
 
     def facts_of(self, tag: str) -> Iterator[tuple[str, str]]:
-        """The figures of one tag."""
+        """The main figures of one tag."""
         report = self.reports[tag]
         if isinstance(report, TagReport):
             yield "tag", tag
@@ -122,7 +122,7 @@ class ReplayResult(Result, frozen=True, eq=False):
         yield "height", note if report.height_m is None else f"{report.height_m:.3f} m, {note}"
         yield "median position", _triple(report.median_m)
         yield "scatter of the fixes", _triple(report.std_m)
-        # without truth, the tag's own motion is in it
+        # Without truth the scatter includes the tag's own motion.
         truth_known = any(pair.against_truth for pair in report.pairs)
         yield "noise of a difference" if truth_known else "scatter of a difference", cm(report.tdoa_noise_m)
         yield from _judged_facts(report)
@@ -137,7 +137,7 @@ class ReplayResult(Result, frozen=True, eq=False):
 
 
 def _judged_facts(report: ReplayReport) -> Iterator[tuple[str, str]]:
-    """What comes of the truth, and what fixes say of themselves."""
+    """Figures of judged fixes, protection levels and alerts."""
     if report.first_fix_s is not None:
         off = "" if report.first_fix_error_m is None else f", {cm(report.first_fix_error_m)} off"
         yield "first fix", f"after {report.first_fix_s:.2f} s{off}"
@@ -172,7 +172,7 @@ def _share(value: float | None) -> str:
 
 
 def _same(report: TagReport) -> str:
-    """How the fixes of a replay compare with the recorded ones."""
+    """Compare the fixes of a replay with the recorded ones, in words."""
     found = report.identical
     if found is None:
         return "–"
@@ -188,19 +188,17 @@ def _triple(values_m: tuple[float, float, float] | None) -> str:
 
 
 OnFix = Callable[[str, float, Fix], None]
-"""Gets the tag's name, the fix's time in the recording's own scale (Unix time for one of skyless record), and the fix.
-"""
+"""Called with the tag's name, the fix's time on the recording's scale (Unix time for skyless record), and the fix."""
 
 Begin = Callable[[tuple[str, ...], str], OnFix | None]
-"""Gets, before a replay begins, the tags' names, and the method or what the filter is given."""
-
+"""Called before a replay with the tags' names, and the method or the kind of measurements; returns the fixes' sink."""
 
 OnMeasured = Callable[[str, float, Packet | PairTdoa, bool], None]
-"""Gets the tag's name, a time, what the estimator was given and whether it used that."""
+"""Called with the tag's name, a time, a measurement given to the estimator, and whether it was used."""
 
 
 def replay_recording(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | None = None) -> ReplayResult:
-    """Replay a recording; ``begin`` says what gets the fixes, and the result holds none, nor measurements.
+    """Replay a recording. Fixes go to the sink that ``begin`` returns; the result has no fixes and no measurements.
 
     Raises SkylessError.
     """
@@ -263,11 +261,11 @@ def _result(
 
 
 def run_replay(asked: ReplayOptions) -> ReplayResult:
-    """Turn a recording into fixes, as ``skyless replay`` does; judge them where the truth is known.
+    """Turn a recording into fixes, as ``skyless replay`` does, and judge them where the truth is known.
 
-    A recording of ``skyless record`` knows its site and truth; of the arguments below it takes ``site``, ``tag``,
+    A recording of ``skyless record`` contains its site and truth; of the arguments below it takes ``site``, ``tag``,
     ``method``, ``integrity_risk``, ``alert_limit_m``, ``max_acceleration_mps2``, ``tag_height_std_m``, ``settle_s`` and
-    ``above_m``. One of another system needs ``anchors`` or ``site``, unless it holds their positions.
+    ``above_m``. A recording of another system needs ``anchors`` or ``site``, unless it contains the positions.
     """
     recorders: list[tuple[FixRecorder, MeasurementRecorder]] = []
 
@@ -296,19 +294,19 @@ def open_recording(
     listener: str | None = None,
     anchors_m: Mapping[int, Point] | None = None,
 ) -> Recording | McapRecording:
-    """Open a recording of a named format, or of the one that its first bytes show.
+    """Open a recording in a named format, or in the one recognised by its first bytes.
 
     An MCAP gives an ``McapRecording``, whose methods give fixes, truth and raw receptions by time; any other format a
     ``Recording``, to be iterated over once. Close either, or use ``with``.
 
     Args:
-        path: The recording; those of other systems also gzip.
+        path: The recording; those of other systems may be gzipped.
         format_name: Name of the format of another system.
-        listener: Chooses one receiver where a recording of another system holds several.
-        anchors_m: Positions that replace all that the anchors of a recording of DL-TDoA state.
+        listener: Chooses one receiver if a recording of another system has several.
+        anchors_m: Positions that replace those stated by the anchors of a DL-TDoA recording.
 
     Raises:
-        ConfigurationError: the file cannot be opened, its format is not known, or an argument makes no sense.
+        ConfigurationError: the file cannot be opened, its format is unknown, or an argument does not apply.
     """
     if format_name is not None or not is_mcap(path):
         return open_foreign(path, format_name, listener, anchors_m)

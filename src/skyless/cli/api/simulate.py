@@ -45,11 +45,11 @@ class SimulationResult(Result, frozen=True, eq=False):
     """Result of a simulation."""
 
     request: Request
-    """What was simulated."""
+    """The simulated conditions."""
     report: FleetReport
-    """Figures over one fix of each tag and superframe after ``settle_s``."""
+    """Figures over one fix per tag and superframe after ``settle_s``."""
     fixes: Fixes
-    """All fixes, with the truth; ``fixes.judged`` are those of the report."""
+    """All fixes, with the truth; ``fixes.judged`` marks those of the report."""
 
     @property
     def site(self) -> Site:
@@ -58,7 +58,7 @@ class SimulationResult(Result, frozen=True, eq=False):
 
     @property
     def room(self) -> Room | None:
-        """Errors of positions and ranges that were drawn; None where all is exact."""
+        """Drawn errors of positions and ranges; None if all are exact."""
         return self.request.room
 
     @property
@@ -68,7 +68,7 @@ class SimulationResult(Result, frozen=True, eq=False):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The object that ``skyless simulate --json`` writes, in SI units, but for the version."""
+        """The object that ``skyless simulate --json`` writes, in SI units, without the version."""
         settings = {
             "seed": self.request.seed, "noise_ps": self.request.noise_ps, "warmup_s": self.request.settle_s,
             "site": self.site.name, "errors_drawn": self.room,
@@ -80,7 +80,7 @@ class SimulationResult(Result, frozen=True, eq=False):
         return self.fixes.to_dataframe()
 
     def plot(self, tag: str | None = None) -> "Figure":
-        """Track, height, errors and stated σ over time, histograms and distribution of one tag, by default the first.
+        """Draw track, height, errors and stated σ over time, and error distributions of a tag, by default the first.
 
         Raises:
             SkylessError: there is no such tag.
@@ -91,11 +91,11 @@ class SimulationResult(Result, frozen=True, eq=False):
         return track_figure(rows, f"{self.site.name}, {tag or self.tags[0]}, simulated: {len(rows)} fixes")
 
     def title(self) -> str:
-        """What was simulated."""
+        """Title of the simulation."""
         return f"{self.report.method} at site {self.site.name}, simulated, seed {self.request.seed}"
 
     def facts(self) -> Iterator[tuple[str, str]]:
-        """The figures that matter, each with its name and unit."""
+        """The main figures: name, and value with its unit."""
         found = self.report
         yield "tags", f"{found.tags}"
         yield "errors drawn", errors_words(self.site, self.room)
@@ -121,10 +121,10 @@ class SimulationResult(Result, frozen=True, eq=False):
 
 
 class Simulation:
-    """A simulation that has not begun."""
+    """A simulation that is ready to run."""
 
     def __init__(self, asked: SimulateOptions) -> None:
-        """Make the world and its tags. Raises SkylessError."""
+        """Create the world and its tags. Raises SkylessError."""
         self._asked = asked
         site, is_room = _site(asked), asked.scenario == "room"
         at_rest, make = bool(asked.positions_m) and not asked.paths_m, asked.estimator
@@ -141,7 +141,7 @@ class Simulation:
             raise SkylessError(str(error)) from None
 
     def run(self, on_fix: Callable[[JudgedFix], None] | None) -> FleetReport:
-        """Run to the end; ``on_fix`` gets every fix."""
+        """Run to the end; ``on_fix`` is called with every fix."""
         started_s = time.perf_counter()
         run_fleet(self.fleet, self.request, self._asked.until_s, on_fix, self.request.progress)
         self.request.progress(1.0)
@@ -182,16 +182,16 @@ simulate = python_function(SimulateOptions, run_simulate)
 
 
 class StudyResult(Result, frozen=True, eq=False):
-    """Rows of a study, one a case; all is simulated."""
+    """Simulated rows of a study, one per case."""
 
     name: str
     plan: Plan
-    """How much was simulated, and with what."""
+    """Amount and conditions of the simulations."""
     rows: tuple[Row, ...]
     """n rows with all figures."""
     wall_s: float
     parts: Parts
-    """How many parts of the work were computed, and how many came from the folder ``resume``."""
+    """Numbers of parts that were computed, and that came from the folder ``resume``."""
 
     @property
     def cases(self) -> tuple[str, ...]:
@@ -200,11 +200,11 @@ class StudyResult(Result, frozen=True, eq=False):
 
     @property
     def rmse_m(self) -> Vector:
-        """Shape (n,); NaN where a case has none."""
+        """RMSE of each case, shape (n,); NaN if it has none."""
         return self.column("rmse_m")
 
     def column(self, name: str) -> Vector:
-        """A figure of all rows by its field's name, shape (n,); NaN where it does not apply. Raises SkylessError."""
+        """One field of all rows, shape (n,); NaN where it does not apply. Raises SkylessError."""
         numbers = tuple(one for one in self._fields if self._is_number(one))
         check_choice("name", name, numbers)
         return figures(getattr(row, name) for row in self.rows)
@@ -218,7 +218,7 @@ class StudyResult(Result, frozen=True, eq=False):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The object that ``skyless study --json`` writes, in SI units, but for the version."""
+        """The object that ``skyless study --json`` writes, in SI units, without the version."""
         rows = msgspec.to_builtins(self.rows, enc_hook=methodcaller("tolist"))
         return {
             "study": self.name, "simulated": True, **msgspec.to_builtins(self.plan), "wall_s": self.wall_s,
@@ -226,7 +226,7 @@ class StudyResult(Result, frozen=True, eq=False):
         }  # fmt: skip
 
     def to_dataframe(self) -> "DataFrame":
-        """One row a case, with all fields of the study's ``Row``; NaN where a number does not apply.
+        """One row per case, with all fields of the study's ``Row``; NaN where a number does not apply.
 
         Raises:
             SkylessError: pandas is not installed.
@@ -239,15 +239,15 @@ class StudyResult(Result, frozen=True, eq=False):
         return data_frame(columns)
 
     def plot(self) -> "Figure":
-        """The picture that ``skyless study --plot`` writes."""
+        """Draw the picture that ``skyless study --plot`` writes."""
         return STUDIES[self.name].draw(self.rows)
 
     def title(self) -> str:
-        """What it is of."""
+        """Title of the study."""
         return f"{STUDIES[self.name].title}: {self.plan.method}, seed {self.plan.seed}, simulated"
 
     def facts(self) -> Iterator[tuple[str, str]]:
-        """The figures that matter, each with its name and unit."""
+        """The main figures: name, and value with its unit."""
         for row in self.rows:
             nees = "" if row.nees is None else f", NEES {row.nees:.2f}"
             limits = "" if row.passed is None else ", limits held" if row.passed else ", limits missed"
@@ -257,7 +257,7 @@ class StudyResult(Result, frozen=True, eq=False):
 def run_study(asked: StudyOptions) -> StudyResult:
     """Measure errors over many simulated runs, as ``skyless study`` does.
 
-    Several processes import the script that calls this: there it stands below ``if __name__ == "__main__":``.
+    Several processes import the calling script, so call this below ``if __name__ == "__main__":``.
     """
     started_s = time.perf_counter()
     plan = plan_of(

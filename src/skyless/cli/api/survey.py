@@ -1,4 +1,4 @@
-"""``skyless.survey_site``: positions and antenna delays of anchors, from what they receive of one another."""
+"""``skyless.survey_site``: positions and antenna delays of anchors from their receptions of one another."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -34,18 +34,17 @@ from skyless.site.survey.watch import drop_moved, with_changes
 from skyless.site.tables import read_ranges
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
     from pandas import DataFrame
 
-# The picture of a survey, from above: anchors with their ellipses, ranges, those left out, and other solutions.
+# Picture of a survey from above: anchors with their ellipses, ranges, those left out, and other solutions.
 
 _SIGMAS: Final = 3.0
 _SMALLEST_SHARE: Final = 0.01
-"""Least size of the median ellipse, as a share of the picture: ellipses are magnified by 10, 100 … for it."""
+"""Least size of the median ellipse, as a share of the picture; smaller ellipses are magnified by 10, 100 …"""
 
 
 def survey_figure(survey: Survey) -> Figure:
-    """A survey from above."""
+    """Draw a survey from above."""
     at_m = {one.id: (one.x_m, one.y_m) for one in survey.anchors if one.x_m is not None and one.y_m is not None}
     with report_style():
         figure, axes = panel("survey, from above", 4.2)
@@ -65,7 +64,7 @@ def survey_figure(survey: Survey) -> Figure:
 
 
 def bias_figure(name: str, anchors: Integers, bias_m: Vector, std_m: Vector) -> Figure:
-    """Constants of anchors with their standard errors, one bar an anchor."""
+    """Draw anchors' constants with their standard errors, one bar per anchor."""
     with report_style():
         figure, axes = panel(f"{name}: constants of the anchors, zero is their mean")
         at = np.arange(len(anchors))
@@ -95,7 +94,7 @@ def _anchor(axes: Axes, one: SurveyedAnchor, at_m: tuple[float, float], scale: f
 
 
 def _magnification(survey: Survey, at_m: dict[int, tuple[float, float]]) -> float:
-    """A power of ten with which the median ellipse can be seen."""
+    """Power of ten that makes the median ellipse visible."""
     std_m = [one.std_m for one in survey.anchors if one.id in at_m and one.std_m]
     if not std_m:
         return 1.0
@@ -119,18 +118,18 @@ def _legend(survey: Survey, at_m: dict[int, tuple[float, float]], scale: float) 
 
 
 class Gathered(Struct, frozen=True):
-    """What a survey starts from."""
+    """Input of a survey."""
 
     site: Site | None
-    """That of --site, else that of the recording."""
+    """The site of --site, else of the recording."""
     ranges: Callable[[], PairRanges]
-    """With the antenna delays of the site."""
+    """Gives the ranges with the antenna delays of the site."""
     ranger: PairRanger | None = None
-    """What makes the ranges, where their times are known."""
+    """Source of the ranges, if their times are known."""
     drops: tuple[str, ...] = ()
-    """What could not be used of a recording, by reason."""
+    """Unusable parts of a recording, by reason."""
     is_foreign: bool = False
-    """Whether it is a recording of another system."""
+    """Whether the recording is of another system."""
     recorded: Site | None = None
     """The site of the recording."""
 
@@ -139,17 +138,17 @@ class SurveyResult(Result, frozen=True, eq=False):
     """Positions and delays of n anchors."""
 
     survey: Survey
-    """Everything that was found."""
+    """All results."""
     count: Count
     warnings: tuple[str, ...]
-    """About the inputs and the facts that were stated."""
+    """Warnings about the input and the stated facts."""
     drops: tuple[str, ...]
-    """What could not be used of the recording, by reason."""
+    """Unusable parts of the recording, by reason."""
     site: Site | None
     file: Path | None
-    """The site's file, if it comes from one."""
+    """The site's file, if there is one."""
     ranges: PairRanges
-    """What was measured, with the antenna delays of the site."""
+    """Measured ranges, with the antenna delays of the site."""
 
     @property
     def anchors(self) -> Integers:
@@ -158,7 +157,7 @@ class SurveyResult(Result, frozen=True, eq=False):
 
     @property
     def delay_m(self) -> Vector:
-        """Shape (n,): half of what TX and RX delay together are off; NaN where that is not determined."""
+        """Shape (n,): half the error of TX and RX delay together; NaN if not determined."""
         return figures(one.delay_m for one in self.survey.anchors)
 
     @property
@@ -169,12 +168,12 @@ class SurveyResult(Result, frozen=True, eq=False):
 
     @property
     def unchanged(self) -> tuple[int, ...]:
-        """Anchors of the site that stay as they are."""
+        """Anchors of the site that the survey does not change."""
         return () if self.site is None else unchanged_anchors(self.site, self.survey)
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The object that ``skyless survey --json`` writes, in SI units, but for the version and the files written."""
+        """The object that ``skyless survey --json`` writes, in SI units, without the version and the files written."""
         survey: dict[str, Any] = msgspec.to_builtins(self.survey)
         survey["ambiguous"] = survey.pop("ambiguities")
         survey["excluded_pairs"] = [[pair.a, pair.b] for pair in self.survey.pairs if pair.excluded]
@@ -196,7 +195,7 @@ class SurveyResult(Result, frozen=True, eq=False):
         return surveyed_text(self.file.read_bytes().decode("utf-8-sig"), self.survey, self.site, self.file)
 
     def to_dataframe(self) -> "DataFrame":
-        """One row an anchor, with all fields of ``skyless.site.survey.facts.SurveyedAnchor`` but the covariance.
+        """One row per anchor, with all fields of ``skyless.site.survey.facts.SurveyedAnchor`` except the covariance.
 
         Raises:
             SkylessError: pandas is not installed.
@@ -205,15 +204,15 @@ class SurveyResult(Result, frozen=True, eq=False):
         return data_frame({name: [getattr(one, name) for one in self.survey.anchors] for name in names})
 
     def plot(self) -> "Figure":
-        """The anchors from above, with their ellipses."""
+        """Draw the anchors from above, with their ellipses."""
         return survey_figure(self.survey)
 
     def title(self) -> str:
-        """What was surveyed."""
+        """Title of the survey."""
         return self.count.sentence
 
     def facts(self) -> Iterator[tuple[str, str]]:
-        """The figures that matter, each with its name and unit."""
+        """The main figures: name, and value with its unit."""
         for one in self.survey.anchors:
             delay = "" if one.delay_m is None else f", delay {cm(one.delay_m)} ± {cm(one.delay_std_m)}"
             at = f"({one.x_m:.3f}, {one.y_m:.3f}, {one.z_m or 0.0:.3f}) m ± {cm(one.std_m)}" if one.determined else ""
@@ -224,13 +223,13 @@ class SurveyResult(Result, frozen=True, eq=False):
 
 
 class BiasResult(Result, frozen=True, eq=False):
-    """Constants of n anchors of another system, ordered by identifier; NaN where one is not determined."""
+    """Constants of n anchors of another system, ordered by identifier; NaN where not determined."""
 
     path: Path
     found: Biases
-    """Everything that was estimated."""
+    """All estimates."""
     table: Path | None
-    """The table of anchors that is to be corrected; None for a new one."""
+    """The table of anchors to correct; None for a new one."""
 
     @property
     def anchors(self) -> Integers:
@@ -239,7 +238,7 @@ class BiasResult(Result, frozen=True, eq=False):
 
     @property
     def bias_m(self) -> Vector:
-        """Shape (n,): by how much the anchor's signals seem late; only differences count, the zero is their mean."""
+        """Shape (n,): apparent lateness of each anchor's signals, relative to the mean."""
         return figures(one.bias_m for one in self.found.estimate.anchors)
 
     @property
@@ -249,7 +248,7 @@ class BiasResult(Result, frozen=True, eq=False):
 
     @property
     def summary(self) -> dict[str, Any]:
-        """The object that ``skyless survey --json`` writes, in SI units, but for the version and the file written."""
+        """The object that ``skyless survey --json`` writes, in SI units, without the version and the file written."""
         return self.found.report()
 
     def corrected_file(self) -> str:
@@ -257,7 +256,7 @@ class BiasResult(Result, frozen=True, eq=False):
         return self.found.table(self.table)
 
     def to_dataframe(self) -> "DataFrame":
-        """One row an anchor: ``anchor``, ``bias_m``, ``std_m``, ``noise_m``, ``count``.
+        """One row per anchor: ``anchor``, ``bias_m``, ``std_m``, ``noise_m``, ``count``.
 
         Raises:
             SkylessError: pandas is not installed.
@@ -269,16 +268,16 @@ class BiasResult(Result, frozen=True, eq=False):
         )
 
     def plot(self) -> "Figure":
-        """The constants with their standard errors, one bar an anchor."""
+        """Draw the constants with their standard errors, one bar per anchor."""
         return bias_figure(self.path.name, self.anchors, self.bias_m, self.std_m)
 
     def title(self) -> str:
-        """What was found."""
+        """Title of the calibration."""
         found = self.found.estimate
         return f"{self.found.format}: {found.used} differences used, {found.rejected} outliers"
 
     def facts(self) -> Iterator[tuple[str, str]]:
-        """The figures that matter, each with its name and unit."""
+        """The main figures: name, and value with its unit."""
         found = self.found.estimate
         for one in found.anchors:
             value = "not determined" if one.bias_m is None else f"{cm(one.bias_m)} ± {cm(one.std_m)}"
@@ -295,14 +294,14 @@ class BiasResult(Result, frozen=True, eq=False):
 
 
 def is_of_biases(asked: SurveyOptions) -> bool:
-    """Whether the recording is another system's, whose anchors' biases a tag at known positions shows."""
+    """Whether to estimate biases: a recording of another system, with a tag at known positions."""
     if asked.recording is None or is_mcap(asked.recording):
         return False
     return asked.knows_tag or format_of(asked.recording, asked.format).name == "miluv"
 
 
 def gathered(asked: SurveyOptions) -> Gathered:
-    """The ranges of a table or recording, and the site if one is known. Raises SkylessError."""
+    """Read the ranges of a table or recording, and the site if known. Raises SkylessError."""
     site = None if asked.site is None else site_of(asked.site)[0]
     if asked.ranges is not None:
         table = read_ranges(asked.ranges)
@@ -321,7 +320,10 @@ def gathered(asked: SurveyOptions) -> Gathered:
 
 
 def surveyed(asked: SurveyOptions, given: Gathered, on_count: Callable[[Count], None]) -> SurveyResult:
-    """The survey; ``on_count`` gets the numbers of measurements and unknowns before it. Raises SkylessError."""
+    """Run the survey; ``on_count`` is called before with the numbers of measurements and unknowns.
+
+    Raises SkylessError.
+    """
     site = given.site
     ranges = _with_all_anchors(given.ranges(), site)
     facts = facts_of(asked, ranges.anchors, site, is_foreign=given.is_foreign)
@@ -342,7 +344,7 @@ def surveyed(asked: SurveyOptions, given: Gathered, on_count: Callable[[Count], 
         ranges = _with_all_anchors(given.ranges(), site)
     counted = count(ranges, facts)
     on_count(counted)
-    # a tag's differences hold the delays of the recording: so must the ranges, and the delays count from these
+    # A tag's differences include the delays of the recording, so the ranges must, too; delays are relative to these.
     result = run_survey(ranges.without_delays({anchor: -half_m for anchor, half_m in before_m.items()}), facts)
     result = replace(result, anchors=tuple(_less(one, before_m.get(one.id, 0.0)) for one in result.anchors))
     warnings = () if counted.warning is None else (counted.warning,)
@@ -351,12 +353,12 @@ def surveyed(asked: SurveyOptions, given: Gathered, on_count: Callable[[Count], 
     return SurveyResult(found, counted, warnings, given.drops, site, file, ranges)
 
 
-def _less(anchor: Any, half_m: float) -> Any:  # noqa: ANN401 - SurveyedAnchor
+def _less(anchor: SurveyedAnchor, half_m: float) -> SurveyedAnchor:
     return anchor if anchor.delay_m is None or not half_m else replace(anchor, delay_m=anchor.delay_m - half_m)
 
 
 def _with_all_anchors(ranges: PairRanges, site: Site | None) -> PairRanges:
-    """The same ranges, with those anchors of the site added that have none: the survey reports them, too."""
+    """Add the site's anchors without ranges, as the survey reports them, too."""
     of_site: Sequence[int] = () if site is None else [anchor.id for anchor in site.all_anchors]
     return replace(ranges, anchors=tuple(sorted({*ranges.anchors, *of_site})))
 
@@ -365,7 +367,7 @@ def run_survey_site(asked: SurveyOptions) -> SurveyResult | BiasResult:
     """Find the anchors' positions and the errors of their antenna delays, as ``skyless survey`` does.
 
     With a tag at known positions (``stays``, ``truth``, ``recorded_truth``) the anchors' positions are kept. In a
-    recording of another system such a tag shows by how much each anchor seems late, less a constant of all: a
+    recording of another system such a tag shows each anchor's apparent lateness, up to a common constant: a
     ``BiasResult``.
     """
     if is_of_biases(asked):

@@ -2,7 +2,7 @@
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 from cyclopts import App, Parameter
 
@@ -13,16 +13,8 @@ from skyless.core.errors import SkylessError
 from skyless.radio.interface import AntennaDelays
 from skyless.run.anchor import Anchors
 from skyless.run.keys import AnchorKeys
-from skyless.run.open_radio import (
-    DEFAULT_RADIO,
-    is_simulated,
-    open_radios,
-)
+from skyless.run.open_radio import DEFAULT_RADIO, is_simulated, open_radios
 from skyless.site.file.check import plan_files
-
-if TYPE_CHECKING:
-    pass
-
 
 app = App(name="anchor", help_epilogue="Example: skyless anchor 3 --site site.toml")
 

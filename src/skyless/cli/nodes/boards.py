@@ -169,7 +169,7 @@ def ether(*, asked: EtherOptions, broker: MqttOptions, output: JsonOptions) -> N
 
 
 def _move(text: str, anchors: Iterable[int]) -> "AnchorDisplacement":
-    """An anchor, by how much it is moved, and when. Raises SkylessError."""
+    """Parse an anchor's displacement and its time. Raises SkylessError."""
     from skyless.sim.impairments import AnchorDisplacement
 
     name, is_named, rest = text.partition("=")
@@ -234,7 +234,7 @@ class FlashOptions(Options, frozen=True, kw_only=True):
     """Fixes whose protection level exceeds this, in metres, carry an alert; 0 for none."""
 
     def check(self) -> None:
-        """See that limits that belong together fit. Raises SkylessError."""
+        """Check limits of combined values. Raises SkylessError."""
         if self.bluetooth_ms is not None and 0 < self.bluetooth_ms < 100:
             raise wrong("--bluetooth-ms", self.bluetooth_ms, "0, or at least 100")
         if self.sleep_s is not None and 0.0 < self.sleep_s < 1e-3:
@@ -243,7 +243,7 @@ class FlashOptions(Options, frozen=True, kw_only=True):
             raise wrong("--z-bounds", self.z_bounds_m, "a lower and a higher height, within 100 km")
 
     def changes(self) -> dict[str, Any]:
-        """The fields of ``BoardSettings`` that are asked for."""
+        """The given fields of ``BoardSettings``."""
         asked = {one.name: getattr(self, one.name, None) for one in fields(BoardSettings)}
         asked["mode"] = None if self.mode is None else MODES.index(self.mode)
         asked["output"] = None if self.output is None else OUTPUTS.index(self.output)

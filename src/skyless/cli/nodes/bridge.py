@@ -1,4 +1,4 @@
-"""``skyless bridge``: a running site's fixes for programs and devices of other kinds."""
+"""``skyless bridge``: give a running site's fixes to other programs and devices."""
 
 from typing import Annotated
 
@@ -18,7 +18,7 @@ _EXAMPLE = "Example: skyless bridge nmea+tcp://:10110, and then: gpsd -N -n tcp:
 
 
 def _targets() -> str:
-    """The table of schemes for the help."""
+    """Table of schemes for the help."""
     rows = [f"{scheme}: {kind.summary}." for scheme, kind in TARGET_KINDS.items()]
     keys = "Every target takes ?tag=NAME, the only tag that it gets, and &hz=RATE, fixes a second and tag at most."
     return "\n\n".join(["Targets:", *rows, keys, _EXAMPLE])
@@ -51,7 +51,7 @@ def bridge(*targets: Annotated[str, Parameter(name="TARGETS")], live: SiteOption
 
 
 def hub_of(targets: tuple[str, ...], address: MqttAddress | None) -> Hub:
-    """What gives fixes to targets. Raises SkylessError: one of them is not right."""
+    """Open the hub that gives fixes to targets. Raises SkylessError if a target is wrong."""
     context = BridgeContext(log, address)
     return open_hub([open_route(target, context) for target in targets], log)
 

@@ -162,17 +162,17 @@ async def _serve_once(
 
 
 async def _ended(running: Broker) -> None:
-    """Wait for the end that a broker should not have. Raises SkylessError then."""
+    """Wait for an unexpected end of the broker. Raises SkylessError then."""
     await running.wait()
     raise SkylessError(f"nats-server has ended by itself; {running.data / 'nats-server.log'} may show why")
 
 
 def _reader(settings: BrokerSettings, running: Broker) -> MqttAddress:
-    """The broker's address for a history; where there are roles, as one that reads everything, the stream included."""
+    """The broker's address for a history; with roles, for one that may read everything, including the stream."""
     if settings.roles is None:
         return running.address
     role = Role.PAGE if running.nats is None else Role.OPERATOR
-    password = os.environ[PASSWORD_VARIABLE] = settings.roles[role]  # its children take it from there
+    password = os.environ[PASSWORD_VARIABLE] = settings.roles[role]  # for child processes
     return replace(running.address, user=str(role), password=password)
 
 

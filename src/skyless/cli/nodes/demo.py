@@ -13,7 +13,7 @@ from cyclopts import App
 from skyless.cli.common import JsonOptions, command, console, print_json
 from skyless.cli.nodes.demo_site import DemoOptions, WholeSite, sentence
 from skyless.cli.nodes.options import log
-from skyless.cli.nodes.site_view import Picture
+from skyless.cli.nodes.site_view import Picture, drawn
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress
 from skyless.run.process import run
 
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _LONGEST_START_S: Final = 60.0
-"""Programs that have not made a fix for every tag by then will not."""
+"""Longest wait until every tag has a fix."""
 
 _POLL_S: Final = 0.05
 _FRAME_S: Final = 0.25
-"""Time between two drawings of the site."""
+"""Interval between two drawings of the site."""
 
 app = App(name="demo", help_epilogue="Example: skyless demo --duration 10 --json")
 
@@ -55,7 +55,7 @@ def demo(*, asked: DemoOptions, output: JsonOptions) -> None:
 
 
 class _Stage:
-    """A demo as it runs: shown on a terminal a few times a second, and summed up."""
+    """A running demo, which is drawn on a terminal several times a second, and summarised."""
 
     def __init__(self, asked: DemoOptions, output: JsonOptions) -> None:
         self.whole, self._asked, self._json = WholeSite(asked, log), asked, output.json
@@ -64,7 +64,7 @@ class _Stage:
         self._took_s = 0.0
 
     async def run(self) -> None:
-        """Start everything, print its addresses, and watch for as long as was asked."""
+        """Start everything, print the addresses, and watch for the requested time."""
         site, begun_s = asyncio.ensure_future(self.whole.run()), None
         try:
             await _either(site, self.whole.ready.wait())
@@ -80,7 +80,7 @@ class _Stage:
             await asyncio.gather(site, return_exceptions=True)
 
     def _print_addresses(self) -> None:
-        """Print where everything is; on standard error when standard output is for a program."""
+        """Print all addresses, on standard error if standard output is for JSON."""
         whole = self.whole
         lines = [f"page      {whole.page}", f"broker    {whole.address}"]
         if whole.address is not None:
@@ -95,7 +95,7 @@ class _Stage:
         print(*lines, "Ctrl-C stops", sep="\n", file=sys.stderr if self._json else sys.stdout, flush=True)
 
     async def _until_all_fix(self) -> None:
-        """Until a fix and the health of every tag have arrived."""
+        """Wait until a fix and the health of every tag have arrived."""
         begun_s = time.monotonic()
         while time.monotonic() - begun_s < _LONGEST_START_S:
             if sum(tag.health is not None for tag in self.whole.figures.tags.values()) >= self._asked.tags:
@@ -104,7 +104,7 @@ class _Stage:
         log("not all tags have a fix yet; skyless/… on the broker and the page show more")
 
     async def _watch(self) -> None:
-        """Draw, where there is a terminal, until the time is over."""
+        """Draw the site, if there is a terminal, until the time is over."""
         from rich.live import Live  # while the site's programs start
 
         out = console()
@@ -120,13 +120,11 @@ class _Stage:
                     await asyncio.sleep(_FRAME_S)
 
     def drawn(self, picture: Picture, height: int = sys.maxsize) -> "RenderableType":
-        """The site as ``skyless watch`` shows it, and the errors of its fixes."""
-        from skyless.cli.nodes.site_view import drawn
-
+        """The site as ``skyless watch`` shows it, with the errors of its fixes."""
         return drawn(picture, height, {name: tag.error_m for name, tag in self.whole.figures.tags.items()})
 
     def summary(self) -> dict[str, Any]:
-        """The figures, for a program."""
+        """The figures for JSON."""
         return {
             **self.whole.figures.summary(),
             "restarts": sum(max(0, child.starts - 1) for child in self.whole.children),
@@ -137,7 +135,7 @@ class _Stage:
 
 
 async def _either(site: asyncio.Task[None], part: Awaitable[object]) -> None:
-    """Wait for a part, unless the site fails first."""
+    """Wait for ``part``, or raise the site's error if it fails first."""
     waiting = asyncio.ensure_future(part)
     try:
         for done in (await asyncio.wait((site, waiting), return_when=asyncio.FIRST_COMPLETED))[0]:
@@ -147,7 +145,7 @@ async def _either(site: asyncio.Task[None], part: Awaitable[object]) -> None:
 
 
 def _subscriber(address: MqttAddress) -> str:
-    """How to watch this broker with mosquitto's program."""
+    """Command line of ``mosquitto_sub`` for this broker."""
     words = ["mosquitto_sub"]
     if address.host != "127.0.0.1":
         words.append(f"-h {address.host}")

@@ -89,7 +89,7 @@ from skyless.site.survey.facts import (
 
 # Figures of a demo: errors of its fixes against the truth, rates, alerts and latencies.
 
-_WARMUP_S: Final = 1.0  # fixes of a tag count for the errors from this time after its first
+_WARMUP_S: Final = 1.0  # a tag's fixes count for the errors only this long after its first
 
 _ALERTS: Final = frozenset(alert.value for alert in Alert)
 _ALERT_WORDS: Final[dict[str, str]] = {
@@ -101,11 +101,11 @@ _ALERT_WORDS: Final[dict[str, str]] = {
 
 
 class TagFigures(Struct):
-    """What is known of one tag."""
+    """Figures of one tag."""
 
     first_unix_s: float
     error_m: float | None = None
-    """Of its newest fix; None where the truth is not known."""
+    """Error of the newest fix; None if the truth is unknown."""
     health: TagHealth | None = None
     began: tuple[float, int] | None = None
     """Time and number of fixes of the first health message that counts."""
@@ -119,7 +119,7 @@ class TagFigures(Struct):
 
 
 class DemoFigures:
-    """Gathered from what a view of the site receives."""
+    """Figures of a demo, from what a view of the site receives."""
 
     def __init__(self, *, planar: bool) -> None:
         self.tags: dict[str, TagFigures] = {}
@@ -127,14 +127,14 @@ class DemoFigures:
         self.variance_sum_m2 = 0.0
         self.judged = 0
         self.alerts: Counter[str] = Counter()
-        """How often fixes reported each state of their integrity, for methods that report one."""
+        """Number of fixes with each state of integrity, for methods that report one."""
         self.arrivals = Latencies()  # from the end of a fix's last frame to its arrival in this process
-        self.latencies = Latencies()  # from there to the computed fix, as the tags report them
+        self.latencies = Latencies()  # from the end of that frame to the computed fix, as the tags report them
         self._late_transmissions: dict[int, int] = {}  # by anchor
         self._truths = TruthBuffer()
 
     def follow(self, view: SiteView) -> None:
-        """Take what this view receives from now on."""
+        """Collect figures from what this view receives from now on."""
         view.on_fix.append(self._on_fix)
         view.on_health.append(self._on_health)
         view.link.subscribe(truth_topic(view.number), reader(TruthMessage, self._truths.add, lambda: None))
@@ -166,7 +166,7 @@ class DemoFigures:
                 tag.began = health.unix_s, health.fixes
 
     def summary(self) -> dict[str, Any]:
-        """The figures, for a program."""
+        """The figures for JSON."""
         rates = [rate for tag in self.tags.values() if (rate := tag.updates_per_s) is not None]
         healths = [tag.health for tag in self.tags.values() if tag.health is not None]
         firsts = sorted(health.first_fix_s for health in healths if health.first_fix_s is not None)
@@ -188,12 +188,12 @@ class DemoFigures:
             "dropped": dropped.total(),
             "first_fix_s": firsts[len(firsts) // 2] if firsts else None,
             "alerts": dict(sorted(self.alerts.items())),
-            # from the end of a frame on the air to the fix, and to a subscriber of the broker
+            # From the end of a frame on the air to the fix, and to a subscriber of the broker.
             "fix_latency_p50_s": fix_p50_s,
             "fix_latency_p99_s": fix_p99_s,
             "subscriber_latency_p50_s": here_p50_s,
             "subscriber_latency_p99_s": here_p99_s,
-            # what was too old to be used or given
+            # Too old to be used or published.
             "late_receptions": dropped["late-reception"],
             "late_fixes": dropped["late-fix"],
             "late_transmissions": sum(self._late_transmissions.values()),
@@ -201,7 +201,7 @@ class DemoFigures:
 
 
 def sentence(summary: dict[str, Any]) -> str:
-    """A summary with its ``duration_s``, for a person."""
+    """Describe a summary in a sentence."""
     if not summary["tags"]:
         return "no fix was made"
     late = ""
@@ -224,7 +224,7 @@ def sentence(summary: dict[str, Any]) -> str:
     )
 
 
-# What the demo's own site has besides walking tags: a plan, zones, names, a rule, a georeference, a moved anchor.
+# Furnishings of the demo's own site: a plan, zones, names, an alarm rule, a georeference, a moved anchor.
 
 _SITE_NAME: Final = "Workshop"
 _PLAN: Final = Path(__file__).with_name("demo_plan.png")
@@ -240,11 +240,11 @@ _RULE: Final = AlarmRule(
     "robot-cell", "inside", "Person in the robot cell", zone=_CELL.id, tags=(f"group:{_PEOPLE}",), severity="critical"
 )
 MOVED: Final = "3=0,0.6@60"
-"""The anchor that is hung elsewhere after a minute, for ``skyless ether --move``."""
+"""Move of an anchor after a minute, for ``skyless ether --move``."""
 
 
 def furnished(lab: Site) -> Site:
-    """The lab as a workshop. Where it is on the Earth is made up."""
+    """The lab as a workshop, at an invented place on the Earth."""
     return replace(
         lab,
         name=_SITE_NAME,
@@ -256,7 +256,7 @@ def furnished(lab: Site) -> Site:
 
 
 def survey_record(site: Site) -> SurveyRecord:
-    """The survey that has hung its anchors, without errors: with its ranges the watch need not learn what is usual."""
+    """An error-free survey of the site, whose ranges spare the watch learning the usual ones."""
     pairs = tuple(
         PairRange(a.id, b.id, dist((a.x_m, a.y_m, a.z_m), (b.x_m, b.y_m, b.z_m)), std_m=0.005, exchanges=1000)
         for a, b in combinations(site.anchors, 2)
@@ -268,7 +268,7 @@ def survey_record(site: Site) -> SurveyRecord:
 
 
 def messages_of(site: Site) -> dict[str, bytes]:
-    """By topic what the page would make the broker keep: zones, and the tags' names."""
+    """Retained messages by topic, as the page would publish them: zones, and the tags' names."""
     return {
         zones_topic(site.id): msgspec.json.encode(ZonesMessage((_CELL, _GOODS_IN), site=site.name)),
         assets_topic(site.id): msgspec.json.encode(AssetsMessage(_ASSETS, site=site.name)),
@@ -285,12 +285,12 @@ _RECORDING_LIMIT_MB: Final = "1000"
 
 _SLOW_SHARE: Final = 0.1
 _SLOW_FOR: Final = 8
-"""An emulated air that misses so large a share of the transmissions, on average of this many seconds, is too slow."""
+"""The emulated air is too slow if it misses this share of the transmissions, averaged over this many seconds."""
 _LEAST_RATE_HZ: Final = 15.0
-"""Beacons a second of each anchor. A computer that other programs keep busy misses its share of fewer, too."""
+"""Least beacons per second of each anchor, as a busy computer would miss some even at lower rates."""
 
 _SURVEY_DELAY_S: Final = 4.0
-"""Nothing else waits for the survey. Started with the others it would delay the first fix by a second on two cores."""
+"""Delay of the survey's start: nothing waits for it, and it would delay the first fix by a second on two cores."""
 
 
 class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
@@ -333,7 +333,7 @@ class DemoOptions(ProtectionOptions, frozen=True, kw_only=True):
 
 
 class WholeSite:
-    """Starts everything and keeps it alive."""
+    """All programs of a demo, started and kept alive."""
 
     def __init__(self, asked: DemoOptions, log: Log) -> None:
         """Raises SkylessError."""
@@ -341,7 +341,7 @@ class WholeSite:
         self._asked, self._log = asked, log
         self._ports = TemporaryDirectory(prefix="skyless-demo-")
         self._own_file = Path(self._ports.name, "demo.toml") if asked.site is None and not asked.paper else None
-        """The demo's own site; where it is set, the rate of its beacons is lowered on a slow computer."""
+        """File of the demo's own site, whose beacon rate is lowered on a slow computer; None for another site."""
         self._has_story = self._own_file is not None and not asked.plain
         self._missed_shares: deque[float] = deque(maxlen=_SLOW_FOR)
         self._site_name = f"paper:{asked.noise_ps:g}" if asked.site is None else str(asked.site.absolute())
@@ -371,12 +371,12 @@ class WholeSite:
         tags = [f"tag{number}" for number in range(1, asked.tags + 1)]
         self._tags = tags[: asked.tags - asked.boards]
         self.boards = {tag: Path(self._ports.name, tag) for tag in tags[len(self._tags) :]}
-        """The others, which are boards, and their serial ports."""
+        """Serial ports of the tags that are emulated boards."""
         which = self._site_name if asked.site is not None else f"{asked.plain} {asked.paper}"
         self.kept_as = f"{self.site.id}-{crc32(which.encode()):08x}"
-        """The embedded broker's folder is of this site file, or of this kind of demo."""
+        """Suffix of the embedded broker's folder: one for each site file, or kind of demo."""
         self.keeps = asked.mqtt is None and (asked.site is not None or asked.history is not None)
-        """Whether the embedded broker's names, zones and rules are there again the next time."""
+        """Whether the embedded broker keeps names, zones and rules for the next demo."""
         self.figures = DemoFigures(planar=self.site.tags.height_m is not None)
         self.view: SiteView | None = None
         self.children: list[Child] = []
@@ -384,7 +384,7 @@ class WholeSite:
 
     @property
     def gone(self) -> str:
-        """What ends with the demo although its page has shown it; empty where nothing does."""
+        """Data that will be lost at the end of the demo, in words; empty if none."""
         ended = [] if self._asked.mqtt is not None or self.keeps else ["names", "zones"]
         ended += ["history"] if self.history is not None and self._asked.history is None else []
         return " and ".join(", ".join(ended).rsplit(", ", 1))
@@ -408,7 +408,7 @@ class WholeSite:
                 await self._run_with(broker.address, broker)
 
     async def _own_broker(self) -> Broker:
-        """A broker that keeps names, zones and rules for the next demo of the site, where the user keeps anything."""
+        """Start the embedded broker, with a permanent store if ``keeps`` and possible, else a temporary one."""
         if self.keeps:
             try:
                 return await start_broker(BrokerSettings(data=data_folder() / f"demo-{self.kept_as}"))
@@ -438,7 +438,7 @@ class WholeSite:
         await outlasting(link.run(), together(*(child.run() for child in self.children)))  # its end is published
 
     def _on_health(self, health: Health) -> None:
-        """Lower the rate of the own site's beacons where the emulated air does not keep up with them."""
+        """Lower the beacon rate of the demo's own site if the emulated air does not keep up."""
         if self._own_file is None or not isinstance(health, EtherHealth) or len(self.figures.tags) < self._asked.tags:
             return
         self._missed_shares.append(health.missed_share)
@@ -455,7 +455,7 @@ class WholeSite:
                 child.restart()
 
     async def _keep(self, broker: Broker) -> None:
-        """Start the embedded broker again, on the same port and with the same store, whenever it ends."""
+        """Restart the embedded broker, on the same port and with the same store, whenever it ends."""
         settings = BrokerSettings(port=broker.address.port, data=broker.data)
         try:
             while True:
@@ -513,7 +513,7 @@ class WholeSite:
 
 
 def _check(asked: DemoOptions) -> None:
-    """Whether the options fit each other. Raises SkylessError."""
+    """Check that the options are compatible. Raises SkylessError."""
     if asked.mqtt == "none":
         raise SkylessError("--mqtt is 'none'; the demo needs a broker, and brings one where --mqtt is not given")
     if asked.mqtt is None and asked.mqtt_ca is not None:
@@ -528,7 +528,7 @@ def _check(asked: DemoOptions) -> None:
 
 
 def _recording(asked: str | None, folder: Path) -> Path | None:
-    """Where to record; None: nowhere. Raises SkylessError."""
+    """File of the recording; None for none. Raises SkylessError."""
     if asked == "none":
         return None
     file = new_recording(folder, "demo") if asked is None else Path(asked)
@@ -538,7 +538,7 @@ def _recording(asked: str | None, folder: Path) -> Path | None:
 
 
 async def _place(address: MqttAddress, messages: Mapping[str, bytes], log: Log, *, is_new: bool) -> None:
-    """Publish messages for the broker to keep, unless it has others; a new broker has none."""
+    """Publish retained messages, unless the broker already has others. ``is_new``: the broker is known to have none."""
     try:
         there = {} if is_new else await kept_messages(address, messages)
         await _publish(address, {topic: text for topic, text in messages.items() if not there.get(topic)})
@@ -547,7 +547,7 @@ async def _place(address: MqttAddress, messages: Mapping[str, bytes], log: Log, 
 
 
 async def _publish(address: MqttAddress, messages: Mapping[str, bytes]) -> None:
-    """Publish messages for the broker to keep."""
+    """Publish retained messages."""
     connection = await open_connection(address, address.tls_context(), Introduction("", _KEEPALIVE_S))
     for topic, text in messages.items():
         connection.publish(topic, text, 1, retain=True)
@@ -555,9 +555,9 @@ async def _publish(address: MqttAddress, messages: Mapping[str, bytes]) -> None:
 
 
 async def _cleared_at_the_end(address: MqttAddress, site: int, own: Mapping[str, bytes], log: Log) -> None:
-    """Wait until cancelled. Then clear what the site's programs, which have ended, have left retained at the broker.
+    """Wait until cancelled, then clear the retained messages that the site's ended programs have left at the broker.
 
-    ``own`` are messages of the demo, which go as well where nobody has changed them.
+    ``own``: messages of the demo, which are also cleared unless somebody has changed them.
     """
     try:
         await asyncio.Event().wait()
@@ -582,19 +582,19 @@ async def _clear_retained(address: MqttAddress, site: int, own: Mapping[str, byt
 
 
 def _mqtt(address: MqttAddress) -> tuple[str, ...]:
-    """The options that name the broker. A password is in the programs' environment."""
+    """Options that name the broker; its password is in the programs' environment."""
     option = ("--mqtt", str(replace(address, password=None)))
     return option if address.ca is None else (*option, "--mqtt-ca", str(address.ca))
 
 
 def _options(**values: float | str | Path | None) -> list[str]:
-    """Options of a program, without those that are None."""
+    """Command line options from values, without those that are None."""
     given = ((f"--{name.replace('_', '-')}", str(value)) for name, value in values.items() if value is not None)
     return [word for option in given for word in option]
 
 
 def _tags_text(tags: int) -> str:
-    """The number of tags as ``skyless ether`` takes it."""
+    """The number of tags as an option of ``skyless ether``."""
     return f"{tags}@{tags.floor}" if isinstance(tags, TagCount) and tags.floor is not None else str(tags)
 
 
@@ -603,5 +603,5 @@ def _groups(names: list[str], size: int) -> list[list[str]]:
 
 
 def _named(kind: str, names: list[str]) -> str:
-    """The name of a process in messages."""
+    """Name of a process for messages."""
     return f"{kind} {names[0]}" if len(names) == 1 else f"{kind}s {names[0]} to {names[-1]}"

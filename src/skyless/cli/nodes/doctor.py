@@ -31,7 +31,7 @@ from skyless.site.file.load import load_site
 
 _FIND_S: Final = 8.0
 _NAMED_S: Final = 3.0
-"""By then the kept messages of a site, and fixes of its tags, have come."""
+"""Time by which a site's retained messages, and fixes of its tags, have arrived."""
 
 app = App(name="doctor", help_epilogue="Example: skyless doctor --radio serial:/dev/ttyACM0 --mqtt none --duration 30")
 
@@ -89,7 +89,7 @@ def doctor(*, asked: DoctorOptions, live: SiteOptions, output: JsonOptions) -> i
 
 
 def _boards(radio: str | None) -> tuple[SerialRadio, ...]:
-    """The boards that are to listen. Raises SkylessError."""
+    """Open the boards that shall listen. Raises SkylessError."""
     if radio is None:
         return ()
     kind, _, ports = radio.partition(":")
@@ -107,7 +107,7 @@ async def _examine(
     seconds: float,
     progress: Callable[[float], None],
 ) -> list[Check]:
-    """All checks; ``progress`` is called with the seconds that have gone. Each is logged as soon as it is known."""
+    """Run all checks, logging each as soon as it is known; ``progress`` is called with the seconds passed."""
     checks = [*port_checks(), clock_check()]
     shown: set[str] = set()
 
@@ -154,7 +154,7 @@ async def _examine(
 
 
 def _report(checks: Sequence[Check]) -> str:
-    """The report as Markdown, what has failed first."""
+    """The report as Markdown, failed checks first."""
     order = get_args(Result)
     counts = Counter(check.result for check in checks)
     lines = [

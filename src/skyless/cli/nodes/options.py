@@ -1,4 +1,4 @@
-"""Options that the commands of a running site share."""
+"""Common options of the commands of a running site."""
 
 import contextlib
 import sys
@@ -41,7 +41,7 @@ class MqttOptions(Options, frozen=True, kw_only=True):
     def address(self) -> MqttAddress | None:
         """The broker's address; None for ``none``. Raises SkylessError.
 
-        By default the broker that runs on this machine, which is said in one line; else the usual address.
+        The default is the broker running on this machine, which is then logged, else the usual address.
         """
         if self.mqtt is None and self.mqtt_ca is None and (found := running_broker()) is not None:
             log(f"broker {found}, which runs on this machine (--mqtt names another)")
@@ -61,7 +61,7 @@ class MqttOptions(Options, frozen=True, kw_only=True):
 
 
 def hub_address(hub: str, ca: Path | None) -> NatsAddress:
-    """The servers of the hub that ``--hub`` names. Raises SkylessError, also without nats-py."""
+    """The hub's servers from ``--hub``. Raises SkylessError, also without nats-py."""
     extra_module("nats", "--hub")
     address = nats_address(hub, "--hub", ca)
     address.tls_context()
@@ -76,7 +76,7 @@ class SiteOptions(MqttOptions, frozen=True, kw_only=True):
 
 
 class GatherOptions(Options, frozen=True, kw_only=True):
-    """What is gathered of a site with thousands of tags."""
+    """Options for gathering a site with thousands of tags."""
 
     site_id: SiteId | None = None
     """Number of the site that is gathered; by default the first one of which anything is heard."""
@@ -85,9 +85,9 @@ class GatherOptions(Options, frozen=True, kw_only=True):
 
 
 def site_named(site: str) -> Site:
-    """The site in a file, or a built-in one: ``lab``, or ``paper``, the same with the paper's protocol.
+    """Load a site file, or a built-in site: ``lab``, or ``paper``, the same with the paper's protocol.
 
-    With other noise than 100 ps as ``lab:PS``. Raises SkylessError.
+    ``lab:PS`` sets a noise other than 100 ps. Raises SkylessError.
     """
     from skyless.sim.lab import lab_site, paper_lab_site
     from skyless.site.file.load import load_site
@@ -104,7 +104,7 @@ def site_named(site: str) -> Site:
 
 
 def listen_address(text: str, usual_port: int) -> tuple[str, int | None]:
-    """HOST:PORT, or one of both; the port is None where it is not given. Raises SkylessError."""
+    """Parse HOST:PORT, or one of both; the port is None if not given. Raises SkylessError."""
     host, colon, digits = text.rpartition(":")
     if text.isdecimal():
         host = "127.0.0.1"
@@ -119,7 +119,7 @@ def listen_address(text: str, usual_port: int) -> tuple[str, int | None]:
 
 
 def run_until_stopped(program: Coroutine[Any, Any, None], *, punctual: bool = False) -> None:
-    """Run it until it ends, or Ctrl-C or a signal ends it. ``punctual`` is as for ``skyless.run.process.run``."""
+    """Run a program until it ends, or Ctrl-C or a signal ends it. ``punctual``: see ``skyless.run.process.run``."""
     from skyless.run.process import run
 
     with contextlib.suppress(KeyboardInterrupt):
@@ -127,19 +127,19 @@ def run_until_stopped(program: Coroutine[Any, Any, None], *, punctual: bool = Fa
 
 
 def log(line: str) -> None:
-    """Show a line to a person, on standard error. What came from the network may be in it."""
+    """Print a line for people on standard error; it may contain text from the network."""
     print(plain(line, "\n"), file=sys.stderr, flush=True)
 
 
 def name_unplaced(site: Site) -> None:
-    """Name the anchors of a simulated site that take no part, on standard error."""
+    """Log the anchors that are not simulated, as they have no position."""
     if site.unplaced:
         names = ", ".join(str(anchor.id) for anchor in site.unplaced)
         log(f"not simulated, as the site file has no position: anchor {names}")
 
 
 def check_live(site: Site, method: str = DEFAULT_METHOD) -> None:
-    """See that tags of an emulated site can have fixes, and warn of one that sends too much for real time.
+    """Check that tags of an emulated site can have fixes, and warn if it sends too much for real time.
 
     Raises SkylessError.
     """

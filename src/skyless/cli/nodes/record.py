@@ -1,4 +1,4 @@
-"""``skyless record``: a running site into a file; ``skyless export``: such a file as a bag of ROS 2."""
+"""``skyless record``: record a running site; ``skyless export``: convert a recording to a ROS 2 bag."""
 
 import asyncio
 import contextlib

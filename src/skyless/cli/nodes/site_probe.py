@@ -1,36 +1,27 @@
-"""Checks of a running site for ``skyless doctor``: the page's condition of it, and what takes longer to measure."""
+"""Checks of a running site for ``skyless doctor``: its condition as on the page, and slower measurements."""
 
 import math
 import statistics
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
+from skyless.cli.nodes.site_view import GONE, LINK_NAME, SiteView
 from skyless.core.any_receiver import beacon_period_s
 from skyless.core.geometry import RADIO_REACH_M
 from skyless.core.site import Site, site_digest
 from skyless.run.doctor import Check, CounterPairs, Result, counters_check, judged, residuals_check, sentence
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.messages import (
-    FixMessage,
-    RequestMessage,
-    StampsMessage,
-)
+from skyless.run.mqtt.messages import FixMessage, RequestMessage, StampsMessage
 from skyless.run.process import reader
 
-if TYPE_CHECKING:
-    pass
-from skyless.cli.nodes.site_view import GONE, LINK_NAME, SiteView
-
 _LEASE_S: Final = 15.0
-
-
 _MAX_FIXES: Final = 20_000
 
 
 class SiteProbe:
-    """Asks the anchors for their stamps, and gathers what is judged at the end."""
+    """Requests the anchors' stamps, and gathers data that are judged at the end."""
 
     def __init__(self, view: SiteView, clock: Callable[[], float] = time.monotonic) -> None:
         self.view, self._clock = view, clock
@@ -40,7 +31,7 @@ class SiteProbe:
         self._fixes: deque[FixMessage] = deque(maxlen=_MAX_FIXES)
         self._pairs = CounterPairs()
         self._stamps: Counter[tuple[int, int]] = Counter()  # by receiver and sender
-        self._stamps_s: dict[int, tuple[float, float]] = {}  # by receiver: when its first and last message came
+        self._stamps_s: dict[int, tuple[float, float]] = {}  # by receiver: times of its first and last message
         view.link.subscribe(topics.stamps_topic(view.number, "+"), reader(StampsMessage, self._on_stamps, lambda: None))
 
     def _on_stamps(self, message: StampsMessage) -> None:
@@ -48,12 +39,12 @@ class SiteProbe:
         first_s, _ = self._stamps_s.get(anchor, (now_s, now_s))
         self._stamps_s[anchor] = first_s, now_s
         for stamp in message.stamps:
-            if first_s != now_s:  # those of the first message came before the time that is counted
+            if first_s != now_s:  # the first message only starts the time span
                 self._stamps[anchor, stamp.anchor] += 1
             self._pairs.add(f"{anchor}/{message.run}", stamp.anchor, stamp.tx_ticks, stamp.rx_ticks, now_s)
 
     def sample(self) -> None:
-        """Gather what the view has now, and ask again for stamps."""
+        """Gather the view's current data, and renew the request for stamps."""
         self._picture = picture = self.view.picture()
         for reason in picture.condition.reasons:
             result: Result = "failed" if reason.level == "bad" else "warning"
@@ -67,14 +58,14 @@ class SiteProbe:
         self.view.link.publish(topics.request_topic(self.view.number), request)
 
     def known(self, file_site: Site | None, *, named: bool) -> Iterable[Check]:
-        """What will not change before the end: where ``named``, the site, and what was found to be wrong."""
+        """Checks that are already final: the site if ``named``, and faults."""
         message = self.view.site
         if named and message is not None:
             yield self._site(message.whole_site, file_site)
         yield from self._found.values()
 
     def checks(self, file_site: Site | None) -> tuple[Check, ...]:
-        """What was found; ``file_site`` is that of a site file that the running one should be."""
+        """All checks; ``file_site``: the site that should be running."""
         trouble, message = self._picture.trouble, self.view.site
         if trouble is not None:
             return (broker_failed(trouble),)
@@ -101,7 +92,7 @@ class SiteProbe:
         return Check("site", "ok", f"{finding}.")
 
     def _slots(self) -> Check:
-        """Transmissions that were missed."""
+        """Check of missed transmissions."""
         shares = {anchor: statistics.mean(shares) for anchor, shares in self._missed.items()}
         worst, share = max(shares.items(), key=lambda one: one[1])
         finding = f"Anchor {worst} misses the most transmissions: {share:.1%}."
@@ -109,7 +100,7 @@ class SiteProbe:
         return judged("transmissions", share, 0.1, 0.5, finding, advice)
 
     def _losses(self, site: Site) -> Check:
-        """What anchors receive of those within the range in the open, against what these send."""
+        """Check of the share of beacons that anchors receive from those within the range in the open."""
         places = {one.id: (one.x_m, one.y_m, one.z_m) for one in site.anchors if str(one.id) in self._missed}
         shares = {}
         for receiver, (first_s, last_s) in self._stamps_s.items():
@@ -132,6 +123,6 @@ class SiteProbe:
 
 
 def broker_failed(trouble: str) -> Check:
-    """The check of a broker that cannot be used."""
+    """Failed check of a broker that cannot be used."""
     advice = "Start it (skyless broker), or give another with --mqtt; --mqtt none checks no site."
     return Check("broker", "failed", sentence(trouble), advice)

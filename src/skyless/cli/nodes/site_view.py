@@ -1,4 +1,4 @@
-"""``skyless watch`` and ``skyless sites``: what a running site publishes, gathered and shown as text."""
+"""``skyless watch`` and ``skyless sites``: running sites as text."""
 
 import asyncio
 import contextlib
@@ -48,34 +48,34 @@ if TYPE_CHECKING:
     from skyless.run.hub import HubSite
 
 GONE: Final = ("silent", "offline")
-"""States of anchors that are not there."""
+"""States of absent anchors."""
 
 LINK_NAME: Final = f"{platform.node()}-{os.getpid()}"
 _WAIT_SHARE: Final = 3.0
 
 
 class TagRow(Struct, frozen=True):
-    """A tag as it is shown."""
+    """A tag in the view."""
 
     tag: str
     state: Literal["fix", "no fix", "offline"]
     age_s: float | None = None
-    """Since the last frame of the newest fix; None before the first."""
+    """Time since the last frame of the newest fix; None before the first."""
     fix: FixMessage | None = None
     health: TagHealth | None = None
-    """None where it does not report."""
+    """None if the tag does not report."""
     name: str = ""
-    """What people call it, as the page shows it; empty where no asset names it."""
+    """Name of the tag's asset, as on the page; empty without one."""
 
 
 class AnchorRow(Struct, frozen=True):
-    """An anchor as it is shown."""
+    """An anchor in the view."""
 
     anchor: str
     state: str
-    """Its role; ``used`` where it has no program of its own; ``silent`` or ``offline``."""
+    """The anchor's role; ``used`` without a program of its own; ``silent`` or ``offline``."""
     age_s: float | None = None
-    """Since its last report."""
+    """Time since the last report."""
     health: AnchorHealth | None = None
 
 
@@ -91,18 +91,18 @@ class Picture(Struct, frozen=True):
     """Why the broker is not connected; None while it is."""
     condition: Condition
     tags: tuple[TagRow, ...]
-    """Those with trouble first, then by name."""
+    """Tags with trouble first, then by name."""
     anchors: tuple[AnchorRow, ...]
     alarms: tuple[AlarmMessage, ...]
-    """Those that nobody has acknowledged first."""
+    """Unacknowledged alarms first."""
     drops: dict[str, int]
-    """What tags and anchors have dropped since they started, by reason, the most frequent first."""
+    """Drops at tags and anchors since their start, by reason, the most frequent first."""
     wrong_messages: int
-    """Messages that could not be read."""
+    """Number of unreadable messages."""
 
 
 async def site_number(address: MqttAddress, longest_s: float | None) -> int:
-    """The number of the site that is online. Raises SkylessError where there is none by then, or several are."""
+    """Find the number of the site that is online. Raises SkylessError if none, or several, are found in time."""
     try:
         async with asyncio.timeout(longest_s):
             return await find_site(address)
@@ -111,7 +111,7 @@ async def site_number(address: MqttAddress, longest_s: float | None) -> int:
 
 
 class SiteView:
-    """Subscribes to a site's topics. It publishes nothing but its own status."""
+    """Subscriber to a site's topics, which publishes only its own status."""
 
     def __init__(
         self,
@@ -121,22 +121,22 @@ class SiteView:
         wall_clock: Callable[[], float] = time.time,
         used_share: Callable[[float], float | None] = lambda _: None,
     ) -> None:
-        """``used_share`` is as for the page's ``LiveSite``."""
+        """``used_share``: see the page's ``LiveSite``."""
         self.link, self.number, self._clock, self._wall_clock = link, number, clock, wall_clock
         self._used_share = used_share
         self.evidence = Evidence(platform.node(), clock())
         self._monitor = ConditionMonitor(self.evidence)
         self.condition = self._monitor.evaluate(clock())
         self.site: SiteMessage | None = None
-        self._fixes: dict[str, tuple[FixMessage, float]] = {}  # with the time at which its last frame ended
+        self._fixes: dict[str, tuple[FixMessage, float]] = {}  # with the end time of the last frame
         self._alarms: dict[str, AlarmMessage] = {}
-        self._watch: tuple[WatchMessage, float] | None = None  # with the time at which it was made
+        self._watch: tuple[WatchMessage, float] | None = None  # with its creation time
         self._wrong = 0
         self._assets = AssetsMessage(())
         self.on_fix: list[Callable[[FixMessage], None]] = []
         """Called with every fix."""
         self.on_health: list[Callable[[Health], None]] = []
-        """Called with every health of a tag, an anchor or the air."""
+        """Called with every health message of a tag, an anchor or the air."""
         for topic, kind, handle in (
             (topics.site_topic(number), SiteMessage, self._on_site),
             (topics.fix_topic(number, "+"), FixMessage, self._on_fix),
@@ -154,7 +154,7 @@ class SiteView:
 
     def _on_state(self, connected: bool) -> None:
         self._watch = None
-        self._alarms.clear()  # the broker sends again what it keeps
+        self._alarms.clear()  # the broker sends retained alarms again
         self.evidence.set_connected(connected=connected, now_s=self._clock())
 
     def _on_wrong(self) -> None:
@@ -180,7 +180,7 @@ class SiteView:
             listener(health)
 
     def _on_watch(self, message: WatchMessage) -> None:
-        """Note when it was made: the first after a connection may be an old one that the broker kept."""
+        """Keep the message with its creation time: the first one after connecting may be an old, retained one."""
         kept_s = max(0.0, self._wall_clock() - message.unix_s) if self._watch is None else 0.0
         self._watch = message, self._clock() - kept_s
 
@@ -194,7 +194,7 @@ class SiteView:
             self._alarms.pop(topic, None)
 
     async def run(self, seconds: float | None, act: Callable[[], None]) -> None:
-        """Stay connected for some time; evaluate the condition twice a second, and call ``act`` each time."""
+        """Stay connected for some time, evaluating the condition and then calling ``act`` about twice a second."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(seconds):
                 await together(keep(self.link, log), self._evaluate_often(act))
@@ -205,13 +205,13 @@ class SiteView:
             began_s = time.monotonic()
             self.evaluate(began_s - due_s)
             act()
-            # Of very many tags it takes longer, and the messages are to be read as well.
+            # With very many tags this takes longer, and messages must be read, too.
             wait_s = max(EVALUATION_S, _WAIT_SHARE * (time.monotonic() - began_s))
             due_s = time.monotonic() + wait_s
             await asyncio.sleep(wait_s)
 
     def evaluate(self, lag_s: float = 0.0) -> None:
-        """Find the condition again, as the page does. ``lag_s`` is the delay of this call."""
+        """Update the condition as the page does. ``lag_s``: delay of this call."""
         now_s = self._clock()
         watch, made_s = self._watch or (None, now_s)
         used, unread_s, refused = self._used_share(now_s), self.link.unread_s, self.link.refused
@@ -280,7 +280,7 @@ def _alarm_rank(alarm: AlarmMessage) -> tuple[bool, int, float]:
     return alarm.acknowledged_unix_s is not None, severity, -alarm.unix_s
 
 
-# The text view of a site: a picture of it in a given number of lines.
+# Text view of a site in a given number of lines.
 
 _COLOURS: Final = {"good": "bold green", "waiting": "bold cyan", "warning": "bold yellow", "bad": "bold red"}
 _ALERTS: Final[dict[str | None, str]] = {
@@ -296,9 +296,9 @@ _T = TypeVar("_T")
 def drawn(
     picture: Picture, height: int = sys.maxsize, errors_m: Mapping[str, float | None] | None = None
 ) -> RenderableType:
-    """The picture in ``height`` lines. What does not fit is counted in the last row of its table.
+    """Draw the picture in ``height`` lines. The last row of a table counts the rows that do not fit.
 
-    ``errors_m`` are those of the tags' fixes, where the truth is known.
+    ``errors_m``: errors of the tags' fixes, where the truth is known.
     """
     condition, alarms, anchors = picture.condition, picture.alarms, picture.anchors
     reasons = condition.reasons
@@ -342,7 +342,7 @@ def _text(words: str, style: str = "") -> Text:
 def _table(
     name: str, columns: tuple[str, ...], items: Sequence[_T], most: int, cells: Callable[[_T], list[Text]]
 ) -> Table:
-    """At most ``most`` rows. Columns of figures keep their width; the first column and an unnamed last one give way."""
+    """A table of at most ``most`` rows. Columns of figures keep their width; the first and unnamed ones may shrink."""
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="dim")
     table.add_column(Text(f"{name} ({len(items)})", "bold"))
     for title in columns:
@@ -364,7 +364,7 @@ def _alarm(alarm: AlarmMessage) -> list[Text]:
 
 
 def _tag(row: TagRow, errors_m: Mapping[str, float | None] | None) -> list[Text]:
-    """The cells of a tag. What is not of now is dim, and its age is in words, in red."""
+    """The cells of a tag. Outdated values are dim, with their age in words, in red."""
     fix, health, fresh = row.fix, row.health, row.state == "fix"
     style = "" if fresh else "dim"
     errors = () if errors_m is None else (errors_m.get(row.tag),)
@@ -402,7 +402,7 @@ def _anchor(row: AnchorRow) -> list[Text]:
 
 _FIND_S: Final = 5.0
 _PICTURE_S: Final = 3.0
-"""One picture is made after this time: tags and anchors report every second."""
+"""Delay before a single picture: tags and anchors report every second."""
 
 watch_app = App(name="watch", help_epilogue="Example: skyless watch --mqtt mqtts://page@hall.example")
 

@@ -1,4 +1,4 @@
-"""``skyless survey`` at a running site: gather for some seconds, or serve as the site's survey program."""
+"""``skyless survey`` at a running site: gather ranges for some seconds, or serve as the site's survey program."""
 
 import asyncio
 import contextlib
@@ -48,11 +48,11 @@ class LiveOptions(Options, frozen=True, kw_only=True):
 
     @property
     def is_live(self) -> bool:
-        """Whether a running site is to be surveyed."""
+        """Whether to survey a running site."""
         return self.mqtt is not None or self.radio is not None
 
     def check(self) -> None:
-        """See that the options fit one another. Raises SkylessError."""
+        """Check that the options are compatible. Raises SkylessError."""
         if not self.is_live:
             why = "a running site is surveyed by --mqtt or --radio"
             self.leave_out("duration", "serve", "site_id", why=why)
@@ -61,7 +61,7 @@ class LiveOptions(Options, frozen=True, kw_only=True):
 
 
 def gather_live(asked: LiveOptions, known: SurveyOptions) -> "tuple[Site, Callable[[], PairRanges], PairRanger]":
-    """The site, the ranges between its anchors after some seconds, and what makes them. Raises SkylessError."""
+    """Gather ranges for some seconds: the site, its anchors' ranges, and their source. Raises SkylessError."""
     found: list[SurveyNode] = []
     run(_gather(asked, known, found))
     live = found[0].live if found else None
@@ -76,7 +76,7 @@ def gather_live(asked: LiveOptions, known: SurveyOptions) -> "tuple[Site, Callab
 
 
 def serve_live(asked: LiveOptions, known: SurveyOptions) -> None:
-    """Be the survey program of a site until Ctrl-C. Raises SkylessError."""
+    """Run as the survey program of a site until Ctrl-C. Raises SkylessError."""
 
     async def serve() -> None:
         node = await _node(asked, known, serves=True)
@@ -95,7 +95,7 @@ async def _gather(asked: LiveOptions, known: SurveyOptions, found: "list[SurveyN
 
 
 async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "SurveyNode":
-    """Raises SkylessError."""
+    """Create the survey program. Raises SkylessError."""
     from skyless.run.survey.program import SurveyNode, SurveySettings
     from skyless.site.survey.solve import run_survey
 
@@ -104,7 +104,7 @@ async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "S
     site = None if file is None else load_site(file)
     site_id = site.id if asked.site_id is None and site is not None else asked.site_id
     if site is not None:
-        _facts(known, site)  # options that do not fit it are refused before the program serves
+        _facts(known, site)  # refuses options that do not fit the site before the program serves
         if site_id != site.id:
             raise SkylessError(f"--site-id is {site_id}; the site of {known.site} is number {site.id}")
     if site_id is None:

@@ -44,10 +44,10 @@ if TYPE_CHECKING:
     from skyless.core.air.masterless_packets import Point
     from skyless.research.masterless.packet_tags import PacketTagSettings
 
-# Fixes as lines on standard output: for people, as CSV, or as JSON; ``skyless tag`` writes them while it runs.
+# Fixes as lines on standard output: for people, as CSV, or as JSON.
 #
-# A reader that takes lines too slowly must not delay the tags. So a thread writes them; what it cannot keep up with
-# is dropped and counted.
+# A thread writes them, so that a slow reader does not delay the tags; lines that it cannot keep up with are dropped and
+# counted.
 
 CSV_COLUMNS: Final = (
     *("unix_s", "tag", "x_m", "y_m", "z_m", "std_m", "vx_mps", "vy_mps", "vz_mps"),
@@ -56,10 +56,10 @@ CSV_COLUMNS: Final = (
 """Columns of ``--csv``."""
 
 _NO_ALERTS: Final = (None, Alert.NONE, Alert.UNAVAILABLE)
-"""Those that are not shown to people: that there is no protection level is usual after a start."""
+"""Alerts that are not shown to people: having no protection level is usual after a start."""
 
 _MAX_WAITING: Final = 1000
-"""Lines that wait for the reader: twenty tags' for a second."""
+"""Lines that may wait for the reader: those of twenty tags in a second."""
 
 _CLOSE_S: Final = 1.0
 """How long the last lines may take."""
@@ -76,7 +76,7 @@ class LineOptions(Options, frozen=True, kw_only=True):
     """Write one JSON object for each fix on standard output, a line each, as on MQTT."""
 
     def lines(self, log: Log) -> "FixLines | None":
-        """What writes them; None where no lines are asked for. Raises SkylessError."""
+        """The writer of the requested lines; None if none are requested. Raises SkylessError."""
         asked = {"print": self.print, "csv": self.csv, "json": self.json}
         chosen = [name for name, is_asked in asked.items() if is_asked]
         if len(chosen) > 1:
@@ -90,7 +90,7 @@ class LineOptions(Options, frozen=True, kw_only=True):
 
 
 def line_for_people(fix: FixMessage) -> str:
-    """Local time, tag, position in metres, its standard deviation and alert in one line."""
+    """A line of local time, tag, position in metres, its standard deviation, and alert."""
     x_m, y_m, z_m = fix.position_m
     clock = time.strftime("%H:%M:%S", time.localtime(fix.unix_s))
     height = f"z {z_m:.3f} m (given)" if fix.height_known else f"z {z_m:.3f} m"
@@ -100,7 +100,7 @@ def line_for_people(fix: FixMessage) -> str:
 
 
 def csv_row(fix: FixMessage) -> str:
-    """The values of ``CSV_COLUMNS``; empty where there is none, anchors with spaces between."""
+    """The values of ``CSV_COLUMNS``; empty for missing ones, anchors separated by spaces."""
     velocity = (None, None, None) if fix.velocity_mps is None else fix.velocity_mps
     moved = [_figure(value) for value in (*fix.position_m, fix.std_m, *velocity)]
     levels = [_figure(value) for value in (fix.latency_s, fix.hpl_m, fix.vpl_m)]
@@ -122,12 +122,12 @@ class FixLines:
         self._ended = asyncio.Event()
         self._trouble: OSError | None = None
         self.dropped = 0
-        """Lines for which the reader was too slow."""
+        """Lines dropped because the reader was too slow."""
         if header is not None:
             self._waiting.put_nowait(header)
 
     def on_fix(self, fix: FixMessage) -> None:
-        """Write a fix soon, or drop it."""
+        """Queue a fix for writing, or drop it."""
         try:
             self._waiting.put_nowait(self._line(fix))
         except queue.Full:
@@ -137,7 +137,7 @@ class FixLines:
         """Write until cancelled.
 
         Raises:
-            OSError: standard output takes no more; a ``BrokenPipeError`` where its reader is gone.
+            OSError: standard output cannot be written; ``BrokenPipeError`` if its reader is gone.
         """
         loop = asyncio.get_running_loop()
         thread = threading.Thread(target=self._write_all, args=(loop,), daemon=True)
@@ -150,7 +150,7 @@ class FixLines:
             self._close(thread)
 
     def _close(self, thread: threading.Thread) -> None:
-        """Write what waits; leave a reader alone that takes nothing."""
+        """Write the waiting lines, unless the reader is stuck."""
         try:
             self._waiting.put_nowait(None)
         except queue.Full:
@@ -171,9 +171,9 @@ class FixLines:
 
 
 def _standard_output() -> TextIO:
-    """Standard output, flushed with each line.
+    """A duplicate of standard output, flushed with each line.
 
-    It is apart from ``sys.stdout``, which Python flushes at its end: a reader that takes nothing must not delay that.
+    It is separate from ``sys.stdout``, which Python flushes at exit, so that a stuck reader does not delay the exit.
     """
     return os.fdopen(os.dup(sys.stdout.fileno()), "w", 1, sys.stdout.encoding, "backslashreplace")
 
@@ -184,7 +184,7 @@ _OF_BOARDS: Final = (
     *("method", "qa", "dynamics", "tag_height_std", "site_id", "site_key", "trust", "clock_bound_ms"),
     *("integrity_risk", "alert_limit_m", "max_acceleration_mps2"),
 )
-"""Options of the filter, which a board that computes has in its own settings."""
+"""Options of the filter, for which a computing board uses its own settings."""
 
 app = App(name="tag", help_epilogue="Example: skyless tag tag1 --print")
 
@@ -281,7 +281,7 @@ def tag(
 
 
 def _listener(lines: FixLines | None, bridge: TagBridge | None) -> FixListener | None:
-    """Calls all that want fixes; None where nobody does."""
+    """A function that passes a fix to all consumers; None without any."""
     listeners = [part.on_fix for part in (lines, bridge) if part is not None]
 
     def on_fix(fix: FixMessage) -> None:
@@ -298,7 +298,7 @@ def _on_radios(
     on_fix: FixListener | None,
     bridge: TagBridge | None,
 ) -> Coroutine[Any, Any, None]:
-    """Tags that hear beacons."""
+    """Run tags that receive beacons."""
     required = asked.requirement(asked.method, asked.tag_height_std)
     trust = _site_trust(asked)
     settings = TagSettings(
@@ -315,7 +315,7 @@ def _on_radios(
 
 
 def _site_trust(asked: TagOptions) -> SiteTrust | None:
-    """Which beacons and fixes are accepted; None without a public key. Raises SkylessError."""
+    """Rules for accepting beacons and fixes; None without a public key. Raises SkylessError."""
     if asked.site_key is None:
         option = "--clock-bound-ms" if asked.trust is None else f"--trust {asked.trust}"
         if (asked.trust, asked.clock_bound_ms) != (None, None):
@@ -335,7 +335,7 @@ def _on_sniffers(
     on_fix: FixListener | None,
     bridge: TagBridge | None,
 ) -> Coroutine[Any, Any, None]:
-    """Tags that hear the packets of another system."""
+    """Run tags that receive the packets of another system."""
     from skyless.research.masterless.packet_tags import PacketTags
 
     settings = _system(asked)
@@ -362,7 +362,7 @@ def _on_sniffers(
 
 
 def _system(asked: TagOptions) -> "PacketTagSettings":
-    """What sniffers cannot hear, and FiRa boards may not. Raises SkylessError."""
+    """Settings that sniffers, and some FiRa boards, cannot receive from the air. Raises SkylessError."""
     from skyless.core.geometry import GUESSED_STD_M, plane_height_m
     from skyless.research.masterless.packet_tags import TDOA_SITE, PacketTagSettings
     from skyless.site.tables import read_anchors, read_calibration

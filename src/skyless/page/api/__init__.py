@@ -1,1 +1,1 @@
-"""The HTTP interface, version 1 (``docs/http.md``): ``routes.ROUTES`` lists all that programs can ask for."""
+"""The HTTP interface, version 1 (``docs/http.md``): ``routes.ROUTES`` lists everything that programs can request."""

@@ -1,4 +1,4 @@
-"""What requests and answers of the HTTP interface consist of: parameters, structs, and the OpenAPI document."""
+"""Requests and answers of the HTTP interface: parameters, structs, and the OpenAPI document."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ class SiteAnswer(SiteMessage, frozen=True, kw_only=True):
     connected: bool
     """Whether the page's server is connected to the broker."""
     history: bool
-    """Whether it has a history."""
+    """Whether the page's server has a history."""
     version: str
 
 
@@ -46,18 +46,18 @@ class Anchor(Struct, frozen=True):
     id: int
     position_m: Vector
     online: bool | None
-    """None where it has not reported."""
+    """None if the anchor has not reported."""
 
 
 class Tag(Asset, frozen=True, kw_only=True):
     """One tag, with its asset."""
 
     online: bool | None
-    """None where it has not reported."""
+    """None if the tag has not reported."""
     zones: tuple[str, ...]
-    """Identifiers of the zones that it is in."""
+    """Identifiers of the zones that contain the tag."""
     fix: FixMessage | None
-    """None where it has had no usable one within five seconds."""
+    """None without a usable fix within five seconds."""
 
 
 class TagsAnswer(Struct, frozen=True):
@@ -65,7 +65,7 @@ class TagsAnswer(Struct, frozen=True):
 
     tags: tuple[Tag, ...]
     next: str | None
-    """What to ask for ``after``; None where these are the last."""
+    """Value of ``after`` for the next page; None for the last page."""
 
 
 class ZoneTags(Zone, frozen=True, kw_only=True):
@@ -79,25 +79,25 @@ class EventsAnswer(Struct, frozen=True):
 
     events: tuple[SiteEvent, ...]
     before: int | None
-    """What to ask for ``before``; None where these are the oldest."""
+    """Value of ``before`` for the next page; None for the last page."""
 
 
 class AlarmRulesAnswer(AlarmRulesMessage, frozen=True, kw_only=True):
     """The rules of alarms."""
 
     file_rules: tuple[AlarmRule, ...]
-    """Those of the site's file."""
+    """Rules of the site's file."""
 
 
 class Acknowledgement(Struct, frozen=True):
     """Somebody has seen an alarm."""
 
     id: _Text
-    """Of the occurrence that was seen."""
+    """Identifier of the occurrence that was seen."""
     by: _Text
 
 
-# The parameters of requests: a type for each, which checks and describes it; signatures of functions name them.
+# Parameters of requests: types that check and describe them, for the signatures of functions.
 
 _Query = TypeVar("_Query", bound=Struct)
 _KEY: Final = re.compile(r"`\$\.([^`.\[]+)`")
@@ -127,7 +127,7 @@ RENAMED: Final = {"begin": "from", "end": "to"}
 
 
 class SiteQuery(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What every route takes."""
+    """Parameters of every route."""
 
     site: (
         Annotated[int, Meta(ge=0, le=65_535, description="The site's number; by default one that is alive.")]
@@ -136,12 +136,12 @@ class SiteQuery(Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     @property
     def site_text(self) -> str | None:
-        """The number as it was asked for."""
+        """The requested number as text."""
         return None if self.site is UNSET else str(self.site)
 
 
 class MapQuery(SiteQuery, frozen=True, kw_only=True):
-    """What routes take whose answer a map can show."""
+    """Parameters of routes whose answer a map can show."""
 
     format: Annotated[
         Literal["json", "geojson"], Meta(description="geojson: WGS 84; status 409 where the site is not georeferenced.")
@@ -149,14 +149,14 @@ class MapQuery(SiteQuery, frozen=True, kw_only=True):
 
 
 def read_query(given: Mapping[str, str], kind: type[_Query]) -> _Query:
-    """The parameters of a request. Raises HTTPException, which names key, value and what would be right."""
+    """Parse the parameters of a request. Raises HTTPException, which names key, value and what would be right."""
     values = {key: value for key, value in given.items() if key != "token"}
     schema = parameters_schema(kind)
     try:
         return msgspec.convert(values, kind, strict=False)
     except msgspec.ValidationError as error:
         found = _KEY.search(str(error))
-        if found is None:  # one that is unknown or missing
+        if found is None:  # an unknown or missing parameter
             raise HTTPException(400, f"{error}; the parameters here are {', '.join(schema)}") from None
         key = found[1]
         shown = values[key] if len(values[key]) <= _MAX_SHOWN else values[key][: _MAX_SHOWN - 1] + "…"
@@ -165,7 +165,7 @@ def read_query(given: Mapping[str, str], kind: type[_Query]) -> _Query:
 
 @cache
 def parameters_schema(kind: type[Struct]) -> dict[str, dict[str, Any]]:
-    """JSON schemas of a struct's fields by the names of the parameters."""
+    """JSON schemas of a struct's fields, by parameter name."""
     _, components = msgspec.json.schema_components([kind])
     properties: dict[str, dict[str, Any]] = components[kind.__name__]["properties"]
     return properties
@@ -182,7 +182,7 @@ def _expected(schema: dict[str, Any]) -> str:
 
 
 def names(text: str) -> tuple[str, ...]:
-    """Names that are separated by commas."""
+    """Split names separated by commas."""
     return tuple(name.strip() for name in text.split(",") if name.strip())
 
 
@@ -197,7 +197,7 @@ _NOTES: Final = (
 
 
 def document(routes: "Sequence[ApiRoute]") -> dict[str, Any]:
-    """The document; its schemas are those of the structs."""
+    """The OpenAPI document, with the schemas of the structs."""
     kinds = [ErrorAnswer, *(kind for route in routes for kind in (route.answer, route.body) if _is_struct(kind))]
     _, components = msgspec.json.schema_components(kinds, ref_template="#/components/schemas/{name}")
     paths: dict[str, dict[str, Any]] = {}
@@ -262,7 +262,7 @@ def _is_struct(kind: type | None) -> bool:
 
 
 def _plain(schema: object) -> object:
-    """The same schema without ``prefixItems`` where all are equal: generators of clients do not know them."""
+    """Replace ``prefixItems`` that are all equal by ``items``, as client generators do not support them."""
     if isinstance(schema, list):
         return [_plain(part) for part in schema]
     if not isinstance(schema, dict):

@@ -1,4 +1,4 @@
-"""The questions of the HTTP interface: the site as it is now, its map as GeoJSON, and its history."""
+"""Answers of the HTTP interface: the site's current state, its map as GeoJSON, and its history."""
 
 import asyncio
 import time
@@ -148,7 +148,7 @@ def fixes(live: LiveSite) -> tuple[FixMessage, ...]:
 
 
 def usable(given: Iterable[tuple[FixMessage, float]]) -> list[FixMessage]:
-    """Those of fixes that may be used, with the time by the server's clock, which is given with each."""
+    """Select usable fixes, with their times replaced by those of the server's clock, which are given with them."""
     return [replace(fix, unix_s=round(ended_unix_s, 4)) for fix, ended_unix_s in given if is_usable(fix)]
 
 
@@ -204,7 +204,7 @@ def put_alarm_rules(live: LiveSite, *, body: AlarmRulesMessage) -> AlarmRulesAns
     """Replace the rules that were made on the page."""
     live.require_site()
     live.alarms.store_rules(body.rules, body.site)
-    return replace(alarm_rules(live), rules=body.rules)  # they hold from the next tick on
+    return replace(alarm_rules(live), rules=body.rules)  # in effect from the next tick on
 
 
 async def acknowledge(live: LiveSite, *, rule: RuleId, subject: Subject, body: Acknowledgement) -> Acknowledgement:
@@ -219,9 +219,9 @@ async def acknowledge(live: LiveSite, *, rule: RuleId, subject: Subject, body: A
     return body
 
 
-# Questions to the history: a process of its own answers them one after the other.
+# Questions to the history: a separate process answers them one after the other.
 #
-# So a long one takes neither memory nor time from the server, which raises alarms as well, and can be ended.
+# A long one thus takes neither memory nor time from the server, which also raises alarms, and can be ended.
 
 
 class _Question(Struct, frozen=True):
@@ -235,13 +235,13 @@ class Past:
     """The history of the sites that the server shows."""
 
     def __init__(self, folder: Path | None) -> None:
-        """Without a folder there is none."""
+        """``folder``: of the history; None without one."""
         self._folder = folder
         self._process = TaskProcess("skyless.page.api.questions", fault=400)
         self._waiting = 0
 
     async def ask(self, site: int | None, name: str, given: dict[str, Any]) -> bytes:
-        """The answer of a site's history to a function of this file, as JSON. Raises HTTPException."""
+        """Answer a question to a site's history by a function of this file, as JSON. Raises HTTPException."""
         if self._folder is None:
             raise HTTPException(404, "this server has no history: start the page's server with --history FOLDER")
         if site is None:
@@ -261,7 +261,7 @@ class Past:
             self._waiting -= 1
 
     def stop(self) -> None:
-        """End the question at hand, and begin no further one."""
+        """End the current question, and start no further one."""
         self._process.stop()
 
 
@@ -313,7 +313,7 @@ def past_alarms(history: "History", *, begin: Begin, end: End = "") -> tuple[Ala
 
 
 def _answer(question: _Question) -> object:
-    """What the process answers; a tuple as an object with one key. Raises SkylessError."""
+    """Answer a question in the process; a tuple becomes an object with one key. Raises SkylessError."""
     from skyless.run.history.queries import History  # noqa: PLC0415 - of the extra history
 
     functions = (past_tags, track, heatmap, dwell, occupancy, contacts, past_alarms)
@@ -330,7 +330,7 @@ if __name__ == "__main__":
 
 
 def collection(live: LiveSite, kind: str) -> Response:
-    """The tags with fixes, the anchors or the zones: longitude, latitude (WGS 84), height above the ellipsoid.
+    """Tags with fixes, anchors or zones as GeoJSON: longitude, latitude (WGS 84), height above the ellipsoid.
 
     Raises:
         HTTPException: no site is known yet, or it is not georeferenced.
@@ -345,7 +345,7 @@ def collection(live: LiveSite, kind: str) -> Response:
 
 
 def _fixes(live: LiveSite, origin: GeoreferenceSite) -> Iterator[dict[str, Any]]:
-    """Points of those whose use no alert forbids."""
+    """Points of the fixes that no alert makes unusable."""
     for fix, ended_unix_s in live.recent_fixes():
         if not is_usable(fix):
             continue

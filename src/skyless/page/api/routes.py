@@ -36,24 +36,23 @@ from skyless.run.assets import MAX_BYTES
 from skyless.run.mqtt.messages import AlarmMessage
 from skyless.run.web import PAGE as LIMITS
 
-# The stream of a site over a WebSocket: the newest fix of each tag, and what happens (``docs/http.md``).
+# The stream of a site over a WebSocket: the newest fix of each tag, and events (``docs/http.md``).
 #
-# Each stream looks at the site ten times a second and keeps no queue: after a pause, its reader gets the newest
-# state.
+# Each stream polls the site ten times a second and keeps no queue: after a pause, its reader gets the newest state.
 
 PERIOD_S: Final = 0.1
-_PAUSES: Final = 9.0  # of very many tags a stream is sent less often, so that it takes a tenth of a processor at most
+_PAUSES: Final = 9.0  # with very many tags a stream is sent less often, to use at most a tenth of a processor
 _MAX_REASON_BYTES: Final = 120  # of the 123 that the protocol allows
 
 
 class StreamQuery(SiteQuery, frozen=True):
-    """Which tags a stream is about."""
+    """Parameters of a stream."""
 
     tags: TagNames = ""
 
 
 class SiteStream:
-    """What one reader has been sent."""
+    """Messages to one reader, which contain only what it has not been sent yet."""
 
     def __init__(self, live: LiveSite, tags: frozenset[str]) -> None:
         """An empty set of tags means all."""
@@ -70,7 +69,7 @@ class SiteStream:
         return msgspec.json.encode({"type": "hello", **fields})
 
     def new(self) -> list[bytes]:
-        """What is new to the reader."""
+        """Messages with everything that is new to the reader."""
         return [*self._new_fixes(), *self._new_zone_events(), *self._new_alarms()]
 
     def _carries(self, *tags: str) -> bool:
@@ -105,7 +104,7 @@ def _message(kind: str, value: Struct, **more: object) -> bytes:
 
 
 def endpoint(sites: Sites) -> Callable[[WebSocket], Awaitable[None]]:
-    """The WebSocket's handler."""
+    """Create the WebSocket's handler."""
     open_streams: set[WebSocket] = set()
 
     async def serve(socket: WebSocket) -> None:
@@ -144,7 +143,7 @@ MAX_BODY_BYTES: Final = 2 * MAX_BYTES
 
 
 class ApiRoute:
-    """One thing that programs can ask for.
+    """One route of the HTTP interface.
 
     Keyword-only arguments of its function are the parameters, ``body`` is the body, and the docstring is the summary.
     A tuple is answered as an object with one key, the last part of the path.
@@ -159,14 +158,14 @@ class ApiRoute:
         *,
         is_map: bool = False,
     ) -> None:
-        """``path`` is below ``ROOT``; ``media_type`` is that of bytes."""
+        """``path``: below ``ROOT``; ``media_type``: of an answer that is bytes."""
         self.method, self.path, self.is_map, self.function = method, path, is_map, answer
         self.is_past = path.startswith("/history/")
         self.key = path.rsplit("/", 1)[-1]
         self.summary = (answer.__doc__ or "").rstrip(".")
         self.media_types = (JSON, GEOJSON) if is_map else (media_type,)
         self.role: Final = "reader" if method == "GET" else "operator"
-        """Whose token is needed where the server has tokens."""
+        """Role whose token is needed if the server has tokens."""
         signature = inspect.signature(answer)
         given = {name: one for name, one in signature.parameters.items() if one.kind is one.KEYWORD_ONLY}
         self.body: type | None = given.pop("body").annotation if "body" in given else None
@@ -212,7 +211,7 @@ ROUTES: Final = (
 
 
 def api_routes(sites: Sites, history: Past) -> list[BaseRoute]:
-    """The routes of the server."""
+    """Create the server's routes of the interface."""
     whole = document(ROUTES)
 
     async def openapi(_request: Request) -> Response:
@@ -246,7 +245,7 @@ def _endpoint(route: ApiRoute, sites: Sites, history: Past) -> Callable[[Request
 
 
 async def read_bytes(request: Request, most_bytes: int, fault: str = "") -> bytes:
-    """The request's body. One that is too long is answered with status 413 and the given words."""
+    """Read the request's body; if it is too long, answer with status 413 and ``fault``."""
     body = bytearray()
     try:
         async for chunk in request.stream():

@@ -1,4 +1,4 @@
-"""How a site is: what its messages show, and the reasons why its page is green, amber or red.
+"""The condition of a site: evidence from its messages, and the reasons why its page is green, amber or red.
 
 Public: evidence, monitor.
 """

@@ -1,4 +1,4 @@
-"""What can be wrong with a live site: each function looks for one cause and gives its reason. No I/O."""
+"""Faults of a live site: each function checks for one cause and gives its reason. No I/O."""
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence, Sized
@@ -21,37 +21,37 @@ MISSED_SHARE: Final = 0.1
 """Share of transmissions missed in a second. A computer with little to do misses 1 to 4 % in most seconds."""
 
 EMULATED_MISSED_SHARE: Final = 0.3
-"""The same where the air is emulated: what it misses is lost as frames are on a real air, which costs little."""
+"""The same for an emulated air, where missed transmissions are like lost frames on a real one, and matter little."""
 
 DROPPED_SHARE: Final = 0.02
 """Share of receptions dropped by a tag. On an idle computer it is 0."""
 
 VERY_SLOW_SHARE: Final = 0.5
-"""Share of either."""
+"""Share of missed or dropped frames that is bad."""
 
 BUSY_SHARE: Final = 0.95
-"""Share of processor time in use. Above it each program waits for others, and positions may come late."""
+"""Share of processor time in use above which programs wait for each other, and positions may be late."""
 
 LAG_S: Final = 0.25
 """Delay of the page's server itself that counts as too slow."""
 
 MULTIPATH_RATIO: Final = 1.3
-"""Multipath that exceeds what the site file states by less is within what a tag can learn."""
+"""Multipath above the site file's value by less than this factor is within what a tag can learn."""
 
 START_S: Final = 20.0
-"""Where no anchor has been online yet, all of them may be offline for this long: the site is being started."""
+"""All anchors may be offline for this long if none has been online yet, as the site is starting."""
 
 OFTEN: Final = 3
 OFTEN_S: Final = 60.0
-"""A master that changes this often within this time changes too often."""
+"""Changes of the master within this time that are too many."""
 
 WATCH_AGE_S: Final = 60.0
 """A watch that has not reported for longer is not running."""
 
 UNREAD_S: Final = 0.5
-"""Messages that have waited unread at the page's server for this long show that it does not keep up."""
+"""The page's server does not keep up if messages have waited unread for this long."""
 
-_MIN_ANCHORS: Final = 3  # fewer on the air give no position
+_MIN_ANCHORS: Final = 3  # with fewer on the air there is no position
 _MIN_DROPPED: Final = 3
 _MAX_NAMED: Final = 6
 
@@ -92,10 +92,10 @@ _NOT_ACCEPTED: Final[Mapping[str, str]] = {
     Fault.EARLY: "come too early: a clock is wrong, or they are forged",
 }
 _FORGED: Final[frozenset[str]] = frozenset({Fault.BAD_CODE, Fault.REPEATED, Fault.NO_CODE})
-"""Where tags do not verify beacons, these may be in their positions."""
+"""Faults of beacons that may affect positions of tags that do not verify them."""
 
 _Statements = dict[str, dict[tuple[str, str], str]]
-"""By anchor: the fault that each node, by kind and name, states of its beacons."""
+"""By anchor: the fault of its beacons that each node, by kind and name, states."""
 
 _Severity = Literal["warning", "bad"]
 
@@ -111,7 +111,7 @@ class Reason(Struct, frozen=True):
     advice: str
     """What to do next."""
     names: tuple[str, ...] = ()
-    """The tags or anchors concerned, as ``tag/t1`` or ``anchor/3``; of many only the first."""
+    """The tags or anchors concerned, as ``tag/t1`` or ``anchor/3``; if many, only the first."""
 
 
 def _of(what: str, kind: str, level: _Severity, text: str, advice: str, names: Iterable[str]) -> Reason:
@@ -120,7 +120,7 @@ def _of(what: str, kind: str, level: _Severity, text: str, advice: str, names: I
 
 
 def broker_reason(hub_trouble: str | None) -> Reason:
-    """Nothing else can be known then."""
+    """Reason for a disconnected broker, or hub, in which case nothing else is known."""
     if hub_trouble is not None:
         return Reason("broker", "bad", f"{hub_trouble}; nothing is updated", "The page connects by itself.")
     advice = "Start the broker again, or see whether its computer is reachable; the page connects by itself."
@@ -128,7 +128,7 @@ def broker_reason(hub_trouble: str | None) -> Reason:
 
 
 def refused_reason(topic_filters: Collection[str]) -> Reason | None:
-    """The broker refuses subscriptions, so that a part of what the site says is missing."""
+    """The broker refuses subscriptions, so that some messages of the site are missing."""
     if not topic_filters:
         return None
     named = ", ".join(sorted(topic_filters)[:_MAX_NAMED])
@@ -138,7 +138,7 @@ def refused_reason(topic_filters: Collection[str]) -> Reason | None:
 
 
 def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> Reason | None:
-    """Positions arrive late. ``ages`` are those of ``FixAges.least_ages_s``."""
+    """Positions arrive late. ``ages``: from ``FixAges.least_ages_s``."""
     late = sorted(name for name, (age_s, _) in ages.items() if age_s > LATE_S + _key_wait_s(evidence, name))
     if not late:
         return None
@@ -165,7 +165,7 @@ def _key_wait_s(evidence: Evidence, tag: str) -> float:
 
 
 def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None:
-    """Computers do not keep up: one reason for all signs of it. ``lag_s`` is the delay of the page's server."""
+    """Computers do not keep up: one reason for all signs. ``lag_s``: delay of the page's server."""
     signs = [*_missed(evidence, now_s), *_dropped(evidence, now_s)]
     if lag_s > LAG_S:
         signs.insert(0, (evidence.host, 0.0, f"the page's server was delayed by {lag_s:.1f} s"))
@@ -181,7 +181,7 @@ def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None
 
 
 def behind_reason(ages: Mapping[str, tuple[float, float]], unread_s: float) -> Reason | None:
-    """The page's server does not keep up with the messages, which wait in its own queue for ``unread_s``."""
+    """The page's server does not keep up with messages, which have waited in its queue for ``unread_s``."""
     if unread_s < UNREAD_S:
         return None
     age_s = max((age_s for age_s, _ in ages.values()), default=0.0)
@@ -191,7 +191,7 @@ def behind_reason(ages: Mapping[str, tuple[float, float]], unread_s: float) -> R
 
 
 def left_out_reason(evidence: Evidence, now_s: float) -> Reason | None:
-    """Tags or anchors beyond the number that is taken in."""
+    """Tags or anchors are not shown, as there are too many."""
     counts = {kind: evidence.roster.left_out(kind, now_s) for kind in MAX_NAMES}
     words = [f"{count} {kind}{'s' if count > 1 else ''}" for kind, count in counts.items() if count]
     if not words:
@@ -205,23 +205,23 @@ def left_out_reason(evidence: Evidence, now_s: float) -> Reason | None:
 
 
 def busy_reason(evidence: Evidence, used_share: float | None) -> Reason | None:
-    """All processors of the page's computer are in use, by any program. An emulated air says itself what it misses."""
+    """All processors of the page's computer are in use, by any program. An emulated air reports its own misses."""
     if used_share is None or used_share < BUSY_SHARE or _airs(evidence):
         return None
     text = f"{evidence.computer(evidence.host)} is fully busy: {100.0 * used_share:.0f} % of its processors are in use"
     return Reason("busy", "warning", text, "End other programs there, or positions may come late or not at all.")
 
 
-_Sign = tuple[str, float, str]  # computer, share of what was lost, and words
+_Sign = tuple[str, float, str]  # computer, lost share, and words
 
 
 def _airs(evidence: Evidence) -> list[Node]:
-    """Emulated airs that run."""
+    """Running emulated airs."""
     return [air for _, air in evidence.of("ether") if air.online is not False]
 
 
 def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
-    """Transmissions of the emulated air, and of anchors."""
+    """Missed transmissions of the emulated air, and of anchors."""
     airs = _airs(evidence)
     most = EMULATED_MISSED_SHARE if airs else MISSED_SHARE
     for air in airs:
@@ -239,7 +239,7 @@ def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
 
 
 def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
-    """Receptions and fixes that tags dropped between their last two health messages, as they were too old."""
+    """Receptions and fixes that tags dropped as too old between their last two health messages."""
     found: dict[str, list[tuple[str, int, float]]] = {}
     for name, tag in evidence.of("tag"):
         now, before = tag.health, tag.previous
@@ -256,7 +256,7 @@ def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
 
 
 def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
-    """Tags that are online and have no fix, with what they give as the cause, or without any word."""
+    """Tags are online without a fix, with the cause that they state, or without a report."""
     online = [(name, tag) for name, tag in evidence.of("tag") if tag.online]
     without = [(n, tag) for n, tag in online if not tag.has_fix(now_s) and not evidence.in_grace(now_s, tag)]
     missed = evidence.missed(now_s)
@@ -284,7 +284,7 @@ def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
 
 
 def _causes(causes: Mapping[str, str], tags: int) -> tuple[str, str]:
-    """Why ``tags`` tags have no fix, with names where it is not the same for all, and what to do for most of them."""
+    """Why ``tags`` tags have no fix, with names unless all share one cause, and advice for most of them."""
     groups = [(cause, names) for cause, names in alike(causes) if cause]
     words = [cause.replace("-", " ") for cause, _ in groups]
     common, most = groups[0] if groups else ("", [])
@@ -296,7 +296,7 @@ def _causes(causes: Mapping[str, str], tags: int) -> tuple[str, str]:
 
 
 def alike(values: Mapping[str, str]) -> list[tuple[str, list[str]]]:
-    """Each value with the names that have it, the most common first."""
+    """Group names by value, the most common value first."""
     return [
         (value, [name for name, of_name in values.items() if of_name == value])
         for value, _ in Counter(values.values()).most_common()
@@ -307,11 +307,11 @@ _ALERT_REASONS: Final[tuple[tuple[str, int, _Severity, str], ...]] = (
     ("limit", 2, "bad", "Do not rely on the position; see which anchors the tag uses and what blocks them."),
     ("alert", 1, "warning", "The position is still sound; see what blocks an anchor, or whether one has moved."),
 )
-"""Kind of the reason, what the alerts count in ``ALERTS``, level and advice."""
+"""Kind of the reason, the alerts' grade in ``ALERTS``, level and advice."""
 
 
 def alert_reasons(evidence: Evidence) -> Iterable[Reason]:
-    """Alerts of integrity in the fixes since the last evaluation."""
+    """Fixes since the last evaluation have integrity alerts."""
     for kind, grade, level, advice in _ALERT_REASONS:
         alerts = {name: alert for name, alert in evidence.alerts.items() if ALERTS[alert] == grade}
         if alerts:
@@ -320,7 +320,7 @@ def alert_reasons(evidence: Evidence) -> Iterable[Reason]:
 
 
 def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
-    """Anchors of the site that are offline, only cut off from the broker, or not synchronised."""
+    """Anchors of the site are offline, only cut off from the broker, or not synchronised."""
     if evidence.site is None:
         return
     names = evidence.site_anchors()
@@ -343,7 +343,7 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
 
 
 def offline_anchors(evidence: Evidence, now_s: float) -> list[str] | None:
-    """Anchors of the site that are offline, or None while nothing can be known of them yet."""
+    """Anchors of the site that are offline; None while it is too early to tell."""
     return None if evidence.site is None or evidence.in_grace(now_s) else _anchors(evidence, now_s)[0]
 
 
@@ -374,7 +374,7 @@ def _is_idle(health: AnchorHealth) -> bool:
 
 
 def multipath_reason(evidence: Evidence, now_s: float) -> Reason | None:
-    """Ranges change more with the tag's way than the site file states."""
+    """Ranges change more along a tag's path than the site file states."""
     site = evidence.site
     stated_m = 0.0 if site is None else site.accuracy.place_std_m
     found = {
@@ -408,7 +408,7 @@ def master_reason(evidence: Evidence, now_s: float) -> Reason | None:
 
 
 def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[Reason]:
-    """What the watch of the anchors has found."""
+    """The watch of the anchors has findings."""
     ended = (age_s or 0.0) > WATCH_AGE_S
     findings = () if watch is None else watch.findings
     moved = [finding for finding in findings if finding.kind == "moved"]
@@ -423,11 +423,11 @@ def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[R
         yield _of("anchor", kind, "bad" if kind == "moved" and not ended else "warning", text, advice, names)
 
 
-# Codes and keys: nothing is found at a site without keys and of tags without its public key
+# Codes and keys: no reasons at a site without keys, or for tags without its public key
 
 
 def authentication_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
-    """All that is found."""
+    """All reasons about codes and keys."""
     tags = {
         name: node.health
         for name, node in evidence.of("tag")
@@ -452,12 +452,12 @@ def _has_keys(health: AnchorHealth) -> bool:
 
 
 def _left_s(health: AnchorHealth) -> float:
-    """Until its last key chain ends, by its own clock."""
+    """Time until the end of an anchor's last key chain, by its own clock."""
     return float("inf") if health.chain_ends_unix_s is None else health.chain_ends_unix_s - health.unix_s
 
 
 def _clock(tags: Mapping[str, TagHealth]) -> Iterable[Reason]:
-    """Clocks of tags that differ from the site's by more than the tags' bounds."""
+    """Clocks of tags differ from the site's by more than the tags' bounds."""
     errors_s = {name: health.clock_error_s for name, health in tags.items() if health.clock_error_s is not None}
     if not errors_s:
         return
@@ -473,7 +473,7 @@ def _clock(tags: Mapping[str, TagHealth]) -> Iterable[Reason]:
 
 
 def _not_verified(evidence: Evidence, tags: Mapping[str, TagHealth], now_s: float) -> Iterable[Reason]:
-    """Tags that receive beacons none of which is verified. Where their clock is wrong, that is another reason."""
+    """Tags receive beacons but verify none, apart from tags with a wrong clock, which is another reason."""
     found = {
         name: health
         for name, health in tags.items()
@@ -492,7 +492,7 @@ def _not_verified(evidence: Evidence, tags: Mapping[str, TagHealth], now_s: floa
 
 
 def _receives(tag: Node, now_s: float) -> bool:
-    """Whether a tag that has not just started has received beacons between its last two messages."""
+    """Whether a tag that has not just started received beacons between its last two health messages."""
     now, before = tag.health, tag.previous
     if not isinstance(now, TagHealth) or not isinstance(before, TagHealth) or tag.since_s is None:
         return False
@@ -500,7 +500,7 @@ def _receives(tag: Node, now_s: float) -> bool:
 
 
 def _chains(keyed: Mapping[str, AnchorHealth]) -> Iterable[Reason]:
-    """Key chains that have ended or end soon."""
+    """Key chains have ended or end soon."""
     advice = "Make a successor with skyless site keys rotate, and give the anchors its files."
     ended = [name for name, health in keyed.items() if _left_s(health) <= 0.0]
     if ended:
@@ -521,7 +521,7 @@ def _all_or_some(names: list[str], keyed: Mapping[str, AnchorHealth]) -> str:
 
 
 def _codes(evidence: Evidence, keyed: Mapping[str, AnchorHealth], now_s: float) -> Iterable[Reason]:
-    """Anchors with keys that send without codes, and why."""
+    """Anchors with keys send without codes."""
     without = {
         name: health.code_fault
         for name, health in keyed.items()
@@ -542,7 +542,7 @@ def _codes(evidence: Evidence, keyed: Mapping[str, AnchorHealth], now_s: float) 
 def _keys(
     evidence: Evidence, keyed: Mapping[str, AnchorHealth], anchors: Mapping[str, AnchorHealth], now_s: float
 ) -> Iterable[Reason]:
-    """Anchors without keys among others that have them."""
+    """Anchors have no keys although others have them."""
     without = [
         name for name in anchors if name not in keyed and not evidence.in_grace(now_s, evidence.nodes["anchor", name])
     ]
@@ -556,7 +556,7 @@ def _keys(
 def _forged(
     evidence: Evidence, tags: Mapping[str, TagHealth], anchors: Mapping[str, AnchorHealth], now_s: float
 ) -> Iterable[Reason]:
-    """Anchors whose beacons, or beacons in whose name, tags and other anchors do not accept."""
+    """Tags and other anchors do not accept beacons of anchors, or in their name."""
     statements = _that_count(_statements(evidence, tags, anchors, now_s))
     if not statements:
         return
@@ -584,7 +584,7 @@ def _forged(
 def _statements(
     evidence: Evidence, tags: Mapping[str, TagHealth], anchors: Mapping[str, AnchorHealth], now_s: float
 ) -> _Statements:
-    """What nodes state of anchors, apart from what other reasons explain: a wrong clock, and anchors without codes."""
+    """Faults of anchors that nodes state, except those that other reasons explain: a wrong clock or missing codes."""
     found: _Statements = {}
 
     def add(node: tuple[str, str], faults: Mapping[str, str], *, is_clock_wrong: bool) -> None:
@@ -611,7 +611,7 @@ def _may_be_without_codes(evidence: Evidence, anchor: str, now_s: float) -> bool
 
 
 def _that_count(statements: _Statements) -> _Statements:
-    """Without statements by an anchor that more nodes fault: one with a wrong seed finds faults everywhere."""
+    """Drop statements by an anchor that more nodes fault: one with a wrong seed finds faults everywhere."""
 
     def count(node: tuple[str, str]) -> int:
         return len(statements.get(node[1], ())) if node[0] == "anchor" else 0
@@ -623,7 +623,7 @@ def _that_count(statements: _Statements) -> _Statements:
 
 
 def _finders(nodes: Iterable[tuple[str, str]]) -> str:
-    """``2 tags and anchor 3``."""
+    """Name nodes as in ``2 tags and anchor 3``."""
     by_kind: dict[str, list[str]] = {}
     for kind, name in nodes:
         by_kind.setdefault(kind, []).append(name)
@@ -638,16 +638,16 @@ _ORDER: Final = (
     *("moved", "anchors", "master", "no-fix", "alert", "keys", "not-synchronised", "silent-anchors", "silent", "watch"),
     *("multipath", "chain"),
 )
-"""Causes before their effects."""
+"""Kinds of reasons, causes before their effects."""
 
 
 def rank(reason: Reason) -> tuple[bool, int]:
-    """The key by which reasons are sorted, the worst first."""
+    """Sort key of reasons, the worst first."""
     return reason.level != "bad", _ORDER.index(reason.kind) if reason.kind in _ORDER else len(_ORDER)
 
 
 def listed(kind: str, names: Sequence[str]) -> str:
-    """``anchors 3, 5 and 8``, or only the first of many."""
+    """List names as in ``anchors 3, 5 and 8``; only the first of many."""
     if len(names) == 1:
         return f"{kind} {names[0]}"
     if len(names) > _MAX_NAMED:
@@ -656,7 +656,7 @@ def listed(kind: str, names: Sequence[str]) -> str:
 
 
 def counted(kind: str, names: Sequence[str]) -> str:
-    """``anchor 3``, or ``5 anchors``."""
+    """Name one item or count several: ``anchor 3``, ``5 anchors``."""
     return f"{kind} {names[0]}" if len(names) == 1 else f"{len(names)} {kind}s"
 
 

@@ -1,6 +1,6 @@
-"""What is known of the live site's programs, and since when: the evidence of its condition. No I/O.
+"""Evidence of a live site's condition: the state of its programs, with times. No I/O.
 
-``now_s`` is the page server's monotonic clock everywhere, ``unix_s`` its clock of the day.
+``now_s`` is always the page server's monotonic clock, ``unix_s`` its wall clock.
 """
 
 from collections import deque
@@ -19,7 +19,7 @@ GRACE_S: Final = 5.0
 """A tag that has just started may be without a fix for this long, and an anchor without a report."""
 
 ALERTS: Final[dict[str | None, int]] = {"detected-excluded": 1, "detected-not-excluded": 2, "alert-limit-exceeded": 2}
-"""Integrity alerts that are reported: 1 where the position is still sound, 2 where it may be wrong."""
+"""Grades of reported integrity alerts: 1 if the position is still sound, 2 if it may be wrong."""
 
 ALERT_WORDS: Final = {
     "detected-excluded": "a faulty anchor is excluded",
@@ -28,36 +28,36 @@ ALERT_WORDS: Final = {
 }
 
 EXPECTED_S: Final = 600.0
-"""A tag that is known from batches alone, so without a status, is missed for this long after its last fix."""
+"""A tag known only from batches, and so without a status, is expected for this long after its last fix."""
 
 _MESSAGES_S: Final = 3.0
-"""A fix in a batch follows the message of the same fix, if there is one, within this time."""
+"""Longest delay of a fix in a batch after the message of the same fix."""
 
 MAX_NAMES: Final = {"tag": 200_000, "anchor": 20_000}
-"""Names of a kind that are taken in."""
+"""Most names admitted of each kind."""
 
 MAX_OTHERS: Final = 2_000
-"""Names of all other kinds together."""
+"""Most names admitted of all other kinds together."""
 
 _COUNT_S: Final = 10.0
-"""Names that were not taken in are counted again after this time, so that the count falls when they end."""
+"""Interval at which refused names are counted anew, so that the count falls when they end."""
 
 _WINDOW_S: Final = 60.0
-_HEALTH_AGE_S: Final = 2.5  # the delay of a health message holds for this long
+_HEALTH_AGE_S: Final = 2.5  # how long the delay of a health message is valid
 
 _RECENT_S: Final = 10.0
-"""Percentiles are of the ages of this time, so that they are steady where tags have a fix a second."""
+"""Period of the ages in the percentiles, long enough for tags with one fix per second."""
 
-_MAX_AGES: Final = 4096  # of more fixes the newest count
+_MAX_AGES: Final = 4096  # of the newest fixes
 
 _LEADER_AGE_S: Final = 3.5  # an anchor whose health is older does not count
 _MAX_CHANGES: Final = 100
 
 USE_WINDOW_S: Final = 2.0
-"""Time over which the use is averaged."""
+"""Time over which processor use is averaged."""
 
 _IDLE, _IO_WAIT = 3, 4
-"""Columns of the first line of ``/proc/stat`` that count time in which a processor had nothing to do."""
+"""Columns of idle time in the first line of ``/proc/stat``."""
 
 
 class Node:
@@ -69,61 +69,61 @@ class Node:
 
     def __init__(self) -> None:
         self.online: bool | None = None  # by its status; None without one
-        self.host = ""  # name of its computer; empty where it is not known
+        self.host = ""  # name of its computer; empty if unknown
         self.health: Health | None = None
         self.previous: Health | None = None  # the health before
-        self.since_s: float | None = None  # when it came online, or its first message came
-        self.health_s = float("-inf")  # when the last health came
-        self.fix_s = float("-inf")  # when the last fix came, as a message or in a batch
-        self.batched_s = float("-inf")  # when the last one came in a batch
-        self.used_s = float("-inf")  # when the last fix came that used it as an anchor
-        self.codes_s: float | None = None  # since when it states that its beacons have codes
+        self.since_s: float | None = None  # time when it came online, or of its first message
+        self.health_s = float("-inf")  # time of the last health message
+        self.fix_s = float("-inf")  # time of the last fix, as a message or in a batch
+        self.batched_s = float("-inf")  # time of the last fix in a batch
+        self.used_s = float("-inf")  # time of the last fix that used this anchor
+        self.codes_s: float | None = None  # time since when it states that its beacons have codes
 
     def begin(self, now_s: float) -> None:
-        """It is there since now, unless it has been before."""
+        """Mark it present from now, unless it already is."""
         if self.since_s is None:
             self.since_s = now_s
 
     def reports(self, now_s: float) -> bool:
-        """Whether it is online and its health is fresh."""
+        """Whether the node is online with a fresh health message."""
         return self.online is not False and now_s - self.health_s < FRESH_S
 
     def has_fix(self, now_s: float) -> bool:
-        """Whether a fix has come recently."""
+        """Whether there is a recent fix."""
         return now_s - self.fix_s < FRESH_S
 
     def codes_for_s(self, now_s: float) -> float:
-        """For how long its beacons have had codes, as it states, or 0 where they have none."""
+        """How long its beacons have had codes, as it states; 0 without codes."""
         return 0.0 if self.codes_s is None else now_s - self.codes_s
 
 
 class Evidence:
-    """The newest of every node's messages, and when they came."""
+    """The newest messages of every node, with their times of arrival."""
 
     def __init__(self, host: str, now_s: float) -> None:
-        """``host`` is this computer's name, as nodes state theirs."""
+        """``host``: this computer's name, as nodes state theirs."""
         self.host = host
         self.connected = self.was_connected = False
         self.hub_trouble: str | None = None  # at a hub: why it is not connected
-        self.ready_s = now_s  # when it began to wait for messages
+        self.ready_s = now_s  # time since when messages can arrive
         self.site: Site | None = None
         self.nodes: dict[tuple[str, str], Node] = {}  # by kind and name
-        self.batched_s: dict[str, float] = {}  # when the last fix came of tags that are known from batches alone
-        self.batches_connected = True  # where a site has batches, whether they can arrive
-        self.alerts: dict[str, str] = {}  # by tag: the worst of its fixes since the last evaluation
+        self.batched_s: dict[str, float] = {}  # time of the last fix of tags known only from batches
+        self.batches_connected = True  # whether batches, if a site has them, can arrive
+        self.alerts: dict[str, str] = {}  # by tag: the worst alert of its fixes since the last evaluation
         self.roster = Roster()
         self._sorted: dict[str, list[tuple[str, Node]]] = {}
         self.ages = FixAges()
         self.leader = LeaderTracker()
 
     def set_connected(self, *, connected: bool, now_s: float) -> None:
-        """Whether the broker is connected."""
+        """Update whether the broker is connected."""
         if connected != self.connected:
             self.connected, self.ready_s = connected, now_s
             self.was_connected = True
 
     def set_site(self, site: Site, now_s: float) -> None:
-        """Which anchors there should be."""
+        """Update the site, and with it the expected anchors."""
         if self.site is None:
             self.ready_s = now_s
         self.site = site
@@ -135,13 +135,13 @@ class Evidence:
         return self.site is not None and not self.site.anchors
 
     def site_anchors(self) -> list[str]:
-        """The names of the site's anchors that are taken in."""
+        """Names of the site's anchors, as far as admitted."""
         site = self.site
         ids = [] if site is None else [*(a.id for a in site.anchors), *(a.id for a in site.unplaced)]
         return [name for name in map(str, ids) if self.roster.admits("anchor", name)]
 
     def add_status(self, status: StatusMessage, now_s: float) -> None:
-        """Whether a node is online."""
+        """Add a status, which says whether a node is online."""
         node = self._node(status.kind, status.name)
         if node is None:
             return
@@ -154,7 +154,7 @@ class Evidence:
             self.ages.remove(status.name)
 
     def add_health(self, kind: str, name: str, health: Health, now_s: float, unix_s: float) -> None:
-        """A node's health."""
+        """Add a node's health."""
         node = self._node(kind, name)
         if node is None:
             return
@@ -170,7 +170,7 @@ class Evidence:
             self.ages.add_health(name, unix_s - health.unix_s, now_s)
 
     def add_fix(self, fix: FixMessage, now_s: float) -> float:
-        """A fix of a tag. Returns its age as ``FixAges`` has it, in s."""
+        """Add a fix of a tag. Returns its age in s, from ``FixAges``."""
         node = self._node("tag", fix.tag)
         if node is None:
             return 0.0
@@ -183,13 +183,13 @@ class Evidence:
         return self.add_batched(fix, now_s)
 
     def add_batched(self, fix: FixMessage, now_s: float) -> float:
-        """A fix that came in a batch, of a tag that ``hear`` is given as well. Returns its age."""
+        """Add a fix from a batch, for a tag also passed to ``hear``. Returns its age in s."""
         if fix.alert is not None and ALERTS.get(fix.alert, 0) > ALERTS.get(self.alerts.get(fix.tag), 0):
             self.alerts[fix.tag] = fix.alert
         return self.ages.add_fix(fix.tag, fix.unix_s, fix.latency_s, now_s)
 
     def hear(self, tag: str, now_s: float) -> None:
-        """A batch has a fix of a tag."""
+        """Note that a batch has a fix of a tag."""
         node = self.nodes.get(("tag", tag))
         if node is None:
             self.batched_s[tag] = now_s
@@ -197,17 +197,17 @@ class Evidence:
             node.fix_s = node.batched_s = now_s
 
     def sends_messages(self, tag: str, now_s: float) -> bool:
-        """Whether a tag's fixes arrive as messages, so that those in batches are the same once more."""
+        """Whether a tag's fixes arrive as messages, so that those in batches are duplicates."""
         node = self.nodes.get(("tag", tag))
         return node is not None and node.fix_s > node.batched_s and now_s - node.fix_s < _MESSAGES_S
 
     def missed(self, now_s: float) -> list[str]:
-        """The tags, known from batches alone, that have no fixes any more."""
+        """Tags known only from batches that have no fixes any more."""
         self.batched_s = {tag: fix_s for tag, fix_s in self.batched_s.items() if now_s - fix_s < EXPECTED_S}
         return [tag for tag, fix_s in self.batched_s.items() if now_s - fix_s >= FRESH_S]
 
     def of(self, kind: str) -> list[tuple[str, Node]]:
-        """Names and nodes of a kind, in their natural order."""
+        """Names and nodes of a kind, in natural order."""
         if kind not in self._sorted:
             found = [(name, node) for (of_kind, name), node in self.nodes.items() if of_kind == kind]
             found.sort(key=lambda item: (len(item[0]) if item[0].isdecimal() else 1 << 30, item[0]))
@@ -220,7 +220,7 @@ class Evidence:
         return now_s - since_s < GRACE_S
 
     def computer(self, host: str) -> str:
-        """Words for a computer. An unknown one counts as this one."""
+        """Name a computer in words. An unknown one counts as this one."""
         return "this computer" if host in {"", self.host} else f"computer {host}"
 
     def _node(self, kind: str, name: str) -> Node | None:
@@ -233,20 +233,20 @@ class Evidence:
         return node
 
 
-# Names that are taken in
+# Admission of names
 
 
 class Roster:
-    """The names of one site."""
+    """The admitted names of one site, in bounded memory."""
 
     def __init__(self) -> None:
         self._names: dict[str, set[str]] = {}
-        self._left_out: dict[str, set[int]] = {}  # hashes of the names that were not taken in since the last count
+        self._left_out: dict[str, set[int]] = {}  # hashes of names refused since the last count
         self._counted: dict[str, int] = {}
         self._counted_s = float("-inf")
 
     def admits(self, kind: str, name: str) -> bool:
-        """Whether a name is taken in: the first ones are, for good."""
+        """Whether a name is admitted: the first ones are, permanently."""
         group, entry, most = kind, name, MAX_NAMES.get(kind)
         if most is None:
             group, entry, most = "", f"{kind}/{name}", MAX_OTHERS
@@ -262,11 +262,11 @@ class Roster:
         return False
 
     def size(self, kind: str) -> int:
-        """How many names of a kind are taken in."""
+        """Number of admitted names of a kind."""
         return len(self._names.get(kind, ()))
 
     def left_out(self, kind: str, now_s: float) -> int:
-        """How many names of a kind, tag or anchor, were not taken in. At most as many as are taken in are counted."""
+        """Number of refused names of a kind, tag or anchor, counted at most up to the limit of admitted ones."""
         if now_s - self._counted_s >= _COUNT_S:
             self._counted = {group: len(names) for group, names in self._left_out.items()}
             self._left_out, self._counted_s = {}, now_s
@@ -277,7 +277,7 @@ class Roster:
 
 
 class _Tag:
-    """Delays of one tag's messages: ``now_s`` of arrival less ``unix_s`` of sending, so with the clocks' difference."""
+    """Delays of one tag's messages: ``now_s`` of arrival less ``unix_s`` of sending, including the clock difference."""
 
     __slots__ = ("before_s", "begun_s", "delay_s", "delay_seen_s", "least_s", "unix_s")
 
@@ -285,31 +285,31 @@ class _Tag:
         self.begin(now_s)
         self.unix_s = float("-inf")  # of the last fix
         self.delay_s, self.delay_seen_s = 0.0, float("-inf")
-        """Delay of the last health message, if this computer sent it, and when that message arrived."""
+        """Delay of the last health message, if this computer sent it, and its time of arrival."""
 
     def begin(self, now_s: float) -> None:
-        """Begin the window. What was before does not count."""
+        """Begin a window, and forget the one before."""
         self.begun_s = now_s
-        self.least_s = self.before_s = float("inf")  # the least in the window that has begun, and in the one before
+        self.least_s = self.before_s = float("inf")  # least delays in the current window, and in the one before
 
 
 class FixAges:
-    """Ages of fixes on arrival, by the page server's monotonic clock: the least of each tag, and all of them together.
+    """Ages of fixes on arrival, by the page server's monotonic clock: the least of each tag, and percentiles of all.
 
-    A fix was made ``latency_s`` after its last frame by one clock, the tag's, so that part is exact. How long its
-    message then travelled follows, for tags of this computer, from their health messages. For others it is measured
-    against the tag's quickest message in the last one to two minutes, so that clocks which differ, or are set, raise no
-    alarm. A delay that was the same from the first message on therefore looks like a clock that differs. A fix whose
-    time is before that of the fix before it shows that the clock was set back: then the minutes begin again.
+    A fix was made ``latency_s`` after its last frame by the tag's clock alone, so this part is exact. The travel time
+    of its message follows, for tags of this computer, from their health messages. For others it is relative to the
+    tag's quickest message in the last one to two minutes, so that clocks that differ, or are set, raise no alarm; a
+    constant delay therefore looks like a different clock. A fix with an earlier time than the previous one shows that
+    the clock was set back: then the minutes start again.
     """
 
     def __init__(self) -> None:
         self._tags: dict[str, _Tag] = {}
-        self._least: dict[str, tuple[float, float]] = {}  # what ``least_ages_s`` gives next
-        self._recent: deque[tuple[float, float]] = deque(maxlen=_MAX_AGES)  # when fixes arrived, and their ages
+        self._least: dict[str, tuple[float, float]] = {}  # next result of ``least_ages_s``
+        self._recent: deque[tuple[float, float]] = deque(maxlen=_MAX_AGES)  # arrival times of fixes, and their ages
 
     def add_fix(self, name: str, unix_s: float, latency_s: float, now_s: float) -> float:
-        """Add a fix whose last frame ended at ``unix_s`` by the tag's clock, and that arrives now. Returns its age."""
+        """Add a fix that arrives now and whose last frame ended at ``unix_s`` by the tag's clock. Returns its age."""
         tag = self._tags.get(name)
         if tag is None:
             tag = self._tags[name] = _Tag(now_s)
@@ -331,20 +331,20 @@ class FixAges:
         return age_s
 
     def add_health(self, name: str, delay_s: float, now_s: float) -> None:
-        """Add how long a health message of a tag of this computer has travelled."""
+        """Add the travel time of a health message from a tag of this computer."""
         if name in self._tags:
             self._tags[name].delay_s, self._tags[name].delay_seen_s = max(delay_s, 0.0), now_s
 
     def least_ages_s(self) -> dict[str, tuple[float, float]]:
         """By tag: the least age of its fixes since the last call, and the part of it until the fix was made.
 
-        The least, so that a burst of messages that waited for this program for a moment counts as its youngest.
+        Using the least, a burst of messages that briefly waited for this program counts as the youngest of them.
         """
         found, self._least = self._least, {}
         return found
 
     def percentiles_s(self, now_s: float) -> tuple[float | None, float | None]:
-        """Median and 99th percentile of all ages of the last ``_RECENT_S``, or None without any."""
+        """Median and 99th percentile of the ages in the last ``_RECENT_S``; None without any."""
         while self._recent and now_s - self._recent[0][0] > _RECENT_S:
             self._recent.popleft()
         if not self._recent:
@@ -361,12 +361,12 @@ class FixAges:
 
 
 class LeaderTracker:
-    """Follows who is the master by the anchors' health. Where several say that they are, the newest term counts."""
+    """Tracks which anchor is the master from health messages. If several claim to be, the newest term counts."""
 
     def __init__(self) -> None:
         self.leader: int | None = None
         self.changes_s: deque[float] = deque(maxlen=_MAX_CHANGES)  # times of the changes, the newest last
-        self._masters: dict[int, tuple[float, int]] = {}  # by anchor: when it last said so, and its term
+        self._masters: dict[int, tuple[float, int]] = {}  # by anchor: time of its last claim, and its term
 
     def update(self, health: AnchorHealth, time_s: float) -> int | None:
         """Process a health message. Returns the new leader if the leader has changed."""
@@ -389,17 +389,17 @@ class LeaderTracker:
 
 
 class ProcessorUse:
-    """Samples the counters of the system."""
+    """Measures processor use from the system's counters."""
 
     def __init__(self, counters: Path = Path("/proc/stat")) -> None:
         self._counters = counters
         self._samples: deque[tuple[float, int, int]] = deque()
-        """Time of the sample, and ticks of all processors together: idle ones and all."""
+        """Time of the sample, idle ticks and all ticks, of all processors together."""
 
     def share(self, now_s: float) -> float | None:
-        """Share of all processors' time that was in use in the last ``USE_WINDOW_S``.
+        """Share of all processors' time in use in the last ``USE_WINDOW_S``.
 
-        None at first, and where the system does not say.
+        None at first, and if the system does not tell.
         """
         try:
             with self._counters.open(encoding="ascii") as counters:

@@ -1,8 +1,8 @@
 """The condition of the live site, in one word and with reasons. No I/O: the time is passed in.
 
-A reason appears with the first evaluation that finds it and disappears when no evaluation has found it for ``HOLD_S``;
-its level, too, falls only after that time. The condition is good only on fresh evidence: the broker is connected, some
-tag has a fix that has just arrived, and nothing speaks against it. Where nothing is known it is "waiting".
+A reason appears with the first evaluation that finds it, and disappears when none has found it for ``HOLD_S``; its
+level also falls only after that time. The condition is good only on fresh evidence: the broker is connected, some tag
+has a recent fix, and there is no reason against it. If nothing is known it is "waiting".
 """
 
 from collections.abc import Collection
@@ -40,7 +40,7 @@ EVALUATION_S: Final = 0.5
 """Interval of the evaluations."""
 
 HOLD_S: Final = 3.0
-"""A reason stays for this long after it was last found, so that the page does not flicker."""
+"""How long a reason stays after it was last found, so that the page does not flicker."""
 
 
 class Condition(Struct, frozen=True):
@@ -48,26 +48,26 @@ class Condition(Struct, frozen=True):
 
     level: Literal["waiting", "good", "warning", "bad"]
     text: str
-    """Text of the first reason, or what is being waited for. Empty where all is well."""
+    """Text of the first reason, or what is being waited for. Empty if all is well."""
     reasons: tuple[Reason, ...]
     """The worst first."""
     latency_p50_s: float | None
     latency_p99_s: float | None
-    """From a frame's end to the arrival of its fix at the page's server, of all tags in the last ten seconds."""
+    """From a frame's end to the arrival of its fix at the page's server, over all tags in the last ten seconds."""
     tags: int = 0
-    """How many are known."""
+    """Number of known tags."""
     tags_with_fix: int = 0
     anchors: int = 0
     """Anchors of the site, and others that report."""
 
 
 class ConditionMonitor:
-    """Evaluates evidence, and holds what it has found for a while."""
+    """Evaluates evidence, and holds the reasons found for a while."""
 
     def __init__(self, evidence: Evidence) -> None:
         self.evidence = evidence
-        self._held: dict[str, tuple[float, Reason]] = {}  # by kind: when the reason was last found
-        self._bad_s: dict[str, float] = {}  # by kind: when it was last found to be bad
+        self._held: dict[str, tuple[float, Reason]] = {}  # by kind: the reason, and the time when it was last found
+        self._bad_s: dict[str, float] = {}  # by kind: time when it was last bad
         self._blind_until_s = float("-inf")
 
     def evaluate(
@@ -80,11 +80,11 @@ class ConditionMonitor:
         unread_s: float = 0.0,
         refused: Collection[str] = (),
     ) -> Condition:
-        """The condition now.
+        """Evaluate the condition.
 
-        ``lag_s`` is by how much the server's own work was delayed since the last evaluation, ``used_share`` the share
-        of its computer's processors that is in use, None where it is not known; ``unread_s`` is for how long messages
-        have waited in its own queue, and ``refused`` which subscriptions the broker has refused.
+        ``lag_s``: delay of the server's own work since the last evaluation. ``used_share``: share of its computer's
+        processors in use, None if unknown. ``unread_s``: how long messages have waited in its own queue. ``refused``:
+        subscriptions that the broker has refused.
         """
         evidence = self.evidence
         ages = evidence.ages.least_ages_s()
@@ -111,7 +111,7 @@ class ConditionMonitor:
             *watch_reasons(watch, watch_age_s),
         ]
         if lag_s > LAG_S or behind is not None:
-            self._blind_until_s = now_s + 2 * EVALUATION_S  # what has arrived meanwhile is still to be read
+            self._blind_until_s = now_s + 2 * EVALUATION_S  # until messages that arrived meanwhile have been read
         if not self.is_blind(now_s) and not evidence.is_bare:
             found += [*fix_reasons(evidence, now_s), *anchor_reasons(evidence, now_s)]
         for reason in filter(None, found):

@@ -1,1 +1,1 @@
-"""What a survey needs, from options and recordings: facts, ranges of anchors, and tags."""
+"""Input of a survey from options and recordings: facts, ranges of anchors, and tags."""

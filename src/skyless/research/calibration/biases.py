@@ -1,4 +1,4 @@
-"""By how much each anchor of another system seems late, from a tag at known positions, in bounded memory."""
+"""Tags and ranges from recordings for a survey, and biases of another system's anchors, in bounded memory."""
 
 import math
 import os
@@ -42,18 +42,18 @@ _TAG_STD_M: Final = 0.02
 """Standard deviation of a tag's known position, per axis."""
 
 _OFFSET_STD_M: Final = 0.03
-"""Each anchor's own constant at the tag, which is no delay: reflections that are always there. It is less than in a
-walk, as delays are what is looked for."""
+"""Standard deviation of each anchor's own constant at the tag that is no delay, such as constant reflections. It is
+less than in a walk, as delays are to be found."""
 
 _HEIGHT_STD_M: Final = 0.1
-"""How well the height of a tag that is carried around is known."""
+"""Standard deviation of the height of a tag that is carried around."""
 
 PositionAt = Callable[[float], Point | None]
-"""Where the tag's antenna was at a time of the recording; None where that is not known."""
+"""Position of the tag's antenna at a time of the recording; None if unknown."""
 
 
 def position_of_truth(truth: TruthTrack, above_m: float | None) -> PositionAt:
-    """Truth by time, where it is high enough."""
+    """Position by time from truth that is high enough."""
 
     def position_at(time_s: float) -> Point | None:
         at_m = truth.at(time_s)
@@ -63,10 +63,10 @@ def position_of_truth(truth: TruthTrack, above_m: float | None) -> PositionAt:
 
 
 def position_of_stays(stays: Sequence[Stay], height_m: float | None, begin_s: float) -> PositionAt:
-    """Known positions by time; of stays that overlap the first counts.
+    """Position by time from stays; the first of overlapping ones counts.
 
     Raises:
-        SkylessError: a stay has no height, and the site does not know it either.
+        SkylessError: a stay has no height, and the site does not state it either.
     """
     stays_m: list[tuple[Stay, Point]] = []
     for stay in stays:
@@ -83,7 +83,7 @@ def position_of_stays(stays: Sequence[Stay], height_m: float | None, begin_s: fl
 
 
 def walks_of(recording: McapRecording, site: int, asked: SurveyOptions) -> tuple[TagEpochs, ...]:
-    """What the tags of --walk received while they were carried around. Raises SkylessError."""
+    """Differences of the tags of --walk while they were carried around. Raises SkylessError."""
     return tuple(
         replace(
             walk_of(recording, site, walk.tag, (walk.from_s, walk.to_s), asked.walk_height_m),
@@ -97,9 +97,9 @@ def walks_of(recording: McapRecording, site: int, asked: SurveyOptions) -> tuple
 def known_tags(
     recording: McapRecording, site: Site, asked: SurveyOptions, truth: Truth | None
 ) -> tuple[TagEpochs, ...]:
-    """What tags received while it was known where they were.
+    """Differences of tags while at known positions.
 
-    ``truth``: that of a table, in Unix time. Raises SkylessError.
+    ``truth``: from a table, in Unix time. Raises SkylessError.
     """
     raw = tags_to_replay(recording.summary())
     names, recorded = ", ".join(raw), recorded_truth(recording)
@@ -127,7 +127,7 @@ def known_tags(
 
 
 def _end_s(epochs: TagEpochs, begin_s: float, first: object) -> float:
-    """Until when a tag is used."""
+    """Time until which a tag is used."""
     if not isinstance(first, First):
         return inf
     if first.seconds is not None:
@@ -142,9 +142,9 @@ def _end_s(epochs: TagEpochs, begin_s: float, first: object) -> float:
 def walk_of(
     recording: McapRecording, site: int, tag: str, span: tuple[float, float] = (0.0, inf), height_m: float | None = None
 ) -> TagEpochs:
-    """Differences of a tag that was carried around; ``span``: from and to, in seconds since its first reception.
+    """Differences of a tag that was carried around; ``span``: begin and end, in seconds since its first reception.
 
-    ``height_m``: of the tag above the floor, if it is known within some 0.1 m; free otherwise.
+    ``height_m``: of the tag above the floor, if known within some 0.1 m; free otherwise.
 
     Raises:
         SkylessError: the recording has no receptions of the tag, or none in the span that give a difference.
@@ -178,7 +178,7 @@ def walk_of(
 
 
 def at_positions(epochs: TagEpochs, tag: str, position_at: PositionAt) -> TagEpochs:
-    """The epochs with known positions. Epochs without one are left out."""
+    """The epochs with their known positions. Epochs without one are left out."""
     known = [position_at(t_s) for t_s in epochs.t_s.tolist()]
     is_known = np.array([one is not None for one in known], dtype=bool)
     rows = is_known[epochs.epoch]
@@ -200,7 +200,7 @@ def at_positions(epochs: TagEpochs, tag: str, position_at: PositionAt) -> TagEpo
 
 
 class NewReceptions:
-    """One tag's receptions, as they come, each once."""
+    """Reads one tag's receptions from messages, each once."""
 
     def __init__(self) -> None:
         self._clock: HostClock[Reception] = HostClock()
@@ -208,14 +208,14 @@ class NewReceptions:
         self._next = 0
 
     def begins(self, message: ReceptionsMessage) -> bool:
-        """Whether the tag has started again; receptions before are of another counter."""
+        """Whether the tag has restarted, so that earlier receptions have another counter."""
         if message.segment == self._segment:
             return False
         self._segment, self._next, self._clock = message.segment, message.first, HostClock()
         return True
 
     def read(self, message: ReceptionsMessage) -> Iterator[tuple[Reception, float]]:
-        """Receptions, each once, with Unix time: of this run and of runs before, as their times become known."""
+        """New receptions with their Unix times, as these become known, also of earlier messages."""
         new = message.receptions[max(self._next - message.first, 0) :]
         self._next = max(self._next, message.first + len(message.receptions))
         for raw in new:
@@ -228,24 +228,24 @@ _MANY_OUTLIERS: Final = 0.05
 _UNEXPLAINED_SHARE: Final = 0.5
 
 _MAX_ROWS: Final = 300_000
-"""Rows that are kept; of a longer recording an even sample is used."""
+"""Most rows kept; of a longer recording an even sample is used."""
 
 _NEAREST_M: Final = 0.01
 
 
 class Samples(Struct, frozen=True):
-    """Time differences at known positions, out of a recording."""
+    """Time differences at known positions, from a recording."""
 
     differences: Differences
     anchors_m: dict[int, Point]
-    """Where the anchors stand, or last stood."""
+    """Latest positions of the anchors."""
     seen: int
     drops: dict[str, int]
-    """Differences that could not be used, by reason."""
+    """Unusable differences, by reason."""
 
 
 class Biases(Struct, frozen=True):
-    """What a tag at known positions has shown of the anchors of another system."""
+    """Biases of another system's anchors, estimated from a tag at known positions."""
 
     format: str
     estimate: CalibrationEstimate
@@ -253,7 +253,7 @@ class Biases(Struct, frozen=True):
 
     @property
     def notes(self) -> list[str]:
-        """What the user should know."""
+        """Sentences for the user about doubtful results."""
         found = self.estimate
         notes = [f"anchor {one.anchor} is not determined: {one.reason}" for one in found.anchors if one.reason]
         if found.rejected > _MANY_OUTLIERS * (found.used + found.rejected):
@@ -267,21 +267,21 @@ class Biases(Struct, frozen=True):
         return notes
 
     def report(self) -> dict[str, Any]:
-        """All of it, SI units."""
+        """The whole report, SI units."""
         estimated = msgspec.to_builtins(self.estimate)
         return {"format": self.format, **estimated, "drops": self.samples.drops, "notes": self.notes}
 
     def table(self, anchors: str | Path | None) -> str:
-        """The table of anchors with the biases in it; a new one where none is given. Raises SkylessError."""
+        """The table of anchors with the biases added; a new one if none is given. Raises SkylessError."""
         known = self.estimate.calibration()
         return new_table(self.samples.anchors_m, known) if anchors is None else calibrated_table(anchors, known)
 
 
 def biases_of(asked: SurveyOptions) -> Biases:
-    """Constants of the anchors of another system, whose zero is their mean.
+    """Estimate constants of another system's anchors, relative to their mean.
 
     Raises:
-        SkylessError: the recording cannot be used, or holds nothing at a known position.
+        SkylessError: the recording cannot be used, or has no differences at a known position.
     """
     asked.leave_out("tag", "recorded_truth", "walks", why="it is for recordings of skyless record")
     path, first = Path(str(asked.recording)), asked.first if isinstance(asked.first, First) else First()
@@ -306,7 +306,7 @@ def biases_of(asked: SurveyOptions) -> Biases:
 
 
 def tdoas_of(recording: Recording, anchors_m: Mapping[int, Point]) -> Iterator[PairTdoa]:
-    """All time differences of a recording in any format."""
+    """Time differences of a recording in any format."""
     bits = recording.format.tx_bits
     engine = None if bits is None else PairEngine(bits, anchors_m=dict(anchors_m))
     for record in recording:
@@ -323,7 +323,7 @@ def gather(
     position_from: Callable[[float], PositionAt],
     first: First,
 ) -> Samples:
-    """Gather the differences at known positions; ``position_from`` gets the time of the first difference."""
+    """Gather the differences at known positions; ``position_from`` is called with the time of the first difference."""
     drops: Drops = Counter()
     anchor_positions_m = dict(anchors_m)
     sample = EvenSample(5, _MAX_ROWS)
@@ -352,7 +352,7 @@ def gather(
 
 
 def _row(pair: PairTdoa, anchor_positions_m: dict[int, Point], position_at: PositionAt) -> tuple[float, ...] | str:
-    """Time, anchors, excess over the geometry, logarithm of the ranges' ratio; or why there is none."""
+    """Time, anchors, excess over the geometry, and log of the ranges' ratio; or the reason for a drop."""
     if pair.a_m is not None:
         anchor_positions_m[pair.anchor_a] = pair.a_m
     if pair.b_m is not None:
@@ -368,28 +368,28 @@ def _row(pair: PairTdoa, anchor_positions_m: dict[int, Point], position_at: Posi
     return pair.time_s, float(pair.anchor_a), float(pair.anchor_b), excess_m, log(range_b / range_a)
 
 
-# Ranges of pairs of anchors out of a recording: of a running site, or of another system whose anchors range.
+# Ranges of pairs of anchors from a recording of a site, or of another system whose anchors range.
 
 _REPORT_EVERY: Final = 1000
 """Records between two reports of progress."""
 
 _MAX_SEEN: Final = 1 << 16
-"""Legs that are known to have been added: several listeners relay the same ones."""
+"""Added legs that are remembered, as several listeners relay the same ones."""
 
 
 class RecordedRanges(Struct, frozen=True):
-    """Ranges out of a recording, and what could not be used."""
+    """Ranges from a recording, and its unusable parts."""
 
     ranges: PairRanges
     ranger: PairRanger
-    """What made the ranges, and can drop those from before an anchor was moved."""
+    """Source of the ranges, which can drop those from before an anchor was moved."""
     format: str
     site: Site | None
     """The recorded site. None for recordings of other systems."""
     drops: dict[str, int]
-    """What could not be used, by reason."""
+    """Unusable data, by reason."""
     damage: dict[str, int] = {}
-    """Those of the drops that are damage of the file, which other readers of it meet as well."""
+    """The part of the drops that is damage of the file, which other readers also find."""
 
 
 def ranges_of(
@@ -403,11 +403,11 @@ def ranges_of(
     to_s: float = math.inf,
     on_progress: Callable[[float], None] | None = None,
 ) -> RecordedRanges:
-    """Ranges of a recording of ``skyless record``, or of another system's; ``format_name`` chooses its format.
+    """Ranges from a recording of ``skyless record``, or of another system; ``format_name`` chooses the format.
 
-    ``identifier``: of the site, where it should be checked. ``block_s``, ``on_block``: of ``PairRanger``. ``from_s``,
-    ``to_s``: the part in use, in seconds since the first leg. ``on_progress`` is given the share of the recording that
-    has been read, now and then.
+    ``identifier``: of the site, if it should be checked. ``block_s``, ``on_block``: see ``PairRanger``. ``from_s``,
+    ``to_s``: the part in use, in seconds since the first leg. ``on_progress`` is called now and then with the share of
+    the recording that has been read.
 
     Raises:
         ConfigurationError: the file cannot be read, or its format has no stamps of anchors.
@@ -425,7 +425,7 @@ def ranges_of(
 
 
 class _Part:
-    """The legs of a part of a recording, each once."""
+    """Collects the legs in a part of a recording, each once."""
 
     def __init__(
         self, ranger: PairRanger, from_s: float, to_s: float, on_progress: Callable[[float], None] | None
@@ -437,7 +437,7 @@ class _Part:
         self._seen: OrderedDict[tuple[int, int, int], None] = OrderedDict()
 
     def add(self, leg: AnchorLeg) -> None:
-        """Add a leg that lies in the part."""
+        """Add a leg if it is new and within the part."""
         key = (leg.sender, leg.receiver, leg.rx_ticks)
         if key in self._seen:
             return
@@ -456,12 +456,12 @@ class _Part:
             self._on_progress(min(max(share(), 0.0), 1.0))
 
     def finish(self) -> PairRanges:
-        """The ranges of all legs."""
+        """Finish, and return the ranges from all legs."""
         self.ranger.finish()
         return self.ranger.ranges()
 
     def drops(self) -> Counter[str]:
-        """What the ranger could not use."""
+        """Data that the ranger could not use, by reason."""
         return _drops(self.ranger.counters)
 
 
@@ -470,7 +470,7 @@ def _drops(counters: Counter[str]) -> Counter[str]:
 
 
 def _of_site(path: str | PathLike[str], identifier: int | None, part: _Part) -> RecordedRanges:
-    """From what tags received, and from anchors' own stamps where they were recorded."""
+    """Ranges from tags' receptions, and from anchors' own stamps if recorded."""
     drops: Counter[str] = Counter()
     collectors: dict[str, LegCollector] = {}
     runs: dict[int, str] = {}
@@ -504,7 +504,7 @@ def _of_site(path: str | PathLike[str], identifier: int | None, part: _Part) -> 
 
 
 def _damage(recording: McapRecording) -> Counter[str]:
-    """What could not be read of the file, after it was read."""
+    """Unreadable parts of the file, after reading it."""
     summary = recording.summary()
     damage = Counter(summary.drops)
     if summary.unread_bytes:
@@ -513,7 +513,7 @@ def _damage(recording: McapRecording) -> Counter[str]:
 
 
 def _of_anchor(message: StampsMessage, ranger: PairRanger, runs: dict[int, str]) -> list[AnchorLeg]:
-    """What an anchor received; its time is that of the message."""
+    """Legs that an anchor received, with the message's time."""
     if runs.setdefault(message.anchor, message.run) != message.run:
         runs[message.anchor] = message.run
         ranger.forget(message.anchor)
@@ -524,7 +524,7 @@ def _of_anchor(message: StampsMessage, ranger: PairRanger, runs: dict[int, str])
 
 
 def _of_tag(found: Recorded, collector: LegCollector) -> list[AnchorLeg]:
-    """What a tag learned of anchors, in Unix time."""
+    """Legs that a tag learned from beacons, in Unix time."""
     message = cast("ReceptionsMessage", found.message)
     legs: list[AnchorLeg] = []
     for raw in message.receptions:
@@ -534,9 +534,9 @@ def _of_tag(found: Recorded, collector: LegCollector) -> list[AnchorLeg]:
 
 
 def _add_packets(path: str | PathLike[str], format_name: str, part: _Part) -> Counter[str]:
-    """Add what a listener of another system's packets learned; its own counter gives the times.
+    """Add legs learned by a listener to another system's packets, with times by its own counter.
 
-    Antenna delays that the stamps include are subtracted, so that ranges are near the distances.
+    Antenna delays included in the stamps are subtracted, so that ranges are near the distances.
     """
     with open_recording(path, format_name) as recording:
         matcher, ticks = RelayMatcher(recording.format.tx_bits or TICK_BITS), Unwrapper()
@@ -553,7 +553,7 @@ def _add_packets(path: str | PathLike[str], format_name: str, part: _Part) -> Co
 
 
 def _add_receptions(path: str | PathLike[str], part: _Part) -> Counter[str]:
-    """Add what Avalue's anchors received of one another."""
+    """Add legs between Avalue's anchors."""
     drops: Drops = Counter()
     with open_source(path) as stream:
         size = Path(path).stat().st_size

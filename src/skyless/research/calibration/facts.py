@@ -1,4 +1,4 @@
-"""What a user states of a site for a survey, from the options and the site's file."""
+"""The user's facts for a survey, from the options and the site's file."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,18 +15,17 @@ from skyless.site.tables import read_heights
 _SKETCH_STD_M: Final = 0.3
 _FOREIGN_DELAY_STD_M: Final = 0.03
 _FOREIGN_COMMON_DELAY_STD_M: Final = 1.0
-"""For recordings of other systems: boards of one kind without calibration are nearly alike, but nothing is known of
-what they share."""
-
+"""For recordings of other systems: uncalibrated boards of one kind are nearly alike, but their common delay is
+unknown."""
 
 _UNCALIBRATED_DELAY_STD_M: Final = 0.15
-"""How much delays of boards that nobody has calibrated are expected to be off."""
+"""Expected delay error of boards that were never calibrated."""
 
 
 def facts_of(asked: SurveyOptions, anchors: Iterable[int], site: Site | None, *, is_foreign: bool = False) -> Facts:
-    """The facts; ``site`` is that of --site or of the recording. Raises SkylessError.
+    """The facts for a survey. Raises SkylessError.
 
-    ``is_foreign``: whether the ranges are of a recording of another system.
+    ``site``: of --site or of the recording. ``is_foreign``: the ranges are from a recording of another system.
     """
     known, keep = set(anchors), asked.keep_positions or asked.knows_tag
     if keep and (site is None or not site.anchors):
@@ -74,7 +73,7 @@ def _stated_std_m(site: Site) -> float:
 
 
 def _heights(asked: SurveyOptions, known: set[int]) -> dict[int, float]:
-    """By option: single heights before those of the table, these before the height of all. Raises SkylessError."""
+    """Heights by anchor: single options override the table, and the table the height of all. Raises SkylessError."""
     given = asked.anchor_height_m
     by_anchor = dict(given) if isinstance(given, dict) else {}
     of_all = by_anchor.pop(None, None)

@@ -1,4 +1,4 @@
-"""What is asked of a survey: options of ``skyless survey``, and arguments of ``skyless.survey_site``."""
+"""Options of ``skyless survey``, and arguments of ``skyless.survey_site``."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -38,14 +38,14 @@ class Stay(Struct, frozen=True):
     x_m: float
     y_m: float
     z_m: float | None = None
-    """None: at the height of the site's tags."""
+    """None for the height of the site's tags."""
     from_s: float = -inf
-    """Since the first difference."""
+    """Time since the first difference."""
     to_s: float = inf
 
 
 class Walk(Struct, frozen=True):
-    """A tag that was carried around, and when, in seconds since its first reception."""
+    """A tag that was carried around, with the times in seconds since its first reception."""
 
     tag: str
     from_s: float = 0.0
@@ -53,7 +53,7 @@ class Walk(Struct, frozen=True):
 
 
 class First(Struct, frozen=True):
-    """Only the beginning of a recording: a number of differences, of seconds, or a part of its time."""
+    """Limit to the beginning of a recording: a number of differences, of seconds, or a share of its time."""
 
     count: int | None = None
     seconds: float | None = None
@@ -61,7 +61,7 @@ class First(Struct, frozen=True):
 
 
 def _metres(name: str, text: str, counts: tuple[int, ...], part: str | None = None) -> tuple[float, ...]:
-    """Coordinates or lengths within the range of the almanac. Raises SkylessError."""
+    """Parse coordinates or lengths within the range of the almanac. Raises SkylessError."""
     values = read_numbers(name, text, counts, part=part)
     if any(abs(one) > MAX_COORDINATE_M for one in values):
         raise SkylessError(f"{name} is {text!r}; it should be metres, at most {MAX_COORDINATE_M:g}")
@@ -69,7 +69,7 @@ def _metres(name: str, text: str, counts: tuple[int, ...], part: str | None = No
 
 
 def _anchor(name: str, text: str, part: str) -> int:
-    """The anchor that a part of a text names. Raises SkylessError."""
+    """Parse an anchor's identifier in ``part`` of a text. Raises SkylessError."""
     try:
         return int(part, 0) if part.strip().lower().startswith("0x") else int(part)
     except ValueError:
@@ -283,11 +283,11 @@ class SurveyOptions(RecordingOptions, frozen=True, kw_only=True):
 
     @property
     def knows_tag(self) -> bool:
-        """Whether it is stated where a tag of the recording was."""
+        """Whether the options tell where a tag of the recording was."""
         return bool(self.stays or self.truth is not None or self.recorded_truth)
 
     def check(self) -> None:
-        """See that the options fit one another. Raises SkylessError."""
+        """Check that the options are compatible. Raises SkylessError."""
         if self.recording is None:
             self.leave_out(
                 *("format", "walks", "stays", "truth", "recorded_truth", "first", "anchors", "listener", "tag"),

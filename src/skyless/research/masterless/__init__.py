@@ -1,1 +1,1 @@
-"""Positioning from packets of anchors that have no common time."""
+"""Positioning from packets of anchors without a common time."""

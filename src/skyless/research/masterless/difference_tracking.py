@@ -1,4 +1,4 @@
-"""Fixes from ready-made time differences: a start from a window of them, then the estimator, and again when lost."""
+"""Fixes from given time differences: a start from a window of them, then the estimator; a new start when lost."""
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
@@ -38,12 +38,12 @@ DIFFERENCES: Final = EstimatorSettings(
     earliest_m=-0.25,
     stationary_s=3.0,
 )
-"""What recorded flights of DW1000s show (docs/recordings.md): reflections change within half a metre, and by how much
-differs from anchor to anchor."""
+"""Settings from recorded flights of DW1000s (docs/recordings.md): reflections change within half a metre, by amounts
+that differ between anchors."""
 
 
 class DifferenceTracking:
-    """One tag that is given differences of its ranges to pairs of anchors."""
+    """Tracks one tag from differences of its ranges to pairs of anchors."""
 
     def __init__(
         self,
@@ -52,15 +52,15 @@ class DifferenceTracking:
         z_bounds_m: tuple[float, float] | None = None,
         calibration: DifferenceCalibration | None = None,
     ) -> None:
-        """``anchors_m``: the anchors' positions; a difference that carries positions needs none.
+        """``anchors_m``: the anchors' positions, not needed for differences that contain them.
 
-        ``calibration`` is subtracted from every difference; anchors that are not in it are typical ones.
+        ``calibration`` is subtracted from every difference; anchors without one are taken as typical.
         """
         self._calibration = DifferenceCalibration({}) if calibration is None else calibration
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
         self.used: list[bool] = []
-        """Of each difference of the last update, whether the filter took it."""
+        """For each difference of the last update, whether the filter used it."""
         is_calibrated = bool(self._calibration.anchors)
         self._settings = settings.changed(
             difference_std_m=self._calibration.difference_std_m(settings.difference_std_m),
@@ -95,9 +95,9 @@ class DifferenceTracking:
             self.counters["outlier-height"] += 1
 
     def update(self, pairs: Sequence[PairTdoa]) -> bool:
-        """Process the differences of one reception, receptions in the order of time.
+        """Process the differences of one reception; receptions must be in the order of time.
 
-        True if they made a fix, else ``reason`` states why not.
+        Returns whether they gave a fix; if not, ``reason`` states why.
         """
         self.used = []
         for pair in pairs:
@@ -109,7 +109,7 @@ class DifferenceTracking:
         return any(self.used) and self._start is not None and self._is_plausible()
 
     def _update_positions(self, pair: PairTdoa) -> bool:
-        """Whether it is known where both anchors stand."""
+        """Take positions from a difference. Returns whether the positions of both anchors are known."""
         positions_m = self._positions_m
         if pair.a_m is not None:
             positions_m[pair.anchor_a] = np.array(pair.a_m)
@@ -135,7 +135,7 @@ class DifferenceTracking:
         return used
 
     def _process(self, pair: PairTdoa) -> bool:
-        """Process a difference by the filter, less the calibrated or typical errors of its anchors."""
+        """Pass a difference to the filter, less the calibrated or typical errors of its anchors."""
         position_m = self.position_m
         error_m = self._calibration.error_m(pair.anchor_b, dist(position_m, self._positions_m[pair.anchor_b]))
         error_m -= self._calibration.error_m(pair.anchor_a, dist(position_m, self._positions_m[pair.anchor_a]))
@@ -147,18 +147,18 @@ class DifferenceTracking:
         return found == ACCEPTED
 
     def ticks(self, time_s: float) -> int:
-        """A time on the scale of the filter."""
+        """Convert a time to the filter's ticks."""
         return round((time_s - self._begin_s) * TICK_RATE_HZ)
 
     def _is_out_of_reach(self, silent_s: float) -> bool:
-        """Whether the filter cannot predict that far: too long a silence for it, or a clock that went back."""
+        """Whether the filter cannot predict over this silence: it is too long, or the clock went back."""
         if not 0.0 <= silent_s <= TUNING.longest_silence_s:
             return True
         is_short = silent_s <= TUNING.short_silence_s
         return not is_short and self._estimator.horizontal_variance_m2(silent_s) > TUNING.most_horizontal_std_m**2
 
     def _is_plausible(self) -> bool:
-        """Whether the state is near the anchors, where differences have information, and known well enough."""
+        """Whether the state is near the anchors, where differences have information, and accurate enough."""
         start, state, dim = self._start, self._estimator.state, self._estimator.dim
         if start is None or not start.holds(self._estimator.position_m()):
             self.reason = NoFixReason.NOT_CONVERGED
@@ -179,21 +179,21 @@ class DifferenceTracking:
         return x, y, z[0] if z else self._settings.height_m
 
     def fix(self) -> Fix:
-        """The newest position with all that is known of it; only after an ``update`` that made one."""
+        """The newest fix; only after an ``update`` that gave one."""
         used = [anchor for anchor, when_s in self._received_s.items() if self._newest_s - when_s <= TUNING.start_age_s]
         anchors_m = np.array([self._positions_m[anchor] for anchor in used]).reshape(-1, 3)
         rows, known = self._estimator.rows, self._settings.known_height_m is not None
         return Fix(self._newest_s, rows, tuple(used), anchors_m, "joint", known, 1, self._asked)
 
     def _stop(self) -> None:
-        """Forget the state; a new start is looked for."""
+        """Forget the state, so that a new start is searched for."""
         self.counters["restart"] += 1
         self._start = None
         self._is_confirmed = False
         self._window.clear()
 
     def _is_time_to_start(self, pair: PairTdoa) -> bool:
-        """Gather differences; whether they are enough for a start."""
+        """Add a difference to the window. Returns whether to try a start now."""
         window = self._window
         while window and not 0.0 <= pair.time_s - window[0].time_s <= TUNING.longest_silence_s:
             window.popleft()
@@ -203,7 +203,7 @@ class DifferenceTracking:
         return is_enough and not 0.0 <= pair.time_s - self._tried_s < every_s
 
     def _try_start(self) -> bool:
-        """Look for a start, or for one that confirms or contradicts the present one; True if the filter begins."""
+        """Search for a start, or for one that confirms or contradicts the current one. Returns True if it is used."""
         window, dim = self._window, self._estimator.dim
         self._tried_s = self._newest_s
         start = find_start(
@@ -230,7 +230,7 @@ class DifferenceTracking:
         self._estimator.withhold_levels(True)
         self._start = start
         for anchor, (late_m, variance_m2) in start.late.items():
-            may_stay = anchor not in self._calibration.anchors  # else it was not late then
+            may_stay = anchor not in self._calibration.anchors  # a calibrated anchor has no constant lateness
             self._estimator.know_anchor(anchor, self._positions_m[anchor])
             self._estimator.expect_late(anchor, late_m, variance_m2, may_stay)
         self._received_s = {anchor: self._newest_s for kept in window for anchor in (kept.anchor_a, kept.anchor_b)}
@@ -242,30 +242,30 @@ class DifferenceTracking:
 # Start
 
 
-JOINING_STEPS: Final = 4  # of least squares with the weights that the last one shows
+JOINING_STEPS: Final = 4  # iterations of reweighted least squares
 
 
 class Start(Struct, frozen=True):
-    """Where a filter begins."""
+    """Initial state of a filter."""
 
     position_m: Array
     """Shape (3,)."""
     covariance_m2: Array
-    """Shape (3, 3), with the distances between all hypotheses in it."""
+    """Shape (3, 3), including the spread of all hypotheses."""
     late: dict[int, list[float]]
-    """By how much each anchor is expected to be late, and the variance."""
+    """Expected lateness of each anchor, and its variance."""
     is_ambiguous: bool
     """Whether another position fits nearly as well, or some anchor is late."""
     corners_m: Array
-    """Opposite ones of the neighbourhood of the anchors, shape (2, 3)."""
+    """Opposite corners of the neighbourhood of the anchors, shape (2, 3)."""
 
     def holds(self, position_m: Array) -> bool:
-        """Whether a position, of two or three coordinates, lies in the neighbourhood of the anchors."""
+        """Whether a position, of two or three coordinates, is in the neighbourhood of the anchors."""
         return is_within(self.corners_m, position_m)
 
 
 def neighbourhood_m(anchors_m: Array) -> Array:
-    """Opposite corners of the space around the anchors beyond which time differences say nothing, shape (2, 3)."""
+    """Opposite corners of the space around the anchors in which time differences have information, shape (2, 3)."""
     low, high = anchors_m.min(axis=0), anchors_m.max(axis=0)
     reach_m = TUNING.neighbourhood * np.linalg.norm((high - low)[:2])
     corners_m: Array = (low + high) / 2.0 + np.outer((-reach_m, reach_m), np.ones(3))
@@ -273,7 +273,7 @@ def neighbourhood_m(anchors_m: Array) -> Array:
 
 
 def is_within(corners_m: Array, position_m: Array) -> bool:
-    """Whether a position, of two or three coordinates, lies between two corners."""
+    """Whether a position, of two or three coordinates, is between two corners."""
     low_m, high_m = corners_m[:, : len(position_m)]
     return bool(np.all((low_m <= position_m) & (position_m <= high_m)))
 
@@ -285,9 +285,9 @@ def find_start(
     height_m: float | None,
     z_bounds_m: tuple[float, float] | None,
 ) -> Start | NoSolution:
-    """Mean and covariance of the position over all hypotheses of which anchors are late, by their probabilities.
+    """Find a start: mean and covariance of the position over all hypotheses about late anchors, by probability.
 
-    No anchor is early. None is accused before a whole window, with two degrees of freedom to spare.
+    Anchors are never early. Late ones are considered only with a whole window, and two spare degrees of freedom.
     """
     grouped: dict[tuple[int, int], list[float]] = {}
     for pair in window:
@@ -342,10 +342,10 @@ def find_start(
 
 
 def joined_tdoas(pairs: Sequence[tuple[int, int]], differences_m: ArrayLike) -> tuple[tuple[int, ...], Array, Array]:
-    """Best linear estimate of TDoAs against one anchor from measurements ``|p − b| − |p − a|`` of pairs (a, b).
+    """Best linear estimate of TDoAs to one reference anchor from measurements ``|p − b| − |p − a|`` of pairs (a, b).
 
-    Returns the anchors, the reference first, the TDoAs, and their covariance. Least squares are weighted again until
-    what does not fit the others counts by its absolute value. Of a graph in several parts the largest is used.
+    Returns the anchors, the reference first, the TDoAs, and their covariance. Least squares are reweighted so that
+    outliers count by their absolute value. If the pairs are not all linked, the largest part is used.
     """
     anchors, index = np.unique(pairs, return_inverse=True)
     a, b = index.reshape(-1, 2).T

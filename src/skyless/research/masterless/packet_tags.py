@@ -1,6 +1,6 @@
-"""Tags on sniffers and FiRa boards: they receive the packets of a system without a master.
+"""Tags on sniffers and FiRa boards, which receive the packets of a system without a master.
 
-Its anchors' positions are configured, or a FiRa board's messages state them.
+The anchors' positions are configured, or stated in a FiRa board's messages.
 """
 
 import time
@@ -30,28 +30,28 @@ from skyless.site.file.check import check_site
 from skyless.site.survey.anchor_errors import DifferenceCalibration
 
 TDOA_SITE: Final = 0
-"""The site in the topics of a system that has no site identifier."""
+"""Site number in the topics of a system without a site identifier."""
 
 _METHOD: Final = "joint"
 
-_NEW_HEIGHT_M: Final = 0.05  # a change of the anchors' mean height with which tracking begins again
+_NEW_HEIGHT_M: Final = 0.05  # change of the anchors' mean height that restarts tracking
 
 PacketRadio = SnifferRadio | UciRadio
 
 
 class PacketTagSettings(Struct, frozen=True):
-    """Configuration of the tags of such a system."""
+    """Configuration of the tags of a system without a master."""
 
     anchors_m: Mapping[int, Point]
-    """Empty where messages state them."""
+    """Positions of the anchors; empty if messages state them."""
     site: int = TDOA_SITE
     qa: float = MASTERLESS.qa
     height_m: float | None = None
-    """Height of the tags where it is known, or None to estimate it."""
+    """Known height of the tags, or None to estimate it."""
     height_std_m: float = 0.0
     """Standard deviation of a known height."""
     auto_height: bool = False
-    """Whether tags take the anchors' height as soon as these turn out to lie too flat to determine it."""
+    """Whether tags assume the anchors' height once these turn out to be too flat to determine the height."""
     calibration: DifferenceCalibration | None = None
     publish_hz: float = 50.0
 
@@ -59,9 +59,9 @@ class PacketTagSettings(Struct, frozen=True):
 def site_of(
     settings: PacketTagSettings, heard_m: Mapping[int, Point] | None = None, origin: GeoreferenceSite | None = None
 ) -> Site | None:
-    """The system as a site that a page can draw, or None for anchors that no site can have.
+    """The system as a site that a page can draw; None for anchors that no site can have.
 
-    ``heard_m``: their positions, where they are not configured; ``origin``: where on the Earth these begin.
+    ``heard_m``: positions of the anchors if they are not configured; ``origin``: origin of these on the Earth.
     """
     positions_m = settings.anchors_m or heard_m or {}
     anchors = tuple(AnchorSite(anchor, *position_m) for anchor, position_m in sorted(positions_m.items()))
@@ -77,7 +77,7 @@ def site_of(
 
 
 class PacketTagNode:
-    """Runs ``PacketTracking`` on a sniffer. ``publish`` is called with the fixes that are to be published."""
+    """Runs ``PacketTracking`` on a radio. ``publish`` is called with the fixes to publish."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class PacketTagNode:
         log: Log,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``clock`` gives the host's monotonic time in s, as ``host_s`` of the packets."""
+        """``clock``: the host's monotonic time in s, as in ``host_s`` of the packets."""
         self.settings, self.radio, self._clock = settings, radio, clock
         self._height_m, self._height_std_m = settings.height_m, settings.height_std_m
         self._anchors_seen = 0
@@ -96,7 +96,7 @@ class PacketTagNode:
         self.fix_log = FixLog(radio.name, publish, settings.publish_hz, clock)
         self.monitor = RadioMonitor(f"tag {radio.name}", "listening", log, radio.advice)
         self._drops: Counter[str] = Counter()
-        self._known = 0  # packets of anchors whose positions are known
+        self._known = 0  # packets of anchors with known positions
 
     def _new_tracking(self) -> PacketTracking:
         asked = self.settings
@@ -112,11 +112,11 @@ class PacketTagNode:
 
     @property
     def drops(self) -> Counter[str]:
-        """What could not be used, by reason."""
+        """Unusable data, by reason."""
         return self._drops + self.tracking.drops + self.radio.counters + self.fix_log.lateness.drops
 
     def check_reception(self, now_s: float) -> None:
-        """Log where to look if it receives nothing usable. ``now_s`` is the host's monotonic clock."""
+        """Log advice if the radio receives nothing usable. ``now_s``: the host's monotonic clock."""
         self.monitor.check(now_s, self.packets, self._known, self.drops)
 
     async def run(self) -> None:
@@ -131,7 +131,7 @@ class PacketTagNode:
         self.monitor.on_event(event)
         if isinstance(event, Restarted) and self.packets:
             self._height_m, self._height_std_m = self.settings.height_m, self.settings.height_std_m
-            self._anchors_seen = 0  # the anchors may stand elsewhere now
+            self._anchors_seen = 0  # the anchors may have been moved
             self._begin_again()
 
     def _begin_again(self) -> None:
@@ -139,7 +139,7 @@ class PacketTagNode:
         self.tracking = self._new_tracking()
 
     def _update_height(self) -> None:
-        """Take the anchors' height, or estimate the tag's again, where another anchor has stated its position."""
+        """When another anchor has stated its position, decide again whether to assume the anchors' height."""
         known_m = self.tracking.anchors_m
         if not self.settings.auto_height or len(known_m) <= self._anchors_seen:
             return
@@ -177,10 +177,10 @@ class PacketTags:
         on_health: Callable[[TagHealth], None] | None = None,
         on_anchors: Callable[[Mapping[int, Point], GeoreferenceSite | None], None] | None = None,
     ) -> None:
-        """``simulated`` is asked again when a radio has restarted: its port may lead to another device.
+        """``simulated`` is called again when a radio has restarted, as its port may lead to another device.
 
-        ``on_fix`` and ``on_health`` are called with all that is to be published, with or without a broker;
-        ``on_anchors`` with positions that messages state, and where on the Earth they begin, whenever there are others.
+        ``on_fix`` and ``on_health`` are called with everything to publish, with or without a broker; ``on_anchors``
+        with positions stated in messages, and their origin on the Earth, whenever they change.
         """
         self._settings, self._log, self._on_fix, self._on_health = settings, log, on_fix, on_health
         self._links = tuple(link_of(address, radio.name, site=settings.site, kind="tag") for radio in radios)
@@ -211,7 +211,7 @@ class PacketTags:
         return publish
 
     def _publish_health(self) -> None:
-        """Health of all tags, and the site with the anchors' positions."""
+        """Publish the health of all tags, and the site with the anchors' positions."""
         share, memory_bytes = self._usage.sample()
         if not self._settings.anchors_m:
             self._update_site()
@@ -237,7 +237,7 @@ class PacketTags:
                 link.publish(health_topic(self._settings.site, "tag", node.radio.name), health)
 
     def _update_site(self) -> None:
-        """The site of the positions that the tags have heard by now."""
+        """Update the site with the positions that the tags have received."""
         heard_m = dict(self._heard_m)
         for node in self.nodes:
             heard_m |= node.tracking.anchors_m

@@ -1,7 +1,7 @@
-"""``joint`` for systems without a master: their packets as they are, instead of time differences made of them.
+"""``joint`` for systems without a master, which uses their packets directly instead of time differences.
 
 Stamps are unwrapped along the tag's clock, antenna delays are subtracted from relayed receptions (``RelayDelays``), and
-what cannot be used is counted. The filter decides which measurements are used.
+unusable data are counted. The filter decides which measurements are used.
 """
 
 from collections import Counter
@@ -46,35 +46,35 @@ MASTERLESS: Final = DIFFERENCES.changed(
     phase_wander=9e-4,
     stationary_s=0.0,
 )
-"""Ranges err as in ``DIFFERENCES``. In captures of TDoA3 anchors a reception is 4 cm off by itself.
-Phases count less than they could, as neither heights of recorded anchors are known nor their places to a centimetre."""
+"""Range errors are as in ``DIFFERENCES``. In captures of TDoA3 anchors each reception has its own error of 4 cm.
+Phases have less weight than possible, as heights and exact places of recorded anchors are unknown."""
 
 DL_TDOA: Final = EstimatorSettings(qa=DIFFERENCES.qa)
-"""For FiRa's radios, of which there are no recordings yet: a site with typical errors is assumed."""
+"""For FiRa radios, of which there are no recordings yet: a site with typical errors is assumed."""
 
 DL_TDOA_ONE_WAY: Final = DL_TDOA.changed(
     pair_std_m=0.0,
     survey_std_m=0.0,
     range_std_m=sqrt(DL_TDOA.range_std_m**2 + 3.0 * DL_TDOA.survey_std_m**2),
 )
-"""The same where only one anchor of each pair relays the other. The constant error of their range cannot be separated
-from their clocks then, so it counts, with the survey's, as an error of the tag's range."""
+"""The same if only one anchor of each pair relays the other. The constant error of their range cannot be separated from
+their clocks then, so it counts, with the survey's, as an error of the tag's range."""
 
 PERIOD_S: Final = 0.15
-"""Anchors send 6 to 60 times a second; the filter assumes the slowest."""
+"""Period of the slowest anchors, as assumed by the filter: they send 6 to 60 times per second."""
 
 RELAY_MAX_AGE_S: Final = 0.5
-"""How long ago a relayed packet may have been received; a 7-bit sequence number recurs."""
+"""Greatest age of a relayed packet's reception, as a 7-bit sequence number recurs."""
 
 RESTART_IN_ROW: Final = 3
-"""This number of impossible stamps of one anchor in a row mean that its counter has restarted."""
+"""Consecutive impossible stamps of an anchor that mean that its counter has restarted."""
 
 BACK_IN_ROW: Final = 8
-"""This number of packets in a row from before the newest mean that the tag's counter has restarted."""
+"""Consecutive packets from before the newest that mean that the tag's counter has restarted."""
 
 
 class _Anchor:
-    """What the tag knows of one anchor: its position, its newest stamps, and when its latest packets were received."""
+    """One anchor at the tag: its position, its newest stamps, and the stamps of its latest packets."""
 
     __slots__ = ("anchor_m", "heard", "impossible", "position_m", "rx_ticks", "tx_ticks")
 
@@ -87,7 +87,7 @@ class _Anchor:
         """Sequence number → unwrapped (tx_ticks of the anchor, rx_ticks of the tag)."""
 
     def update(self, tx_counter: int, rx_ticks: int, bits: int) -> bool:
-        """Process the stamps of another packet; False if no crystal went from the newest to these."""
+        """Process the stamps of a packet. Returns False if no crystal could get from the newest to these."""
         tx_ticks = continued(tx_counter, self.tx_ticks, rx_ticks - self.rx_ticks, bits)
         if tx_ticks is None:
             self.impossible += 1
@@ -97,7 +97,7 @@ class _Anchor:
 
 
 class PacketTracking:
-    """One tag that receives the packets of anchors without a master. No I/O; what cannot be used is counted."""
+    """Tracks one tag that receives packets of anchors without a master. No I/O; unusable data are counted."""
 
     def __init__(
         self,
@@ -108,10 +108,10 @@ class PacketTracking:
         calibration: DifferenceCalibration | None = None,
         one_way: EstimatorSettings | None = None,
     ) -> None:
-        """``anchors_m``: the anchors' positions; where it has none, those that packets carry are used.
+        """``anchors_m``: the anchors' positions; for others, positions in packets are used.
 
         ``tx_bits``: width of the anchors' stamps. ``calibration`` is subtracted from the tag's receptions; without one
-        the anchors' antenna delays are estimated from how they range each other. ``one_way``: settings that hold until
+        the anchors' antenna delays are estimated from their ranging of each other. ``one_way``: settings to use until
         two anchors have relayed each other.
         """
         self.reason = NoFixReason.NO_BEACONS
@@ -120,7 +120,7 @@ class PacketTracking:
         self.position_m: Point | None = None
         """Position of the newest fix."""
         self.used = False
-        """Whether the filter took the reception of the last packet."""
+        """Whether the filter used the reception of the last packet."""
         self._tx_bits = tx_bits
         self._positions_m = dict(anchors_m)
         self._surveyed = frozenset(anchors_m)
@@ -134,7 +134,7 @@ class PacketTracking:
         self._settings, self._z_bounds_m = settings if one_way is None else one_way, z_bounds_m
         self._both_ways = settings
         self._pairs: set[tuple[int, int]] | None = None if one_way is None else set()
-        """Listeners and senders of relays, until two have relayed each other."""
+        """Pairs of listener and sender in relays, until two anchors have relayed each other."""
         self._tracking = self._new_tracking()
         self._area_m = np.zeros((2, 3))
         self._drops: Counter[str] = Counter()
@@ -142,22 +142,22 @@ class PacketTracking:
 
     @property
     def tracking(self) -> Estimation:
-        """The filter behind."""
+        """The filter."""
         return self._tracking
 
     @property
     def anchors_m(self) -> Mapping[int, Point]:
-        """Positions that are known, surveyed or stated by packets."""
+        """Known positions, surveyed or stated in packets."""
         return self._positions_m
 
     @property
     def newest_s(self) -> float:
-        """When the newest packet that could be used was received, on the scale of fixes' times."""
+        """Reception time of the newest usable packet, on the scale of fixes' times."""
         return ((self._newest_rx_ticks or 0) - self._time.first_ticks_master) * TICK_S
 
     @property
     def drops(self) -> Counter[str]:
-        """What was not used, by reason."""
+        """Unused data, by reason."""
         self._count_relays()
         return self._drops + Counter({"relay-outlier": self._rejected_before + self._rejected_now})
 
@@ -167,9 +167,9 @@ class PacketTracking:
         return self._delays.contradictions_m
 
     def on_packet(self, packet: Packet) -> Fix | None:
-        """Process one packet; a fix, or None, and ``reason`` states why.
+        """Process one packet. Returns a fix, or None with the ``reason``.
 
-        A fix's ``time_s`` counts from the first packet, by the tag's clock.
+        A fix's ``time_s`` is since the first packet, by the tag's clock.
         """
         self.used = False
         anchor = self._unwrap(packet)
@@ -215,7 +215,7 @@ class PacketTracking:
         return self._checked(fix)
 
     def _look_both_ways(self, listener: int, sender: int) -> None:
-        """Begin again with the settings for pairs that relay each other, once there is one."""
+        """Restart with the settings for pairs that relay each other, once there is one."""
         assert self._pairs is not None
         if (sender, listener) in self._pairs:
             self._settings, self._pairs = self._both_ways, None
@@ -228,7 +228,7 @@ class PacketTracking:
         return Estimation(self._settings, self._z_bounds_m, self._time, PERIOD_S)
 
     def _checked(self, fix: Fix | NoFixReason) -> Fix | None:
-        """A fix near the anchors, beyond which time differences have no information, that is known well enough."""
+        """The fix if it is accurate enough and near the anchors, as time differences have no information elsewhere."""
         if isinstance(fix, Fix):
             x_m, y_m, z_m = fix.position_m.tolist()
             self.position_m, self.time_s = (x_m, y_m, z_m), fix.time_s
@@ -248,7 +248,8 @@ class PacketTracking:
         rx_ticks = self._tag_clock.unwrap(packet.rx_ticks, packet.host_s)
         if abs(rx_ticks) > LAST_TICKS:
             self._drops["impossible-host-time"] += 1
-            self._forget_clocks()
+            self._tag_clock, self._newest_rx_ticks = Unwrapper(), None
+            self._anchors.clear()
             return None
         if self._newest_rx_ticks is None:
             fix_time_s(self._time, rx_ticks, rx_ticks)
@@ -279,7 +280,7 @@ class PacketTracking:
         return anchor
 
     def _has_new_counter(self, packet: Packet, rx_ticks: int) -> bool:
-        """Whether a packet from before the newest one is not late, but the tag's counter has restarted."""
+        """Whether a packet from before the newest one means that the tag's counter has restarted."""
         anchor = self._anchors.get(packet.anchor)
         known = None if anchor is None else anchor.heard.get(packet.sequence)
         if known is not None and known[1] == rx_ticks:
@@ -292,13 +293,8 @@ class PacketTracking:
         self._anchors.clear()
         return True
 
-    def _forget_clocks(self) -> None:
-        self._tag_clock = Unwrapper()
-        self._newest_rx_ticks = None
-        self._anchors.clear()
-
     def _position_of(self, packet: Packet) -> Point | None:
-        """The sender's position: as surveyed, else as stated, now or last."""
+        """The sender's position: as surveyed, else as stated in this or an earlier packet."""
         known = self._positions_m.get(packet.anchor)
         stated_m = None if packet.anchor in self._surveyed else packet.position_m
         if stated_m is None or (known is None and len(self._positions_m) >= MAX_ANCHORS):
@@ -310,7 +306,7 @@ class PacketTracking:
         self._area_m = neighbourhood_m(np.array([anchor.position_m for anchor in self._anchors.values()]))
 
     def _relayed(self, listener: int, anchor: _Anchor, relay: Relay) -> int | str:
-        """The anchor's reception of another's packet, unwrapped and without antenna delays, or why it cannot be had."""
+        """The anchor's reception of another's packet, unwrapped and without antenna delays, or why there is none."""
         sender = self._anchors.get(relay.anchor)
         heard = None if sender is None else sender.heard.get(relay.sequence)
         if heard is None or sender is anchor:
@@ -324,7 +320,7 @@ class PacketTracking:
         return "time-of-flight-unknown" if delay is None else rx_ticks - delay
 
     def _calibrated(self, name: int, anchor: _Anchor) -> int:
-        """The tag's stamp of an anchor's newest packet without the bias that a calibration found."""
+        """The tag's stamp of an anchor's newest packet without the calibrated bias."""
         assert self._calibration is not None
         known = self._calibration.anchors.get(name, NO_BIAS)
         bias_m = known.bias_m
@@ -333,7 +329,7 @@ class PacketTracking:
         return anchor.rx_ticks - round(bias_m / TICK_M)
 
     def _count_relays(self) -> None:
-        """Add up what filters rejected: each start, before which there are packets without a fix, counts from zero."""
+        """Update the sum of relays rejected by filters, whose counter starts from zero with each start."""
         rejected = self._tracking.estimator.state.status.relays_rejected
         if rejected < self._rejected_now:
             self._rejected_before += self._rejected_now
@@ -341,5 +337,5 @@ class PacketTracking:
 
 
 def _phase_of(received: Packet | Relay) -> float:
-    """The phase of a carrier as the filter takes it: below 0 where it is not known."""
+    """The carrier phase for the filter; negative if unknown."""
     return -1.0 if received.carrier_phase_cycles is None else received.carrier_phase_cycles

@@ -1,14 +1,14 @@
 """Time differences without a master: any anchor that relays when it received another is a reference for it.
 
 Anchor b relays that it received anchor a's packet at ``r`` of its own clock. That packet left a one time of flight
-earlier, so had b sent at ``r - tof``, both packets would have left at once, and the interval in which the tag receives
-them is the time difference of arrival. The tag knows b's clock from b's packets
-(``BroadcastClock``), and with it when a packet that b sent at ``r - tof`` would have been received:
+earlier, so if b had sent at ``r - tof``, both packets would have left simultaneously, and the interval between their
+receptions at the tag is the time difference of arrival. The tag knows b's clock from b's packets (``BroadcastClock``),
+and so the time at which it would have received a packet sent by b at ``r - tof``:
 
     TDoA = c·[(rx_b + phase_b − rx_a) − (1 + rate_b)·(tof + tx_b − r)]
 
-This is the textbook formula, in which ``phase_b`` is zero, with the noise of ``rx_b`` filtered. As the rate holds
-the tag's own motion, the TDoA is that of the moment at which the tag received a.
+This is the textbook formula, in which ``phase_b`` is zero, with the noise of ``rx_b`` filtered. As the rate includes
+the tag's own motion, the TDoA applies to the moment at which the tag received a.
 """
 
 from collections import Counter
@@ -27,28 +27,28 @@ MAX_ANCHORS: Final = 256
 """Further identifiers are ignored, so that memory stays bounded."""
 
 PAIR_PACKETS_KEPT: Final = 64
-"""Packets of one anchor that are kept for relays to come."""
+"""Packets of each anchor that are kept for later relays."""
 
 MARGIN_M: Final = 1.0
-"""By how much a TDoA may exceed the distance of its anchors."""
+"""Margin by which a TDoA may exceed the distance of its anchors."""
 
 LONGEST_M: Final = 1500.0
-"""Limit of a TDoA where the anchors' positions are unknown."""
+"""Limit of a TDoA if the anchors' positions are unknown."""
 
 MAX_CLOCK_ERROR_M: Final = 0.15
-"""A clock is used once the error of its rate, over the time to be bridged, is smaller than this."""
+"""A clock is used once the error due to its rate, over the time to be bridged, is below this."""
 
 Pair = tuple[int, int]
 
 
-# The clock of an anchor, packet after packet, against the listener's clock alone
+# The clock of an anchor, packet by packet, relative to the listener's clock
 
 
 STAMP_TICKS: Final = 150e-12 / TICK_S
 """Noise of TX and RX stamp together; a DW1000 has 100 to 163 ps on a reception."""
 
 BROADCAST_WALK_FM: Final = 3e-9
-"""Random walk of each clock's rate in 1/√s. Measured on the captures of TDoA3 anchors: 1e-9 begins to lag behind."""
+"""Random walk of each clock's rate in 1/√s. On captures of TDoA3 anchors the filter starts to lag with 1e-9."""
 
 ACCELERATION_M2PS3: Final = 4.0
 """Power of the listener's acceleration, m²/s³: a change of 2 m/s in a second."""
@@ -56,7 +56,7 @@ ACCELERATION_M2PS3: Final = 4.0
 WHITE_FM: Final = 2e-11
 GATE: Final = 5.0
 RESTART_AFTER: Final = 3
-"""If this number of rejected packets in a row agree with each other, the clock has restarted."""
+"""After this number of consecutive rejected packets that agree with each other, the clock has restarted."""
 
 _WALK: Final = (2 * BROADCAST_WALK_FM**2 + ACCELERATION_M2PS3 / SPEED_OF_LIGHT_MPS**2) * TICK_S
 _WHITE: Final = 2 * WHITE_FM**2 / TICK_S
@@ -65,14 +65,14 @@ _START_RATE_VARIANCE: Final = (MAX_RELATIVE_RATE / 2) ** 2
 
 
 class BroadcastClock:
-    """One anchor's clock against the listener's: TX counters of ``tx_bits``, RX stamps already unwrapped.
+    """One anchor's clock relative to the listener's: TX counters of ``tx_bits``, RX stamps already unwrapped.
 
-    A two-state filter (phase and rate) over the pairs of TX stamp and RX stamp, all in ticks. The rate contains the
-    Doppler shift of a moving listener, and must: then the phase, carried back by a few milliseconds, is that of the
-    position at that time.
+    A two-state filter (phase and rate) over pairs of TX and RX stamps, all in ticks. The rate must contain the Doppler
+    shift of a moving listener, so that the phase, extrapolated back by a few milliseconds, applies to the position at
+    that time.
 
-    ``tx_ticks`` and ``rx_ticks`` are those of the last accepted packet, unwrapped. By the filter that packet
-    was received ``phase`` ticks later than stamped; ``rate`` is what the listener's clock gains on the anchor's.
+    ``tx_ticks`` and ``rx_ticks`` are the unwrapped stamps of the last accepted packet. According to the filter it was
+    received ``phase`` ticks later than stamped; ``rate`` is the gain of the listener's clock on the anchor's.
     """
 
     __slots__ = (
@@ -104,15 +104,15 @@ class BroadcastClock:
     def unwrap(self, counter: int, rx_ticks: int) -> int:
         """Unwrapped time of the anchor's counter at about the listener's time ``rx_ticks``.
 
-        The listener's 40 bits determine how often the anchor's 32 bits wrapped since the last packet; right for gaps of
-        minutes, which 32 bits alone are not beyond 67 ms (``docs/maths.md`` section 3).
+        The listener's 40 bits determine how often the anchor's 32 bits wrapped since the last packet. This is right for
+        gaps of minutes, while 32 bits alone are ambiguous beyond 67 ms (``docs/maths.md`` section 3).
         """
         elapsed = rx_ticks - self.rx_ticks
         guess = self.tx_ticks + elapsed - int(self.rate * elapsed)
         return nearest(counter, guess, self._tx_bits)
 
     def update(self, tx_counter: int, rx_ticks: int) -> bool:
-        """Process one packet; False when it does not fit the clock and was left out."""
+        """Process one packet. Returns False if it does not fit the clock and was rejected."""
         tx_ticks = self.unwrap(tx_counter, rx_ticks)
         span = tx_ticks - self.tx_ticks
         if span > 0 and rx_ticks > self.rx_ticks and self._filter(span, rx_ticks - self.rx_ticks - span):
@@ -125,7 +125,7 @@ class BroadcastClock:
         return False
 
     def _filter(self, span: int, gained: int) -> bool:
-        """Predict over ``span`` ticks of the anchor and measure the gain of the listener's clock on it."""
+        """Predict over ``span`` ticks of the anchor, and update with the gain of the listener's clock."""
         covariance = predict(self._covariance, span, _WHITE, _WALK)
         innovation = gained - (self.phase + self.rate * span)
         if innovation * innovation > GATE * GATE * (covariance[0] + _STAMP_VARIANCE):
@@ -136,7 +136,7 @@ class BroadcastClock:
         return True
 
     def _reject(self, tx_counter: int, rx_ticks: int) -> None:
-        """Keep a rejected packet; start again when several in a row agree with each other."""
+        """Note a rejected packet; restart if several in a row agree with each other."""
         agrees = False
         if self._rejected is not None:
             tx_before, rx_before = self._rejected
@@ -150,7 +150,7 @@ class BroadcastClock:
             self._begin(tx_counter, rx_ticks)
 
     def uncertainty_ticks(self, span: float) -> float:
-        """Standard deviation in ticks of what the rate's error does over ``span`` ticks."""
+        """Standard deviation in ticks of the rate's effect over ``span`` ticks."""
         return float(abs(span) * self._covariance[2] ** 0.5)
 
 
@@ -158,7 +158,7 @@ class BroadcastClock:
 
 
 class _Anchor:
-    """What the tag knows of one anchor: its clock, and its latest packets by sequence number."""
+    """One anchor at the tag: its clock, and its latest packets by sequence number."""
 
     __slots__ = ("clock", "packets")
 
@@ -169,7 +169,7 @@ class _Anchor:
 
 
 def remember(packets: dict[int, tuple[int, int]], sequence: int, tx_ticks: int, rx_ticks: int) -> None:
-    """Keep an anchor's packet, by its sequence number, for relays to come."""
+    """Keep an anchor's packet by its sequence number for later relays."""
     packets.pop(sequence, None)
     if len(packets) >= PAIR_PACKETS_KEPT:
         del packets[next(iter(packets))]
@@ -177,10 +177,10 @@ def remember(packets: dict[int, tuple[int, int]], sequence: int, tx_ticks: int, 
 
 
 class PairEngine:
-    """From the packets that one tag hears to TDoAs of pairs of anchors. No I/O; what cannot be used is counted.
+    """Turns the packets that one tag receives into TDoAs of pairs of anchors. No I/O; unusable data are counted.
 
-    ``tx_bits`` is the width of the anchors' TX and relay stamps; the tag's have 40 bits. ``anchors_m``
-    (identifier → x, y, z) arms the physical gate; positions that packets carry serve where it has none.
+    ``tx_bits``: width of the anchors' TX and relay stamps; the tag's have 40 bits. ``anchors_m`` (identifier → x, y, z)
+    limits TDoAs to what is physically possible; for other anchors positions in packets are used.
     """
 
     def __init__(self, tx_bits: int = 32, anchors_m: dict[int, Point] | None = None) -> None:
@@ -195,10 +195,10 @@ class PairEngine:
         self._flights = AnchorFlights()
 
     def on_packet(self, packet: Packet) -> list[PairTdoa]:
-        """Take one packet; return the TDoAs that it completes, in the order of its relays.
+        """Process one packet. Returns the TDoAs that it completes, in the order of its relays.
 
-        Their ``time_s`` is when the tag heard this packet; each holds for the moment of the relayed packet, at
-        most ``PAIR_RELAY_MAX_AGE_S`` before.
+        Their ``time_s`` is when the tag received this packet; each applies to the moment of the relayed packet, at most
+        ``PAIR_RELAY_MAX_AGE_S`` earlier.
         """
         sender = self._anchors.get(packet.anchor)
         if sender is None and len(self._anchors) >= MAX_ANCHORS:
@@ -226,7 +226,7 @@ class PairEngine:
         return tdoas
 
     def _update_clock(self, sender: _Anchor, packet: Packet, rx_ticks: int) -> bool:
-        """Advance the sender's clock; False for a packet that cannot be used."""
+        """Update the sender's clock. Returns False for an unusable packet."""
         known = sender.packets.get(packet.sequence)
         if known is not None and known[1] == rx_ticks:
             self.drops["duplicate"] += 1
@@ -244,7 +244,7 @@ class PairEngine:
         return False
 
     def _tdoa_m(self, b: int, clock: BroadcastClock, relay: Relay, rx_b: int) -> float | str:
-        """One TDoA in metres, or the reason why it cannot be had."""
+        """One TDoA in metres, or the reason why there is none."""
         a = relay.anchor
         anchor = self._anchors.get(a)
         heard = None if anchor is None else anchor.packets.get(relay.sequence)
@@ -267,7 +267,7 @@ class PairEngine:
         return tdoa_m
 
     def _flight_ticks(self, a: int, b: int, tx_a: int, rx_b: int, carried: float | None) -> float | None:
-        """Time of flight of a pair: as anchors state it, else what two-way ranging gave, else the known distance."""
+        """Time of flight of a pair: as stated by anchors, else from two-way ranging, else from the known distance."""
         flight = self._flights.update(a, b, tx_a, rx_b, carried)
         return distance_ticks(self._anchors_m, a, b) if flight is None else flight
 
@@ -280,7 +280,7 @@ class PairEngine:
         return limit
 
     def _keep_position(self, anchor: int, position_m: Point) -> None:
-        """Keep the position that a packet carries; the limits of the anchor's pairs are computed again."""
+        """Keep the position in a packet, and reset the limits of the anchor's pairs if it is new."""
         if self._carried_m.get(anchor) != position_m:
             self._carried_m[anchor] = position_m
             self._limits_m = {pair: limit for pair, limit in self._limits_m.items() if anchor not in pair}

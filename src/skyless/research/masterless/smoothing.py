@@ -1,12 +1,12 @@
-"""Fixed-interval smoothing: what all of a recording says of each moment, by the filter's own model.
+"""Fixed-interval smoothing: the state at each moment given the whole recording, by the filter's own model.
 
-The filter runs through the recording, and the recursion of Rauch, Tung and Striebel (1965) back: with the state x and
-covariance P that the filter had, the transition F to the next one and its process noise Q,
+The filter runs forward through the recording, and the recursion of Rauch, Tung and Striebel (1965) backward: with the
+filter's state x and covariance P, the transition F to the next state and its process noise Q,
 
     C = P·Fᵀ·(F·P·Fᵀ + Q)⁻¹,    x̂ = x + C·(x̂⁺ − F·x),    P̂ = P + C·(P̂⁺ − F·P·Fᵀ − Q)·Cᵀ.
 
-The state is that of the filter but for clocks, which time differences do not have: motion, range errors, surveys. Where
-the filter began again, nothing is carried back.
+The state is that of the filter (motion, range errors, surveys) without clocks, which time differences do not have.
+Nothing is carried back across a restart of the filter.
 """
 
 from collections import Counter
@@ -36,11 +36,11 @@ from skyless.research.masterless.difference_tracking import DifferenceTracking
 from skyless.research.masterless.pair_engine import PairEngine
 
 CHUNK: Final = 2_000
-"""Events between two copies of the filter, from which it runs once more: memory for as many covariances."""
+"""Events between two copies of the filter, from which it is rerun; limits the covariances in memory."""
 
 
 class Height(NamedTuple):
-    """A reading of a sensor of the tag's height."""
+    """A reading of the tag's height sensor."""
 
     time_s: float
     height_m: float
@@ -52,7 +52,7 @@ Event = PairTdoa | Height
 
 
 class _Decay(NamedTuple):
-    """A state that decays towards zero: the share that is kept, and the variance that is added."""
+    """Decay of a state towards zero: the share kept, and the variance added."""
 
     state: int
     kept: float
@@ -60,12 +60,12 @@ class _Decay(NamedTuple):
 
 
 def _decay(state: int, kept: float, variance: float) -> _Decay:
-    """``variance`` is that in the long run."""
+    """Decay with this stationary ``variance``."""
     return _Decay(state, kept, variance * (1.0 - kept * kept))
 
 
 class _Step(NamedTuple):
-    """The filter after an event, and how it came there from the event before."""
+    """The filter after an event, and the transition from the event before."""
 
     start: int
     """Number of the filter's start."""
@@ -78,7 +78,7 @@ class _Step(NamedTuple):
 
 
 class _States:
-    """Where the states that are smoothed stand, of all anchors that a recording has, present or not."""
+    """Layout of the smoothed states, for all anchors of a recording, whether currently in the filter or not."""
 
     def __init__(self, tracking: DifferenceTracking) -> None:
         estimator = tracking.estimator
@@ -98,20 +98,20 @@ class _States:
             self._prior[first : first + number] = variance
 
     def column(self, anchor: int) -> int:
-        """Number of an anchor."""
+        """Index of an anchor."""
         return self._column[anchor]
 
     def of_anchor(self, anchor: int) -> list[int]:
-        """All states of an anchor."""
+        """Indices of all states of an anchor."""
         column, survey = self._column[anchor], self._survey + self.dim * self._column[anchor]
         return [self.change + column, self.constant + column, *range(survey, survey + self.dim)]
 
     def prior(self, state: int) -> float:
-        """Variance of a state of an anchor that is not there."""
+        """Variance of a state of an anchor that is not in the filter."""
         return float(self._prior[state])
 
     def read(self, tracking: DifferenceTracking) -> tuple[Vector, Matrix]:
-        """State and covariance of the filter as it is now."""
+        """Current state and covariance of the filter."""
         s, anchors, dim = tracking.estimator.state, tracking.estimator.anchors, self.dim
         where, columns = s.layout, [self._column[anchor] for anchor in anchors]
         count = len(columns)
@@ -131,10 +131,10 @@ class _States:
 
 
 def smoothed(tracking: DifferenceTracking, events: Sequence[Event]) -> Iterator[tuple[int, Fix]]:
-    """Fixes of all of the events together, each with the number of its event, from the last one back.
+    """Smoothed fixes with the numbers of their events, from the last one back.
 
-    ``tracking`` has heard nothing yet. There is a fix where the filter makes one; it has no protection level, as those
-    are of what is known at the time.
+    ``tracking`` must be new. There is a fix wherever the filter gives one; it has no protection level, as levels
+    apply to what is known at the time.
     """
     copies = []
     for number, event in enumerate(events):
@@ -159,7 +159,7 @@ def smoothed(tracking: DifferenceTracking, events: Sequence[Event]) -> Iterator[
 
 
 def _process(tracking: DifferenceTracking, event: Event) -> bool:
-    """Process one event; whether it made a fix."""
+    """Process one event. Returns whether it gave a fix."""
     if isinstance(event, PairTdoa):
         return tracking.update((event,))
     tracking.update_height(event.height_m, event.std_m, event.is_barometer)
@@ -186,7 +186,7 @@ def _forward(
 
 
 def _transition(tracking: DifferenceTracking, event: Event, states: _States) -> tuple[float, float, list[_Decay]]:
-    """Time, density of the acceleration, and what decays, from the newest event to this one."""
+    """Time, density of the acceleration, and decays, from the newest event to this one."""
     if not tracking.has_started:
         return 0.0, 0.0, []
     estimator = tracking.estimator
@@ -216,7 +216,7 @@ def _transition(tracking: DifferenceTracking, event: Event, states: _States) -> 
 
 
 def _back(step: _Step, later: _Step, x_later: Vector, P_later: Matrix, dim: int) -> tuple[Vector, Matrix]:
-    """One step of the recursion: state and covariance given all that came later."""
+    """One step of the backward recursion: state and covariance given everything later."""
     x, P, dt_s, q = step.x, step.P, later.dt_s, later.q
     kept, positions, speeds = np.ones(len(x)), range(dim), range(dim, 2 * dim)
     for decay in later.decays:
@@ -240,7 +240,7 @@ def _back(step: _Step, later: _Step, x_later: Vector, P_later: Matrix, dim: int)
 
 
 def _as_fix(fix: Fix, x: Vector, P: Matrix, dim: int) -> Fix:
-    """The filter's fix with what is smoothed instead."""
+    """The filter's fix with smoothed position and velocity."""
     rows = np.frombuffer(fix.rows).reshape(-1, 3)[: VELOCITY + 4].copy()
     for first, states in ((POSITION, slice(0, dim)), (VELOCITY, slice(dim, 2 * dim))):
         rows[first, :dim] = x[states]
@@ -248,20 +248,20 @@ def _as_fix(fix: Fix, x: Vector, P: Matrix, dim: int) -> Fix:
     return replace(fix, rows=rows.tobytes(), method="joint-smoothed", requirement=None)
 
 
-# One's own estimator at a site: beacons become time differences, as the anchors' stamps and relays state them.
+# A user's own estimator at a site: beacons become time differences by the anchors' stamps and relays.
 
 
 class OwnEstimator(Protocol):
-    """What an estimator of the reader's own has."""
+    """Interface of a user's own estimator."""
 
     def hear(self, observation: PairTdoa) -> Fix | None:
-        """Process one time difference, which holds both anchors' positions; a fix if it makes one (``Fix.of``)."""
+        """Process one time difference, which contains both anchors' positions. Returns a fix (``Fix.of``) or None."""
 
 
 def heard(estimator: OwnEstimator, pair: PairTdoa, anchors_m: Mapping[int, Point], drops: Counter[str]) -> Fix | None:
-    """Give an estimator one difference, with the positions that it lacks; unknown anchors are counted.
+    """Pass one difference to an estimator, with missing positions added; unknown anchors are counted.
 
-    Raises SkylessError where the estimator fails or returns anything but a fix or None.
+    Raises SkylessError if the estimator fails or returns anything but a fix or None.
     """
     a_m, b_m = pair.a_m or anchors_m.get(pair.anchor_a), pair.b_m or anchors_m.get(pair.anchor_b)
     if a_m is None or b_m is None:
@@ -282,21 +282,21 @@ def heard(estimator: OwnEstimator, pair: PairTdoa, anchors_m: Mapping[int, Point
 
 
 class OwnReceiver:
-    """Receives as a tag of the site does, and gives an estimator one time difference after the other."""
+    """Receives like a tag of the site, and passes time differences to an estimator."""
 
     def __init__(self, estimator: OwnEstimator, site: Site) -> None:
-        """``site`` says where the anchors are."""
+        """``site``: gives the anchors' positions."""
         self._estimator = estimator
         self._anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
         bits = SHORT_BITS if site.schedule.sends_phases else TICK_BITS
         self._engine = PairEngine(bits, anchors_m=dict(self._anchors_m))
         self.counters: Counter[str] = Counter()
-        """Frames by what became of them."""
+        """Frames by result."""
         self.reason = NoFixReason.NO_BEACONS
-        """Why the last frame has made no fix."""
+        """Why the last frame gave no fix."""
 
     def hear(self, reception: Reception) -> Fix | None:
-        """Process a frame from the air; the newest fix of its differences."""
+        """Process a frame from the air. Returns the newest fix of its differences."""
         beacon = decode_any(reception.frame)
         if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
@@ -304,7 +304,7 @@ class OwnReceiver:
         return self.hear_beacon(beacon, reception)
 
     def hear_beacon(self, beacon: SiteBeacon, reception: Reception) -> Fix | None:
-        """Process a beacon that is decoded already, as ``hear`` does."""
+        """Process a decoded beacon like ``hear``."""
         relays = tuple(Relay(heard.anchor, heard.sequence, heard.rx_ticks, None) for heard in beacon.heard)
         sent = (beacon.anchor, beacon.sequence, beacon.tx_ticks)
         fix = None

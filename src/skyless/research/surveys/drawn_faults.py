@@ -1,4 +1,4 @@
-"""Ranges of a site's anchors drawn with drift and noise, and events that change them, as input of the watch."""
+"""Random ranges of a site's anchors with drift and noise, and events that change them, as input of the watch."""
 
 import math
 from typing import Final, Literal
@@ -22,10 +22,10 @@ _STAMP_S: Final = 100e-12
 
 LEARNING_WINDOWS: Final = 60
 _LASTS_WINDOWS: Final = 4
-"""For so long an event lasts at most; it ends when it is found."""
+"""Longest duration of an event, which ends when it is found."""
 _SLOW_MPS: Final = 1e-3
 _RETURN_WINDOWS: Final = 6
-"""After an event, until the next: its findings should end within them."""
+"""Windows between two events, within which findings should end."""
 
 _DOOR_REACH_M: Final = 0.3
 _DOOR_LATE_M: Final = (0.1, 0.5)
@@ -38,7 +38,7 @@ _Truth = set[tuple[Kind, tuple[int, ...]]]
 
 
 class WatchRun(Struct, frozen=True):
-    """One site that is watched while one thing after another happens."""
+    """A run of one watched site with a series of events."""
 
     layout: SurveyLayout
     event: Event
@@ -49,39 +49,39 @@ class WatchRun(Struct, frozen=True):
     drift_s: float
     """Correlation time of the drift, a Gauss–Markov process."""
     lively_m: float
-    """Drift of one pair more than the others; 0 for none."""
+    """Larger drift of a single pair; 0 for none."""
     missing: float
-    """Share of pairs that have no ranges."""
+    """Share of pairs without ranges."""
     events: int
-    """For the event ``none``: windows."""
+    """Number of events; of windows for the event ``none``."""
     seed: int
 
 
 class WatchResult(Struct, frozen=True):
-    """How many events of a run the watch found, and what else it reported."""
+    """Numbers of events in a run with certain findings, and of false alarms."""
 
     tries: int
     found: int
-    """With any finding."""
+    """Events with any finding."""
     named: int
-    """With the right anchor or link alone, of any kind."""
+    """Events with only the right anchors or links named, as any kind."""
     kind: int
-    """With the right kind as well."""
+    """Events with also the right kind."""
     wrong: int
-    """With an anchor said to have moved, or its delay to have changed, that has not."""
+    """Events with an anchor wrongly said to have moved, or its delay to have changed."""
     ended: int
-    """Whose findings ended after it did."""
+    """Events whose findings ended afterwards."""
     found_s: tuple[float, ...]
-    """From the event to its finding."""
+    """Times from an event to its finding."""
     alarms: int
     """Findings while nothing happened."""
     alarms_moved: int
-    """Those that say an anchor has moved or its delay has changed."""
+    """Alarms that an anchor has moved or its delay has changed."""
     windows: int
 
 
 class _Site:
-    """Ranges as they are at the moment."""
+    """A simulated site with its current ranges, and its watch."""
 
     def __init__(self, run: WatchRun, draw: np.random.Generator) -> None:
         self.layout = run.layout
@@ -107,12 +107,12 @@ class _Site:
         self.watch = AnchorWatch(at_m, self.layout.dimensions)
 
     def true_m(self) -> Array:
-        """Without drift and noise, shape (m,)."""
+        """Ranges without drift and noise, shape (m,)."""
         apart = self.position_m[self.first] - self.position_m[self.second]
         return np.asarray(np.linalg.norm(apart, axis=1) + self.late_m)
 
     def run_step(self) -> None:
-        """Give the watch the blocks of a window."""
+        """Simulate a window, and pass its blocks to the watch."""
         draw, m = self.draw, len(self.first)
         self._drift_m = self._kept * self._drift_m
         self._drift_m += math.sqrt(1.0 - self._kept**2) * self._drift_std_m * draw.standard_normal(m)
@@ -130,7 +130,7 @@ class _Site:
 
 
 def run_watch(run: WatchRun) -> WatchResult:
-    """Run the events one after another, and count what the watch finds."""
+    """Run the events one after another, and count the watch's findings."""
     draw = np.random.default_rng(run.seed)
     site = _Site(run, draw)
     for _ in range(LEARNING_WINDOWS):
@@ -144,7 +144,7 @@ def run_watch(run: WatchRun) -> WatchResult:
         standing = site.watch.findings
         alarms += len(standing)
         alarms_moved += sum(one.kind in {"moved", "delay"} for one in standing)
-        if standing:  # so that what was wrong before is not counted for the next event
+        if standing:  # so that earlier findings do not count for the next event
             site.watch.accept()
         truth, findings, passed_s, took = _happen(site, run, draw)
         windows += took
@@ -167,7 +167,7 @@ def run_watch(run: WatchRun) -> WatchResult:
 
 
 def _undisturbed(site: _Site, windows: int) -> WatchResult:
-    """Findings while nothing happens; each counts once, when it appears."""
+    """Count findings while nothing happens, each once when it appears."""
     known: _Truth = set()
     alarms = alarms_moved = 0
     for _ in range(windows):
@@ -180,7 +180,10 @@ def _undisturbed(site: _Site, windows: int) -> WatchResult:
 
 
 def _happen(site: _Site, run: WatchRun, draw: np.random.Generator) -> tuple[_Truth, tuple[Finding, ...], float, int]:
-    """One event, until it is found and for one window more; then all is as before. Also the number of steps."""
+    """Simulate one event until one window after it is found, then restore the site.
+
+    Returns the truth, the findings, the time until found, and the number of steps.
+    """
     position_m = site.position_m.copy()
     truth: _Truth = _begin(site, run, draw)
     findings: tuple[Finding, ...] = ()
@@ -197,7 +200,7 @@ def _happen(site: _Site, run: WatchRun, draw: np.random.Generator) -> tuple[_Tru
         took += 1
         passed_s += _WINDOW_S
         findings = site.watch.findings
-    if findings:  # what is said once all of it has been seen
+    if findings:  # use the findings of a window that shows the whole event
         site.run_step()
         findings = site.watch.findings or findings
     site.position_m = position_m
@@ -206,7 +209,7 @@ def _happen(site: _Site, run: WatchRun, draw: np.random.Generator) -> tuple[_Tru
 
 
 def _begin(site: _Site, run: WatchRun, draw: np.random.Generator) -> _Truth:
-    """Change the site; what a perfect watch says of it."""
+    """Begin the event. Returns the findings of a perfect watch."""
     n = len(site.position_m)
     if run.event in {"moved", "two moved", "slow"}:
         movers = draw.choice(n, 2 if run.event == "two moved" else 1, replace=False).tolist()
@@ -230,7 +233,7 @@ def _begin(site: _Site, run: WatchRun, draw: np.random.Generator) -> _Truth:
 
 
 def _crossing(site: _Site, person_m: Array) -> Integers:
-    """Pairs whose line of sight passes by a person."""
+    """Pairs whose line of sight passes near a person."""
     start, end = site.position_m[site.first, :2], site.position_m[site.second, :2]
     along = end - start
     part = np.clip(np.einsum("pd,pd->p", person_m - start, along) / np.einsum("pd,pd->p", along, along), 0.0, 1.0)
@@ -238,7 +241,7 @@ def _crossing(site: _Site, person_m: Array) -> Integers:
 
 
 def striking_windows(layout: SurveyLayout, window_s: float, alarm: float, windows: int, seed: int) -> int:
-    """How many windows of white noise alone strike."""
+    """Number of windows that are significant with white noise alone."""
     draw = np.random.default_rng(seed)
     position_m = layout.position_m
     n = len(position_m)

@@ -1,10 +1,10 @@
-"""Rooms for studies of surveys: drawn errors, layouts, the air between anchors, and the judge of a result.
+"""Rooms for studies of surveys: layouts, random errors, the air between anchors, and the evaluation of results.
 
-In the air are: antenna delays that are off, errors of the pairs of anchors, and the errors of the ranges at tags that
-the scenario ``room`` has. The truth of a room does not depend on who writes its file.
+The air has wrong antenna delays, errors of the pairs of anchors, and the range errors at tags of the scenario ``room``.
+The truth of a room does not depend on its site file.
 
-A file's positions are moved to the true frame by the best rigid alignment of all anchors: which way the axes point is
-no error of the site's shape, and tags then walk the same ways for every file.
+A file's positions are moved to the true frame by the best rigid alignment of all anchors: the direction of the axes is
+no error of the site's shape, and tags then walk the same paths for every file.
 """
 
 import math
@@ -40,7 +40,7 @@ from skyless.site.survey.problem import Problem, jacobian, superimposed
 from skyless.site.survey.solve import run_survey
 from skyless.site.survey.surveyed_site import surveyed_site
 
-# Sites on which surveys of anchors are studied.
+# Sites for studies of surveys.
 
 SLOT_S: Final = 2.5e-3
 _ROOM_M: Final = (
@@ -56,7 +56,7 @@ _ROOM_M: Final = (
 
 
 class SurveyLayout(Struct, frozen=True, eq=False):
-    """Anchors 1 to n."""
+    """Positions of anchors 1 to n."""
 
     name: str
     dimensions: Literal[2, 3]
@@ -71,7 +71,7 @@ class SurveyLayout(Struct, frozen=True, eq=False):
 
     @property
     def heights_m(self) -> dict[int, float]:
-        """What a survey in two dimensions is given; empty in three."""
+        """Heights that a survey in two dimensions is given; empty in three."""
         heights = dict(zip(self.anchors, self.position_m[:, 2].tolist(), strict=True))
         return heights if self.dimensions == 2 else {}
 
@@ -90,16 +90,16 @@ def survey_layouts() -> dict[str, SurveyLayout]:
     }
 
 
-# Ranges of a site's anchors from simulated air: real machines, and what they receive of one another.
+# Ranges of a site's anchors from simulated air, with real machines.
 
 OnLeg = Callable[[int, int, int, int, float], None]
-"""Sender, receiver, TX and RX ticks, true time: as ``PairRanger.add`` accepts them."""
+"""Called with sender, receiver, TX and RX ticks, and true time, like ``PairRanger.add``."""
 
 
 def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *, settle_s: float = 0.0) -> PairRanger:
-    """Ranges of ``seconds`` of a site, from all that its anchors receive.
+    """Ranges of a site from all receptions of its anchors within ``seconds``.
 
-    ``settle_s``: time that passes before the first leg. The last block is closed.
+    ``settle_s``: time before the first leg. The last block is closed.
     """
     whole = PairRanger()
     until_s = settle_s + seconds
@@ -118,7 +118,7 @@ def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *
 
 
 class RecordedAnchor:
-    """An anchor whose receptions of its site are handed on as legs."""
+    """An anchor whose receptions from its site are passed on as legs."""
 
     def __init__(self, machine: AnchorMachine, site_id: int, on_leg: OnLeg) -> None:
         self._machine, self._site_id, self._on_leg = machine, site_id, on_leg
@@ -129,7 +129,7 @@ class RecordedAnchor:
         return self._machine.id
 
     def hear(self, reception: Reception) -> None:
-        """Process one frame, and hand on its leg."""
+        """Process one frame, and pass on its leg."""
         self._machine.hear(reception)
         beacon = decode_any(reception.frame)
         if not isinstance(beacon, Malformed) and beacon.site == self._site_id and beacon.anchor != self.id:
@@ -137,37 +137,37 @@ class RecordedAnchor:
             self._on_leg(beacon.anchor, self.id, beacon.tx_ticks, reception.rx_ticks, t_s)
 
     def next_transmission_ticks(self, now_ticks: int) -> int | None:
-        """That of the wrapped machine."""
+        """The wrapped machine's next transmission."""
         return self._machine.next_transmission_ticks(now_ticks)
 
     def transmission(self, tx_ticks: int) -> Transmission:
-        """That of the wrapped machine."""
+        """The wrapped machine's transmission."""
         return self._machine.transmission(tx_ticks)
 
 
-# The air of one run: sites with errors that are drawn, and what their anchors receive of one another.
+# The air of one run: sites with random errors, and their anchors' ranges.
 
 LATE_M: Final = (0.2, 1.0)
-"""By how much late pairs are."""
+"""Least and greatest lateness of late pairs."""
 _SENSITIVITY_DBM: Final = -105.0
-"""All anchors receive one another."""
+"""Sensitivity at which all anchors receive one another."""
 _SETTLE_S: Final = 1.0
-"""Until anchors of protocol 2 send regularly."""
+"""Time until anchors of protocol 2 send regularly."""
 
 
 class AirErrors(Struct, frozen=True):
-    """How errors are drawn."""
+    """Distribution of the errors in the air."""
 
     delay_std_m: float = 0.0
     pair_std_m: float = 0.0
-    """Constant error of each pair."""
+    """Standard deviation of each pair's constant error."""
     late_share: float = 0.0
     missing_share: float = 0.0
     """Shares of all pairs that are late, and that have no ranges."""
 
 
 class DrawnErrors(Struct, frozen=True, eq=False):
-    """What is wrong with the air of one run."""
+    """Errors in the air of one run."""
 
     delay_m: Array
     """Shape (n,)."""
@@ -177,12 +177,12 @@ class DrawnErrors(Struct, frozen=True, eq=False):
 
 
 def free_axes(layout: SurveyLayout) -> Array:
-    """Coordinates that are estimated: 1, the others 0."""
+    """Estimated coordinates as 1, the others as 0, shape (3,)."""
     return np.array([1.0, 1.0, 1.0 if layout.dimensions == 3 else 0.0])
 
 
 def drawn_errors(errors_of: AirErrors, layout: SurveyLayout, draw: np.random.Generator) -> DrawnErrors:
-    """Delays, and errors of pairs; each pair is late or missing for itself."""
+    """Draw delays, and errors of pairs, which are late or missing independently."""
     anchors = layout.anchors
     delay_m = draw.normal(0.0, errors_of.delay_std_m, len(anchors)) if errors_of.delay_std_m else np.zeros(len(anchors))
     late, missing, errors = [], [], []
@@ -202,7 +202,7 @@ def drawn_errors(errors_of: AirErrors, layout: SurveyLayout, draw: np.random.Gen
 
 
 def ranges_in_air(layout: SurveyLayout, drawn: DrawnErrors, seconds: float, noise_ps: float, seed: int) -> PairRanges:
-    """What the anchors of a site in such air receive of one another."""
+    """Ranges between the anchors of a site in this air."""
     anchors = tuple(
         AnchorSite(anchor, x_m, y_m, z_m)
         for anchor, (x_m, y_m, z_m) in zip(layout.anchors, layout.position_m.tolist(), strict=True)
@@ -225,33 +225,33 @@ def ranges_in_air(layout: SurveyLayout, drawn: DrawnErrors, seconds: float, nois
     return stamps_of(site, air, seconds, seed, settle_s=settle_s).ranges()
 
 
-# A survey against the truth: errors after the best rigid alignment, its bound, and what a tag makes of it.
+# A survey compared with the truth: errors after the best rigid alignment, their bound, and errors of a tag.
 
 _GRID: Final = np.linspace(0.15, 0.85, 5)
 """Positions of tags, as shares of the site's length and width."""
 
 
 class Outcome(Struct, frozen=True):
-    """One survey, judged. Lengths are rms over anchors, after the best rigid alignment."""
+    """Evaluation of one survey. Lengths are RMS over anchors, after the best rigid alignment."""
 
     variant: str
     bound_m: float
     """Cramér–Rao bound of the anchors' distance error."""
     is_determined: bool
-    """All anchors; the figures below are None otherwise."""
+    """Whether all anchors are determined; otherwise the figures below are None."""
     is_open: bool
-    """Whether it says that something is not determined, even if only delays against positions."""
+    """Whether the survey states that something is not determined, even if only delays against positions."""
     is_flagged: bool
-    """Whether it says that it is ambiguous, that nothing checks it, or that an anchor is not determined."""
+    """Whether the survey states that it is ambiguous, unchecked, or that an anchor is not determined."""
     hand_tag_m: float
-    """Error of a tag's position, rms, by positions measured by hand and no knowledge of delays."""
+    """RMS error of a tag's position with anchor positions measured by hand and unknown delays."""
     error_m: float | None = None
     said_m: float | None = None
     nees: float | None = None
     delay_m: float | None = None
-    """Error of delays less their mean."""
+    """Error of the delays relative to their mean."""
     tag_m: float | None = None
-    """Error of a tag's position, rms, by the survey."""
+    """RMS error of a tag's position with the survey."""
     late: int = 0
     found: int = 0
     """Late pairs that were left out."""
@@ -262,7 +262,7 @@ class Outcome(Struct, frozen=True):
 def survey_bound_m(
     layout: SurveyLayout, ranges: PairRanges, facts: Facts, drawn: DrawnErrors, seconds: float, noise_ps: float
 ) -> float:
-    """Bound of the anchors' distance error, rms, of the pairs in the air, had it been known which are late."""
+    """Bound of the anchors' RMS distance error for the pairs in the air, if it were known which are late."""
     n = len(layout.position_m)
     if facts.keep_positions:
         return facts.sketch_std_m * math.sqrt(layout.dimensions)
@@ -294,7 +294,7 @@ def survey_bound_m(
 
 
 def judged(layout: SurveyLayout, survey: Survey, drawn: DrawnErrors, outcome: Outcome) -> Outcome:
-    """The outcome with what came of the survey."""
+    """The outcome with the survey's figures added."""
     is_determined = all(one.determined for one in survey.anchors) and len(survey.anchors) == len(layout.anchors)
     flagged = bool(survey.ambiguities) or survey.unchecked is not None or not is_determined
     excluded = {(pair.a, pair.b) for pair in survey.pairs if pair.excluded}
@@ -334,14 +334,14 @@ def judged(layout: SurveyLayout, survey: Survey, drawn: DrawnErrors, outcome: Ou
 
 
 def aligned(true_m: Array, found_m: Array, axes: int) -> Array:
-    """True positions, shape (n, 3), turned, mirrored and shifted to fit the found ones best; in 2-D on the floor."""
+    """True positions, shape (n, 3), rotated, reflected and shifted to best fit the found ones; in 2-D on the floor."""
     moved = true_m.copy()
     moved[:, :axes] = superimposed(true_m[:, :axes], found_m[:, :axes], np.ones(len(true_m)))
     return moved
 
 
 def tag_error_m(layout: SurveyLayout, found_m: Array, delay_m: Array, true_delay_m: Array) -> float:
-    """What tags' positions are off without noise, rms over a grid, by positions (n, 3) and delays (n,) of anchors.
+    """Noise-free RMS error of tags' positions over a grid, due to anchor positions (n, 3) and delays (n,).
 
     The tag's clock is free; its height is estimated in 3-D.
     """
@@ -368,18 +368,18 @@ TAPE_STD_M: Final = 0.005
 
 
 class RoomErrors(Struct, frozen=True):
-    """How the errors of a room are drawn."""
+    """Distribution of the errors of a room."""
 
     delay_std_m: float = 0.0
     """Standard deviation of h, half of the sum of an anchor's TX and RX delay errors, and of half their difference."""
     pair_std_m: float = 0.0
-    """Constant error of each pair of anchors."""
+    """Standard deviation of the constant error of each pair of anchors."""
     ranges: RangeErrorModel = RangeErrorModel()
-    """At tags."""
+    """Range errors at tags."""
 
 
 class DrawnRoom(Struct, frozen=True, eq=False):
-    """One room. Arrays are in the order of the layout's anchors."""
+    """A room with its errors. Arrays are in the order of the layout's anchors."""
 
     layout: SurveyLayout
     tx_delay_m: Array
@@ -399,7 +399,7 @@ class DrawnRoom(Struct, frozen=True, eq=False):
 
 
 def drawn_room(layout: SurveyLayout, errors: RoomErrors, noise_ps: float, seed: int) -> DrawnRoom:
-    """A room with its own errors."""
+    """Draw the errors of a room."""
     draw = np.random.default_rng(seed)
     n, anchors = len(layout.anchors), layout.anchors
     common_m, half_m = errors.delay_std_m * draw.standard_normal((2, n))
@@ -421,7 +421,7 @@ def drawn_room(layout: SurveyLayout, errors: RoomErrors, noise_ps: float, seed: 
 
 
 def site_at(layout: SurveyLayout, position_m: Array, noise_ps: float) -> Site:
-    """A site whose file states these positions, shape (n, 3), with the usual delays and accuracy."""
+    """A site file with these positions, shape (n, 3), and the usual delays and accuracy."""
     anchors = tuple(
         AnchorSite(anchor, x_m, y_m, z_m)
         for anchor, (x_m, y_m, z_m) in zip(layout.anchors, position_m.tolist(), strict=True)
@@ -431,7 +431,7 @@ def site_at(layout: SurveyLayout, position_m: Array, noise_ps: float) -> Site:
 
 
 def air_of(room: DrawnRoom, site: Site) -> Impairments:
-    """What is wrong in a room's air against what a site file states."""
+    """Errors of a room's air relative to a site file."""
     stated_m = anchor_positions(site)
     usual = AnchorSite(0, 0.0, 0.0)
     return replace(
@@ -454,7 +454,7 @@ def air_of(room: DrawnRoom, site: Site) -> Impairments:
 
 
 def true_site(room: DrawnRoom) -> Site:
-    """A file that states the truth, and that its positions are exact; delays are such that all h are 0."""
+    """A site file with the true positions, stated as exact, and delays that make all h 0."""
     site = site_at(room.layout, room.layout.position_m, room.noise_ps)
     delays = zip(site.anchors, room.tx_delay_m, room.rx_delay_m, strict=True)
     anchors = tuple(
@@ -465,33 +465,33 @@ def true_site(room: DrawnRoom) -> Site:
 
 
 def exact_site(room: DrawnRoom) -> Site:
-    """The true site, which also states that ranges are right."""
+    """The true site, which also states exact ranges."""
     return replace(true_site(room), accuracy=EXACT)
 
 
 def hand_site(room: DrawnRoom) -> Site:
-    """A file with positions measured by hand and the usual delays."""
+    """A site file with positions measured by hand and the usual delays."""
     return _aligned(room, site_at(room.layout, room.layout.position_m + room.hand_m, room.noise_ps))
 
 
 def ranges_of(room: DrawnRoom, seconds: float) -> PairRanges:
-    """What the anchors receive of one another, with the file of somebody who has a sketch."""
+    """Ranges between the anchors, with a site file from a sketch."""
     site = site_at(room.layout, room.layout.position_m + room.sketch_m, room.noise_ps)
     return stamps_of(site, air_of(room, site), seconds, room.seed).ranges()
 
 
 def kept_site(room: DrawnRoom, ranges: PairRanges) -> Site:
-    """A file with positions measured by hand, and delays by ``--keep-positions``."""
+    """A site file with positions measured by hand, and delays from ``--keep-positions``."""
     rough_m = room.layout.position_m + room.hand_m
     facts = replace(_facts(room, rough_m), sketch_std_m=HAND_STD_M, keep_positions=True)
     return _aligned(room, _written(room, rough_m, run_survey(ranges, facts), AccuracySite()))
 
 
 def surveyed_room(room: DrawnRoom, ranges: PairRanges, *, with_tape: bool = False, is_exact: bool = False) -> Site:
-    """A file of which positions, delays and their accuracy come from a survey that started from a sketch.
+    """A site file with positions, delays and accuracy from a survey that started from a sketch.
 
-    ``with_tape``: the distance that the survey asks for has been measured. ``is_exact``: the survey knows that delays
-    are right and pairs without errors, and the file states ranges without errors.
+    ``with_tape``: the distance that the survey advises is measured. ``is_exact``: the survey knows that delays and
+    pairs have no errors, and the file states exact ranges.
     """
     rough_m = room.layout.position_m + room.sketch_m
     facts = _facts(room, rough_m)
@@ -515,7 +515,7 @@ def _facts(room: DrawnRoom, rough_m: Array) -> Facts:
 
 
 def _written(room: DrawnRoom, rough_m: Array, survey: Survey, accuracy: AccuracySite) -> Site:
-    """``accuracy``: as the file stated it before."""
+    """The site file with a survey written into it; ``accuracy``: as stated before."""
     return surveyed_site(replace(site_at(room.layout, rough_m, room.noise_ps), accuracy=accuracy), survey)
 
 

@@ -20,26 +20,21 @@ from skyless.core.geometry import (
 )
 from skyless.core.site import ScheduleSite, Site
 
-_MAX_OVERLOAD: Final = 2.0  # over the best number of frames in reach; half or double of it costs a tag less than 8 %
-
-
+_MAX_OVERLOAD: Final = 2.0  # multiple of the best beacon rate in reach; half or double costs a tag less than 8 %
 _MAX_NAMED: Final = 8
 
-
 _ONLY_IN: Final = {"rate_hz": "free", "carrier_phase": "free", "slots": "master", "frames_per_node": "master"}
-"""Keys of the schedule that mean something in one mode only."""
-
+"""Keys of the schedule that have an effect in one mode only."""
 
 _SHORTEST_GUARD_S: Final = 0.35e-3
 """Shortest turn-around of a host that reads one frame and prepares the next (firmware in C)."""
 
-
 _FLATTEST: Final = 0.05
-"""Extent across the best plane (or line) over the whole extent, below which anchors count as in it."""
+"""Anchors count as in one plane (or line) if their extent across it is a smaller share of the whole extent."""
 
 
 def warnings_of(site: Site) -> list[str]:
-    """Soft problems of a valid site, each a sentence; empty when there is none."""
+    """Sentences on the soft problems of a valid site."""
     general = [*_count(site), *_geometry(site), *_height(site), *_outline(site), *_guard(site), *_accuracy(site)]
     general += _without_effect(site)
     if site.schedule.needs_master:
@@ -48,7 +43,7 @@ def warnings_of(site: Site) -> list[str]:
 
 
 def too_few_anchors(site: Site) -> str | None:
-    """Say that the placed anchors give no position; None where they are enough."""
+    """Say that the placed anchors are too few for a position; None if they are enough."""
     needed, what = anchors_needed(site)
     count = len(site.anchors)
     if count >= needed:
@@ -60,7 +55,7 @@ def too_few_anchors(site: Site) -> str | None:
 
 
 def anchors_needed(site: Site) -> tuple[int, str]:
-    """How many anchors a position at this site needs, and which kind of position it is."""
+    """Number of anchors that a position at this site needs, and the kind of position."""
     return (4, "with its height") if site.tags.height_m is None else (3, "at a known height")
 
 
@@ -94,13 +89,13 @@ def _geometry(site: Site) -> list[str]:
 
 
 def _flat_everywhere(points: Array) -> str | None:
-    """Say that all anchors lie in one line or plane; None where they do not."""
+    """Say that all anchors are in one line or plane; None if not."""
     extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     return "all anchors" if extents[-1] < _FLATTEST * extents[0] else None
 
 
 def _flat_in_reach(site: Site, points: Array) -> str | None:
-    """Name the anchors around which all others in reach lie in one line or plane: tags there receive no more."""
+    """Name the anchors around which all others in reach are in one line or plane, as tags there receive only these."""
     ones, others = links_in_reach(site)
     count, dimensions = points.shape
     pairs = np.concatenate([ones, others]), np.concatenate([others, ones])
@@ -145,7 +140,7 @@ def _outline(site: Site) -> list[str]:
 
 
 def _without_effect(site: Site) -> list[str]:
-    """Keys that are set and mean nothing in the site's mode."""
+    """Warn of keys that have no effect in the site's mode."""
     schedule, usual = site.schedule, ScheduleSite()
     found = [
         f"schedule.{key} is {str(getattr(schedule, key)).lower()}, which has no effect in mode {schedule.mode}"
@@ -163,7 +158,7 @@ def _without_effect(site: Site) -> list[str]:
 
 
 def _neighbours(site: Site) -> list[str]:
-    """Anchors without a neighbour in reach, and groups of anchors that have no link between them."""
+    """Warn of anchors without a neighbour in reach, and of groups of anchors without a link between them."""
     points = anchor_positions(site)
     if len(points) < 2:
         return []
@@ -187,7 +182,7 @@ def _neighbours(site: Site) -> list[str]:
 
 
 def _load(site: Site) -> list[str]:
-    """Frames at random instants: above the best number in reach they destroy each other."""
+    """Warn of too high a rate: frames at random instants collide if too many are in reach."""
     rate_hz = site.schedule.rate_hz
     if rate_hz is None or not site.anchors:
         return []

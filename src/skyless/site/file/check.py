@@ -1,4 +1,4 @@
-"""The rules of a site beyond the types of its values: limits of each number, then rules between them.
+"""Validation of a site beyond the types of its values: limits of each number, then rules between them.
 
 Every violation is a configuration error.
 """
@@ -26,7 +26,7 @@ ANY_ADDRESS: Final = 65_533
 
 
 class Limits(Struct, frozen=True):
-    """A closed interval, without its lower end where ``above`` is set."""
+    """A closed interval; ``above`` excludes its lower end."""
 
     low: float
     high: float
@@ -35,12 +35,12 @@ class Limits(Struct, frozen=True):
     above: bool = False
 
     def contains(self, value: float) -> bool:
-        """Whether the value is finite and lies within."""
+        """Whether the value is finite and within."""
         enough = value > self.low if self.above else value >= self.low
         return math.isfinite(value) and enough and value <= self.high
 
     def __str__(self) -> str:
-        """Return their text for error messages."""
+        """Description for error messages."""
         noun = "a whole number" if self.whole else "a number"
         unit = f" of {self.unit}" if self.unit else ""
         if self.above:
@@ -55,7 +55,7 @@ _STD = Limits(0, 6.5, "metres")
 _STATED_STD = Limits(0, 0.255, "metres")
 """Sent as an 8-bit number of millimetres in protocol 2."""
 _SLOT = Limits(0, 254, whole=True)
-_MAX_BY_PAIRS: Final = 255  # up to so large a site all pairs are compared one by one
+_MAX_BY_PAIRS: Final = 255  # anchors up to which all pairs are compared one by one
 _DELAY = Limits(0, 65_535, "ticks (15.65 ps)", whole=True)
 
 SITE_LIMITS: Final = {
@@ -108,7 +108,7 @@ SITE_LIMITS: Final = {
     "georeference.height_m": Limits(-1e4, 1e5, "metres"),
     "georeference.heading_deg": Limits(-360, 360, "degrees"),
 }
-"""By key, without the indices in lists."""
+"""Limits by key, without indices in lists."""
 
 _STATED_COORDINATE = Limits(-8388, 8388, "metres in mode free, where anchors state their positions,")
 """Sent as a 24-bit number of millimetres."""
@@ -118,7 +118,7 @@ PROTOCOL_2_LIMITS: Final = {
     "anchors.y_m": _STATED_COORDINATE,
     "anchors.z_m": _STATED_COORDINATE,
 }
-"""Those that are narrower in protocol 2."""
+"""Limits that are narrower in protocol 2."""
 
 _FEWEST_CORNERS: Final = 3
 _MAX_CORNERS: Final = 1000
@@ -146,7 +146,7 @@ _OTHERS: Final = {
 
 
 def expected(key: str, *, protocol_2: bool = False) -> str:
-    """What the value of a key (without indices in lists) should be."""
+    """Describe valid values of a key (without indices in lists)."""
     limits = {**SITE_LIMITS, **PROTOCOL_2_LIMITS} if protocol_2 else SITE_LIMITS
     if key in limits:
         return str(limits[key])
@@ -188,7 +188,7 @@ def check_site(site: Site, file: Path) -> None:
 
 
 def _check_floors(site: Site, file: Path) -> None:
-    """Check that floors are listed from the lowest up, each once, and that an image has its width."""
+    """Check that floors are listed once each from the lowest up, and that an image has its width."""
     if site.floors is UNSET:
         return
     if len(site.floors) > _MAX_FLOORS:
@@ -207,17 +207,17 @@ def _check_floors(site: Site, file: Path) -> None:
 
 
 def plan_files(site: Site, file: Path) -> dict[int | None, Path]:
-    """The images of a site's floors by their numbers; None is the number of the whole site's."""
+    """Images of a site's floors by number; None for the image of the whole site."""
     named: dict[int | None, str | None] = {None: None if site.floor_plan is None else site.floor_plan.image}
     named |= {floor.number: floor.image for floor in (() if site.floors is UNSET else site.floors)}
     return {number: file.parent / image for number, image in named.items() if image is not None}
 
 
 def check_floor_plans(site: Site, file: Path) -> None:
-    """Check that the images of all floors are PNGs or JPEGs that can be read.
+    """Check that the images of all floors are readable PNGs or JPEGs.
 
     Raises:
-        ConfigurationError: when one is not.
+        ConfigurationError: one is not.
     """
     if site.floor_plan is not None:
         _check_image(file, "floor_plan.image", site.floor_plan.image)
@@ -238,7 +238,7 @@ def _check_image(file: Path, key: str, image: str) -> None:
 
 
 def with_anchor(path: str, anchors: Sequence[object], unplaced: Sequence[object] = ()) -> str:
-    """Add the anchor's identifier, which its owner knows, to the path of a value in the lists of anchors."""
+    """Add the anchor's identifier, which users know, to the path of a value in the lists of anchors."""
     match = re.match(r"(anchors|unplaced)\[(\d+)\]", path)
     if match is None:
         return path
@@ -252,7 +252,7 @@ def _with_anchor(path: str, site: Site) -> str:
 
 
 def _numbers(value: object, path: str = "", row: int | None = None) -> Iterator[tuple[str, int | None, float]]:
-    """Every number in a tree of structs: its key without indices, its row where it is in a list, and itself."""
+    """Every number in a tree of structs: its key without indices, its row if in a list, and its value."""
     if isinstance(value, Struct):
         for field in value.__struct_fields__:
             yield from _numbers(getattr(value, field), f"{path}.{field}" if path else field, row)
@@ -321,14 +321,14 @@ def _check_anchors(site: Site, file: Path) -> None:
 
 
 def _rows(site: Site) -> Iterator[tuple[str, AnchorSite | UnplacedAnchor]]:
-    """Every anchor with its row, as ``anchors[3]``."""
+    """Every anchor, preceded by its place, such as ``anchors[3]``."""
     for index, anchor in enumerate(site.all_anchors):
         placed = index < len(site.anchors)
         yield f"anchors[{index}]" if placed else f"unplaced[{index - len(site.anchors)}]", anchor
 
 
 def _at_one_point(site: Site) -> Iterator[tuple[int, int]]:
-    """Rows of placed anchors that are at the same point."""
+    """Pairs of rows of placed anchors at the same point."""
     if len(site.anchors) <= _MAX_BY_PAIRS:
         points = [(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]
         pairs = combinations(range(len(points)), 2)
@@ -341,7 +341,7 @@ def _at_one_point(site: Site) -> Iterator[tuple[int, int]]:
 
 
 def _check_protocol_2(site: Site, file: Path) -> None:
-    """Check what an anchor can state of itself."""
+    """Check that anchors can state their standard deviations."""
     most = _STATED_STD.high
     if site.accuracy.survey_std_m > most and any(anchor.std_m is None for anchor in site.anchors):
         right = f"at most {most:g} in mode free, which is the largest std_m that an anchor can state"
@@ -409,7 +409,7 @@ _START_OF_FRAME: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
-    """Width and height in pixels of a PNG or JPEG, None when the bytes are neither or contain no size.
+    """Width and height in pixels of a PNG or JPEG; None for other or damaged files.
 
     Sources: PNG (W3C, third edition) 11.2.2, JPEG (ITU-T T.81) B.1 and B.2.2.
     """
@@ -427,7 +427,7 @@ def _png_size(data: bytes) -> tuple[int, int] | None:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Search marker by marker for the frame header."""
+    """Find the frame header, marker by marker."""
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]

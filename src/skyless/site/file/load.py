@@ -1,4 +1,4 @@
-"""From a TOML file to a validated site."""
+"""Load a validated site from a TOML file, and edit values in the file's text."""
 
 import difflib
 import json
@@ -31,9 +31,9 @@ from skyless.core.site import (
 )
 from skyless.site.file.check import check_floor_plans, check_site, expected, with_anchor
 
-_MAX_BYTES: Final = 1 << 24  # devices do not end
+_MAX_BYTES: Final = 1 << 24  # a device would never end
 _TOO_DEEP: Final = re.compile(rb"(?:[\w-]+[ \t]*\.[ \t]*){64}")
-"""A dotted key of more than 64 parts; a site file needs two. The time to read a key grows with their square."""
+"""A dotted key of more than 64 parts: parsing takes quadratic time, and a site file needs only two."""
 
 _TABLES: Final[dict[str, type[Struct]]] = {
     "schedule": ScheduleSite,
@@ -55,7 +55,7 @@ _MISSING = re.compile(r"Object missing required field `(?P<name>\w+)`")
 
 
 def load_site(path: Path | str) -> Site:
-    """The site that a TOML file describes.
+    """Load and check a site file.
 
     Raises:
         ConfigurationError: naming the file, the key, its value and what would be right.
@@ -76,7 +76,7 @@ def load_site(path: Path | str) -> Site:
 
 
 def _refuse_mode_slots(path: Path, document: dict[str, Any]) -> None:
-    """Say what a file of version 0.2 without a master needs instead."""
+    """Refuse the mode ``slots`` of version 0.2, and say what replaces it."""
     schedule = document.get("schedule")
     if isinstance(schedule, dict) and schedule.get("mode") == "slots":
         right = (
@@ -94,14 +94,14 @@ def _converted(path: Path, document: dict[str, Any]) -> Site:
 
 
 class _Rows(Struct):
-    """Where the anchors stand in the file's list: those with a position, and those without."""
+    """Rows in the file's list of the anchors with and without a position."""
 
     anchors: list[int]
     unplaced: list[int]
 
 
 def _separate_unplaced(path: Path, document: dict[str, Any]) -> _Rows | None:
-    """Move a protocol 2 document's anchors without a position to a list of their own; name a master if it has none.
+    """Move a protocol 2 document's anchors without a position to a separate list, and name a master if there is none.
 
     Returns None for protocol 1, and for a document that the conversion will refuse.
     """
@@ -128,7 +128,7 @@ def _separate_unplaced(path: Path, document: dict[str, Any]) -> _Rows | None:
 
 
 def _refuse_without_position(path: Path, row: str, entry: dict[str, Any]) -> None:
-    """Refuse what only an anchor with a position may have."""
+    """Refuse keys that only an anchor with a position may have."""
     for key, value in entry.items():
         if key not in UnplacedAnchor.__struct_fields__:
             right = "left out, or given with x_m and y_m: this anchor has no position"
@@ -136,7 +136,7 @@ def _refuse_without_position(path: Path, row: str, entry: dict[str, Any]) -> Non
 
 
 def _in_file(text: str, rows: _Rows | None) -> str:
-    """A text with the rows of separate lists of anchors changed to those of the file's one list."""
+    """Replace rows of the separate lists of anchors in a text by those of the file's single list."""
     if rows is None:
         return text
 
@@ -157,7 +157,7 @@ def _parse(path: Path) -> dict[str, Any]:
             raise ConfigurationError(path, "", None, f"a site file, {_MAX_BYTES >> 20} MiB at most")
         if _TOO_DEEP.search(text):
             raise ConfigurationError(path, "", None, "a site file; this one nests or counts too far")
-        return tomllib.loads(text.decode("utf-8-sig"))  # editors of Windows put a byte order mark before it
+        return tomllib.loads(text.decode("utf-8-sig"))  # Windows editors add a byte order mark
     except OSError as error:
         raise ConfigurationError(path, "", None, f"a readable site file ({error.strerror})") from None
     except UnicodeDecodeError as error:
@@ -179,7 +179,7 @@ def _refuse_unknown_keys(path: Path, document: dict[str, Any]) -> None:
 
 
 def _refuse_unknown(path: Path, document: dict[str, Any], prefix: str, table: object, struct: type[Struct]) -> None:
-    """Refuse keys that are no field of a struct, and fields that the file does not have."""
+    """Refuse keys that a table cannot have."""
     if not isinstance(table, dict):
         return  # a wrong type, which the conversion reports
     known = [name for name in struct.__struct_fields__ if name != "unplaced"]
@@ -191,7 +191,7 @@ def _refuse_unknown(path: Path, document: dict[str, Any], prefix: str, table: ob
 
 
 def _wrong_type(path: Path, document: dict[str, Any], message: str) -> ConfigurationError:
-    """The error that msgspec's message means: which key of the file, its value, and what would be right."""
+    """Translate msgspec's message: which key of the file, its value, and what would be right."""
     match = _FINDING.fullmatch(message)
     key_path = match["path"] or "" if match else ""
     missing = _MISSING.match(message)
@@ -217,10 +217,10 @@ def _value_at(document: object, key_path: str) -> object:
 
 
 def site_of(site: Site | str | Path) -> tuple[Site, Path]:
-    """A site, and the file that errors name and next to which its image lies; a value without a file is ``site``.
+    """A checked site, and the file to name in errors and to find images; ``site`` for a site without a file.
 
     Raises:
-        SkylessError: there is no such file, or the site has a value that cannot be used.
+        SkylessError: there is no such file, or the site has an invalid value.
     """
     if isinstance(site, Site):
         file = Path("site")
@@ -233,7 +233,7 @@ def site_of(site: Site | str | Path) -> tuple[Site, Path]:
     return load_site(file), file
 
 
-# Writes values of anchors and sections into the text of a site file; all else stays unchanged, comments included.
+# Edits of values of anchors and sections in the text of a site file, which keep everything else including comments.
 
 OfAnchors = Mapping[int, Mapping[str, float]]
 """Values by anchor and key."""
@@ -248,10 +248,10 @@ _ASSIGNMENT = re.compile(r"(\s*)[\w-]+\s*=.*?(\r?\n)?$", re.DOTALL)
 
 
 def with_values(text: str, of_anchors: OfAnchors, of_sections: OfSections, path: str | PathLike[str], what: str) -> str:
-    """The text with values changed where their keys stand, and added where they do not; ``what`` names them in errors.
+    """Set values in a site file's text, adding missing keys. ``what`` names the values in errors.
 
     Raises:
-        ConfigurationError: the anchors or the sections are written in a form that this cannot edit.
+        ConfigurationError: the anchors or the sections have a form that cannot be edited.
     """
     lines = text.splitlines(keepends=True)
     starts = [number for number, line in enumerate(lines) if _HEADER.match(line)]
@@ -278,14 +278,14 @@ def with_values(text: str, of_anchors: OfAnchors, of_sections: OfSections, path:
     return result
 
 
-def _with_all(lines: list[str], values: Mapping[str, float | str] | Mapping[str, float]) -> list[str]:
+def _with_all(lines: list[str], values: Mapping[str, float | str]) -> list[str]:
     for key, value in values.items():
         lines = _with_value(lines, key, value)
     return lines
 
 
 def _with_value(lines: list[str], key: str, new: float | str) -> list[str]:
-    """The lines of one table with a key's value changed, or added after the last key."""
+    """Set a key's value in the lines of one table, or add it after the last key."""
     present = re.compile(rf"(\s*{key}\s*=\s*)(\"[^\"]*\"|[^\s#]+)(.*)", re.DOTALL)
     value = _toml(new)
     for number, line in enumerate(lines):

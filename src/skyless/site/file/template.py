@@ -1,4 +1,4 @@
-"""Sites to start from, and their files with a comment on every key."""
+"""Template sites, and their files with a comment on every key."""
 
 import json
 from itertools import product
@@ -183,13 +183,13 @@ _EXAMPLE_GEOREFERENCE = GeoreferenceSite(latitude_deg=47.3769, longitude_deg=8.5
 
 
 _FROM_FLOOR_AND_CEILING_M: Final = 0.5
-_FARTHEST_M: Final = 8388.0  # distance from the origin along each axis that an anchor can state
+_FARTHEST_M: Final = 8388.0  # largest coordinate that an anchor can state
 
 
 def site_template(site: Site) -> str:
-    """Site file, with a comment on every key of its mode, of a site whose anchors have no keys but position and slot.
+    """Site file with a comment on every key of its mode; of anchors it has only position and slot.
 
-    Walls, floor plan and georeference that the site has not are commented examples.
+    Walls, floor plan and georeference that the site lacks are commented examples.
     """
     schedule, noise = site.schedule, site.noise
     head = _HEAD.format(
@@ -259,7 +259,7 @@ def _floors(site: Site) -> str:
 
 
 def _floor(floor: FloorSite, off: str) -> str:
-    """Its table; a floor without an image has none of the keys of one."""
+    """The table of a floor; without an image it lacks the image's keys."""
     texts = {key: json.dumps(getattr(floor, key), ensure_ascii=False) for key in ("name", "image")}
     loss_db, delay_m = floor.slab
     slab = {"slab_loss_db": loss_db, "slab_delay_m": delay_m}
@@ -269,7 +269,7 @@ def _floor(floor: FloorSite, off: str) -> str:
 
 
 def _rule(rule: AlarmRule, off: str = "") -> str:
-    """The table of a rule, with the keys that are not at their defaults."""
+    """The table of an alarm rule, with the keys that differ from their defaults."""
     values = {key: value for key, value in structs.asdict(rule).items() if value not in (None, "", ())}
     usual = {field.name: field.default for field in structs.fields(AlarmRule)}
     lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in values.items() if value != usual[key]]
@@ -277,15 +277,15 @@ def _rule(rule: AlarmRule, off: str = "") -> str:
 
 
 def rectangle(width_m: float, depth_m: float) -> Outline:
-    """The outline of a rectangular room from the corner (0, 0) on."""
+    """Outline of a rectangular room with a corner at (0, 0)."""
     return (0.0, 0.0), (width_m, 0.0), (width_m, depth_m), (0.0, depth_m)
 
 
 def rectangular_site(width_m: float, depth_m: float, anchors: int, height_m: float, tag_height_m: float | None) -> Site:
-    """A rectangular room with anchors evenly along its walls, from the corner (0, 0) on.
+    """A rectangular room with anchors evenly spaced along its walls, starting at the corner (0, 0).
 
-    They alternate between half a metre above the floor and half a metre below the ceiling, so that heights can
-    be estimated; with a known ``tag_height_m`` all are below the ceiling.
+    Anchors alternate between half a metre above the floor and half a metre below the ceiling, so that heights can be
+    estimated; with a known ``tag_height_m`` all are below the ceiling.
     """
     high = round(max(height_m - _FROM_FLOOR_AND_CEILING_M, 0.0), 3)
     low = high if tag_height_m is not None else min(_FROM_FLOOR_AND_CEILING_M, high)
@@ -305,7 +305,7 @@ def rectangular_site(width_m: float, depth_m: float, anchors: int, height_m: flo
 
 
 def unplaced_site(anchors: int, tag_height_m: float | None) -> Site:
-    """Anchors 1 to ``anchors`` whose positions are not known yet."""
+    """A site of anchors 1 to ``anchors`` without positions."""
     return Site(
         name="site",
         id=1,
@@ -320,9 +320,9 @@ def unplaced_site(anchors: int, tag_height_m: float | None) -> Site:
 def grid_site(
     width_m: float, depth_m: float, spacing_m: float, height_m: float, tag_height_m: float | None = None
 ) -> Site:
-    """A hall from the corner (0, 0) on, its anchors on a square grid, half a spacing or so from the walls.
+    """A hall with a corner at (0, 0) and anchors on a square grid, about half a spacing from the walls.
 
-    A side too long for positions on the air is centred on the origin.
+    A side too long for coordinates on the air is centred on the origin.
 
     Raises:
         ValueError: there are more anchors than identifiers.
@@ -343,7 +343,7 @@ def grid_site(
 
 
 def _along_side(length_m: float, spacing_m: float) -> list[float]:
-    """Coordinates along one side, to the millimetre, as far from one end as from the other."""
+    """Centred coordinates along one side, rounded to millimetres."""
     count = max(1, round(length_m / spacing_m))
     first_m = (length_m - (count - 1) * spacing_m) / 2.0
     origin_m = 0.0 if length_m <= _FARTHEST_M else length_m / 2.0
@@ -351,7 +351,7 @@ def _along_side(length_m: float, spacing_m: float) -> list[float]:
 
 
 def _along_walls(share: float, width_m: float, depth_m: float) -> tuple[float, float]:
-    """The point at a share of the way around the walls, to the millimetre."""
+    """The point at a share of the way around the walls, rounded to millimetres."""
     way_m = share * 2 * (width_m + depth_m)
     if way_m <= width_m:
         x, y = way_m, 0.0

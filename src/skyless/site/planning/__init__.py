@@ -1,1 +1,1 @@
-"""Predicted errors, ranges and places of anchors."""
+"""Predicted errors and reception, and optimal positions of anchors."""

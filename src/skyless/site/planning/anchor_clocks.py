@@ -1,7 +1,4 @@
-"""The anchors of a site with a master as tags receive them.
-
-How they receive the master, whose clock is good enough, who sends when, and what is relayed.
-"""
+"""A site's anchors in planning: their reception of the master, their clocks, the schedule of messages, and relays."""
 
 import math
 from collections.abc import Iterator
@@ -32,30 +29,30 @@ _MAX_SUPERFRAMES: Final = 20_000  # superframes after which a filter counts as s
 
 
 MIN_SHARE: Final = 0.01
-"""A reception that is relayed more rarely does not count."""
+"""Receptions that are relayed more rarely are ignored."""
 
 jitted(predict)
 jitted(update)
 
 
 class AnchorClocks(NamedTuple):
-    """One superframe of a site, message by message: who sends, and when."""
+    """The messages of one superframe: senders and times."""
 
     sends: Mask
     """Anchors whose clock is known well enough to send; shape (anchors,)."""
     sender: Integers
     """Row of the sending anchor; shape (messages,)."""
     gap_s: Vector
-    """Time since the message before."""
+    """Time since the previous message."""
     kept: float
-    """Share of the messages that no other one on the air destroys."""
+    """Share of the messages that are not lost to collisions."""
 
 
 def anchor_clocks(site: Site, share: Vector) -> AnchorClocks:
-    """For anchors, in the order of the file, that receive these shares of the master's messages.
+    """Superframe of anchors, in the order of the file, that receive these shares of the master's messages.
 
-    Anchors without a master are taken to send one after the other, which is what random instants are on average; a
-    message arrives if no other anchor in reach begins one within its length before or after.
+    Anchors without a master are assumed to send one after the other, the average of random instants; a message arrives
+    if no other anchor in reach begins one within its length before or after.
     """
     if not site.schedule.needs_master:
         count, period_s = len(site.anchors), beacon_period_s(site)
@@ -78,7 +75,7 @@ def row_of_master(site: Site) -> int:
 
 
 def offset_variances(site: Site, share: Vector) -> Vector:
-    """Variance of its sender's clock that each message states in the steady state, m²; 0 of the master's."""
+    """Variance of the sender's clock offset that each message states in the steady state, m²; 0 for the master."""
     noise = clock_noise(site.noise.white_fm, site.noise.random_walk_fm)
     master = row_of_master(site)
     sender, time_s, superframe_s = _messages(site)
@@ -100,7 +97,7 @@ def stamp_variances(site: Site) -> tuple[float, float]:
 
 
 def _messages(site: Site) -> tuple[Integers, Vector, float]:
-    """Rows of the anchors in the order in which they send in a superframe, their times, and its length."""
+    """Rows of the sending anchors and times of the messages in a superframe, in order, and its length in seconds."""
     schedule, first = schedule_of(site), first_slots(site)
     slot_s = schedule.slot_ticks * TICK_S
     order = sorted((slot, row) for row, a in enumerate(site.anchors) for slot in schedule.slots_of(first[a.id]))
@@ -120,7 +117,7 @@ def _run_filter(
     walk: float,
     reported: Vector,
 ) -> None:
-    """Run one anchor's filter into its steady state: its offset's variance at every message."""
+    """Run one anchor's clock filter to its steady state, and store its offset's variance at every message."""
     covariance = (variance, 0.0, 144.0)
     last_s = 0.0
     for _ in range(_MAX_SUPERFRAMES):
@@ -142,24 +139,24 @@ def _run_filter(
 
 
 class Relays(NamedTuple):
-    """Receptions that the messages of a superframe relay, one after the other."""
+    """Receptions relayed in the messages of a superframe, concatenated."""
 
     ends: Integers
-    """Where those of each message end; shape (messages,)."""
+    """End index of each message's relays; shape (messages,)."""
     sender: Integers
     """Row of the anchor whose packet was received; this and the following have shape (relays,)."""
     age_s: Vector
-    """How long ago it was sent."""
+    """Time since that packet was sent."""
     share: Vector
-    """Share of the listener's messages that relay it."""
+    """Share of the listener's messages that relay the reception."""
     delay_m: Vector
-    """By walls."""
+    """Delay by walls."""
 
 
 def relays_of(anchors_m: Matrix, master: int | None, clocks: AnchorClocks, budget: Vector, walls: Matrix) -> Relays:
-    """The relays of a site's superframe, whose frames carry the last receptions that fit.
+    """The relays of a site's superframe; each frame carries as many of the latest receptions as fit.
 
-    ``anchors_m``: shape (anchors, 3); ``master``: row of the master, whose packets have a field of their own.
+    ``anchors_m``: shape (anchors, 3); ``master``: row of the master, whose packets have a separate field.
     """
     share, delay_m = links(anchors_m, anchors_m, budget, walls)
     share *= clocks.kept * (clocks.sends & clocks.sends[:, None])
@@ -181,10 +178,10 @@ def relays_of(anchors_m: Matrix, master: int | None, clocks: AnchorClocks, budge
 def _relayed(
     clocks: AnchorClocks, k: int, share: Vector, master: int | None, capacity: int
 ) -> Iterator[tuple[int, float, float]]:
-    """What message k relays: senders, how long ago they sent, and how often it relays them.
+    """Relays in message k: sender, time since it sent, and share of the messages that relay it.
 
-    From an anchor's message back to its one before: a packet is relayed if it was received and fits, as fewer that
-    came later were received than fit. Of an anchor that sent several only the last counts.
+    Goes back to the same anchor's previous message: a packet is relayed if it was received and fewer later ones were
+    received than fit. If an anchor sent several, only the last one counts.
     """
     fewer = np.zeros(capacity + 1)  # element i: probability that i − 1 later packets were received
     fewer[1] = 1.0
@@ -205,28 +202,28 @@ def _relayed(
             yield sender, age_s, part
 
 
-# How the anchors receive their master, and which anchor should be it
+# Reception of the master, and choice of the best master
 
 
 _RELIABLE: Final = 0.9
-"""An anchor should receive at least this share of the master's frames; a tenth less hardly matters to its clock."""
+"""An anchor should receive at least this share of the master's frames; losing a tenth hardly matters to its clock."""
 
 _MAX_NAMED: Final = 8  # anchors named in one warning
 
 
 class MasterReception(Struct, frozen=True):
-    """How the anchors of a site, in the order of its file, receive their master; shape (anchors,) each."""
+    """Reception of the master by the anchors of a site, in the order of its file; shape (anchors,) each."""
 
     distance_m: Vector
-    """From the master."""
+    """Distance from the master."""
     share: Vector
-    """Share of its frames that arrives; 1 for the master itself."""
+    """Share of the master's frames that arrives; 1 for the master itself."""
     sends: Mask
-    """Those whose clock is known well enough to send."""
+    """Whether the anchor's clock is known well enough to send."""
 
 
 def reception_of(site: Site, channel: ChannelModel) -> MasterReception:
-    """Predict how the anchors receive their master, with the losses of the site's walls."""
+    """Predict the anchors' reception of their master, with the losses of the site's walls."""
     anchors_m, master = anchor_positions(site), row_of_master(site)
     share = anchor_links(anchors_m, master, link_budget(channel), pack_walls(site.walls, site.storeys)).share
     return MasterReception(
@@ -235,27 +232,26 @@ def reception_of(site: Site, channel: ChannelModel) -> MasterReception:
 
 
 def with_best_master(site: Site, channel: ChannelModel) -> Site:
-    """The same site with the master that the others receive best; of equals that in the middle."""
+    """The same site with the master that the others receive best; among equals the most central one."""
     best = _masters(site, channel)[0]
     return replace(site, master=site.anchors[best].id)
 
 
 def master_warnings(site: Site, channel: ChannelModel) -> list[str]:
-    """Anchors that receive the master badly have a poor clock, or none and stay silent; a better master, if any."""
+    """Warn of anchors that receive the master badly, so that their clock is poor or they stay silent.
+
+    Names a better master, if there is one.
+    """
     if not site.schedule.needs_master:
         return []
     found = reception_of(site, channel)
     poor = found.share < _RELIABLE
-    warnings = [
-        text
-        for text in (
-            _named(site, found, np.flatnonzero(~found.sends), "stay silent", "stays silent"),
-            _named(
-                site, found, np.flatnonzero(found.sends & poor), "follow its clock badly", "follows its clock badly"
-            ),
-        )
-        if text
-    ]
+    silent, late = np.flatnonzero(~found.sends), np.flatnonzero(found.sends & poor)
+    both = (
+        _named(site, found, silent, "stay silent", "stays silent"),
+        _named(site, found, late, "follow its clock badly", "follows its clock badly"),
+    )
+    warnings = [text for text in both if text]
     if not warnings:
         return []
     best = int(_masters(site, channel)[0])
@@ -268,7 +264,7 @@ def master_warnings(site: Site, channel: ChannelModel) -> list[str]:
 
 
 def _named(site: Site, found: MasterReception, rows: Integers, do: str, does: str) -> str:
-    """One sentence for all anchors that do the same, each with its share, the worst first."""
+    """One sentence for all these anchors, each with its share, the worst first; empty without any."""
     if len(rows) == 0:
         return ""
     rows = rows[np.argsort(found.share[rows].round(2), kind="stable")]

@@ -1,7 +1,7 @@
-"""The colours of predicted values, the same on the page's map and in the plan's pictures.
+"""Colours of predicted values, common to the page's map and the plan's pictures.
 
-A value's colour depends on the logarithm of its ratio to the lowest value of the scale: 1 cm and 2 cm differ
-as much as 1 m and 2 m. Plain Python, because the dashboard's process does without NumPy.
+The scale is logarithmic: 1 cm and 2 cm differ as much as 1 m and 2 m. Plain Python, as the dashboard's process does not
+load NumPy.
 """
 
 import math
@@ -23,41 +23,32 @@ COLOUR_STOPS: Final = (
     "#bddf26",
     "#fde725",
 )
-"""Red, green and blue at equal steps from the best value to the worst, with straight lines between; they are those of
-viridis (matplotlib's, CC0), which colour-blind readers and grey prints keep in order."""
-
+"""Colours at equal steps from the best value to the worst, to be interpolated linearly: matplotlib's viridis (CC0),
+which stays in order for colour-blind readers and in grey prints."""
 
 LOW_QUANTILE: Final = 0.01
-
-
 HIGH_QUANTILE: Final = 0.98
-"""Ends of the scale among the values; otherwise single extreme cells next to an anchor would use up the colours."""
-
+"""Quantiles at the ends of the scale, so that single extreme cells next to an anchor do not use up the colours."""
 
 _MIN_SPAN: Final = 1.5
 """A scale reaches to at least this multiple of its lowest value, so that small differences look small."""
 
-
 _MIN: Final = 1e-6
-
-
 _MAX_TICKS: Final = 6
-
-
 _WIDE: Final = 8.0  # scales wider than this have ticks at 1, 2 and 5 times powers of ten
 
 
 class ValueScale(Struct, frozen=True):
-    """Which values have which colours; values outside have the colour of the nearer end."""
+    """Colour scale of values; values outside have the colour of the nearer end."""
 
     low: float
     high: float
     ticks: tuple[float, ...]
-    """Round values between both."""
+    """Round values between ``low`` and ``high``."""
 
 
 def scale_of(ordered: Sequence[float]) -> ValueScale | None:
-    """The scale of finite values in ascending order; None without any."""
+    """The scale for finite values in ascending order; None without any."""
     if len(ordered) == 0:
         return None
     low, high = (float(ordered[round(share * (len(ordered) - 1))]) for share in (LOW_QUANTILE, HIGH_QUANTILE))

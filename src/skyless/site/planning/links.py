@@ -1,6 +1,6 @@
-"""Which anchors are received where, by the simulated channel's own formulas without its chance.
+"""Predicted reception of anchors, from the simulated channel's formulas without randomness; columns of predictions.
 
-Also the columns of the tables that predictions fill.
+Also the floor of a site and the places where anchors may be mounted.
 """
 
 import math
@@ -26,7 +26,7 @@ from skyless.site.file.check import image_size
 from skyless.site.kernels import kernel, threaded_kernel
 
 PLAN_COLUMNS: Final = (
-    "anchors",  # number in view
+    "anchors",  # in view
     "gdop",
     "pdop",
     "hdop",
@@ -36,12 +36,12 @@ PLAN_COLUMNS: Final = (
     "sigma_x_m",
     "sigma_y_m",
     "sigma_z_m",
-    "bias_m",  # length of the mean error that walls leave
-    "rmse_m",  # both together
+    "bias_m",  # length of the mean error due to walls
+    "rmse_m",  # standard deviation and bias together
     "fix_share",  # of the rounds that give a fix
-    "claimed_m",  # the standard deviation that the fixes themselves will report
+    "claimed_m",  # standard deviation that the fixes themselves will report
 )
-"""Names of a prediction's columns, metres; infinite where there is no fix."""
+"""Columns of a prediction, metres; infinite where there is no fix."""
 
 ANCHORS_IN_VIEW, GDOP, PDOP, HDOP, VDOP, TDOP, SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z, BIAS, RMSE, FIX_SHARE, CLAIMED = range(
     14
@@ -55,7 +55,7 @@ def fill_errors(
     square_bias_m2: Array,
     claimed_m2: Array,
 ) -> None:
-    """Fill the columns of errors in some rows of a table: variances of three axes, shape (k, 3), the others (k,)."""
+    """Fill the error columns in these rows of a table. ``variance_m2``: of three axes, shape (k, 3); others (k,)."""
     table[rows, SIGMA_X : SIGMA_Z + 1] = np.sqrt(variance_m2)
     table[rows, SIGMA] = np.sqrt(variance_m2.sum(axis=1))
     table[rows, BIAS] = np.sqrt(square_bias_m2)
@@ -66,39 +66,39 @@ def fill_errors(
 IN_VIEW: Final = 0.5
 """An anchor is in view where at least this share of its frames arrives."""
 
-_NEGLIGIBLE_SHARE: Final = 1e-4  # a share below this, in free space already, counts as none
-_NEGLIGIBLE_LOSS: Final = 1e-7  # a share of losses below this, in free space, counts as none
+_NEGLIGIBLE_SHARE: Final = 1e-4  # a smaller share of received frames, in free space, counts as none
+_NEGLIGIBLE_LOSS: Final = 1e-7  # a smaller share of lost frames, in free space, counts as none
 MIN_SYNC: Final = 0.01
-"""An anchor that misses more of the master's frames than all but these stays silent, for planning."""
+"""An anchor that receives less than this share of the master's frames is assumed to stay silent."""
 
 
 class AnchorLinks(Struct, frozen=True):
-    """How the anchors of a site, in the order of its file, receive their master; shape (anchors,) each."""
+    """Links from the master to the anchors of a site, in the order of its file; shape (anchors,) each."""
 
     share: Vector
-    """Share of the master's frames that arrive; 1 for the master itself."""
+    """Share of the master's frames that arrives; 1 for the master itself."""
     delay_m: Vector
-    """By how much walls delay them."""
+    """Delay by walls."""
 
 
 def range_of(channel: ChannelModel, exponent: float = 2.0) -> float:
-    """Distance in metres at which half of the frames arrive with nothing between, by the path loss's exponent."""
+    """Distance in metres at which half of the frames arrive without obstacles, for a path loss exponent."""
     budget_db = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - channel.sensitivity_dbm
     return float(10.0 ** (budget_db / (10.0 * exponent)))
 
 
 def with_range(channel: ChannelModel, range_m: float, exponent: float = 2.0) -> ChannelModel:
-    """A channel like this one with another range, by another sensitivity."""
+    """The channel with its sensitivity changed to give this range."""
     sensitivity_dbm = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 10.0 * exponent * math.log10(range_m)
     values = {name: getattr(channel, name) for name in channel.__struct_fields__}
     return ChannelModel(**{**values, "sensitivity_dbm": sensitivity_dbm})
 
 
 def link_budget(channel: ChannelModel) -> Vector:
-    """What ``link`` needs of a channel.
+    """A channel's parameters for ``link``.
 
-    Power sent, sensitivity, its width, share lost by chance, and the squared
-    distances, m², beyond which nothing arrives and within which all does.
+    Transmit power, sensitivity, its width, share lost at random, and the squared distances, m², beyond which nothing
+    and within which everything arrives.
     """
     farthest_db = math.log(1.0 / _NEGLIGIBLE_SHARE) * channel.sensitivity_width_db
     farthest_m = range_of(channel) * 10.0 ** (farthest_db / 20.0)
@@ -141,21 +141,21 @@ def _fill_links(
 
 
 def links(senders_m: Matrix, listeners_m: Matrix, budget: Vector, walls: Matrix) -> tuple[Matrix, Matrix]:
-    """Share of each sender's frames that reach each listener, and their delay in metres; shape (listeners, senders)."""
+    """Share of each sender's frames that reach each listener, and delay in metres; shape (listeners, senders) each."""
     share, delay_m = np.empty((2, len(listeners_m), len(senders_m)))
     _fill_links(senders_m, listeners_m, budget, walls, share, delay_m)
     return share, delay_m
 
 
 def anchor_links(anchors_m: Matrix, master: int, budget: Vector, walls: Matrix) -> AnchorLinks:
-    """How anchors, shape (anchors, 3), receive the anchor in row ``master``."""
+    """Links from the anchor in row ``master`` to anchors at positions of shape (anchors, 3)."""
     share, delay_m = links(anchors_m[master : master + 1], anchors_m, budget, walls)
     share[master] = 1.0
     return AnchorLinks(share[:, 0], delay_m[:, 0])
 
 
 def masters_by_links(anchors_m: Matrix, budget: Vector, walls: Matrix) -> Integers:
-    """Rows of anchors, best master first, which all others hear best; equals by distance from the middle."""
+    """Rows of anchors ordered by how well all others receive them, best first; equals by distance from the middle."""
     heard, _ = links(anchors_m, anchors_m, budget, walls)
     total = np.round(np.minimum(heard, 0.99).sum(axis=0), 3)
     middle = np.linalg.norm(anchors_m[:, :2] - anchors_m[:, :2].mean(axis=0), axis=1)
@@ -163,24 +163,24 @@ def masters_by_links(anchors_m: Matrix, budget: Vector, walls: Matrix) -> Intege
 
 
 class Scene(NamedTuple):
-    """Anchors, and the walls between them and points."""
+    """Anchors and walls, for the reception at points."""
 
     anchors: Matrix
     """Positions, shape (anchors, 3)."""
     sends: Vector
-    """Share of each one's frames that is sent and not destroyed by others, shape (anchors,)."""
+    """Share of each anchor's frames that is sent and not lost to collisions, shape (anchors,)."""
     budget: Vector
-    """``link_budget``."""
+    """From ``link_budget``."""
     walls: Matrix
-    """``pack_walls``."""
+    """From ``pack_walls``."""
 
     def heard_at(self, points: Matrix) -> tuple[Matrix, Matrix]:
-        """Share of each anchor's frames that arrives at points, and the walls' delay, metres; shape (m, anchors)."""
+        """Share of each anchor's frames that arrives at points, and the walls' delay in metres; shape (m, anchors)."""
         share, delay_m = links(self.anchors, points, self.budget, self.walls)
         return share * self.sends, delay_m
 
     def strongest(self, point: Vector, rows: Integers, most: int) -> Integers:
-        """Those of these rows of anchors, at most ``most``, from which a point receives the most power; ascending."""
+        """The up to ``most`` of these rows of anchors that a point receives with the most power; ascending."""
         if len(rows) <= most:
             return rows
         power_dbm = [
@@ -195,18 +195,18 @@ class Scene(NamedTuple):
 
 
 def fill_dops(scene: Scene, points: Matrix, share: Matrix, dim: int, table: Matrix) -> None:
-    """Fill the number of anchors in view and the columns of their DOPs."""
+    """Fill the columns of anchors in view and of their DOPs."""
     in_view = share >= IN_VIEW
     table[:, ANCHORS_IN_VIEW] = in_view.sum(axis=1)
     table[:, GDOP : TDOP + 1] = dops_at(scene.anchors, points, height_known=dim == 2, weights=in_view)
 
 
 def weighted_pdop(scene: Scene, points: Matrix, share: Matrix, dim: int) -> Vector:
-    """PDOP of anchors weighted by their shares of frames, without steps where one comes into view; may be infinite."""
+    """PDOP with anchors weighted by their shares of frames, so that it has no steps; may be infinite."""
     return dops_at(scene.anchors, points, height_known=dim == 2, weights=share)[:, PDOP - GDOP]
 
 
-# The floor of a site: its outline, points inside it, and the walls on which anchors may hang.
+# The floor of a site: its outline, points inside it, and the walls on which anchors may be mounted.
 
 
 class Floor(Struct, frozen=True):
@@ -215,11 +215,11 @@ class Floor(Struct, frozen=True):
     outline_m: Matrix
     """Corners in order, shape (k, 2)."""
     region_m: Box
-    """x1, y1, x2, y2 of the region; of it, what lies inside the outline counts."""
+    """x1, y1, x2, y2 of the region; only its part inside the outline counts."""
 
 
 def floor_plan_box(site: Site, file: Path) -> Box | None:
-    """Where the floor plan's image lies, from the width that the site gives and the image's shape."""
+    """Position of the floor plan's image, from its width in the site and its aspect ratio; None without an image."""
     plan = site.floor_plan
     if plan is None:
         return None
@@ -233,7 +233,7 @@ def floor_of(site: Site, file: Path, outline_m: Matrix | None, region_m: Box | N
     """The floor: the given outline, or the site's, or the floor plan, or the box around the anchors.
 
     Raises:
-        ConfigurationError: an anchor lies outside the floor, or the floor has no area. Anchors outside the site's own
+        ConfigurationError: an anchor is outside the floor, or the floor has no area. Anchors outside the site's own
             outline are accepted, as ``skyless site check`` warns of them.
     """
     floor_m = outline_of(site) if outline_m is None else outline_m
@@ -260,15 +260,11 @@ def _check_inside(site: Site, file: Path, outline_m: Matrix) -> None:
     anchors = anchor_positions(site)[:, :2]
     for index in np.flatnonzero(~inside(anchors, outline_m)).tolist():
         if distance_outside(anchors[index], outline_m) > OUTSIDE_M:
-            raise _outside(site, file, index, outline_m)
-
-
-def _outside(site: Site, file: Path, index: int, outline_m: Matrix) -> ConfigurationError:
-    anchor = site.anchors[index]
-    (x1, y1), (x2, y2) = outline_m.min(axis=0).tolist(), outline_m.max(axis=0).tolist()
-    key = f"anchors[{index}] (anchor {anchor.id})"
-    right = f"on the floor, which reaches from ({x1:g}, {y1:g}) to ({x2:g}, {y2:g}) m"
-    return ConfigurationError(file, key, f"at ({anchor.x_m:g}, {anchor.y_m:g})", right)
+            anchor = site.anchors[index]
+            (x1, y1), (x2, y2) = outline_m.min(axis=0).tolist(), outline_m.max(axis=0).tolist()
+            key = f"anchors[{index}] (anchor {anchor.id})"
+            right = f"on the floor, which reaches from ({x1:g}, {y1:g}) to ({x2:g}, {y2:g}) m"
+            raise ConfigurationError(file, key, f"at ({anchor.x_m:g}, {anchor.y_m:g})", right)
 
 
 def sides(outline_m: Matrix) -> Matrix:
@@ -277,7 +273,7 @@ def sides(outline_m: Matrix) -> Matrix:
 
 
 class Mounts(Struct, frozen=True):
-    """Walls and heights at which anchors may hang."""
+    """Walls and heights at which anchors may be mounted."""
 
     segments_m: Matrix
     """Shape (k, 4): x1, y1, x2, y2."""
@@ -289,7 +285,7 @@ class Mounts(Struct, frozen=True):
         return float(np.linalg.norm(self.segments_m[:, 2:] - self.segments_m[:, :2], axis=1).sum())
 
     def at(self, along_m: Vector, levels: Integers) -> Matrix:
-        """Points at distances along the walls and at heights by their index, to the millimetre; shape (m, 3)."""
+        """Points at distances along the walls and at indexed heights, rounded to millimetres; shape (m, 3)."""
         points = np.column_stack([points_along(self.segments_m, along_m), np.array(self.heights_m)[levels]])
         rounded: Matrix = np.round(points, 3)
         return rounded
@@ -302,7 +298,7 @@ def lowest_and_highest(site: Site) -> tuple[float, float]:
 
 
 def usual_tag_heights(site: Site) -> tuple[float, ...]:
-    """Heights of the maps where none are asked for: the known one, or three between the lowest and highest anchor."""
+    """Default heights of maps: the known tag height, or three between the lowest and highest anchor."""
     if site.tags.height_m is not None:
         return (site.tags.height_m,)
     low, high = lowest_and_highest(site)
@@ -310,7 +306,7 @@ def usual_tag_heights(site: Site) -> tuple[float, ...]:
 
 
 def mounts_of(site: Site, floor: Floor, walls_m: Matrix | None, heights_m: tuple[float, ...] | None) -> Mounts:
-    """Where anchors may hang: on the walls, shape (k, 4), by default the floor's sides; at which heights.
+    """Mounts on walls, shape (k, 4), by default the floor's sides.
 
     By default the heights are those of the lowest and highest anchor.
     """
@@ -319,7 +315,7 @@ def mounts_of(site: Site, floor: Floor, walls_m: Matrix | None, heights_m: tuple
 
 
 def check_anchor_count(site: Site, file: Path) -> None:
-    """See that the site has anchors enough for a position. Raises ConfigurationError."""
+    """Check that the site has enough anchors for a position. Raises ConfigurationError."""
     needed, what = anchors_needed(site)
     if len(site.anchors) < needed:
         right = f"at least {needed}, which a position {what} needs"
@@ -327,7 +323,7 @@ def check_anchor_count(site: Site, file: Path) -> None:
 
 
 def points_along(segments_m: Matrix, along_m: Vector) -> Matrix:
-    """Points, shape (m, 2), at distances along segments, shape (k, 4), one after the other and round again."""
+    """Points, shape (m, 2), at distances along joined segments, shape (k, 4), modulo their total length."""
     lengths = np.linalg.norm(segments_m[:, 2:] - segments_m[:, :2], axis=1)
     ends = np.cumsum(lengths)
     distances = np.mod(along_m, ends[-1])
@@ -338,9 +334,9 @@ def points_along(segments_m: Matrix, along_m: Vector) -> Matrix:
 
 
 def sample_points(floor: Floor, heights_m: tuple[float, ...], most: int) -> tuple[Matrix, Vector]:
-    """About ``most`` points all over the region, up to 10 cm from its edges; shape (m, 3).
+    """About ``most`` points all over the region, up to 10 cm from its edges, shape (m, 3), and their weights.
 
-    With them their weights in a mean over the area, shape (m,), of sum 1: half on edges, a quarter in corners.
+    Weights are for a mean over the area, shape (m,), with sum 1: half on edges, a quarter in corners.
     """
     x1, y1, x2, y2 = floor.region_m
     width, depth = x2 - x1, y2 - y1

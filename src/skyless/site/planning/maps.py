@@ -1,8 +1,8 @@
-"""Maps: predictions over a grid of the floor, one slice for each height; and the map as a table for other programs.
+"""Maps: predictions over a grid of the floor, one slice per height, and their export as tables.
 
-The filter's points take long to compute. On large grids they are computed on a coarser one (on the largest the other
-methods, too), and their ratio to the PDOP of anchors weighted by their share of frames, which is smooth, is
-interpolated; that PDOP is computed at every point, so that edges behind walls stay sharp.
+The filter's predictions are slow. On large grids they are computed on a coarser grid (on the largest grids those of the
+other methods, too), and their ratio to the PDOP weighted by shares of frames, which is smooth, is interpolated; that
+PDOP is computed at every point, so that edges behind walls stay sharp.
 """
 
 import math
@@ -34,21 +34,21 @@ from skyless.site.planning.predict import Predictor
 _MAX_POINTS: Final = 5_000_000
 _NICE_POINTS: Final = 12_000
 MIN_BIAS_M: Final = 1e-4
-"""Mean errors of positions below this are none."""
+"""Smaller mean errors of positions are ignored."""
 
 _STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 _JOINT_BUDGET: Final = 2.5e5
-"""Points of the joint filter times what one costs, the square of the anchors in view and a constant."""
+"""Points of the joint filter times the cost of one: the square of the anchors in view plus a constant."""
 
-_SAMPLE_POINTS: Final = 500  # points from which the mean number of anchors in view is estimated
+_SAMPLE_POINTS: Final = 500  # points to estimate the mean number of anchors in view
 _SNAPSHOT_BUDGET: Final = 20_000_000
-"""Points of a snapshot method times what one costs, anchors and a constant; only the largest grids exceed it."""
+"""Points of a snapshot method times the cost of one: anchors plus a constant. Only the largest grids exceed this."""
 
 _TABLE_ROWS: Final = 20_000  # rows of a table that are written at once
 
 
 class Grid(Struct, frozen=True):
-    """Cell centres over the box of the region; those outside the outline do not count."""
+    """Cell centres over the region's box; those outside the outline do not count."""
 
     x_m: Vector
     y_m: Vector
@@ -59,7 +59,7 @@ class Grid(Struct, frozen=True):
 
     @property
     def points(self) -> int:
-        """How many points count."""
+        """Number of points inside the outline, at all heights."""
         return int(self.within.sum()) * len(self.heights_m)
 
 
@@ -70,7 +70,7 @@ class PlanMap(Struct, frozen=True):
     table: Array
     """Shape (heights, ny, nx, columns); NaN outside the outline."""
     computed_every_m: float
-    """Spacing of the points that were computed in full; wider than the grid's where the rest was interpolated."""
+    """Spacing of the fully computed points; wider than the grid's if the rest is interpolated."""
 
     def column(self, index: int) -> Array:
         """One column, shape (heights, ny, nx)."""
@@ -78,17 +78,17 @@ class PlanMap(Struct, frozen=True):
 
     @property
     def has_bias(self) -> bool:
-        """Whether walls delay frames so that positions somewhere have a mean error."""
+        """Whether positions somewhere have a mean error, as walls delay frames."""
         bias = self.column(BIAS)
         return bool((bias[np.isfinite(bias)] > MIN_BIAS_M).any())
 
 
 class MapSummary(Struct, frozen=True):
-    """A map in a few numbers, metres; None where no point has a fix."""
+    """Statistics of a map, metres; None if no point has a fix."""
 
     points: int
     covered_share: float
-    """Share of the points that have a fix in at least half of the rounds or messages."""
+    """Share of the points with a fix in at least half of the rounds or messages."""
     mean_sigma_m: float | None
     """Over the covered points."""
     median_sigma_m: float | None
@@ -103,7 +103,7 @@ class MapSummary(Struct, frozen=True):
 
 
 def grid_of(floor: Floor, heights_m: tuple[float, ...], step_m: float | None) -> Grid:
-    """Grid over the floor's region; without a step, one that makes some ten thousand points.
+    """Grid over the floor's region; by default with some ten thousand points.
 
     Raises:
         ValueError: the region has no area or no point inside the outline, or there would be too many points.
@@ -127,7 +127,7 @@ def grid_of(floor: Floor, heights_m: tuple[float, ...], step_m: float | None) ->
 
 
 def plan_map(predictor: Predictor, grid: Grid, progress: Callable[[float], None] | None = None) -> PlanMap:
-    """Predict over a grid; ``progress`` gets the share done."""
+    """Predict over a grid; ``progress`` is called with the share done."""
     slices = [
         _slice(predictor, grid, height, _slice_progress(progress, k, grid)) for k, height in enumerate(grid.heights_m)
     ]
@@ -192,7 +192,7 @@ def points_of(grid: Grid, height_m: float) -> Array:
 
 
 def _stride(predictor: Predictor, grid: Grid, points: Matrix) -> int:
-    """One in how many rows and columns is computed; ``points``: those of a slice that count, shape (n, 3)."""
+    """Stride of the rows and columns to compute in full; ``points``: a slice's points inside the outline, (n, 3)."""
     if predictor.settings.method == "joint":
         some = points[:: math.ceil(len(points) / _SAMPLE_POINTS)]
         most = _JOINT_BUDGET / float(((predictor.geometry_at(some)[:, ANCHORS_IN_VIEW] + 8.0) ** 2).mean())
@@ -202,7 +202,7 @@ def _stride(predictor: Predictor, grid: Grid, points: Matrix) -> int:
 
 
 def _every(stride: int, count: int) -> Integers:
-    """Every ``stride``-th index, the last one included."""
+    """Every ``stride``-th index, and the last one."""
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
@@ -214,9 +214,9 @@ def _interpolate(
     within: Mask,
     fine: Matrix,
 ) -> None:
-    """Fill the method's columns of ``fine`` from a coarse table that holds these rows and columns of the grid.
+    """Fill the method's columns of ``fine`` from a coarse table of these rows and columns of the grid.
 
-    ``carrier`` is the coarse points' weighted PDOP; that of the fine ones stands in their column of ``sigma_m``.
+    ``carrier``: weighted PDOP at the coarse points; at the fine points it is in the column ``sigma_m``.
     """
     from scipy.ndimage import distance_transform_edt, map_coordinates  # noqa: PLC0415 (SciPy is loaded late)
 
@@ -265,7 +265,7 @@ def rows_of(plan: PlanMap) -> Matrix:
 
 
 def csv_lines(plan: PlanMap) -> Iterator[str]:
-    """The table in pieces; empty fields where there is no fix."""
+    """The map as CSV, in pieces; fields are empty where there is no fix."""
     yield ",".join(("x_m", "y_m", "z_m", *PLAN_COLUMNS)) + "\n"
     pattern = (
         ",".join(["%.3f"] * 3 + ["%d" if k == ANCHORS_IN_VIEW else "%.4g" for k in range(len(PLAN_COLUMNS))]) + "\n"
@@ -276,10 +276,10 @@ def csv_lines(plan: PlanMap) -> Iterator[str]:
 
 
 def geojson_lines(plan: PlanMap, georeference: GeoreferenceSite | None) -> Iterator[str]:
-    """A FeatureCollection in pieces; null where there is no fix.
+    """The map as a GeoJSON FeatureCollection, in pieces; values are null where there is no fix.
 
-    With a georeference of the site the coordinates are longitude and latitude as RFC 7946 requires; without one
-    they are the site's metres; a member ``skyless:frame`` names the frame.
+    With a georeference the coordinates are longitude and latitude as RFC 7946 requires, otherwise the site's metres;
+    the member ``skyless:frame`` names the frame.
     """
     frame = "WGS 84" if georeference else "site, metres"
     yield f'{{"type":"FeatureCollection","skyless:frame":"{frame}","features":[\n'
@@ -298,7 +298,7 @@ def geojson_lines(plan: PlanMap, georeference: GeoreferenceSite | None) -> Itera
 
 
 def to_wgs84(points_m: Matrix, origin: GeoreferenceSite) -> Matrix:
-    """Longitude, latitude (degrees) and height (m) of points of a site, shape (m, 3), as ``geodetic``."""
+    """Convert points of a site to longitude, latitude (degrees) and height (m), shape (m, 3)."""
     found = np.array([geodetic((x, y, z), origin) for x, y, z in points_m.tolist()]).reshape(-1, 3)
     return found[:, [1, 0, 2]]
 

@@ -1,10 +1,9 @@
-"""Where anchors should hang: the best of several starts, first on a lattice, then by the method's own prediction.
+"""Optimise anchor positions: the best of several starts, first on a lattice, then by the method's own prediction.
 
-A quick search exchanges anchors on a lattice of mounts. The error that counts there is given by (HᵀWH)⁻¹ with each
-anchor weighted by the share of its frames that arrives: independent of the method. What it finds is judged, and
-improved, by the method's own prediction. The evenly spaced layout is one of the starts, so the result is never worse
-than it. Mean and worst error over the region count alike, relative to that layout's. Same seed, same result, unless
-the time runs out before the search ends.
+A quick search exchanges anchors on a lattice of mounts. Its error measure is (HᵀWH)⁻¹ with each anchor weighted by the
+share of its frames that arrives, independent of the method. The results are then improved and judged by the method's
+own prediction. The evenly spaced layout is one of the starts, so the result is never worse. Mean and worst error over
+the region count equally, relative to those of that layout. The same seed gives the same result, unless time runs out.
 """
 
 import math
@@ -37,18 +36,18 @@ _SEARCH_POINTS: Final = 140
 _JUDGE_POINTS: Final = 1500
 _MAX_CANDIDATES: Final = 220
 _STARTS: Final = 16
-_REFINED: Final = 4  # starts that the method's own prediction improves further, the even layout among them
+_REFINED: Final = 4  # starts improved further by the method's own prediction, including the even layout
 _FINEST_M: Final = 0.05
 
 _MAX_PASSES: Final = 12  # of an exchange on the lattice
-_CLOSEST_M: Final = 0.3  # anchors nearer to each other than this are not considered
+_CLOSEST_M: Final = 0.3  # least distance between anchors
 _MIN_HEARD: Final = 0.5  # share of the master's frames below which an anchor loses weight
 _PENALTY: Final = 10.0
-"""Cost of a mean or a worst error that is not clearly smaller than the reference's, against a gain elsewhere."""
+"""Penalty factor for a mean or worst error that is not clearly smaller than the reference's."""
 
 _CLEARLY_SMALLER: Final = 0.95
 
-_NOTICEABLE: Final = 0.05  # share of an error by which one more anchor should lower it to be worth its mounting
+_NOTICEABLE: Final = 0.05  # relative reduction of an error that makes one more anchor worth mounting
 
 
 # Layouts
@@ -58,25 +57,25 @@ class Layout(Struct, frozen=True):
     """Anchors on mounts."""
 
     along_m: Vector
-    """Distance of each one along the walls."""
+    """Distance of each anchor along the walls."""
     levels: Integers
-    """Index of each one's height."""
+    """Index of each anchor's height."""
 
 
 def even_layout(mounts: Mounts, anchors: int) -> Layout:
-    """Anchors evenly along the walls from their beginning, heights in turn."""
+    """Anchors evenly spaced along the walls, with heights in turn."""
     return Layout(np.arange(anchors) * mounts.length_m / anchors, np.arange(anchors) % len(mounts.heights_m))
 
 
 def site_with(site: Site, anchors_m: Matrix, master: int) -> Site:
-    """The site with other anchors, shape (n, 3), numbered from 1; ``master`` is a row."""
+    """The site with other anchors, shape (n, 3), numbered from 1; ``master``: row of the master."""
     anchors = tuple(AnchorSite(k + 1, *position) for k, position in enumerate(anchors_m.tolist()))
     schedule = replace(site.schedule, slots=None)
     return replace(site, anchors=anchors, master=master + 1, schedule=schedule)
 
 
 def site_with_one_more(site: Site, position_m: Vector) -> Site:
-    """The site with one more anchor; its superframe grows by one slot for each frame of the anchor."""
+    """The site with one more anchor; if needed, the superframe grows by a slot for each of its frames."""
     number = max(anchor.id for anchor in site.anchors) + 1
     slots, schedule = site.schedule.slots, site.schedule
     if slots is not None and slots < (len(site.anchors) + 1) * schedule.frames_per_node:
@@ -89,18 +88,18 @@ def site_with_one_more(site: Site, position_m: Vector) -> Site:
 
 
 class Lattice(NamedTuple):
-    """What candidates for anchors' positions contribute to the points."""
+    """Precomputed contributions of candidate anchor positions to the points."""
 
     apart_m: Matrix
     """Distances between candidates; shape (candidates, candidates)."""
     rows: Matrix
     """Weighted rows [1, unit vector] of H; shape (candidates, points, 1 + dim)."""
     heard: Matrix
-    """Share of each candidate's frames that reach each other one; shape (candidates, candidates)."""
+    """Share of each candidate's frames that reaches each other one; shape (candidates, candidates)."""
     weights: Vector
-    """Weights of the points in a mean, of sum 1."""
+    """Weights of the points in a mean, with sum 1."""
     cap_m: float
-    """Error that stands for "no position"."""
+    """Error used for "no position"."""
 
 
 def lattice_of(
@@ -114,7 +113,7 @@ def lattice_of(
     *,
     has_master: bool = True,
 ) -> Lattice:
-    """Candidates, shape (c, 3), for points, shape (m, 3); ``sigma_m`` is a pseudorange's noise."""
+    """The lattice of candidates, shape (c, 3), and points, shape (m, 3); ``sigma_m``: noise of a pseudorange."""
     share, _ = links(points_m, candidates_m, budget, walls)
     heard, _ = links(candidates_m, candidates_m, budget, walls) if has_master else (np.ones((len(share),) * 2), None)
     np.fill_diagonal(heard, 1.0)
@@ -128,7 +127,7 @@ def lattice_of(
 
 @threaded_kernel
 def mean_and_worst(chosen: Integers, lattice: Lattice) -> tuple[float, float]:
-    """Mean and largest error over the points for these candidates, the best heard of them being the master."""
+    """Mean and largest error over the points for these candidates, with the best received one as the master."""
     rows, heard = lattice.rows, lattice.heard
     size = rows.shape[2]
     normal, inverse = np.zeros((size, size)), np.zeros((size, size))
@@ -161,7 +160,7 @@ def mean_and_worst(chosen: Integers, lattice: Lattice) -> tuple[float, float]:
 
 @kernel
 def relative_score(mean: float, worst: float, mean_reference: float, worst_reference: float) -> float:
-    """Mean and worst error against a reference's; costly where either is not clearly smaller."""
+    """Mean of both errors relative to a reference, with a penalty for one that is not clearly smaller."""
     a, b = mean / mean_reference, worst / worst_reference
     return 0.5 * (a + b) + _PENALTY * (max(a - _CLEARLY_SMALLER, 0.0) + max(b - _CLEARLY_SMALLER, 0.0))
 
@@ -174,9 +173,9 @@ def exchange(
     passes: int,
     late: Callable[[], bool] = lambda: False,
 ) -> float:
-    """Move one anchor after the other to its best candidate until none moves; the first ``fixed`` stay. The score.
+    """Move each anchor in turn to its best candidate until none moves, except the first ``fixed``. Returns the score.
 
-    Ends between two anchors once it is ``late``.
+    Stops early once ``late()``.
     """
     score = relative_score(*mean_and_worst(chosen, lattice), *reference)
     for _ in range(passes):
@@ -211,18 +210,18 @@ class Scored(Struct, frozen=True):
 
 
 class Optimised(Struct, frozen=True):
-    """The result and the even layout of as many anchors."""
+    """Result of an optimisation, with the even layout of the same number of anchors."""
 
     best: Scored
     even: Scored
     evaluations: int
     finished: bool
-    """Whether the search was complete before time ran out or Ctrl-C was pressed."""
+    """Whether the search was completed before time ran out or Ctrl-C was pressed."""
     target_met: bool | None
 
 
 class Search:
-    """One optimisation: what is searched for, and its state."""
+    """One optimisation: its parameters and state."""
 
     def __init__(
         self,
@@ -243,17 +242,17 @@ class Search:
         self._begin_s, self._seconds = time.monotonic(), seconds
         self._cap_m = float(np.linalg.norm(np.ptp(mounts.segments_m.reshape(-1, 2), axis=0)))
         self._found: list[tuple[float, Layout]] = []
-        """The best layout of each start that was refined, with its score."""
+        """The best layout of each refined start, with its score."""
         self.evaluations = 0
 
     def run(self, target_m: float | None = None, progress: Callable[[float], None] | None = None) -> Optimised:
-        """Search until nothing improves, the time is up, or Ctrl-C: the best of what has been found by then.
+        """Search until nothing improves, time is up, or Ctrl-C. Returns the best result so far.
 
-        ``progress`` gets the share of the time.
+        ``progress`` is called with the share of the time.
         """
         self._progress = progress
         even = even_layout(self._mounts, self._anchors)
-        reference = self._score(even)  # at the first time it loads kernels, too
+        reference = self._score(even)  # not timed, as the first call also loads kernels
         thorough = self._plan_judging(even)
         first = self._judge(even)
         judged, finished = [first], False
@@ -271,9 +270,9 @@ class Search:
         return Optimised(best, first, self.evaluations, finished, met)
 
     def _plan_judging(self, layout: Layout) -> bool:
-        """Choose at how many points and with how many masters layouts are judged, so that it takes half of the time.
+        """Choose the numbers of points and masters for judging layouts, so that this takes at most half of the time.
 
-        Returns whether it is at all of them.
+        Returns whether the largest numbers are possible.
         """
         begin_s = time.monotonic()
         self._score(layout)
@@ -288,7 +287,7 @@ class Search:
         return masters > 1 and points == _JUDGE_POINTS
 
     def _late(self) -> bool:
-        """Whether the search has to end, so that what it found can be judged in time."""
+        """Whether the search must end, to leave time to judge its results."""
         passed = (time.monotonic() - self._begin_s) / self._search_s
         if self._progress is not None:
             self._progress(min(passed, 1.0))
@@ -328,7 +327,7 @@ class Search:
         return site_with(self._site, anchors_m, master)
 
     def _sigma(self, site: Site, sample: tuple[Matrix, Vector]) -> tuple[float, float, float]:
-        """Mean and worst over the points, those without a fix counting as lost; and the share with one."""
+        """Mean and worst standard deviation over the points, capped, as without a fix; and the share with a fix."""
         self.evaluations += 1
         rows = Predictor(site, self._settings).at(sample[0])
         covered = rows[:, FIX_SHARE] >= 0.5
@@ -340,7 +339,7 @@ class Search:
         return mean, worst
 
     def _refine(self, start: Layout, reference: tuple[float, float]) -> None:
-        """Shift one anchor after the other along the walls, by less and less, and between the heights."""
+        """Shift anchors along the walls, by decreasing steps, and between heights while that improves the score."""
         layout, step = start, self._mounts.length_m / (2.0 * self._anchors)
         score = relative_score(*self._score(layout), *reference)
         self._found.append((score, layout))
@@ -359,7 +358,7 @@ class Search:
                 step /= 2.0
 
     def _moves(self, layout: Layout, k: int, step: float) -> list[Layout]:
-        """Layouts with one anchor elsewhere, a step away or anywhere, far enough from all others."""
+        """Layouts with anchor ``k`` moved, by a step or anywhere, but not too close to another."""
         moves = []
         for shift in (step, -step, self._random.uniform(step, self._mounts.length_m - step)):
             along_m = layout.along_m.copy()
@@ -378,23 +377,21 @@ class Search:
         return bool(distances.min(initial=np.inf) >= _CLOSEST_M)
 
     def _judge(self, layout: Layout) -> Scored:
-        """Score on many more points, with the best of the masters that are heard about equally well."""
-        scored = []
-        for rank in range(min(self._masters, self._anchors)):
-            site = self._site_of(layout, rank)
-            scored.append(Scored(site, *self._sigma(site, self._judge_points)))
+        """Score at many more points, with the best of the best received masters."""
+        sites = [self._site_of(layout, rank) for rank in range(min(self._masters, self._anchors))]
+        scored = [Scored(site, *self._sigma(site, self._judge_points)) for site in sites]
         return min(scored, key=lambda s: s.mean_sigma_m * s.worst_sigma_m)
 
 
 def _candidates(mounts: Mounts, most: int, least: int = 1) -> tuple[Vector, Integers]:
-    """Distances along the walls and levels of some candidates, evenly spaced at every height."""
+    """Distances along the walls and levels of candidates, evenly spaced at every height."""
     levels = len(mounts.heights_m)
     count = max(most // levels, least)
     return np.repeat(np.arange(count) * mounts.length_m / count, levels), np.tile(np.arange(levels), count)
 
 
 class OneMore(Struct, frozen=True):
-    """Where one more anchor helps most, and how much: means and worst over the region, metres."""
+    """Best position of one more anchor, and its effect on mean and worst error over the region, metres."""
 
     position_m: tuple[float, float, float]
     mean_before_m: float
@@ -402,15 +399,15 @@ class OneMore(Struct, frozen=True):
     worst_before_m: float
     worst_after_m: float
     helps: bool
-    """Whether it lowers the mean or the worst noticeably, and raises neither by as much."""
+    """Whether the anchor noticeably lowers the mean or the worst error, and does not raise the other as much."""
 
 
 def one_more(
     site: Site, settings: PlanSettings, floor: Floor, mounts: Mounts, heights_m: tuple[float, ...]
 ) -> OneMore | None:
-    """Try one more anchor at a hundred positions; None where none is free.
+    """Try one more anchor at a hundred positions; None if none is free.
 
-    The position follows from the quick search on the lattice, its gain from the method's own prediction.
+    The quick search on the lattice gives the position, the method's own prediction its benefit.
     """
     before = Predictor(site, settings)
     points, weights = sample_points(floor, heights_m, _SEARCH_POINTS)

@@ -1,4 +1,4 @@
-"""Pictures of a plan: the predicted error over the floor and what makes it, or the beacons that reach tags."""
+"""Pictures of a plan: the predicted error over the floor and its causes, or the beacons that reach tags."""
 
 from pathlib import Path
 from typing import Final
@@ -23,18 +23,18 @@ from skyless.site.planning.rates import RateMap
 
 _NO_FIX: Final = "#d9d9d9"
 _EDGE: Final = "black"
-_FLAT: Final = 0.45  # floors flatter than this have the bar of colours below them, not at their side
+_FLAT: Final = 0.45  # floors with a smaller aspect ratio have the colour bar below them
 _PANEL_IN: Final = 8.0
 _SMALL_PANEL_IN: Final = 5.2
-_TALLEST: Final = 1.2  # largest height of a floor over its width in the picture
-_MARGIN: Final = 0.07  # free space around the floor, of its longer side: names of anchors on the walls stand in it
+_TALLEST: Final = 1.2  # largest ratio of a floor's height to its width in the picture
+_MARGIN: Final = 0.07  # margin for names of anchors, as a share of the floor's longer side
 _NAME_OFFSETS: Final = (
     *((7, 6), (-7, 6), (7, -6), (-7, -6), (0, 9), (0, -9), (10, 0), (-10, 0)),
     *((14, 12), (-14, 12), (14, -12), (-14, -12), (0, 18), (0, -18)),
 )
-"""Where a name may stand, seen from its anchor, in points; the first free one is taken."""
+"""Candidate offsets of a name from its anchor, in points; the first free one is used."""
 
-_HALF_MARK: Final = 5.0  # half of an anchor's mark in points
+_HALF_MARK: Final = 5.0  # half the size of an anchor's mark, in points
 
 
 class Layer(Struct, frozen=True):
@@ -45,11 +45,11 @@ class Layer(Struct, frozen=True):
     unit: str
     scale: float = 1.0
     more_is_better: bool = False
-    """The colours run from the best value to the worst one, so these layers have them the other way round."""
+    """Whether to reverse the colours, which run from the best value to the worst."""
 
     @property
     def label(self) -> str:
-        """Words for the bar of colours."""
+        """Label of the colour bar."""
         return f"{self.title} in {self.unit}" if self.unit else self.title
 
 
@@ -64,23 +64,23 @@ _LAYERS: Final = (
 
 
 class Background(Struct, frozen=True):
-    """What is drawn in addition to the map."""
+    """Content drawn in addition to the map."""
 
     site: Site
     floor: Floor
     file: Path
-    """The site's file, next to which the image of the floor lies."""
+    """The site's file; the floor plan's image is relative to it."""
     described: str
     """Method, noise and schedule, in words."""
 
 
 def main_layer(plan: PlanMap) -> Layer:
-    """The predicted error: with the walls' delays where there are any."""
+    """The layer of the predicted error, including the walls' delays if there are any."""
     return RMSE_LAYER if plan.has_bias else SIGMA_LAYER
 
 
 def layers_for(plan: PlanMap) -> tuple[Layer, ...]:
-    """The layers worth showing: RMSE only where walls bias positions, VDOP and PDOP only in 3-D."""
+    """The layers to show: RMSE only if walls bias positions, VDOP and PDOP only in 3-D."""
     layers = list(_LAYERS)
     if plan.has_bias:
         layers.insert(1, RMSE_LAYER)
@@ -91,13 +91,13 @@ def layers_for(plan: PlanMap) -> tuple[Layer, ...]:
 
 
 def value_colours(*, reversed_: bool = False) -> Colormap:
-    """The colours of predicted values, from the best to the worst; reversed for what is better the more of it."""
+    """Colour map of predicted values, from the best to the worst; reversed if more is better."""
     stops = COLOUR_STOPS[::-1] if reversed_ else COLOUR_STOPS
     return LinearSegmentedColormap.from_list("predicted", list(stops))
 
 
 def draw_layer(plan: PlanMap, layer: Layer, background: Background) -> Figure:
-    """One layer, a slice for each height, next to each other."""
+    """Draw one layer, with a panel for each height."""
     heights = plan.grid.heights_m
     x1, y1 = background.floor.outline_m.min(axis=0)
     x2, y2 = background.floor.outline_m.max(axis=0)
@@ -131,16 +131,16 @@ def draw_layer(plan: PlanMap, layer: Layer, background: Background) -> Figure:
         bar.ax.minorticks_off()
     handles = {handle.get_label(): handle for axes in panels for handle in axes.get_legend_handles_labels()[0]}
     figure.legend(handles=list(handles.values()), loc="outside lower center", ncols=4, fontsize=8, frameon=False)
-    figure.draw_without_rendering()  # the layout is known from here on, and with it what overlaps
+    figure.draw_without_rendering()  # computes the layout, which shows what overlaps
     for axes, names, contours in labels:
         _separate(axes, names, contours)
     return figure
 
 
 def _separate(axes: Axes, names: list[Annotation], contours: list[Text]) -> None:
-    """Move the names of anchors to free positions, and remove labels of contours that cover something.
+    """Move anchor names to free positions, and remove contour labels that cover something.
 
-    A name that has no free position is removed: it would erase another one.
+    A name without a free position is removed, as it would cover another one.
     """
     figure = axes.figure
     points = figure.dpi / 72.0
@@ -175,7 +175,7 @@ def _contains(outer: Bbox, inner: Bbox) -> bool:
 
 
 def _norm(values: Array, layer: Layer) -> tuple[LogNorm | BoundaryNorm | None, tuple[float, ...] | None]:
-    """Colours: whole numbers for anchors, per cent from 0 to 100, else the scale that the page's map has too."""
+    """Colour norm and ticks: whole numbers for anchors, default for per cent, else the scale of the page's map."""
     known = np.sort(values[np.isfinite(values)])
     if layer.column == ANCHORS_IN_VIEW:
         most = int(known.max(initial=1))
@@ -191,7 +191,7 @@ def _norm(values: Array, layer: Layer) -> tuple[LogNorm | BoundaryNorm | None, t
 def _slice(
     axes: Axes, plan: PlanMap, values: Array, norm: LogNorm | BoundaryNorm | None, layer: Layer, background: Background
 ) -> tuple[AxesImage, list[Text]]:
-    """The colours and contours of one height; returns the image, and the contours' labels."""
+    """Draw colours and contours of one height. Returns the image and the contour labels."""
     grid = plan.grid
     draw_image(axes, background.site, background.file)
     shown = np.where(grid.within, values, np.nan)
@@ -218,7 +218,7 @@ def _slice(
 
 
 def cells_box(grid: Grid) -> Box:
-    """Return the outer edges of a grid's cells as an image's extent: left, right, bottom, top, metres."""
+    """Outer edges of a grid's cells as an image extent: left, right, bottom, top, metres."""
     return (*_extent(grid.x_m), *_extent(grid.y_m))
 
 
@@ -242,7 +242,7 @@ def _contours(axes: Axes, plan: PlanMap, shown: Array, norm: LogNorm, layer: Lay
 
 
 def draw_image(axes: Axes, site: Site, file: Path) -> None:
-    """Draw the image of the floor, below everything else; the path of it is relative to the site's file."""
+    """Draw the floor plan's image, if any, below everything else; its path is relative to the site's file."""
     plan = site.floor_plan
     box = floor_plan_box(site, file)
     if plan is None or box is None:
@@ -254,7 +254,7 @@ def draw_image(axes: Axes, site: Site, file: Path) -> None:
 
 
 def draw_outline_and_walls(axes: Axes, site: Site, floor: Floor) -> None:
-    """Draw the floor's outline and the walls; the first wall has a label, and the axes end just outside."""
+    """Draw the floor's outline and the walls, the first with a label, and set the axes' limits just outside."""
     closed = np.vstack([floor.outline_m, floor.outline_m[:1]])
     axes.plot(closed[:, 0], closed[:, 1], color=_EDGE, linewidth=1.2, zorder=4)
     for index, wall in enumerate(site.walls):
@@ -268,7 +268,7 @@ def draw_outline_and_walls(axes: Axes, site: Site, floor: Floor) -> None:
 
 
 def _site_plan(axes: Axes, background: Background) -> list[Annotation]:
-    """Outline, walls, and anchors; the master is a star. Returns the anchors' names."""
+    """Draw outline, walls and anchors, with a star for the master. Returns the anchors' names."""
     site = background.site
     draw_outline_and_walls(axes, site, background.floor)
     names = []
@@ -293,13 +293,13 @@ def _site_plan(axes: Axes, background: Background) -> list[Annotation]:
 # Beacons per second, at a site without a master
 
 
-_MAX_LABELS: Final = 300  # with more anchors the picture has no identifiers
+_MAX_LABELS: Final = 300  # identifiers are left out with more anchors
 _RATES_PANEL_IN: Final = 9.0
 _POINTS_PER_IN: Final = 72.0
 
 
 def draw_rates(site: Site, floor: Floor, mapped: RateMap, file: Path, described: str) -> Figure:
-    """Beacons per second at a tag, the lowest of the heights' at every point; ``file`` is the site's."""
+    """Draw the beacons per second at a tag, the minimum over the heights at every point; ``file``: the site's."""
     x1, y1 = floor.outline_m.min(axis=0)
     x2, y2 = floor.outline_m.max(axis=0)
     height_in = float(np.clip(_RATES_PANEL_IN * (y2 - y1) / (x2 - x1), 2.0, 1.3 * _RATES_PANEL_IN))
@@ -323,7 +323,7 @@ def draw_rates(site: Site, floor: Floor, mapped: RateMap, file: Path, described:
 
 
 def _draw_anchors(axes: Axes, site: Site) -> None:
-    """One dot for each anchor, with its identifier where there is space."""
+    """Draw a dot for each anchor, sized by spacing, with its identifier unless there are too many."""
     points = anchor_positions(site)
     extent = np.ptp(points[:, :2], axis=0)
     spacing_m = max(float(np.sqrt(extent[0] * extent[1] / len(points))), float(extent.max() / len(points)), 0.1)

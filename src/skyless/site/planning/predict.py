@@ -1,4 +1,4 @@
-"""Predictions for a site at any points: its numbers gathered once, then compiled work on all cores."""
+"""Predicted position errors of a site at any points, in compiled code on all cores."""
 
 import math
 import os
@@ -54,10 +54,10 @@ from skyless.site.planning.links import (
 
 # Predicted errors of ``joint``, from the estimator's covariance at points of a site: at rest, and after a walk.
 
-_RARELY: Final = 0.1  # an anchor of whose frames fewer arrive does not help the tag
+_RARELY: Final = 0.1  # an anchor does not help a tag that receives a smaller share of its frames
 
-# The state is compared with that of so long ago, or of a superframe, if that is longer; at the latest after _MAX_S and
-# _MAX_SUPERFRAMES it counts as steady.
+# The state counts as steady when it equals that of _COMPLETE_OVER_S, or one superframe if longer, before; at the latest
+# after _MAX_S and _MAX_SUPERFRAMES.
 _COMPLETE_OVER_S: Final = 0.1
 _MAX_S: Final = 4.0
 _MAX_SUPERFRAMES: Final = 20
@@ -77,9 +77,9 @@ def fill_joint_sigma(
     most: int | None,
     table: Matrix,
 ) -> None:
-    """Fill ``table`` (points, columns) for the points, shape (m, 3).
+    """Fill ``table`` (points, columns) with errors of ``joint`` at points, shape (m, 3).
 
-    ``most``: anchors that a tag uses at most; the share of fixes is then that of these anchors' messages. None for all.
+    ``most``: most anchors that a tag uses; the share of fixes then refers to these anchors' messages. None for all.
     """
     dim = settings.dim
     shares, delays_m = scene.heard_at(points)
@@ -116,10 +116,10 @@ def walked_sigma(
     most: int | None,
     has_phases: bool,
 ) -> float:
-    """Standard deviation, metres, that the filter claims of a tag that rested at a point and has walked for a second.
+    """Standard deviation, metres, that the filter claims for a tag that rested at a point and then walked for a second.
 
-    With ``has_phases`` the tag measures the phase of the carrier with the noise and wander that the filter begins with.
-    Infinite where there is no fix.
+    With ``has_phases`` the tag measures carrier phases, with the noise and wander that the filter starts with.
+    Infinite if there is no fix.
     """
     (share,), (delay_m,) = scene.heard_at(point[None])
     in_view = scene.strongest(point, np.flatnonzero(share >= _RARELY), most or MAX_ANCHORS)
@@ -137,7 +137,7 @@ def walked_sigma(
 def _state_at(
     settings: EstimatorSettings, anchors_m: Matrix, in_view: Integers, point: Vector, has_phases: bool = False
 ) -> State:
-    """The estimator's state at a point, with the anchors in these rows of the site."""
+    """The estimator's state at a point, with the site's anchors in these rows."""
     s = new_state(settings)
     s.status.walk_scale, s.status.has_phases = 1.0, has_phases
     for axis in range(2 * s.dim):
@@ -165,7 +165,7 @@ def _steady_state(
 def _planned(
     clocks: AnchorClocks, relays: Relays, share: Vector, delay_m: Vector, in_view: Integers
 ) -> tuple[Any, Any]:
-    """A superframe's messages and what they relay, as records."""
+    """A superframe's messages and their relays, as records."""
     index_of = np.full(len(share), -1)
     index_of[in_view] = np.arange(len(in_view))
     messages: NDArray[Any] = np.zeros(len(clocks.sender), np.dtype(PlannedMessage))
@@ -180,36 +180,35 @@ def _planned(
 
 # Predicted errors of the snapshot methods at points: the TDoAs' covariance through the geometry, G·Σ·Gᵀ.
 #
-# Where frames arrive only at times, fixes come from changing sets of anchors: the sets that the most uncertain
-# anchors make are gone through one by one, each with its probability; other anchors count by whether they mostly take
-# part.
+# If frames are lost, fixes come from changing sets of anchors: all sets of the most uncertain anchors are enumerated,
+# each with its probability; any other anchor counts as present if it mostly takes part.
 #
 # The crystals' noise between the stamps, which matters in long superframes, is added to the stamps' noise of
-# ``uncertainty/tdoa.py``: a TDoA with its pair at κ and κ + 1 rounds holds (1 + κ)·x(κ) − κ·x(κ + 1) − x(0) of a
+# ``uncertainty/tdoa.py``: a TDoA with its pair at κ and κ + 1 rounds contains (1 + κ)·x(κ) − κ·x(κ + 1) − x(0) of a
 # clock's phase x, and the anchor's own clock enters with the same weights. For the delayed messages and the bracketed
 # form, which refer to the second message, it is (1 − κ)·x(κ + 1) + κ·x(κ) − x(1).
 
-_MAX_UNCERTAIN: Final = 4  # anchors whose presence and absence are both gone through
-_UNCERTAIN: Final = 0.01  # an anchor whose part is within this of 0 or 1 is sure not to take part, or to
-_MIN_EIGENVALUE: Final = 1e-3  # part of the largest eigenvalue below which a common error is left out
+_MAX_UNCERTAIN: Final = 4  # anchors whose presence and absence are both considered
+_UNCERTAIN: Final = 0.01  # an anchor whose part is within this of 0 or 1 counts as certain
+_MIN_EIGENVALUE: Final = 1e-3  # common errors below this share of the largest eigenvalue are left out
 
 
 class Rounds(Struct, frozen=True):
-    """Errors of the TDoAs of a site's anchors (the master's row is not used), in the order of its file."""
+    """Errors of the TDoAs of a site's anchors, in the order of its file (the master's row is not used)."""
 
     usable: Mask
     """Whether the anchor sends after the master within a round, as the snapshot methods need; shape (n,)."""
     assumed_own: Vector
-    """Variance of each TDoA that the method assumes, beyond the common part; m², shape (n,)."""
+    """Variance of each TDoA as the method assumes, without the common part; m², shape (n,)."""
     assumed_common: float
     true_own: Vector
     """``assumed_own`` plus the variance from the crystals' noise."""
     common: Matrix
-    """Errors that several TDoAs share: their covariance is common·commonᵀ; shape (n, k), metres."""
+    """Factor of the errors that several TDoAs share, with covariance common·commonᵀ; shape (n, k), metres."""
 
 
 def rounds_of(site: Site, method: SnapshotMethod) -> Rounds:
-    """Errors of the snapshot methods' TDoAs at a site whose noise figures hold."""
+    """Errors of a snapshot method's TDoAs, from the site's noise figures."""
     noise = site.noise
     tx_var, rx_var = stamp_variances(site)
     kappa, round_s = delays(site)
@@ -230,7 +229,7 @@ def rounds_of(site: Site, method: SnapshotMethod) -> Rounds:
 
 
 def delays(site: Site) -> tuple[Vector, float]:
-    """κ of each anchor, shape (n,), negative where it sends before the master; and the round's length in s."""
+    """κ of each anchor, shape (n,), negative if it sends before the master, and the round's length in s."""
     schedule = schedule_of(site)
     first = first_slots(site)
     spacing = schedule.slots // schedule.frames_per_node
@@ -240,7 +239,7 @@ def delays(site: Site) -> tuple[Vector, float]:
 
 
 def phase_covariance(kappa: Vector, round_s: float, noise: ClockNoise, *, first: bool) -> Matrix:
-    """Covariance, m², of what one clock's noise contributes to TDoAs with these κ; shape (n, n)."""
+    """Covariance, m², of one clock's noise in TDoAs with these κ; shape (n, n)."""
     reference = 0.0 if first else 1.0
     near, far = (1.0 + kappa, -kappa) if first else (kappa, 1.0 - kappa)
     times = np.array([kappa, kappa + 1.0, np.full_like(kappa, reference)]) * round_s
@@ -253,7 +252,7 @@ def phase_covariance(kappa: Vector, round_s: float, noise: ClockNoise, *, first:
 
 
 def _phase(s: Matrix, t: Matrix, noise: ClockNoise) -> Matrix:
-    """Covariance of the phase of a clock at two times after an instant at which phase and rate are exact."""
+    """Covariance of a clock's phase at two times after an instant with exact phase and rate."""
     low, high = np.maximum(np.minimum(s, t), 0.0), np.maximum(s, t)
     covariance: Matrix = noise.white * low + noise.walk * low * low * (3.0 * high - low) / 6.0
     return covariance
@@ -267,10 +266,10 @@ def _factors(covariance: Matrix) -> Matrix:
 
 
 def gains(towards: Array, weights: Matrix, common: float) -> Array:
-    """G of the least squares over TDoAs, shape (m, n, dim); infinite where singular.
+    """Gain G of the least squares over TDoAs, shape (m, n, dim); infinite where singular.
 
-    ``towards``: rows of H, shape (m, n, dim). The weight matrix is that of variances 1/weights, shape (m, n), and
-    ``common`` in all (Sherman-Morrison).
+    ``towards``: rows of H, shape (m, n, dim). TDoAs have variances 1/weights, shape (m, n), and a common error of
+    variance ``common`` (Sherman-Morrison).
     """
     weighted = weights[..., None] * towards
     mean = weighted.sum(axis=1)
@@ -283,16 +282,16 @@ def gains(towards: Array, weights: Matrix, common: float) -> Array:
 
 
 def variances(gain: Array, own: Matrix, common: Array) -> Matrix:
-    """The diagonal of G·(diag(own) + common·commonᵀ)·Gᵀ, shape (m, dim); shapes (m, n) and (m, n, k)."""
+    """Diagonal of G·(diag(own) + common·commonᵀ)·Gᵀ, shape (m, dim). ``own``: shape (m, n); ``common``: (m, n, k)."""
     together = gain.transpose(0, 2, 1) @ common
     found: Matrix = np.einsum("mna,mna,mn->ma", gain, gain, own) + (together * together).sum(axis=2)
     return found
 
 
 def anchor_sets(part: Matrix) -> Iterator[tuple[Vector, Mask]]:
-    """Sets of anchors from which points' fixes come: their probabilities, shape (m,), and masks, shape (m, n).
+    """Sets of anchors that fixes at points may use: their probabilities, shape (m,), and masks, shape (m, n).
 
-    ``part``: each anchor's part in the rounds, shape (m, n).
+    ``part``: share of the rounds in which each anchor takes part, shape (m, n).
     """
     uncertain = (part > _UNCERTAIN) & (part < 1.0 - _UNCERTAIN)
     order = np.argsort(np.where(uncertain, np.abs(part - 0.5), np.inf), axis=1, kind="stable")[:, :_MAX_UNCERTAIN]
@@ -317,7 +316,7 @@ def fill_snapshot_sigma(
     farthest_m: float,
     table: Matrix,
 ) -> None:
-    """Fill ``table`` (points, columns) for the points, shape (m, 3).
+    """Fill ``table`` (points, columns) with errors of a snapshot method at points, shape (m, 3).
 
     Sets of anchors whose error would exceed ``farthest_m`` give no fix.
     """
@@ -325,7 +324,7 @@ def fill_snapshot_sigma(
     fill_dops(scene, points, share, dim, table)
     part = share * share * np.where(rounds.usable & (scene.sends > 0.0), links.share**2, 0.0)
     part[:, master] = 0.0
-    # of each point only the anchors that take part, in the order of how much
+    # For each point only the anchors that take part, in descending order of their part.
     some = np.argsort(-part, axis=1, kind="stable")[:, : int((part > _UNCERTAIN).sum(axis=1).max())]
     part = np.take_along_axis(part, some, axis=1)
     towards = (_directions(scene.anchors[some], points) - _directions(scene.anchors[master], points))[..., :dim]
@@ -368,24 +367,24 @@ Fill = Callable[[Matrix, Matrix], None]
 MAX_PREDICTED: Final = 60
 """Larger sites of protocol 2 are planned by the beacons that reach tags (``rates``)."""
 
-# Points that a thread computes at a time. The filter takes longer for each.
+# Points that a thread computes at a time: fewer for the filter, which is slower.
 _SNAPSHOT_CHUNK: Final = 2000
 _FILTER_CHUNK: Final = 100
 
 
 class PlanSettings(Struct, frozen=True):
-    """What is assumed beyond the site file."""
+    """Assumptions beyond the site file."""
 
     method: str = DEFAULT_METHOD
     noise_ps: float | None = None
     """Noise of every TX and RX stamp; None for the site's own figures."""
     qa: float = 0.3
-    """Process noise that the filter assumes: spectral density of the acceleration, m²/s³."""
+    """Process noise of the filter: spectral density of the acceleration, m²/s³."""
     channel: ChannelModel = ChannelModel()
 
 
 class Predictor:
-    """The predictions of one site by one method."""
+    """Predictions for one site and one method."""
 
     def __init__(self, site: Site, settings: PlanSettings) -> None:
         self.site = with_noise(site, settings.noise_ps)
@@ -420,9 +419,9 @@ class Predictor:
         )
 
     def walked_sigma(self, points_m: Matrix, *, has_phases: bool) -> Vector:
-        """Standard deviations that ``joint`` claims of tags after walks of 1 m, along x and along y, from points.
+        """Standard deviations that ``joint`` claims after walks of 1 m from points, along x and along y, shape (2·m,).
 
-        Walks go towards the middle of the points, shape (m, 3), at 1 m/s; shape (2·m,). Infinite where there is no fix.
+        Walks go towards the middle of the points, shape (m, 3), at 1 m/s. Infinite where there is no fix.
         """
         joint, sides = self._joint_site(), np.where(points_m > points_m.mean(axis=0), -1.0, 1.0)
         walks = ((point, side * axis) for point, side in zip(points_m, sides, strict=True) for axis in np.eye(3)[:2])
@@ -435,7 +434,7 @@ class Predictor:
         )
 
     def _joint_site(self) -> tuple[EstimatorSettings, Scene, AnchorClocks, Relays, int | None]:
-        """What the estimator assumes, the anchors as tags and anchors hear them, and how many a tag uses at most."""
+        """Estimator settings, anchors, messages and relays of the site, and the most anchors that a tag uses."""
         settings = estimator_settings(
             self.settings.qa, self.site.tags.height_m, *filter_pages_of(self.site), superframe_s(self.site)
         )
@@ -443,11 +442,11 @@ class Predictor:
         return settings, self.scene, self.clocks, relays, MAX_ANCHORS_IN_USE if self.master is None else None
 
     def at(self, points_m: Matrix, progress: Callable[[float], None] | None = None) -> Matrix:
-        """Predictions at points, shape (m, 3): a table (m, len(PLAN_COLUMNS)); ``progress`` gets the points done."""
+        """Table of predictions (m, len(PLAN_COLUMNS)) at points, shape (m, 3); ``progress`` gets the points done."""
         return in_threads(self._fill, np.ascontiguousarray(points_m, np.float64), self._chunk, progress)
 
     def geometry_at(self, points_m: Matrix) -> Matrix:
-        """A table with anchors in view and DOPs only. Its column ``sigma_m`` is the weighted PDOP."""
+        """Table with only anchors in view and DOPs; its column ``sigma_m`` is the weighted PDOP."""
         return in_threads(self._geometry, np.ascontiguousarray(points_m, np.float64), _SNAPSHOT_CHUNK)
 
     def _geometry(self, points: Matrix, table: Matrix) -> None:
@@ -457,14 +456,14 @@ class Predictor:
 
 
 def with_noise(site: Site, noise_ps: float | None) -> Site:
-    """The site with another noise of every stamp, unless it is None."""
+    """The site with this noise of every stamp, or unchanged for None."""
     if noise_ps is None:
         return site
     return replace(site, noise=replace(site.noise, tx_stamp_ps=noise_ps, rx_stamp_ps=noise_ps))
 
 
 def in_threads(fill: Fill, points_m: Matrix, chunk: int, progress: Callable[[float], None] | None = None) -> Matrix:
-    """Fill a table of predictions for points, in pieces on all cores."""
+    """Fill a table of predictions for points, in chunks on all cores."""
     table: Matrix = np.zeros((len(points_m), len(PLAN_COLUMNS)))
     starts = range(0, len(points_m), chunk)
     if len(starts) == 1:

@@ -1,7 +1,6 @@
-"""Beacons a second that reach tags at a site of protocol 2, whose anchors send at random instants.
+"""Beacons per second that reach tags at a site of protocol 2, whose anchors send at random instants.
 
-A frame arrives if its power is above the sensitivity and, of all frames on the air with it, exceeds each by the
-capture margin.
+A frame arrives if its power is above the sensitivity and exceeds that of each concurrent frame by the capture margin.
 """
 
 import math
@@ -30,31 +29,31 @@ from skyless.site.planning.links import IN_VIEW, Floor, range_of
 from skyless.site.planning.maps import Grid, grid_of
 
 RECEIVED_HZ: Final = 2.0
-"""An anchor received more rarely than this is of no use to a tag, whose estimator forgets it after a second."""
+"""An anchor received more rarely is useless to a tag, whose estimator forgets it after a second."""
 
 FEWEST_ANCHORS: Final = 5
-"""With fewer in the worst twentieth of the positions a plan warns: one more than a position with its height needs."""
+"""A plan warns of fewer in the worst twentieth of the positions: one more than a 3-D position needs."""
 
 _ENOUGH_ANCHORS: Final = 7
-_CERTAIN_LOSS_WIDTHS: Final = 10.0  # steps of the sensitivity's width below it at which a frame counts as lost
+_CERTAIN_LOSS_WIDTHS: Final = 10.0  # a frame counts as lost this many widths below the sensitivity
 _POINTS: Final = 3000
 _PLASTIC: Final = np.array([0.7548776662, 0.5698402910])  # multiples of these, modulo 1, fill a square evenly
 
 
 class TagRates(Struct, frozen=True):
-    """What a tag receives at points; shape (points,) each."""
+    """A tag's reception at points; shape (points,) each."""
 
     beacons_per_s: Vector
     in_reach: Integers
-    """Anchors of whose frames at least half would arrive if nobody else sent."""
+    """Anchors of which at least half of the frames would arrive if no other sent."""
     received: Integers
-    """Anchors of which at least ``RECEIVED_HZ`` beacons a second arrive."""
+    """Anchors of which at least ``RECEIVED_HZ`` beacons per second arrive."""
 
 
 def tag_rates(site: Site, points_m: Matrix, channel: ChannelModel, exponent: float = 2.0) -> TagRates:
-    """Return what tags at points, shape (m, 3), receive; anchors without a position are left out.
+    """Predict the reception of tags at points, shape (m, 3); anchors without a position are left out.
 
-    ``exponent``: of the path loss; the power falls by ten times this many decibels for each factor of ten in distance.
+    ``exponent``: path loss exponent; the power falls by ten times this many decibels per factor of ten in distance.
     """
     anchors_m, period_s = anchor_positions(site), beacon_period_s(site)
     order = np.argsort(anchors_m[:, 0], kind="stable")
@@ -82,9 +81,9 @@ def tag_rates(site: Site, points_m: Matrix, channel: ChannelModel, exponent: flo
 def _fill_rates(points_m: Matrix, anchors_m: Matrix, settings: Vector, walls: Matrix, table: Matrix) -> None:
     """Fill beacons per period, anchors in reach and anchors received; anchors in the order of x.
 
-    ``settings``: power sent, sensitivity, its width, capture margin, share not lost by chance, exponent, distance
-    beyond which nothing matters, the share of the time in which another anchor's frame would overlap, and the share
-    of an anchor's frames that make it received.
+    ``settings``: transmit power, sensitivity, its width, capture margin, share not lost at random, exponent, distance
+    beyond which anchors are ignored, share of the time in which another anchor's frame would overlap, and share of an
+    anchor's frames that makes it count as received.
     """
     tx_dbm, sensitivity_dbm, width_db, capture_db = settings[0], settings[1], settings[2], settings[3]
     kept, exponent, farthest_m, overlap, useful = settings[4], settings[5], settings[6], settings[7], settings[8]
@@ -117,22 +116,22 @@ def _fill_rates(points_m: Matrix, anchors_m: Matrix, settings: Vector, walls: Ma
 
 
 class Distribution(Struct, frozen=True):
-    """A quantity over the region's positions."""
+    """Distribution of a quantity over the region's positions."""
 
     median: float
     worst_5_percent: float
-    """What all but the worst twentieth of the positions have at least."""
+    """Least value in all but the worst twentieth of the positions."""
     least: float
 
 
 class Reception(Struct, frozen=True):
-    """What tags receive over the region."""
+    """Tags' reception over the region."""
 
     beacons_per_s: Distribution
     anchors_in_reach: Distribution
-    """If one anchor sent at a time."""
+    """Without collisions."""
     anchors_received: Distribution
-    """With all that are on the air at once."""
+    """With collisions."""
 
 
 class RateMap(Struct, frozen=True):
@@ -147,7 +146,7 @@ class RateMap(Struct, frozen=True):
 def rate_map(
     site: Site, floor: Floor, heights_m: tuple[float, ...], step_m: float | None, channel: ChannelModel, exponent: float
 ) -> RateMap:
-    """Return what reaches tags over the region; without a step, at some three thousand points.
+    """Predict tags' reception over the region; by default at some three thousand points.
 
     Raises:
         ValueError: the region has no area or no point inside the outline, or there would be too many points.
@@ -164,9 +163,9 @@ def rate_map(
 
 
 def _points_in_cells(grid: Grid) -> Matrix:
-    """A point in each cell within the outline, shape (m, 2), each elsewhere in its cell.
+    """A point in each cell within the outline, at varying places in the cells, shape (m, 2).
 
-    On the cells' centres a grid of anchors would be met at the same few positions between its anchors only.
+    Cell centres would sample a regular grid of anchors only at the same few places between its anchors.
     """
     centres = np.stack(np.meshgrid(grid.x_m, grid.y_m), axis=-1)[grid.within]
     shares = np.arange(1, len(centres) + 1)[:, None] * _PLASTIC % 1.0 - 0.5
@@ -183,7 +182,7 @@ def _distribution(values: Vector | Integers) -> Distribution:
 def rate_report(
     site: Site, floor: Floor | None, mapped: RateMap | None, channel: ChannelModel, exponent: float
 ) -> dict[str, Any]:
-    """The whole report, SI units; without anchors with positions there is neither floor nor map."""
+    """The whole report, SI units; without placed anchors ``floor`` and ``mapped`` are None."""
     return {
         "site": site.name,
         "mode": site.schedule.mode,
@@ -209,7 +208,7 @@ def rate_report(
 
 
 def described_rates(result: dict[str, Any]) -> str:
-    """Who sends how often, in one line."""
+    """Mode and beacon rate in one line."""
     return f"mode {result['mode']}, {result['beacons_per_s_of_each_anchor']:.1f} beacons/s of each anchor"
 
 

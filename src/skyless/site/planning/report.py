@@ -1,4 +1,4 @@
-"""The report of a plan: everything that it found as one tree of plain values, warnings included."""
+"""The report of a plan: all results and warnings as one tree of plain values."""
 
 from typing import Any, Final
 
@@ -15,29 +15,20 @@ from skyless.core.protocol1.snapshots import literal_covariance
 from skyless.core.tag.position import NoSolution, locate
 from skyless.site.file.advice import warnings_of
 from skyless.site.planning.anchor_clocks import master_warnings, stamp_variances
-from skyless.site.planning.links import (
-    BIAS,
-    FIX_SHARE,
-    IN_VIEW,
-    SIGMA,
-    Floor,
-    Mounts,
-    range_of,
-    sample_points,
-)
+from skyless.site.planning.links import BIAS, FIX_SHARE, IN_VIEW, SIGMA, Floor, Mounts, range_of, sample_points
 from skyless.site.planning.maps import MapSummary, PlanMap
 from skyless.site.planning.optimise import Optimised, Scored, one_more
 from skyless.site.planning.predict import Predictor, delays
 
 
 class PointCheck(Struct, frozen=True):
-    """One point: prediction and simulation, metres; None where either has no fix."""
+    """Prediction and simulation at one point, metres; None where either has no fix."""
 
     position_m: tuple[float, float, float]
     predicted_sigma_m: float | None
     simulated_sigma_m: float | None
     ratio: float | None
-    """Simulated over predicted standard deviation; over RMSE where survey and ranges have errors."""
+    """Simulated over predicted standard deviation; ratio of RMSE if survey and ranges have errors."""
     ratio_error: float | None
     """Standard error of the ratio, from the scatter of the batches."""
     predicted_rmse_m: float | None
@@ -50,7 +41,7 @@ class PointCheck(Struct, frozen=True):
 
 
 class Verification(Struct, frozen=True):
-    """All points, and how far the ratios lie from one."""
+    """All checked points, and statistics of the ratios."""
 
     method: str
     seed: int
@@ -63,10 +54,10 @@ class Verification(Struct, frozen=True):
 
 
 class AfterMetre(Struct, frozen=True):
-    """What ``joint`` claims after a tag has walked a metre, metres; *stamps* without phases of the carrier."""
+    """Standard deviation that ``joint`` claims after a tag has walked a metre; ``stamps_``: without carrier phases."""
 
     walks: int
-    """From places all over the floor, along x and along y; those that have fixes."""
+    """Number of walks with fixes, from places all over the floor, along x and along y."""
     median_sigma_m: float
     worst_sigma_m: float
     stamps_median_sigma_m: float
@@ -126,7 +117,7 @@ _WALKED_PLACES: Final = 6
 
 
 def _after_metre(predictor: Predictor, floor: Floor, heights_m: tuple[float, ...]) -> AfterMetre | None:
-    """What phases of the carrier give tags that walk; None where the site has none or nothing is estimated."""
+    """Benefit of carrier phases to walking tags; None if the site has none or the method does not use them."""
     if predictor.site.schedule.carrier_phase is not True or predictor.settings.method not in FILTERS:
         return None
     points, _ = sample_points(floor, heights_m, _WALKED_PLACES)
@@ -172,12 +163,12 @@ def described(result: dict[str, Any]) -> str:
     )
 
 
-_WEAK_RATIO: Final = 2.0  # a position is weak where the error exceeds this multiple of the median
+_WEAK_RATIO: Final = 2.0  # a position is weak if its error exceeds this multiple of the median
 _MIRROR_POINTS: Final = 150
 
 
 def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
-    """All that may cost accuracy or the fix, from the site alone and from its map."""
+    """Warnings of anything that may cost accuracy or the fix, from the site and its map."""
     return [
         *warnings_of(predictor.site),
         *master_warnings(predictor.site, predictor.settings.channel),
@@ -201,7 +192,7 @@ def _order(predictor: Predictor) -> list[str]:
 
 
 def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
-    """Ask the solver itself, with TDoAs that are exact, whether a position has a mirror image that fits as well."""
+    """Warn of positions with a mirror image that fits as well, according to the solver with exact TDoAs."""
     points, _ = sample_points(floor, tuple(plan.grid.heights_m.tolist()), _MIRROR_POINTS)
     tx_var, rx_var = stamp_variances(predictor.site)
     height = predictor.site.tags.height_m
@@ -221,7 +212,7 @@ def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
 
 
 def _has_mirror(anchors: Array, point: Array, height_m: float | None, tx_var: float, rx_var: float) -> bool:
-    """Whether the anchors in view, shape (n, 3), or the nearest of many, leave two positions."""
+    """Whether the anchors in view, shape (n, 3), or the nearest of many, leave two possible positions."""
     nearest = np.argsort(np.linalg.norm(anchors - point, axis=1))[:MAX_ANCHORS]
     anchors = anchors[np.sort(nearest)]
     if len(anchors) < (4 if height_m is None else 3):
@@ -237,7 +228,7 @@ def _holes(plan: PlanMap) -> list[str]:
     missing = share < 0.5
     if not missing.any():
         return []
-    part = missing.sum() / (plan.grid.points)
+    part = missing.sum() / plan.grid.points
     x, y, z = _central(plan, missing)
     return [f"{part:.1%} of the region has no fix most of the time, as around ({x:.1f}, {y:.1f}, {z:.1f})"]
 
@@ -264,7 +255,7 @@ def _walls(predictor: Predictor, plan: PlanMap) -> list[str]:
     if not worse.any():
         return []
     largest = float(bias[known].max())
-    # its monitors are not in the prediction (docs/planning.md)
+    # The prediction does not include joint's fault monitors (docs/planning.md).
     monitors = "; joint may take delays for faults of anchors there, and err more than predicted"
     return [
         f"walls' delays shift positions by more than their standard deviation in {worse.sum() / known.sum():.0%} of "

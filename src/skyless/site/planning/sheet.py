@@ -1,4 +1,4 @@
-"""The installer's sheet: for each floor a page with a plan of the anchors and a table of what to measure and mount."""
+"""The installer's sheet: for each floor a page with a plan of the anchors and a table for mounting and measuring."""
 
 import io
 import math
@@ -16,29 +16,18 @@ from msgspec import Struct
 
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import AnchorSite, Site
-from skyless.site.planning.links import (
-    floor_of,
-)
+from skyless.site.planning.links import floor_of
 from skyless.site.planning.picture import draw_image, draw_outline_and_walls
 from skyless.site.report import BLUE, INK, MUTED, ORANGE, report_style
 
 _A4_IN: Final = (8.27, 11.69)
-
-
 _ROWS_BELOW_PLAN: Final = 26
-
-
 _ROWS_OF_PAGE: Final = 60
-
-
 _DPI: Final = 110.0
-
-
 _COLUMNS: Final = {
     "anchor": 0.1, "x / m": 0.13, "y / m": 0.13, "height / m": 0.13, "cable / m": 0.2, "done": 0.08, "measured": 0.23,
 }  # fmt: skip
-"""Titles of the table and the columns' widths. The last two are for the person who mounts."""
-
+"""Titles and widths of the table's columns. The installer fills in the last two."""
 
 Point = tuple[float, float, float]
 
@@ -48,11 +37,11 @@ class Mount(Struct, frozen=True):
 
     anchor: AnchorSite
     cable_m: tuple[float, float] | None
-    """Length of its cable, straight and along x, then y, then up, without what is needed to go round things."""
+    """Length of the anchor's cable, straight and along the axes, without detours."""
 
 
 def mounts(site: Site, cables_from: Point | None = None) -> tuple[Mount, ...]:
-    """The rows of all placed anchors, by floor and identifier."""
+    """Rows of all placed anchors, by floor and identifier."""
     ordered = sorted(site.anchors, key=lambda one: (one.floor, one.id))
     return tuple(Mount(one, None if cables_from is None else _cable_m(one, cables_from)) for one in ordered)
 
@@ -69,9 +58,9 @@ def sheet(
     date: str,
     cables_from: Point | None = None,
 ) -> bytes:
-    """The sheet as a file: a page A4 for each floor, more where its anchors do not fit; in a PNG one below the other.
+    """The sheet as a file: one or more A4 pages per floor; in a PNG one below the other.
 
-    ``file`` is the site's, next to which the image of the floor lies; without it the image is left out.
+    ``file``: the site's file, to which the floor plan's image is relative; without it the image is left out.
 
     Raises:
         ConfigurationError: no anchor has a position, or the anchors outline no floor.

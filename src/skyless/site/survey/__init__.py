@@ -1,1 +1,1 @@
-"""Positions and antenna delays of anchors from what they receive of one another."""
+"""Positions and antenna delays of anchors from their receptions of one another."""

@@ -13,30 +13,31 @@ from skyless.core.ticks import TICK_BITS, TICK_M
 from skyless.site.survey.legs import RunningMedian, TwoWayRanging
 
 MIN_NOISE_M: Final = 0.05
-"""Smallest noise that is assumed: positions that a calibration has not seen differ somewhat."""
+"""Least noise assumed, as positions outside the calibration differ somewhat."""
 
 SLOPE_NEAREST_M: Final = 0.5
 """Below this range the slope does not apply."""
 
 SHARED_NOISE_SCALE: Final = 1.5
-"""Factor: successive differences share receptions and reflections, which the filter counts as new in each."""
+"""Factor on the noise: successive differences share receptions and reflections, but the filter takes them as
+independent."""
 
 TYPICAL_SLOPE_M: Final = 0.05
 """Slope of an uncalibrated DW1000: APS011 gives 0.03 to 0.10 m, recorded flights 0.03 to 0.08 m."""
 
 KNOWN_STD_M: Final = 0.02
-"""Standard deviation of a calibrated constant, without the error of the survey. With that error, constants of the same
-anchors differ by 3 cm between recordings."""
+"""Standard deviation of a calibrated constant, without the survey's error. With it, constants of the same anchors
+differ by 3 cm between recordings."""
 
 
 class AnchorCalibration(Struct, frozen=True):
-    """What is known of one anchor, metres."""
+    """Range errors of one anchor, metres."""
 
     bias_m: float
     slope_m: float = 0.0
-    """Growth of the bias while the range grows by the factor e."""
+    """Growth of the bias as the range grows by a factor of e."""
     noise_m: float | None = None
-    """Standard deviation of the differences that the anchor takes part in, outliers apart."""
+    """Standard deviation of the anchor's differences, without outliers."""
 
 
 NO_BIAS: Final = AnchorCalibration(0.0)
@@ -44,25 +45,25 @@ TYPICAL_ANCHOR: Final = AnchorCalibration(0.0, TYPICAL_SLOPE_M)
 
 
 class DifferenceCalibration(Struct, frozen=True):
-    """What is known of the anchors; others are typical ones."""
+    """Calibrated anchors; any other is taken as a typical one."""
 
     anchors: dict[int, AnchorCalibration]
 
     def of(self, anchor: int) -> AnchorCalibration:
-        """What is known of an anchor, or of any."""
+        """The anchor's calibration, or a typical one."""
         return self.anchors.get(anchor, TYPICAL_ANCHOR)
 
     def error_m(self, anchor: int, range_m: float) -> float:
-        """By how much an anchor seems too far away."""
+        """Error of a range to the anchor: bias and slope."""
         known = self.of(anchor)
         return known.bias_m + known.slope_m * log(max(range_m, SLOPE_NEAREST_M))
 
     def constant_m(self, pair: PairTdoa) -> float:
-        """By how much a difference is too large for its anchors' constants."""
+        """Error of a difference due to its anchors' biases."""
         return self.of(pair.anchor_b).bias_m - self.of(pair.anchor_a).bias_m
 
     def difference_std_m(self, otherwise_m: float) -> float:
-        """Standard deviation of a difference: from the median of the anchors' noise, at most ``otherwise_m``."""
+        """Standard deviation of a difference, from the median noise of the anchors; at most ``otherwise_m``."""
         known = [anchor.noise_m for anchor in self.anchors.values() if anchor.noise_m is not None]
         return (
             min(SHARED_NOISE_SCALE * max(float(np.median(known)), MIN_NOISE_M), otherwise_m) if known else otherwise_m
@@ -73,22 +74,22 @@ class DifferenceCalibration(Struct, frozen=True):
 
 
 RANGED_WINDOW: Final = 101
-"""Exchanges over which the ranged flight of a pair is the median."""
+"""Exchanges in the running median of a pair's ranged flight."""
 
 Pair = tuple[int, int]
 
 
 class AnchorFlights:
-    """Median of the flights that either anchor of a pair stated recently, or of exchanges where neither states any."""
+    """Median flight of each pair: as stated by its anchors, or ranged from exchanges if neither states any."""
 
     def __init__(self) -> None:
         self._stated: dict[Pair, RunningMedian] = {}
         self._ranging = TwoWayRanging(TICK_BITS, window=RANGED_WINDOW)
 
     def update(self, a: int, b: int, tx_a: int, rx_b: int, stated_ticks: float | None) -> float | None:
-        """Process b's reception of a's packet, both stamps unwrapped, with the flight that b states if there is one.
+        """Add b's reception of a's packet, with the flight that b states, if any. Stamps are unwrapped.
 
-        Returns the flight between the two in ticks, None while it is unknown.
+        Returns the pair's flight in ticks, None while unknown.
         """
         pair = (a, b) if a < b else (b, a)
         median = self._stated.get(pair)
@@ -102,12 +103,12 @@ class AnchorFlights:
         return self._ranging.flight_ticks(a, b)
 
     def forget(self, anchor: int) -> None:
-        """Drop the open exchanges of an anchor whose clock restarted; its flights stay."""
+        """Drop the open exchanges of an anchor whose clock restarted, but keep its flights."""
         self._ranging.forget(anchor)
 
 
 def distance_ticks(anchors_m: Mapping[int, Point], a: int, b: int) -> float | None:
-    """Flight between two anchors by their positions, without any antenna delay; None where one is not known."""
+    """Time of flight between two anchors' positions, without antenna delays; None if a position is unknown."""
     one, other = anchors_m.get(a), anchors_m.get(b)
     return None if one is None or other is None else dist(one, other) / TICK_M
 
@@ -116,17 +117,17 @@ def distance_ticks(anchors_m: Mapping[int, Point], a: int, b: int) -> float | No
 
 
 EXCESS_STD_M: Final = 0.1
-"""Parts of a pair's excess other than its nodes' delays: errors of positions, strong and weak signals."""
+"""Standard deviation of a pair's excess apart from its nodes' delays: position errors, strong and weak signals."""
 
 ANTENNA_DELAY_STD_M: Final = 0.07
-"""How much the delays of nodes of one kind scatter: two of them as much as all else."""
+"""Standard deviation of the delays of nodes of one kind: two of them scatter as much as everything else."""
 
 BLOCKED_M: Final = 0.5
-"""A pair whose excess is farther from all others' is blocked or reflected."""
+"""A pair whose excess is farther than this from the median is blocked or reflected."""
 
 
 def antenna_delays_m(excess_m: Mapping[Pair, float]) -> dict[int, float]:
-    """Best linear estimate of each anchor's delay a, less the mean of all; ``excess_m``: flights less distances."""
+    """Best linear estimate of each anchor's antenna delay, relative to the mean; ``excess_m``: flight less distance."""
     if not excess_m:
         return {}
     middle = float(np.median(list(excess_m.values())))
@@ -140,9 +141,9 @@ def antenna_delays_m(excess_m: Mapping[Pair, float]) -> dict[int, float]:
 
 
 def contradictions_m(excess_m: Mapping[Pair, float], delays_m: Mapping[int, float]) -> dict[Pair, float]:
-    """Pairs whose flights cannot be had by their positions, by how much they are too long; empty where all can.
+    """Excess of each pair whose flight contradicts the positions; empty unless a flight is too short.
 
-    Obstacles make flights longer, and only that; where one is too short, positions are wrong.
+    Obstacles can only lengthen a flight, so one that is too short means wrong positions.
     """
     if not excess_m:
         return {}
@@ -155,7 +156,7 @@ def contradictions_m(excess_m: Mapping[Pair, float], delays_m: Mapping[int, floa
 
 
 def _design(pairs: Mapping[Pair, float], anchors: list[int]) -> Array:
-    """A row for each pair: its two anchors, and what all have in common in the last column."""
+    """Design matrix: one row per pair with its two anchors; the last column is the part common to all."""
     column = {anchor: k for k, anchor in enumerate(anchors)}
     H = np.zeros((len(pairs), len(anchors) + 1))
     H[:, -1] = 1.0
@@ -169,20 +170,20 @@ def _design(pairs: Mapping[Pair, float], anchors: list[int]) -> Array:
 
 ALWAYS_REFRESHED: Final = 32
 REFRESH: Final = 8
-"""After this number of receptions of a pair in one direction, only every eighth updates the flight."""
+"""After ``ALWAYS_REFRESHED`` receptions in one direction, only every eighth updates the flight."""
 
 FIRST_ESTIMATE: Final = 128
 MAX_BETWEEN_ESTIMATES: Final = 1024
-"""Flights received between two estimates of the antenna delays: twice as many each time, up to this number."""
+"""Flights received between two estimates of the antenna delays: doubled each time, up to the maximum."""
 
 UNRANGED: Final = 20
-"""Receptions of a pair after which no ranging of it is expected: then it has the others' excess."""
+"""Receptions without a ranged flight after which a pair gets the median excess of the others."""
 
 EXCESSES: Final = 101
 
 
 class _Direction:
-    """Receptions by one anchor of another's packets."""
+    """One anchor's receptions of another's packets."""
 
     __slots__ = ("delay_ticks", "heard", "skip", "unranged")
 
@@ -192,23 +193,23 @@ class _Direction:
 
 
 class RelayDelays:
-    """Delays of all pairs, for anchors at ``anchors_m``, which may grow."""
+    """Delays of relayed receptions for all pairs of the anchors in ``anchors_m``, which may grow."""
 
     def __init__(self, anchors_m: Mapping[int, Point], estimate: bool) -> None:
-        """``estimate``: the anchors' own delays too; otherwise a pair shares its delay equally."""
+        """``estimate``: also estimate each anchor's own delay; otherwise a pair shares its delay equally."""
         self._anchors_m = anchors_m
         self._flights = AnchorFlights()
         self._directions: dict[Pair, _Direction] = {}
         self._excess_m: dict[Pair, RunningMedian] = {}
         self.own_m: dict[int, float] = {}
-        """The anchors' own delays, each half of TX and RX together, less what all have in common."""
+        """Each anchor's own delay, half of TX and RX together, relative to the mean."""
         self.contradictions_m: dict[Pair, float] = {}
-        """Pairs that range each other nearer, or farther, than their positions are while others seem nearer."""
+        """See ``contradictions_m``."""
         self._estimates_own = estimate
         self._until_estimate = self._wait = FIRST_ESTIMATE
 
     def ticks(self, listener: int, sender: int, tx_ticks: int, rx_ticks: int, stated_ticks: float | None) -> int | None:
-        """What to subtract from this reception, whole ticks; None while the pair's flight is unknown.
+        """Whole ticks to subtract from this reception; None while the pair's flight is unknown.
 
         Stamps are unwrapped, each on its own clock.
         """
@@ -226,7 +227,7 @@ class RelayDelays:
         return direction.delay_ticks
 
     def forget(self, anchor: int) -> None:
-        """An anchor's clock restarted."""
+        """Drop the open exchanges of an anchor whose clock restarted."""
         self._flights.forget(anchor)
 
     def _refresh(self, direction: _Direction, listener: int, sender: int, flight: float | None) -> None:
@@ -252,7 +253,7 @@ class RelayDelays:
         return known[len(known) // 2] if known else 0.0
 
     def _estimate(self) -> None:
-        """Estimate the anchors' own delays; the pairs' follow with their next flights."""
+        """Estimate the anchors' own delays; pairs use them from their next flights."""
         self._wait = min(2 * self._wait, MAX_BETWEEN_ESTIMATES)
         self._until_estimate = self._wait
         known = {pair: value for pair, median in self._excess_m.items() if (value := median.value) is not None}

@@ -1,7 +1,7 @@
-"""What the measurements determine: first by counting, then by the covariance; and which tapes would help most.
+"""Which anchors the measurements determine, by counting and by covariance, and which tapes would help most.
 
-A survey knows positions up to a rigid motion, so a covariance needs a set of anchors, the core, over which results are
-aligned. An anchor whose standard deviation remains above ``max_std_m`` leaves the core; it is not determined.
+A survey knows positions only up to a rigid motion, so a covariance needs a set of anchors, the core, over which results
+are aligned. An anchor whose standard deviation remains above ``max_std_m`` leaves the core: it is not determined.
 """
 
 from typing import Final
@@ -24,24 +24,24 @@ from skyless.site.survey.problem import (
 
 
 class Links(Struct, frozen=True, eq=False):
-    """What counting shows. ``n`` anchors."""
+    """Result of counting distances, for ``n`` anchors."""
 
     has_enough: Mask
-    """Shape (n,): anchors of the group that can be laid out."""
+    """Shape (n,): anchors of the chosen group."""
     adjacent: Mask
-    """Shape (n, n): a range or a tape."""
+    """Shape (n, n): pairs with a range or a tape."""
     groups: tuple[tuple[int, ...], ...]
-    """Groups that can be laid out, each in itself, the largest first; indices."""
+    """Groups that can each be laid out, as indices, the largest first."""
     needed: Integers
-    """Shape (n,): distances that an anchor needs."""
+    """Shape (n,): distances that each anchor needs."""
 
 
 def count_links(adjacent: Mask, unknown: Integers, is_known: Mask, least: int) -> Links:
     """Leave out anchors with too few distances until all that remain have enough, then choose the largest group.
 
-    ``unknown``: coordinates of each anchor that are not given, shape (n,). ``is_known``: anchors whose positions are
-    given; the distances between them are known as well. ``least``: anchors of the smallest group that has a shape.
-    No group is chosen where the second one has more than half of the largest one's anchors.
+    ``unknown``: number of coordinates of each anchor that are not given, shape (n,). ``is_known``: anchors whose
+    positions, and so the distances between them, are given. ``least``: anchors of the smallest group that has a shape.
+    No group is chosen if the second largest has more than half as many anchors as the largest.
     """
     needed = np.where(is_known, 0, unknown + 1)
     joined = (adjacent | np.outer(is_known, is_known)) & ~np.eye(len(adjacent), dtype=bool)
@@ -67,7 +67,7 @@ def count_links(adjacent: Mask, unknown: Integers, is_known: Mask, least: int) -
 
 
 def _groups(joined: Mask, active: Mask) -> list[Integers]:
-    """Connected parts of the anchors that are active."""
+    """Connected components of the active anchors."""
     members = np.flatnonzero(active)
     if not members.size:
         return []
@@ -83,12 +83,12 @@ _MAX_RANGE_STDS: Final = 4.0
 """Standard deviation per axis above which an anchor is not determined, in metres and as a multiple of a range's."""
 
 TOUCHED: Final = 0.3
-"""Part of a direction's largest component from which on it touches an anchor."""
+"""A direction touches an anchor that moves by at least this share of the largest shift."""
 
-_UNKNOWN_STD_M: Final = 30.0  # what an unknown that nothing determines is given, so that matrices stay regular
+_UNKNOWN_STD_M: Final = 30.0  # prior of every unknown, so that matrices stay regular
 _SAME: Final = 1e-9
 _BARRIER: Final = 4.0  # increase of the cost that separates two shapes
-_NEARLY_FLAT: Final = 0.3  # extent across, as a part of the extent along, below which a shape may be flat
+_NEARLY_FLAT: Final = 0.3  # a shape may be flat if its extent across is a smaller share of that along
 _FLAT_BARRIER: Final = 11.0
 """Increase of the cost (3.3 σ) by which a flat shape must fit worse for the extent across to be real."""
 
@@ -96,8 +96,8 @@ _FLAT_BARRIER: Final = 11.0
 def max_std_m(problem: Problem) -> float:
     """Standard deviation per axis above which an anchor is not determined.
 
-    Where ranges are poor, so are positions, and poor ones with an honest error are of use: what counts there is that
-    the ranges hold an anchor from all sides, and that not a few ranges' errors add up along one direction.
+    Poor ranges give poor positions, which are useful with an honest error. What counts then is that ranges hold an
+    anchor from all sides, so that the errors of several do not add up along one direction.
     """
     if not len(problem.variance_m2):
         return _MAX_STD_M
@@ -110,19 +110,19 @@ class Direction(Struct, frozen=True, eq=False):
     std_m: float
     """Standard deviation of the anchor that moves most."""
     shift_m: Array
-    """Shape (n, 3), of positions; the anchor that moves most moves by 1 m."""
+    """Shape (n, 3): change of the positions, scaled so that the largest shift is 1 m."""
     delay_m: Array
-    """Shape (n,): what delays change at the same time."""
+    """Shape (n,): simultaneous change of the delays."""
 
     @property
     def anchors(self) -> Mask:
-        """Shape (n,): those that it touches."""
+        """The anchors that this direction touches, shape (n,)."""
         length = np.linalg.norm(self.shift_m, axis=1)
         return np.asarray(length > TOUCHED * length.max(initial=0.0))
 
 
 def rank(rows: Array) -> int:
-    """Rank of a Jacobian, whose columns may have different scales."""
+    """Rank of a Jacobian whose columns may have different scales."""
     squares = rows.T @ rows
     scale = np.sqrt(np.diag(squares))
     kept = scale > 0.0
@@ -133,7 +133,7 @@ def rank(rows: Array) -> int:
 def aligned_covariance(problem: Problem, rows: Array, position_m: Array, core: Mask) -> Array:
     """Covariance of coordinates and delays after the best rigid alignment over the core, shape (4 n, 4 n).
 
-    Rows of coordinates that are not estimated are 0; what nothing determines has a standard deviation of some 30 m.
+    Rows of coordinates that are not estimated are 0; undetermined unknowns have a standard deviation of some 30 m.
     """
     used = unknown_columns(problem)
     information = rows[:, used].T @ rows[:, used]
@@ -170,9 +170,9 @@ def position_stds_m(problem: Problem, covariance_m2: Array) -> Array:
 
 
 def determined_core(problem: Problem, rows: Array, position_m: Array, least: int) -> Mask:
-    """Anchors that have a standard deviation of at most ``max_std_m`` when aligned over themselves, shape (n,).
+    """Mask of the anchors whose standard deviation is at most ``max_std_m`` when aligned over themselves, shape (n,).
 
-    None, where fewer than ``least`` remain.
+    All False if fewer than ``least`` remain.
     """
     core, most_m = np.ones(len(position_m), bool), max_std_m(problem)
     while core.sum() >= least:
@@ -185,7 +185,7 @@ def determined_core(problem: Problem, rows: Array, position_m: Array, least: int
                 std = position_stds_m(problem, aligned_covariance(problem, rows, position_m, core))
                 core = core & (std <= most_m)
             return core
-        # All that are equally uncertain leave at once, so that no order of anchors decides.
+        # Equally uncertain anchors leave together, so that their order does not matter.
         core &= std < worst * (1.0 - 1e-6)
     return np.zeros(len(position_m), bool)
 
@@ -193,7 +193,7 @@ def determined_core(problem: Problem, rows: Array, position_m: Array, least: int
 def weak_directions(
     problem: Problem, covariance_m2: Array, core: Mask, least_std_m: float, most: int
 ) -> list[Direction]:
-    """The least determined directions of the core's positions that move an anchor by ``least_std_m`` or more (1 σ)."""
+    """The ``most`` least determined directions of the core that move an anchor by ``least_std_m`` or more (1 σ)."""
     n = len(problem.is_free)
     chosen = np.flatnonzero(np.repeat(core, 3) & problem.is_free.ravel())
     if not chosen.size:
@@ -213,7 +213,7 @@ def weak_directions(
 
 
 def folds(problem: Problem, position_m: Array, delay_m: Array, weight: Array, direction: Direction) -> bool:
-    """Whether the shape can be moved by twice ``max_std_m`` along a direction without ranges that contradict."""
+    """Whether the shape can move by twice ``max_std_m`` along a direction without contradicting the ranges."""
     most = total_cost(problem, position_m[None], delay_m[None], weight)[0] + _BARRIER
     for sign in (1.0, -1.0):
         step = sign * np.arange(0.05, 2.0 * max_std_m(problem) + 0.01, 0.05)
@@ -226,8 +226,8 @@ def folds(problem: Problem, position_m: Array, delay_m: Array, weight: Array, di
 def may_be_flat(problem: Problem, position_m: Array, delay_m: Array, weight: Array, axes: int) -> bool:
     """Whether all anchors may stand on one line (``axes`` 2, seen from above) or in one plane (3).
 
-    Anchors on a line have no first-order hold across it; their ranges' errors put them next to the line, where they
-    seem to have one. So the anchors are fitted on the line, which must fit worse.
+    Ranges do not hold anchors on a line across it to first order; range errors put the anchors beside the line, where
+    ranges seem to hold them. So the anchors are also fitted exactly flat; they may be flat unless that fits worse.
     """
     if np.isfinite(problem.coordinate_variance_m2[:, :axes]).any() or len(position_m) < 2:
         return False
@@ -250,7 +250,7 @@ def may_be_flat(problem: Problem, position_m: Array, delay_m: Array, weight: Arr
 
 
 def _rigid_motions(problem: Problem, position_m: Array, inside: Mask, used: Integers) -> Array:
-    """Velocities of all unknowns in motions of the whole site, orthonormal over the core, shape (u, motions)."""
+    """Velocities of all unknowns under rigid motions of the site, orthonormal over the core, shape (u, motions)."""
     n = len(position_m)
     columns = np.flatnonzero(inside)
     centre = position_m[np.unique(used[columns] // 3)].mean(axis=0) if columns.size else np.zeros(3)
@@ -271,27 +271,27 @@ def _rigid_motions(problem: Problem, position_m: Array, inside: Mask, used: Inte
 
 
 TAPE_STD_M: Final = 0.005
-"""Standard deviation of a distance that has not been measured yet."""
+"""Assumed standard deviation of a distance that is yet to be measured."""
 
-_MIN_GAIN: Final = 0.02  # part of the standard deviation that a tape must save to be named
+_MIN_GAIN: Final = 0.02  # share of the standard deviation that a tape must remove to be advised
 
 
 _AS_GOOD: Final = 0.98
 _AS_LITTLE: Final = 1.2
-"""Gain, as a part of the best one, and what remains, as a multiple of the least, that are no worse.
+"""A tape is as good as the best with this share of the best gain and this multiple of the least remaining variance.
 
-Noise does not change which of several equal tapes is named: it is the first.
+The first of several equally good tapes is chosen, so that noise does not change the choice.
 """
 
 
 class TapeChoice(Struct, frozen=True, eq=False):
-    """A distance, by indices, and what it would change."""
+    """A distance to measure, by indices, and its benefit."""
 
     first: int
     second: int
     std_before_m: float
     std_after_m: float
-    """rms over the anchors of the core."""
+    """RMS over the anchors of the core."""
     worst_after_m: float
     """Standard deviation of the least determined anchor of the core."""
 
@@ -299,7 +299,7 @@ class TapeChoice(Struct, frozen=True, eq=False):
 def best_tapes(
     problem: Problem, position_m: Array, covariance_m2: Array, core: Mask, most: int = 3, until_m: float = 0.0
 ) -> list[TapeChoice]:
-    """The best distances one after another, until the worst anchor has a standard deviation of ``until_m`` or less.
+    """Choose the best distances one by one, until the worst standard deviation is ``until_m`` or less.
 
     ``covariance_m2``: after alignment over the core, shape (4 n, 4 n).
     """
@@ -341,7 +341,7 @@ def best_tapes(
 
 
 def mending_tapes(problem: Problem, position_m: Array, covariance_m2: Array, core: Mask) -> list[TapeChoice]:
-    """The distances after which every anchor of the core is determined; empty where a few do not suffice."""
+    """The distances that would determine every anchor of the core; empty if six are not enough."""
     most_m = max_std_m(problem)
     chosen = best_tapes(problem, position_m, covariance_m2, core, most=6, until_m=most_m)
     return chosen if chosen and chosen[-1].worst_after_m <= most_m else []

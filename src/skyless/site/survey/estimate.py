@@ -1,8 +1,8 @@
-"""One constant for each anchor from time differences at known positions, robustly, with honest standard errors.
+"""Robust estimates of one constant per anchor from time differences at known positions, with honest standard errors.
 
 A difference measures |p − b| − |p − a| + bias_b − bias_a (+ slope·ln(|p − b| / |p − a|)) + noise. With p known the
-biases follow by linear regression: Huber's weights, and nothing beyond four standard deviations. Only differences of
-constants can be seen. The zero is their mean.
+biases follow by linear regression with Huber's weights; residuals beyond four standard deviations are rejected. Only
+differences of constants are observable, so their mean is set to zero.
 """
 
 from typing import Any, Final, Literal
@@ -16,7 +16,7 @@ from skyless.core.arrays import Array, Integers, Mask, Vector
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.site.survey.legs import STD_OVER_MAD
 
-# The robust regression behind a calibration: constants of anchors, and a slope, from differences at known positions.
+# Robust regression
 
 _HUBER: Final = 1.345
 """Standard deviations up to which a residual has full weight: 95 % of the efficiency on Gaussian noise."""
@@ -24,34 +24,34 @@ _HUBER: Final = 1.345
 _REJECT: Final = 4.0
 
 _BLOCK_S: Final = 5.0
-"""Reflections change while a walker or a drone goes a metre or two: errors within such a time count as one."""
+"""Reflections persist until a walker or a drone has moved a metre or two: errors within this time count as one."""
 
 _FEWEST_BLOCKS: Final = 10
 
 _MIN_MOTION: Final = 0.05
-"""How much the logarithms of the ratios must change beyond what constants explain for a slope to be looked for."""
+"""Change of the log ratios, beyond what constants explain, that is needed to estimate a slope."""
 
 
 class Differences(Struct, frozen=True):
-    """Time differences at known positions, n of them."""
+    """``n`` time differences at known positions."""
 
     t_s: Vector
     """Shape (n,), not decreasing."""
     anchor_a: Integers
     anchor_b: Integers
     excess_m: Vector
-    """Measured less what follows from the geometry."""
+    """Measured difference less the geometric one."""
     log_ratio: Vector
     """ln(range to b / range to a)."""
 
     def select(self, rows: Mask | Integers) -> "Differences":
-        """These rows."""
+        """Select rows."""
         a, b = self.anchor_a[rows], self.anchor_b[rows]
         return Differences(self.t_s[rows], a, b, self.excess_m[rows], self.log_ratio[rows])
 
 
 class Fit(Struct, frozen=True):
-    """A regression: m anchors, n differences."""
+    """Result of a regression over ``m`` anchors and ``n`` differences."""
 
     anchors: Integers
     bias_m: Vector
@@ -68,7 +68,7 @@ class Fit(Struct, frozen=True):
 
 
 def fit(data: Differences, anchors: Integers, *, slope: bool) -> Fit:
-    """Fit one constant for each of the anchors, all of them tied together by the differences, perhaps with a slope."""
+    """Fit one constant per anchor, and a slope if wanted. The differences must link all anchors."""
     a, b = np.searchsorted(anchors, data.anchor_a), np.searchsorted(anchors, data.anchor_b)
     design = _design(a, b, data.log_ratio if slope else np.zeros(len(a)), len(anchors))
     y = _pair_medians(a, b, data.excess_m, len(anchors))
@@ -93,7 +93,7 @@ def fit(data: Differences, anchors: Integers, *, slope: bool) -> Fit:
 
 
 def moves(data: Differences, found: Fit) -> bool:
-    """Whether the ranges change enough; at one position a slope looks like constants."""
+    """Whether the ranges change enough to separate a slope from the constants."""
     still = np.zeros(len(found.a))
     design = _design(found.a, found.b, still, len(found.anchors))
     alike = np.linalg.solve(_normal(design, still + 1.0), design.T @ data.log_ratio)
@@ -101,7 +101,7 @@ def moves(data: Differences, found: Fit) -> bool:
 
 
 def _pair_medians(a: Integers, b: Integers, excess_m: Vector, count: int) -> Vector:
-    """Each difference replaced by the median of its pair: a start that outliers do not touch."""
+    """Each difference replaced by its pair's median: a start for the fit that outliers do not affect."""
     start = np.empty_like(excess_m)
     pair = a * count + b
     for one in np.unique(pair):
@@ -111,14 +111,14 @@ def _pair_medians(a: Integers, b: Integers, excess_m: Vector, count: int) -> Vec
 
 
 def _design(a: Integers, b: Integers, x: Vector, count: int) -> Any:  # noqa: ANN401 - a sparse array
-    """Derivatives of the differences by the constants and, in the last column, by the slope; shape (n, count + 1)."""
+    """Derivatives of the differences with respect to the constants and, last, the slope; shape (n, count + 1)."""
     ones, rows = np.ones(len(a)), np.tile(np.arange(len(a)), 3)
     columns = np.concatenate([b, a, np.full(len(a), count)])
     return csr_array((np.concatenate([ones, -ones, x]), (rows, columns)), shape=(len(a), count + 1))
 
 
 def _normal(design: Any, weights: Vector) -> Array:  # noqa: ANN401 - a sparse array
-    """Hᵀ W H; the sum of the constants is held at zero, and the slope where nothing determines it."""
+    """Hᵀ W H, with terms that hold the sum of the constants, and an undetermined slope, at zero."""
     normal: Array = (design.T @ design.multiply(weights[:, None])).toarray()
     count = len(normal) - 1
     typical = max(float(np.trace(normal[:-1, :-1])) / count, 1e-9)
@@ -128,7 +128,7 @@ def _normal(design: Any, weights: Vector) -> Array:  # noqa: ANN401 - a sparse a
 
 
 def _covariance(t_s: Vector, design: Any, residual_m: Vector, scale_m: float) -> Array:  # noqa: ANN401 - sparse
-    """Errors within a block of time taken as one (sandwich); never less than independent ones would make it."""
+    """Sandwich covariance, clustered by blocks of time; no variance is below that for independent errors."""
     share = np.abs(residual_m) / scale_m
     influence = np.where(share <= _REJECT, np.clip(residual_m, -_HUBER * scale_m, _HUBER * scale_m), 0.0)
     bread = np.linalg.inv(_normal(design, (share < _HUBER).astype(np.float64)))
@@ -142,26 +142,26 @@ def _covariance(t_s: Vector, design: Any, residual_m: Vector, scale_m: float) ->
     return result
 
 
-# The estimate: which constants are determined, their zero and their standard errors.
+# Calibration: which constants are determined, their zero and their standard errors.
 
 _FEWEST: Final = 3  # accepted differences below which an anchor's constant is not determined
-_MAX_STD_M: Final = 0.1  # a constant that is known worse does more harm than good
+_MAX_STD_M: Final = 0.1  # a constant with a larger error does more harm than good
 _STEEPEST_M: Final = 0.12
-"""Decawave's table (APS011) is nowhere steeper than 12 mm/dB, 0.105 m while the range grows by the factor e."""
+"""Decawave's table (APS011) is nowhere steeper than 12 mm/dB, 0.105 m as the range grows by a factor of e."""
 
-_SURE: Final = 3.0  # the slope is used if it is at least this number of its standard errors
+_SURE: Final = 3.0  # the slope is used if it is at least this many standard errors
 _MAD_ERROR: Final = 1.17  # relative standard error of a 1.4826 MAD of n Gaussian values, times √n
 _ALIKE: Final = "not used: the positions are too much alike to determine it"
 
 
 class AnchorEstimate(Struct, frozen=True):
-    """What was found out about one anchor, metres."""
+    """Calibration result of one anchor, metres."""
 
     anchor: int
     count: int
-    """Differences that were used."""
+    """Differences used."""
     bias_m: float | None
-    """None where it is not determined."""
+    """None if not determined."""
     std_m: float | None
     """Standard error."""
     noise_m: float | None
@@ -170,21 +170,21 @@ class AnchorEstimate(Struct, frozen=True):
 
 
 class CalibrationEstimate(Struct, frozen=True):
-    """All that a calibration found, metres."""
+    """Result of a calibration, metres."""
 
     anchors: tuple[AnchorEstimate, ...]
     zero: Literal["mean"]
-    """The mean of the determined anchors."""
+    """Biases are relative to the mean of the determined anchors."""
     slope_m: float | None
-    """Growth of every bias while the range grows by the factor e; None where it is not used."""
+    """Growth of every bias as the range grows by a factor of e; None if not used."""
     slope_std_m: float | None
     slope_note: str
     noise_m: float | None
-    """Noise of a difference once the calibration is off (1.4826 MAD)."""
+    """Noise of a difference after the calibration (1.4826 MAD)."""
     noise_before_m: float | None
     """Noise of a difference before the calibration (1.4826 MAD about zero)."""
     loop_m: float | None
-    """What constants cannot explain: root mean square over the pairs of their median residual."""
+    """Error that constants cannot explain: RMS over the pairs of their median residual."""
     used: int
     rejected: int
 
@@ -201,14 +201,14 @@ class CalibrationEstimate(Struct, frozen=True):
 
 
 def _at_most(anchor: AnchorEstimate) -> float | None:
-    """The noise that it has at most, as far as its differences can show (twice the error of a 1.4826 MAD)."""
+    """Upper limit of the anchor's noise: its estimate plus twice the standard error of a 1.4826 MAD."""
     return None if anchor.noise_m is None else anchor.noise_m * (1.0 + 2.0 * _MAD_ERROR / anchor.count**0.5)
 
 
 def estimate(differences: Differences) -> CalibrationEstimate:
-    """Estimate the anchors' constants, whose mean is 0.
+    """Estimate the anchors' constants, with mean 0.
 
-    Their growth with the range is estimated too, and used if it differs from zero and is one that the radio can have.
+    A slope over the range is also estimated, and used if it differs from zero and is plausible for the radio.
     """
     found = np.unique(np.concatenate([differences.anchor_a, differences.anchor_b]))
     kept, reasons = _connected(differences, found)
@@ -224,7 +224,7 @@ def estimate(differences: Differences) -> CalibrationEstimate:
 
 
 def _connected(differences: Differences, anchors: Integers) -> tuple[Integers, dict[int, str]]:
-    """Anchors of the part with most anchors, and why the others are left out."""
+    """Anchors of the largest connected component, and why each other anchor is left out."""
     ends = np.searchsorted(anchors, differences.anchor_a), np.searchsorted(anchors, differences.anchor_b)
     links = coo_array((np.ones(len(ends[0])), ends), shape=(len(anchors), len(anchors)))
     part = connected_components(links, directed=False)[1]
@@ -281,7 +281,7 @@ def _estimate(
 
 
 def _spent(differences: int, anchors: int) -> float:
-    """Residuals are smaller than the noise by what the estimated constants took out of them."""
+    """Factor from residuals to noise, for the degrees of freedom that the constants use up."""
     return float(np.sqrt(differences / max(differences - anchors + 1, 1)))
 
 

@@ -1,12 +1,12 @@
-"""Which causes explain the changes of a window, and which others would as well.
+"""Find the causes that explain a window's range changes, and the alternatives that would explain them as well.
 
-A cause is an anchor's displacement (its ranges change by the projection on their directions), an anchor's delay (they
-all change by as much), or one late link. Its evidence is by how much chi-squared falls when it is allowed for. Causes
-are numbered: displacements of the ``n`` anchors, their delays, then the ``m`` links.
+A cause is an anchor's displacement (each of its ranges changes by the projection on its direction), a change of an
+anchor's delay (all its ranges change equally), or one late link. Its evidence is the drop of chi-squared when it is
+allowed for. Causes are numbered: displacements of the ``n`` anchors, their delays, then the ``m`` links.
 
-Sets of causes grow one by one, a few best sets side by side. Each cause must be worth more than chance among all causes
-gives, so that one displacement is preferred to two late links, but not to one that explains as much. What every set
-within a margin of the best has in common is certain; where they differ, the anchors are in question.
+A beam search adds one cause at a time. Each cause must gain more than chance gives among all causes, so that one
+displacement is preferred to two late links, but not to one link that explains as much. Causes that all sets within a
+margin of the best share are certain; where the sets differ, the anchors are in question.
 """
 
 import math
@@ -29,17 +29,17 @@ Kind = Literal["moved", "delay", "link", "check"]
 
 
 class Finding(Struct, frozen=True):
-    """Something at the anchors has changed."""
+    """A detected change at the anchors."""
 
     kind: Kind
-    """An anchor has moved; its delay has changed; one link is blocked; something has changed, unclear what."""
+    """An anchor has moved; its delay has changed; one link is blocked; something unclear has changed."""
     anchors: tuple[int, ...]
     """The anchor, or both ends of the link; for ``check`` those in question, in ascending order."""
     size_m: float
-    """How far it has moved, or by how much its delay h or the link's range has grown; 0 for a link that is silent."""
+    """Displacement, or growth of the delay h or of the link's range; 0 for a silent link."""
     std_m: float | None
     since_s: float
-    """When the first window in which it was seen began, on the clock of the blocks."""
+    """Start of the first window that showed the change, on the clock of the blocks."""
     sentence: str
 
 
@@ -47,12 +47,12 @@ _SILENT: Final = "anchors {} and {} no longer receive each other"
 
 
 def silent_link(a: int, b: int, since_s: float) -> Finding:
-    """A pair without ranges while both anchors have them with others."""
+    """Finding for a pair without ranges although both anchors have ranges with others."""
     return Finding("link", (a, b), 0.0, None, since_s, _SILENT.format(a, b))
 
 
 def sentence_of(kind: Kind, anchors: tuple[int, ...], size_m: float, *, or_else: Kind | None = None) -> str:
-    """One sentence without a full stop. ``or_else``: what the same anchor may have done as well."""
+    """One sentence without a full stop. ``or_else``: another change of the same anchor that would explain it too."""
     if kind == "moved":
         sentence = f"anchor {anchors[0]} has moved by about {_length(size_m)}"
         return f"{sentence}, or its delay has changed" if or_else else sentence
@@ -79,18 +79,18 @@ def _length(size_m: float) -> str:
 
 
 _MIN_INFORMATION_PER_M2: Final = 4.0
-"""A displacement in a direction in which its standard deviation exceeds half a metre is not seen."""
+"""A displacement is not observable in directions where its standard deviation exceeds half a metre."""
 
-_SHARED: Final = 0.25  # correlation of two pairs that share an anchor, as TX noise makes up half of a range's variance
+_SHARED: Final = 0.25  # correlation of two pairs that share an anchor: TX noise is half of a range's variance
 _STEPS: Final = 8
 _SMALLEST_STEP_M: Final = 1e-4
 
 
 class Pairs(Struct, frozen=True, eq=False):
-    """What is compared in a window: ``m`` pairs of ``n`` anchors."""
+    """The ``m`` pairs of ``n`` anchors that a window compares."""
 
     position_m: Array
-    """Shape (n, 3), where the anchors should be."""
+    """Shape (n, 3): the anchors' positions without any change."""
     first: Integers
     second: Integers
     """Shape (m,): indices of each pair's anchors."""
@@ -110,10 +110,10 @@ class Pairs(Struct, frozen=True, eq=False):
 
 
 class Fit(Struct, frozen=True, eq=False):
-    """Changes explained by a set of causes."""
+    """Least squares fit of a set of causes to the changes."""
 
     chi2: float
-    """That is left."""
+    """Remaining chi-squared."""
     residual_m: Array
     """Shape (m,)."""
     parameter_m: tuple[Array, ...]
@@ -126,21 +126,21 @@ class Fit(Struct, frozen=True, eq=False):
 def weight_of(first: Integers, second: Integers, anchors: int, white_m: Array, drift_m: Array) -> Array:
     """Inverse covariance, shape (m, m), of changes with white noise of stamps and drift, each shape (m,)."""
     rows = np.arange(len(first))
-    shared = np.zeros((len(first), anchors))  # what an anchor's TX noise does to its pairs
+    shared = np.zeros((len(first), anchors))  # effect of each anchor's TX noise on its pairs
     shared[rows, first] = shared[rows, second] = math.sqrt(_SHARED) * white_m
     own = 1.0 / ((1.0 - 2.0 * _SHARED) * white_m**2 + drift_m**2)
     weighted = own[:, None] * shared
-    inner = np.linalg.inv(np.eye(anchors) + shared.T @ weighted)  # of anchors, not of pairs: the matrix inversion lemma
+    inner = np.linalg.inv(np.eye(anchors) + shared.T @ weighted)  # matrix inversion lemma: n × n, not m × m
     weight: Array = -(weighted @ inner) @ weighted.T
     weight[rows, rows] += own
     return weight
 
 
 def evidence(pairs: Pairs, weight: Array, weighted_m: Array) -> tuple[Array, Integers]:
-    """Fall of chi-squared by each cause alone, shape (..., causes), and its degrees of freedom, shape (causes,).
+    """Drop of chi-squared by each cause alone, shape (..., causes), and its degrees of freedom, shape (causes,).
 
-    ``weight``: shape (m, m), with what other causes explain already taken out. ``weighted_m``: ``weight`` times the
-    changes, shape (..., m).
+    ``weight``: shape (m, m), after other causes are projected out. ``weighted_m``: ``weight`` times the changes, shape
+    (..., m).
     """
     n, dim, m = pairs.anchors, pairs.dimensions, len(pairs.first)
     moved = _moved_columns(pairs, pairs.position_m).reshape(m, n * dim)
@@ -164,7 +164,7 @@ def _scalar(along: Array, information: Array) -> tuple[Array, Mask]:
 
 
 def thresholds(dof: Integers, probability: float) -> Array:
-    """What chi-squared exceeds by chance with that probability, in any of the causes; infinite without a freedom."""
+    """Chi-squared that chance exceeds in any cause with this probability; infinite without a degree of freedom."""
     found = np.full(len(dof), np.inf)
     seen = dof > 0
     found[seen] = chdtri(dof[seen], probability / max(int(seen.sum()), 1))
@@ -172,9 +172,9 @@ def thresholds(dof: Integers, probability: float) -> Array:
 
 
 def fit(pairs: Pairs, change_m: Array, causes: Sequence[int], scratch: Fit | None = None) -> Fit:
-    """Least squares of these causes together; displacements may be as large as they like.
+    """Joint least squares fit of these causes, iterated so that displacements may be large.
 
-    ``change_m``: shape (m,). ``scratch``: the fit of all but the last cause, where to begin.
+    ``change_m``: shape (m,). ``scratch``: fit of all but the last cause, as a start.
     """
     sizes = [pairs.dimensions if cause < pairs.anchors else 1 for cause in causes]
     ends = np.cumsum(sizes, dtype=np.int64)
@@ -204,7 +204,7 @@ def fit(pairs: Pairs, change_m: Array, causes: Sequence[int], scratch: Fit | Non
 
 
 def weight_without(pairs: Pairs, found: Fit) -> Array:
-    """The weight of what the causes of a fit leave unexplained."""
+    """Weight with the causes of a fit projected out."""
     if not found.columns.shape[1]:
         return pairs.weight
     weighted = pairs.weight @ found.columns
@@ -212,14 +212,14 @@ def weight_without(pairs: Pairs, found: Fit) -> Array:
 
 
 def _inverse(information: Array) -> Array:
-    """Without the directions that are not seen."""
+    """Pseudo-inverse that leaves out unobservable directions."""
     values, vectors = np.linalg.eigh(information)
     is_seen = values > _MIN_INFORMATION_PER_M2
     return np.asarray((vectors * np.where(is_seen, 1.0 / np.where(is_seen, values, 1.0), 0.0)) @ vectors.T)
 
 
 def _moved_columns(pairs: Pairs, position_m: Array) -> Array:
-    """Shape (m, n, dim): by how much each pair's distance grows when an anchor moves."""
+    """Derivatives of each pair's distance with respect to the anchors' positions, shape (m, n, dim)."""
     apart = (position_m[pairs.first] - position_m[pairs.second])[:, : pairs.dimensions]
     distance = np.linalg.norm(position_m[pairs.first] - position_m[pairs.second], axis=1)
     unit = apart / np.maximum(distance, 1e-6)[:, None]
@@ -231,7 +231,7 @@ def _moved_columns(pairs: Pairs, position_m: Array) -> Array:
 
 
 def _delay_columns(pairs: Pairs) -> Array:
-    """Shape (m, n)."""
+    """Derivatives of each pair's range with respect to the anchors' delays, shape (m, n)."""
     columns = np.zeros((len(pairs.first), pairs.anchors))
     rows = np.arange(len(pairs.first))
     columns[rows, pairs.first] = columns[rows, pairs.second] = 1.0
@@ -239,7 +239,7 @@ def _delay_columns(pairs: Pairs) -> Array:
 
 
 def _model(pairs: Pairs, causes: Sequence[int], ends: Integers, parameter: Array) -> tuple[Array, Array]:
-    """Derivatives, shape (m, k), and the changes that these parameters make, shape (m,)."""
+    """Derivatives, shape (m, k), and changes predicted from these parameters, shape (m,)."""
     n, m, dim = pairs.anchors, len(pairs.first), pairs.dimensions
     position_m = pairs.position_m.copy()
     for cause, end in zip(causes, ends.tolist(), strict=True):
@@ -266,18 +266,18 @@ def _model(pairs: Pairs, causes: Sequence[int], ends: Integers, parameter: Array
 
 
 _ADDED: Final = 1e-4  # probability that chance adds a cause to a set
-_MARGIN: Final = 9.0  # twice the logarithm of the odds up to which two sets are both possible: 1 to 90
+_MARGIN: Final = 9.0  # difference of scores (twice the log odds) up to which both sets are possible: odds of 90 to 1
 _BEAM: Final = 5
 _BRANCHES: Final = 8
 _MAX_CAUSES: Final = 5
 
 _FURTHER_LINK: Final = 9.0
-"""By how much less evidence every late link after the first needs in comparisons of sets: one body blocks several."""
-_LATE: Final = 3.0  # standard deviations from which on a link counts as late
+"""Reduction of the evidence that every late link after the first needs, as one body can block several."""
+_LATE: Final = 3.0  # standard deviations above which a link counts as late
 
 
 class Part(Struct, frozen=True):
-    """Something that has changed in a window."""
+    """One change in a window."""
 
     kind: Kind
     anchors: tuple[int, ...]
@@ -285,17 +285,17 @@ class Part(Struct, frozen=True):
     size_m: float
     std_m: float | None
     or_else: Kind | None = None
-    """What the same anchor may have done as well."""
+    """Another change of the same anchor that would explain it too."""
 
 
 class Explanation(Struct, frozen=True, eq=False):
-    """What has changed in a window, and what is left when that is allowed for."""
+    """The changes in a window, and the remainder after allowing for them."""
 
     parts: tuple[Part, ...]
     weight: Array
     """Shape (m, m)."""
     weighted_m: Array
-    """Shape (m,): the weight times the changes that are left."""
+    """Shape (m,): weight times the remaining changes."""
 
 
 class _Set(Struct, frozen=True, eq=False):
@@ -307,16 +307,16 @@ class _Set(Struct, frozen=True, eq=False):
 
 
 def is_significant(pairs: Pairs, change_m: Array, false_alarm: float) -> Array:
-    """Whether any cause has more evidence than chance gives with probability ``false_alarm``.
+    """Whether the evidence for any cause exceeds what chance gives with probability ``false_alarm``.
 
-    ``change_m``: shape (..., m); result of shape (...).
+    ``change_m``: shape (..., m). Returns shape (...).
     """
     found, dof = evidence(pairs, pairs.weight, change_m @ pairs.weight)
     return np.asarray((found > thresholds(dof, false_alarm)).any(axis=-1))
 
 
 def nothing(pairs: Pairs, change_m: Array) -> Explanation:
-    """Explanation of a window that noise and drift explain."""
+    """Explanation of a window that shows only noise and drift."""
     return Explanation((), pairs.weight, change_m @ pairs.weight)
 
 
@@ -369,7 +369,7 @@ def _best_sets(
     worth: Array,
     whole: float,
 ) -> list[_Set]:
-    """The sets with one more cause that explain most. ``whole``: chi-squared without any cause."""
+    """The best sets with one more cause. ``whole``: chi-squared without any cause."""
     grown: dict[frozenset[int], _Set] = {}
     for _, one, cause in sorted(candidates, key=lambda candidate: -candidate[0])[: _BEAM * _BRANCHES]:
         key = frozenset((*one.causes, cause))
@@ -390,7 +390,7 @@ def _cost(pairs: Pairs, causes: tuple[int, ...], worth: Array) -> float:
 
 
 def _blocked(pairs: Pairs, change_m: Array, best: _Set) -> list[_Set]:
-    """For each displaced or delayed anchor, the set in which its late links are blocked instead."""
+    """For each displaced or delayed anchor, the alternative set with its late links blocked instead."""
     n = pairs.anchors
     whole = float(change_m @ pairs.weight @ change_m)
     _, dof = evidence(pairs, pairs.weight, change_m @ pairs.weight)
@@ -420,7 +420,7 @@ def _displaced(pairs: Pairs, one: _Set) -> Pairs:
 
 
 def _parts(pairs: Pairs, best: _Set, rivals: list[_Set]) -> list[Part]:
-    """Each cause of the best set as certain as the rivals leave it."""
+    """The causes of the best set; those that the rivals leave uncertain are merged into one ``check``."""
     differences = [frozenset(best.causes) ^ frozenset(rival.causes) for rival in rivals]
     uncertain: list[tuple[int, ...]] = []
     parts = []
@@ -439,7 +439,7 @@ def _parts(pairs: Pairs, best: _Set, rivals: list[_Set]) -> list[Part]:
 
 
 def _is_checked(pairs: Pairs, best: _Set, cause: int, *, or_else: bool) -> bool:
-    """Whether a range is left over that checks a displacement or a delay, and the other ``or_else``."""
+    """Whether a spare range checks this displacement or delay; ``or_else``: and the alternative to it."""
     n = pairs.anchors
     if cause >= 2 * n:
         return True
@@ -469,7 +469,7 @@ def _part(pairs: Pairs, best: _Set, number: int, *, or_else: bool) -> Part:
 
 
 def _check(pairs: Pairs, sets: list[tuple[int, ...]], best: _Set) -> Part:
-    """All anchors in question; of many, those that most causes share."""
+    """Part that names all anchors in question, or of many only those in most causes."""
     named = [anchor for one in sets for cause in one for anchor in _anchors(pairs, cause)]
     counts: Integers = np.bincount(named, minlength=pairs.anchors)
     anchors = np.flatnonzero(counts > 0)
@@ -480,30 +480,30 @@ def _check(pairs: Pairs, sets: list[tuple[int, ...]], best: _Set) -> Part:
     return Part("check", tuple(anchors.tolist()), max(sizes), None)
 
 
-# The watch of the anchors by the phases of their carriers: millimetres, but only modulo half a wavelength.
+# Watch of the anchors by carrier phase: millimetres, but only modulo half a wavelength.
 #
 #     −phase(b receives a) − phase(a receives b)  =  2·distance/λ + constant      (mod 1 cycle)
 #
-# The clocks cancel where both phases are of one instant: those of one direction are interpolated at the receptions of
-# the other, along the difference of the clocks that the stamps show. The constant stays as long as both radios keep
-# their supply (``docs/watch.md``).
+# The clocks cancel if both phases are taken at one instant, so the phases of one direction are interpolated at the
+# receptions of the other, following the clock difference known from the stamps. The constant stays as long as both
+# radios stay powered (``docs/watch.md``).
 
 BLOCK_S: Final = 2.0
 _LIMIT_M: Final = 0.002
 _SIGMAS: Final = 5.0
 _LEARNING_BLOCKS: Final = 5
-_USUAL_BLOCKS: Final = 300  # whose mean is the reference, without those that were off
-_STRIKES: Final = 2  # blocks in a row after which a pair has changed, or has not any more
-_FEWEST: Final = 8  # legs of each direction, and sums, in a block
+_USUAL_BLOCKS: Final = 300  # blocks without a change whose mean is the reference
+_STRIKES: Final = 2  # consecutive blocks after which a pair counts as changed, or as unchanged again
+_FEWEST: Final = 8  # legs in each direction, and sums, in a block
 _MOST: Final = 4096  # legs in a block
-_LONGEST_GAP_S: Final = 0.1  # between two phases that one is interpolated from
-_LARGEST_SCATTER: Final = 0.12  # cycles of one sum
+_LONGEST_GAP_S: Final = 0.1  # between two phases used for interpolation
+_LARGEST_SCATTER: Final = 0.12  # cycles, of one sum
 _DRIFT_TICKS_PER_S: Final = MAX_BRACKET_RATE * TICK_RATE_HZ
-_LONGEST_JUMP_TICKS: Final = TICK_RATE_HZ  # where clocks may have drifted farther, a restart cannot be recognised
+_LONGEST_JUMP_TICKS: Final = TICK_RATE_HZ  # if clocks may have drifted farther, a restart cannot be recognised
 
 
 def circular_mean(cycles: Array) -> tuple[float, float]:
-    """Mean of phases, shape (n,), n > 0, without outliers, in [0, 1), and the scatter of one of them, in cycles."""
+    """Mean in [0, 1) and standard deviation of phases without outliers, in cycles. ``cycles``: shape (n,), n > 0."""
     kept, mean = cycles, 0.0
     for sigmas in (1e9, 5.0, 3.0, 3.0, 3.0, 3.0):  # many wild phases move the first means
         off = (cycles - mean + 0.5) % 1.0 - 0.5
@@ -513,22 +513,22 @@ def circular_mean(cycles: Array) -> tuple[float, float]:
 
 
 class _Pair(Struct):
-    """The newest legs of a pair, its sums of blocks in which nothing had changed, and what has."""
+    """Legs of a pair in the current block, its reference sums, and its change."""
 
     legs: list[AnchorLeg] = field(default_factory=list)
     block: int = 0
-    """Number of the present one."""
+    """Number of the current block."""
     usual_cycles: deque[float] = field(default_factory=lambda: deque(maxlen=_USUAL_BLOCKS))
     clock_ticks: int = 0
-    """Difference of the counters in the block ``clock_block``."""
+    """Difference of the counters in block ``clock_block``."""
     clock_block: int = 0
     change_cycles: float = 0.0
     strikes: int = 0
     since_s: float | None = None
-    """When it changed; None while it has not."""
+    """Time of the change; None while unchanged."""
 
     def add(self, cycles: float, std_cycles: float, limit_cycles: float) -> None:
-        """Compare the present block with the usual ones."""
+        """Compare the current block's sum with the reference."""
         is_off = False
         if len(self.usual_cycles) >= _LEARNING_BLOCKS:
             usual, scatter = circular_mean(np.array(self.usual_cycles))
@@ -544,16 +544,16 @@ class _Pair(Struct):
 
 
 class PhaseWatch:
-    """Names anchors that have moved by more than 2 mm, or turned. Its time is ``t_s`` of the legs."""
+    """Finds anchors that have moved by more than 2 mm, or turned. Times are ``t_s`` of the legs."""
 
     def __init__(self, carrier_cycles: int = CARRIER_CYCLES[5]) -> None:
-        """``carrier_cycles``: of the carrier in 128 ticks."""
+        """``carrier_cycles``: carrier cycles in 128 ticks."""
         self._cycles_per_tick = carrier_cycles / 128
         self._half_wave_m = TICK_M / self._cycles_per_tick / 2.0
         self._pairs: dict[tuple[int, int], _Pair] = {}
 
     def add(self, leg: AnchorLeg) -> None:
-        """Add a leg, in any order within a second. One without a phase teaches nothing."""
+        """Add a leg, in any order within a second. A leg without a phase is ignored."""
         phase_cycles = leg.carrier_phase_cycles
         if phase_cycles is None or leg.sender == leg.receiver or not math.isfinite(phase_cycles + leg.t_s):
             return
@@ -566,7 +566,7 @@ class PhaseWatch:
             one.legs.append(leg)
 
     def _conclude(self, pair: tuple[int, int], one: _Pair) -> None:
-        """Look at a block that is over. Where a counter has restarted, what is usual is learned again."""
+        """Evaluate a finished block. If a counter has restarted, the reference is learned again."""
         found = _sum_of(one.legs, pair[0], self._cycles_per_tick)
         one.legs.clear()
         if found is None:
@@ -580,7 +580,7 @@ class PhaseWatch:
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """The anchors most of whose pairs have changed, at least two, while most pairs of the others have not."""
+        """Anchors with most of their pairs changed, at least two, while most pairs of the others have not."""
         rest = {pair: one for pair, one in self._pairs.items() if len(one.usual_cycles) >= _LEARNING_BLOCKS}
         found = []
         while changed := {pair: one for pair, one in rest.items() if one.since_s is not None}:
@@ -601,7 +601,10 @@ class PhaseWatch:
 
 
 def _sum_of(legs: list[AnchorLeg], first: int, cycles_per_tick: float) -> tuple[float, float, int] | None:
-    """Both directions' sum and its standard deviation in cycles, and the counters' difference; None of too few legs."""
+    """Phase sum of both directions and its standard deviation in cycles, and the counters' difference in ticks.
+
+    None if there are too few legs or the sums scatter too much.
+    """
     if len(legs) < 2 * _FEWEST:
         return None
     is_out = np.array([leg.sender == first for leg in legs])
@@ -611,13 +614,13 @@ def _sum_of(legs: list[AnchorLeg], first: int, cycles_per_tick: float) -> tuple[
     gained -= (middle := float(np.median(gained)))
     begin_ticks = stamps[int(np.argmin(np.abs(gained)))][0]
     t_s = np.array([difference(x_ticks, begin_ticks) for x_ticks, _ in stamps]) / TICK_RATE_HZ
-    run = np.flatnonzero(np.abs(gained) < 2.0 * BLOCK_S * _DRIFT_TICKS_PER_S)  # of both counters
+    run = np.flatnonzero(np.abs(gained) < 2.0 * BLOCK_S * _DRIFT_TICKS_PER_S)  # one run of both counters
     run = run[np.argsort(t_s[run])]
     t_s, gained, is_out = t_s[run], gained[run], is_out[run]
     if min(is_out.sum(), (~is_out).sum()) < _FEWEST:
         return None
     way = np.where(is_out, 1.0, -1.0)
-    terms = np.stack([t_s, t_s * t_s, way, np.ones(len(run))], axis=1)  # flight and delays have another sign each way
+    terms = np.stack([t_s, t_s * t_s, way, np.ones(len(run))], axis=1)  # flight and delays change sign with direction
     off_ticks, fit = np.zeros(len(run)), np.zeros(4)
     for _ in range(2):
         near = np.abs(off_ticks) <= _SIGMAS * STD_OVER_MAD * float(np.median(np.abs(off_ticks)))

@@ -1,4 +1,4 @@
-"""What goes into a survey and what comes out, as values: ranges, facts of the user, positions and delays."""
+"""Input and output of a survey: ranges, facts given by the user, positions and delays."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from os import PathLike
@@ -13,11 +13,11 @@ from skyless.core.ticks import TICK_M
 
 
 class TagReceived(Struct, frozen=True, eq=False):
-    """What a tag received of the anchors. It is always a ``TagEpochs``, whose arrays are not sent in messages."""
+    """A tag's receptions from the anchors: always a ``TagEpochs``, whose arrays are not sent in messages."""
 
 
 class PairRange(Struct, frozen=True, gc=False):
-    """The mean of one pair's ranges: its distance plus both anchors' delays, ``d + h_a + h_b``."""
+    """Mean range of one pair: distance plus both anchors' delays, ``d + h_a + h_b``."""
 
     a: int
     b: int
@@ -28,21 +28,21 @@ class PairRange(Struct, frozen=True, gc=False):
     exchanges: int
     """Number of two-way exchanges, or of single ranges, in the mean."""
     late_share: float = 0.0
-    """Part of them that was left out because it came later than the rest."""
+    """Share of exchanges left out because they came later than the rest."""
 
 
 class PairRanges(Struct, frozen=True):
-    """What is known of all pairs of a site; a pair that does not receive one another is missing."""
+    """Ranges of all pairs of a site; pairs that do not receive each other are missing."""
 
     pairs: tuple[PairRange, ...]
     anchors: tuple[int, ...]
-    """All anchors, in ascending order; those without a pair, too."""
+    """All anchors in ascending order, including those without a pair."""
     tx_std_m: dict[int, float] = {}
-    """Error of an anchor's TX stamps in the mean, which all its ranges share as if it were a delay; 0 where missing."""
+    """Error of each anchor's TX stamps in the mean, which all its ranges share like a delay; 0 if missing."""
     duration_s: float = 0.0
 
     def without_delays(self, delays_m: Mapping[int, float]) -> "PairRanges":
-        """The ranges less delays of some of the anchors."""
+        """Subtract known anchor delays from the ranges."""
         shorter = (
             structs.replace(pair, range_m=pair.range_m - delays_m.get(pair.a, 0.0) - delays_m.get(pair.b, 0.0))
             for pair in self.pairs
@@ -51,7 +51,7 @@ class PairRanges(Struct, frozen=True):
 
 
 class PairBlock(Struct, frozen=True, gc=False):
-    """The mean of one pair's ranges within a block of time, a second or so."""
+    """Mean range of one pair within a block of about a second."""
 
     a: int
     b: int
@@ -61,12 +61,12 @@ class PairBlock(Struct, frozen=True, gc=False):
     mean_m: float
     """Distance plus both anchors' delays, ``d + h_a + h_b``."""
     std_m: float
-    """Standard deviation of the mean, from stamps' noise, shared or not."""
+    """Standard deviation of the mean from stamp noise, shared or not."""
     exchanges: int
 
 
 Point = tuple[float, float, float | None]
-"""Site coordinates x, y, z in metres; z None where it is not known."""
+"""Site coordinates x, y, z in metres; z is None if unknown."""
 
 
 class Tape(Struct, frozen=True):
@@ -79,7 +79,7 @@ class Tape(Struct, frozen=True):
 
 
 class KnownDelay(Struct, frozen=True):
-    """The delay ``h`` of an anchor, half the error of its TX and RX antenna delays together, found by a tag."""
+    """Delay ``h`` of an anchor: half the error of its TX and RX antenna delays together, found by a tag."""
 
     anchor: int
     delay_m: float
@@ -87,7 +87,7 @@ class KnownDelay(Struct, frozen=True):
 
 
 class Gauge(Struct, frozen=True):
-    """The anchors that define the frame: one at the origin, one on the positive x axis, and one on its left (y > 0)."""
+    """Anchors that define the frame: one at the origin, one on the positive x axis, one on its left (y > 0)."""
 
     origin: int
     x_axis: int
@@ -95,10 +95,10 @@ class Gauge(Struct, frozen=True):
 
 
 class Facts(Struct, frozen=True):
-    """All that a user has given. The frame follows from ``gauge``, else from ``points``, else from ``sketch_m``."""
+    """Facts given by the user. The frame follows from ``gauge``, else from ``points``, else from ``sketch_m``."""
 
     dimensions: Literal[2, 3] = 2
-    """2: heights are given, or all anchors hang at one height (0 m); 3: they are estimated."""
+    """2: heights are given, or all anchors are at one height (0 m); 3: heights are estimated."""
     heights_m: dict[int, float] = {}
     height_std_m: float = 0.02
     tapes: tuple[Tape, ...] = ()
@@ -106,16 +106,16 @@ class Facts(Struct, frozen=True):
     """Anchors whose positions are known."""
     point_std_m: float = 0.005
     sketch_m: dict[int, Point] = {}
-    """Rough positions, such as those of the present site file."""
+    """Rough positions, such as those of the current site file."""
     sketch_std_m: float = 0.3
     keep_positions: bool = False
-    """Only delays are wanted: the positions of ``sketch_m`` stay, and are as good as ``sketch_std_m``."""
+    """Keep the positions of ``sketch_m``, known to ``sketch_std_m``, and estimate only delays."""
     delay_std_m: float = 0.07
-    """Standard deviation of each delay h, apart from the part that all share; 0 if delays are known."""
+    """Standard deviation of each anchor's own part of the delay h; 0 if delays are known."""
     common_delay_std_m: float = 0.1
     """Standard deviation of the part of the delays that all anchors share; not used if delays are known."""
     pair_std_m: float = 0.03
-    """Constant error of each pair's range, which no averaging removes."""
+    """Constant error of each pair's range, which averaging does not remove."""
     delays: tuple[KnownDelay, ...] = ()
     gauge: Gauge | None = None
     tags: tuple[TagReceived, ...] = ()
@@ -123,7 +123,7 @@ class Facts(Struct, frozen=True):
 
 
 MIN_CHECKS: Final = 3
-"""Ranges more than unknowns below which a late range cannot be found."""
+"""Spare ranges needed to find a late range."""
 _RIGID: Final = {2: 3, 3: 6}  # rigid motions of the whole site, by dimensions; no range depends on them
 
 
@@ -131,7 +131,7 @@ class Count(Struct, frozen=True):
     """Numbers of measurements and unknowns of a survey."""
 
     anchors: int
-    """With at least one range."""
+    """Anchors with at least one range."""
     pairs: int
     possible: int
     unknowns: int
@@ -141,7 +141,7 @@ class Count(Struct, frozen=True):
 
     @property
     def sentence(self) -> str:
-        """These numbers in words."""
+        """The counts in words."""
         many = f"{self.anchors} anchors, {self.pairs} of {self.possible} pairs, {self.unknowns} unknowns"
         if self.spare < 0:
             return f"{many}: {-self.spare} ranges or facts too few, so expected delays decide what is left open"
@@ -149,7 +149,7 @@ class Count(Struct, frozen=True):
 
     @property
     def warning(self) -> str | None:
-        """What to do before a survey that nothing checks; None if enough does."""
+        """Advice if too few ranges check the survey; otherwise None."""
         if self.spare >= MIN_CHECKS:
             return None
         return (
@@ -159,7 +159,7 @@ class Count(Struct, frozen=True):
 
 
 def count(ranges: PairRanges, facts: Facts) -> Count:
-    """Count before a survey; anchors without a range are left out."""
+    """Count the measurements and unknowns of a survey; anchors without a range are left out."""
     anchors = {anchor for pair in ranges.pairs for anchor in (pair.a, pair.b)}
     n = len(anchors)
     delays = n if facts.delay_std_m > 0.0 else 0
@@ -180,11 +180,11 @@ def _given(facts: Facts, anchor: int) -> int:
     return int(facts.dimensions == 3 and anchor in facts.heights_m)
 
 
-# What a survey has found, how far it is to be relied on, and the record that is kept of it.
+# Result of a survey, and its record.
 
 
 class SurveyedAnchor(Struct, frozen=True):
-    """One anchor. Where it is not determined there are no figures."""
+    """Survey result of one anchor; without figures if it is not determined."""
 
     id: int
     determined: bool
@@ -192,27 +192,27 @@ class SurveyedAnchor(Struct, frozen=True):
     y_m: float | None = None
     z_m: float | None = None
     std_m: float | None = None
-    """Standard deviation per axis, rms over the axes that were estimated, after the best rigid alignment."""
+    """Standard deviation per axis, RMS over the estimated axes, after the best rigid alignment."""
     covariance_m2: tuple[tuple[float, float, float], ...] | None = None
-    """Shape (3, 3), x, y, z, after the best rigid alignment; rows of coordinates that were not estimated are 0."""
+    """Shape (3, 3), after the best rigid alignment; rows of coordinates that were not estimated are 0."""
     delay_m: float | None = None
-    """h: half of what TX and RX delay together are off. The TX antenna delay grows by 2·h."""
+    """h: half the error of TX and RX delay together. The TX antenna delay grows by 2·h."""
     delay_std_m: float | None = None
     reason: str | None = None
-    """Why it is not determined."""
+    """Why the anchor is not determined."""
 
 
 class SurveyedPair(Struct, frozen=True):
-    """A pair's range against the result."""
+    """A pair's range compared with the result."""
 
     a: int
     b: int
     range_m: float
     residual_m: float | None
-    """Range less distance and delays; None where one of the anchors is not determined."""
+    """Range less distance and delays; None if an anchor is not determined."""
     std_m: float
     excluded: bool
-    """Whether it was left out, as late."""
+    """Whether the range was left out as late."""
 
 
 class Ambiguity(Struct, frozen=True):
@@ -220,54 +220,54 @@ class Ambiguity(Struct, frozen=True):
 
     sentence: str
     anchors: tuple[int, ...]
-    """Those that would be elsewhere."""
+    """Anchors that would be elsewhere."""
     positions_m: dict[int, tuple[float, float, float]]
-    """Where they would be."""
+    """Their alternative positions."""
 
 
 class TapeAdvice(Struct, frozen=True):
-    """The distance that would help most if it were measured."""
+    """A distance that is worth measuring."""
 
     a: int
     b: int
     std_before_m: float
     std_after_m: float
-    """rms over the ``std_m`` of all anchors that are determined, with the earlier tapes measured."""
+    """RMS of ``std_m`` over all determined anchors, with the earlier tapes measured."""
 
 
 class Survey(Struct, frozen=True):
-    """A survey's result."""
+    """Result of a survey."""
 
     anchors: tuple[SurveyedAnchor, ...]
     pairs: tuple[SurveyedPair, ...]
     range_std_m: float
-    """Constant error of a pair that the result assumes: the given one, or what the residuals show if that is more."""
+    """Constant error of a pair that the result assumes: as given, or as the residuals show if that is more."""
     redundancy: int
-    """Ranges in use less unknowns: how many ranges check the result."""
+    """Ranges in use less unknowns: the number of ranges that check the result."""
     unchecked: str | None
-    """A sentence where too little checks the result; None otherwise."""
+    """A sentence if too few ranges check the result; otherwise None."""
     not_determined: tuple[str, ...]
-    """Sentences: what is not determined, and why."""
+    """Sentences on what is not determined, and why."""
     ambiguities: tuple[Ambiguity, ...]
     tapes: tuple[TapeAdvice, ...]
-    """The best first; the later ones after the earlier ones have been measured."""
+    """The best first; each assumes that those before it have been measured."""
     frame: str
-    """A sentence: what names origin and axes."""
+    """A sentence on what defines origin and axes."""
     gauge: Gauge | None
     notes: tuple[str, ...]
-    """Sentences about facts that do not fit, and the like."""
+    """Sentences, for instance on facts that do not fit."""
     assumed_heights: str | None = None
-    """A sentence where heights are assumed, as they are neither given nor estimated; None otherwise."""
+    """A sentence if heights are assumed, being neither given nor estimated; otherwise None."""
 
 
-# The record next to the site's file, ``NAME.survey.json``, for the watch
+# Record next to the site's file, ``NAME.survey.json``, for the watch
 
 
 FORMAT: Final = "skyless survey 1"
 
 
 class SurveyRecord(Struct, frozen=True, tag=FORMAT, tag_field="format"):
-    """A survey that has been written into a site's file."""
+    """Record of a survey that was written into a site's file."""
 
     site: str
     site_id: int
@@ -276,24 +276,24 @@ class SurveyRecord(Struct, frozen=True, tag=FORMAT, tag_field="format"):
     """Ranges measured with the antenna delays before the survey."""
     survey: Survey
     delay_changes_ticks: dict[int, int]
-    """What was added to the TX antenna delays."""
+    """Changes of the TX antenna delays."""
 
 
 def record_path(site_file: str | PathLike[str]) -> Path:
-    """Where the record of a site's file lies."""
+    """Path of the survey record of a site's file."""
     return Path(site_file).with_suffix(".survey.json")
 
 
 def encode_record(record: SurveyRecord) -> bytes:
-    """Its bytes."""
+    """Encode a survey record as JSON."""
     return msgspec.json.format(msgspec.json.encode(record), indent=1) + b"\n"
 
 
 def read_record(path: str | PathLike[str]) -> SurveyRecord:
-    """The record in a file.
+    """Read a survey record.
 
     Raises:
-        ConfigurationError: it cannot be read, or is not the record of a survey.
+        ConfigurationError: the file cannot be read, or is not the record of a survey.
     """
     try:
         return msgspec.json.decode(Path(path).read_bytes(), type=SurveyRecord)
@@ -304,7 +304,7 @@ def read_record(path: str | PathLike[str]) -> SurveyRecord:
 
 
 def baseline(record: SurveyRecord) -> PairRanges:
-    """The ranges as they are measured with the new antenna delays: what the watch compares with.
+    """The ranges expected with the new antenna delays, as the reference of the watch.
 
     A range holds half of each anchor's TX delay.
     """
@@ -317,7 +317,7 @@ def baseline(record: SurveyRecord) -> PairRanges:
 
 
 def joined(names: Iterable[object]) -> str:
-    """1, 2 and 3."""
+    """Join names as in ``1, 2 and 3``."""
     texts = [str(name) for name in names]
     return texts[0] if len(texts) == 1 else f"{', '.join(texts[:-1])} and {texts[-1]}" if texts else "none"
 
@@ -328,7 +328,7 @@ def anchors_named(anchors: Sequence[int]) -> str:
 
 
 def are(anchors: Sequence[int]) -> str:
-    """The verb that goes with them."""
+    """The verb for these anchors: ``is`` or ``are``."""
     return "is" if len(anchors) == 1 else "are"
 
 

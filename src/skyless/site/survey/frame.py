@@ -1,6 +1,6 @@
-"""A survey's rows, and the frame that its shape is moved to: named anchors, known points, a sketch or a default.
+"""Build a survey's problem, and move its result to the frame of named anchors, known points, a sketch or a default.
 
-Ranges leave a shape free to turn, to shift and to be mirrored.
+Ranges determine a shape only up to rotation, shift and reflection.
 """
 
 import math
@@ -19,20 +19,20 @@ from skyless.site.survey.problem import Problem, distances_m
 MIN_RANGE_STD_M: Final = 1e-5
 _UNKNOWN_DELAY_STD_M: Final = 1e3  # standard deviation of a delay about which nothing is known
 _LARGEST_M: Final = 1e5
-"""No range, distance or standard deviation of a site is larger; with far larger ones the fit would not end."""
+"""Limit of ranges, distances and standard deviations; with far larger ones the fit would not converge."""
 
 _STDS: Final = (
     "height_std_m", "point_std_m", "sketch_std_m", "delay_std_m", "common_delay_std_m", "pair_std_m",
 )  # fmt: skip
-"""Standard deviations among the facts."""
+"""Names of the standard deviations in ``Facts``."""
 
 _OFTEN_LATE_STD_M: Final = 0.15
-"""Further standard deviation of a pair's range, times the share of its ranges that came late: an object near the path
-may have delayed the earliest ones, too."""
+"""Extra standard deviation of a pair's range per share of late ranges, as an object near the path may also have delayed
+the earliest ones."""
 
 
 class Measured(Struct, frozen=True, eq=False):
-    """Ranges and facts that can be used, with sentences about those that cannot."""
+    """The usable ranges and facts, with sentences about the others."""
 
     anchors: tuple[int, ...]
     pairs: tuple[PairRange, ...]
@@ -43,10 +43,10 @@ class Measured(Struct, frozen=True, eq=False):
 
 
 def usable(ranges: PairRanges, facts: Facts) -> Measured:
-    """Leave out ranges and facts that are not finite, or that name anchors without ranges, with a sentence about each.
+    """Leave out, with a sentence about each, ranges and facts that are not finite or name anchors without ranges.
 
     Raises:
-        SkylessError: a standard deviation of the facts is not finite, or is negative.
+        SkylessError: a standard deviation of the facts is negative, not finite or too large.
     """
     for name in _STDS:
         if not _is_std(getattr(facts, name)):
@@ -112,14 +112,14 @@ def _finite(points: dict[int, Point]) -> dict[int, Point]:
 
 
 def fixed_heights_m(measured: Measured) -> Array:
-    """Z of all anchors in two dimensions, shape (n,): given ones, else the median of these, else 0."""
+    """Heights of all anchors in two dimensions, shape (n,): as given, else the median of the given ones, else 0."""
     given_m = _given_heights_m(measured.facts)
     common_m = _common_height_m(given_m)
     return np.array([given_m.get(anchor, common_m) for anchor in measured.anchors])
 
 
 def assumed_heights(measured: Measured) -> str | None:
-    """A sentence about anchors whose heights ``fixed_heights_m`` assumes; None where it assumes none."""
+    """A sentence about the anchors whose heights ``fixed_heights_m`` assumes; None if there are none."""
     if measured.facts.dimensions == 3 and not measured.facts.keep_positions:
         return None
     given_m = _given_heights_m(measured.facts)
@@ -148,21 +148,21 @@ def levels(measured: Measured) -> bool:
 
 
 def as_array(points: dict[int, Point], anchors: tuple[int, ...]) -> Array:
-    """Shape (n, 3), NaN where a coordinate is not given."""
+    """Points of these anchors as an array of shape (n, 3), NaN where a coordinate is not given."""
     nothing = (math.nan, math.nan, math.nan)
     rows = [points.get(anchor, nothing) for anchor in anchors]
     return np.array([[math.nan if value is None else value for value in row] for row in rows]).reshape(-1, 3)
 
 
 def indices_of(measured: Measured, kept: Integers) -> dict[int, int]:
-    """Index of each kept anchor, by identifier."""
+    """Index of each kept anchor among the kept ones, by identifier."""
     return {measured.anchors[index]: number for number, index in enumerate(kept)}
 
 
 def build_problem(
     measured: Measured, kept: Integers, pair_std_m: float, point_m: Array | None, sketch_m: Array | None
 ) -> tuple[Problem, list[PairRange]]:
-    """The problem of the kept anchors (indices), and the pairs of its ranges in their order.
+    """Build the problem of the kept anchors (indices). Returns it with the pairs of its ranges, in order.
 
     ``point_m``, ``sketch_m``: known and rough coordinates of the kept anchors, shape (k, 3), NaN where there are none.
     """
@@ -207,14 +207,14 @@ def build_problem(
 
 
 def own_variance_m2(pair: PairRange) -> float:
-    """Variance of a range without the constant error that any pair has."""
+    """Variance of a range without the constant error of a pair."""
     return pair.std_m**2 + (_OFTEN_LATE_STD_M * pair.late_share) ** 2 + MIN_RANGE_STD_M**2
 
 
 def with_free_delays(problem: Problem) -> tuple[Problem, Mask]:
-    """Without the expected delays that are coarser than a range: what the measurements alone determine.
+    """The problem without delay priors that are coarser than a range, to see what the measurements alone determine.
 
-    Also which delays, shape (n,), are unknown in this sense.
+    Also returns which delays have no prior then, shape (n,).
     """
     typical = float(np.median(problem.variance_m2)) if len(problem.variance_m2) else 0.0
     own, common = problem.delay_variance_m2, problem.common_delay_m
@@ -229,10 +229,9 @@ def with_free_delays(problem: Problem) -> tuple[Problem, Mask]:
 def own_delays(
     measured: Measured, anchors: tuple[int, ...], problem: Problem, delay_m: Array, covariance_m2: Array
 ) -> tuple[Array, Array]:
-    """Delays less the error of TX stamps that all ranges of an anchor share, and standard deviations, shape (k,).
+    """Delays without the shared error of an anchor's TX stamps, and their standard deviations, shape (k,) each.
 
-    ``delay_m``, ``covariance_m2``: of both together, as fitted. What is known of their shares is in the expected
-    delays.
+    ``delay_m``, ``covariance_m2``: delay and stamp error together, as fitted; the priors tell how to divide them.
     """
     shared = np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in anchors])
     common = np.zeros(len(anchors)) if problem.common_delay_m is None else problem.common_delay_m
@@ -245,7 +244,7 @@ def own_delays(
 
 
 def _heights(measured: Measured, kept: Integers) -> Array:
-    """Known heights as points, shape (k, 3); none where fewer than three level the site."""
+    """Known heights as points, shape (k, 3); all NaN if they do not level the site."""
     known = np.full((len(kept), 3), np.nan)
     if levels(measured):
         known[:, 2] = [measured.facts.heights_m.get(measured.anchors[index], math.nan) for index in kept]
@@ -262,14 +261,14 @@ def _add(coordinate: Array, variance: Array, known_m: Array | None, std_m: float
 
 
 _DECIDED: Final = 16.0
-"""Difference of the costs of an alignment and its mirror image from which on the better one is right."""
+"""Least difference between the costs of an alignment and its mirror image that decides for the better one."""
 
-_OFF_AXIS: Final = 0.1  # distance from the x axis, as a part of its length, from which on an anchor's side is clear
+_OFF_AXIS: Final = 0.1  # least distance from the x axis, as a share of its length, that makes an anchor's side clear
 _MAX_SIGMA: Final = 3.0
 
 
 class Motion(Struct, frozen=True, eq=False):
-    """A rotation, perhaps with a reflection, and then a shift."""
+    """A rotation, possibly with a reflection, followed by a shift."""
 
     rotation: Array
     """Shape (3, 3)."""
@@ -277,22 +276,23 @@ class Motion(Struct, frozen=True, eq=False):
     """Shape (3,)."""
 
     def moved(self, position_m: Array) -> Array:
-        """Positions of shape (..., 3)."""
+        """Apply the motion to positions of shape (..., 3)."""
         return np.asarray(position_m @ self.rotation.T + self.shift_m)
 
 
 class Alignment(Struct, frozen=True, eq=False):
-    """The motion that fits one set of positions to another best."""
+    """The motion that best fits one set of positions to another."""
 
     motion: Motion
     mirror_decided: bool
-    """Whether the mirror image fits worse."""
+    """Whether the mirror image fits clearly worse."""
 
 
 def align(position_m: Array, other_m: Array, std_m: float, axes: int) -> Alignment:
-    """Least squares without scale, positions of shape (k, 3); ``axes`` 2: about the vertical, z stays as it is.
+    """Least squares alignment without scale, of positions of shape (k, 3).
 
-    ``std_m``: of both sets' difference per axis, shape (k,) or one for all; decides about mirror images only.
+    ``axes`` 2: rotate about the vertical and keep z. ``std_m``: standard deviation of the sets' difference per axis,
+    used only to decide about mirror images.
     """
     own, other = position_m[:, :axes], other_m[:, :axes]
     centre, goal = own.mean(axis=0), other.mean(axis=0)
@@ -317,9 +317,10 @@ def align(position_m: Array, other_m: Array, std_m: float, axes: int) -> Alignme
 
 
 def fitting_points(position_m: Array, covariance_m2: Array, point_m: Array, point_std_m: float) -> Mask:
-    """Which points agree about the distances between them, shape (k,); ``covariance_m2`` of shape (3 k, 3 k).
+    """Mask of the points whose mutual distances agree with the positions, shape (k,).
 
-    The point that contradicts most others leaves, until none does. Two points alone that contradict each other stay.
+    The point that contradicts most others is removed until none does, but the last two stay. ``covariance_m2``: shape
+    (3 k, 3 k).
     """
     k = len(position_m)
     apart = position_m[:, None] - position_m[None]
@@ -348,16 +349,16 @@ class Axes(Struct, frozen=True, eq=False):
     x_axis: int
     left: int | None
     side_decided: bool
-    """Whether an anchor stands clearly on the left."""
+    """Whether an anchor is clearly on the left."""
 
 
 def axes_through(
     position_m: Array, usable: Mask, axes: int, origin: int, x_axis: int | None = None, left: int | None = None
 ) -> Axes:
-    """The frame with ``origin`` at 0, ``x_axis`` on +x and ``left`` at y > 0; at least two anchors are usable.
+    """The frame with anchor ``origin`` at 0, ``x_axis`` on +x and ``left`` at y > 0; needs two usable anchors.
 
-    By default the farthest anchor names the x axis, and the first one that is clearly off it the left. ``axes`` 2: z
-    stays as it is; 3: the three anchors lie at z = 0, and the first one that is clearly off their plane above it.
+    By default the farthest anchor defines the x axis, and the first one clearly off it the left. ``axes`` 2: z is kept;
+    3: the three anchors are at z = 0, and the first anchor clearly off their plane is above it.
     """
     arm = position_m - position_m[origin]
     if axes == 2:
@@ -397,15 +398,15 @@ def _perpendicular(along: Array, axes: int) -> Array:
     return np.asarray(other / np.linalg.norm(other))
 
 
-# The frame that the facts name
+# The frame that the facts define
 
 
 _NEAR: Final = 0.5
-"""Distance of the x axis's anchor from the origin, as a part of the farthest one's, below which advice is due."""
+"""Advise another anchor if the x axis's is nearer to the origin than this share of the farthest one's distance."""
 
 
 class Framed(Struct, frozen=True, eq=False):
-    """A shape in its frame. ``k`` anchors."""
+    """A shape of ``k`` anchors in its frame."""
 
     motion: Motion
     position_m: Array
@@ -425,7 +426,7 @@ def in_frame(
     core: Mask,
     points_used: tuple[int, ...],
 ) -> Framed:
-    """Move positions, shape (k, 3), and their covariance, shape (4 k, 4 k), to the frame that the facts name."""
+    """Move positions, shape (k, 3), and their covariance, shape (4 k, 4 k), to the frame that the facts define."""
     anchors = np.array([measured.anchors[index] for index in kept])
     motion, sentence, gauge, notes = _motion(measured, anchors, position_m, core, points_used)
     k = len(kept)
@@ -443,7 +444,10 @@ def _motion(
     by_points, points_decide = _best(facts.points, max(facts.point_std_m, 0.03), anchors, position_m, core, axes)
     by_sketch, sketch_decides = _best(facts.sketch_m, facts.sketch_std_m, anchors, position_m, core, axes)
     decided = points_decide or sketch_decides
-    gauge, notes = facts.gauge, _level_notes(measured)
+    notes: list[str] = []
+    if axes == 3:
+        notes.append("the site may be tilted: give the heights of three anchors that are not on one line")
+    gauge = facts.gauge
     if gauge is not None:
         index = {int(anchor): number for number, anchor in enumerate(anchors) if core[number]}
         named = [gauge.origin, gauge.x_axis, *([] if gauge.left is None else [gauge.left])]
@@ -482,7 +486,7 @@ def _by_gauge(
     decided: bool,
     notes: list[str],
 ) -> tuple[Motion, str, Gauge | None, list[str]]:
-    """Axes through named anchors; if none is named for the left, points or the sketch choose the mirror image."""
+    """Frame through named anchors; if none is named for the left, points or the sketch decide the mirror image."""
     origin, x_axis = chosen[:2]
     if known is not None:
         position_m = known.moved(position_m)
@@ -512,7 +516,7 @@ def _by_gauge(
 
 
 def _left_of_points(measured: Measured, anchors: Integers, motion: Motion, position_m: Array, core: Mask) -> Motion:
-    """The mirror image that has the first anchor clearly off the points' line on its left."""
+    """The motion, mirrored if need be so that the first anchor clearly off the points' line is on its left."""
     given = [number for number, anchor in enumerate(anchors) if int(anchor) in measured.facts.points and core[number]]
     moved = motion.moved(position_m)
     found = axes_through(moved, core, 2, given[0], given[1])
@@ -529,7 +533,7 @@ def _left_of_points(measured: Measured, anchors: Integers, motion: Motion, posit
 def _best(
     points: dict[int, Point], std_m: float, anchors: Integers, position_m: Array, core: Mask, axes: int
 ) -> tuple[Motion | None, bool]:
-    """The motion to these points, and whether they exclude the mirror image."""
+    """The best motion to these points, None if they are too few, and whether they exclude the mirror image."""
     there_m = as_array(points, tuple(anchors.tolist()))
     known = core & np.isfinite(there_m[:, :axes]).all(axis=1)
     if known.sum() < axes:
@@ -543,12 +547,6 @@ def _sentence(anchors: Integers, found: Axes, axes: int) -> str:
     left = f", anchor {anchors[found.left]} on the left (y > 0)" if found.left is not None else ""
     level = "" if axes == 2 else "; these three lie at z = 0, as fewer than three heights are given"
     return f"anchor {anchors[found.origin]} is the origin, anchor {anchors[found.x_axis]} on the x axis{left}{level}"
-
-
-def _level_notes(measured: Measured) -> list[str]:
-    if levels(measured):
-        return []
-    return ["the site may be tilted: give the heights of three anchors that are not on one line"]
 
 
 def _gauge_of(axes: Axes, anchors: Integers) -> Gauge:

@@ -1,7 +1,7 @@
-"""Legs: beacons between anchors as any listener can know them, from stamps and relays, and what they repeat.
+"""Legs between anchors, as any listener can reconstruct them from beacons, and ranges and differences from them.
 
-A beacon states its TX stamp, and relays when its sender received which frame of which other anchor. A listener that has
-received that frame, too, knows both stamps of the leg. An anchor's own receptions are legs as they are.
+A beacon states its TX stamp, and relays when its sender received which frame of which other anchor. A listener that
+also received that frame knows both stamps of the leg. An anchor's own receptions are legs already.
 """
 
 import math
@@ -20,12 +20,12 @@ from skyless.core.arrays import Array, Mask
 from skyless.core.ticks import MAX_DRIFT, TICK_BITS, TICK_M, TICK_RATE_HZ, Unwrapper, difference, to_seconds
 from skyless.site.survey.facts import PairRange, PairRanges
 
-# Time of flight between two nodes that both broadcast and receive each other, by bracketing.
+# Time of flight between two nodes that receive each other's broadcasts, by bracketing.
 #
-# Node x sends twice, at ``t1`` and ``t2`` of its clock, and y receives it at ``r1`` and ``r2`` of its own. In between
-# x receives y at ``r`` (clock of x), sent at ``t`` (clock of y). The line through (t1, r1) and (t2, r2) maps a time
-# of x to the time of y one flight later, so ``line(r) - t`` is twice the time of flight. The rate of the two clocks
-# comes from the bracket itself, and a rate that drifts acts only in the second order.
+# Node x sends twice, at ``t1`` and ``t2`` of its clock, and y receives at ``r1`` and ``r2`` of its own. In between
+# y sends at ``t`` (clock of y), and x receives at ``r`` (clock of x). The line through (t1, r1) and (t2, r2) maps a
+# time of x to the time of y one flight later, so ``line(r) - t`` is twice the time of flight. The bracket itself gives
+# the relative rate of the clocks, and a drift of that rate has only a second-order effect.
 
 
 class RunningMedian:
@@ -40,7 +40,7 @@ class RunningMedian:
         return len(self._sorted)
 
     def add(self, value: float) -> float:
-        """Add one finite value and return the median, the upper one of an even number of values."""
+        """Add one finite value and return the median (the upper one for an even number of values)."""
         ordered = self._sorted
         if len(ordered) == self._window:
             del ordered[bisect_left(ordered, self._arrived.popleft())]
@@ -55,26 +55,26 @@ class RunningMedian:
 
 
 MAX_BRACKET_RATE: Final = 80e-6
-"""Twice what two crystals of ±20 ppm can differ: a bracket beyond it mixes stamps of different clocks."""
+"""Twice the largest rate between crystals of ±20 ppm: a bracket beyond it mixes stamps of different clocks."""
 
 MAX_FLIGHT_TICKS: Final = 1 << 18
-"""1.2 km of flight and antenna delay; more than that is a pairing error."""
+"""1.2 km of flight and antenna delay; more is a pairing error."""
 
 
 class Leg(Struct, frozen=True, gc=False):
     """One broadcast and its reception by the other node."""
 
     tx_ticks: int
-    """In the clock of the sender."""
+    """On the sender's clock."""
     rx_ticks: int
-    """In the clock of the receiver."""
+    """On the receiver's clock."""
 
 
 def bracketed_flight_ticks(before: Leg, back: Leg, after: Leg, bits: int) -> float | None:
-    """Time of flight in ticks of the answering node y; ``before`` and ``after`` went x → y, ``back`` y → x.
+    """Time of flight in ticks of y's clock, from ``before`` and ``after`` (x → y) and ``back`` (y → x).
 
-    None when ``back`` does not lie between the two, or when the stamps cannot belong to one pair of clocks.
-    Counters have ``bits`` bits and the bracket must be shorter than half a wrap.
+    None if ``back`` is not between the two, or the stamps cannot belong to one pair of clocks. Counters have ``bits``
+    bits, and the bracket must be shorter than half a wrap.
     """
     span_x = difference(after.tx_ticks, before.tx_ticks, bits)
     until_back_x = difference(back.rx_ticks, before.tx_ticks, bits)
@@ -90,7 +90,7 @@ def bracketed_flight_ticks(before: Leg, back: Leg, after: Leg, bits: int) -> flo
 
 
 class TwoWayRanging:
-    """Times of flight of all pairs of nodes, reception by reception; each pair's answer is a running median."""
+    """Running median of the time of flight of every pair of nodes, updated with each reception."""
 
     def __init__(self, bits: int, window: int = 1001) -> None:
         self._bits = bits
@@ -99,7 +99,7 @@ class TwoWayRanging:
         self._flights: dict[tuple[int, int], RunningMedian] = {}
 
     def add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int) -> float | None:
-        """Add one reception; return the time of flight in ticks that it completes, if it does."""
+        """Add one reception. Returns the time of flight in ticks if this completes a bracket."""
         leg = Leg(tx_ticks, rx_ticks)
         before = self._last.get((sender, receiver))
         self._last[sender, receiver] = leg
@@ -113,7 +113,7 @@ class TwoWayRanging:
         return flight
 
     def forget(self, node: int) -> None:
-        """Drop the open brackets of a node whose clock restarted; its times of flight stay."""
+        """Drop the open brackets of a node whose clock restarted, but keep its times of flight."""
         self._last = {pair: leg for pair, leg in self._last.items() if node not in pair}
 
     def flight_ticks(self, x: int, y: int) -> float | None:
@@ -131,10 +131,10 @@ def _pair(x: int, y: int) -> tuple[int, int]:
 
 
 _LONGEST_AGE_TICKS: Final = round(2.0 * TICK_RATE_HZ)
-"""Anchors relay stamps of the last second; what is older belongs to another frame of that sequence number."""
+"""Anchors relay stamps of the last second; an older frame only has the same sequence number."""
 
 _MAX_FRAMES: Final = 1 << 14
-"""More than fit on the air in ``_LONGEST_AGE_TICKS``."""
+"""More frames than fit on the air in ``_LONGEST_AGE_TICKS``."""
 _MAX_LEGS: Final = 1 << 16
 
 
@@ -144,13 +144,13 @@ class AnchorLeg(Struct, frozen=True, gc=False):
     sender: int
     receiver: int
     tx_ticks: int
-    """In the counter of the sender."""
+    """On the sender's counter."""
     rx_ticks: int
-    """In the counter of the receiver."""
+    """On the receiver's counter."""
     t_s: float
     """When the listener received the same broadcast, on its own clock."""
     carrier_phase_cycles: float | None = None
-    """Phase of the carrier as the receiver heard it, where it was measured and relayed."""
+    """Carrier phase at the receiver, if it was measured and relayed."""
 
 
 class _Received(Struct, frozen=True, gc=False):
@@ -161,38 +161,37 @@ class _Received(Struct, frozen=True, gc=False):
 
 
 class RelayMatcher:
-    """Finds the frames that relays name, among those that one listener has received.
+    """Matches relays with the frames that one listener has received, which gives legs.
 
-    Memory is bounded by the frames of two seconds. ``counters``: ``legs``, and relays without one:
-    ``frame-not-received`` (the listener missed the frame that it names), ``other-frame`` (it names a frame before that
-    of this sequence number, or a counter has restarted).
+    Memory is bounded by the frames of two seconds. ``counters``: ``legs``, and relays without a leg:
+    ``frame-not-received`` (the listener missed the relayed frame), ``other-frame`` (the relay means an earlier frame
+    with the same sequence number, or a counter has restarted).
     """
 
     def __init__(self, bits: int = TICK_BITS) -> None:
-        """``bits``: of the anchors' counters."""
+        """``bits``: width of the anchors' counters."""
         self.counters: Counter[str] = Counter()
         self._bits = bits
         self._frames: dict[tuple[int, int], _Received] = {}
         """By anchor and sequence number, in the order of reception."""
         self._last: dict[tuple[int, int], int] = {}
-        """RX stamp of each directed pair's last leg: a stamp is relayed until there is another."""
+        """RX stamp of each directed pair's last leg, as a stamp is relayed until there is a newer one."""
 
     def add(
         self, anchor: int, sequence: int, tx_ticks: int, relays: Iterable[Relay | Heard], now_ticks: int, t_s: float
     ) -> list[AnchorLeg]:
-        """The legs that a frame's relays complete. ``now_ticks``: the listener's counter, unwrapped, and its clock."""
-        legs = []
-        for relay in relays:
-            leg = self._leg(anchor, tx_ticks, relay, now_ticks)
-            if leg is not None:
-                legs.append(leg)
+        """Add a frame and return the legs that its relays complete.
+
+        ``now_ticks``, ``t_s``: the listener's unwrapped counter, and its clock.
+        """
+        legs = [leg for relay in relays if (leg := self._leg(anchor, tx_ticks, relay, now_ticks)) is not None]
         self._frames.pop((anchor, sequence), None)
         self._frames[anchor, sequence] = _Received(tx_ticks, now_ticks, t_s)
         self._prune(now_ticks)
         return legs
 
     def _leg(self, anchor: int, tx_ticks: int, relay: Relay | Heard, now_ticks: int) -> AnchorLeg | None:
-        """The leg that a relay describes, if the listener has received the same frame."""
+        """The leg that a relay describes, if the listener received the relayed frame."""
         pair = (relay.anchor, anchor)
         if relay.anchor == anchor or self._last.get(pair) == relay.rx_ticks:
             return None
@@ -200,8 +199,8 @@ class RelayMatcher:
         if frame is None:
             self.counters["frame-not-received"] += 1
             return None
-        # Between the two frames the listener's counter and that of the anchor that relays advance alike: a check that
-        # another frame of the same sequence number, or a counter that has restarted, does not pass.
+        # Between the two frames the listener's and the relaying anchor's counters must advance equally: this rejects
+        # another frame with the same sequence number, and a restarted counter.
         age_ticks = now_ticks - frame.listener_ticks
         rx_ticks = relay.rx_ticks_near(tx_ticks - age_ticks) if isinstance(relay, Heard) else relay.rx_ticks
         apart_ticks = abs(difference(tx_ticks, rx_ticks + age_ticks, self._bits))
@@ -215,7 +214,7 @@ class RelayMatcher:
         return AnchorLeg(relay.anchor, anchor, frame.tx_ticks, rx_ticks, frame.t_s, phase_cycles)
 
     def _prune(self, now_ticks: int) -> None:
-        """Remove frames that no relay can name any more."""
+        """Remove frames that are too old to be relayed."""
         oldest_ticks = now_ticks - _LONGEST_AGE_TICKS
         while self._frames:
             key = next(iter(self._frames))
@@ -239,7 +238,7 @@ class LegCollector:
         self.counters = self._matcher.counters
 
     def add(self, reception: Reception) -> list[AnchorLeg]:
-        """The legs that a reception completes."""
+        """Add a reception and return the legs that it completes."""
         beacon = decode_any(reception.frame)
         if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
@@ -252,16 +251,16 @@ class LegCollector:
         return self._matcher.add(beacon.anchor, beacon.sequence, beacon.tx_ticks, beacon.relayed, now_ticks, t_s)
 
 
-# From repeated ranges of pairs to one range of each: the mean of the earliest cluster.
+# One range of each pair from repeated ranges: the mean of the earliest cluster.
 #
-# A signal can come late and not early, so where a pair's ranges fall into clusters the earliest is the direct way, if
-# it holds enough of them.
+# A signal can be late but not early, so if a pair's ranges form clusters, the earliest with enough of them is the
+# direct path.
 
 STD_OVER_MAD: Final = 1.4826
-"""Standard deviation of normally distributed values over the median of their distances from their median."""
+"""Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 
 MIN_CLUSTER_SHARE: Final = 0.1
-"""An earlier cluster with a smaller share of all exchanges is an error."""
+"""An early cluster with a smaller share of all exchanges is taken as an error."""
 
 _SIGMAS: Final = 4.0
 _DENSE_SHARE: Final = 0.3
@@ -269,10 +268,10 @@ _DENSE_WIDTH: Final = 0.771  # standard deviations that hold this share of a nor
 
 
 def earliest_cluster(value: Array, weight: Array, std: float, total: float | None = None) -> Mask:
-    """The members of the earliest cluster that holds a tenth of the weight, shape (n,); the heaviest if none does.
+    """Mask of the earliest cluster that holds a tenth of the weight, shape (n,); of the heaviest if none does.
 
-    ``value``, ``weight``: shape (n,), n > 0; ``std``: the least standard deviation within a cluster; ``total``: of the
-    weights, where it is more than their sum.
+    ``value``, ``weight``: shape (n,), n > 0; ``std``: least standard deviation within a cluster; ``total``: total
+    weight, if more than the sum of ``weight``.
     """
     order = np.argsort(value, kind="stable")
     ordered, until = value[order], np.cumsum(weight[order])
@@ -289,7 +288,7 @@ def earliest_cluster(value: Array, weight: Array, std: float, total: float | Non
 
 
 def half_sample_mode(ordered: Array) -> float:
-    """The mode of ascending values: the densest half, of that the densest half, and so on."""
+    """Half-sample mode of ascending values: repeatedly keep the densest half."""
     while len(ordered) > 3:
         half = (len(ordered) + 1) // 2
         begin = int(np.argmin(ordered[half - 1 :] - ordered[: len(ordered) - half + 1]))
@@ -307,17 +306,17 @@ def _densest(ordered: Array, until: Array) -> float:
     return float(np.min(ordered[ends[whole]] - ordered[whole]))
 
 
-_ENOUGH: Final = 5  # ranges of a pair from which it has clusters; of fewer the median is used
-_MIN_COUNT: Final = 3  # ranges in a cluster, and of a pair whose scatter is looked at
+_ENOUGH: Final = 5  # ranges of a pair needed to look for clusters; of fewer the median is used
+_MIN_COUNT: Final = 3  # ranges in a cluster, and of a pair whose scatter is used
 _MEDIAN_OVER_MEAN: Final = 1.25  # standard deviation of a median over that of the mean
 _MIN_NOISE_M: Final = 1e-3
 _UNKNOWN_NOISE_M: Final = 0.05  # of a range where no pair was measured more than once
 
 
 def mean_ranges(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> PairRanges:
-    """One range of each pair, by pair ``(a, b)`` with a < b.
+    """Reduce repeated ranges, by pair ``(a, b)`` with a < b, to one range per pair.
 
-    Ranges that are not finite are left out, and so are pairs without any other.
+    Ranges that are not finite are left out, and so are pairs without a finite one.
     """
     finite_m = {pair: [value for value in values if math.isfinite(value)] for pair, values in ranges_m.items()}
     noise_m = _noise(finite_m)
@@ -326,7 +325,7 @@ def mean_ranges(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> PairRang
 
 
 def _noise(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> float:
-    """Noise of one range that all pairs share: root mean square of theirs, without the quarter with the most."""
+    """Noise of one range, common to all pairs: RMS over the pairs, without the noisiest quarter."""
     own, weight = [], []
     for values in ranges_m.values():
         if len(values) >= _MIN_COUNT:
@@ -339,7 +338,7 @@ def _noise(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> float:
 
 
 def _robust_std(values: Array) -> float:
-    """Robust standard deviation; of few values corrected for their number."""
+    """Standard deviation from the median absolute deviation, corrected for few values."""
     deviation = float(np.median(np.abs(values - np.median(values))))
     return STD_OVER_MAD * deviation * math.sqrt(len(values) / (len(values) - 1.0))
 
@@ -358,22 +357,22 @@ def _mean(a: int, b: int, values_m: Array, noise_m: float) -> PairRange:
 
 # Time differences of a tag without site time: one anchor relays when it received another, and the tag receives both.
 #
-# With T, S and R for stamps of transmission, of the anchor's and of the tag's reception, ``R_b − R_a − (T_b − S_ba)``
-# is ``|p − b| − |p − a| + D_ab + h_b − h_a``: D_ab is the range that the anchors themselves measure. No position is
-# needed, and D_ab includes every delay of the way between the two anchors.
+# With stamps T of transmission, S of the anchor's reception and R of the tag's, ``R_b − R_a − (T_b − S_ba)`` is
+# ``|p − b| − |p − a| + D_ab + h_b − h_a``, where D_ab is the range that the anchors measure. No position is needed, and
+# D_ab includes every delay between the two anchors.
 
 _LONGEST_TICKS: Final = round(0.3 * TICK_RATE_HZ)
-"""Over a longer time two counters do not run evenly enough."""
+"""Two counters do not run evenly enough over a longer time."""
 
 _RATE_TICKS: Final = round(0.1 * TICK_RATE_HZ)
-"""Least time over which a rate is measured; its noise is that of two stamps."""
+"""Least time over which a rate is measured, with the noise of two stamps."""
 
 _MAX_RELAYED_FRAMES: Final = 4096
 _MAX_BEFORE: Final = 256
 
 
 class RelayedDifference(Struct, frozen=True, gc=False):
-    """One difference, of the moment when the tag received ``first``."""
+    """A time difference, valid at the moment when the tag received ``first``."""
 
     first: int
     second: int
@@ -383,7 +382,7 @@ class RelayedDifference(Struct, frozen=True, gc=False):
 
 
 class RelayedDifferences:
-    """One tag's receptions, as they come, to differences of all pairs of anchors that relay each other."""
+    """Turns one tag's receptions into differences of all pairs of anchors that relay each other."""
 
     def __init__(self, site_id: int) -> None:
         self._site_id = site_id
@@ -393,10 +392,10 @@ class RelayedDifferences:
         self._before: dict[int, deque[tuple[int, int]]] = {}
         """TX stamps and the tag's stamps of each anchor's last beacons."""
         self._last: dict[tuple[int, int], int] = {}
-        """RX stamp of each directed pair's last relay: a stamp is relayed until there is another."""
+        """RX stamp of each directed pair's last relay, as a stamp is relayed until there is a newer one."""
 
     def add(self, reception: Reception) -> list[RelayedDifference]:
-        """The differences that a reception completes; what is no beacon of the site gives none."""
+        """Add a reception and return the differences that it completes; none unless it is a beacon of the site."""
         beacon = decode_any(reception.frame)
         if isinstance(beacon, Malformed) or beacon.site != self._site_id:
             return []
@@ -423,9 +422,9 @@ class RelayedDifferences:
         return found
 
     def _relative_rate(self, beacon: SiteBeacon, now_ticks: int) -> float | None:
-        """By how much faster than the anchor's counter the tag's runs; None while that is not known.
+        """Relative rate by which the tag's counter runs faster than the anchor's; None while unknown.
 
-        As the tag sees it, so the tag's motion is in it, and differences are those of one moment.
+        It includes the tag's motion, so that differences apply to one moment.
         """
         before = self._before.setdefault(beacon.anchor, deque(maxlen=_MAX_BEFORE))
         while before and now_ticks - before[0][1] > _LONGEST_TICKS:
@@ -442,5 +441,5 @@ class RelayedDifferences:
 
 
 def _most_apart(ticks: int) -> float:
-    """Two counters do not differ by more over such a time, nor ways by more than 3 km."""
+    """Largest possible difference of two counters' advances, with paths that differ by up to 3 km."""
     return 2.0 * MAX_DRIFT * abs(ticks) + 3000.0 / TICK_M

@@ -1,7 +1,7 @@
-"""Ranges of all pairs of anchors as their stamps arrive: brackets, means of blocks, the earliest cluster of blocks.
+"""Ranges of all pairs of anchors from arriving stamps: brackets, means of blocks, the earliest cluster of blocks.
 
-Two kinds of noise are in a pair's mean (``docs/survey.md``): RX stamps, each pair's own, and TX stamps, which all
-pairs of an anchor share. Two pairs that were bracketed with the same frame of an anchor show the part that is shared.
+A pair's mean has two kinds of noise (``docs/survey.md``): of RX stamps, which is the pair's own, and of TX stamps,
+which all pairs of an anchor share. The shared part shows in two pairs bracketed with the same frame of an anchor.
 """
 
 import math
@@ -18,14 +18,14 @@ from skyless.core.ticks import TICK_BITS, TICK_M, TICK_RATE_HZ, Unwrapper
 from skyless.site.survey.facts import PairBlock, PairRange, PairRanges
 from skyless.site.survey.legs import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS, STD_OVER_MAD, earliest_cluster
 
-_KEPT_S: Final = 5.0  # legs wait so long for the other direction, which another anchor may publish later
-_LONGEST_BRACKET_S: Final = 0.5  # between two frames of an anchor that bracket one of another; at most half a wrap
-_LARGEST_TICKS: Final = 1 << 62  # stamps are computed with 64 bits
+_KEPT_S: Final = 5.0  # how long legs wait for the other direction, which another anchor may publish later
+_LONGEST_BRACKET_S: Final = 0.5  # between the two frames of a bracket; at most half a wrap
+_LARGEST_TICKS: Final = 1 << 62  # stamps are 64-bit integers
 _MAX_BLOCKS: Final = 256
 _MAX_PAIRS: Final = 1 << 16
-_MAX_OPEN_LEGS: Final = 1 << 18  # a block with more legs is closed before its time
+_MAX_OPEN_LEGS: Final = 1 << 18  # a block with this many legs is closed early
 _OUTLIER_SIGMAS: Final = 5.0
-_PRIOR_WEIGHT: Final = 500.0  # weight of the site's noise in a pair's, in flights
+_PRIOR_WEIGHT: Final = 500.0  # weight of the site's noise in the estimate of a pair's, in flights
 _PRIOR_PRODUCTS: Final = 200.0
 """Weight of the assumption that TX and RX stamps are equally good, in products of two pairs."""
 
@@ -33,7 +33,7 @@ _MIN_BATCHES: Final = 6
 _MIN_OWN_SHARE: Final = 0.2  # share of a mean's variance that is the pair's own
 
 
-# Brackets: times of flight of many pairs at once, as ``bracketed_flight_ticks`` in ``site/survey/legs.py``
+# Brackets: like ``bracketed_flight_ticks`` in ``site/survey/legs.py``, for many pairs at once
 
 
 class Legs(Struct, frozen=True, eq=False):
@@ -43,15 +43,15 @@ class Legs(Struct, frozen=True, eq=False):
     """Number of the pair."""
     a_ticks: Integers
     b_ticks: Integers
-    """Stamps on the counters of its two anchors, unwrapped."""
+    """Unwrapped stamps on the counters of the pair's two anchors."""
     is_back: Mask
-    """Whether it went from b to a."""
+    """Whether the leg went from b to a."""
     is_used: Mask
-    """Whether its time of flight has been computed before."""
+    """Whether its time of flight has already been computed."""
     t_s: Array
 
     def part(self, index: Integers | Mask) -> "Legs":
-        """Some of the rows."""
+        """Select rows."""
         return Legs(*(column[index] for column in astuple(self)))
 
 
@@ -62,14 +62,14 @@ class Flights(Struct, frozen=True, eq=False):
     """Index of the bracketed leg."""
     ticks: Array
     part: Array
-    """Where it lies between the two legs that bracket it, 0 to 1."""
+    """Position of that leg between the two that bracket it, 0 to 1."""
 
 
 def flights_of(legs: Legs, longest_ticks: int) -> tuple[Flights, Legs, int]:
-    """Times of flight of all legs that were not used before and are bracketed within ``longest_ticks``.
+    """Times of flight of all legs that are not yet used and are bracketed within ``longest_ticks``.
 
-    Returns them (they index ``legs``), the legs that later ones need, and the number of brackets that cannot be of one
-    pair of counters.
+    Returns the flights (which index ``legs``), the legs needed for later brackets, and the number of brackets that
+    cannot belong to one pair of counters.
     """
     legs_a = _bracketed(legs, legs.a_ticks, legs.b_ticks, legs.is_back, longest_ticks)
     legs_b = _bracketed(legs, legs.b_ticks, legs.a_ticks, ~legs.is_back, longest_ticks)
@@ -91,7 +91,7 @@ class _OneWay(Struct, frozen=True, eq=False):
 
 
 def _bracketed(legs: Legs, x_ticks: Integers, y_ticks: Integers, is_reply: Mask, longest_ticks: int) -> _OneWay:
-    """Replies y → x between two legs x → y, in the order of x's counter."""
+    """Flights of replies y → x that lie between two legs x → y on x's counter."""
     order = np.lexsort((x_ticks, legs.pair))
     order = order[_first_of_equals(legs.pair[order], x_ticks[order], is_reply[order])]
     pair, reply = legs.pair[order], is_reply[order]
@@ -112,7 +112,7 @@ def _bracketed(legs: Legs, x_ticks: Integers, y_ticks: Integers, is_reply: Mask,
     in_time = (span > 0.0) & (span <= longest_ticks)
     good = in_time & (until > 0.0) & (until < span) & (np.abs(rate) <= MAX_BRACKET_RATE)
     good &= np.abs(ticks) < MAX_FLIGHT_TICKS
-    # a later reply comes after the pair's last reply, so all before the leg that precedes that one has served.
+    # Later replies come after the pair's last reply, so only the leg that precedes it and newer ones are still needed.
     needed = np.ones(len(legs.pair), dtype=bool)
     replies = np.flatnonzero(reply)
     if len(replies):
@@ -125,17 +125,17 @@ def _bracketed(legs: Legs, x_ticks: Integers, y_ticks: Integers, is_reply: Mask,
 
 
 def _first_of_equals(pair: Integers, ticks: Integers, reply: Mask) -> Mask:
-    """Rows that do not repeat the one before."""
+    """Mask of the rows that do not repeat the one before."""
     first = np.ones(len(pair), dtype=bool)
     first[1:] = (pair[1:] != pair[:-1]) | (ticks[1:] != ticks[:-1]) | (reply[1:] != reply[:-1])
     return first
 
 
-# Steps: ranges in the order of time, from which it shows whether they stayed the same
+# Steps: ranges in the order of time, to see whether they stayed the same
 
 
 STEP_S: Final = 3.0
-_MAX_STEPS: Final = 64  # beyond them the older half is joined two by two
+_MAX_STEPS: Final = 64  # with more, the older half is merged in pairs
 _MEDIAN_VARIANCE: Final = math.pi / 2.0
 
 
@@ -148,7 +148,7 @@ class StepTable(Struct, frozen=True, eq=False):
     range_m: Array
     """Shape (k, m), NaN where a pair has no range."""
     variance_m2: Array
-    """Shape (k, m), of stamps' noise."""
+    """Shape (k, m), from stamp noise."""
 
 
 class _Step(Struct, frozen=True):
@@ -158,14 +158,14 @@ class _Step(Struct, frozen=True):
 
 
 class RangeSteps:
-    """Gathers blocks; memory does not grow with time."""
+    """Reduces blocks to steps, in bounded memory."""
 
     def __init__(self) -> None:
         self._steps: list[_Step] = []
         self._open: list[PairBlock] = []
 
     def add(self, block: PairBlock) -> None:
-        """Add a block, in the order of time; a clock that was set back begins the steps again."""
+        """Add a block, in the order of time. If the clock was set back, all steps are dropped."""
         step = math.floor(block.t_s / STEP_S)
         if self._open:
             now = math.floor(self._open[0].t_s / STEP_S)
@@ -176,7 +176,7 @@ class RangeSteps:
         self._open.append(block)
 
     def finish(self) -> None:
-        """Close the step that is open."""
+        """Close the open step."""
         if not self._open:
             return
         gathered: dict[tuple[int, int], list[PairBlock]] = {}
@@ -196,11 +196,11 @@ class RangeSteps:
             self._steps = [_joined_steps(*old[index : index + 2]) for index in range(0, len(old), 2)] + new
 
     def drop_before(self, t_s: float) -> None:
-        """Forget the steps that began earlier."""
+        """Drop the steps that began earlier."""
         self._steps = [one for one in self._steps if one.start_s >= t_s]
 
     def table(self) -> StepTable:
-        """The steps that are closed."""
+        """The closed steps as arrays."""
         pairs = tuple(sorted({pair for one in self._steps for pair in one.ranges}))
         nothing = (math.nan, math.nan)
         both = np.array([[one.ranges.get(pair, nothing) for pair in pairs] for one in self._steps])
@@ -220,11 +220,10 @@ def _joined_steps(one: _Step, other: _Step) -> _Step:
 
 
 class PairRanger:
-    """Gathers directed legs between anchors; memory does not grow with time.
+    """Computes ranges from directed legs between anchors, in bounded memory.
 
-    ``counters``: ``legs``, and what was dropped: ``impossible`` (brackets that cannot be of one pair of counters),
-    ``unusable`` (legs from an anchor to itself, without a finite time, or with stamps that no counter has),
-    ``too-many-pairs``.
+    ``counters``: ``legs``, and dropped input: ``impossible`` (brackets that cannot belong to one pair of counters),
+    ``unusable`` (legs from an anchor to itself, without a finite time, or with impossible stamps), ``too-many-pairs``.
     """
 
     def __init__(
@@ -233,10 +232,10 @@ class PairRanger:
         block_s: float = 1.0,
         on_block: Callable[[PairBlock], None] | None = None,
     ) -> None:
-        """``bits``: of the counters; ``block_s``: length of a block.
+        """``bits``: width of the counters; ``block_s``: length of a block.
 
-        ``on_block`` is given every block of every pair when its time is over, late ones too, and the blocks of one time
-        directly after one another.
+        ``on_block`` is called with every block of every pair once its time is over, even a late one; blocks of the same
+        time come in succession.
         """
         self.counters: Counter[str] = Counter()
         self._bits, self._block_s, self._on_block = bits, block_s, on_block
@@ -247,18 +246,18 @@ class PairRanger:
         self._kept = _legs_of([])
         self._histories: list[_History] = []
         self._shared_m2 = self._products = 0.0
-        """Sum of the products of two pairs that share an anchor's frame, and their number."""
+        """Sum of residual products of two pairs that share an anchor's frame, and their number."""
         self._block: int | None = None
-        """Number of the open block since time 0."""
+        """Number of the open block, counted from time 0."""
         self._first_s = self._last_s = math.nan
         self._duration_s = 0.0
         self.steps = RangeSteps()
-        """The ranges in the order of time."""
+        """The ranges as a time series."""
 
     def add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float) -> None:
-        """Add one reception. ``t_s``: of any clock that all legs share, good to a second, and to a quarter of a wrap.
+        """Add one reception. ``t_s``: on a clock common to all legs, accurate to a second and to a quarter of a wrap.
 
-        Order matters little: directions of a pair may come one after the other, seconds late.
+        Order matters little: the two directions of a pair may come seconds apart.
         """
         if sender == receiver or not math.isfinite(t_s) or max(abs(tx_ticks), abs(rx_ticks)) > _LARGEST_TICKS:
             self.counters["unusable"] += 1
@@ -281,27 +280,27 @@ class PairRanger:
             self._close_block()
 
     def forget(self, anchor: int) -> None:
-        """Drop the open legs of an anchor whose counter has restarted; its ranges stay."""
+        """Drop the open legs of an anchor whose counter has restarted, but keep its ranges."""
         self._clocks.pop(anchor, None)
         numbers = [number for pair, number in self._number.items() if anchor in pair]
         self._open = [leg for leg in self._open if leg[0] not in set(numbers)]
         self._kept = self._kept.part(~np.isin(self._kept.pair, numbers))
 
     def drop_before(self, t_s: float) -> None:
-        """Drop the ranges from before a time, because an anchor was elsewhere then."""
+        """Drop the ranges from before a time, when an anchor was elsewhere."""
         self.steps.drop_before(t_s)
         for history in self._histories:
             history.drop_before(t_s)
         self._duration_s = max(min(self._duration_s, self._last_s - t_s), 0.0)
 
     def finish(self) -> None:
-        """Close the block that is open, at the end of the data."""
+        """Close the open block, at the end of the data."""
         self._close_block()
         self.steps.finish()
 
     @property
     def tx_stamp_std_m(self) -> float:
-        """Noise of one TX stamp, as far as it can be separated from that of RX stamps; 0 before the first block.
+        """Noise of one TX stamp, as far as it can be separated from RX noise; 0 before the first block.
 
         The means of two pairs that share an anchor have the covariance ``tx_stamp_std_m²/(4·exchanges)``.
         """
@@ -337,7 +336,7 @@ class PairRanger:
         return clock
 
     def _pass_to(self, t_s: float) -> None:
-        """Close the open block if its time is over; a clock that was set starts the blocks again."""
+        """Close the open block if its time is over. After a jump of the clock, blocks start anew."""
         block, number = self._block, math.floor(t_s / self._block_s)
         if block is None or number > block or t_s < block * self._block_s - _KEPT_S:
             if block is not None:
@@ -365,7 +364,7 @@ class PairRanger:
             self._add_block(legs, flights, (self._block + 0.5) * self._block_s)
 
     def _add_block(self, legs: Legs, flights: Flights, t_s: float) -> None:
-        """Means of the pairs' flights without outliers, and what their scatter says of the stamps' noise."""
+        """Add the mean of each pair's flights without outliers, and learn the stamp noise from their scatter."""
         pair, range_m = legs.pair[flights.leg], flights.ticks * TICK_M
         good = _inliers(pair, range_m)
         leg, pair, range_m, part = flights.leg[good], pair[good], range_m[good], flights.part[good]
@@ -376,7 +375,7 @@ class PairRanger:
         mean_m = np.bincount(pair, range_m, minlength=count) / np.maximum(n, 1)
         residual_m = range_m - mean_m[pair]
         squares_m2 = np.bincount(pair, residual_m**2, minlength=count)
-        # a flight is half of one leg and of the legs before and after it, with weights 1 - part and part.
+        # A flight is half the sum of one leg and of the legs before and after it, with weights 1 - part and part.
         flight_weight = np.bincount(pair, 1.0 + part**2 + (1.0 - part) ** 2, minlength=count)
         freedom = flight_weight - n * one_each
         self._share(legs, leg, residual_m, n)
@@ -397,7 +396,7 @@ class PairRanger:
                 self._on_block(block)
 
     def _share(self, legs: Legs, leg: Integers, residual_m: Array, n: Integers) -> None:
-        """Add up the products of residuals of two pairs that were bracketed with the same frame of an anchor."""
+        """Sum the residual products of pairs that were bracketed with the same frame of an anchor."""
         anchors = np.array(list(self._number), dtype=np.int64).reshape(-1, 2)
         pair, is_back = legs.pair[leg], legs.is_back[leg]
         sender = np.where(is_back, anchors[pair, 1], anchors[pair, 0])
@@ -409,7 +408,7 @@ class PairRanger:
         total_m = np.bincount(group, residual_m[order])
         squares_m2 = np.bincount(group, residual_m[order] ** 2)
         size = np.bincount(group)
-        # The pairs' means have been subtracted, and share 2/n of that covariance.
+        # Subtracting the pairs' means has removed 2/n of that covariance.
         freedom = 1.0 - 2.0 * float(np.mean(1.0 / np.maximum(n[pair], 2)))
         self._shared_m2 += float(np.sum(total_m**2 - squares_m2))
         self._products += float(np.sum(size * (size - 1))) * max(freedom, 0.0)
@@ -423,30 +422,30 @@ class PairRanger:
 class _Mean(Struct, frozen=True):
     range_m: float
     noise_m2: float
-    """Variance of the mean from stamps' noise."""
+    """Variance of the mean from stamp noise."""
     wander_m2: float
-    """What the scatter between the blocks shows beyond that."""
+    """Further variance, from the scatter between blocks."""
     exchanges: float
     late_share: float
 
 
 class _History:
-    """The blocks of one pair, in the order of time; neighbours are merged when there are too many."""
+    """The blocks of one pair in the order of time; if there are too many, neighbours are merged."""
 
     def __init__(self) -> None:
         self.blocks: list[tuple[float, float, float]] = []
-        """Middle, mean range in metres, exchanges."""
+        """Middle time, mean range in metres, exchanges."""
         self.squares_m2 = self.freedom = 0.0
         """Their ratio is the noise of a TX and an RX stamp together."""
         self._early = self._late = 0.0
-        """Exchanges of blocks outside the cluster that were dropped."""
+        """Exchanges of dropped blocks before and after the cluster."""
 
     def leg_variance_m2(self, site_m2: float) -> float:
-        """Noise of one TX and one RX stamp together; that of the site counts as much as some hundred flights."""
+        """Noise of one TX and one RX stamp together, with the site's noise as a prior worth some hundred flights."""
         return (self.squares_m2 + _PRIOR_WEIGHT * site_m2) / (self.freedom + _PRIOR_WEIGHT)
 
     def add(self, t_s: float, range_m: float, exchanges: float, site_m2: Callable[[], float]) -> None:
-        """Add a block; ``site_m2`` gives the noise of a leg at the site."""
+        """Add a block; ``site_m2()``: noise of a leg at the site."""
         self.blocks.append((t_s, range_m, exchanges))
         if len(self.blocks) > _MAX_BLOCKS:
             self._merge(self.leg_variance_m2(site_m2()))
@@ -457,7 +456,7 @@ class _History:
         self._early = self._late = 0.0
 
     def mean(self, leg_m2: float) -> _Mean:
-        """The mean of the earliest cluster; ``leg_m2`` is the noise of a leg."""
+        """Mean of the earliest cluster; ``leg_m2``: noise of a leg."""
         blocks = np.array(self.blocks)
         inside, late, total = self._cluster(blocks, leg_m2)
         range_m, exchanges = blocks[inside, 1], blocks[inside, 2]
@@ -467,7 +466,7 @@ class _History:
         return _Mean(mean_m, noise_m2, wander_m2, float(np.sum(exchanges)), late / total)
 
     def _cluster(self, blocks: Array, leg_m2: float) -> tuple[Mask, float, float]:
-        """The blocks inside the earliest cluster, exchanges that are later, and all exchanges."""
+        """Mask of the blocks in the earliest cluster, number of later exchanges, and of all exchanges."""
         range_m, exchanges = blocks[:, 1], blocks[:, 2]
         total = self._early + self._late + float(np.sum(exchanges))
         std_m = math.sqrt(0.5 * leg_m2 / float(np.median(exchanges)))
@@ -476,7 +475,7 @@ class _History:
         return inside, self._late + float(np.sum(exchanges[is_late])), total
 
     def _merge(self, leg_m2: float) -> None:
-        """Drop what is outside the cluster, and join neighbours of the rest."""
+        """Drop the blocks outside the cluster, and join neighbours of the rest."""
         blocks = np.array(self.blocks)
         inside, self._late, total = self._cluster(blocks, leg_m2)
         self._early = total - self._late - float(np.sum(blocks[inside, 2]))
@@ -489,9 +488,9 @@ class _History:
 
 
 def _wander_m2(range_m: Array, exchanges: Array, noise_m2: float) -> float:
-    """Variance of the mean beyond stamps' noise: the scatter of blocks, joined until errors that persist show.
+    """Variance of the mean beyond stamp noise, from the scatter of blocks, joined step by step to show slow errors.
 
-    Only what chance does not explain counts, so that a pair without such errors keeps the variance of its noise.
+    Only scatter beyond chance counts, so that a pair without such errors keeps the variance of its noise.
     """
     wander_m2, value, weight = 0.0, range_m, exchanges
     while len(value) >= _MIN_BATCHES:
@@ -508,7 +507,7 @@ def _wander_m2(range_m: Array, exchanges: Array, noise_m2: float) -> float:
 
 
 def _inliers(pair: Integers, value: Array) -> Mask:
-    """Flights near the median of their pair, shape (n,): within 5 sigma, by the pair's or the site's scatter."""
+    """Mask of flights within 5 sigma of their pair's median, by the larger of the pair's and the site's scatter."""
     order = np.lexsort((value, pair))
     begin = np.flatnonzero(np.append(True, np.diff(pair[order]) != 0))
     size = np.diff(np.append(begin, len(order)))

@@ -1,10 +1,10 @@
-"""Unknowns, rows and least squares of a survey: a range of a pair is ``d + h_a + h_b`` (``docs/survey.md``).
+"""Least squares of a survey, where a pair's range is ``d + h_a + h_b`` (``docs/survey.md``).
 
 Normal equations are summed pair by pair, for many starts and weights at once: a robust fit and the search for other
 results need hundreds of small solutions.
 
-Positions are only known up to a rigid motion here, unless facts name coordinates: steps have minimum norm, so that a
-solution stays where its start was (a free network).
+Unless facts give coordinates, positions are determined only up to a rigid motion: steps have minimum norm, so that a
+solution stays near its start (a free network).
 """
 
 import zlib
@@ -25,7 +25,7 @@ _MIN_DAMPING: Final = 1e-9
 
 
 class MoreRows(Protocol):
-    """What else constrains positions and delays, such as a tag's receptions."""
+    """Further constraints on positions and delays, such as a tag's receptions."""
 
     def rows(self, position_m: Array, delay_m: Array) -> tuple[Array, Array]:
         """Weighted Jacobian, shape (r, 4n): coordinates anchor by anchor, then delays; weighted residuals, (r,)."""
@@ -33,37 +33,37 @@ class MoreRows(Protocol):
 
 
 class Problem(Struct, frozen=True, eq=False):
-    """What is fitted. ``n`` anchors, ``m`` ranges, ``t`` tapes."""
+    """A least squares problem of ``n`` anchors, ``m`` ranges and ``t`` tapes."""
 
     is_free: Mask
-    """Shape (n, 3): coordinates that are estimated; the others stay as in the start, ``coordinate_m`` by default."""
+    """Shape (n, 3): coordinates to estimate; the others stay as in the start, by default ``coordinate_m``."""
     first: Integers
     second: Integers
     """Shape (m,): indices of the anchors of each range."""
     range_m: Array
     """Shape (m,)."""
     variance_m2: Array
-    """Shape (m,): of each range, noise and constant error of the pair together."""
+    """Shape (m,): noise and constant error of each pair together."""
     delay_m: Array
     delay_variance_m2: Array
-    """Shape (n,): expected delays h, and of their own part, which no other anchor shares."""
+    """Shape (n,): expected delays h, and variance of each anchor's own part."""
     coordinate_m: Array
     coordinate_variance_m2: Array
-    """Shape (n, 3): known coordinates; infinite variance for none."""
+    """Shape (n, 3): known coordinates; infinite variance where unknown."""
     tape_first: Integers
     tape_second: Integers
     tape_m: Array
     tape_variance_m2: Array
     """Shape (t,)."""
     common_delay_m: Array | None = None
-    """Shape (n,): standard deviation of the part of its delay that an anchor shares with all others, 0 for one that
-    shares none; None where nobody does."""
+    """Shape (n,): standard deviation of the part of the delay that all anchors share, 0 for an anchor without it; None
+    if there is no shared part."""
     more: tuple[MoreRows, ...] = ()
-    """Costly: for a last fit, not for searches."""
+    """Costly: for a final fit, not for searches."""
 
 
 class Solution(Struct, frozen=True, eq=False):
-    """Positions and delays, with the information matrix of their unknowns."""
+    """Fitted positions and delays, with the information matrix of the unknowns."""
 
     position_m: Array
     """Shape (n, 3)."""
@@ -78,7 +78,7 @@ class Solution(Struct, frozen=True, eq=False):
 
 
 class Solutions(Struct, frozen=True, eq=False):
-    """``b`` solutions of one problem, from other starts or with other weights."""
+    """``b`` solutions of one problem, from different starts or with different weights."""
 
     position_m: Array
     """Shape (b, n, 3)."""
@@ -91,9 +91,9 @@ class Solutions(Struct, frozen=True, eq=False):
 
 
 def solve_least_squares(problem: Problem, position_m: Array, weight: Array | None = None) -> Solution:
-    """Levenberg–Marquardt from a start, shape (n, 3), with delays from their expectation.
+    """Levenberg–Marquardt from one start, shape (n, 3); delays start at their expected values.
 
-    ``weight``: of each range, shape (m,), multiplies 1/variance; by default 1.
+    ``weight``: factor on 1/variance of each range, shape (m,), by default 1.
     """
     given = np.ones(len(problem.range_m)) if weight is None else weight
     many = solve_many(problem, position_m[None], given[None])
@@ -107,7 +107,7 @@ def solve_many(
 ) -> Solutions:
     """Levenberg–Marquardt from ``b`` starts, shape (b, n, 3), with weights of shape (b, m), all at once.
 
-    ``delay_m``: shape (b, n), their starts; by default their expectation.
+    ``delay_m``: starts of the delays, shape (b, n); by default their expected values.
     """
     equations = _Equations(problem)
     position_m = position_m.astype(np.float64).copy()
@@ -144,7 +144,7 @@ def solve_many(
 
 
 def delay_weights(problem: Problem) -> Array:
-    """The root of the information that is expected of delays, shape (n, n): weights of what they differ."""
+    """Square root of the delays' prior information, shape (n, n): weights of deviations from expected delays."""
     own = 1.0 / np.sqrt(np.maximum(problem.delay_variance_m2, _MIN_STD_M**2))
     if problem.common_delay_m is None:
         return np.diag(own)
@@ -163,7 +163,7 @@ def residuals_m(problem: Problem, position_m: Array, delay_m: Array) -> Array:
 
 
 def unit_vectors(position_m: Array, first: Integers, second: Integers) -> Array:
-    """Directions from the second to the first anchor of each pair, shape (pairs, 3); 0 where both are at one place."""
+    """Unit vectors from the second to the first anchor of each pair, shape (pairs, 3); 0 where they coincide."""
     apart = position_m[first] - position_m[second]
     return np.asarray(apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None])
 
@@ -171,8 +171,8 @@ def unit_vectors(position_m: Array, first: Integers, second: Integers) -> Array:
 def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -> Array:
     """Weighted derivatives of ranges, tapes, delay priors and coordinate priors, shape (rows, 4 n).
 
-    Columns: coordinates anchor by anchor, then delays; those of coordinates that are not estimated are 0.
-    ``weight``: of each range, shape (m,), multiplies 1/variance.
+    Columns: coordinates anchor by anchor, then delays; 0 for coordinates that are not estimated. ``weight``: factor on
+    1/variance of each range, shape (m,).
     """
     n, m, t = len(position_m), len(problem.range_m), len(problem.tape_m)
     of_range = np.sqrt((1.0 if weight is None else weight) / problem.variance_m2)
@@ -198,35 +198,35 @@ def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -
 
 
 def unknown_columns(problem: Problem) -> Integers:
-    """Those of a ``jacobian`` that are estimated: free coordinates, then delays."""
+    """Columns of a ``jacobian`` that are estimated: free coordinates, then delays."""
     n = len(problem.delay_m)
     return np.concatenate([np.flatnonzero(problem.is_free.ravel()), 3 * n + np.arange(n)])
 
 
 def total_cost(problem: Problem, position_m: Array, delay_m: Array, weight: Array) -> Array:
-    """Sum of the weighted squares of ranges, tapes and priors, shape (b,), of positions (b, n, 3), delays (b, n).
+    """Weighted sum of squares of ranges, tapes and priors, shape (b,), for positions (b, n, 3) and delays (b, n).
 
-    ``weight``: of each range, shape (m,).
+    ``weight``: factor on 1/variance of each range, shape (m,).
     """
     equations = _Equations(replace(problem, more=()))
     return equations.cost(position_m, delay_m, np.broadcast_to(weight, (len(position_m), len(weight))))
 
 
 def adjacency(n: int, first: Integers, second: Integers) -> Mask:
-    """Which of n anchors these pairs join, shape (n, n), symmetric."""
+    """Symmetric adjacency matrix of n anchors joined by these pairs, shape (n, n)."""
     adjacent = np.zeros((n, n), bool)
     adjacent[first, second] = adjacent[second, first] = True
     return adjacent
 
 
 def distances_m(position_m: Array) -> Array:
-    """Between all positions, shape (n, n)."""
+    """Distances between all positions, shape (n, n)."""
     apart = position_m[:, None] - position_m[None]
     return np.asarray(np.sqrt(np.einsum("ijk,ijk->ij", apart, apart)))
 
 
 def superimposed(position_m: Array, target_m: Array, weight: Array) -> Array:
-    """Positions rotated, shifted and perhaps reflected to fit a target best (the weighted Procrustes problem).
+    """Positions rotated, shifted and possibly reflected to best fit a target (weighted Procrustes problem).
 
     ``position_m``, ``target_m``: shape (n, d). ``weight``: of each anchor's squared distance, shape (n,), not all 0.
     """
@@ -245,7 +245,7 @@ class _Equations:
         self._free = np.flatnonzero(problem.is_free.ravel())
         self._unknowns = len(self._free) + n
         self._more_columns = unknown_columns(problem)
-        # Coordinates that stay have the column behind the last one, which is cut off again.
+        # Fixed coordinates use an extra last column, which is cut off again.
         column = np.full((n, 4), self._unknowns)
         flat = np.full(3 * n, self._unknowns)
         flat[self._free] = np.arange(len(self._free))
@@ -274,7 +274,7 @@ class _Equations:
         weights = self._weights(weight)
         unit = (apart / np.maximum(distance, 1e-9)[:, :, None])[:, :, self._axes]
         delays = np.broadcast_to(self._has_delay[None, :, None], (*distance.shape, 1))
-        # In this order in memory: products of another one would have to be copied.
+        # C order, as the products below would otherwise be copied.
         derivative = np.ascontiguousarray(np.concatenate([unit, delays, -unit, delays], axis=2))
         weighted = weights[:, :, None] * derivative
         item = np.arange(b)[:, None]
@@ -317,7 +317,7 @@ class _Equations:
         return flat.reshape(position_m.shape), delay_m + step[:, len(self._free) :]
 
     def _rows(self, position_m: Array, delay_m: Array) -> tuple[Array, Array, Array]:
-        """Vectors from the second anchor of a row to its first, their lengths, residuals."""
+        """Vectors from the second to the first anchor of each row, their lengths, and the residuals."""
         apart = position_m[:, self._first] - position_m[:, self._second]
         distance = np.sqrt(np.einsum("bij,bij->bi", apart, apart))
         delays = self._has_delay * (delay_m[:, self._first] + delay_m[:, self._second])
@@ -329,21 +329,20 @@ class _Equations:
         return np.concatenate([weight * self._of_range, of_tape], axis=1)
 
 
-# Starts of a fit: ranges completed by shortest paths and laid out, the sketch, and perturbed ones.
+# Starts of a fit: the layout of ranges completed by shortest paths, the sketch, and perturbed layouts.
 #
-# Ranges that come late and paths around corners are too long, never too short: so are the distances that are filled
-# in. Several starts differ enough that one of them unfolds. What is random is drawn from the data: equal data, equal
-# starts.
+# Late ranges and paths around corners are too long, never too short, and so are completed distances. The starts differ
+# enough that one of them unfolds. The random seed is derived from the data, so that equal data give equal starts.
 
 _PERTURBED: Final = 6
-_KEPT_SHARE: Final = 0.75  # ranges kept in a perturbed start; the others are filled in by paths
-_MOVED_SHARE: Final = 0.1  # standard deviation of a perturbed start's positions, of the site's size
+_KEPT_SHARE: Final = 0.75  # ranges kept in a perturbed start; paths replace the others
+_MOVED_SHARE: Final = 0.1  # standard deviation of a perturbed start's positions, as a share of the site's size
 
 
 def start_positions(problem: Problem, sketch_m: Array | None = None) -> list[Array]:
-    """Positions, each of shape (n, 3), from which a fit should be tried.
+    """Starting positions for a fit, each of shape (n, 3).
 
-    ``sketch_m``: rough positions, shape (n, 3), NaN where there is none. Starts are moved to fit it and known
+    ``sketch_m``: rough positions, shape (n, 3), NaN where there is none. Starts are aligned with the sketch and known
     coordinates. Coordinates that are not estimated are those of ``coordinate_m``.
     """
     axes = np.flatnonzero(problem.is_free.any(axis=0))
@@ -370,7 +369,7 @@ def start_positions(problem: Problem, sketch_m: Array | None = None) -> list[Arr
 
 
 def _known_distances(problem: Problem, axes: Integers) -> Array:
-    """Distances along the axes that are estimated, shape (n, n); infinite where there is no range."""
+    """Distances along the estimated axes, shape (n, n); infinite where there is no range."""
     n = len(problem.delay_m)
     first = np.concatenate([problem.first, problem.tape_first])
     second = np.concatenate([problem.second, problem.tape_second])
@@ -388,7 +387,7 @@ def _known_distances(problem: Problem, axes: Integers) -> Array:
 
 
 def _completed(distance_m: Array) -> Array:
-    """Lengths of the shortest paths; parts of the site that nothing connects stand as far apart as the longest path."""
+    """Lengths of the shortest paths; unconnected parts of the site are as far apart as the longest path."""
     path_m = distance_m.copy()
     for middle in range(len(path_m)):
         np.minimum(path_m, path_m[:, middle, None] + path_m[middle], out=path_m)
@@ -419,7 +418,7 @@ def _moved_to(layout_m: Array, known_m: Array, axes: Integers) -> Array:
 
 
 def _levelled(position_m: Array, height_m: Array) -> Array:
-    """Rotated so that z fits the known heights best."""
+    """Positions rotated so that z best fits the known heights."""
     known = np.isfinite(height_m)
     centre = position_m[known].mean(axis=0)
     upwards = np.linalg.lstsq(position_m[known] - centre, height_m[known] - height_m[known].mean(), rcond=None)[0]
@@ -431,7 +430,7 @@ def _levelled(position_m: Array, height_m: Array) -> Array:
 
 
 def _aligned(position_m: Array, known_m: Array, axes: Integers) -> Array:
-    """Moved rigidly, or reflected, along some axes to anchors known in all of these."""
+    """Positions moved rigidly, or reflected, in these axes to fit the anchors whose coordinates are known in all."""
     known: Mask = np.asarray(np.isfinite(known_m[:, axes]).all(axis=1))
     if not known.any():
         return position_m

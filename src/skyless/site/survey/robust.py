@@ -1,9 +1,9 @@
-"""A fit that late ranges do not spoil, and the other results that fit the ranges as well.
+"""A fit that is robust to late ranges, and the alternative results that fit the ranges as well.
 
-Radio may take a longer way, never a shorter one: a range counts as wrong if it comes 3 σ later than the positions say,
-or 6 σ earlier. The weighted squares, each cut off there, have many minima; graduated non-convexity (Yang and others,
+Radio may take a longer path, never a shorter one: a range counts as wrong if it is 3 σ longer than the positions say,
+or 6 σ shorter. The cost, weighted squares cut off there, has many minima; graduated non-convexity (Yang and others,
 2020) leads from plain least squares to a good one, from several starts. The best is improved until no result close to
-it is better: with an anchor elsewhere, or with one or two ranges fewer. Those nearly as good make it ambiguous.
+it, with an anchor elsewhere or with one or two ranges fewer, is better. Results nearly as good make it ambiguous.
 """
 
 from itertools import combinations
@@ -34,7 +34,7 @@ EARLY_CUTOFF: Final = 6.0
 
 _LATE_BEND: Final = 0.5
 _EARLY_BEND: Final = 3.0
-"""Where Huber's cost becomes linear, in standard deviations: absolute values on the late side, nearly."""
+"""Where Huber's cost becomes linear, in standard deviations; nearly absolute values on the late side."""
 
 _HUBER_ROUNDS: Final = 12
 _STEPS_A_ROUND: Final = 2
@@ -42,28 +42,28 @@ _GROWTH: Final = 1.4
 _FAST_GROWTH: Final = 2.0
 _MANY_UNKNOWNS: Final = 100
 _AGREEING_STARTS: Final = 3
-"""Large sites have ranges to spare: larger steps lead to the same minimum, and where the first starts agree the others
-are left out."""
+"""Large sites have many spare ranges: larger steps lead to the same minimum, and if the first starts agree the others
+are not tried."""
 
-_LAST_CONTROL: Final = 30.0  # where the graduated cost is as good as cut off
-_MAX_CHANGES: Final = 10  # of the set of used ranges, until it no longer changes
+_LAST_CONTROL: Final = 30.0  # at which the graduated cost is practically cut off
+_MAX_CHANGES: Final = 10  # of the set of used ranges until it is stable
 _MIN_CHECKS: Final = 4.0
 _SIGNIFICANT: Final = 2.6
-"""Standard deviations by which squares of residuals must exceed what is expected if no range was left out."""
+"""Standard deviations by which the squared residuals must exceed their expectation if no range was left out."""
 
 _MIN_LEFT: Final = 1.0
-"""Ranges more than unknowns that must remain after some were left out: with less, any range can be left out, and what
-remains fits exactly, even if folded."""
+"""Spare ranges that must remain after some were left out: with fewer, any range can be left out and the others fit
+exactly, even if folded."""
 
 _LARGEST_SQUARES: Final = 6.6
 _WIDEST: Final = 2.0
-"""Weighted squares of one range too many in 99 % of sites, and the part by which standard deviations may be too small
-before a range must be late even so."""
+"""99 % quantile of the weighted square of one spare range, and the factor by which standard deviations may be too small
+before a range must be late after all."""
 
 _EXCESS_WEIGHT: Final = 15.0
 _MIN_EVIDENCE: Final = 20.0
-"""For a larger error: twice the logarithm of likelihoods, and these standard deviations times a weight. Late ranges
-that were left out say nothing of the error of the others; so likelihoods alone mistake many late ranges for it."""
+"""Evidence needed for a larger error: twice the log likelihood ratio plus the weighted excess. Left out ranges say
+nothing about the error of the others, so likelihoods alone would mistake many late ranges for a larger error."""
 
 _FIRST_WIDTH: Final = 4.0  # in expected errors
 _MAX_WIDENINGS: Final = 20
@@ -72,8 +72,8 @@ _MIN_STD_M: Final = 0.005
 _LARGEST_STD_M: Final = 0.3
 
 _MAX_IMPROVEMENTS: Final = 8
-_MIN_GAIN: Final = 0.01  # fall of the cost by a better result nearby
-_SAME_M: Final = 0.005  # residuals that differ by less belong to one minimum
+_MIN_GAIN: Final = 0.01  # least decrease of the cost for a better result nearby
+_SAME_M: Final = 0.005  # results whose residuals differ by less are one minimum
 
 
 class RobustFit(Struct, frozen=True, eq=False):
@@ -84,15 +84,15 @@ class RobustFit(Struct, frozen=True, eq=False):
     solution: Solution
     """With the weights below."""
     weight: Array
-    """Shape (m,), of ranges: 1 and 0, or less than 1 for those that come late where errors are larger than expected."""
+    """Shape (m,), of ranges: 1 or 0, or below 1 for late ones if errors are larger than expected."""
     used: Mask
     """Shape (m,): ranges in use; the others are late."""
     cost: float
-    """All weighted squares, each range's cut off."""
+    """Sum of weighted squares, cut off for each range."""
     range_std_m: float
     """Constant error of a pair that the fit assumes."""
     others: "Minima"
-    """Minima found near this one, for the search of ambiguities."""
+    """Minima found near this one, to search for ambiguities."""
 
 
 class Minima(Struct, frozen=True, eq=False):
@@ -110,8 +110,8 @@ class Minima(Struct, frozen=True, eq=False):
 def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0) -> RobustFit:
     """Fit positions and delays to the ranges that agree, from several starts of shape (n, 3).
 
-    ``pair_std_m``: the part of the ranges' standard deviations that is a pair's constant error. Where the residuals
-    show that it is larger, the larger one is used.
+    ``pair_std_m``: the part of the ranges' standard deviations that is a pair's constant error. If the residuals show a
+    larger one, that is used.
     """
     start_m = np.stack(starts)
     narrow = _best_near(problem, _from_starts(problem, start_m), pair_std_m)
@@ -127,7 +127,7 @@ def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0)
         return narrow
     wider = replace(problem, variance_m2=problem.variance_m2 - pair_std_m**2 + std_m**2)
     wide = _best_near(wider, _from_starts(wider, start_m), std_m)
-    # Twice the logarithm of how much likelier the ranges are: a larger error makes each range in use less likely.
+    # Twice the log likelihood ratio: a larger error makes each range in use less likely.
     in_use = wide.used
     width = np.mean(np.log(wider.variance_m2 / problem.variance_m2)[in_use])
     likelier = narrow.cost - wide.cost - redundancy(wider, wide.solution, in_use) * width
@@ -135,7 +135,7 @@ def fit_robustly(problem: Problem, starts: list[Array], pair_std_m: float = 0.0)
 
 
 def _with_all_ranges(fit: RobustFit, start_m: Array) -> RobustFit | None:
-    """The fit with all ranges, if nothing checks that some of them are late and all agree within larger errors."""
+    """The fit with all ranges, if nothing confirms that some are late and all agree within larger errors."""
     if redundancy(fit.problem, fit.solution, fit.used) >= _MIN_LEFT:
         return None
     everything = np.ones(len(fit.used), dtype=np.bool_)
@@ -156,9 +156,9 @@ def _with_all_ranges(fit: RobustFit, start_m: Array) -> RobustFit | None:
 
 
 def _softened(fit: RobustFit) -> RobustFit:
-    """The fit with late ranges bent instead of cut off.
+    """The fit with a one-sided Huber cost for late ranges instead of a cut-off.
 
-    Where ranges scatter more than is expected, no gap parts late ranges from the others, and cutting some of them off
+    If ranges scatter more than expected, no gap separates late ranges from the others, and which ones are cut off
     depends on chance: one-sided absolute values are a quarter more accurate on drawn plants.
     """
     problem = fit.problem
@@ -172,7 +172,7 @@ def _softened(fit: RobustFit) -> RobustFit:
 
 
 def _best_near(problem: Problem, minima: Minima, pair_std_m: float) -> RobustFit:
-    """The best of some minima, or a better one that is found from there."""
+    """The best of these minima, or a better one found nearby."""
     presence = Presence(problem, minima.position_m[0])
     best_whole = np.inf
     fit: RobustFit | None = None
@@ -191,10 +191,10 @@ def _best_near(problem: Problem, minima: Minima, pair_std_m: float) -> RobustFit
 
 
 def _shown_std_m(fit: RobustFit) -> float:
-    """The constant error of a pair that residuals of ranges in use show, if it is more than the fit assumes.
+    """Constant error of a pair according to the residuals of ranges in use; at least what the fit assumes.
 
-    Few ranges too many can be made to agree by leaving out those that do not, even small ones: so the search
-    begins with a larger error, and goes on to what the residuals show until both agree.
+    With few spare ranges, leaving out even slightly deviating ones makes the rest agree. So the search starts with a
+    larger error and iterates until it agrees with the residuals.
     """
     least_m, problem = fit.range_std_m, fit.problem
     position_m, delay_m = fit.solution.position_m[None], fit.solution.delay_m[None]
@@ -220,7 +220,7 @@ def _squares(problem: Problem, solution: Solution, used: Mask) -> float:
 
 
 def _excess(squares: float, checks: float) -> float:
-    """Standard deviations by which weighted squares exceed what is expected: their cube root is nearly normal."""
+    """Standard deviations by which weighted squares exceed their expectation (their cube root is nearly normal)."""
     variance = 2.0 / (9.0 * max(checks, 1e-6))
     return float((np.cbrt(squares / max(checks, 1e-6)) - 1.0 + variance) / np.sqrt(variance))
 
@@ -243,7 +243,7 @@ def _joined(some: Minima, more: Minima) -> Minima:
 
 
 def redundancy(problem: Problem, solution: Solution, used: Mask) -> float:
-    """Ranges in use less the unknowns that they determine; what is expected of delays and coordinates counts, too."""
+    """Ranges in use less the unknowns that they determine, where priors determine a part of the unknowns."""
     in_use = np.flatnonzero(used)
     derivative = jacobian(problem, solution.position_m)[np.ix_(in_use, unknown_columns(problem))]
     influence = np.linalg.solve(regular(solution.information), derivative.T)
@@ -251,14 +251,14 @@ def redundancy(problem: Problem, solution: Solution, used: Mask) -> float:
 
 
 def _from_starts(problem: Problem, start_m: Array) -> Minima:
-    """Minima that plain and one-sided least squares and graduated non-convexity reach."""
+    """Minima reached by graduated non-convexity from plain and from one-sided least squares."""
     plain = _plain(problem, start_m[:_AGREEING_STARTS] if _is_large(problem) else start_m)
     if _is_large(problem) and len(plain.cost) > 1:
         plain = _plain(problem, start_m)
     bent = _distinct(_huber(problem, plain))
     position_m = np.concatenate([plain.position_m, bent.position_m, bent.position_m])
     delay_m = np.concatenate([plain.delay_m, bent.delay_m, bent.delay_m])
-    # a bent start comes twice: from the convex cost, and from one that trusts it.
+    # A bent start is used twice: with the convex cost, and with one near the cut-off.
     nearly_cut = np.arange(len(position_m)) >= len(plain.position_m) + len(bent.position_m)
     return graduated(problem, position_m, delay_m, np.where(nearly_cut, 0.3, 0.0))
 
@@ -273,7 +273,7 @@ def _is_large(problem: Problem) -> bool:
 
 
 def _huber(problem: Problem, start: Solutions) -> Solutions:
-    """Least squares with late residuals by their absolute value."""
+    """Least squares with nearly absolute values for late residuals (iteratively reweighted)."""
     fit = start
     for _ in range(_HUBER_ROUNDS):
         weight = _bent_weight(problem, fit.residual_m)
@@ -282,14 +282,14 @@ def _huber(problem: Problem, start: Solutions) -> Solutions:
 
 
 def _bent_weight(problem: Problem, residual_m: Array) -> Array:
-    """Weights that make squares absolute values, far on the early and soon on the late side; shape as given."""
+    """Huber weights, which bend far out on the early side and near on the late side; shape as given."""
     scaled = residual_m / np.sqrt(problem.variance_m2)
     bend = np.where(scaled > 0.0, _LATE_BEND, _EARLY_BEND)
     return np.asarray(bend / np.maximum(np.abs(scaled), bend))
 
 
 def graduated(problem: Problem, position_m: Array, delay_m: Array, least_control: Array) -> Minima:
-    """Graduated non-convexity from ``b`` starts: controls of 0 begin with a convex cost, of 1 near the cut-off one."""
+    """Graduated non-convexity from ``b`` starts. ``least_control``: 0 begins with a convex cost, 1 near the cut-off."""
     scaled = _in_cutoffs(problem, residuals_m(problem, position_m, delay_m))
     convex = 1.0 / np.maximum(2.0 * np.max(scaled, axis=1, initial=0.0) - 1.0, 1.0 / _LAST_CONTROL)
     control = np.maximum(convex, least_control)
@@ -308,7 +308,7 @@ def graduated(problem: Problem, position_m: Array, delay_m: Array, least_control
 def cut_off(problem: Problem, position_m: Array, delay_m: Array, used: Mask | None = None) -> Minima:
     """Minima of the cut-off cost near ``b`` positions, where least squares and the set of used ranges agree.
 
-    ``used``: shape (b, m), the first set; by default what the positions' residuals say.
+    ``used``: the initial sets, shape (b, m); by default from the positions' residuals.
     """
     nearby = _in_cutoffs(problem, residuals_m(problem, position_m, delay_m)) < 1.0
     used = nearby if used is None else used.copy()
@@ -321,7 +321,7 @@ def cut_off(problem: Problem, position_m: Array, delay_m: Array, used: Mask | No
         fit = solve_many(problem, position_m[busy], weight, delay_m[busy])
         scaled = _in_cutoffs(problem, fit.residual_m)
         new = scaled < 1.0
-        # Squares of all ranges, those that are out by what leaving them out costs.
+        # Squares of all ranges; those left out cost the cut-off.
         squares = fit.residual_m**2 / problem.variance_m2
         limit = np.where(fit.residual_m > 0.0, LATE_CUTOFF**2, EARLY_CUTOFF**2)
         whole = fit.cost + np.sum(np.where(new, squares, limit) - weight * squares, axis=1)
@@ -339,13 +339,13 @@ def cut_off(problem: Problem, position_m: Array, delay_m: Array, used: Mask | No
 
 
 def _in_cutoffs(problem: Problem, residual_m: Array) -> Array:
-    """Squares of residuals, 1 where they are cut off; shape as given."""
+    """Squared residuals, scaled to 1 at the cut-off; shape as given."""
     cutoff = np.where(residual_m > 0.0, LATE_CUTOFF, EARLY_CUTOFF)
     return np.asarray(residual_m**2 / (problem.variance_m2 * cutoff**2))
 
 
 def _distinct(fits: Solutions) -> Solutions:
-    """One of each minimum, by residuals, the cheapest first: these do not see how a site is turned."""
+    """The distinct minima, the cheapest first, compared by residuals, which are independent of rotations."""
     kept: list[int] = []
     for index in np.argsort(fits.cost, kind="stable"):
         apart = np.abs(fits.residual_m[kept] - fits.residual_m[index])
@@ -362,25 +362,26 @@ _MAX_RELOCATIONS: Final = 3  # per anchor
 _LOOSE_STD_M: Final = 0.05  # added to a range's standard deviation while all other anchors stay
 _LOOSE_COST: Final = 40.0  # a relocation may be worse by this while all other anchors stay
 _APART_M: Final = 0.25
-"""Positions of an anchor that differ by less are the same: leaving ranges out leads from one to the other."""
+"""Positions of an anchor that differ by less count as one: leaving ranges out leads from one to the other."""
 
 _MIN_LATE: Final = 1.5
-"""Standard deviations by which a range is late if it is left out, by a linear prediction that errs."""
+"""Standard deviations by which a range must be late after leaving it out, by an approximate linear prediction."""
 
 _MIN_MOTION_M: Final = 0.03  # motion that leaving ranges out must cause, by the same prediction
-_UNCONTROLLED: Final = 0.02  # a share of redundancy below which ranges are not checked by others
+_UNCONTROLLED: Final = 0.02  # share of redundancy below which no other ranges check a range
 _MIN_REFITS: Final = 10
 _MAX_REFITS: Final = 600
 _REFIT_WORK: Final = 6e5  # refits times squared unknowns
 
 
 def relocated(problem: Problem, position_m: Array, delay_m: Array) -> Array:
-    """Starts with one anchor where circles (spheres) of two (three) of its ranges meet, shape (b, n, 3)."""
+    """Starts with one anchor moved to where circles (spheres) of two (three) of its ranges meet, shape (b, n, 3)."""
     axes = np.flatnonzero(problem.is_free.all(axis=0))
-    found: list[tuple[float, int, Array]] = []
-    for anchor in range(len(position_m)):
-        for worse, other_m in _other_positions(problem, position_m, delay_m, anchor, axes):
-            found.append((worse, anchor, other_m))
+    found = [
+        (worse, anchor, other_m)
+        for anchor in range(len(position_m))
+        for worse, other_m in _other_positions(problem, position_m, delay_m, anchor, axes)
+    ]
     found.sort(key=lambda item: item[:2])
     unknowns = int(np.count_nonzero(problem.is_free)) + len(position_m)
     starts = []
@@ -392,14 +393,14 @@ def relocated(problem: Problem, position_m: Array, delay_m: Array) -> Array:
 
 
 def _most_refits(unknowns: int) -> int:
-    """As many as large sites allow in little time."""
+    """Number of refits that takes little time even at large sites."""
     return int(np.clip(_REFIT_WORK / unknowns**2, _MIN_REFITS, _MAX_REFITS))
 
 
 def _other_positions(
     problem: Problem, position_m: Array, delay_m: Array, anchor: int, axes: Integers
 ) -> list[tuple[float, Array]]:
-    """Where one anchor may be as well, the best first, while all others stay; and by how much worse that fits."""
+    """Alternative positions of one anchor while all others stay, best first, each after its increase of the cost."""
     own = np.flatnonzero((problem.first == anchor) | (problem.second == anchor))
     neighbour = problem.first[own] + problem.second[own] - anchor
     if len(own) < len(axes) or len(axes) < 2:
@@ -431,7 +432,7 @@ def _other_positions(
 
 
 def _meeting_points(centre_m: Array, radius_m: Array) -> Array:
-    """Both points where circles, or spheres, meet: centres (c, d, d), radii (c, d); shape (2 c, d)."""
+    """Both intersections of d circles or spheres, shape (2 c, d), from centres (c, d, d) and radii (c, d)."""
     origin_m, side_m = centre_m[:, 0], centre_m[:, 1:] - centre_m[:, :1]
     right = 0.5 * (radius_m[:, :1] ** 2 - radius_m[:, 1:] ** 2 + np.sum(side_m**2, axis=2))
     foot_m = np.einsum("cij,cj->ci", np.linalg.pinv(side_m, rcond=1e-6), right)
@@ -445,9 +446,9 @@ def _meeting_points(centre_m: Array, radius_m: Array) -> Array:
 
 
 def without_ranges(problem: Problem, solution: Solution, used: Mask) -> Mask:
-    """Sets of used ranges with one or two fewer that would then be late and let anchors move, shape (b, m).
+    """Sets of used ranges without one or two that would then be late and let anchors move, shape (b, m).
 
-    What leaving out would do is predicted with the equations of the solution, so that only few sets need a refit.
+    The effect is predicted with the linearised equations of the solution, so that only few sets need a refit.
     """
     in_use = np.flatnonzero(used)
     if not in_use.size:
@@ -458,7 +459,7 @@ def without_ranges(problem: Problem, solution: Solution, used: Mask) -> Mask:
     redundancy = np.eye(len(in_use)) - derivative @ influence
     residual = solution.residual_m[in_use] / std_m
     own = np.maximum(np.diag(redundancy), 1e-6)
-    # Residuals of two ranges predicted without these, from the inverse of their part of the redundancy.
+    # Residuals of two ranges when predicted without both, from the inverse of their block of the redundancy matrix.
     determinant = own[:, None] * own - redundancy**2
     np.fill_diagonal(determinant, 1.0)
     safe = np.maximum(determinant, 1e-6)
@@ -488,14 +489,14 @@ def without_ranges(problem: Problem, solution: Solution, used: Mask) -> Mask:
 
 
 def regular(information: Array) -> Array:
-    """With a little of information on everything, a hundredth of a metre's, so that it can be inverted."""
+    """Invertible information matrix: a little information (1e-4 per m², 100 m standard deviation) on every unknown."""
     return np.asarray(information + 1e-4 * np.eye(len(information)))
 
 
 def mirrored(problem: Problem, position_m: Array) -> Array:
     """Starts with parts reflected in the line (plane) through the two (three) anchors that hold them, shape (b, n, 3).
 
-    Single anchors are among those of ``relocated``.
+    ``relocated`` covers single anchors.
     """
     axes = np.flatnonzero(problem.is_free.all(axis=0))
     n = len(position_m)
@@ -510,7 +511,7 @@ def mirrored(problem: Problem, position_m: Array) -> Array:
 
 
 def _hanging_parts(joined: Mask, dimensions: int) -> list[Mask]:
-    """Pairs of anchors held by no more others than there are dimensions; each shape (n,)."""
+    """Masks of the pairs of anchors held by no more others than there are dimensions, each of shape (n,)."""
     n = len(joined)
     parts = []
     for pair in combinations(range(n), 2):
@@ -521,7 +522,7 @@ def _hanging_parts(joined: Mask, dimensions: int) -> list[Mask]:
 
 
 def _reflection(position_m: Array, hinge_m: Array) -> Array:
-    """Positions, shape (k, d), reflected in the line or plane that fits the hinge best, shape (h, d)."""
+    """Positions, shape (k, d), reflected in the line or plane that best fits the hinge, shape (h, d)."""
     if not len(hinge_m):
         return position_m
     centre = hinge_m.mean(axis=0)
@@ -534,14 +535,14 @@ def _reflection(position_m: Array, hinge_m: Array) -> Array:
 
 _PRESENCE_STEPS: Final = 12
 _MIN_PRESENCE_EVIDENCE: Final = 30.0
-"""Twice the logarithm of likelihoods by which distance must explain which pairs have a range, else it says nothing."""
+"""Twice the log likelihood ratio by which distance must explain which pairs have a range; else it is not used."""
 
-_PRESENCE_WEIGHT: Final = 0.5  # pairs behind one wall are missing together
-_SURE: Final = 1e-3  # probability that a pair at any distance has, or lacks, a range for another reason
+_PRESENCE_WEIGHT: Final = 0.5  # below 1, as pairs behind one wall are missing together
+_SURE: Final = 1e-3  # probability that a pair has, or lacks, a range for a reason other than distance
 
 
 class Presence:
-    """A logistic curve of the share of pairs with a range over distance, fitted to one result of a problem."""
+    """Logistic curve of the probability of a range over distance, fitted to one result of a problem."""
 
     def __init__(self, problem: Problem, position_m: Array) -> None:
         """``position_m``: shape (n, 3)."""
@@ -564,7 +565,7 @@ class Presence:
             self._curve = curve
 
     def cost(self, position_m: Array) -> Array:
-        """What is to be added to the weighted squares of results, shape (b, n, 3); shape (b,)."""
+        """Term to add to the cost of results of shape (b, n, 3); shape (b,)."""
         if self._curve is None:
             return np.zeros(len(position_m))
         return np.asarray(_PRESENCE_WEIGHT * self._surprise(self._distances(position_m), self._curve))
@@ -573,7 +574,7 @@ class Presence:
         return np.asarray(np.linalg.norm(position_m[:, self._first] - position_m[:, self._second], axis=2))
 
     def _surprise(self, distance_m: Array, curve: Array) -> Array:
-        """Twice the negative logarithm of the likelihood of the pairs that have a range, over the last axis."""
+        """Minus twice the log likelihood of which pairs have a range, summed over the last axis."""
         share = 1.0 / (1.0 + np.exp(-np.clip(curve[0] + curve[1] * distance_m, -30.0, 30.0)))
         share = _SURE + (1.0 - 2.0 * _SURE) * share
         return np.asarray(-2.0 * np.sum(np.log(np.where(self._is_present, share, 1.0 - share)), axis=-1))
@@ -582,10 +583,10 @@ class Presence:
 # Ambiguities
 
 
-_MIRROR_AS_GOOD: Final = 16.0  # weighted squares by which a result that uses the same ranges may fit worse
-_OTHERS_AS_GOOD: Final = 12.0  # the same for a result that takes other ranges for late
+_MIRROR_AS_GOOD: Final = 16.0  # cost by which a result that uses the same ranges may be worse
+_OTHERS_AS_GOOD: Final = 12.0  # the same for a result that takes other ranges as late
 _LATE_GAIN: Final = 16.0
-"""Weighted squares that leaving ranges out must save; below, no range is late and no other result takes any for it."""
+"""Cost that leaving ranges out must save; otherwise results that take other ranges as late are ignored."""
 
 _MOVED_STDS: Final = 3.0
 _MOVED_M: Final = 0.1  # motion of an anchor that makes two results different
@@ -596,11 +597,11 @@ class OtherFit(Struct, frozen=True, eq=False):
     """Another result that fits as well."""
 
     position_m: Array
-    """Shape (n, 3), moved rigidly onto the best fit's."""
+    """Shape (n, 3), aligned with the best fit."""
     used: Mask
     """Shape (m,)."""
     anchors: tuple[int, ...]
-    """Indices of those that are elsewhere."""
+    """Indices of the anchors that are elsewhere."""
 
 
 def find_ambiguities(fit: RobustFit) -> tuple[OtherFit, ...]:
@@ -621,8 +622,7 @@ def find_ambiguities(fit: RobustFit) -> tuple[OtherFit, ...]:
             motion_m = np.linalg.norm(position_m - fit.solution.position_m, axis=1)
             elsewhere = np.flatnonzero((motion_m > _MOVED_M) & (motion_m > _MOVED_STDS * std_m))
             if elsewhere.size:
-                used = minima.used[index]
-                other = OtherFit(position_m, used, tuple(elsewhere.tolist()))
+                other = OtherFit(position_m, minima.used[index], tuple(elsewhere.tolist()))
                 others.append((float(minima.cost[index]), other))
     others.sort(key=lambda item: item[0])
     kept: list[OtherFit] = []
@@ -634,9 +634,9 @@ def find_ambiguities(fit: RobustFit) -> tuple[OtherFit, ...]:
 
 
 def aligned_to(problem: Problem, position_m: Array, target_m: Array) -> Array:
-    """Moved rigidly, or reflected, along the free axes so that it fits the target best; both shape (n, 3).
+    """Positions moved rigidly, or reflected, in the free axes to best fit the target; both shape (n, 3).
 
-    Anchors that are elsewhere must not pull the others along: the alignment follows those that fit.
+    The alignment is robust, so that anchors that are elsewhere do not shift the others.
     """
     axes = np.flatnonzero(problem.is_free.any(axis=0))
     weight = np.ones(len(position_m))
@@ -648,7 +648,7 @@ def aligned_to(problem: Problem, position_m: Array, target_m: Array) -> Array:
 
 
 def aligned_std_m(fit: RobustFit) -> Array:
-    """Standard deviation of each anchor's distance from the truth after the best rigid alignment, shape (n,)."""
+    """Standard deviation of each anchor's position error after the best rigid alignment, all axes together, (n,)."""
     position_m, n = fit.solution.position_m, len(fit.solution.position_m)
     rows = jacobian(fit.problem, position_m, fit.weight)
     covariance_m2 = aligned_covariance(fit.problem, rows, position_m, np.ones(n, bool))

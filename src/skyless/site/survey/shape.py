@@ -1,4 +1,4 @@
-"""The shape of a site, by a fit of all anchors with enough ranges; and what the measurements leave open."""
+"""The shape of a site, from a fit of all anchors with enough ranges, and sentences on what remains undetermined."""
 
 import math
 import re
@@ -47,9 +47,9 @@ from skyless.site.survey.problem import (
 from skyless.site.survey.robust import OtherFit, RobustFit, fit_robustly
 from skyless.site.survey.walk import TagEpochs, fit_with_tag
 
-_MIN_REDUNDANCY: Final = 4  # ranges more than unknowns from which on residuals show how good the ranges are
+_MIN_REDUNDANCY: Final = 4  # spare ranges needed to judge the ranges by their residuals
 _FALSE_ALARM: Final = 0.01
-"""Share of sites with ranges as good as stated whose residuals nevertheless seem to contradict that."""
+"""Share of sites whose ranges are as good as stated but whose residuals seem to contradict that."""
 
 _MAX_ROUNDS: Final = 4
 
@@ -72,7 +72,7 @@ class Fitted(Struct, frozen=True, eq=False):
     """Shape (m,): ranges in use."""
     range_std_m: float
     core: Mask
-    """Shape (k,): anchors that are determined."""
+    """Shape (k,): determined anchors."""
     covariance_m2: Array
     """Shape (4 k, 4 k), coordinates and delays, aligned over the core, or over all if no anchor is determined."""
     points_used: tuple[int, ...]
@@ -86,7 +86,7 @@ class Fitted(Struct, frozen=True, eq=False):
 
 
 def fit_shape(measured: Measured, kept: Integers) -> Fitted:
-    """The shape, without and then with known points, with the error of ranges that its residuals show."""
+    """Fit the shape, first without and then with known points, with the range error that the residuals show."""
     facts = measured.facts
     anchors = tuple(measured.anchors[index] for index in kept)
     sketch = as_array(facts.sketch_m, anchors) if facts.sketch_m else None
@@ -119,7 +119,7 @@ def _round(
     extra: list[Array],
 ) -> Fitted:
     problem, pairs = build_problem(measured, kept, range_std_m, point, sketch)
-    # a known point decides more than a sketch; a start needs no more than the latter.
+    # Starts only need the sketch; known points take part in the fit.
     robust = fit_robustly(problem, [*start_positions(problem, sketch), *extra], range_std_m)
     problem, solution, used = robust.problem, robust.solution, robust.used
     if sketch is not None:
@@ -134,7 +134,7 @@ def _round(
 def _determined(
     measured: Measured, kept: Integers, problem: Problem, solution: Solution, used: Mask, point: Array | None
 ) -> tuple[Mask, Array]:
-    """Which anchors are determined, and the covariance aligned over them."""
+    """Mask of the determined anchors, and the covariance aligned over them."""
     weight = used.astype(np.float64)
     surveyed = structs.replace(problem, coordinate_variance_m2=_without_sketch(measured, kept, point))
     rows = jacobian(surveyed, solution.position_m, weight)
@@ -156,9 +156,9 @@ def _determined(
 
 
 def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Mask) -> Array:
-    """The covariance, aligned over the core, of the shape or of one within 1 σ along its least certain direction.
+    """The largest covariance, aligned over the core, of shapes within 1 σ along the least certain direction.
 
-    Errors bend a shape that only expected delays hold, and a bent one seems to be held by its ranges.
+    Errors bend a shape that is held only by expected delays, and a bent shape seems to be held by its ranges.
     """
 
     def covariance_at(at_m: Array) -> Array:
@@ -174,7 +174,7 @@ def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Ma
 
 
 def with_tag(fitted: Fitted, rows: MoreRows, solution: Solution, used: Mask) -> Fitted:
-    """The shape with what a tag received, where that is in the solution."""
+    """The shape with a tag's rows, for a solution that includes them."""
     problem = structs.replace(fitted.problem, more=(*fitted.problem.more, rows))
     core, covariance = _determined(fitted.measured, fitted.kept, problem, solution, used, _points(fitted))
     return structs.replace(fitted, problem=problem, solution=solution, used=used, core=core, covariance_m2=covariance)
@@ -200,7 +200,7 @@ def _without_sketch(measured: Measured, kept: Integers, point: Array | None) -> 
 def _held_by_points(
     free: Fitted, point: Array, sketch: Array | None
 ) -> tuple[Mask, Array | None, Array | None, list[str]]:
-    """Points that agree with the shape, the shape and the sketch moved to them, and sentences about the others."""
+    """Mask of the points that agree with the shape, shape and sketch moved to them, and sentences on the others."""
     facts, anchors, position = free.measured.facts, free.anchors, free.solution.position_m
     is_given: Mask = np.asarray(np.isfinite(point[:, :2]).all(axis=1))
     axes = 2 if levels(free.measured) else 3
@@ -246,7 +246,7 @@ def _moved_sketch(sketch: Array | None, motion: Motion) -> Array | None:
 
 
 def _shown_std_m(fitted: Fitted) -> float:
-    """Constant error of a pair that the residuals show, if they contradict the assumed one; 0 otherwise."""
+    """Constant error of a pair from the residuals, if they contradict the assumed one; otherwise 0."""
     problem, used = fitted.problem, fitted.used
     full = jacobian(problem, fitted.solution.position_m, used.astype(np.float64))
     everyone = np.ones(len(fitted.kept), bool)
@@ -267,7 +267,7 @@ def _shown_std_m(fitted: Fitted) -> float:
 
 
 def redundancy(fitted: Fitted) -> int:
-    """Measurements in use less unknowns that they determine; delays known to a range's error are no unknowns."""
+    """Measurements in use less the unknowns that they determine; delays known as well as a range are no unknowns."""
     problem, _ = with_free_delays(surveyed_problem(fitted))
     rows = jacobian(problem, fitted.solution.position_m, fitted.used.astype(np.float64))
     return int(np.any(rows != 0.0, axis=1).sum()) - determination.rank(rows)
@@ -285,9 +285,9 @@ def _points(fitted: Fitted) -> Array | None:
 
 
 def with_tags(fitted: Fitted, others: tuple[OtherFit, ...]) -> tuple[Fitted, tuple[OtherFit, ...]]:
-    """The shape with all tags that fit it, and those of the other results that they do not rule out.
+    """The shape with all tags that fit it, and the other results that the tags do not rule out.
 
-    Sentences say what was used and what was not.
+    Its notes say what was used.
     """
     ranges_m = {(pair.a, pair.b): pair.range_m for pair in fitted.measured.pairs}
     for epochs in fitted.measured.facts.tags:
@@ -308,20 +308,20 @@ def with_tags(fitted: Fitted, others: tuple[OtherFit, ...]) -> tuple[Fitted, tup
 
 # Sentences: what a survey does not determine, why, and which distances to measure.
 
-_FLAT: Final = 0.3  # a site is flat if its smallest extent is a smaller part of its largest one
+_FLAT: Final = 0.3  # a site is flat if its smallest extent is a smaller share of its largest one
 _ONE_AXIS: Final = 0.7
-"""Positions change along one direction if at least this part of their squared changes is along it."""
+"""Positions change along one direction if at least this share of their squared changes is along it."""
 
 _NOTABLE_BEND_M: Final = 0.01
 _BENT_SIGMA: Final = 3.0
 """A shape with at least this standard deviation is also examined when bent, by up to this multiple of it."""
 
-_AXIS_PART: Final = 0.9  # a direction is that of an axis if the square of the cosine between both is larger
+_AXIS_PART: Final = 0.9  # a direction is along an axis if the squared cosine between both is larger
 _UNLIKELY_SIGMAS: Final = 3.0
 
 
 def unlikely_delays(anchors: Iterable[SurveyedAnchor], facts: Facts) -> tuple[str, ...]:
-    """Sentences about delays far beyond what is expected: a wrong height, tape or point of an anchor looks so."""
+    """Sentences about unexpectedly large delays, a sign of an anchor's wrong height, tape or point."""
     expected_m = math.hypot(facts.delay_std_m, facts.common_delay_std_m if facts.delay_std_m > 0.0 else 0.0)
     return tuple(
         f"the delay of anchor {one.id} is off by {100.0 * one.delay_m:.0f} cm, where ±{100.0 * expected_m:.0f} cm is "
@@ -382,13 +382,13 @@ def _loose(fitted: Fitted) -> dict[int, str]:
 
 
 def missing_sentences(measured: Measured, links: Links, fitted: Fitted | None) -> tuple[str, ...]:
-    """One for each reason: which anchors, why, and which distances to measure."""
+    """One sentence per reason: which anchors are not determined, why, and which distances to measure."""
     if not measured.anchors:
         return ("no anchor is determined: there are no anchors",)
     reasons = anchor_reasons(measured, links, fitted)
     by_reason: dict[str, list[int]] = {}
     for anchor, reason in reasons.items():
-        # Anchors with equally few ranges share a sentence, which then does not name to whom they are.
+        # Anchors with equally few ranges share a sentence, which then does not say to whom the ranges are.
         by_reason.setdefault(re.sub(r", to .*;", ";", reason), []).append(anchor)
     by_reason = {reasons[anchors[0]] if len(anchors) == 1 else reason: anchors for reason, anchors in by_reason.items()}
     sentences = []
@@ -425,7 +425,7 @@ def _distances_to_measure(measured: Measured, links: Links, fitted: Fitted | Non
 
 
 def _far_apart(near: list[int], placed: list[int], fitted: Fitted, count: int) -> list[int]:
-    """Anchors of ``near`` that are far from one another."""
+    """Choose ``count`` anchors of ``near`` that are far from one another."""
     number = {index: k for k, index in enumerate(fitted.kept.tolist())}
     position = fitted.solution.position_m
     chosen: list[int] = []
@@ -444,7 +444,7 @@ def _advised(pairs: list[tuple[int, int]]) -> str:
 
 
 def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
-    """A sentence where only the expected delays separate delays from positions."""
+    """A sentence if only the expected delays separate delays from positions."""
     surveyed, unknown = with_free_delays(surveyed_problem(fitted))
     if not unknown.any():
         return ()
@@ -472,7 +472,7 @@ def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
 
 
 def _expected_m(problem: Problem, delay_m: Array) -> float:
-    """How much one delay is expected to be off in such a change of delays."""
+    """Expected error of one delay in a joint change of delays."""
     along = float(np.sum((delay_weights(problem) @ delay_m) ** 2))
     common = 0.0 if problem.common_delay_m is None else float(np.median(problem.common_delay_m))
     one = math.sqrt(float(np.median(problem.delay_variance_m2)) + common**2)
@@ -480,10 +480,10 @@ def _expected_m(problem: Problem, delay_m: Array) -> float:
 
 
 def _least_held(fitted: Fitted, surveyed: Problem) -> tuple[Array, Array]:
-    """Positions that the fit does not exclude and that ranges alone hold least, with their covariance.
+    """Possible positions that ranges alone hold least, with their covariance.
 
-    Where only expected delays hold a shape, they are off, and bend it: a bent shape seems to be held by its ranges,
-    although the true one is not. So the shapes along the least certain direction are looked at, up to 3 σ.
+    If a shape is held only by expected delays, their errors bend it, and a bent shape seems to be held by its ranges
+    although the true one is not. So shapes along the least certain direction are examined, up to 3 σ.
     """
     weight = fitted.used.astype(np.float64)
     start = fitted.solution.position_m
@@ -512,7 +512,7 @@ def _touched(size: Array, allowed: Mask) -> Mask:
 
 
 def _axis(fitted: Fitted, framed: Framed, directions: list[determination.Direction]) -> str:
-    """Along what the positions change: an axis, or the pair of anchors that is the most parallel."""
+    """Direction in which the positions change, in words: an axis, or the most parallel pair of anchors."""
     shift = np.concatenate([direction.shift_m @ framed.motion.rotation.T for direction in directions])
     values, vectors = np.linalg.eigh(shift.T @ shift)
     if values[-1] < _ONE_AXIS * values.sum():
@@ -529,7 +529,7 @@ def _axis(fitted: Fitted, framed: Framed, directions: list[determination.Directi
 
 
 def unchecked(fitted: Fitted) -> str | None:
-    """A sentence where too few ranges check the result."""
+    """A sentence if too few ranges check the result."""
     checks, excluded = redundancy(fitted), int((~fitted.used).sum())
     if checks <= 0:
         return "nothing checks this survey: there are as many unknowns as ranges"
@@ -544,7 +544,7 @@ def unchecked(fitted: Fitted) -> str | None:
 
 
 def advised_tapes(fitted: Fitted) -> tuple[TapeAdvice, ...]:
-    """The three distances that would help most, one after another."""
+    """The three distances that would help most, each given those before it."""
     problem = fitted.problem
     chosen = best_tapes(problem, fitted.solution.position_m, fitted.covariance_m2, fitted.core)
     return tuple(_advice(fitted, item) for item in chosen)

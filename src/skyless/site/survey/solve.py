@@ -1,11 +1,11 @@
-"""A survey: positions and delays of all anchors from the ranges of their pairs and what the user knows.
+"""Survey: positions and delays of all anchors from the ranges of their pairs and the user's facts.
 
 Counting comes first: only anchors with enough ranges are fitted. The fit finds a shape (``shape.py``), which is moved
-to its frame (``frame.py``); then follows what is not determined (``shape.py``).
+to its frame (``frame.py``); then ``shape.py`` tells what is not determined.
 
-Where positions are given and stay, only delays are sought. Positions are held in the fit, and their errors count as
-errors of the ranges. Delays then make up for a part of the positions' errors: they are farther from the truth than
-those of a joint fit, and a tag that uses both is closer to it (``docs/maths.md`` section 9).
+If positions are given and kept, only delays are estimated, and the positions' errors count as errors of the ranges.
+Delays then compensate for a part of the positions' errors: they are farther from the truth than those of a joint fit,
+but a tag that uses both is closer to it (``docs/maths.md`` section 9).
 """
 
 import math
@@ -56,21 +56,21 @@ from skyless.site.survey.shape import (
 )
 from skyless.site.survey.walk import TagEpochs, fit_with_tag
 
-_MOVED_M: Final = 0.1  # an anchor whose position differs less in another result is at the same position
+_MOVED_M: Final = 0.1  # an anchor that differs less between two results is at the same position
 _ELSEWHERE: Final = 0.3
-"""Share of the largest distance of an anchor between two results above which an anchor is elsewhere; below it only
+"""An anchor is elsewhere in another result if it moves by more than this share of the largest motion; with less it only
 follows the others."""
 
-_SAME_M: Final = 0.5  # two other results whose anchors elsewhere are as near to each other are the same
+_SAME_M: Final = 0.5  # two alternative results are the same if their moved anchors are this near to each other
 _MAX_NAMED: Final = 3  # anchors whose places are named
 _DECIDES: Final = 0.7
-"""Among distances that differ by this share of the largest difference or more, the shortest decides."""
+"""The shortest of the distances whose difference is at least this share of the largest is the one to measure."""
 
 
 def run_survey(ranges: PairRanges, facts: Facts) -> Survey:
-    """Positions and delays, or, where there are none, why.
+    """Estimate positions and delays, or say why they are not determined.
 
-    What is not determined has no figures. Ranges and facts that do not suffice or do not fit raise nothing:
+    Anchors that are not determined have no figures. Insufficient or contradictory ranges and facts raise no error:
     ``not_determined`` and ``notes`` name them.
     """
     measured = usable(ranges, facts)
@@ -118,7 +118,7 @@ def _links(measured: Measured) -> Links:
     unknown = np.full(len(index), facts.dimensions)
     if facts.dimensions == 3 and levels(measured):
         unknown[[index[anchor] for anchor in facts.heights_m]] -= 1
-    # a sketch shows which of two positions is the right one.
+    # A sketch shows which of two positions is the right one.
     unknown[[index[anchor] for anchor in facts.sketch_m]] -= 1
     is_known: Mask = np.asarray(
         np.isfinite(as_array(facts.points, measured.anchors)[:, : facts.dimensions]).all(axis=1)
@@ -173,7 +173,7 @@ def _pairs(measured: Measured, fitted: Fitted | None) -> tuple[SurveyedPair, ...
 
 
 def _ambiguities(fitted: Fitted, framed: Framed, others: tuple[OtherFit, ...]) -> tuple[Ambiguity, ...]:
-    """Each other place once: results that differ only in what else came late are the same to a user."""
+    """The alternative results, without those that differ only in which ranges came late."""
     found: list[Ambiguity] = []
     for other in others:
         position_m = framed.motion.moved(other.position_m)
@@ -196,7 +196,7 @@ def _is_same(one: dict[int, tuple[float, float, float]], other: dict[int, tuple[
 def _sentence(
     fitted: Fitted, framed: Framed, other: OtherFit, position_m: Array, distance_m: Array, elsewhere: Integers
 ) -> str:
-    """Which anchors are elsewhere, where, by how much the rest differs, and which tape decides."""
+    """Say which anchors are elsewhere, where, by how much the others differ, and which distance decides."""
     case, here_m = _case(fitted, other.used), framed.position_m
     if len(elsewhere) > _MAX_NAMED:
         anchors = anchors_named([fitted.anchors[index] for index in elsewhere])
@@ -256,14 +256,14 @@ def _nothing(measured: Measured, links: Links, fitted: Fitted | None) -> Survey:
     )
 
 
-# Delays alone, of anchors whose positions stay
+# Only delays, of anchors whose positions are kept
 
 
 _NO_POSITION = "no position is given for it"
 
 
 def survey_of_kept_positions(measured: Measured) -> Survey:
-    """Delays with their standard deviations; positions are those of the sketch. Anchors without one have no figures."""
+    """Estimate only delays; positions are those of the sketch, and anchors without one have no figures."""
     facts = measured.facts
     sketch = as_array(facts.sketch_m, measured.anchors)
     sketch[:, 2] = np.where(np.isnan(sketch[:, 2]), fixed_heights_m(measured), sketch[:, 2])
@@ -321,7 +321,7 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
 def _kept_with_tags(
     fit: RobustFit, measured: Measured, ids: tuple[int, ...], position_m: Array
 ) -> tuple[RobustFit, Array, tuple[str, ...]]:
-    """The fit with what tags received, their information on coordinates and delays, (4 k, 4 k), and sentences."""
+    """The fit with the tags' receptions, their information on coordinates and delays, (4 k, 4 k), and sentences."""
     ranges_m = {(pair.a, pair.b): pair.range_m for pair in measured.pairs}
     information = np.zeros((4 * len(ids), 4 * len(ids)))
     sentences: list[str] = []
@@ -340,7 +340,7 @@ def _kept_with_tags(
 def _delay_covariance(
     fit: RobustFit, position_m: Array, position_std_m: float, dimensions: int, tag_information: Array
 ) -> Array:
-    """Covariance of the delays, shape (k, k); errors of positions are shared by all ranges of an anchor."""
+    """Covariance of the delays, shape (k, k), with position errors, which all ranges of an anchor share."""
     problem, k = fit.problem, len(position_m)
     weight = fit.used / problem.variance_m2
     incidence = _incidence(problem)
@@ -362,7 +362,7 @@ def _delay_covariance(
 
 
 def _incidence(problem: Problem) -> Array:
-    """Shape (m, k): 1 where a range has the delay of an anchor."""
+    """Incidence matrix of ranges and anchors, shape (m, k): 1 where a range contains an anchor's delay."""
     rows = np.zeros((len(problem.first), len(problem.delay_m)))
     number = np.arange(len(rows))
     rows[number, problem.first] = 1.0

@@ -1,15 +1,15 @@
-"""A survey's result in a site: positions, TX antenna delays, and how accurate both are.
+"""Write a survey's result into a site: positions, TX antenna delays, and their accuracy.
 
-What goes where (``docs/survey.md``, "What is written"):
+Rules (``docs/survey.md``, "What is written"):
 
-- The antenna delay of an anchor's transmissions grows by 2·h; then h is 0 for tags and anchors alike.
-- The accuracy of positions goes to each anchor in protocol 2 (``std_m``), in protocol 1 as one figure for all
-  (``accuracy.survey_std_m``). Errors of delays are not added: a survey's delays are off in such a way that they make up
-  for errors of its positions, so that a tag sees less than either alone.
+- The TX antenna delay of an anchor grows by 2·h; then h is 0 for tags and anchors alike.
+- The accuracy of positions is stated per anchor in protocol 2 (``std_m``), and as one figure for all in protocol 1
+  (``accuracy.survey_std_m``). Errors of delays are not added: they partly compensate for errors of the positions, so
+  that a tag sees less than either alone.
 - ``accuracy.range_std_m`` is raised to the constant error of the ranges between anchors, if that is larger: a tag's
   ranges are not better.
-- Where delays change, something of the accuracy does, by 0.1 mm if nothing else: tags see from it that they have to
-  begin again. What they have learned of ranges holds the earlier delays, and delays are not on the air.
+- If delays change, the accuracy changes as well, by 0.1 mm if nothing else: this tells tags to start anew, because the
+  range errors that they have learned include the old delays, and delays are not sent on the air.
 """
 
 import math
@@ -24,31 +24,18 @@ from skyless.core.site import AccuracySite, AnchorSite, Site, UnplacedAnchor
 from skyless.core.ticks import TICK_M
 from skyless.site.file.check import SITE_LIMITS, check_site
 from skyless.site.file.load import with_values
-from skyless.site.survey.facts import (
-    Survey,
-    SurveyedAnchor,
-)
+from skyless.site.survey.facts import Survey, SurveyedAnchor
 
 _DELAY: Final = SITE_LIMITS["anchors.tx_antenna_delay_ticks"]
-
-
 _MAX_STATED_M: Final = SITE_LIMITS["anchors.std_m"].high
-
-
 _RANGE_STD: Final = SITE_LIMITS["accuracy.range_std_m"]
-
-
 _STD_STEPS_PER_M: Final = 1e4
-
-
 _POSITION_DIGITS: Final = 4
-
-
 _KEYS: Final = ("x_m", "y_m", "z_m", "tx_antenna_delay_ticks", "std_m")
 
 
 def surveyed_site(site: Site, survey: Survey) -> Site:
-    """The site with what the survey has determined; all other anchors stay as they are.
+    """The site updated with the survey's determined anchors; all others are unchanged.
 
     Anchors that had no position come after those that had one, so the order may differ from that of a file.
 
@@ -70,11 +57,11 @@ def surveyed_site(site: Site, survey: Survey) -> Site:
 
 
 def surveyed_text(text: str, survey: Survey, site: Site, path: str | PathLike[str]) -> str:
-    """The text of the site's file with the same changes as ``surveyed_site``; comments and layout stay.
+    """The text of the site's file with the changes of ``surveyed_site``, keeping comments and layout.
 
     Raises:
-        ConfigurationError: the file is written in a form that this cannot edit, or the result is no valid site, such as
-            one whose anchors share slots too near.
+        ConfigurationError: the file has a form that cannot be edited, or the result is no valid site, for instance
+            because anchors that share a slot are too near.
         SkylessError: an anchor would need an antenna delay that no radio has.
     """
     new = surveyed_site(site, survey)
@@ -96,7 +83,7 @@ def unchanged_anchors(site: Site, survey: Survey) -> tuple[int, ...]:
 
 
 def delay_changes_ticks(site: Site, survey: Survey) -> dict[int, int]:
-    """What is added to the TX antenna delays of determined anchors of the site.
+    """Changes of the TX antenna delays of the site's determined anchors.
 
     Raises:
         SkylessError: an anchor would need an antenna delay that no radio has.
@@ -110,9 +97,9 @@ def delay_changes_ticks(site: Site, survey: Survey) -> dict[int, int]:
 
 
 def delay_differences_m(recorded: Site, site: Site) -> dict[int, float]:
-    """By how much half of the antenna delays of anchors is larger in a site than in a recording of it.
+    """Half the increase of each anchor's antenna delays from a recording of the site to the site.
 
-    ``PairRanges.without_delays`` subtracts them from ranges that were measured with the delays of the recording.
+    To be subtracted with ``PairRanges.without_delays`` from ranges measured with the delays of the recording.
     """
     before = {anchor.id: anchor for anchor in recorded.all_anchors}
     half_m = {}
@@ -143,7 +130,7 @@ def _placed(
 
 
 def _delay_ticks(anchor: AnchorSite | UnplacedAnchor, found: SurveyedAnchor) -> int:
-    """The TX antenna delay with what the survey adds. Raises SkylessError."""
+    """The anchor's TX antenna delay after the survey. Raises SkylessError if no radio has such a delay."""
     ticks = anchor.tx_antenna_delay_ticks + round(2.0 * (found.delay_m or 0.0) / TICK_M)
     if not _DELAY.contains(ticks):
         raise SkylessError(f"anchor {anchor.id} would need an antenna delay of {ticks}; it should be {_DELAY}")
@@ -169,13 +156,13 @@ def _accuracy(site: Site, found: dict[int, SurveyedAnchor], range_std_m: float) 
 
 
 def _another_std(std_m: float) -> float:
-    """The next step on the air, or the one before where there is none."""
+    """The next larger value that the air format can state, or the next smaller one at the upper limit."""
     more_m = _up(std_m, _STD_STEPS_PER_M) + 1.0 / _STD_STEPS_PER_M
     return round(more_m if _RANGE_STD.contains(more_m) else more_m - 2.0 / _STD_STEPS_PER_M, 4)
 
 
 def _changes(before: AnchorSite | UnplacedAnchor, after: AnchorSite) -> dict[str, float]:
-    """Keys whose values differ, or which the anchor had not."""
+    """Values that are new or differ, by key."""
     return {
         key: getattr(after, key)
         for key in _KEYS
@@ -184,10 +171,10 @@ def _changes(before: AnchorSite | UnplacedAnchor, after: AnchorSite) -> dict[str
 
 
 def _rounded(value_m: float) -> float:
-    """To a tenth of a millimetre, and never minus zero."""
+    """Round to a tenth of a millimetre, never to minus zero."""
     return round(value_m, _POSITION_DIGITS) + 0.0
 
 
 def _up(value_m: float, steps_per_m: float) -> float:
-    """Rounded up to whole steps, so that nothing is stated to be more accurate than it is."""
+    """Round up to whole steps, so that no stated accuracy is too good."""
     return math.ceil(value_m * steps_per_m - 1e-6) / steps_per_m

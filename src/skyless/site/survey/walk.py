@@ -1,9 +1,8 @@
-"""What a tag that is carried around, or stands at known positions, adds to a survey (``docs/survey.md``).
+"""Contribution to a survey of a tag that is carried around or stands at known positions (``docs/survey.md``).
 
 In epoch k the range to anchor j is ``|p_k − a_j| + h_j + o_j + s·ln(|p_k − a_j| / 3 m) + c_k``. The tag's position p_k
-and clock c_k are free in every epoch; the anchor's own constant o_j and the slope s, both from the strength of signals,
-are the same in all. What remains once these are eliminated (Schur complement) constrains the anchors' positions and
-delays h.
+and clock c_k are free in every epoch; the anchor's own constant o_j and the slope s, both due to signal strength, are
+the same in all. After these are eliminated (Schur complement), the rest constrains the anchors' positions and delays h.
 """
 
 from array import array
@@ -27,16 +26,16 @@ from skyless.site.survey.robust import LATE_CUTOFF
 
 
 EPOCH_S: Final = 0.5
-"""Reflections change while a tag is carried for half a second: the errors of two epochs count as independent."""
+"""Reflections change within half a second of carrying a tag, so the errors of two epochs count as independent."""
 
 WALK_OFFSET_STD_M: Final = 0.07
-"""Constant by which a tag's ranges to an anchor differ from what the anchors' own ranges say of its delay: stamps of
-strong signals are early (APS011), and signals are stronger or weaker between anchors than at a tag."""
+"""Standard deviation of the constant by which an anchor's delay differs between a tag's ranges and those of anchors:
+stamps of strong signals are early (APS011), and signals between anchors are stronger or weaker than at a tag."""
 
-_MAX_SAMPLES: Final = 2_000_000  # twenty minutes of a site with 12 anchors; what comes later is not used
+_MAX_SAMPLES: Final = 2_000_000  # twenty minutes of a site with 12 anchors; later samples are not used
 _LONE_STD_M: Final = 0.07  # of a single difference, for its weight against the velocity's prior
 _FLOOR_COUNT: Final = 20
-"""With more samples of a pair in one epoch the errors that they share exceed their noise: the weight grows no more."""
+"""More samples of a pair in one epoch do not increase its weight, as their common errors exceed their noise."""
 
 _SPEED_STD_MPS: Final = 1.5
 _REJECT: Final = 4.0
@@ -45,44 +44,44 @@ _HUBER_ROUNDS: Final = 4
 
 
 class TagEpochs(TagReceived, frozen=True, eq=False):
-    """Differences of one tag, ``r`` means over an epoch and a pair of anchors, in ``k`` epochs; ``n`` anchors.
+    """One tag's differences to ``n`` anchors in ``k`` epochs: ``r`` means, each over an epoch and a pair of anchors.
 
-    A difference is the range to ``second`` less that to ``first``, both with their delays h, plus the range of the pair
-    as the anchors measure it: ``second`` has received ``first`` and sent its own stamp of it. ``tag_ranges`` subtracts
-    the pair's range with all its errors, which are the same.
+    A difference is the range to ``second`` less that to ``first``, both with their delays h, plus the pair's range as
+    measured by the anchors: ``second`` has received ``first`` and sent its stamp of that. ``tag_ranges`` subtracts the
+    pair's range, which has the same errors.
     """
 
     anchors: tuple[int, ...]
     """In ascending order."""
     t_s: Vector
-    """Shape (k,): the middle of each epoch."""
+    """Shape (k,): middle of each epoch."""
     epoch: Integers
     first: Integers
     second: Integers
     """Shape (r,): indices."""
     difference_m: Vector
     since_s: Vector
-    """Shape (r,): mean time of a difference's samples since the middle of its epoch."""
+    """Shape (r,): mean time of a difference's samples relative to the middle of its epoch."""
     count: Integers
     """Shape (r,): samples in the mean."""
     known_m: Array
-    """Shape (k, 3): the tag's coordinates where they are known, NaN elsewhere."""
+    """Shape (k, 3): known coordinates of the tag, NaN where unknown."""
     known_std_m: tuple[float, float, float] = (0.01, 0.01, 0.01)
     offset_std_m: float = WALK_OFFSET_STD_M
-    """Standard deviation of each anchor's own constant at the tag, apart from its delay."""
+    """Standard deviation of each anchor's own constant at the tag, beyond its delay."""
     name: str = "the walk"
     """For sentences."""
 
 
 class EpochCollector:
-    """Gathers a tag's differences as they come."""
+    """Gathers a tag's differences and averages them over epochs."""
 
     def __init__(self) -> None:
         self._times, self._values = array("d"), array("d")
         self._firsts, self._seconds = array("q"), array("q")
 
     def add(self, t_s: float, first: int, second: int, difference_m: float) -> None:
-        """Add the range to ``second`` less that to ``first`` at a time."""
+        """Add one sample: the range to ``second`` less that to ``first``."""
         if len(self._times) < _MAX_SAMPLES:
             self._times.append(t_s)
             self._firsts.append(first)
@@ -90,7 +89,7 @@ class EpochCollector:
             self._values.append(difference_m)
 
     def epochs(self) -> TagEpochs:
-        """All that was gathered; samples that are far from the median of their pair and epoch are left out."""
+        """Means per epoch and pair, without samples far from the median of their pair and epoch."""
         t_s, value_m = np.array(self._times), np.array(self._values)
         ids = np.array([self._firsts, self._seconds], dtype=np.int64).reshape(2, -1)
         anchors = np.unique(ids)
@@ -130,10 +129,10 @@ def _group_medians(group_of: Integers, values: Vector, groups: int) -> Vector:
 
 
 def tag_ranges(epochs: TagEpochs, pair_ranges_m: Mapping[tuple[int, int], float]) -> Array:
-    """Ranges to all anchors in each epoch up to one constant, shape (k, n); NaN where there are none.
+    """Ranges to all anchors in each epoch, up to one constant per epoch, shape (k, n); NaN where there are none.
 
-    ``pair_ranges_m``: of the anchors, by identifiers in ascending order. A difference whose pair is missing there is
-    not used. Anchors that an epoch's differences do not tie to most others are NaN.
+    ``pair_ranges_m``: ranges between anchors, by identifiers in ascending order. Differences of other pairs are not
+    used. Anchors that an epoch's differences do not link to its largest group are NaN.
     """
     k, n = len(epochs.t_s), len(epochs.anchors)
     of_pair = np.full((n, n), np.nan)
@@ -168,7 +167,7 @@ def tag_ranges(epochs: TagEpochs, pair_ranges_m: Mapping[tuple[int, int], float]
 
 
 def _largest_part(first: Integers, second: Integers, k: int, n: int) -> Array:
-    """Whether each anchor is in its epoch's largest part that differences tie together, shape (k, n), truth values."""
+    """Mask of the anchors in their epoch's largest group linked by differences, shape (k, n)."""
     edges = coo_array((np.ones(len(first)), (first, second)), shape=(k * n, k * n))
     label = connected_components(edges, directed=False)[1]
     size = np.bincount(label, minlength=k * n)
@@ -182,13 +181,13 @@ def _largest_part(first: Integers, second: Integers, k: int, n: int) -> Array:
 
 
 TAG_STD_M: Final = 0.1
-"""Standard deviation of a range in one epoch. Noise and reflections make 0.07 m, but some reflections return with each
-round through a room: with 0.07 m, flights of four minutes spoil a room's horizontal positions by a fifth."""
+"""Standard deviation of a range in one epoch. Noise and reflections give 0.07 m, but some reflections recur with each
+round through a room: with 0.07 m, flights of four minutes worsen a room's horizontal positions by a fifth."""
 
-_MIN_SCALE_M: Final = 0.05  # of residuals, when ranges that do not fit are looked for
-_MIN_FREE: Final = 0.05  # least part of a range's error that is assumed to show in its residual
+_MIN_SCALE_M: Final = 0.05  # least scale of residuals in the search for outliers
+_MIN_FREE: Final = 0.05  # least share of a range's error assumed to show in its residual
 _SLOPE_M: Final = 0.025
-_SLOPE_STD_M: Final = 0.03  # between none, and 0.05 m of a typical DW1000 (docs/calibration.md)
+_SLOPE_STD_M: Final = 0.03  # covers no slope as well as the 0.05 m of a typical DW1000 (docs/calibration.md)
 _SLOPE_RANGE_M: Final = 3.0
 _NEAREST_M: Final = 0.3
 _INNER_STEPS: Final = 30
@@ -197,18 +196,18 @@ _LONGEST_STEP_M: Final = 2.0
 _SINGULAR: Final = 1e-9
 _GRID: Final = 9  # positions along each horizontal axis from which an epoch may start
 _ELSEWHERE_M: Final = 2.0
-"""If an anchor has moved by more since the last evaluation, it is another result: the tag's positions start again."""
+"""If an anchor has moved by more since the last evaluation, the result is a different one: the tag starts anew."""
 
 _LEVELS: Final = 5  # heights from which a walk may start; all of its epochs start at one
 
 
 class WalkRows:
-    """A tag's ranges as rows of a problem; the tag's positions are the start of the next evaluation."""
+    """A tag's ranges as rows of a problem; each evaluation starts at the tag's positions of the one before."""
 
     def __init__(self, epochs: TagEpochs, range_m: Array, position_m: Array) -> None:
-        """``range_m``: of ``tag_ranges`` with the problem's anchors as columns, shape (k, n); NaN where none.
+        """``range_m``: from ``tag_ranges``, with the problem's anchors as columns, shape (k, n); NaN where none.
 
-        ``position_m``: of the anchors, shape (n, 3), as a start.
+        ``position_m``: positions of the anchors as a start, shape (n, 3).
         """
         self._known_m = epochs.known_m
         self._prior = np.where(np.isfinite(epochs.known_m), 1.0 / np.array(epochs.known_std_m) ** 2, 0.0)
@@ -222,7 +221,7 @@ class WalkRows:
         self.tag_m = self._start(position_m)
         self.cost = 0.0
         self._latest: tuple[Array, Array, Mask, tuple[Array, Array]] | None = None
-        """Positions, delays and ranges in use of the latest rows, and these."""
+        """Positions, delays, ranges in use, and the rows of the latest evaluation."""
 
     @property
     def epochs(self) -> int:
@@ -231,7 +230,7 @@ class WalkRows:
 
     @property
     def excluded_share(self) -> float:
-        """Part of the ranges that is not in use."""
+        """Share of the ranges not in use."""
         return 1.0 - float(self.used.sum()) / max(int(self.measured.sum()), 1)
 
     @property
@@ -241,15 +240,15 @@ class WalkRows:
         return int(self.used.sum() - (self._fewest[busy] - 1).sum())
 
     def residuals_m(self, position_m: Array, delay_m: Array) -> Array:
-        """Measured less modelled ranges with the latest positions of the tag, shape (k, n); 0 where none was made."""
+        """Measured less modelled ranges at the latest tag positions, shape (k, n); 0 where none was measured."""
         distance = self._distances(position_m)
         model = distance + delay_m + self._offset_m + self._slope_m * np.log(distance / _SLOPE_RANGE_M)
         return np.asarray(np.where(self.measured, self._range_m - model - self._clock_m[:, None], 0.0))
 
     def exclude_beyond(self, position_m: Array, delay_m: Array, limit: float) -> None:
-        """Exclude of each epoch the range that fits worst, if it is off by more than ``limit`` standard deviations.
+        """Exclude each epoch's worst range if it is off by more than ``limit`` standard deviations.
 
-        Residuals are scaled up by what the tag's free position and clock take out of them.
+        Residuals are scaled up by the share that the tag's free position and clock absorb.
         """
         local, _, residual = self._derivatives(position_m, delay_m)
         inverse = self._inverse_local(local)
@@ -261,7 +260,7 @@ class WalkRows:
             self.used = self._with_enough(self.used & ~worst)
 
     def rows(self, position_m: Array, delay_m: Array) -> tuple[Array, Array]:
-        """Jacobian and residuals as ``MoreRows`` has them; the last residual is what no position changes."""
+        """Jacobian and residuals as in ``MoreRows``; the last residual is the cost that no position changes."""
         if self._latest is not None:
             before_m, before_delay_m, used, rows = self._latest
             if used is self.used and np.array_equal(before_m, position_m) and np.array_equal(before_delay_m, delay_m):
@@ -291,7 +290,7 @@ class WalkRows:
         return _square_root(information, gradient[: 4 * n] - gain.T @ gradient[4 * n :], self.cost)
 
     def _locate_tag(self, position_m: Array, delay_m: Array) -> None:
-        """Gauss–Newton for the tag's positions, clocks and constants while the anchors stay."""
+        """Gauss–Newton for the tag's positions, clocks and constants with fixed anchors."""
         before = np.inf
         for _ in range(_INNER_STEPS):
             local, constants, residual = self._derivatives(position_m, delay_m)
@@ -311,7 +310,10 @@ class WalkRows:
             before = cost
 
     def _derivatives(self, position_m: Array, delay_m: Array) -> tuple[Array, Array, Array]:
-        """By tag and clock, (k, n, 4); by constants and slope, (k, n, n + 1); residuals, (k, n), 0 where not in use."""
+        """Derivatives by tag and clock, (k, n, 4), by constants and slope, (k, n, n + 1), and residuals, (k, n).
+
+        Residuals of ranges not in use are 0.
+        """
         k, n = self.used.shape
         distance = self._distances(position_m)
         growth = (1.0 + self._slope_m / distance) / distance
@@ -325,7 +327,10 @@ class WalkRows:
     def _eliminated(
         self, local: Array, whole: Array, residual: Array
     ) -> tuple[Array, Array, tuple[Array, Array, Array]]:
-        """Normal matrix and gradient of ``whole``'s g columns without tag and clocks; and what gives these back."""
+        """Normal matrix and gradient of ``whole``'s g columns after eliminating tag and clocks.
+
+        Also returns the terms from which tag and clocks can be computed again.
+        """
         weight = self.used / TAG_STD_M**2
         inverse = self._inverse_local(local)
         right = np.einsum("kjl,kj->kl", local, weight * residual)
@@ -340,14 +345,14 @@ class WalkRows:
         return normal, gradient, (inverse, cross, right)
 
     def _inverse_local(self, local: Array) -> Array:
-        """Covariance of tag and clock in each epoch while all else is known, shape (k, 4, 4)."""
+        """Covariance of tag and clock in each epoch given everything else, shape (k, 4, 4)."""
         normal = np.einsum("kjl,kj,kjm->klm", local, self.used / TAG_STD_M**2, local)
         diagonal = np.arange(3)
         normal[:, diagonal, diagonal] += self._prior
         return np.asarray(np.linalg.pinv(normal, rcond=_SINGULAR, hermitian=True))
 
     def _constants_prior(self) -> tuple[Array, Array]:
-        """Information on constants and slope, and how far they are from what is expected, each (n + 1,)."""
+        """Prior information on constants and slope, and expected less current values, each (n + 1,)."""
         prior = np.append(np.full(len(self._offset_m), self._offset_std_m**-2), _SLOPE_STD_M**-2)
         return prior, np.append(-self._offset_m, _SLOPE_M - self._slope_m)
 
@@ -361,11 +366,11 @@ class WalkRows:
         return np.asarray(np.maximum(np.sqrt(np.einsum("kja,kja->kj", apart, apart)), _NEAREST_M))
 
     def _with_enough(self, usable: Mask) -> Mask:
-        """Without epochs that have no more ranges than unknowns."""
+        """The mask without epochs that have too few ranges."""
         return np.asarray(usable & (usable.sum(axis=1) >= self._fewest)[:, None])
 
     def _start(self, position_m: Array) -> Array:
-        """The tag in each epoch, shape (k, 3): the best of a grid, all epochs on that level which fits best."""
+        """Start of the tag in each epoch, shape (k, 3): the best of a grid, with all epochs on the best level."""
         low, high = position_m.min(axis=0), position_m.max(axis=0)
         size = float((high - low)[:2].max())
         across = [np.linspace(low[axis] - 0.1 * size, high[axis] + 0.1 * size, _GRID) for axis in (0, 1)]
@@ -390,7 +395,7 @@ class WalkRows:
 
 
 def _square_root(information: Array, gradient: Array, cost: float) -> tuple[Array, Array]:
-    """Rows whose normal equations these are, and whose squared residuals sum up to the cost."""
+    """Jacobian and residuals that have these normal equations and this sum of squares."""
     values, vectors = np.linalg.eigh(information)
     kept = values > _SINGULAR * values.max(initial=0.0)
     root = np.sqrt(values[kept])
@@ -404,36 +409,36 @@ def _square_root(information: Array, gradient: Array, cost: float) -> tuple[Arra
 
 
 _FEWEST_EPOCHS: Final = 10
-_LIMIT: Final = 4.0  # standard deviations beyond which a range of the tag is not used
+_LIMIT: Final = 4.0  # standard deviations beyond which a tag's range is not used
 _MAX_EXCLUDED: Final = 0.2
 _FALSE_ALARM: Final = 1e-4  # probability that the chi-squared tests reject a walk that fits
 _RANGES_PER_INDEPENDENT: Final = 4.0
-"""The residuals of a walk are tested as if only every fourth range were independent: reflections outlast an epoch."""
+"""Residuals of a walk are tested as if only every fourth range were independent, as reflections outlast an epoch."""
 
-_CLEARLY: Final = 16.0  # a result whose cost is higher by this is not the right one
+_CLEARLY: Final = 16.0  # a result whose cost is higher by more than this is ruled out
 _EXCLUSION_ROUNDS: Final = 6
 
 
 class JointFit(Struct, frozen=True, eq=False):
-    """What came of a walk."""
+    """Result of a fit with a walk."""
 
     solution: Solution | None
-    """With the walk; None if it was not used."""
+    """Solution with the walk; None if it was not used."""
     chosen: int
-    """Which of the starts led to it."""
+    """Number of the start that led to ``solution``."""
     possible: tuple[int, ...]
-    """Starts whose results the walk does not rule out, ``chosen`` among them; all of them if it was not used."""
+    """Starts that the walk does not rule out, including ``chosen``; all if the walk was not used."""
     sentence: str
-    """What was done with it and why."""
+    """How the walk was used, or why not."""
     rows: WalkRows | None
-    """For fits that go on from ``solution``: ``replace(problem, more=(*problem.more, rows))``."""
+    """For further fits from ``solution``: ``replace(problem, more=(*problem.more, rows))``."""
 
 
 class _Trial(Struct, frozen=True, eq=False):
     solution: Solution
     rows: WalkRows
     cost: float
-    """With what ranges that are not used cost at the limit, those of the tag and those of anchors."""
+    """Including unused ranges of the tag and of anchors, each with the cost at its limit."""
 
 
 def fit_with_tag(
@@ -444,10 +449,10 @@ def fit_with_tag(
     pair_ranges_m: Mapping[tuple[int, int], float],
     used: Sequence[Mask] = (),
 ) -> JointFit:
-    """Fit ranges and tag together, from each of the results of the ranges ``alone``, of which the first is the best.
+    """Fit ranges and tag together, starting from each result of the ranges ``alone``, best first.
 
-    The first remains, unless the tag contradicts it clearly. ``anchors``: identifiers in the problem's order.
-    ``pair_ranges_m``: see ``tag_ranges``. ``used``: ranges in use, of each result; by default all.
+    The first result is kept unless the tag clearly contradicts it. ``anchors``: identifiers in the problem's order.
+    ``pair_ranges_m``: see ``tag_ranges``. ``used``: ranges in use in each result; by default all.
     """
     everything, name = tuple(range(len(alone))), epochs.name
     range_m = _of_anchors(tag_ranges(epochs, pair_ranges_m), epochs.anchors, anchors)
@@ -471,7 +476,7 @@ def fit_with_tag(
 
 
 def _of_anchors(range_m: Array, have: Sequence[int], wanted: Sequence[int]) -> Array:
-    """Columns of the wanted anchors; NaN where there is none."""
+    """Columns of the wanted anchors; NaN for missing ones."""
     column = {anchor: number for number, anchor in enumerate(have)}
     found = np.full((len(range_m), len(wanted)), np.nan)
     for number, anchor in enumerate(wanted):
@@ -496,7 +501,7 @@ def _trial(problem: Problem, start_m: Array, epochs: TagEpochs, range_m: Array, 
 
 
 def _unfit(problem: Problem, alone: Solution, trial: _Trial) -> str | None:
-    """Why ranges and walk are not to be used together."""
+    """Reason not to use ranges and walk together, or None."""
     rows, solution = trial.rows, trial.solution
     if rows.epochs < _FEWEST_EPOCHS:
         return f"only {rows.epochs} epochs of half a second have enough anchors; {_FEWEST_EPOCHS} are needed"
@@ -523,5 +528,5 @@ def _unfit(problem: Problem, alone: Solution, trial: _Trial) -> str | None:
 
 
 def _same(one: Solution, other: Solution) -> bool:
-    """Whether two results have the same distances, within 2 cm."""
+    """Whether two results have the same distances within 2 cm."""
     return bool(np.abs(distances_m(one.position_m) - distances_m(other.position_m)).max() < 0.02)

@@ -1,4 +1,4 @@
-"""The watch of a site's anchors: windows of ranges, what has changed in each, and what is found in two of three."""
+"""Watch of a site's anchors: changes of ranges in each window, and findings seen in two of three windows."""
 
 import math
 import warnings
@@ -29,20 +29,20 @@ from skyless.site.survey.facts import Facts, PairBlock, PairRange, PairRanges, S
 from skyless.site.survey.legs import STD_OVER_MAD
 from skyless.site.survey.pair_ranger import PairRanger, StepTable
 
-_USUAL_WINDOWS: Final = 60  # windows of which the usual range is the median
+_USUAL_WINDOWS: Final = 60  # windows in the median that is the usual range
 _DRIFT_WINDOWS: Final = 360
 _MIN_DRIFT_M: Final = 0.02
-_GIVEN_WINDOWS: Final = 30  # windows as which a given range counts
+_GIVEN_WINDOWS: Final = 30  # a given range counts as this many windows
 _PRIOR_DIFFERENCES: Final = 4
 _PRIOR_DRIFT_M: Final = 0.03  # expected drift of a pair, which counts as _PRIOR_DIFFERENCES observed differences
-_MIN_LAGS: Final = 6  # known windows over the distance of those compared, at least
-_NOISE_MEMORY: Final = 2000.0  # exchanges after which the estimate of their noise forgets
-_NOISE_JUMP: Final = 9.0  # by how much one block can be noisier than the blocks before
-_PRESENCE_MEMORY: Final = 60.0  # windows after which it is forgotten how regularly a pair's ranges came
+_MIN_LAGS: Final = 6  # least number of known windows per lag between compared ones
+_NOISE_MEMORY: Final = 2000.0  # exchanges that the noise estimate remembers
+_NOISE_JUMP: Final = 9.0  # largest ratio of one block's noise variance to that of the blocks before
+_PRESENCE_MEMORY: Final = 60.0  # windows over which the regularity of a pair's ranges is averaged
 
 
 class RangeHistory:
-    """Usual range, drift and noise of all pairs; a pair's row is its number."""
+    """Usual range, drift and noise of all pairs, indexed by pair number."""
 
     def __init__(self) -> None:
         self._usual = np.full((0, _USUAL_WINDOWS), np.nan)
@@ -51,12 +51,12 @@ class RangeHistory:
         self._values = np.full((0, _DRIFT_WINDOWS), np.nan)
         self._windows = 0
         self.usual_m = np.zeros(0)
-        """Shape (m,): the usual range; NaN where it is not known."""
+        """Shape (m,): the usual range; NaN where unknown."""
         self.noise_m2 = np.zeros(0)
         """Shape (m,): variance of one exchange."""
         self._noise_exchanges = np.zeros(0)
         self.first_m = np.zeros(0)
-        """Shape (m,): the range that was given, or the first median over ``usual_windows``; NaN before."""
+        """Shape (m,): the given range, or the first median over ``_USUAL_WINDOWS``; NaN before."""
         self.presence = np.zeros(0)
         """Shape (m,): share of the windows with both anchors in which the pair had a range."""
 
@@ -65,17 +65,14 @@ class RangeHistory:
 
     @property
     def windows(self) -> Array:
-        """Shape (m,): windows that the usual range is made of."""
+        """Shape (m,): windows in each usual range."""
         return np.minimum(self._used, _USUAL_WINDOWS).astype(np.float64)
 
     def add_pair(self, given_m: float | None = None) -> int:
-        """The number of another pair. ``given_m``: its range by the survey."""
+        """Add a pair and return its number. ``given_m``: its range by the survey."""
+        first_m, used = (np.nan, 0) if given_m is None else (given_m, _GIVEN_WINDOWS)
         row = np.full((1, _USUAL_WINDOWS), np.nan)
-        used = 0
-        if given_m is not None:
-            used = _GIVEN_WINDOWS
-            row[0, :used] = given_m
-        first_m = np.nan if given_m is None else given_m
+        row[0, :used] = first_m
         self._usual = np.concatenate([self._usual, row])
         self._used = np.append(self._used, used)
         self._values = np.concatenate([self._values, np.full((1, _DRIFT_WINDOWS), np.nan)])
@@ -87,7 +84,7 @@ class RangeHistory:
         return len(self._usual) - 1
 
     def add_noise(self, pair: int, variance_m2: float, exchanges: int) -> None:
-        """Count the noise of a block: variance of one exchange."""
+        """Update a pair's noise from a block. ``variance_m2``: of one exchange."""
         known = self._noise_exchanges[pair]
         if known > 0.0:
             variance_m2 = min(variance_m2, _NOISE_JUMP * self.noise_m2[pair])
@@ -98,8 +95,8 @@ class RangeHistory:
     def add_window(self, range_m: Array, is_usable: Mask, is_drifting: Mask, is_expected: Mask) -> None:
         """Add the ranges of a window, shape (m,), NaN where there is none.
 
-        ``is_usable``: where nothing has changed, so that the usual range may follow it. ``is_drifting``: where changes
-        may count as drift. ``is_expected``: where a missing range counts for ``presence``.
+        ``is_usable``: pairs without a change, whose usual range is updated. ``is_drifting``: pairs whose changes may
+        count as drift. ``is_expected``: pairs for which a missing range lowers ``presence``.
         """
         self._values[:, self._windows % _DRIFT_WINDOWS] = np.where(is_drifting, range_m, np.nan)
         self._windows += 1
@@ -116,8 +113,8 @@ class RangeHistory:
     def drift_m(self) -> Array:
         """Standard deviation of each pair's drift about its usual range, shape (m,).
 
-        From differences of windows up to half the median's length apart: a step spoils few of them, and drift that is
-        slower than the median is left to the median.
+        From differences of windows up to half the median's length apart: a step affects few of them, and the median
+        itself follows slower drift.
         """
         length = _DRIFT_WINDOWS
         known = min(self._windows, length)
@@ -133,37 +130,37 @@ class RangeHistory:
         return np.asarray(np.sqrt(np.maximum(learned_m2, _MIN_DRIFT_M**2)))
 
     def restart(self) -> None:
-        """Forget the usual ranges, which are learned from the start."""
+        """Forget the usual ranges and learn them anew."""
         self._used[:] = 0
         self._usual[:] = np.nan
         self.usual_m[:] = self.first_m[:] = np.nan
         self._values[:] = np.nan
 
 
-_LASTING: Final = 1e-3  # a finding lasts while what it says has more evidence than chance gives with this probability
+_LASTING: Final = 1e-3  # a finding lasts while its evidence exceeds what chance gives with this probability
 _SLOW_DRIFT: Final = 2.0
-"""Drift of the usual range from the first one, as a multiple of one window's difference from the usual range."""
+"""Ratio of the drift between first and usual range to the drift between usual range and one window."""
 
 _REGULAR: Final = 0.8  # share of windows in which a pair must have had ranges for their absence to be a finding
 _KNOWN_WINDOWS: Final = 12
 
 _FARTHEST_M: Final = 1e5  # longest range, delays included
-_MEDIAN_BLOCKS: Final = 3  # blocks from which on their median counts, which short obstacles do not change
+_MEDIAN_BLOCKS: Final = 3  # blocks needed to use their median, which short obstacles do not change
 _MEDIAN_VARIANCE: Final = math.pi / 2.0
 
-_JUMP_WINDOWS: Final = 1000  # blocks that are older than that many windows show that the clock was set back
+_JUMP_WINDOWS: Final = 1000  # a block older than this many windows means that the clock was set back
 
 
 GRACE_S: Final = 3.0
-"""How long after its end a window waits for blocks."""
+"""How long a window waits for blocks after its end."""
 _NEEDED: Final = 2
-_OF: Final = 3  # something is found when it is seen in ``_NEEDED`` of the last ``_OF`` windows
-_FALSE_ALARM: Final = 1e-6  # probability that noise and drift alone make the changes of a window significant
+_OF: Final = 3  # a change becomes a finding when seen in ``_NEEDED`` of the last ``_OF`` windows
+_FALSE_ALARM: Final = 1e-6  # probability that noise and drift alone make a window significant
 _SILENT_WINDOWS: Final = 3  # windows without a range after which a link is blocked
 
 
 class _Held(Struct):
-    """A finding, and whether the last windows support it."""
+    """A finding, and which of the last windows did not support it."""
 
     finding: Finding
     or_else: str | None
@@ -176,10 +173,10 @@ class _Window(Struct, frozen=True):
 
 
 class AnchorWatch:
-    """Compares the ranges between anchors with what they usually are.
+    """Compares the ranges between anchors with their usual values.
 
-    It reads no clock: ``t_s`` of the blocks and ``advance`` are on one clock, whichever. What cannot be used is counted
-    in ``counters``: ``unknown-anchor``, ``impossible-block``, ``late-block``.
+    Reads no clock: ``t_s`` of the blocks and ``advance`` must share one clock. Unusable blocks are counted in
+    ``counters``: ``unknown-anchor``, ``impossible-block``, ``late-block``.
     """
 
     def __init__(
@@ -193,9 +190,9 @@ class AnchorWatch:
     ) -> None:
         """Watch these anchors.
 
-        ``position_m``: of each anchor. ``dimensions``: 2 where anchors can only move horizontally, or heights cannot
-        be seen. ``baseline_m``: ranges with delays when the site was surveyed, by pairs; where they are missing they
-        are learned in ``learning_windows``, before which the watch of a pair does not begin.
+        ``position_m``: of each anchor. ``dimensions``: 2 if anchors can only move horizontally, or heights are not
+        observable. ``baseline_m``: ranges with delays at the time of the survey, by pair; missing ones are learned
+        over ``learning_windows``, after which the pair is watched.
         """
         self.counters: Counter[str] = Counter()
         self._window_s, self._learning_windows = window_s, learning_windows
@@ -211,11 +208,11 @@ class AnchorWatch:
         """Windows without a range since each pair's last one, while both anchors had others."""
         self._pending: dict[int, dict[int, list[PairBlock]]] = {}
         self._open: int | None = None
-        """Number of the oldest window that is not done."""
+        """Number of the oldest open window."""
         self._windows: deque[_Window] = deque(maxlen=_OF)
         self._held: list[_Held] = []
         self._blocked: dict[int, float] = {}
-        """Pairs that are silent, and since when."""
+        """Silent pairs, and since when."""
         self._has_data = False
         for (a, b), range_m in (baseline_m or {}).items():
             if a in self._number and b in self._number and a != b and math.isfinite(range_m):
@@ -223,19 +220,19 @@ class AnchorWatch:
 
     @property
     def state(self) -> Literal["learning", "watching", "no data"]:
-        """``learning`` until some pair's usual range is known well enough."""
+        """``learning`` until the usual range of at least one pair is known well enough."""
         if not self._has_data:
             return "no data"
         return "watching" if bool(self._is_known().any()) else "learning"
 
     @property
     def pairs(self) -> int:
-        """Number of pairs that are compared."""
+        """Number of watched pairs."""
         return int(self._is_known().sum())
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        """What has changed and still is; the largest first, silent links last."""
+        """Current findings: the largest first, unclear ones (``check``) after them, silent links last."""
         held = sorted((one.finding for one in self._held), key=lambda one: (one.kind == "check", -abs(one.size_m)))
         silent = [
             silent_link(self._ids[self._first[row]], self._ids[self._second[row]], since_s)
@@ -244,7 +241,7 @@ class AnchorWatch:
         return (*held, *silent)
 
     def add(self, block: PairBlock) -> None:
-        """Add the ranges of a pair, in any order within ``grace_s``."""
+        """Add a block of a pair, in any order within ``GRACE_S``."""
         if block.a not in self._number or block.b not in self._number or block.a == block.b:
             self.counters["unknown-anchor"] += 1
             return
@@ -266,7 +263,7 @@ class AnchorWatch:
         self.advance(block.t_s)
 
     def advance(self, now_s: float) -> None:
-        """Conclude the windows that are over."""
+        """Evaluate the windows that are over."""
         if self._open is None or not math.isfinite(now_s):
             return
         last = math.floor((now_s - GRACE_S) / self._window_s) - 1
@@ -280,9 +277,9 @@ class AnchorWatch:
             self._open += 1
 
     def accept(self) -> None:
-        """Learn again what is usual. All findings end.
+        """Accept the current state: end all findings and learn the usual ranges anew.
 
-        A site that was surveyed again gets a new watch instead, as positions differ.
+        After a new survey, use a new watch instead, as positions differ.
         """
         self._history.restart()
         self._history.presence[list(self._blocked)] = 0.0
@@ -306,7 +303,7 @@ class AnchorWatch:
         return np.asarray(self._history.windows >= min(self._learning_windows, _USUAL_WINDOWS // 2))
 
     def _conclude(self, window: int, blocks: dict[int, list[PairBlock]]) -> None:
-        """See what has changed in a window."""
+        """Evaluate one window."""
         self._has_data = bool(blocks)
         start_s = window * self._window_s
         range_m, exchanges = self._ranges(blocks)
@@ -329,7 +326,7 @@ class AnchorWatch:
         self._history.add_window(range_m, ~is_touched, ~is_displaced, is_expected)
 
     def _ranges(self, gathered: dict[int, list[PairBlock]]) -> tuple[Array, Array]:
-        """The window's range of each pair, NaN where there is none, and its exchanges as far as they make the noise."""
+        """The window's range of each pair, NaN where there is none, and its effective number of exchanges."""
         range_m, exchanges = np.full(len(self._row), np.nan), np.zeros(len(self._row))
         for row, blocks in gathered.items():
             count = sum(block.exchanges for block in blocks)
@@ -343,7 +340,7 @@ class AnchorWatch:
 
     def _compare(self, known: Integers, range_m: Array, exchanges: Array, drift_m: Array) -> Explanation:
         history = self._history
-        reference = 1.0 + np.minimum(1.0 / history.windows[known], 1.0)  # its noise, too, is in the change
+        reference = 1.0 + np.minimum(1.0 / history.windows[known], 1.0)  # the change also has the usual range's noise
         white_m = np.sqrt(np.maximum(history.noise_m2[known], 1e-8) / exchanges[known] * reference)
         pairs = self._pairs(known, white_m, drift_m[known] * np.sqrt(reference))
         change_m = range_m[known] - history.usual_m[known]
@@ -352,7 +349,7 @@ class AnchorWatch:
         return nothing(pairs, change_m)
 
     def _compare_slowly(self, known: Integers, drift_m: Array) -> tuple[Part, ...]:
-        """The usual ranges against the first ones: what has changed too slowly to be seen in a window."""
+        """Compare the usual with the first ranges, for changes too slow to show in one window."""
         change_m = self._history.usual_m[known] - self._history.first_m[known]
         is_old = np.isfinite(change_m)
         if not is_old.any():
@@ -372,7 +369,7 @@ class AnchorWatch:
         return replace(part, anchors=tuple(self._ids[number] for number in part.anchors))
 
     def _touched(self, found: Iterable[Finding | Part]) -> Mask:
-        """Pairs that one of these concerns, whose usual range stays as it is."""
+        """Mask of the pairs that these findings concern."""
         rows = np.zeros(len(self._row), np.bool_)
         for one in found:
             for pair, row in self._row.items():
@@ -381,7 +378,7 @@ class AnchorWatch:
         return rows
 
     def _update(self, known: Integers, seen: Explanation, present: set[int]) -> None:
-        """Find what was seen in enough windows, and end what is not seen any more."""
+        """Add changes seen in enough windows as findings, and end findings that are no longer supported."""
         newest = self._windows[-1]
         for part in newest.parts:
             found = self._confirmed(part)
@@ -395,7 +392,7 @@ class AnchorWatch:
         self._held = [one for one in self._held if sum(one.lost) < _NEEDED]
 
     def _confirmed(self, part: Part) -> _Held | None:
-        """The part as a finding, if enough of the last windows have the same, or something at the same anchors."""
+        """The part as a finding, if enough of the last windows show it, or other changes at the same anchors."""
         windows = list(self._windows)
         same = [one for one in windows if any(_key(other) == _key(part) for other in one.parts)]
         if len(same) < _NEEDED:
@@ -417,7 +414,7 @@ class AnchorWatch:
         return _Held(finding, part.or_else, deque(maxlen=_OF))
 
     def _hold(self, found: _Held) -> None:
-        """Add a finding, or bring one at the same anchors up to date."""
+        """Add a finding, or update one at the same anchors."""
         new = found.finding
         for number, one in enumerate(self._held):
             old = one.finding
@@ -435,7 +432,7 @@ class AnchorWatch:
         self._held.append(found)
 
     def _lasts(self, finding: Finding, known: Integers, seen: Explanation) -> bool:
-        """Whether there is still evidence for a finding in what else was seen leaves unexplained."""
+        """Whether the changes that remain unexplained are still evidence for a finding."""
         first, second = np.array(self._first)[known], np.array(self._second)[known]
         pairs = Pairs(self._position_m, first, second, self._dimensions, seen.weight)
         found, dof = evidence(pairs, seen.weight, seen.weighted_m)
@@ -453,7 +450,7 @@ class AnchorWatch:
         return any(found[cause] > chdtri(dof[cause], _LASTING / len(causes)) for cause in causes)
 
     def _note_silence(self, is_present: Mask, start_s: float) -> Mask:
-        """Find links that are silent while both anchors are received by others; returns where ranges are expected."""
+        """Find links that are silent although others receive both anchors. Returns pairs with an expected range."""
         heard = {end for row in np.flatnonzero(is_present).tolist() for end in self._ends()[row]}
         expected = np.zeros(len(is_present), np.bool_)
         for row, (a, b) in enumerate(self._ends()):
@@ -468,7 +465,7 @@ class AnchorWatch:
                 if self._silent[row] == _SILENT_WINDOWS and is_regular:
                     self._blocked[row] = start_s - (self._silent[row] - 1) * self._window_s
             else:
-                self._silent[row] = 0  # an anchor that is away blocks no link
+                self._silent[row] = 0  # an absent anchor is no blocked link
         return expected
 
 
@@ -477,40 +474,37 @@ def _key(one: Part | Finding) -> tuple[str, tuple[int, ...]]:
 
 
 def _compromise(part: Part, anchors: set[int], kinds: set[str]) -> Part:
-    """What windows that differ have in common."""
+    """The part that windows with different changes at the same anchors support."""
     if len(anchors) == 1 and kinds == {"moved", "delay"}:
-        if part.kind == "moved":
-            return replace(part, or_else="delay")
-        return replace(part, or_else="moved")
+        return replace(part, or_else="delay" if part.kind == "moved" else "moved")
     return Part("check", tuple(sorted(anchors)), part.size_m, None)
 
 
-# Whether an anchor was moved while its ranges were gathered: ranges from before and after it cannot be used together.
+# Detection of an anchor that was moved while its ranges were gathered: those from before and after do not fit together.
 #
-# All splits of the time are compared. Ranges that differ by more than their own scatter explains, for two pairs of
-# one anchor or more, are explained as the watch of the anchors does: a link that was blocked for a while is no
-# motion.
+# All splits in time are compared. If at least two pairs of one anchor differ by more than their scatter, the difference
+# is explained as in the watch; a link that was blocked for a while is no motion.
 
-_MIN_STEPS: Final = 4  # in fewer, a change and the scatter of ranges look the same
+_MIN_STEPS: Final = 4  # with fewer, a change looks like the scatter of ranges
 _FALSE_MOVE: Final = 1e-3
-"""Probability that the scatter of all ranges and splits alone makes one of them differ, where several have to."""
+"""Probability that scatter alone makes one of all ranges and splits differ (and several have to)."""
 
-_MIN_PAIRS: Final = 2  # pairs of one anchor whose ranges differ
-_DRIFT_FLOOR_M: Final = 0.02  # ranges of rooms wander by this much, and more slowly than steps follow one another
+_MIN_PAIRS: Final = 2  # pairs of one anchor whose ranges must differ
+_DRIFT_FLOOR_M: Final = 0.02  # ranges in rooms wander by this much, and more slowly than one step
 
 Solve = Callable[[PairRanges, Facts], Survey]
 
 
 class Change(Struct, frozen=True):
-    """Something at the anchors has changed."""
+    """A change at the anchors while ranges were gathered."""
 
     sentence: str
     since_s: float
-    """From this time on ranges agree."""
+    """Time from which on ranges agree."""
 
 
 def change_of(table: StepTable, facts: Facts, solve: Solve) -> Change | None:
-    """The largest change of anchors between earlier and later ranges; None where there is none."""
+    """The largest change of an anchor between earlier and later ranges; None if there is none."""
     steps = len(table.start_s)
     if steps < _MIN_STEPS:
         return None
@@ -527,7 +521,7 @@ def change_of(table: StepTable, facts: Facts, solve: Solve) -> Change | None:
     part = _explained(table, before_m[split], after_m[split], white_m2, drift_m2, facts, solve)
     if part is None:
         return None
-    # An anchor is on its way for a moment: the first step after the split is left out, if there is another one.
+    # The anchor may still be moving in the first step after the split, so this is left out if there is another one.
     since_s = float(table.start_s[min(split + 2, steps - 1)])
     return Change(sentence_of(part.kind, part.anchors, part.size_m, or_else=part.or_else), since_s)
 
@@ -542,14 +536,14 @@ def drop_moved(ranger: PairRanger, facts: Facts, solve: Solve) -> tuple[Change, 
 
 
 def with_changes(survey: Survey, changes: tuple[Change, ...], duration_s: float) -> Survey:
-    """The survey with what has changed while its ranges were gathered, of which ``duration_s`` are left."""
+    """The survey with notes on changes while its ranges were gathered, of which ``duration_s`` are left."""
     left = f"only the {duration_s:.0f} s of ranges since then are used"
     notes = tuple(f"during the survey {one.sentence}; {left}" for one in changes)
     return replace(survey, notes=(*notes, *survey.notes))
 
 
 def _splits(range_m: Array) -> tuple[Array, Array, Array]:
-    """Medians before and since every split, shape (k - 1, m), and what they leave of the ranges, shape (k - 1,)."""
+    """Medians before and after every split, shape (k - 1, m), and the sum of absolute residuals, shape (k - 1,)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # a pair may have no range on one side
         before = np.array([np.nanmedian(range_m[:split], axis=0) for split in range(1, len(range_m))])
@@ -562,7 +556,7 @@ def _splits(range_m: Array) -> tuple[Array, Array, Array]:
 
 
 def _scatter(table: StepTable) -> tuple[Array, Array]:
-    """Variance of a step's range from noise and from drift, shape (m,) each; a change makes few steps differ."""
+    """Variance of a step's range from noise and from drift, shape (m,) each, robust to single changes."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)
         white_m2 = np.nanmedian(table.variance_m2, axis=0)
@@ -574,7 +568,7 @@ def _scatter(table: StepTable) -> tuple[Array, Array]:
 def _explained(
     table: StepTable, before_m: Array, after_m: Array, white_m2: Array, drift_m2: Array, facts: Facts, solve: Solve
 ) -> Part | None:
-    """What has changed most, with identifiers of anchors; None where links alone were late."""
+    """The largest change, with identifiers of anchors; None if only links were late."""
     in_both = np.flatnonzero(np.isfinite(after_m - before_m))
     pairs = [table.pairs[row] for row in in_both]
     stds_m = np.sqrt(white_m2 + drift_m2)[in_both]
