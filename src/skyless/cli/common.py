@@ -293,6 +293,12 @@ def check_folder(option: str, output: Path) -> None:
         raise SkylessError(f"{option} is {str(output)!r}; it should be a file in a folder that exists")
 
 
+def check_new(file: Path, *, force: bool) -> None:
+    """Check that a file does not exist yet, unless ``force``. Raises SkylessError."""
+    if file.exists() and not force:
+        raise SkylessError(f"{file} exists; --force overwrites it")
+
+
 def make_folder(option: str, folder: Path) -> None:
     """Make a folder unless it exists. Raises SkylessError."""
     try:

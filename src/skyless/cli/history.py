@@ -1,7 +1,6 @@
 """``skyless history``: keep a site's fixes and events in Parquet files, and query them."""
 
 import asyncio
-import contextlib
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +17,7 @@ from skyless.arguments import Option, Options, Positive, whole
 from skyless.cli.common import (
     NO_FIX,
     check_folder,
+    check_new,
     check_picture,
     command,
     console,
@@ -25,7 +25,7 @@ from skyless.cli.common import (
     print_json,
     write_picture,
 )
-from skyless.cli.nodes.options import MqttOptions, SiteId, log
+from skyless.cli.nodes.options import MqttOptions, SiteId, log, run_until_stopped
 from skyless.core.errors import SkylessError
 from skyless.machine import extra_module
 
@@ -248,8 +248,7 @@ def export(file: Path, /, *tags: str, asked: _Asked, site: Path | None = None, f
         Overwrite what is there, if the file exists.
     """
     check_folder("FILE", file)
-    if file.exists() and not force:
-        raise SkylessError(f"{file} exists; --force overwrites it")
+    check_new(file, force=force)
     history, span = asked.opened()
     origin = None
     if site is not None:
@@ -353,7 +352,6 @@ def run(
     json
         Write one JSON object at the end instead of text.
     """
-    from skyless.run import process
     from skyless.run.gather.subjects import nats_address
     from skyless.run.history.writer import Keep
 
@@ -370,8 +368,7 @@ def run(
         address = broker.required("the broker of the site whose history to keep")
         opening = partial(_of_broker, to, address, site_id, keep, None if nats is None else nats_address(nats))
     make_folder("--to", to)
-    with contextlib.suppress(KeyboardInterrupt):
-        process.run(_keep(opening, found))
+    run_until_stopped(_keep(opening, found))
     state = found[0].state() if found else None
     if json:
         import msgspec

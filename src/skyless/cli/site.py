@@ -14,6 +14,7 @@ from skyless.arguments import number, numbers, read_height, whole
 from skyless.cli.common import (
     JsonOptions,
     check_folder,
+    check_new,
     command,
     console,
     print_facts,
@@ -138,8 +139,7 @@ def _check_free(file: Path, *, force: bool) -> None:
     """Raise SkylessError if the file cannot be written without loss."""
     if file.is_dir():
         raise SkylessError(f"{file} is a folder; it should be the name of a file to write")
-    if file.exists() and not force:
-        raise SkylessError(f"{file} exists; --force overwrites it")
+    check_new(file, force=force)
 
 
 def _tag_height(text: str | None, spacing_m: float | None) -> float | None:

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from skyless.cli.common import (
     JsonOptions,
     check_folder,
+    check_new,
     check_output,
     check_picture,
     cm,
@@ -123,8 +124,7 @@ def _check(asked: SurveyOptions, live: LiveOptions, output: _Output) -> None:
         raise SkylessError(
             f"--out is {str(out)!r}; a site file needs --site to start from (skyless site new --unplaced makes one)"
         )
-    if out.exists() and not output.force:
-        raise SkylessError(f"{out} exists; --force overwrites it")
+    check_new(out, force=output.force)
 
 
 # Files

@@ -12,10 +12,9 @@ from cyclopts import App
 
 from skyless.cli.common import JsonOptions, command, console, print_json
 from skyless.cli.nodes.demo_site import DemoOptions, WholeSite, sentence
-from skyless.cli.nodes.options import log
+from skyless.cli.nodes.options import log, run_until_stopped
 from skyless.cli.nodes.site_view import Picture, drawn
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress
-from skyless.run.process import run
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -39,8 +38,7 @@ def demo(*, asked: DemoOptions, output: JsonOptions) -> None:
     simulated. Watch it on the page, or with: mosquitto_sub -t 'skyless/#' -v
     """
     stage = _Stage(asked, output)
-    with contextlib.suppress(KeyboardInterrupt):
-        run(stage.run())
+    run_until_stopped(stage.run())
     if stage.stopped_early:
         log("stopped")
     summary = stage.summary()

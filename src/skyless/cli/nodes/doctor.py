@@ -12,7 +12,16 @@ from typing import Final, get_args
 from cyclopts import App
 
 from skyless.arguments import Options, Positive
-from skyless.cli.common import JsonOptions, check_folder, command, plain, print_json, progress_bar, write_file
+from skyless.cli.common import (
+    JsonOptions,
+    check_folder,
+    check_new,
+    command,
+    plain,
+    print_json,
+    progress_bar,
+    write_file,
+)
 from skyless.cli.nodes.options import SiteOptions, log
 from skyless.cli.nodes.site_probe import SiteProbe, broker_failed
 from skyless.cli.nodes.site_view import LINK_NAME, SiteView, site_number
@@ -62,8 +71,7 @@ def doctor(*, asked: DoctorOptions, live: SiteOptions, output: JsonOptions) -> i
     report = asked.report
     if report is not None:
         check_folder("--report", report)
-        if report.exists() and not asked.force:
-            raise SkylessError(f"{report} exists; --force overwrites it")
+        check_new(report, force=asked.force)
     file_site = None if asked.site is None else load_site(asked.site)
     site_id = file_site.id if live.site_id is None and file_site is not None else live.site_id
     boards, address = _boards(asked.radio), live.address()
