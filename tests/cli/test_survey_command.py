@@ -17,8 +17,7 @@ from skyless.cli.main import main
 from skyless.core.errors import SkylessError
 from skyless.core.site import AnchorSite, ScheduleSite, Site
 from skyless.core.ticks import TICK_M
-from skyless.research.calibration.facts import facts_of
-from skyless.research.calibration.options import SurveyOptions
+from skyless.research.calibration.options import SurveyOptions, facts_of
 from skyless.sim.impairments import DelayError
 from skyless.sim.lab import lab_site
 from skyless.site.file.load import load_site

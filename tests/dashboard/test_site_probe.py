@@ -3,7 +3,7 @@
 from dashboard_builders import SITE, SITE_ID, Wire, fix, status
 from msgspec.structs import replace
 
-from skyless.cli.nodes.site_probe import SiteProbe
+from skyless.cli.nodes.doctor import SiteProbe
 from skyless.cli.nodes.site_view import SiteView
 from skyless.core.ticks import TICK_RATE_HZ
 from skyless.run.mqtt import topics

@@ -19,8 +19,7 @@ from skyless.core.arrays import Integers, Vector
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site
 from skyless.research.calibration.biases import Biases, biases_of, known_tags, ranges_of, walks_of
-from skyless.research.calibration.facts import facts_of
-from skyless.research.calibration.options import SurveyOptions
+from skyless.research.calibration.options import SurveyOptions, facts_of
 from skyless.research.foreign.formats import format_of
 from skyless.research.replays.inputs import known_truth
 from skyless.run.recordings.recording import McapRecording, is_mcap

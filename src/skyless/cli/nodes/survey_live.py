@@ -116,7 +116,7 @@ async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "S
 
 
 def _facts(known: SurveyOptions, site: Site) -> "Facts":
-    from skyless.research.calibration.facts import facts_of
+    from skyless.research.calibration.options import facts_of
 
     return facts_of(known, (anchor.id for anchor in site.all_anchors), site)
 
