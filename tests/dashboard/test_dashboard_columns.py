@@ -13,11 +13,13 @@ from msgspec.structs import replace
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from skyless.page import gathered
+from skyless.page import live2
+from skyless.page import live2 as columns_module
 from skyless.page.app import Services, make_app
 from skyless.page.connections import AccessRules
-from skyless.page.gathered import Columns, Gathered, View, anchors_message, conditions_message, tags_message
+from skyless.page.gathered import Gathered
 from skyless.page.live import LiveSite
+from skyless.page.live2 import Columns, View, anchors_message, conditions_message, tags_message
 from skyless.page.sites import LiveSites
 from skyless.page.state import read_request
 from skyless.run.fix_batch import RECORD
@@ -89,7 +91,7 @@ def test_tags_that_are_unheard_leave_the_map_and_too_large_numbers_are_counted()
 def test_the_newest_fix_of_each_tag_is_due_once_and_who_waits_longest_comes_first(batches, most):
     columns, now_s, popped, waiting = Columns(), 100.0, {}, {}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gathered, "MAX_DUE", most)
+        patch.setattr(columns_module, "MAX_DUE", most)
         for index, tags in enumerate(batches):
             now_s += 0.1
             columns.update(records_of([(tag, 10**15 + index, index, 1) for tag in tags]), now_s)
@@ -122,7 +124,7 @@ def test_many_tags_are_counts_of_cells_that_add_up(width, height, random):
     columns = Columns()
     columns.update(records_of([(n + 1, 10**15, x, y) for n, (x, y) in enumerate(positions)]), 1.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gathered, "MAX_POINTS", 200)
+        patch.setattr(live2, "MAX_POINTS", 200)
         message = tags_message(columns, replace(VIEW, px=(width, height)), 1.0, 9)
     kind, cell, across, along, zero, unix_us = struct.unpack_from("<BBHHHQ", message)
     assert (chr(kind), zero, unix_us) == ("B", 0, 9)

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from starlette.exceptions import HTTPException
 from websockets.asyncio.client import connect as websocket
 
-from skyless.page import sites
+from skyless.page import hub
 from skyless.page.live import LiveSite
 from skyless.run.gather.node import Gather
 from skyless.run.gather.subjects import NatsAddress, connect
@@ -63,11 +63,11 @@ def test_the_table_has_trouble_first_and_nothing_is_good_that_is_not_heard():
 
 
 async def test_a_site_is_let_go_when_nobody_looks_and_the_next_look_connects_it_again(monkeypatch):
-    monkeypatch.setattr(sites, "LET_GO_S", 0.0)
-    monkeypatch.setattr(sites, "_CHECK_S", 0.01)
+    monkeypatch.setattr(hub, "LET_GO_S", 0.0)
+    monkeypatch.setattr(hub, "_CHECK_S", 0.01)
     for one in (HubLink, HubSites):
         monkeypatch.setattr(one, "run", lambda *_: asyncio.sleep(60))
-    shown = sites.ShownSites(NatsAddress("nats://none"), "here", lambda: LiveSite("here", "nats://none", at_hub=True))
+    shown = hub.ShownSites(NatsAddress("nats://none"), "here", lambda: LiveSite("here", "nats://none", at_hub=True))
     shown.known.add_site(topics.site_topic(NUMBER), msgspec.json.encode({"site": {"name": "Hall"}}))
     running = asyncio.ensure_future(shown.run())
     await asyncio.sleep(0)

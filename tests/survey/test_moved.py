@@ -159,7 +159,7 @@ def test_the_program_and_the_command_use_the_time_since_the_motion(monkeypatch, 
     assert any("anchor 4 has moved by about" in line for line in lines)
 
     ranger.finish()
-    monkeypatch.setattr("skyless.cli.survey.gather_live", lambda *_: (site, ranger.ranges, ranger))
+    monkeypatch.setattr("skyless.cli.survey._gather_live", lambda *_: (site, ranger.ranges, ranger))
     assert main(["survey", "--mqtt", "mqtt://127.0.0.1", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["notes"][0].startswith("during the survey anchor 4 has moved by about")

@@ -147,7 +147,7 @@ def _at_hub(make: "partial[LiveSite]", serves: "partial[Services]", hub: str, ca
     """Services for the sites at a hub. Raises SkylessError."""
     address = hub_address(hub, ca)
     from skyless.page.gathered import Gathered
-    from skyless.page.sites import ShownSites
+    from skyless.page.hub import ShownSites
 
     sites = ShownSites(address, "skyless dashboard", partial(make, broker=str(address), at_hub=True))
     return str(address), serves(sites=sites, gathered=Gathered(address), hub=sites), sites.run()

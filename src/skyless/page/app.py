@@ -63,7 +63,7 @@ from skyless.site.file.check import image_size
 
 if TYPE_CHECKING:
     from skyless.page.gathered import Gathered
-    from skyless.page.sites import ShownSites
+    from skyless.page.hub import ShownSites
     from skyless.run.hub import HubSites
 
 _PAGE: Final = Path(__file__).parent / "browser"
