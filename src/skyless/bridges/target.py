@@ -358,7 +358,7 @@ class _Tag(Struct):
     intervals_s: tuple[float, float] = (0.0, 0.0)
     """Between its last three usable fixes: a single long one is an outage, two are its rate."""
     reported_s: float = -inf
-    """When targets were last told that it has no fix."""
+    """When targets were last notified that it has no fix."""
 
 
 class Hub:

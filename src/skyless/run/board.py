@@ -67,7 +67,7 @@ class BoardTag:
         self.begin(self.flash)
 
     def begin(self, settings: BoardSettings) -> None:
-        """Start afresh with these settings."""
+        """Start again with these settings."""
         self._receiver = Receiver(
             site=None if settings.site == ANY_SITE else settings.site,
             qa=settings.qa_m2ps3,

@@ -8,7 +8,7 @@ measurement h contains s_j·b (Friedland 1969):
 With y = Σ s·ν/S and M = Σ s·sᵀ/S over the innovations ν of variance S, and the prior variances σ_f²·I of the faults,
 the estimate of all anchors' faults is b̂ = (M + I/σ_f²)⁻¹·y with the covariance (M + I/σ_f²)⁻¹, and
 yᵀ·(M + I/σ_f²)⁻¹·y tests whether there are any. Where V, y and M are faded, b is the present size of a fault that
-has grown as fast as they fade: within packets (recent) or seconds (creeping). A fault beyond doubt is added to the
+has grown as fast as they fade: within packets (recent) or seconds (creeping). A detected fault is added to the
 anchor's range error, which gives the state that the filter would have if that error had been open from the beginning.
 """
 
@@ -152,7 +152,7 @@ def _largest(s: State, kind: int) -> float:
 
 
 def open_faults(s: State) -> None:
-    """If the test of all faults of a kind is beyond doubt, add faults of the kind that explains most to the state.
+    """If the test of all faults of a kind exceeds its limit, add faults of the kind that explains most to the state.
 
     None are selected after a start that was contradicted: any number of anchors may be late then, and those that
     explain the test best are sometimes the wrong ones.

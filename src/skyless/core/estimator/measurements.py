@@ -545,8 +545,8 @@ def difference_terms(s: State, a: int, b: int) -> float:
 def difference(s: State, a: int, b: int, rx_ticks: Ticks, difference_m: float) -> int:
     """Process a ready-made difference of ranges, to anchor b minus to anchor a: ``USED`` or ``UNUSED``.
 
-    d = |p − b| − |p − a| + range errors of b − those of a + noise. No clocks are estimated: whoever made the
-    difference has removed them.
+    d = |p − b| − |p − a| + range errors of b − those of a + noise. No clocks are estimated, as the
+    difference contains none.
     """
     settings, walked_m = s.settings, s.status.walked_m
     a_elapsed_s = (rx_ticks - s.anchors[a].rx_ticks) * TICK_S if s.anchors[a].packets > 0 else 0.0

@@ -103,7 +103,7 @@ def _wavelength_m(s: State) -> float:
 
 
 def _certain_m2(s: State) -> float:
-    """Largest variance of a prediction that leaves no doubt of the cycle."""
+    """Largest variance of a prediction that determines the cycle."""
     return square(s.tuning.phase_share * _wavelength_m(s))
 
 
@@ -282,7 +282,7 @@ def _former_age_s(s: State, anchor: int) -> float:
 
 
 def _rejoin(s: State, anchor: int) -> None:
-    """Equate an ambiguity and its former one up to whole cycles, once their number is beyond doubt.
+    """Equate an ambiguity and its former one up to whole cycles, once their number is certain.
 
     Receptions after a gap show how clocks and tag have moved within it.
     """

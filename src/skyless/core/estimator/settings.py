@@ -218,7 +218,7 @@ class Tuning(Record):
     phase_gate: float = 0.35
     """Fraction of a wavelength beyond which no innovation is used: near one half the sign is unknown."""
     phase_share: float = 0.1
-    """Fraction of a wavelength up to which the standard deviation of a prediction leaves no doubt of the cycle."""
+    """Largest standard deviation of a prediction that determines the cycle, as a fraction of a wavelength."""
     phase_step_m: float = 0.02
     """Length of the steps by which reflections change phases [m]."""
     phase_former_s: float = 0.5

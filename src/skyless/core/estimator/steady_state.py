@@ -139,7 +139,7 @@ def find_walked(
     """Find what the filter claims for a tag that rests for some superframes and then walks for others.
 
     ``found`` holds the fixes and variances of the last superframe. A state with phases gets one for each message of
-    which at least half arrive; the phases are as predicted, so cycles are in doubt wherever they are for the filter.
+    which at least half arrive; the phases are as predicted, so cycles are ambiguous wherever they are for the filter.
     """
     s.rows = _walls(s) + 1
     superframe: Ticks = 0

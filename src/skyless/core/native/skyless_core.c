@@ -2451,7 +2451,7 @@ INTERNAL void apply_four(State *s, int32_t k) {
  * With y = Σ s·ν/S and M = Σ s·sᵀ/S over the innovations ν of variance S, and the prior variances σ_f²·I of the faults,
  * the estimate of all anchors' faults is b̂ = (M + I/σ_f²)⁻¹·y with the covariance (M + I/σ_f²)⁻¹, and
  * yᵀ·(M + I/σ_f²)⁻¹·y tests whether there are any. Where V, y and M are faded, b is the present size of a fault that
- * has grown as fast as they fade: within packets (recent) or seconds (creeping). A fault beyond doubt is added to the
+ * has grown as fast as they fade: within packets (recent) or seconds (creeping). A detected fault is added to the
  * anchor's range error, which gives the state that the filter would have if that error had been open from the beginning. */
 
 /* What innovations show (gathered by ``kalman.update_later``) */
@@ -2602,7 +2602,7 @@ INTERNAL real largest(State *s, int32_t kind) {
 
 /* Adding faults to the state */
 
-/* If the test of all faults of a kind is beyond doubt, add faults of the kind that explains most to the state.
+/* If the test of all faults of a kind exceeds its limit, add faults of the kind that explains most to the state.
  *
  * None are selected after a start that was contradicted: any number of anchors may be late then, and those that
  * explain the test best are sometimes the wrong ones. */
@@ -3947,8 +3947,8 @@ INTERNAL real difference_terms(State *s, int32_t a, int32_t b) {
 
 /* Process a ready-made difference of ranges, to anchor b minus to anchor a: ``USED`` or ``UNUSED``.
  *
- * d = |p − b| − |p − a| + range errors of b − those of a + noise. No clocks are estimated: whoever made the
- * difference has removed them. */
+ * d = |p − b| − |p − a| + range errors of b − those of a + noise. No clocks are estimated, as the
+ * difference contains none. */
 INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, real difference_m) {
     EstimatorSettings *settings = &s->settings;
     real walked_m = s->status.walked_m;
@@ -4136,7 +4136,7 @@ INTERNAL real wavelength_m(State *s) {
     return (real)CYCLE_TICKS * TICK_M / (real)s->settings.carrier_cycles;
 }
 
-/* Largest variance of a prediction that leaves no doubt of the cycle. */
+/* Largest variance of a prediction that determines the cycle. */
 INTERNAL real certain_m2(State *s) {
     return square(s->tuning.phase_share * wavelength_m(s));
 }
@@ -4347,7 +4347,7 @@ INTERNAL real former_age_s(State *s, int32_t anchor) {
     return (real)(s->status.epoch_ticks - s->anchors[anchor].former_ticks) * TICK_S;
 }
 
-/* Equate an ambiguity and its former one up to whole cycles, once their number is beyond doubt.
+/* Equate an ambiguity and its former one up to whole cycles, once their number is certain.
  *
  * Receptions after a gap show how clocks and tag have moved within it. */
 INTERNAL void rejoin(State *s, int32_t anchor) {
@@ -4817,7 +4817,7 @@ SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages
 /* Find what the filter claims for a tag that rests for some superframes and then walks for others.
  *
  * ``found`` holds the fixes and variances of the last superframe. A state with phases gets one for each message of
- * which at least half arrive; the phases are as predicted, so cycles are in doubt wherever they are for the filter. */
+ * which at least half arrive; the phases are as predicted, so cycles are ambiguous wherever they are for the filter. */
 SKYLESS_EXPORT void skyless_find_walked(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int32_t
         at_rest, real *velocity_mps, int32_t walked, SteadyState *found) {
     s->rows = walls(s) + 1;

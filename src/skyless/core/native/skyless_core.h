@@ -789,7 +789,7 @@ typedef struct Tuning {
     real phase_wander;
     /* Fraction of a wavelength beyond which no innovation is used: near one half the sign is unknown. */
     real phase_gate;
-    /* Fraction of a wavelength up to which the standard deviation of a prediction leaves no doubt of the cycle. */
+    /* Largest standard deviation of a prediction that determines the cycle, as a fraction of a wavelength. */
     real phase_share;
     real phase_step_m;  /* Length of the steps by which reflections change phases [m]. */
     /* Time for which an ambiguity from before a gap is kept, to resolve the cycles lost in it [s]. */

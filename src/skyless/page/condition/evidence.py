@@ -40,7 +40,7 @@ MAX_OTHERS: Final = 2_000
 """Most names admitted of all other kinds together."""
 
 _COUNT_S: Final = 10.0
-"""Interval at which refused names are counted anew, so that the count falls when they end."""
+"""Interval at which the count of refused names starts again, so that it falls when they end."""
 
 _WINDOW_S: Final = 60.0
 _HEALTH_AGE_S: Final = 2.5  # how long the delay of a health message is valid

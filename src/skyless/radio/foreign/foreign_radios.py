@@ -144,8 +144,8 @@ class SnifferRadio(_ListeningBoard[Packet]):
 class UciRadio(_ListeningBoard[Packet]):
     """A FiRa board in a running session as a DT-tag: its DL-TDoA measurements, as packets.
 
-    Packets carry the host's monotonic time of arrival. Nothing is sent to the board: whoever started the session set it
-    up.
+    Packets carry the host's monotonic time of arrival. Nothing is sent to the board: the program that
+    started the session has configured it.
     """
 
     firmware = "FiRa's UCI with a DL-TDoA session that goes on"

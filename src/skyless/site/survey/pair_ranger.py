@@ -336,7 +336,7 @@ class PairRanger:
         return clock
 
     def _pass_to(self, t_s: float) -> None:
-        """Close the open block if its time is over. After a jump of the clock, blocks start anew."""
+        """Close the open block if its time is over. After a jump of the clock, blocks start again."""
         block, number = self._block, math.floor(t_s / self._block_s)
         if block is None or number > block or t_s < block * self._block_s - _KEPT_S:
             if block is not None:

@@ -8,7 +8,7 @@ Rules (``docs/survey.md``, "What is written"):
   that a tag sees less than either alone.
 - ``accuracy.range_std_m`` is raised to the constant error of the ranges between anchors, if that is larger: a tag's
   ranges are not better.
-- If delays change, the accuracy changes as well, by 0.1 mm if nothing else: this tells tags to start anew, because the
+- If delays change, the accuracy changes as well, by 0.1 mm if nothing else: this tells tags to restart, because the
   range errors that they have learned include the old delays, and delays are not sent on the air.
 """
 

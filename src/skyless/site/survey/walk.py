@@ -196,7 +196,7 @@ _LONGEST_STEP_M: Final = 2.0
 _SINGULAR: Final = 1e-9
 _GRID: Final = 9  # positions along each horizontal axis from which an epoch may start
 _ELSEWHERE_M: Final = 2.0
-"""If an anchor has moved by more since the last evaluation, the result is a different one: the tag starts anew."""
+"""If an anchor has moved by more since the last evaluation, the result is a different one: the tag starts again."""
 
 _LEVELS: Final = 5  # heights from which a walk may start; all of its epochs start at one
 

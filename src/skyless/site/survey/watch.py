@@ -130,7 +130,7 @@ class RangeHistory:
         return np.asarray(np.sqrt(np.maximum(learned_m2, _MIN_DRIFT_M**2)))
 
     def restart(self) -> None:
-        """Forget the usual ranges and learn them anew."""
+        """Forget the usual ranges and learn them again."""
         self._used[:] = 0
         self._usual[:] = np.nan
         self.usual_m[:] = self.first_m[:] = np.nan
@@ -277,7 +277,7 @@ class AnchorWatch:
             self._open += 1
 
     def accept(self) -> None:
-        """Accept the current state: end all findings and learn the usual ranges anew.
+        """Accept the current state: end all findings and learn the usual ranges again.
 
         After a new survey, use a new watch instead, as positions differ.
         """
