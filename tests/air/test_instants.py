@@ -1,4 +1,4 @@
-"""When anchors of protocol 2 send: the published function, the same from Python and from kernels."""
+"""When anchors of protocol 2 send: the published function, the same of integers and of arrays."""
 
 import numpy as np
 from hypothesis import given
@@ -16,22 +16,16 @@ from skyless.core.air.almanac import (
     ticks_ahead,
 )
 from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, WRAP_TICKS, from_seconds, to_seconds
-from skyless.sim.cells import receptions as timetable
-from skyless.site.kernels import kernel
 
 ANCHORS = st.integers(0, 0xFFFF)
 SEQUENCES = st.integers(0, 0xFF)
 CODES = st.integers(0, LONGEST_PERIOD_CODE)
 
 
-@kernel
-def compiled_gap(anchor_id, sequence, code):
-    return timetable.gap_ticks(anchor_id, sequence, code)
-
-
 @given(ANCHORS, SEQUENCES, CODES)
-def test_python_and_kernels_agree(anchor_id, sequence, code):
-    assert compiled_gap(anchor_id, sequence, code) == gap_ticks(anchor_id, sequence, code)
+def test_integers_and_arrays_agree(anchor_id, sequence, code):
+    as_arrays = (np.array([number]) for number in (anchor_id, sequence, code))
+    assert gap_ticks(*as_arrays)[0] == gap_ticks(anchor_id, sequence, code)
 
 
 @given(ANCHORS, SEQUENCES, CODES)

@@ -10,9 +10,8 @@ from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
 from skyless.core.any_receiver import beacon_period_s
 from skyless.core.geometry import RADIO_REACH_M
 from skyless.core.site import AnchorSite, ScheduleSite, Site, TagsSite, WallSite
-from skyless.sim.cells.world import CellWorld, anchors_of
-from skyless.sim.evaluation.cell_fleet import period_codes_of
 from skyless.sim.impairments import Impairments
+from skyless.sim.tape import Tape
 from skyless.sim.trajectory import Static
 from skyless.site.channel import ChannelModel, received_power_dbm
 from skyless.site.file.template import grid_site
@@ -91,7 +90,7 @@ def test_against_a_plain_loop():
 
 
 @pytest.mark.statistical
-def test_rates_of_the_simulated_cells():
+def test_rates_of_a_simulated_site():
     """Tags at rest for a second: 16 times about 155 beacons, so 2 % of chance.
 
     Anchors' beacons are spaced more evenly than at random.
@@ -99,8 +98,8 @@ def test_rates_of_the_simulated_cells():
     site = grid_site(300.0, 300.0, 15.0, 4.0, 1.2)
     points = np.random.default_rng(4).uniform((60.0, 60.0, 1.2), (240.0, 240.0, 1.2), (16, 3))
     tags = [Static(*point) for point in points.tolist()]
-    world = CellWorld(anchors_of(site), period_codes_of(site), tags, Impairments(), 7)
-    simulated = np.mean([len(world.receptions(tag, 2.0, 3.0)) for tag in range(len(tags))])
+    tape = Tape(site, tags, Impairments(), 7)
+    simulated = np.mean([len(tape.hear(tag, 2.0, 3.0)) for tag in range(len(tags))])
     assert simulated == pytest.approx(np.mean(tag_rates(site, points, ChannelModel()).beacons_per_s), rel=0.06)
 
 

@@ -22,7 +22,7 @@ from skyless.site.kernels import kernel
 _KNOTS: Final = 20
 """Knots per correlation length. Linear interpolation between them keeps at least 98.7 % of the standard deviation."""
 
-_SLOPE_MIDDLE_M: Final = 4.0
+SLOPE_MIDDLE_M: Final = 4.0
 """The slope's error is 0 at this distance and reaches its size at 0 and at twice the distance."""
 
 _PURPOSE: Final = 2
@@ -58,7 +58,7 @@ class RangeErrorModel(Struct, frozen=True, forbid_unknown_fields=True):
 @kernel
 def slope_error_m(slope_m: float, distance_m: float) -> float:
     """Range error that depends on the true distance (``RangeErrorModel.slope_m``)."""
-    return slope_m * min(max((distance_m - _SLOPE_MIDDLE_M) / _SLOPE_MIDDLE_M, -1.0), 1.0)
+    return slope_m * min(max((distance_m - SLOPE_MIDDLE_M) / SLOPE_MIDDLE_M, -1.0), 1.0)
 
 
 class RangeErrors:

@@ -130,7 +130,7 @@ def suitable_period_s(anchors: float, rate_hz: float | None) -> float:
 
 
 def mixed(value: int) -> int:
-    """Hash 32 bits (Wellons' lowbias32); the result is the same for Python integers and int64."""
+    """Hash 32 bits (Wellons' lowbias32); the result is the same for Python integers and arrays of int64."""
     value = ((value >> 16) ^ value) * 0x7FEB352D & _LOW
     value = ((value >> 15) ^ value) * 0x846CA68B & _LOW
     return (value >> 16) ^ value
@@ -139,11 +139,12 @@ def mixed(value: int) -> int:
 def gap_ticks(anchor_id: int, sequence: int, code: int) -> int:
     """Return the ticks from the beacon with this sequence number (8 bits) to the next, in the anchor's counter.
 
-    Uniform between half a period and one and a half, in whole steps of the delayed transmission.
+    Uniform between half a period and one and a half, in whole steps of the delayed transmission. The arguments may be
+    arrays of int64.
     """
     drawn = mixed(mixed(anchor_id) ^ (sequence & 0xFF))
     steps = ((_STEPS + (code & 15)) << (code >> 4)) * _UNIT_STEPS
-    return int((steps // 2 + (steps * drawn >> 32)) * DELAYED_TX_GRANULARITY_TICKS)
+    return (steps // 2 + (steps * drawn >> 32)) * DELAYED_TX_GRANULARITY_TICKS
 
 
 def ticks_ahead(anchor_id: int, sequence: int, code: int, beacons: int) -> int:

@@ -1,11 +1,10 @@
 """The studies ``large`` and ``scale``: sites of a thousand anchors, and growing sites.
 
-What anchors send and receive is simulated on demand (``simulation/cells``); each tag gets the beacons that it receives,
-and nothing else. Nothing that keeps time for the site is on the air.
+The anchors are a tape (``sim/tape``); each tag gets the beacons that it receives, and nothing else.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from itertools import chain
 from typing import Final
@@ -14,8 +13,6 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.air.beacon import Beacon
-from skyless.core.air.frame import Reception
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site
@@ -27,11 +24,10 @@ from skyless.research.studies.room import biases_of
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.studies.worlds import box, worlds
 from skyless.research.uncertainty import BoundSettings, Sendings, received_bound, relayed_receptions
-from skyless.sim.cells.world import CellWorld, TagReceptions, anchors_of
-from skyless.sim.evaluation.cell_fleet import SiteBeacons, period_codes_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room
 from skyless.sim.impairments import Impairments, RangeErrorModel
 from skyless.sim.lab import paper_lab_site
+from skyless.sim.tape import Heard, Tape
 from skyless.sim.trajectory import Roaming, Trajectory, Waypoints
 from skyless.site.channel import ChannelModel
 from skyless.site.file.template import grid_site
@@ -55,14 +51,14 @@ _CORNER_S: Final = 2.0
 _SETTLED_S: Final = 2.0
 """After a tag's first fix, from when on it is judged."""
 
-_SPAN_S: Final = 0.5
+_SPAN_S: Final = 1.0
 _ROAM_STD_M: Final = 6.0
 """Standard deviation per axis of the positions of tags that move as the bound assumes."""
 
 _BOUND_S: Final = 12.0
 _ROOM: Final = Room()
 
-_TAG_COST_S: Final = 0.02
+_TAG_COST_S: Final = 0.07
 """About what a second of a tag takes."""
 
 _PATH_KEY: Final = 41
@@ -183,7 +179,7 @@ def _path(case: LargeCase, draw: np.random.Generator, low_m: float, high_m: floa
     return Waypoints(points_m, case.speed_mps, loop=True, corner_s=_CORNER_S)
 
 
-def world_of_cells(run: LargeRun) -> CellWorld:
+def tape_of(run: LargeRun) -> Tape:
     """The site on the air, and the tags of a cell in it."""
     case, plan, site = run.case, run.plan, site_of(run.case)
     draw = np.random.default_rng(seed_of(plan.seed, _PATH_KEY, run.number, 1))
@@ -193,38 +189,35 @@ def world_of_cells(run: LargeRun) -> CellWorld:
         channel=ChannelModel(loss_probability=case.loss),
         range_errors=_ROOM.ranges if case.in_room else RangeErrorModel(),
     )
-    return CellWorld(
-        anchors_of(site),
-        period_codes_of(site),
+    return Tape(
+        site,
         paths(run),
         impairments,
         seed_of(plan.seed, _PATH_KEY, run.number, 2) >> 1,
-        dead=(draw.random(len(site.anchors)) < case.dead_share).tolist(),
+        dead=draw.random(len(site.anchors)) < case.dead_share,
         survey_std_m=_ROOM.axis_std_m if case.in_room else 0.0,
     )
 
 
 def run_large(run: LargeRun) -> LargeResult:
     """Simulate the tags of a cell, and judge their fixes."""
-    world, site = world_of_cells(run), site_of(run.case)
-    return _sum([_judge_tag(run, site, world, tag) for tag in range(run.tags)])
+    tape, site = tape_of(run), site_of(run.case)
+    return _sum([_judge_tag(run, site, tape, tag) for tag in range(run.tags)])
 
 
-def _judge_tag(run: LargeRun, site: Site, world: CellWorld, tag: int) -> LargeResult:
+def _judge_tag(run: LargeRun, site: Site, tape: Tape, tag: int) -> LargeResult:
     case, plan = run.case, run.plan
     seconds = 1.0 if case.starts else _BOUND_S if case.bounded else case.seconds or plan.seconds
     begin_s = float(np.random.default_rng(seed_of(plan.seed, run.number, tag)).uniform(1.0, 20.0))
-    log, beacons = _TagLog(Receiver(qa=plan.qa)), SiteBeacons(site)
-    spans: list[TagReceptions] = []
+    log = _TagLog(Receiver(qa=plan.qa))
+    beacons: list[Heard] = []
     at_s = begin_s
     while at_s < begin_s + seconds and not (case.starts and log.first_fix_s is not None):
-        received = world.receptions(tag, at_s, min(at_s + _SPAN_S, begin_s + seconds))
-        for beacon, reception, row in beacons.received(received):
-            log.add(beacon, reception, received, row)
-        if case.bounded:
-            spans.append(received)
+        for heard in tape.hear(tag, at_s, min(at_s + _SPAN_S, begin_s + seconds)):
+            log.add(heard)
+            beacons.append(heard)
         at_s += _SPAN_S
-    bounds = _bound_m2(world, site, spans, case, plan) if case.bounded else np.zeros(0)
+    bounds = _bound_m2(tape, site, beacons, case, plan) if case.bounded else np.zeros(0)
     return log.result(seconds, bounds)
 
 
@@ -241,22 +234,22 @@ class _TagLog:
         self._judged: list[tuple[int, float, float, float]] = []
         """Number of the beacon, squared error, its normalised square, variance."""
 
-    def add(self, beacon: Beacon, reception: Reception, received: TagReceptions, row: int) -> None:
+    def add(self, heard: Heard) -> None:
         """Let the tag process one beacon."""
-        at_s = float(received.emission_s[row]) if reception.host_s is None else reception.host_s
+        beacon, at_s = heard.beacon, heard.reception.host_s or 0.0
         if self._first_beacon_s is None:
             self._first_beacon_s = at_s
         anchor, method = beacon.anchor, self._receiver.method
         was_running = isinstance(method, Estimation) and not method.is_starting
         was_in = isinstance(method, Estimation) and was_running and method.estimator.has_anchor(anchor)
-        fix = self._receiver.hear_beacon(beacon, reception)
+        fix = self._receiver.hear_beacon(beacon, heard.reception)
         method = self._receiver.method
         if isinstance(method, Estimation) and was_running:
             self._restarts += method.is_starting
             self._joins += not method.is_starting and not was_in and method.estimator.has_anchor(anchor)
         self._beacons += 1
         if fix is not None:
-            self._judge(fix, at_s, received.positions_m[row])
+            self._judge(fix, at_s, heard.truth_m)
 
     def _judge(self, fix: Fix, at_s: float, truth_m: Array) -> None:
         if self.first_fix_s is None:
@@ -304,16 +297,19 @@ def _sum(tags: Sequence[LargeResult]) -> LargeResult:
 # The bound
 
 
-def _bound_m2(world: CellWorld, site: Site, spans: Sequence[TagReceptions], case: LargeCase, plan: Plan) -> Array:
+def _bound_m2(tape: Tape, site: Site, heard: Sequence[Heard], case: LargeCase, plan: Plan) -> Array:
     """Trace of the Cramér–Rao bound after each beacon of a tag, shape (beacons,): of all that these beacons state."""
-    anchor, sequence = (np.concatenate([getattr(one, name) for one in spans]) for name in ("anchor", "sequence"))
-    times_s = np.concatenate([one.emission_s for one in spans])
-    ids, senders = np.unique(anchor, return_inverse=True)
+    sequence = np.array([one.beacon.sequence for one in heard])
+    times_s = np.array([one.reception.host_s for one in heard])
+    ids, senders = np.unique([one.beacon.anchor for one in heard], return_inverse=True)
     index_of = {identifier: index for index, identifier in enumerate(ids.tolist())}
-    relays = [listed for one in spans for listed in _relays(one, index_of)]
+    relays = [
+        [(index_of[relay.anchor], relay.sequence) for relay in one.beacon.heard if relay.anchor in index_of]
+        for one in heard
+    ]
     known = relayed_receptions(senders, sequence, relays, len(ids))
     row_of = {one.id: row for row, one in enumerate(site.anchors)}
-    anchors_m = world.true_positions_m[[row_of[identifier] for identifier in ids.tolist()]]
+    anchors_m = tape.true_positions_m[[row_of[identifier] for identifier in ids.tolist()]]
     noise = site.noise
     settings = BoundSettings(
         plan.noise_ps * 1e-12,
@@ -325,17 +321,9 @@ def _bound_m2(world: CellWorld, site: Site, spans: Sequence[TagReceptions], case
         mesh=True,
     )
     biases = biases_of(_ROOM if case.in_room else None)
-    path_m = np.concatenate([one.positions_m for one in spans])
+    path_m = np.array([one.truth_m for one in heard])
     bound = received_bound(anchors_m, path_m, settings, known, Sendings(senders, times_s), biases)
     return np.asarray(np.trace(bound, axis1=1, axis2=2))
-
-
-def _relays(span: TagReceptions, index_of: dict[int, int]) -> Iterator[list[tuple[int, int]]]:
-    """Of each beacon, anchor and sequence number of those whose reception it relays."""
-    rows = zip(span.relays.tolist(), span.relay_anchor.tolist(), span.relay_sequence.tolist(), strict=True)
-    for count, anchors, sequences in rows:
-        pairs = zip(anchors[:count], sequences[:count], strict=True)
-        yield [(index_of[anchor], sequence) for anchor, sequence in pairs if anchor in index_of]
 
 
 # Cells and rows

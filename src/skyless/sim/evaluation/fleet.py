@@ -19,8 +19,9 @@ from skyless.core.tag.receiver import NOT_DROPS
 from skyless.sim.evaluation.figures import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
 from skyless.sim.impairments import Impairments, Outage, lab_impairments
 from skyless.sim.lab import lab_site, paper_lab_site
-from skyless.sim.listening import TagSpec
+from skyless.sim.listening import Outcome, TagSpec
 from skyless.sim.medium import Tally
+from skyless.sim.tape import Tape
 from skyless.sim.trajectory import Static, Trajectory
 from skyless.sim.world import World
 
@@ -118,7 +119,7 @@ def world_of(site: Site, trajectories: Sequence[Trajectory], impairments: Impair
 
 
 class TagFleet:
-    """Computing tags and their errors; ``Fleet`` and ``CellFleet`` differ in how tags receive."""
+    """Computing tags and their errors; ``Fleet`` and ``TapeFleet`` differ in how tags receive."""
 
     step_s = 0.25
     """Suitable true time per call of ``run``."""
@@ -227,6 +228,52 @@ class Fleet(TagFleet):
                 judged = self.add(tag, self.receivers[tag].hear(reception), truth_m, broadcast.end_s)
                 if judged is not None:
                     yield judged
+
+
+class TapeFleet(TagFleet):
+    """Tags at a large site of protocol 2, whose anchors are a tape; each beacon that a tag hears becomes fixes."""
+
+    step_s = 0.5
+
+    def __init__(
+        self,
+        site: Site,
+        trajectories: Sequence[Trajectory],
+        impairments: Impairments,
+        seed: int,
+        settings: FleetSettings,
+        survey_std_m: float = 0.0,
+    ) -> None:
+        """``survey_std_m``: standard deviation of the anchors' true positions around the stated ones, per axis.
+
+        Raises:
+            ValueError: an impairment is not modelled.
+        """
+        super().__init__(site, len(trajectories), settings)
+        self.tape = Tape(site, trajectories, impairments, seed, survey_std_m=survey_std_m)
+        self._now_s = 0.0
+
+    @property
+    def now_s(self) -> float:
+        """See ``TagFleet``."""
+        return self._now_s
+
+    @property
+    def tally(self) -> Tally:
+        """What tags have received; what others have, and what was lost, is not counted."""
+        return Tally(0, 0, {}, {str(Outcome.HEARD): sum(record.messages for record in self.records)})
+
+    def run(self, until_s: float) -> Iterator[JudgedFix]:
+        """See ``TagFleet``; tag by tag within each half second."""
+        while self._now_s < until_s:
+            end_s = min(self._now_s + self.step_s, until_s)
+            for tag, receiver in enumerate(self.receivers):
+                for heard in self.tape.hear(tag, self._now_s, end_s):
+                    fix = receiver.hear_beacon(heard.beacon, heard.reception)
+                    judged = self.add(tag, fix, heard.truth_m, heard.reception.host_s or 0.0)
+                    if judged is not None:
+                        yield judged
+            self._now_s = end_s
 
 
 class FleetReport(Struct, frozen=True):

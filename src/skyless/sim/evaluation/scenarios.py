@@ -15,8 +15,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.geometry import rectangle_of
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, SNAPSHOTS
 from skyless.core.site import FloorSite, Site
-from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet
-from skyless.sim.evaluation.fleet import Fleet, FleetSettings, JudgedFix, TagFleet, TagReceiver
+from skyless.sim.evaluation.fleet import Fleet, FleetSettings, JudgedFix, TagFleet, TagReceiver, TapeFleet
 from skyless.sim.evaluation.request import Conditions
 from skyless.sim.impairments import AnchorDisplacement, Body, CarrierModel, Impairments, RangeErrorModel, WarmUp
 from skyless.sim.oscillator import OscillatorModel, Temperature
@@ -34,6 +33,9 @@ MIN_WALK_M: Final = 1.0
 """Walking tags have at least this much space along x and y, even around a single anchor."""
 
 WAYPOINTS: Final = 8
+
+MAX_MACHINES: Final = 200
+"""Sites of protocol 2 with more anchors are tapes."""
 
 COMFORT_MPS2: Final = 2.0
 """Acceleration with which people and robots turn."""
@@ -159,7 +161,7 @@ def fleet_of(request: Request) -> Fleet:
 
 
 def fleet_of_any_size(request: Request) -> TagFleet:
-    """Like ``fleet_of``, but simulates the anchors of large sites of protocol 2 on demand.
+    """Like ``fleet_of``, but the anchors of a large site of protocol 2 are a tape.
 
     Raises:
         ValueError: as ``fleet_of``, or a requested fault is not modelled at such a site.
@@ -185,7 +187,7 @@ def fleet_of_any_size(request: Request) -> TagFleet:
     ]
     if unfit:
         raise ValueError(f"{unfit[0]}: not modelled at a site of more than {MAX_MACHINES} anchors")
-    return CellFleet(
+    return TapeFleet(
         site,
         trajectories_of(request),
         replace(faults, anchor_displacements=()),

@@ -1,4 +1,4 @@
-"""Tags at sites whose anchors are simulated on demand."""
+"""Tags at large sites, whose anchors are a tape."""
 
 import pytest
 from msgspec.structs import replace
@@ -6,9 +6,8 @@ from msgspec.structs import replace
 from skyless.core.air.beacon import encode
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.site import EXACT
-from skyless.sim.evaluation.cell_fleet import MAX_MACHINES, CellFleet, SiteBeacons
-from skyless.sim.evaluation.fleet import Fleet, FleetSettings
-from skyless.sim.evaluation.scenarios import Request, fleet_of_any_size
+from skyless.sim.evaluation.fleet import Fleet, FleetSettings, TapeFleet
+from skyless.sim.evaluation.scenarios import MAX_MACHINES, Request, fleet_of_any_size
 from skyless.sim.impairments import Impairments
 from skyless.sim.trajectory import Roaming
 from skyless.site.file.template import grid_site
@@ -22,9 +21,8 @@ def tags(count):
     return [Roaming((100.0 + 10.0 * n, 120.0, 1.0), (6.0, 6.0, 0.0), seed=n) for n in range(count)]
 
 
-@pytest.mark.statistical
 def test_tags_are_as_accurate_as_their_fixes_say():
-    fleet = CellFleet(GRID, tags(3), Impairments(), 7, FleetSettings())
+    fleet = TapeFleet(GRID, tags(3), Impairments(), 7, FleetSettings())
     assert all(judged.fix.std_m < 0.5 for judged in fleet.run(4.0))
     assert fleet.now_s == 4.0
     assert fleet.errors.summary().rmse_2d_m < 0.04
@@ -33,11 +31,11 @@ def test_tags_are_as_accurate_as_their_fixes_say():
 
 
 def test_the_bytes_of_the_frames_make_the_same_fixes():
-    fleet = CellFleet(GRID, tags(1), Impairments(), 8, FleetSettings())
+    fleet = TapeFleet(GRID, tags(1), Impairments(), 8, FleetSettings())
     decoded, from_bytes, fixes = AnyReceiver(), AnyReceiver(), 0
-    for beacon, reception, _ in SiteBeacons(GRID).received(fleet.cells.receptions(0, 0.5, 2.0)):
-        fix = decoded.hear_beacon(beacon, reception)
-        again = from_bytes.hear(replace(reception, frame=encode(beacon)))
+    for heard in fleet.tape.hear(0, 0.5, 2.0):
+        fix = decoded.hear_beacon(heard.beacon, heard.reception)
+        again = from_bytes.hear(replace(heard.reception, frame=encode(heard.beacon)))
         assert (fix is None) == (again is None)
         if fix is not None:
             assert fix.rows == again.rows
@@ -45,9 +43,9 @@ def test_the_bytes_of_the_frames_make_the_same_fixes():
     assert fixes > 150
 
 
-def test_sites_with_more_anchors_than_machines_are_simulated_on_demand():
+def test_sites_with_more_anchors_than_machines_are_tapes():
     assert len(GRID.anchors) > MAX_MACHINES
-    assert isinstance(fleet_of_any_size(Request(GRID)), CellFleet)
+    assert isinstance(fleet_of_any_size(Request(GRID)), TapeFleet)
     small = grid_site(60.0, 60.0, 15.0, 4.0, 1.0)
     assert isinstance(fleet_of_any_size(Request(small)), Fleet)
 

@@ -1,1 +1,0 @@
-"""Sites of thousands of anchors, simulated cell by cell."""
