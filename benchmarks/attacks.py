@@ -36,7 +36,6 @@ from skyless.core.alert import Alert
 from skyless.core.site import ScheduleSite, Site
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.core.trusted_receiver import SiteTrust, Trust
-from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, Room
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.streams import stream
@@ -241,7 +240,6 @@ def main():
     parser.add_argument("--seeds", type=int, default=4)
     parser.add_argument("--room", action="store_true", help="with a real room's errors of survey and ranges")
     asked = parser.parse_args()
-    compile_kernels()
     {"forged": forged, "relayed": relayed}[asked.what](asked)
 
 

@@ -39,7 +39,7 @@ from skyless.core.site import AnchorSite, ScheduleSite
 from skyless.radio.serial.link import BoardSettings, Reader, decode
 from skyless.radio.tag_reports import BoardFix, BoardStatus
 from skyless.run import anchor
-from skyless.sim.evaluation.fleet import compile_kernels, world_of
+from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
 from skyless.sim.lab import lab_site, paper_lab_site
 
@@ -62,7 +62,6 @@ def heads(text):
 
 
 def site(asked):
-    compile_kernels()
     make = HostBoard if asked.boards == "host" else partial(Image, elf=build("all"))
     wire = WireSettings(
         usb=asked.usb, host=HostLatency() if asked.pauses else None, piece_bytes=64 if asked.boards == "host" else 1

@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from skyless.sim.evaluation.fleet import compile_kernels
 from support.tiers import TIERS, file_tiers
 
 settings.register_profile("skyless", deadline=None, derandomize=True)  # a first call compiles; a run repeats itself
@@ -56,19 +55,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if tiers := _tiers(config):
         config.hook.pytest_deselected(items=[item for item in items if _tier(item) not in tiers])
         items[:] = [item for item in items if _tier(item) in tiers]
-
-
-def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile the simulation before the workers of pytest-xdist start; what they collect is not known here."""
-    if session.config.getoption("numprocesses", None) and _tiers(session.config) != ["unit"]:
-        compile_kernels()
-
-
-def pytest_collection_finish(session: pytest.Session) -> None:
-    """Compile before the first test that may start a program. Unit tests compile what they call, when they call it."""
-    is_worker = hasattr(session.config, "workerinput")
-    if not is_worker and not session.config.option.collectonly and {_tier(item) for item in session.items} - {"unit"}:
-        compile_kernels()
 
 
 @pytest.hookimpl(tryfirst=True)

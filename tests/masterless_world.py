@@ -48,9 +48,10 @@ class MasterlessWorld:
         """A node's counter at a true time, whole ticks."""
         whole = int(t_s * TICK_RATE_HZ)
         fraction = t_s * TICK_RATE_HZ - whole
-        advance(self.clocks, self.streams.normals, self.streams.cursors, node, whole, fraction)
-        self.streams.refill(int(self.streams.cursors.max()))
-        return int(self.clocks[node]["local_ticks"]) + round(float(self.clocks[node]["local_fraction"]))
+        clock, noise = self.clocks[node], self.streams.noise[node]
+        advance(clock, noise, whole, fraction)
+        self.streams.refill(noise.used)
+        return clock.local_ticks + round(clock.local_fraction)
 
     def noise(self):
         return self.random.normal(0.0, STAMP_TICKS)

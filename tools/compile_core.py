@@ -1,4 +1,4 @@
-"""Compile ``skyless_core.c``, which is made from the estimator's Python, to libraries beside it.
+"""Compile ``skyless_core.c`` and ``skyless_kernels.c``, which are made from Python, to libraries beside them.
 
 The compiler is ``$CC``, or the first of cc, gcc and clang on the PATH, or else that of PyPI's ``ziglang``, which
 ``CC=ziglang`` asks for. ``SKYLESS_TARGET`` names another machine (x86_64-linux or aarch64-linux), for which ``ziglang``
@@ -18,6 +18,7 @@ import tempfile
 from pathlib import Path
 
 NATIVE = Path("src/skyless/core/native")
+NAMES = ("skyless_core", "skyless_kernels")
 FLAGS = ["-std=c99", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", "-fvisibility=hidden"]
 AVX2_FLAGS = ["-mavx2", "-mbmi", "-mbmi2", "-mmovbe"]
 """One by one, because compilers before 2021 know no ``-march=x86-64-v3``, and zig writes it differently."""
@@ -53,23 +54,25 @@ def target() -> str:
 
 
 def build(native: Path) -> list[Path]:
-    """Compile the libraries in a folder; where they stand. On x86-64 there is one more, for wider vectors.
+    """Compile the libraries in a folder; where they stand. On x86-64 there is one more of each, for wider vectors.
 
     Raises:
         SystemExit: the compiler failed.
     """
-    made = [compiled(native, "libskyless_core.so", [])]
-    if target().startswith(("x86_64-", "AMD64-")):
-        made.append(compiled(native, "libskyless_core_avx2.so", AVX2_FLAGS))
+    made = []
+    for name in NAMES:
+        made.append(compiled(native, name, f"lib{name}.so", []))
+        if target().startswith(("x86_64-", "AMD64-")):
+            made.append(compiled(native, name, f"lib{name}_avx2.so", AVX2_FLAGS))
     return made
 
 
-def compiled(native: Path, name: str, flags: list[str]) -> Path:
-    """Compile one library. It is there as a whole, or as it was before."""
-    source, library = native / "skyless_core.c", native / name
+def compiled(native: Path, name: str, made: str, flags: list[str]) -> Path:
+    """Compile one library of a source. It is there as a whole, or as it was before."""
+    source, library = native / f"{name}.c", native / made
     new = library.with_name(f"{library.stem}-{os.getpid()}.so")
     try:
-        run([*(compiler() or _zig()), *FLAGS, *flags, digest_of(source), str(source), "-o", str(new)])
+        run([*(compiler() or _zig()), *FLAGS, *flags, digest_of(source), str(source), "-lm", "-o", str(new)])
         new.replace(library)
     finally:
         new.unlink(missing_ok=True)

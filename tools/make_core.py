@@ -1,17 +1,18 @@
-"""Make ``skyless_core.h`` and ``skyless_core.c`` from the Python that boards and browsers share with it.
+"""Make C from Python: ``skyless_core``, which boards and browsers share, and ``skyless_kernels`` of the simulation.
 
 python tools/make_core.py
 """
 
-import inspect
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any, Final
 
 from skyless.core.air import beacon, neighbours
 from skyless.core.estimator import kalman, levels, process, state, steady_state
-from skyless.core.native import arithmetic
+from skyless.core.native.library import CORE, FOLDER, KERNELS
 from skyless.core.tag import admission, following, hearing, position
+from skyless.research import benchmark
+from skyless.sim import listening, oscillator
+from skyless.site.planning import links, optimise, rates
 from translator.files import translate
 
 EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
@@ -41,14 +42,25 @@ EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
     following.begin_again,
     following.follow,
 )
-"""What is called from outside."""
+"""What is called from outside of the core."""
+
+KERNEL_EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
+    oscillator.advance,
+    oscillator.foresee,
+    oscillator.emit,
+    listening.receive_frame,
+    links.fill_links,
+    rates.fill_rates,
+    optimise.judge,
+    benchmark.run_plain,
+)
 
 BY_HAND: Final = (kalman.compute_ph, kalman.compute_fault_input, kalman._inform, kalman._apply_updates)
 """What a target may have by hand, in the file that ``SKYLESS_BY_HAND`` names."""
 
-NAME: Final = "skyless_core"
-FOLDER: Final = Path(inspect.getfile(arithmetic)).parent
+FILES: Final = ((CORE, EXPORTS, BY_HAND), (KERNELS, KERNEL_EXPORTS, ()))
 
 if __name__ == "__main__":
-    for text, suffix in zip(translate(EXPORTS, NAME, BY_HAND), ("h", "c"), strict=True):
-        (FOLDER / f"{NAME}.{suffix}").write_text(text)
+    for name, exports, by_hand in FILES:
+        for text, suffix in zip(translate(exports, name, by_hand), ("h", "c"), strict=True):
+            (FOLDER / f"{name}.{suffix}").write_text(text)

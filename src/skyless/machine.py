@@ -19,7 +19,6 @@ EXTRA_OF: Final = {
     "matplotlib": "site",
     "mcap": "site",
     "nats": "gather",
-    "numba": "site",
     "pandas": "pandas",
     "pyarrow": "history",
     "rosbags": "ros2",

@@ -15,7 +15,6 @@ from skyless.run.process import end_with_parent
 from support.processes import free_port
 
 START_S = 120.0
-"""A first start compiles the kernels."""
 
 ORIGIN = (48.137, 11.576)
 """Latitude and longitude in degrees."""

@@ -10,7 +10,6 @@ from site_stage import HOST, boards, wire_of
 from skyless.cli.main import main, program
 from skyless.run import process
 from skyless.run.mqtt.messages import FixMessage
-from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.sim.trajectory import Static
 from skyless.site.file.load import load_site
 
@@ -23,7 +22,6 @@ SECONDS = 1.0
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
     """A site file as ``skyless site new`` writes it."""
-    compile_kernels()
     path = tmp_path_factory.mktemp("site") / "hall.toml"
     assert main(["site", "new", str(path), "--width", "6", "--depth", "8"]) == 0
     return path

@@ -6,17 +6,10 @@ The programs are those of ``skyless anchor`` and ``skyless tag``, behind pseudo-
 import pytest
 from site_stage import KINDS, site_of
 
-from skyless.sim.evaluation.fleet import compile_kernels
-
 pytestmark = pytest.mark.statistical
 
 SECONDS = {"host": 2.0, "image": 1.2}
 WARMUP_S = 0.6
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    compile_kernels()
 
 
 @pytest.fixture(scope="module", params=KINDS)

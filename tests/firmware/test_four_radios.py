@@ -18,7 +18,6 @@ from skyless.core.ticks import from_seconds, wrap
 from skyless.radio.interface import AntennaDelays, Reception
 from skyless.radio.serial.serial_radio import LinkSession
 from skyless.sim.dw1000.chip import Chip
-from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
@@ -39,7 +38,6 @@ DELAYS = AntennaDelays()
 @pytest.fixture(scope="module")
 def tape():
     """What the tag's antenna gets, and that as the driver reads it; ``host_s`` is when each frame ended."""
-    compile_kernels()
     faults = msgspec.structs.replace(impairments_of(Request(LAB, nlos=0.1, carrier=True), LAB), diagnostics=True)
     world = World(LAB, lambda number: Anchor(LAB, number), [TagSpec(Static(2.0, 3.0, 0.0))], faults, SEED)
     tag = TimedNode(WorldAir(world.medium, len(LAB.anchors)))

@@ -6,18 +6,12 @@ import random
 import pytest
 from site_stage import HOST, IMAGE, play, site_of, until
 
-from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.sim.trajectory import Static
 
 pytestmark = pytest.mark.site
 
 SLOT_MS = 5.0
 PLACES = [Static(2.0, 3.0, 0.0)]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    compile_kernels()
 
 
 def with_kind(kind, *values):

@@ -3,7 +3,7 @@
 python tests/firmware/with_board_sizes.py float|double SCRIPT ARGUMENTS…
 """
 
-import ctypes
+import importlib
 import re
 import runpy
 import shutil
@@ -11,7 +11,9 @@ import sys
 import tempfile
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[2] / "tools"))
+sys.path += [str(Path(__file__).parents[2] / "tools"), str(Path(__file__).parents[1] / "native")]
+
+from with_float import narrow_reals
 
 import compile_core
 from skyless.core.native import library, records, views
@@ -31,11 +33,13 @@ def use_board_sizes(real, folder):
             continue
         setattr(records, name, value == "true" if value in {"true", "false"} else int(value))
     if real == "float":
-        records._C_TYPES[float] = ctypes.c_float
+        narrow_reals()
+    else:
+        importlib.import_module("skyless.sim.medium")  # its library, before that of the core is another one
     for part in (library.SOURCE, library.SOURCE.with_suffix(".h")):
         shutil.copy(part, folder)
-    made = compile_core.compiled(folder, "board.so", FLOAT if real == "float" else (*DOUBLE, BY_HAND))
-    library.LIBRARIES = (made, made)
+    compile_core.compiled(folder, library.CORE, "libskyless_core.so", FLOAT if real == "float" else (*DOUBLE, BY_HAND))
+    library.FOLDER = folder
     if real == "float":
         from skyless.core.estimator.estimator import Estimator
 

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from skyless.core.air.frame import Heard, Reception
 from skyless.core.air.site_pages import decode_page, encode_page
+from skyless.core.native.views import view
 from skyless.core.protocol1.almanac import page_for, pages_of
 from skyless.core.protocol1.anchor import MAX_OFFSET_STD_M, Anchor
 from skyless.core.protocol1.beacon import Beacon, MasterTime, decode, encode, first_slots, schedule_of
@@ -29,10 +30,10 @@ def beacons(stage, until_s):
 def master_reading(world, broadcast):
     """What the master's counter truly shows when a frame leaves: unwrapped ticks and fraction."""
     clock = world.medium.clocks[0]
-    ahead = broadcast.emission_ticks - int(clock["true_ticks"])
-    elapsed = (ahead + broadcast.emission_fraction - float(clock["true_fraction"])) * (1.0 + float(clock["rate"]))
+    ahead = broadcast.emission_ticks - clock.true_ticks
+    elapsed = (ahead + broadcast.emission_fraction - clock.true_fraction) * (1.0 + clock.rate)
     whole = math.floor(elapsed)
-    return int(clock["local_ticks"]) + whole, float(clock["local_fraction"]) + elapsed - whole
+    return clock.local_ticks + whole, clock.local_fraction + elapsed - whole
 
 
 class Ideal:
@@ -120,7 +121,7 @@ def test_the_master_time_is_as_good_as_it_says():
     squares, largest = [], 0.0
     for seed in range(8):
         stage = Stage(LAB, seed)
-        stage.world.medium.stations["tx_noise_ticks"][1:] = 0.0
+        view(stage.world.medium.stations)["tx_noise_ticks"][1:] = 0.0
         for broadcast, beacon in beacons(stage, 5.0):
             if beacon.anchor == 1 or broadcast.end_s < 1.0:
                 continue

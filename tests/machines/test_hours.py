@@ -59,7 +59,7 @@ def test_no_jump_in_hours():
     for machine in fleet.anchors.values():
         assert isinstance(machine, Anchor)
         restarts += machine.counters["clock-restart"]
-    wraps = [int(clock["local_ticks"]) // WRAP_TICKS for clock in fleet.world.medium.clocks]
+    wraps = [clock.local_ticks // WRAP_TICKS for clock in fleet.world.medium.clocks]
     print(  # noqa: T201 (pytest -s shows the figures)
         f"\n{HOURS:g} h: {fixes} fixes, {sum(wraps)} wraps of {len(wraps)} counters, largest error {largest_m:.4f} m "
         f"({largest_sigmas:.2f} sigma), normalised error squared per dimension {squares / fixes / 2:.3f}, "

@@ -9,6 +9,7 @@ from bench import EVERY_METHOD, LAB, ROOM, SNAPSHOTS, Stage, assert_honest
 from msgspec.structs import replace
 
 from skyless.core.any_receiver import AnyReceiver
+from skyless.core.native.views import view
 from skyless.core.protocol1.anchor import Anchor, Role
 from skyless.core.protocol1.beacon import decode
 from skyless.core.protocol1.clock import SiteTime, is_newer
@@ -30,7 +31,7 @@ def off(*outages):
 
 def lossy(probability):
     channel = impairments_of(Request(LAB), LAB).channel
-    return replace(channel, loss_probability=probability)
+    return channel.changed(loss_probability=probability)
 
 
 class Walled(Anchor):
@@ -110,7 +111,7 @@ class Story:
 
 def quiet(stage):
     """Without the noise of emissions, which is not the site time's."""
-    stage.world.medium.stations["tx_noise_ticks"][:] = 0.0
+    view(stage.world.medium.stations)["tx_noise_ticks"][:] = 0.0
     return stage
 
 

@@ -33,8 +33,9 @@ def native(tmp_path, monkeypatch):
     """A folder with a small source, and an environment that asks for nothing."""
     for name in ("CC", "SKYLESS_TARGET"):
         monkeypatch.delenv(name, raising=False)
-    (tmp_path / "skyless_core.c").write_text(SMALL)
-    (tmp_path / "skyless_core.h").write_text('#define SKYLESS_EXPORT __attribute__((visibility("default")))\n')
+    for name in compile_core.NAMES:
+        (tmp_path / f"{name}.c").write_text(SMALL.replace("skyless_core", name))
+        (tmp_path / f"{name}.h").write_text('#define SKYLESS_EXPORT __attribute__((visibility("default")))\n')
     return tmp_path
 
 
@@ -88,8 +89,8 @@ def test_zig_compiles_for_any_processor_of_the_machine(no_compiler, monkeypatch)
     monkeypatch.setattr(compile_core, "run", lambda command: commands.append(command) or Path(command[-1]).touch())
     monkeypatch.setenv("SKYLESS_TARGET", "aarch64-linux")
     made = compile_core.build(Path(os.environ["PATH"]))
-    assert [path.name for path in made] == ["libskyless_core.so"]
-    (command,) = commands
+    assert [path.name for path in made] == ["libskyless_core.so", "libskyless_kernels.so"]
+    command, _ = commands
     assert command[:4] == [sys.executable, "-m", "ziglang", "cc"]
     assert command[command.index("-target") + 1] == "aarch64-linux-gnu.2.17"
     monkeypatch.delenv("SKYLESS_TARGET")
@@ -119,8 +120,8 @@ def hook(native):
         sys.path.remove(str(ROOT))
     folder = native / compile_core.NATIVE
     folder.mkdir(parents=True)
-    for name in ("skyless_core.c", "skyless_core.h"):
-        shutil.copy(native / name, folder)
+    for file in native.glob("skyless_*.[ch]"):
+        shutil.copy(file, folder)
     return CoreBuildHook(str(native), {}, None, None, "", "wheel")
 
 
@@ -160,7 +161,9 @@ def test_git_ignores_libraries_and_uv_and_scripts_watch_all_that_they_are_made_f
         assert file in watched
         assert f'"$root/{file}"' in environment
     (pattern,) = [name for name in watched if "*" in name]
-    assert {path.name for path in ROOT.glob(pattern)} == {"skyless_core.c", "skyless_core.h"}
+    assert {path.name for path in ROOT.glob(pattern)} == {
+        f"{name}.{suffix}" for name in compile_core.NAMES for suffix in "ch"
+    }
     assert str(NATIVE.relative_to(ROOT / "src")) in environment
     assert "*.so" in (ROOT / ".gitignore").read_text().split()
 

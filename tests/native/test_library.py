@@ -75,9 +75,8 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.delenv("SKYLESS_UNCOMPILED", raising=False)
     (tmp_path / "skyless_core.c").write_text(SOURCE)
     (tmp_path / "skyless_core.h").write_text('#define SKYLESS_EXPORT __attribute__((visibility("default")))\n')
-    made = compile_core.compiled(tmp_path, "libskyless_core.so", [])
-    monkeypatch.setattr(library, "LIBRARIES", (tmp_path / "libskyless_core_avx2.so", made))
-    monkeypatch.setattr(library, "SOURCE", tmp_path / "skyless_core.c")
+    compile_core.compiled(tmp_path, "skyless_core", "libskyless_core.so", [])
+    monkeypatch.setattr(library, "FOLDER", tmp_path)
     library.library.cache_clear()
     yield tmp_path
     library.library.cache_clear()
@@ -145,18 +144,22 @@ def test_uncompiled_is_the_python_function(folder, monkeypatch):
 def test_a_library_of_another_source_says_so(folder):
     (folder / "skyless_core.h").write_text("/* changed */\n")
     with pytest.raises(SkylessError, match=r"made from another skyless_core.c .*install Skyless again.*scripts/core"):
-        library.library()
+        library.library(library.CORE)
 
 
 def test_a_missing_library_says_what_to_do(folder):
     (folder / "libskyless_core.so").unlink()
     with pytest.raises(SkylessError, match=r"libskyless_core.so: cannot open.*install Skyless again"):
-        library.library()
+        library.library(library.CORE)
 
 
 def test_that_of_this_checkout_is_made_from_its_source():
     """In a process of its own: this one may run uncompiled."""
-    command = [sys.executable, "-c", "from skyless.core.native.library import library; print(library()._name)"]
+    command = [
+        sys.executable,
+        "-c",
+        "from skyless.core.native.library import library; print(library('skyless_core')._name)",
+    ]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()).parent == NATIVE

@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, one_by_one, settings_of
 
 import wasm_core
-from make_core import BY_HAND, EXPORTS, NAME
+from make_core import EXPORTS, FILES
 from skyless.core.air.almanac import GeoreferencePage, NoisePage, SitePage
 from skyless.core.air.beacon import Beacon, StatedPosition, encode
 from skyless.core.air.frame import Heard, fcs
@@ -40,10 +40,15 @@ SITES = [(LAB_M, 0.0, {}), (ROOM_M, 0.0, ERRORS), (ROOM_M, None, ERRORS)]
 FUNCTIONS = Translator(EXPORTS).functions
 
 
-def test_the_files_are_what_their_source_makes():
-    header, source = translate(EXPORTS, NAME, BY_HAND)
-    assert (NATIVE / f"{NAME}.h").read_text() == header, "run scripts/core"
-    assert (NATIVE / f"{NAME}.c").read_text() == source, "run scripts/core"
+@pytest.mark.parametrize(("name", "exports", "by_hand"), FILES, ids=[name for name, *_ in FILES])
+def test_the_files_are_what_their_source_makes(name, exports, by_hand):
+    header, source = translate(exports, name, by_hand)
+    assert (NATIVE / f"{name}.h").read_text() == header, "run scripts/core"
+    assert (NATIVE / f"{name}.c").read_text() == source, "run scripts/core"
+
+
+def test_the_core_calls_no_function_whose_bits_depend_on_the_machine():
+    assert "math.h" not in (NATIVE / "skyless_core.c").read_text()
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ All that the library does is in single precision then: the start, the filter, fa
 """
 
 import ctypes
+import importlib
 import runpy
 import shutil
 import sys
@@ -17,18 +18,28 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 import compile_core
-from skyless.core.native import library, records, views
+from skyless.core import ticks
+from skyless.core.native import arithmetic, library, records, views
 
 FLAGS = ["-DSKYLESS_FLOAT", "-Wdouble-promotion", "-Werror"]
 """No number becomes a double on the way."""
 
 
+def narrow_reals():
+    """From here on a ``float`` of a record that is declared has 32 bits; those of the simulation keep 64."""
+    importlib.import_module("skyless.sim.medium")
+    records._C_TYPES[float] = ctypes.c_float
+    for declared in (arithmetic, ticks):  # the simulation has imported them
+        importlib.reload(declared)
+
+
 def use_float(folder):
-    """Before any record is declared: a ``float`` of a record has 32 bits, as in the library."""
+    """Before the estimator's records are declared: they and the library are in single precision."""
+    narrow_reals()
     for part in (library.SOURCE, library.SOURCE.with_suffix(".h")):
         shutil.copy(part, folder)
-    library.LIBRARIES = (compile_core.compiled(folder, "float.so", FLAGS),) * 2
-    records._C_TYPES[float] = ctypes.c_float
+    compile_core.compiled(folder, library.CORE, "libskyless_core.so", FLAGS)
+    library.FOLDER = folder
     from skyless.core.estimator.estimator import Estimator
 
     # Fixes hold doubles.

@@ -7,7 +7,6 @@ import time
 
 from mqtt_brokers import Mosquitto
 
-from skyless.sim.evaluation.fleet import compile_kernels
 from support.processes import SKYLESS, free_port, usual_signals
 
 START_S = 120.0
@@ -113,7 +112,6 @@ class SevenAnchors:
         return [self.ether, *self.anchors.values(), *self.tags.values(), self.page]
 
     async def start(self):
-        compile_kernels()  # once, where eleven processes would all do it at the same time
         await self.broker.start()
         await asyncio.gather(*(program.start() for program in self.programs))
         await asyncio.gather(*(program.heard("on the air") for program in self.anchors.values()))

@@ -6,14 +6,7 @@ import time
 import pytest
 from live_nodes import PLACES, LiveSite, are_right
 
-from skyless.sim.evaluation.fleet import compile_kernels
-
 pytestmark = pytest.mark.live
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled():
-    compile_kernels()
 
 
 async def test_anchors_and_tags_on_boards_make_the_fixes_of_those_on_the_air_and_survive_pulled_plugs(tmp_path):

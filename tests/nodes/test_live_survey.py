@@ -25,7 +25,6 @@ from skyless.run.mqtt.messages import (
     TruthMessage,
     WatchMessage,
 )
-from skyless.sim.evaluation.fleet import compile_kernels
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge
 from support.processes import free_port
@@ -202,11 +201,6 @@ async def judge_sketched(fresh, survey):
     await judge_saved(fresh, survey)
     errors_m = await fresh.errors_m(300)
     assert np.sqrt(np.mean(errors_m[100:] ** 2)) < 0.1
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _compiled():
-    compile_kernels()  # once, where several processes would all do it at the same time
 
 
 @pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")

@@ -18,7 +18,6 @@ from skyless.cli.main import main
 from skyless.core.keys.chain import ChainKeys
 from skyless.run.keys import read_keys
 from skyless.run.mqtt.link import Link
-from skyless.sim.evaluation.fleet import compile_kernels
 from support.processes import free_port
 from support.waiting import until
 
@@ -76,7 +75,6 @@ def site(tmp_path):
 @pytest.mark.statistical
 async def test_no_key_leaves_the_programs(site, tmp_path):
     seen = []
-    compile_kernels()
     broker = Embedded(tmp_path)
     air, mqtt = f"127.0.0.1:{free_port()}", ("--mqtt", str(broker.address))
     keys, radio = tmp_path / "keys", ("--radio", f"ether:{air}")

@@ -26,7 +26,6 @@ from skyless.run.record import RecorderNode
 from skyless.run.recordings.recorder import McapFile
 from skyless.run.recordings.recording import McapRecording
 from skyless.run.tag import Tags, TagSettings
-from skyless.sim.evaluation.fleet import compile_kernels
 from support.processes import SKYLESS, usual_signals
 from support.waiting import until
 
@@ -122,7 +121,6 @@ async def site(broker):
 
 
 def run(scenario, broker):
-    compile_kernels()
     for place in PLACES:
         tape(LAB, SECONDS, 1, place)  # made before the clock runs
 

@@ -17,7 +17,6 @@ from skyless.core.errors import SkylessError
 from skyless.run.mqtt.address import MqttAddress, Role, create_access, read_access
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
-from skyless.sim.evaluation.fleet import compile_kernels
 from support.processes import free_port
 from support.waiting import until
 
@@ -79,7 +78,6 @@ async def test_the_programs_of_a_site_may_do_all_that_they_do(broker, tmp_path):
         }
         return Program(*arguments, environment=os.environ | password)
 
-    compile_kernels()
     site, air = ("--site", site_file(tmp_path)), f"127.0.0.1:{free_port()}"
     mqtts = ("--mqtt", f"mqtts://survey@127.0.0.1:{broker.address.port}")
     programs = [

@@ -11,7 +11,7 @@ from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site, TagsSite, W
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.research.uncertainty import BoundSettings, tracking_bound
 from skyless.sim.lab import lab_site, paper_lab_site
-from skyless.site.channel import ChannelModel, pack_walls
+from skyless.site.channel import ChannelModel, barriers_of
 from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of, stamp_variances
 from skyless.site.planning.links import (
     BIAS,
@@ -36,7 +36,7 @@ QA = 0.3
 
 def relays_and_clocks(site, channel=None):
     channel = channel or ChannelModel()
-    anchors, budget, walls = anchor_positions(site), link_budget(channel), pack_walls(site.walls)
+    anchors, budget, walls = anchor_positions(site), link_budget(channel), barriers_of(site.walls)
     master = [anchor.id for anchor in site.anchors].index(site.master)
     clocks = anchor_clocks(site, anchor_links(anchors, master, budget, walls).share)
     return clocks, relays_of(anchors, master, clocks, budget, walls)

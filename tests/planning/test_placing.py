@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, ScheduleSite, Site, TagsSite, WallSite
 from skyless.research.verify import random_points, verify
 from skyless.sim.lab import lab_site, paper_lab_site
-from skyless.site.channel import ChannelModel, pack_walls
+from skyless.site.channel import ChannelModel, barriers_of
 from skyless.site.file.template import rectangular_site
 from skyless.site.planning.links import (
     FIX_SHARE,
@@ -137,7 +137,7 @@ def test_exchange_finds_what_trying_all_finds():
     places = mounts.at(np.arange(12) * mounts.length_m / 12, np.zeros(12, np.int64))
     floor = floor_of(paper_lab_site(), FILE, None, None)
     points, weights = sample_points(floor, (0.0,), 60)
-    lattice = lattice_of(places, points, weights, link_budget(ChannelModel()), pack_walls(()), 2, 0.04)
+    lattice = lattice_of(places, points, weights, link_budget(ChannelModel()), barriers_of(()), 2, 0.04)
 
     def score(chosen):
         return sum(mean_and_worst(np.array(chosen), lattice))
@@ -263,7 +263,7 @@ def test_prediction_and_simulation_agree(monkeypatch, name, method, rounds):
 
 
 def test_anchors_that_hear_the_master_through_walls_are_late():
-    walls = pack_walls((WallSite(1.0, -1.0, 1.0, 1.0, loss_db=0.0, delay_m=0.4),))
+    walls = barriers_of((WallSite(1.0, -1.0, 1.0, 1.0, loss_db=0.0, delay_m=0.4),))
     links = anchor_links(
         np.array([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0], [0.5, 0.0, 0.0]]), 0, link_budget(ChannelModel()), walls
     )

@@ -17,7 +17,7 @@ from skyless.core.protocol1.snapshots import (
 )
 from skyless.core.site import AnchorSite, NoiseSite, Site, TagsSite, WallSite
 from skyless.sim.lab import paper_lab_site
-from skyless.site.channel import ChannelModel, pack_walls
+from skyless.site.channel import ChannelModel, barriers_of
 from skyless.site.planning.anchor_clocks import offset_variances, stamp_variances
 from skyless.site.planning.links import (
     CLAIMED,
@@ -153,7 +153,7 @@ def test_anchor_clocks_settle_where_riccati_says():
 def test_links_are_the_simulations():
     channel = with_range(ChannelModel(), 20.0)
     assert range_of(channel) == pytest.approx(20.0)
-    budget, walls = link_budget(channel), pack_walls((WallSite(5.0, -1.0, 5.0, 1.0, loss_db=6.0206, delay_m=0.3),))
+    budget, walls = link_budget(channel), barriers_of((WallSite(5.0, -1.0, 5.0, 1.0, loss_db=6.0206, delay_m=0.3),))
     origin = np.zeros(3)
     assert link(budget, walls, origin, np.array([0.0, 20.0, 0.0])) == pytest.approx((0.5, 0.0))
     assert link(budget, walls, origin, np.array([10.0, 0.0, 0.0])) == pytest.approx((0.5, 0.3), abs=1e-4)

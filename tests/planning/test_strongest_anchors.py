@@ -5,14 +5,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core.site import WallSite
-from skyless.site.channel import ChannelModel, pack_walls
+from skyless.site.channel import ChannelModel, barriers_of
 from skyless.site.planning.links import Scene, link_budget
 
 POINT = np.array([2.0, 3.0, 1.0])
 
 
 def scene(anchors_m, walls=()):
-    return Scene(anchors_m, np.ones(len(anchors_m)), link_budget(ChannelModel()), pack_walls(walls))
+    return Scene(anchors_m, np.ones(len(anchors_m)), link_budget(ChannelModel()), barriers_of(walls))
 
 
 @given(st.integers(1, 40), st.integers(1, 24), st.integers(0, 2**32 - 1))

@@ -29,7 +29,7 @@ def test_without_the_compiler_the_whole_simulation_is_the_same_to_rounding():
     script = "import json, test_without_compiler as t; print(json.dumps(t.positions()))"
     plain = subprocess.run(
         [sys.executable, "-c", script],
-        env={**os.environ, "NUMBA_DISABLE_JIT": "1", "PYTHONPATH": str(Path(__file__).parent)},
+        env={**os.environ, "SKYLESS_UNCOMPILED": "1", "PYTHONPATH": str(Path(__file__).parent)},
         capture_output=True,
         text=True,
         check=True,

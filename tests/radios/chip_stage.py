@@ -76,8 +76,8 @@ class WorldAir:
 
     def now_ticks(self):
         clock = self._medium.clocks[self._node]
-        passed = self._medium.timeline.now_ticks - clock["true_ticks"] - clock["true_fraction"]
-        return wrap(int(clock["local_ticks"]) + round(clock["local_fraction"] + passed * (1.0 + clock["rate"])))
+        passed = self._medium.timeline.now_ticks - clock.true_ticks - clock.true_fraction
+        return wrap(clock.local_ticks + round(clock.local_fraction + passed * (1.0 + clock.rate)))
 
     def now_s(self):
         return self._waited_s + self._medium.now_s

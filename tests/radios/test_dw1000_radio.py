@@ -23,18 +23,11 @@ from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Restarted, 
 from skyless.run.dw1000_model import ModelPort
 from skyless.run.open_radio import is_simulated, open_radios
 from skyless.sim.dw1000.chip import ModelBus
-from skyless.sim.evaluation.fleet import compile_kernels
 from support.waiting import until
 
 pytestmark = pytest.mark.site
 
 
-@pytest.fixture(scope="module")
-def compiled():
-    compile_kernels()
-
-
-@pytest.mark.usefixtures("compiled")
 async def test_frames_fly_between_models_on_the_emulated_air_and_late_ones_do_not():
     ether = make_ether(asyncio.get_running_loop().time)
     server = await ether.serve("127.0.0.1", 0)

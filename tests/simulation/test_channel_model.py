@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from skyless.core.site import WallSite
 from skyless.site.channel import (
     ChannelModel,
+    barriers_of,
     cross_walls,
     delivery_probability,
-    pack_channel,
-    pack_walls,
     power_bias_m,
     received_power_dbm,
 )
@@ -63,17 +62,11 @@ def test_walls_count_where_the_segments_cross(a, b, c, d):
     assume(np.abs(along).min() > 1e-6)
     assume(np.abs(along - 1.0).min() > 1e-6)
     crosses = bool(((along > 0.0) & (along < 1.0)).all())
-    walls = pack_walls((WallSite(*c, *d, loss_db=5.0, delay_m=0.2),))
-    assert cross_walls(walls, *a, 0.0, *b, 0.0) == ((5.0, 0.2) if crosses else (0.0, 0.0))
+    walls = barriers_of((WallSite(*c, *d, loss_db=5.0, delay_m=0.2),))
+    assert cross_walls(*walls, *a, 0.0, *b, 0.0) == ((5.0, 0.2) if crosses else (0.0, 0.0))
 
 
 def test_walls_add_up_and_none_is_nothing():
-    walls = pack_walls((WallSite(1, -1, 1, 1, 6.0, 0.1), WallSite(2, -1, 2, 1, 3.0, 0.2), WallSite(9, 9, 9, 8)))
-    assert cross_walls(walls, 0.0, 0.0, 0.0, 5.0, 0.0, 0.0) == pytest.approx((9.0, 0.3))
-    assert cross_walls(pack_walls(()), 0.0, 0.0, 0.0, 5.0, 0.0, 0.0) == (0.0, 0.0)
-
-
-def test_the_kernels_see_the_model_as_it_was_given():
-    packed = pack_channel(ChannelModel(power_bias=True, loss_probability=0.25))
-    assert (packed[0]["power_bias"], packed[0]["loss_probability"]) == (1.0, 0.25)
-    assert packed[0]["nlos_between_anchors"] == 0.0
+    walls = barriers_of((WallSite(1, -1, 1, 1, 6.0, 0.1), WallSite(2, -1, 2, 1, 3.0, 0.2), WallSite(9, 9, 9, 8)))
+    assert cross_walls(*walls, 0.0, 0.0, 0.0, 5.0, 0.0, 0.0) == pytest.approx((9.0, 0.3))
+    assert cross_walls(*barriers_of(()), 0.0, 0.0, 0.0, 5.0, 0.0, 0.0) == (0.0, 0.0)

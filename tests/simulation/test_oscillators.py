@@ -9,6 +9,8 @@ import pytest
 from scipy.integrate import quad
 from scipy.stats import chi2
 
+from skyless.core.native.library import KERNELS, compiled
+from skyless.core.native.views import view
 from skyless.core.ticks import TICK_RATE_HZ, TICK_S
 from skyless.sim.oscillator import (
     OscillatorModel,
@@ -22,6 +24,8 @@ from skyless.sim.oscillator import (
 )
 from skyless.sim.streams import Streams, draw_normal, draw_uniform, stream
 
+_advance_clock = compiled(advance, KERNELS)
+
 
 def _nodes(model, count, seed=1):
     generators = [stream(seed, 0, node, 1) for node in range(count)]
@@ -29,18 +33,19 @@ def _nodes(model, count, seed=1):
 
 
 def _advance(clocks, streams, node, ticks):
-    advance(clocks, streams.normals, streams.cursors, node, ticks, 0.0)
-    streams.refill(int(streams.cursors[node]))
+    noise = streams.noise[node]
+    _advance_clock(clocks[node], noise, ticks, 0.0)
+    streams.refill(noise.used)
 
 
 def _phase_record_s(model, steps, tau_s):
     clocks, streams = _nodes(model, 1)
-    clocks["local_ticks"], clocks["local_fraction"] = 0, 0.0
+    clocks[0].local_ticks, clocks[0].local_fraction = 0, 0.0
     step = round(tau_s * TICK_RATE_HZ)
     phase = np.zeros(steps + 1)
     for k in range(1, steps + 1):
         _advance(clocks, streams, 0, k * step)
-        phase[k] = (int(clocks[0]["local_ticks"]) - k * step + float(clocks[0]["local_fraction"])) * TICK_S
+        phase[k] = (int(clocks[0].local_ticks) - k * step + float(clocks[0].local_fraction)) * TICK_S
     return phase
 
 
@@ -67,11 +72,12 @@ def test_noise_does_not_depend_on_how_an_interval_is_split():
     whiten = np.linalg.inv(np.linalg.cholesky(theory))
     for stops in ([1.0], [0.01, 0.3, 0.35, 0.9, 1.0]):
         clocks, streams = _nodes(model, count)
-        clocks["local_ticks"], clocks["local_fraction"] = 0, 0.0
+        counters = view(clocks)
+        counters["local_ticks"], counters["local_fraction"] = 0, 0.0
         for stop in stops:
             for node in range(count):
                 _advance(clocks, streams, node, round(stop * end))
-        pairs = np.stack([(clocks["local_ticks"] - end + clocks["local_fraction"]) * TICK_S, clocks["rate"]])
+        pairs = np.stack([(counters["local_ticks"] - end + counters["local_fraction"]) * TICK_S, counters["rate"]])
         x, y = whiten @ pairs
         low, high = chi2.ppf([1e-4, 1 - 1e-4], count) / count
         assert low < np.mean(x * x) < high
@@ -80,7 +86,7 @@ def test_noise_does_not_depend_on_how_an_interval_is_split():
 
 
 def test_offsets_are_uniform_and_counters_start_anywhere():
-    clocks, _ = _nodes(OscillatorModel(offset_ppm=10.0), 400)
+    clocks = view(_nodes(OscillatorModel(offset_ppm=10.0), 400)[0])
     assert np.abs(clocks["rate"]).max() < 10e-6
     assert np.std(clocks["rate"]) == pytest.approx(10e-6 / math.sqrt(3.0), rel=0.12)  # 4 standard errors
     assert clocks["local_ticks"].min() < 2**40 * 0.05
@@ -93,44 +99,44 @@ def test_temperature_phase_is_the_integral_of_the_rate():
     clocks, streams = _nodes(model, 1)
 
     def rate(t_s):
-        clocks[0]["true_ticks"] = round(t_s * TICK_RATE_HZ)
-        return clock_rate(clocks, 0)
+        clocks[0].true_ticks = round(t_s * TICK_RATE_HZ)
+        return clock_rate(clocks[0])
 
-    assert rate(0.0) == pytest.approx(0.2e-6 * 3.0 * math.sin(clocks[0]["swing_phase_rad"]))
+    assert rate(0.0) == pytest.approx(0.2e-6 * 3.0 * math.sin(clocks[0].swing_phase_rad))
     for from_s, to_s in ((0.0, 1.0), (7.0, 300.0), (1000.0, 1000.0025)):
         integral, _ = quad(rate, from_s, to_s, epsabs=1e-18, limit=200)
-        assert temperature_phase_s(clocks, 0, from_s, to_s) == pytest.approx(integral, rel=1e-7, abs=1e-18)
-    clocks[0]["true_ticks"], start = 0, int(clocks[0]["local_ticks"])
+        assert temperature_phase_s(clocks[0], from_s, to_s) == pytest.approx(integral, rel=1e-7, abs=1e-18)
+    clocks[0].true_ticks, start = 0, int(clocks[0].local_ticks)
     for second in range(1, 101):
         _advance(clocks, streams, 0, round(second * TICK_RATE_HZ))
-    gained_s = (int(clocks[0]["local_ticks"]) - start - int(clocks[0]["true_ticks"])) * TICK_S
+    gained_s = (int(clocks[0].local_ticks) - start - int(clocks[0].true_ticks)) * TICK_S
     assert gained_s == pytest.approx(quad(rate, 0.0, 100.0, limit=200)[0], abs=2 * TICK_S)
 
 
 def test_counter_stays_exact_over_months():
     clocks, streams = _nodes(OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0), 1)
     rate = 2.0**-20 + 2.0**-30
-    clocks[0]["rate"], clocks[0]["local_fraction"] = rate, 0.25
-    start = int(clocks[0]["local_ticks"])
+    clocks[0].rate, clocks[0].local_fraction = rate, 0.25
+    start = int(clocks[0].local_ticks)
     hour = round(3600 * TICK_RATE_HZ) + 12345
     for k in range(1, 24 * 180 + 1):
         _advance(clocks, streams, 0, k * hour)
     exact = start + Fraction(1, 4) + 24 * 180 * hour * (1 + Fraction(rate))
-    found = int(clocks[0]["local_ticks"]) + Fraction(float(clocks[0]["local_fraction"]))
+    found = int(clocks[0].local_ticks) + Fraction(float(clocks[0].local_fraction))
     assert abs(found - exact) < Fraction(1, 1000)
 
 
 def test_emission_is_where_the_counter_shows_the_time():
     clocks, streams = _nodes(OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0), 1)
-    clocks[0]["rate"], clocks[0]["local_fraction"] = -7.25e-6, 0.75
-    start = int(clocks[0]["local_ticks"]) + Fraction(3, 4)
-    target = int(clocks[0]["local_ticks"]) + 63_897_601
-    foreseen = foresee(clocks, 0, target)
-    ticks, fraction = emit(clocks, streams.normals, streams.cursors, 0, target, 0.0, 0.0)
+    clocks[0].rate, clocks[0].local_fraction = -7.25e-6, 0.75
+    start = int(clocks[0].local_ticks) + Fraction(3, 4)
+    target = int(clocks[0].local_ticks) + 63_897_601
+    foreseen = foresee(clocks[0], target)
+    fraction = emit(clocks[0], streams.noise[0], target, 0.0, 0.0)
     exact = (target - start) / (1 + Fraction(-7.25e-6))
-    assert abs(ticks + Fraction(fraction) - exact) < Fraction(1, 10**5)
+    assert abs(clocks[0].true_ticks + Fraction(fraction) - exact) < Fraction(1, 10**5)
     assert abs(foreseen - exact) <= 2
-    assert (clocks[0]["local_ticks"], clocks[0]["local_fraction"]) == (target, 0.0)
+    assert (clocks[0].local_ticks, clocks[0].local_fraction) == (target, 0.0)
 
 
 def test_emission_noise_is_that_of_the_interval():
@@ -140,10 +146,10 @@ def test_emission_noise_is_that_of_the_interval():
     dt = 63_897_600
     late = np.empty(count)
     for node in range(count):
-        clocks[node]["local_fraction"] = 0.0
-        target = int(clocks[node]["local_ticks"]) + dt
-        ticks, fraction = emit(clocks, streams.normals, streams.cursors, node, target, 0.0, 0.0)
-        late[node] = (ticks - dt + fraction) * TICK_S
+        clocks[node].local_fraction = 0.0
+        target = int(clocks[node].local_ticks) + dt
+        fraction = emit(clocks[node], streams.noise[node], target, 0.0, 0.0)
+        late[node] = (clocks[node].true_ticks - dt + fraction) * TICK_S
     dt_s = dt * TICK_S
     low, high = chi2.ppf([1e-4, 1 - 1e-4], count) / count
     assert low < np.mean(late**2) / (white**2 * dt_s + walk**2 * dt_s**3 / 3.0) < high
@@ -154,18 +160,18 @@ def test_streams_refill_without_a_trace_of_their_neighbours():
     alone, crowded = Streams([stream(5, 0, 1)]), Streams([stream(5, 0, 1), stream(5, 0, 2)])
     first, second = [], []
     for k in range(3000):
-        first.append(draw_normal(alone.normals, alone.cursors, 0))
-        alone.refill(int(alone.cursors.max()))
-        second.append(draw_normal(crowded.normals, crowded.cursors, 0))
+        first.append(draw_normal(alone.noise[0]))
+        alone.refill()
+        second.append(draw_normal(crowded.noise[0]))
         for _ in range(k % 3):
-            draw_normal(crowded.normals, crowded.cursors, 1)
-        crowded.refill(int(crowded.cursors.max()))
+            draw_normal(crowded.noise[1])
+        crowded.refill()
     assert first == second
 
 
 def test_uniform_draws_are_uniform():
     streams = Streams([stream(3, 0, 1)])
-    values = np.array([draw_uniform(streams.normals, streams.cursors, 0) for _ in range(1000)])
+    values = np.array([draw_uniform(streams.noise[0]) for _ in range(1000)])
     worst = np.abs(np.sort(values) - np.arange(1, 1001) / 1000).max()
     assert worst < 1.95 / math.sqrt(1000)  # Kolmogorov–Smirnov at 0.1 %
     assert 0.0 < values.min() < values.max() < 1.0

@@ -10,6 +10,7 @@ from metronome import IDEAL, Metronome, faulty, site_of, staggered
 from scipy.integrate import quad
 from scipy.stats import chi2, kstest, uniform
 
+from skyless.core.native.views import view
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import WallSite
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S, difference
@@ -94,7 +95,7 @@ def test_displaced_anchors_are_heard_from_where_they_truly_are():
 
 def test_machines_are_told_the_places_of_the_site_file():
     world = World(LAB, staggered(), [], faulty(anchor_displacements=(AnchorDisplacement(3, 1.0),)), 1)
-    assert tuple(world.medium.stations[2]["position_m"]) == (7.0, 4.0, 0.0)
+    assert tuple(world.medium.stations[2].position_m) == (7.0, 4.0, 0.0)
     assert (LAB.anchors[2].x_m, LAB.anchors[2].y_m) == (6.0, 4.0)
 
 
@@ -143,7 +144,7 @@ def test_changing_errors_forget_with_their_correlation_length(along):
     history = []
     for step in range(301):
         world.medium._move_tags(0.5 * step)
-        errors.advance_to(0.5 * step, world.medium.stations)
+        errors.advance_to(0.5 * step, view(world.medium.stations))
         history.append(errors.present_m[2:].copy())
     walking, resting = np.array(history)[:, :-1], np.array(history)[:, -1]
     assert (np.ptp(resting, axis=0) == 0.0).all() == (along == "way")
@@ -247,17 +248,17 @@ def test_a_warming_crystal_gains_what_its_curve_says(ppm):
 
 def test_the_phase_of_a_warm_up_is_the_integral_of_its_rate():
     clocks = make_clocks(OscillatorModel(offset_ppm=0.0), [stream(1, 0, 0, 1)])
-    warm_up(clocks, 0, -2.0, 5.0, 20.0)
+    warm_up(clocks[0], -2.0, 5.0, 20.0)
 
     def rate(t_s):
-        clocks[0]["true_ticks"] = round(t_s * TICK_RATE_HZ)
-        return clock_rate(clocks, 0)
+        clocks[0].true_ticks = round(t_s * TICK_RATE_HZ)
+        return clock_rate(clocks[0])
 
     assert (rate(4.9), rate(5.0)) == (0.0, 0.0)
     assert rate(25.0) == pytest.approx(-2e-6 * (1.0 - math.exp(-1.0)))
     for from_s, to_s in ((0.0, 4.0), (4.0, 6.0), (7.0, 100.0), (30.0, 30.0025)):
         integral, _ = quad(rate, from_s, to_s, epsabs=1e-18, limit=200, points=[min(max(5.0, from_s), to_s)])
-        assert drift_phase_s(clocks, 0, from_s, to_s) == pytest.approx(integral, rel=1e-6, abs=1e-18)
+        assert drift_phase_s(clocks[0], from_s, to_s) == pytest.approx(integral, rel=1e-6, abs=1e-18)
 
 
 def test_an_anchors_crystal_warms_alone():

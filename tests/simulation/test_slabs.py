@@ -10,7 +10,7 @@ from skyless.arguments import tag_count
 from skyless.core.errors import SkylessError
 from skyless.core.site import FloorSite
 from skyless.sim.evaluation.scenarios import CARRIED_M, patrols
-from skyless.site.channel import cross_walls, pack_walls
+from skyless.site.channel import barriers_of, cross_walls
 from skyless.site.file.template import rectangular_site
 
 FLOORS = (FloorSite(0, 0.0), FloorSite(1, 3.2, slab_loss_db=200.0), FloorSite(2, 6.4, slab_delay_m=0.7))
@@ -26,7 +26,7 @@ def house():
 @given(st.floats(-1.0, 10.0), st.floats(-1.0, 10.0))
 def test_a_signal_crosses_the_slabs_between_its_ends(a_m, b_m):
     slabs = [floor for floor in FLOORS[1:] if min(a_m, b_m) < floor.low_m <= max(a_m, b_m)]
-    loss_db, delay_m = cross_walls(pack_walls((), FLOORS), 1.0, 2.0, a_m, 5.0, 1.0, b_m)
+    loss_db, delay_m = cross_walls(*barriers_of((), FLOORS), 1.0, 2.0, a_m, 5.0, 1.0, b_m)
     assert loss_db == pytest.approx(sum(floor.slab[0] for floor in slabs))
     assert delay_m == pytest.approx(sum(floor.slab[1] for floor in slabs))
 

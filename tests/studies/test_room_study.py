@@ -20,7 +20,7 @@ from skyless.research.uncertainty import Biases
 from skyless.sim.evaluation.figures import LevelCounts, LevelTally
 from skyless.sim.impairments import Body
 from skyless.sim.lab import lab_site
-from skyless.site.channel import cross_walls, pack_walls
+from skyless.site.channel import barriers_of, cross_walls
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site
@@ -175,10 +175,10 @@ def test_anchors_are_late_by_amounts_of_their_own_from_the_start_or_for_six_seco
 
 
 def test_the_wall_hides_up_to_three_anchors_for_four_seconds_and_none_before_and_after():
-    walls = pack_walls((room.WALL,))
+    walls = barriers_of((room.WALL,))
     for path in room.past_wall(20, 5):
         hidden = [
-            sum(cross_walls(walls, *path.position(t_s), a.x_m, a.y_m, a.z_m)[1] > 0.0 for a in lab_site().anchors)
+            sum(cross_walls(*walls, *path.position(t_s), a.x_m, a.y_m, a.z_m)[1] > 0.0 for a in lab_site().anchors)
             for t_s in np.arange(0.0, 16.5, 0.05)
         ]
         changes = np.flatnonzero(np.diff(np.array(hidden) > 0))

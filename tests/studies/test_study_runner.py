@@ -14,7 +14,6 @@ from distributed import Client, LocalCluster
 
 from skyless.core.errors import SkylessError
 from skyless.research.studies import lab, runner
-from skyless.research.studies.integrity import FAULTS
 from skyless.research.studies.picture import world_cells, world_rows
 from skyless.research.studies.runner import MEASURED, Cell, Plan, run_cells, run_cells_on_dask
 
@@ -83,16 +82,6 @@ def kill_a_busy_worker(address):
         worker = next(worker for worker, tasks in client.processing().items() if tasks)
     os.kill(pids[worker], signal.SIGKILL)
     return worker
-
-
-def test_a_client_of_a_cluster_compiles_nothing(cluster, tmp_path):
-    small = ["integrity", "--episodes", "1", "--scheduler", cluster.scheduler_address, "--json"]
-    command = [sys.executable, "-m", "skyless.cli.main", "study", *small]
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
-    ended = subprocess.run(command, check=False, env=environment, capture_output=True)
-    assert ended.returncode == 0, ended.stderr
-    assert json.loads(ended.stdout)["parts"] == {"computed": len(FAULTS), "resumed": 0, "damaged": []}
-    assert not [*tmp_path.rglob("*.nb?")]
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,9 @@ What it takes: functions whose parameters and result have types; numbers, record
                  ``for … in range(…)``, ``break``, ``continue``, ``return``, ``pass``, calls
     expressions  arithmetic, comparisons, ``in (A, B)``, ``not in``, ``and``, ``or``, ``not``, ``x if c else y``,
                  attributes, subscripts, calls of other such functions and of ``abs``, ``min``, ``max``, ``int``,
-                 ``float``, ``bool``, ``floor``, ``sqrt``; constants of modules; ``Record()`` as the value of a new
-                 variable, which in a loop is the same memory each time
+                 ``float``, ``bool``, ``floor``, ``sqrt``, and where bits may depend on the machine of ``math``'s
+                 ``exp``, ``log``, ``sin`` and others (``body.LIBM``); constants of modules; ``Record()`` as the value
+                 of a new variable, which in a loop is the same memory each time
 
 All else is refused with file, line and reason; so are a call of what may write fields beside what reads them, which C
 evaluates in any order, and a loop's variable that is assigned in it or used after it. ``//`` and ``%`` round down as in

@@ -35,6 +35,11 @@ from translator.types import (
     type_of,
 )
 
+LIBM: Final = {
+    getattr(math, name): name for name in ("atan2", "cos", "erfc", "exp", "expm1", "hypot", "log", "log10", "sin")
+}
+"""Functions of C's library, whose last bits depend on it."""
+
 BUILTINS: Final[dict[str, Any]] = {"abs": abs, "min": min, "max": max, "int": int, "float": float, "bool": bool}
 SUFFIX: Final = {REAL: "real", LONG: "64", INT: "32", BYTE: "32", BOOL: "32"}
 
@@ -64,6 +69,7 @@ class Translator:
         self.fields: dict[type[Record], dict[str, Type]] = {}
         self.bodies: dict[str, list[str]] = {}
         self.results: dict[str, Results] = {}
+        self.uses_libm = False
         for root in roots:
             self.need(root)  # type: ignore[arg-type]
 
@@ -623,6 +629,11 @@ class Body:
                 raise self.refuse(node, "a new record has no values")
             self.all.need_record(called)
             return Value(called.__name__, Struct(called), NEW)
+        if called in LIBM:
+            values = [converted(self.value(argument), REAL).code for argument in node.args]
+            self.check_order(node, *node.args)
+            self.all.uses_libm = True
+            return Value(f"{LIBM[called]}({', '.join(values)})", REAL)
         if called in BUILTINS.values() or called in (math.sqrt, arithmetic.floor):
             return self.builtin(node, called, [self.value(argument) for argument in node.args])
         if not isinstance(called, FunctionType):

@@ -106,7 +106,16 @@ def translate(
     header += [line for made in translator.records.values() for line in record_lines(made, translator.fields_of(made))]
     header += [line for function in outer for line in wrapped(f"{translator.head(function)};")]
     header += ["", "#endif"]
-    source = [*head, f'#include "{name}.h"', "", *HELPERS.splitlines(), "", *result_lines(translator.results)]
+    included = ["#include <math.h>", ""] if translator.uses_libm else []
+    source = [
+        *head,
+        f'#include "{name}.h"',
+        "",
+        *included,
+        *HELPERS.splitlines(),
+        "",
+        *result_lines(translator.results),
+    ]
     source += [line for function in inner for line in wrapped(f"{translator.head(function)};")]
     before: FunctionType | None = None
     for function in functions:

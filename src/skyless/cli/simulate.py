@@ -20,7 +20,6 @@ from skyless.cli.common import (
     print_facts,
     print_json,
     progress_bar,
-    status,
 )
 from skyless.cli.nodes.options import name_unplaced
 
@@ -62,14 +61,10 @@ def simulate(*, asked: SimulateOptions, output: _Output) -> int:
     check_output("fixes-csv", output.fixes_csv, asked.site if isinstance(asked.site, Path) else None)
     from skyless.cli.api.fixes import FixRecorder
     from skyless.cli.api.simulate import Simulation, SimulationResult
-    from skyless.sim.evaluation.fleet import compile_kernels
 
     with progress_bar("simulating") as reach:
         simulation = Simulation(replace(asked, progress=reach))
         name_unplaced(simulation.request.site)
-        if asked.estimator is None:
-            with status("compiling the simulation"):
-                compile_kernels(asked.method)
         with nullcontext() if output.fixes_csv is None else new_table(output.fixes_csv) as file:
             write = None if file is None else csv.writer(file).writerow
             if write is not None:

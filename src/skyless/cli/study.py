@@ -25,7 +25,6 @@ from skyless.cli.common import (
     print_table,
     progress_bar,
     say_written,
-    status,
     to_json,
 )
 from skyless.core.air.site_pages import MAX_COORDINATE_M
@@ -99,12 +98,8 @@ def study(asked: StudyOptions, output: _Output) -> None:
     """Measure errors over many simulated runs: a table with standard errors, a picture, JSON."""
     check_picture(output.plot)
     from skyless.cli.api.simulate import run_study
-    from skyless.research.studies.run import WITHOUT_POSITIONS, way_on
-    from skyless.sim.evaluation.fleet import compile_kernels
+    from skyless.research.studies.run import way_on
 
-    if asked.scheduler is None and asked.name not in WITHOUT_POSITIONS:
-        with status("compiling the simulation"):
-            compile_kernels(asked.method)
     try:
         with progress_bar(f"studying {asked.name}") as reach:
             result = run_study(replace(asked, progress=reach))

@@ -15,7 +15,7 @@ Matrix = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 Indices = NDArray[np.uint32]
-"""Indices that cannot be negative, so that kernels need not check for them."""
+"""Indices that cannot be negative."""
 
 Mask = NDArray[np.bool_]
 

@@ -8,8 +8,9 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from functools import cache
 from html import escape
 from io import StringIO
+from math import sqrt
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
 import numpy as np
@@ -21,6 +22,11 @@ from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.arrays import Array, Matrix, Vector
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.fix import Fix
+from skyless.core.native import records
+from skyless.core.native.arithmetic import square
+from skyless.core.native.library import KERNELS, compiled
+from skyless.core.native.records import Reals, Record, record
+from skyless.core.native.views import view
 from skyless.files import replace_files, write_whole
 from skyless.research.calibration.biases import biases_of, tdoas_of
 from skyless.research.calibration.options import SurveyOptions
@@ -32,7 +38,6 @@ from skyless.research.replays.options import ReplayOptions
 from skyless.research.replays.site import SITE_FORMAT, SiteReplay
 from skyless.run.recordings.recording import McapRecording, is_mcap
 from skyless.sim.evaluation.figures import Figures, FixTable, Judged, figures_of, truth_at
-from skyless.site.kernels import kernel
 from skyless.site.report import bullets, page, panel, picture, report_style, svg_figure, table
 from skyless.site.survey.anchor_errors import DifferenceCalibration
 
@@ -139,64 +144,117 @@ def plain_track(
     ``start``: position and velocity, shape (6,); the height is fixed if ``is_planar``.
     """
     axes = np.array([1.0, 1.0, 0.0 if is_planar else 1.0])
-    P = np.diag(np.concatenate([axes * START_STD_M**2, axes * START_STD_MPS**2]))
+    t = PlainTrack(is_open=True, time_s=float(time_s[0]))
+    view(t.x)[:], view(t.qa)[:] = start, QA_M2PS3 * axes
+    view(t.P)[:] = np.diag(np.concatenate([axes * START_STD_M**2, axes * START_STD_MPS**2]))
     positions_m, covariances_m2 = np.empty((len(time_s), 3)), np.empty((len(time_s), 3, 3))
-    a_m, b_m, qa = np.ascontiguousarray(a_m), np.ascontiguousarray(b_m), QA_M2PS3 * axes
-    time_s, tdoa_m = np.ascontiguousarray(time_s), np.ascontiguousarray(tdoa_m)
-    _run(time_s, tdoa_m, a_m, b_m, rule, TDOA_STD_M[rule], qa, start.copy(), P, positions_m, covariances_m2)
+    compiled(run_plain, KERNELS)(
+        t,
+        rule,
+        TDOA_STD_M[rule],
+        np.ascontiguousarray(time_s),
+        np.ascontiguousarray(tdoa_m),
+        np.concatenate((a_m, b_m), axis=1).reshape(-1),
+        len(time_s),
+        positions_m.reshape(-1),
+        covariances_m2.reshape(-1),
+    )
     return positions_m, covariances_m2
 
 
-@kernel
-def _run(
-    time_s: Vector,
-    tdoa_m: Vector,
-    a_m: Matrix,
-    b_m: Matrix,
+@record
+class PlainTrack(Record):
+    """State of ``run_plain``."""
+
+    time_s: float
+    good_s: float
+    is_open: bool
+    x: Annotated[Reals, 6]
+    qa: Annotated[Reals, 3]
+    P: Annotated[records.Matrix, 6, 6]
+    H: Annotated[Reals, 3]
+    PH: Annotated[Reals, 6]
+
+
+def run_plain(
+    t: PlainTrack,
     rule: int,
     std_m: float,
-    qa: Vector,
-    x: Vector,
-    P: Matrix,
-    positions_m: Matrix,
-    covariances_m2: Array,
+    times_s: Reals,
+    tdoas_m: Reals,
+    places_m: Reals,
+    count: int,
+    positions_m: Reals,
+    covariances_m2: Reals,
 ) -> None:
-    F, Q, H = np.eye(6), np.zeros((6, 6)), np.zeros(6)
-    last_s, good_s, is_open = time_s[0], 0.0, True
-    for n in range(len(time_s)):
-        dt_s = time_s[n] - last_s
-        last_s = time_s[n]
+    """Run the filter over differences; ``places_m``: of each, the first anchor's position and the second's."""
+    x, P = t.x, t.P
+    for n in range(count):
+        dt_s = times_s[n] - t.time_s
+        t.time_s = times_s[n]
+        predict_plain(t, dt_s)
+        range_a, range_b, apart_m = 0.0, 0.0, 0.0
         for i in range(3):
-            F[i, i + 3] = dt_s
-            Q[i, i] = qa[i] * dt_s**3 / 3
-            Q[i, i + 3] = Q[i + 3, i] = qa[i] * dt_s**2 / 2
-            Q[i + 3, i + 3] = qa[i] * dt_s
-        x[:] = F @ x
-        P[:] = F @ P @ F.T + Q
-        to_a, to_b = x[:3] - a_m[n], x[:3] - b_m[n]
-        range_a, range_b = np.linalg.norm(to_a), np.linalg.norm(to_b)
-        H[:3] = to_b / range_b - to_a / range_a
-        PH = P @ H
-        S = H @ PH + std_m * std_m
-        innovation = tdoa_m[n] - (range_b - range_a)
+            range_a += square(x[i] - places_m[6 * n + i])
+            range_b += square(x[i] - places_m[6 * n + 3 + i])
+            apart_m += square(places_m[6 * n + 3 + i] - places_m[6 * n + i])
+        range_a, range_b = sqrt(range_a), sqrt(range_b)
+        for i in range(3):
+            t.H[i] = (x[i] - places_m[6 * n + 3 + i]) / range_b - (x[i] - places_m[6 * n + i]) / range_a
+        innovation, S = tdoas_m[n] - (range_b - range_a), find_variance(t, std_m)
         if rule == GATE:
             used = innovation * innovation <= GATE_STD * GATE_STD * S
-        elif abs(tdoa_m[n]) >= np.linalg.norm(a_m[n] - b_m[n]):
+        elif abs(tdoas_m[n]) >= sqrt(apart_m):
             used = False
         else:
-            added_s = min(dt_s, LONGEST_ADDED_S)
-            if abs(innovation) < TRUSTED_STD * std_m:
-                good_s = min(good_s + added_s, SUM_S)
-            else:
-                good_s = max(good_s - added_s, 0.0)
-            used = is_open or abs(innovation) < ACCEPTED_STD * std_m
-            is_open = good_s <= CLOSES * SUM_S if is_open else good_s < OPENS * SUM_S
+            used = t.is_open or abs(innovation) < ACCEPTED_STD * std_m
+            note_innovation(t, innovation, std_m, dt_s)
         if used:
-            x += PH * (innovation / S)
-            P -= np.outer(PH, PH) / S
-            P[:] = (P + P.T) / 2
-        positions_m[n] = x[:3]
-        covariances_m2[n] = P[:3, :3]
+            for i in range(6):
+                x[i] += t.PH[i] * (innovation / S)
+                for j in range(6):
+                    P[i][j] -= t.PH[i] * t.PH[j] / S
+        for i in range(3):
+            positions_m[3 * n + i] = x[i]
+            for j in range(3):
+                covariances_m2[9 * n + 3 * i + j] = P[i][j]
+
+
+def predict_plain(t: PlainTrack, dt_s: float) -> None:
+    """Predict the state: x = F·x and P = F·P·Fᵀ + Q."""
+    x, P = t.x, t.P
+    for i in range(3):
+        x[i] += dt_s * x[i + 3]
+        for j in range(6):
+            P[i][j] += dt_s * P[i + 3][j]
+    for i in range(3):
+        for j in range(6):
+            P[j][i] += dt_s * P[j][i + 3]
+    for i in range(3):
+        P[i][i] += t.qa[i] * dt_s * dt_s * dt_s / 3.0
+        P[i][i + 3] += t.qa[i] * dt_s * dt_s / 2.0
+        P[i + 3][i] += t.qa[i] * dt_s * dt_s / 2.0
+        P[i + 3][i + 3] += t.qa[i] * dt_s
+
+
+def find_variance(t: PlainTrack, std_m: float) -> float:
+    """Compute P·Hᵀ. Returns the innovation's variance S = H·P·Hᵀ + R."""
+    S = std_m * std_m
+    for i in range(6):
+        t.PH[i] = t.P[i][0] * t.H[0] + t.P[i][1] * t.H[1] + t.P[i][2] * t.H[2]
+    for i in range(3):
+        S += t.H[i] * t.PH[i]
+    return S
+
+
+def note_innovation(t: PlainTrack, innovation: float, std_m: float, dt_s: float) -> None:
+    """Open or close the filter by Bitcraze's rule."""
+    added_s = min(dt_s, LONGEST_ADDED_S)
+    if abs(innovation) < TRUSTED_STD * std_m:
+        t.good_s = min(t.good_s + added_s, SUM_S)
+    else:
+        t.good_s = max(t.good_s - added_s, 0.0)
+    t.is_open = t.good_s <= CLOSES * SUM_S if t.is_open else t.good_s < OPENS * SUM_S
 
 
 # Estimators without a filter, as they are written in an afternoon: a gradient, and least squares over a window.

@@ -12,7 +12,6 @@ from skyless.core.ticks import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.streams import ANCHOR_KEY, TAG_KEY, stream
 from skyless.site.channel import ChannelModel
-from skyless.site.kernels import kernel
 
 # Errors of the ranges from anchors to tags that are no noise: each pair has its own, constant or changing slowly.
 #
@@ -55,7 +54,6 @@ class RangeErrorModel(Struct, frozen=True, forbid_unknown_fields=True):
             raise ValueError(f"the correlation of range errors is {lengths[0]:g}; it should be more than 0")
 
 
-@kernel
 def slope_error_m(slope_m: float, distance_m: float) -> float:
     """Range error that depends on the true distance (``RangeErrorModel.slope_m``)."""
     return slope_m * min(max((distance_m - SLOPE_MIDDLE_M) / SLOPE_MIDDLE_M, -1.0), 1.0)
@@ -182,7 +180,7 @@ class Carriers:
         self._reflections.advance_to(t_s, stations)
 
     def phases_cycles(self, sender: int, tx_ticks: int, late_ticks: float, heard: Records) -> Array:
-        """Phases of a frame at the nodes that received it (``RECEPTION_RECORD``), shape (n,).
+        """Phases of a frame at the nodes that received it (``sim.listening.Row``), shape (n,).
 
         ``tx_ticks``: the sender's counter at emission; ``late_ticks``: how much later it really left.
         """

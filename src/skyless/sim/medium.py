@@ -17,13 +17,17 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.frame import Transmission, after_rmarker_s, preamble_s
-from skyless.core.arrays import Array, Records
+from skyless.core.arrays import Records
+from skyless.core.native.library import KERNELS, compiled
+from skyless.core.native.views import view
 from skyless.core.site import Site
 from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, TICK_RATE_HZ, TICK_S, difference, from_seconds, wrap
 from skyless.sim.impairments import Carriers, Impairments, RangeErrors
 from skyless.sim.listening import (
     OUTCOMES,
-    RECEPTION_RECORD,
+    OneFrame,
+    Other,
+    Row,
     TagSpec,
     displace,
     make_stations,
@@ -33,7 +37,7 @@ from skyless.sim.listening import (
 )
 from skyless.sim.oscillator import advance, emit, foresee, make_clocks, restart_counter, warm_up
 from skyless.sim.streams import ANCHOR_KEY, TAG_KEY, Streams, stream
-from skyless.site.channel import pack_channel, pack_walls
+from skyless.site.channel import POWER_BIAS_M, barriers_of
 
 TURNAROUND_S: Final = 0.2e-3
 """Time that a host needs to pass a frame to its radio; a preamble due earlier is too late (HPDWARN).
@@ -44,7 +48,11 @@ Longer than any frame after its RMARKER (177 µs), so that all overlapping frame
 _PREAMBLE_TICKS: Final = from_seconds(preamble_s())
 _DX_MASK: Final = ~(DELAYED_TX_GRANULARITY_TICKS - 1)
 
-_NO_OTHERS: Final = np.empty((0, 3))
+_advance = compiled(advance, KERNELS)
+_foresee = compiled(foresee, KERNELS)
+_emit = compiled(emit, KERNELS)
+_receive_frame = compiled(receive_frame, KERNELS)
+
 _KEPT_TICKS: Final = round(2e-3 * TICK_RATE_HZ)
 _FARTHEST_TICKS: Final = round(10e-6 * TICK_RATE_HZ)
 """Flight times up to 10 µs (3 km) can make consecutive frames overlap."""
@@ -133,19 +141,18 @@ class OnAir:
         """Frames whose RMARKER leaves after one time and before another."""
         return [flight for flight in self._flights if from_ticks < flight.marker_ticks < until_ticks]
 
-    def others(self, flight: Flight) -> Array:
-        """Frames that may overlap this one, shape (n, 3): sending node, begin and end in s from this RMARKER."""
+    def others(self, flight: Flight) -> list[Other]:
+        """Frames that may overlap this one."""
         first, last = flight.begin_ticks - _FARTHEST_TICKS, flight.end_ticks + _FARTHEST_TICKS
-        rows = [
-            (
-                other.sender,
-                (other.begin_ticks - flight.marker_ticks) * TICK_S,
-                (other.end_ticks - flight.marker_ticks) * TICK_S,
+        return [
+            Other(
+                sender=other.sender,
+                begin_s=(other.begin_ticks - flight.marker_ticks) * TICK_S,
+                end_s=(other.end_ticks - flight.marker_ticks) * TICK_S,
             )
             for other in self._flights
             if other is not flight and other.begin_ticks <= last and other.end_ticks >= first
         ]
-        return np.array(rows) if rows else _NO_OTHERS
 
 
 class Tally(Struct, frozen=True):
@@ -161,7 +168,7 @@ class Tally(Struct, frozen=True):
 
 @dataclass(slots=True, eq=False)
 class Delivery:
-    """A frame that has just ended, with the rows (``RECEPTION_RECORD``) of the nodes that received it."""
+    """A frame that has just ended, with the rows (``Row``) of the nodes that received it."""
 
     flight: Flight
     by_anchors: Records
@@ -195,9 +202,10 @@ class Medium(Generic[Result]):
         """Nodes of the anchors by identifier."""
         self.stations = make_stations(site.anchors, self._tags, impairments)
         self._piece_ends_s = np.full(len(self._tags), -math.inf)
-        self.boots = [0] * len(self.stations)
+        self._nodes = len(site.anchors) + len(self._tags)
+        self.boots = [0] * self._nodes
         """Number of times each node was switched off."""
-        self._counts = np.zeros((2, len(OUTCOMES)), dtype=np.int64)
+        self._counts = np.zeros(2 * len(OUTCOMES), dtype=np.int64)
         self._transmissions = self._late = 0
         self._deliver = deliver
         self.timeline: Timeline[Result] = Timeline()
@@ -217,17 +225,26 @@ class Medium(Generic[Result]):
             identifiers = [anchor.id for anchor in site.anchors]
             self._carriers = Carriers(impairments.carrier, identifiers, len(self._tags), seed)
         self._plan_changes()
-        self._channel, self._walls = pack_channel(impairments.channel), pack_walls(site.walls, site.storeys)
+        self._barriers = barriers_of(site.walls, site.storeys)
+        self._power_biases_m = POWER_BIAS_M if impairments.channel.power_bias else np.zeros_like(POWER_BIAS_M)
         self._air = OnAir()
         self._missed_ticks = 0
         """Frames due before this are not sent."""
-        self._received = np.zeros(len(keys), dtype=RECEPTION_RECORD)
+        self._frame = OneFrame(
+            anchors=len(site.anchors),
+            nodes=self._nodes,
+            barriers=self._barriers.length,
+            is_diagnosed=impairments.diagnostics,
+            slope_m=impairments.range_errors.slope_m,
+        )
+        self._heard = (Row * self._nodes)()
+        self._received: Records = view(self._heard)
 
     @property
     def tally(self) -> Tally:
         """Counts of what was sent, heard and lost so far, by reason."""
         names = [str(outcome) for outcome in OUTCOMES]
-        at_anchors, at_tags = (dict(zip(names, row, strict=True)) for row in self._counts.tolist())
+        at_anchors, at_tags = (dict(zip(names, row, strict=True)) for row in self._counts.reshape(2, -1).tolist())
         return Tally(self._transmissions, self._late, at_anchors, at_tags)
 
     @property
@@ -241,14 +258,14 @@ class Medium(Generic[Result]):
 
     def switch_off(self, node: int) -> None:
         """Switch a node off; its frame is not sent if the RMARKER has not left."""
-        self.stations[node]["on"] = 0
+        self.stations[node].is_on = False
         self.boots[node] += 1
 
     def switch_on(self, node: int) -> None:
         """Switch a node on, with a new counter except at time 0."""
-        self.stations[node]["on"] = 1
+        self.stations[node].is_on = True
         if self.timeline.now_ticks > 0:
-            restart_counter(self.clocks, node, self._setups[node])
+            restart_counter(self.clocks[node], self._setups[node])
             if self._carriers is not None:
                 self._carriers.restart(node)
 
@@ -256,21 +273,21 @@ class Medium(Generic[Result]):
 
     def _warm_up(self) -> None:
         """Set the crystals' warm-ups, for all tags if no anchor is named."""
-        every_tag = range(len(self._anchors), len(self.clocks))
+        every_tag = range(len(self._anchors), self._nodes)
         for one in self._impairments.warm_ups:
             for node in every_tag if one.anchor is None else (self.node_of[one.anchor],):
-                warm_up(self.clocks, node, one.ppm, one.start_s, one.tau_s)
+                warm_up(self.clocks[node], one.ppm, one.start_s, one.tau_s)
 
     def read_counter(self, node: int) -> int:
         """Advance a node to the present and return its unwrapped counter."""
-        cursors = self._streams.cursors
-        advance(self.clocks, self._streams.normals, cursors, node, self.timeline.now_ticks, 0.0)
-        self._streams.refill(int(cursors[node]))
-        return int(self.clocks[node]["local_ticks"])
+        clock, noise = self.clocks[node], self._streams.noise[node]
+        _advance(clock, noise, self.timeline.now_ticks, 0.0)
+        self._streams.refill(noise.used)
+        return clock.local_ticks
 
     def foresee(self, node: int, local_ticks: int) -> int:
         """True time in whole ticks at which a node's unwrapped counter will show a value."""
-        return int(foresee(self.clocks, node, local_ticks))
+        return _foresee(self.clocks[node], local_ticks)
 
     # Anchors
 
@@ -279,11 +296,11 @@ class Medium(Generic[Result]):
         for shift in self._impairments.anchor_displacements:
             if shift.from_s > 0.0:
                 node = self.node_of[shift.anchor]
-                happen = partial(displace, self.stations, node, self._anchors[node], shift)
+                happen = partial(displace, self.stations[node], self._anchors[node], shift)
                 self.timeline.at(from_seconds(shift.from_s), happen)
         for error in self._impairments.delay_errors:
             if error.from_s > 0.0:
-                happen = partial(set_delays, self.stations, self.node_of[error.anchor], error)
+                happen = partial(set_delays, self.stations[self.node_of[error.anchor]], error)
                 self.timeline.at(from_seconds(error.from_s), happen)
 
     # Transmissions
@@ -320,39 +337,39 @@ class Medium(Generic[Result]):
         if flight.marker_ticks < self._missed_ticks or flight.boot != self.boots[node]:
             self._air.withdraw(flight)
             return
-        normals, cursors = streams.normals, streams.cursors
-        local_ticks, noise_ticks = flight.marker_local_ticks, float(self.stations[node]["tx_noise_ticks"])
-        error_ticks = float(self.stations[node]["tx_error_ticks"])
-        ticks, fraction = emit(self.clocks, normals, cursors, node, local_ticks, noise_ticks, error_ticks)
-        streams.refill(int(cursors[node]))
+        local_ticks, station, clock = flight.marker_local_ticks, self.stations[node], self.clocks[node]
+        noise = streams.noise[node]
+        fraction = _emit(clock, noise, local_ticks, station.tx_noise_ticks, station.tx_error_ticks)
+        streams.refill(noise.used)
+        carry = math.floor(fraction)
+        ticks, fraction = clock.true_ticks + carry, fraction - carry
         flight.emission_ticks, flight.emission_fraction = ticks, fraction
         t_s = ticks * TICK_S
         self._move_tags(t_s)
-        self.range_errors.advance_to(t_s, self.stations)
-        anchors, count, highest = receive_frame(
+        self.range_errors.advance_to(t_s, view(self.stations))
+        others, f = self._air.others(flight), self._frame
+        f.sender, f.ticks, f.fraction, f.bias_m, f.others = node, ticks, fraction, self._bias_m(node, t_s), len(others)
+        f.begin_s = (flight.begin_ticks - flight.marker_ticks) * TICK_S
+        f.end_s = (flight.end_ticks - flight.marker_ticks) * TICK_S
+        _receive_frame(
+            f,
             self.clocks,
-            normals,
-            cursors,
+            streams.noise,
             self.stations,
-            self._channel,
-            self._walls,
-            self._air.others(flight),
-            node,
-            ticks,
-            fraction,
-            ((flight.begin_ticks - flight.marker_ticks) * TICK_S, (flight.end_ticks - flight.marker_ticks) * TICK_S),
-            self._bias_m(node, t_s),
-            self.range_errors.present_m,
-            self._impairments.range_errors.slope_m,
-            self._impairments.diagnostics,
-            self._received,
+            self._impairments.channel,
+            self._power_biases_m,
+            self._barriers.array,
+            (Other * len(others))(*others),
+            self.range_errors.present_m.reshape(-1),
+            self._heard,
             self._counts,
         )
-        streams.refill(highest)
+        streams.refill(f.most_used)
+        anchors, count = f.heard_by_anchors, f.heard
         if self._carriers is not None:
-            clock, heard = self.clocks[node], self._received[:count]
-            late_ticks = (ticks - int(clock["true_ticks"])) + (fraction - float(clock["true_fraction"]))
-            self._carriers.advance_to(t_s, self.stations)
+            heard = self._received[:count]
+            late_ticks = (ticks - clock.true_ticks) + (fraction - clock.true_fraction)
+            self._carriers.advance_to(t_s, view(self.stations))
             heard["phase_cycles"] = self._carriers.phases_cycles(node, local_ticks, late_ticks, heard)
         self._transmissions += 1
         delivery = Delivery(flight, self._received[:anchors].copy(), self._received[anchors:count].copy())
@@ -362,7 +379,7 @@ class Medium(Generic[Result]):
         """Set the next piece of every trajectory whose present one has ended."""
         for tag in np.flatnonzero(self._piece_ends_s <= t_s).tolist():
             piece = self._tags[tag].trajectory.piece(t_s)
-            set_piece(self.stations, len(self._anchors) + tag, piece)
+            set_piece(self.stations[len(self._anchors) + tag], piece)
             self._piece_ends_s[tag] = piece.end_s
 
     def _bias_m(self, node: int, t_s: float) -> float:

@@ -4,13 +4,13 @@ A node's stream depends only on the seed and the node's own key, so that another
 others draw.
 """
 
-import math
-from typing import Final
+from math import erfc, sqrt
+from typing import Annotated, Final
 
 import numpy as np
 
-from skyless.core.arrays import Array, Integers
-from skyless.site.kernels import part
+from skyless.core.native.records import Array, Reals, Record, record
+from skyless.core.native.views import view
 
 BLOCK: Final = 1024
 """Normals drawn ahead for each node."""
@@ -27,36 +27,42 @@ def stream(seed: int, kind: int, number: int, purpose: int = 0) -> np.random.Gen
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(kind, number, purpose))))
 
 
+@record
+class Noise(Record):
+    """Standard normals of a node, drawn ahead."""
+
+    used: int
+    normals: Annotated[Reals, BLOCK]
+
+
 class Streams:
-    """Standard normals of every node, shape (nodes, BLOCK), with a cursor each that the kernels move."""
+    """The noise of every node."""
 
     def __init__(self, generators: list[np.random.Generator]) -> None:
         self._generators = generators
-        self.normals: Array = np.empty((len(generators), BLOCK))
-        self.cursors: Integers = np.zeros(len(generators), dtype=np.int64)
+        self.noise: Array[Noise] = (Noise * len(generators))()
+        self._used, self._normals = view(self.noise)["used"], view(self.noise)["normals"]
         for node in range(len(generators)):
             self._refill(node)
 
-    def refill(self, highest_cursor: int) -> None:
-        """Refill nearly used-up blocks; ``highest_cursor`` is that after the last step."""
-        if highest_cursor > BLOCK - MAX_DRAWS:
-            for node in np.flatnonzero(self.cursors > BLOCK - MAX_DRAWS):
+    def refill(self, most_used: int = BLOCK) -> None:
+        """Refill nearly used-up blocks; ``most_used``: numbers that some node has used."""
+        if most_used > BLOCK - MAX_DRAWS:
+            for node in np.flatnonzero(self._used > BLOCK - MAX_DRAWS):
                 self._refill(int(node))
 
     def _refill(self, node: int) -> None:
-        self._generators[node].standard_normal(out=self.normals[node])
-        self.cursors[node] = 0
+        self._generators[node].standard_normal(out=self._normals[node])
+        self._used[node] = 0
 
 
-@part
-def draw_normal(normals: Array, cursors: Integers, node: int) -> float:
-    """Next standard normal of the node."""
-    value: float = normals[node, cursors[node]]
-    cursors[node] += 1
+def draw_normal(n: Noise) -> float:
+    """Next standard normal of a node."""
+    value = n.normals[n.used]
+    n.used += 1
     return value
 
 
-@part
-def draw_uniform(normals: Array, cursors: Integers, node: int) -> float:
-    """Next uniform number of the node in (0, 1): a normal mapped by its distribution function."""
-    return 0.5 * math.erfc(-draw_normal(normals, cursors, node) / math.sqrt(2.0))
+def draw_uniform(n: Noise) -> float:
+    """Next uniform number of a node in (0, 1): a normal mapped by its distribution function."""
+    return 0.5 * erfc(-draw_normal(n) / sqrt(2.0))

@@ -63,7 +63,7 @@ class Broadcast:
 
 
 def diagnostics_of(row: np.void) -> Diagnostics:
-    """Diagnostics of a node's row (``RECEPTION_RECORD``)."""
+    """Diagnostics of a node's row (``listening.Row``)."""
     return Diagnostics(float(row["rx_power_dbm"]), float(row["first_path_power_dbm"]), float(row["carrier_offset_ppm"]))
 
 

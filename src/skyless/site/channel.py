@@ -4,18 +4,18 @@ Powers follow free space at channel 5. A DW1000 at the regulatory limit sends -4
 total; at 5 m this arrives with -77.0 dBm, where APS011's range bias crosses zero.
 """
 
-import math
-from typing import Final
+from math import exp, log10, pi
+from typing import Final, NamedTuple
 
 import numpy as np
-from msgspec import Struct, structs
+from msgspec import structs
 
-from skyless.core.arrays import Array, Records
+from skyless.core.native.arithmetic import floor
+from skyless.core.native.records import Array, Reals, Record, record
 from skyless.core.site import FloorSite, WallSite
 from skyless.core.ticks import CHANNEL_5_HZ, SPEED_OF_LIGHT_MPS
-from skyless.site.kernels import kernel, part
 
-FREE_SPACE_LOSS_1_M_DB: Final = 20.0 * math.log10(4.0 * math.pi * CHANNEL_5_HZ / SPEED_OF_LIGHT_MPS)
+FREE_SPACE_LOSS_1_M_DB: Final = 20.0 * log10(4.0 * pi * CHANNEL_5_HZ / SPEED_OF_LIGHT_MPS)
 """Free-space loss over the first metre on channel 5, 48.7 dB (Friis)."""
 
 LINE_OF_SIGHT_FIRST_PATH_DB: Final = 2.0
@@ -30,12 +30,15 @@ FIRST_PATH_SCALE_M: Final = 0.1
 _POWER_BIAS_CM: Final = (
     -11.0, -10.5, -10.0, -9.3, -8.2, -6.9, -5.1, -2.7, 0.0, 2.1, 3.5, 4.2, 4.9, 6.2, 7.1, 7.6, 8.1, 8.6,
 )  # fmt: skip
-_POWER_BIAS_M: Final = np.array(_POWER_BIAS_CM) / 100.0
+POWER_BIAS_M: Final = np.array(_POWER_BIAS_CM) / 100.0
+"""Range biases of an RX stamp at powers that fall in steps."""
+_POWER_BIASES: Final = len(_POWER_BIAS_CM)
 _POWER_BIAS_FIRST_DBM: Final = -61.0
 _POWER_BIAS_STEP_DB: Final = 2.0
 
 
-class ChannelModel(Struct, frozen=True, forbid_unknown_fields=True):
+@record
+class ChannelModel(Record):
     """Propagation at a site, and errors of its receivers."""
 
     tx_power_dbm: float = -14.3
@@ -64,73 +67,87 @@ class ChannelModel(Struct, frozen=True, forbid_unknown_fields=True):
     """Noise of the reported carrier offset (assumed: the resolution of RX_TTCKO)."""
 
 
-CHANNEL_RECORD: Final = np.dtype([(field.name, np.float64) for field in structs.fields(ChannelModel)])
-"""A ``ChannelModel`` for the kernels; switches are 0 or 1."""
+@record
+class Barrier(Record):
+    """A wall, or a slab: the ground of a floor above the lowest."""
+
+    is_slab: bool
+    x1_m: float
+    y1_m: float
+    x2_m: float
+    y2_m: float
+    low_m: float
+    """Height of a slab."""
+    loss_db: float
+    delay_m: float
 
 
-def pack_channel(model: ChannelModel) -> Records:
-    """The model as a record for the kernels, shape (1,)."""
-    return np.array([structs.astuple(model)], dtype=CHANNEL_RECORD)
+class Barriers(NamedTuple):
+    """Walls and slabs of a site, as an array and its length."""
+
+    array: Array[Barrier]
+    length: int
 
 
-def pack_walls(walls: tuple[WallSite, ...], floors: tuple[FloorSite, ...] = ()) -> Array:
-    """Walls and slabs for the kernels, shape (n, 6): x1, y1, x2, y2, loss in dB, delay in metres.
+def barriers_of(walls: tuple[WallSite, ...], floors: tuple[FloorSite, ...] = ()) -> Barriers:
+    """The walls of a site, and the grounds of its floors above the lowest."""
+    found = [Barrier(**structs.asdict(wall)) for wall in walls]
+    for one in floors[1:]:
+        loss_db, delay_m = one.slab
+        found.append(Barrier(is_slab=True, low_m=one.low_m, loss_db=loss_db, delay_m=delay_m))
+    return Barriers((Barrier * len(found))(*found), len(found))
 
-    A slab, the ground of a floor above the lowest, has its height as y1, and NaN as x1.
-    """
-    rows = [structs.astuple(wall) for wall in walls]
-    rows += [(math.nan, floor.low_m, math.nan, math.nan, *floor.slab) for floor in floors[1:]]
-    return np.array(rows, dtype=np.float64).reshape(-1, 6)
+
+def cross_wall(b: Barrier, x1_m: float, y1_m: float, z1_m: float, x2_m: float, y2_m: float, z2_m: float) -> bool:
+    """Whether the straight line from one point to another crosses a wall or slab."""
+    if b.is_slab:
+        return (z1_m < b.low_m) != (z2_m < b.low_m)
+    side_1 = (x2_m - x1_m) * (b.y1_m - y1_m) - (y2_m - y1_m) * (b.x1_m - x1_m)
+    side_2 = (x2_m - x1_m) * (b.y2_m - y1_m) - (y2_m - y1_m) * (b.x2_m - x1_m)
+    side_a = (b.x2_m - b.x1_m) * (y1_m - b.y1_m) - (b.y2_m - b.y1_m) * (x1_m - b.x1_m)
+    side_b = (b.x2_m - b.x1_m) * (y2_m - b.y1_m) - (b.y2_m - b.y1_m) * (x2_m - b.x1_m)
+    return side_1 * side_2 < 0.0 and side_a * side_b < 0.0
 
 
-@kernel
 def cross_walls(
-    walls: Array, ax_m: float, ay_m: float, az_m: float, bx_m: float, by_m: float, bz_m: float
+    barriers: Array[Barrier],
+    count: int,
+    x1_m: float,
+    y1_m: float,
+    z1_m: float,
+    x2_m: float,
+    y2_m: float,
+    z2_m: float,
 ) -> tuple[float, float]:
-    """Total loss in dB and delay in metres of all walls and slabs that the straight line from a to b crosses."""
-    loss_db = 0.0
-    delay_m = 0.0
-    for w in range(walls.shape[0]):
-        x1, y1, x2, y2 = walls[w, 0], walls[w, 1], walls[w, 2], walls[w, 3]
-        if math.isnan(x1):
-            if (az_m < y1) != (bz_m < y1):
-                loss_db += walls[w, 4]
-                delay_m += walls[w, 5]
-            continue
-        side_1 = (bx_m - ax_m) * (y1 - ay_m) - (by_m - ay_m) * (x1 - ax_m)
-        side_2 = (bx_m - ax_m) * (y2 - ay_m) - (by_m - ay_m) * (x2 - ax_m)
-        side_a = (x2 - x1) * (ay_m - y1) - (y2 - y1) * (ax_m - x1)
-        side_b = (x2 - x1) * (by_m - y1) - (y2 - y1) * (bx_m - x1)
-        if side_1 * side_2 < 0.0 and side_a * side_b < 0.0:
-            loss_db += walls[w, 4]
-            delay_m += walls[w, 5]
+    """Total loss in dB and delay in metres of the barriers that the straight line from one point to another crosses."""
+    loss_db, delay_m = 0.0, 0.0
+    for index in range(count):
+        b = barriers[index]
+        if cross_wall(b, x1_m, y1_m, z1_m, x2_m, y2_m, z2_m):
+            loss_db += b.loss_db
+            delay_m += b.delay_m
     return loss_db, delay_m
 
 
-@part
 def received_power_dbm(tx_power_dbm: float, distance_m: float, loss_db: float) -> float:
     """Received power after free space and walls; distances below 1 cm count as 1 cm."""
-    return tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 20.0 * math.log10(max(distance_m, 0.01)) - loss_db
+    return tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 20.0 * log10(max(distance_m, 0.01)) - loss_db
 
 
-@part
-def power_bias_m(rx_power_dbm: float) -> float:
+def power_bias_m(rx_power_dbm: float, table_m: Reals = POWER_BIAS_M) -> float:
     """Range bias of an RX stamp (APS011 in docs/radio.md), linearly interpolated and held beyond the ends."""
     position = (_POWER_BIAS_FIRST_DBM - rx_power_dbm) / _POWER_BIAS_STEP_DB
-    position = min(max(position, 0.0), _POWER_BIAS_M.shape[0] - 1.0)
-    low = min(int(position), _POWER_BIAS_M.shape[0] - 2)
-    bias_m: float = _POWER_BIAS_M[low] + (position - low) * (_POWER_BIAS_M[low + 1] - _POWER_BIAS_M[low])
-    return bias_m
+    position = min(max(position, 0.0), _POWER_BIASES - 1.0)
+    low = min(floor(position), _POWER_BIASES - 2)
+    return table_m[low] + (position - low) * (table_m[low + 1] - table_m[low])
 
 
-@part
 def first_path_loss_db(extra_m: float) -> float:
     """First path's power below the total power, for a message that is ``extra_m`` late."""
-    late = 1.0 - math.exp(-max(extra_m, 0.0) / FIRST_PATH_SCALE_M)
+    late = 1.0 - exp(-max(extra_m, 0.0) / FIRST_PATH_SCALE_M)
     return LINE_OF_SIGHT_FIRST_PATH_DB + BLOCKED_FIRST_PATH_DB * late
 
 
-@part
 def delivery_probability(rx_power_dbm: float, sensitivity_dbm: float, width_db: float) -> float:
     """Probability of receiving a frame: logistic in the power, 1/2 at the sensitivity."""
-    return 1.0 / (1.0 + math.exp(min((sensitivity_dbm - rx_power_dbm) / width_db, 700.0)))
+    return 1.0 / (1.0 + exp(min((sensitivity_dbm - rx_power_dbm) / width_db, 700.0)))

@@ -27,7 +27,7 @@ from skyless.arguments import (
     whole,
     wrong,
 )
-from skyless.cli.common import JsonOptions, command, print_json, status
+from skyless.cli.common import JsonOptions, command, print_json
 from skyless.cli.nodes.options import (
     MqttOptions,
     SiteId,
@@ -137,7 +137,6 @@ def ether(*, asked: EtherOptions, broker: MqttOptions, output: JsonOptions) -> N
     air has carried.
     """
     from skyless.run.ether import Ether, EtherNode
-    from skyless.sim.evaluation.fleet import compile_kernels
     from skyless.sim.evaluation.scenarios import Request, impairments_of, patrols
 
     site, address = site_named(asked.site), broker.address()
@@ -147,8 +146,6 @@ def ether(*, asked: EtherOptions, broker: MqttOptions, output: JsonOptions) -> N
         site, noise_ps=asked.noise_ps, loss=asked.loss, nlos=asked.nlos, carrier=asked.carrier, seed=asked.seed
     )
     moves = tuple(_move(text, [anchor.id for anchor in site.anchors]) for text in asked.move)
-    with status("compiling the simulation"):
-        compile_kernels()
     bodies = {f"tag{number}": path for number, path in enumerate(patrols(site, asked.tags, asked.speed), start=1)}
     emulated = Ether(site, bodies, replace(impairments_of(request, site), anchor_displacements=moves), asked.seed)
     for one in moves:

@@ -1,4 +1,4 @@
-"""The library compiled from the Python of ``core`` (``tools/translator``), and its functions.
+"""The libraries compiled from Python (``tools/translator``), and their functions.
 
 With ``SKYLESS_UNCOMPILED=1`` in the environment the Python itself runs: the same bits, some thousand times slower.
 """
@@ -19,11 +19,17 @@ Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 UNCOMPILED_VARIABLE: Final = "SKYLESS_UNCOMPILED"
-LIBRARIES: Final = tuple(Path(__file__).with_name(f"libskyless_core{variant}.so") for variant in ("_avx2", ""))
+CORE: Final = "skyless_core"
+"""The library of a tag: what boards and browsers share with it."""
+KERNELS: Final = "skyless_kernels"
+"""The library of simulation and planning."""
+FOLDER: Final = Path(__file__).parent
+"""Where the sources and libraries are."""
+SOURCE: Final = FOLDER / f"{CORE}.c"
+_VARIANTS: Final = ("_avx2", "")
 """The first is for x86-64 processors with 256-bit vectors; both give the same bits."""
 _AVX2: Final = frozenset({"avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"})
 """Linux's names of the instruction sets of x86-64-v3."""
-SOURCE: Final = Path(__file__).with_name("skyless_core.c")
 
 
 def is_compiled() -> bool:
@@ -32,21 +38,23 @@ def is_compiled() -> bool:
 
 
 @cache
-def library() -> ctypes.CDLL:
-    """The library of this installation.
+def library(name: str) -> ctypes.CDLL:
+    """A library of this installation.
 
     Raises:
         SkylessError: it is missing, or was not compiled from the source beside it.
     """
     again = "install Skyless again (in a checkout: scripts/core)"
-    file = next((one for one in LIBRARIES[:1] if one.exists() and _has_avx2()), LIBRARIES[-1])
+    source = FOLDER / f"{name}.c"
+    files = [FOLDER / f"lib{name}{variant}.so" for variant in _VARIANTS]
+    file = files[0] if files[0].exists() and _has_avx2() else files[-1]
     try:
         found = ctypes.CDLL(str(file))
     except OSError as error:
-        raise SkylessError(f"the estimator's library: {error}; {again}") from None
+        raise SkylessError(f"the library {name}: {error}; {again}") from None
     digest = ctypes.c_char_p.in_dll(found, "skyless_source_digest").value
-    if SOURCE.exists() and digest != source_digest(SOURCE).encode():
-        raise SkylessError(f"{file} was made from another {SOURCE.name} than the one beside it; {again}")
+    if source.exists() and digest != source_digest(source).encode():
+        raise SkylessError(f"{file} was made from another {source.name} than the one beside it; {again}")
     return found
 
 
@@ -66,8 +74,8 @@ def source_digest(source: Path) -> str:
     return hashlib.sha256(source.read_bytes() + header.read_bytes()).hexdigest()[:16]
 
 
-def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """The library's version of a Python function.
+def compiled(function: Callable[Parameters, Result], name: str = CORE) -> Callable[Parameters, Result]:
+    """A library's version of a Python function.
 
     Records are passed as they are, arrays as ctypes or NumPy arrays, bytes also as ``bytes``. Lengths are not checked.
     """
@@ -75,7 +83,7 @@ def compiled(function: Callable[Parameters, Result]) -> Callable[Parameters, Res
         return function
     hints = get_type_hints(function, include_extras=True)
     returned = hints.pop("return")
-    called = library()[f"skyless_{function.__name__}"]
+    called = library(name)[f"skyless_{function.__name__}"]
     called.argtypes = [_argument_type(hint) for hint in hints.values()]
     called.restype = None if returned is type(None) else c_type(returned)
     return cast("Callable[Parameters, Result]", called)

@@ -13,16 +13,15 @@ from skyless.core.any_receiver import AnchorMachine, AnyReceiver, SiteBeacon, ne
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.method_names import DEFAULT_METHOD, FILTERS
+from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import Site
 from skyless.core.tag.receiver import NOT_DROPS
 from skyless.sim.evaluation.figures import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
-from skyless.sim.impairments import Impairments, Outage, lab_impairments
-from skyless.sim.lab import lab_site, paper_lab_site
+from skyless.sim.impairments import Impairments, Outage
 from skyless.sim.listening import Outcome, TagSpec
 from skyless.sim.medium import Tally
 from skyless.sim.tape import Tape
-from skyless.sim.trajectory import Static, Trajectory
+from skyless.sim.trajectory import Trajectory
 from skyless.sim.world import World
 
 _LEVEL_ROWS: Final = 1 << 16
@@ -346,14 +345,3 @@ def _std_m(rmse_m: float | None, summary: ErrorSummary) -> float | None:
     if rmse_m is None or summary.bias_m is None:
         return None
     return float(np.sqrt(max(rmse_m**2 - sum(value * value for value in summary.bias_m), 0.0)))
-
-
-# Compile the simulation before a clock runs: the first time takes some seconds, later ones load it from disk.
-
-
-def compile_kernels(method: str = DEFAULT_METHOD) -> None:
-    """Simulate a fifth of a second of the lab; for snapshots, that of the paper with its protocol."""
-    site = lab_site() if method in FILTERS else paper_lab_site()
-    fleet = Fleet(site, [Static(3.0, 4.0)], lab_impairments(100.0), 0, FleetSettings(method, warmup_s=0.0))
-    for _ in fleet.run(0.2):
-        pass

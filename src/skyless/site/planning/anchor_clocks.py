@@ -20,8 +20,7 @@ from skyless.core.protocol1.anchor import MAX_OFFSET_STD_M
 from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_S
-from skyless.site.channel import ChannelModel, pack_walls
-from skyless.site.kernels import jitted, kernel
+from skyless.site.channel import Barriers, ChannelModel, barriers_of
 from skyless.site.planning.links import MIN_SYNC, anchor_links, link_budget, links, masters_by_links
 
 _STEADY_CHANGE: Final = 1e-7
@@ -30,9 +29,6 @@ _MAX_SUPERFRAMES: Final = 20_000  # superframes after which a filter counts as s
 
 MIN_SHARE: Final = 0.01
 """Receptions that are relayed more rarely are ignored."""
-
-jitted(predict)
-jitted(update)
 
 
 class AnchorClocks(NamedTuple):
@@ -105,7 +101,6 @@ def _messages(site: Site) -> tuple[Integers, Vector, float]:
     return senders, np.array([slot * slot_s for slot, _ in order]), schedule.superframe_ticks * TICK_S
 
 
-@kernel
 def _run_filter(
     sender: Integers,
     time_s: Vector,
@@ -153,12 +148,14 @@ class Relays(NamedTuple):
     """Delay by walls."""
 
 
-def relays_of(anchors_m: Matrix, master: int | None, clocks: AnchorClocks, budget: Vector, walls: Matrix) -> Relays:
+def relays_of(
+    anchors_m: Matrix, master: int | None, clocks: AnchorClocks, budget: Vector, barriers: Barriers
+) -> Relays:
     """The relays of a site's superframe; each frame carries as many of the latest receptions as fit.
 
     ``anchors_m``: shape (anchors, 3); ``master``: row of the master, whose packets have a separate field.
     """
-    share, delay_m = links(anchors_m, anchors_m, budget, walls)
+    share, delay_m = links(anchors_m, anchors_m, budget, barriers)
     share *= clocks.kept * (clocks.sends & clocks.sends[:, None])
     if master is None:
         capacity = master_capacity = beacon.heard_capacity(position=True)
@@ -225,7 +222,7 @@ class MasterReception(Struct, frozen=True):
 def reception_of(site: Site, channel: ChannelModel) -> MasterReception:
     """Predict the anchors' reception of their master, with the losses of the site's walls."""
     anchors_m, master = anchor_positions(site), row_of_master(site)
-    share = anchor_links(anchors_m, master, link_budget(channel), pack_walls(site.walls, site.storeys)).share
+    share = anchor_links(anchors_m, master, link_budget(channel), barriers_of(site.walls, site.storeys)).share
     return MasterReception(
         np.linalg.norm(anchors_m - anchors_m[master], axis=1), share, anchor_clocks(site, share).sends
     )
@@ -281,4 +278,4 @@ def _named(site: Site, found: MasterReception, rows: Integers, do: str, does: st
 
 def _masters(site: Site, channel: ChannelModel) -> Integers:
     anchors_m: Matrix = anchor_positions(site)
-    return masters_by_links(anchors_m, link_budget(channel), pack_walls(site.walls, site.storeys))
+    return masters_by_links(anchors_m, link_budget(channel), barriers_of(site.walls, site.storeys))

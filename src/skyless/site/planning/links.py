@@ -4,18 +4,24 @@ Also the floor of a site and the places where anchors may be mounted.
 """
 
 import math
+from math import sqrt
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 from msgspec import UNSET, Struct
 
-from skyless.core.arrays import Array, Integers, Matrix, Vector
+from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.errors import ConfigurationError
 from skyless.core.geometry import OUTSIDE_M, Box, anchor_positions, area, distance_outside, dops_at, inside, outline_of
+from skyless.core.native.arithmetic import square
+from skyless.core.native.library import KERNELS, compiled
+from skyless.core.native.records import Array, Reals
 from skyless.core.site import Site
 from skyless.site.channel import (
     FREE_SPACE_LOSS_1_M_DB,
+    Barrier,
+    Barriers,
     ChannelModel,
     cross_walls,
     delivery_probability,
@@ -23,7 +29,6 @@ from skyless.site.channel import (
 )
 from skyless.site.file.advice import anchors_needed
 from skyless.site.file.check import image_size
-from skyless.site.kernels import kernel, threaded_kernel
 
 PLAN_COLUMNS: Final = (
     "anchors",  # in view
@@ -49,11 +54,11 @@ ANCHORS_IN_VIEW, GDOP, PDOP, HDOP, VDOP, TDOP, SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z,
 
 
 def fill_errors(
-    table: Array,
+    table: Matrix,
     rows: Integers,
-    variance_m2: Array,
-    square_bias_m2: Array,
-    claimed_m2: Array,
+    variance_m2: Matrix,
+    square_bias_m2: Vector,
+    claimed_m2: Vector,
 ) -> None:
     """Fill the error columns in these rows of a table. ``variance_m2``: of three axes, shape (k, 3); others (k,)."""
     table[rows, SIGMA_X : SIGMA_Z + 1] = np.sqrt(variance_m2)
@@ -90,8 +95,7 @@ def range_of(channel: ChannelModel, exponent: float = 2.0) -> float:
 def with_range(channel: ChannelModel, range_m: float, exponent: float = 2.0) -> ChannelModel:
     """The channel with its sensitivity changed to give this range."""
     sensitivity_dbm = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 10.0 * exponent * math.log10(range_m)
-    values = {name: getattr(channel, name) for name in channel.__struct_fields__}
-    return ChannelModel(**{**values, "sensitivity_dbm": sensitivity_dbm})
+    return channel.changed(sensitivity_dbm=sensitivity_dbm)
 
 
 def link_budget(channel: ChannelModel) -> Vector:
@@ -115,48 +119,59 @@ def link_budget(channel: ChannelModel) -> Vector:
     )
 
 
-@kernel
-def link(budget: Vector, walls: Matrix, a_m: Vector, b_m: Vector) -> tuple[float, float]:
-    """Share of the frames that arrive over the straight line from a to b, and the walls' delay in metres."""
-    loss_db, delay_m = 0.0, 0.0
-    x, y, z = b_m[0] - a_m[0], b_m[1] - a_m[1], b_m[2] - a_m[2]
-    squared_m2 = x * x + y * y + z * z
-    if squared_m2 > budget[4]:
-        return 0.0, 0.0
-    if walls.shape[0] > 0:
-        loss_db, delay_m = cross_walls(walls, a_m[0], a_m[1], a_m[2], b_m[0], b_m[1], b_m[2])
-    if loss_db == 0.0 and squared_m2 < budget[5]:
-        return 1.0 - budget[3], delay_m
-    power_dbm = received_power_dbm(budget[0], math.sqrt(squared_m2), loss_db)
-    return (1.0 - budget[3]) * delivery_probability(power_dbm, budget[1], budget[2]), delay_m
-
-
-@threaded_kernel
-def _fill_links(
-    senders_m: Matrix, listeners_m: Matrix, budget: Vector, walls: Matrix, share: Matrix, delay_m: Matrix
+def fill_links(
+    senders_m: Reals,
+    senders: int,
+    listeners_m: Reals,
+    listeners: int,
+    budget: Reals,
+    barriers: Array[Barrier],
+    count: int,
+    share: Reals,
+    delays_m: Reals,
 ) -> None:
-    for i in range(len(listeners_m)):
-        for j in range(len(senders_m)):
-            share[i, j], delay_m[i, j] = link(budget, walls, senders_m[j], listeners_m[i])
+    """Fill the results of ``links``, listener by listener; points are x, y and z one after the other."""
+    for i in range(listeners):
+        x_m, y_m, z_m = listeners_m[3 * i], listeners_m[3 * i + 1], listeners_m[3 * i + 2]
+        for j in range(senders):
+            k = i * senders + j
+            share[k], delays_m[k] = 0.0, 0.0
+            from_x_m, from_y_m, from_z_m = senders_m[3 * j], senders_m[3 * j + 1], senders_m[3 * j + 2]
+            squared_m2 = square(x_m - from_x_m) + square(y_m - from_y_m) + square(z_m - from_z_m)
+            if squared_m2 > budget[4]:
+                continue
+            loss_db, delay_m = cross_walls(barriers, count, from_x_m, from_y_m, from_z_m, x_m, y_m, z_m)
+            delays_m[k] = delay_m
+            if loss_db == 0.0 and squared_m2 < budget[5]:
+                share[k] = 1.0 - budget[3]
+                continue
+            power_dbm = received_power_dbm(budget[0], sqrt(squared_m2), loss_db)
+            share[k] = (1.0 - budget[3]) * delivery_probability(power_dbm, budget[1], budget[2])
 
 
-def links(senders_m: Matrix, listeners_m: Matrix, budget: Vector, walls: Matrix) -> tuple[Matrix, Matrix]:
+_fill_links = compiled(fill_links, KERNELS)
+
+
+def links(senders_m: Matrix, listeners_m: Matrix, budget: Vector, barriers: Barriers) -> tuple[Matrix, Matrix]:
     """Share of each sender's frames that reach each listener, and delay in metres; shape (listeners, senders) each."""
     share, delay_m = np.empty((2, len(listeners_m), len(senders_m)))
-    _fill_links(senders_m, listeners_m, budget, walls, share, delay_m)
+    senders, listeners = (np.ascontiguousarray(one, np.float64).reshape(-1) for one in (senders_m, listeners_m))
+    _fill_links(
+        senders, len(senders_m), listeners, len(listeners_m), budget, *barriers, share.reshape(-1), delay_m.reshape(-1)
+    )
     return share, delay_m
 
 
-def anchor_links(anchors_m: Matrix, master: int, budget: Vector, walls: Matrix) -> AnchorLinks:
+def anchor_links(anchors_m: Matrix, master: int, budget: Vector, barriers: Barriers) -> AnchorLinks:
     """Links from the anchor in row ``master`` to anchors at positions of shape (anchors, 3)."""
-    share, delay_m = links(anchors_m[master : master + 1], anchors_m, budget, walls)
+    share, delay_m = links(anchors_m[master : master + 1], anchors_m, budget, barriers)
     share[master] = 1.0
     return AnchorLinks(share[:, 0], delay_m[:, 0])
 
 
-def masters_by_links(anchors_m: Matrix, budget: Vector, walls: Matrix) -> Integers:
+def masters_by_links(anchors_m: Matrix, budget: Vector, barriers: Barriers) -> Integers:
     """Rows of anchors ordered by how well all others receive them, best first; equals by distance from the middle."""
-    heard, _ = links(anchors_m, anchors_m, budget, walls)
+    heard, _ = links(anchors_m, anchors_m, budget, barriers)
     total = np.round(np.minimum(heard, 0.99).sum(axis=0), 3)
     middle = np.linalg.norm(anchors_m[:, :2] - anchors_m[:, :2].mean(axis=0), axis=1)
     return np.lexsort((middle, -total))
@@ -171,12 +186,11 @@ class Scene(NamedTuple):
     """Share of each anchor's frames that is sent and not lost to collisions, shape (anchors,)."""
     budget: Vector
     """From ``link_budget``."""
-    walls: Matrix
-    """From ``pack_walls``."""
+    barriers: Barriers
 
     def heard_at(self, points: Matrix) -> tuple[Matrix, Matrix]:
         """Share of each anchor's frames that arrives at points, and the walls' delay in metres; shape (m, anchors)."""
-        share, delay_m = links(self.anchors, points, self.budget, self.walls)
+        share, delay_m = links(self.anchors, points, self.budget, self.barriers)
         return share * self.sends, delay_m
 
     def strongest(self, point: Vector, rows: Integers, most: int) -> Integers:
@@ -187,7 +201,7 @@ class Scene(NamedTuple):
             received_power_dbm(
                 self.budget[0],
                 float(np.linalg.norm(point - anchor_m)),
-                cross_walls(self.walls, *anchor_m, *point)[0],
+                cross_walls(*self.barriers, *anchor_m, *point)[0],
             )
             for anchor_m in self.anchors[rows]
         ]

@@ -6,19 +6,21 @@ own prediction. The evenly spaced layout is one of the starts, so the result is 
 the region count equally, relative to those of that layout. The same seed gives the same result, unless time runs out.
 """
 
-import math
 import time
 from collections.abc import Callable
-from typing import Final, NamedTuple
+from math import sqrt
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.arrays import Integers, Matrix, Vector
+from skyless.core.native.arithmetic import factorise, solve
+from skyless.core.native.library import KERNELS, compiled
+from skyless.core.native.records import Array, Reals, Record, Ticks, record
 from skyless.core.site import AnchorSite, Site
-from skyless.site.channel import pack_walls
-from skyless.site.kernels import factorise, invert, kernel, threaded_kernel
+from skyless.site.channel import Barriers, barriers_of
 from skyless.site.planning.anchor_clocks import stamp_variances
 from skyless.site.planning.links import (
     FIX_SHARE,
@@ -107,15 +109,15 @@ def lattice_of(
     points_m: Matrix,
     weights: Vector,
     budget: Vector,
-    walls: Matrix,
+    barriers: Barriers,
     dim: int,
     sigma_m: float,
     *,
     has_master: bool = True,
 ) -> Lattice:
     """The lattice of candidates, shape (c, 3), and points, shape (m, 3); ``sigma_m``: noise of a pseudorange."""
-    share, _ = links(points_m, candidates_m, budget, walls)
-    heard, _ = links(candidates_m, candidates_m, budget, walls) if has_master else (np.ones((len(share),) * 2), None)
+    share, _ = links(points_m, candidates_m, budget, barriers)
+    heard, _ = links(candidates_m, candidates_m, budget, barriers) if has_master else (np.ones((len(share),) * 2), None)
     np.fill_diagonal(heard, 1.0)
     away = points_m - candidates_m[:, None]
     unit = away / np.maximum(np.linalg.norm(away, axis=2, keepdims=True), 1e-3)
@@ -125,40 +127,71 @@ def lattice_of(
     return Lattice(apart_m, rows, heard, weights, cap_m)
 
 
-@threaded_kernel
-def mean_and_worst(chosen: Integers, lattice: Lattice) -> tuple[float, float]:
-    """Mean and largest error over the points for these candidates, with the best received one as the master."""
-    rows, heard = lattice.rows, lattice.heard
-    size = rows.shape[2]
-    normal, inverse = np.zeros((size, size)), np.zeros((size, size))
+@record
+class Verdict(Record):
+    """Errors over the points of a lattice, and memory to compute them."""
+
+    mean: float
+    worst: float
+    normal: Annotated[Reals, 10]
+    column: Annotated[Reals, 4]
+
+
+def judge(
+    chosen: Array[Ticks],
+    count: int,
+    heard: Reals,
+    candidates: int,
+    rows: Reals,
+    weights: Reals,
+    points: int,
+    size: int,
+    cap_m: float,
+    v: Verdict,
+) -> None:
+    """Fill the verdict on the chosen candidates, with the best received one as the master."""
     best, master = -1.0, 0
-    for i in chosen:
+    for one in range(count):
         total = 0.0
-        for j in chosen:
-            total += min(heard[i, j], 0.9)
+        for other in range(count):
+            total += min(heard[chosen[one] * candidates + chosen[other]], 0.9)
         if total > best:
-            best, master = total, i
-    mean, worst = 0.0, 0.0
-    for m in range(rows.shape[1]):
-        normal[:] = 0.0
-        for i in chosen:
-            factor = min(heard[i, master] / _MIN_HEARD, 1.0)
+            best, master = total, one
+    v.mean, v.worst = 0.0, 0.0
+    for m in range(points):
+        for k in range(size * (size + 1) // 2):
+            v.normal[k] = 0.0
+        for one in range(count):
+            factor = min(heard[chosen[one] * candidates + chosen[master]] / _MIN_HEARD, 1.0)
+            begin = (chosen[one] * points + m) * size
             for a in range(size):
                 for b in range(a + 1):
-                    normal[a, b] += factor * rows[i, m, a] * rows[i, m, b]
-        error = lattice.cap_m
-        if factorise(normal, size):
-            invert(normal, size, inverse)
+                    v.normal[a * (a + 1) // 2 + b] += factor * rows[begin + a] * rows[begin + b]
+        error = cap_m
+        if factorise(v.normal, size):
             trace = 0.0
             for a in range(1, size):
-                trace += inverse[a, a]
-            error = min(math.sqrt(trace), error)
-        mean += lattice.weights[m] * error
-        worst = max(worst, error)
-    return mean, worst
+                for b in range(size):
+                    v.column[b] = 1.0 if a == b else 0.0
+                solve(v.normal, size, v.column)
+                trace += v.column[a]
+            error = min(sqrt(trace), error)
+        v.mean += weights[m] * error
+        v.worst = max(v.worst, error)
 
 
-@kernel
+_judge = compiled(judge, KERNELS)
+
+
+def mean_and_worst(chosen: Integers, lattice: Lattice) -> tuple[float, float]:
+    """Mean and largest error over the points for these candidates, with the best received one as the master."""
+    verdict = Verdict()
+    candidates, points, size = lattice.rows.shape
+    heard, rows = lattice.heard.reshape(-1), lattice.rows.reshape(-1)
+    _judge(chosen, len(chosen), heard, candidates, rows, lattice.weights, points, size, lattice.cap_m, verdict)
+    return verdict.mean, verdict.worst
+
+
 def relative_score(mean: float, worst: float, mean_reference: float, worst_reference: float) -> float:
     """Mean of both errors relative to a reference, with a penalty for one that is not clearly smaller."""
     a, b = mean / mean_reference, worst / worst_reference
@@ -235,7 +268,7 @@ class Search:
         seconds: float,
     ) -> None:
         self._site, self._settings, self._mounts, self._anchors = site, settings, mounts, anchors
-        self._budget, self._walls = link_budget(settings.channel), pack_walls(site.walls, site.storeys)
+        self._budget, self._barriers = link_budget(settings.channel), barriers_of(site.walls, site.storeys)
         self._points = sample_points(floor, heights_m, _SEARCH_POINTS)
         self._floor, self._heights_m = floor, heights_m
         self._random = np.random.default_rng([seed, anchors])
@@ -302,7 +335,7 @@ class Search:
         candidates_m = self._mounts.at(all_along_m, all_levels)
         has_master = self._site.schedule.needs_master
         lattice = lattice_of(
-            candidates_m, *self._points, self._budget, self._walls, dim, noise_m, has_master=has_master
+            candidates_m, *self._points, self._budget, self._barriers, dim, noise_m, has_master=has_master
         )
         even_m = self._mounts.at(even.along_m, even.levels)
         snapped = np.array([np.argmin(np.linalg.norm(candidates_m - anchor_m, axis=1)) for anchor_m in even_m])
@@ -323,7 +356,7 @@ class Search:
 
     def _site_of(self, layout: Layout, rank: int = 0) -> Site:
         anchors_m = self._mounts.at(layout.along_m, layout.levels)
-        master = int(masters_by_links(anchors_m, self._budget, self._walls)[rank])
+        master = int(masters_by_links(anchors_m, self._budget, self._barriers)[rank])
         return site_with(self._site, anchors_m, master)
 
     def _sigma(self, site: Site, sample: tuple[Matrix, Vector]) -> tuple[float, float, float]:
@@ -415,7 +448,7 @@ def one_more(
     candidates_m = np.concatenate([before.anchors_m, free])
     noise_m = sum(stamp_variances(before.site)) ** 0.5
     lattice = lattice_of(
-        candidates_m, points, weights, before.budget, before.walls, before.dim, noise_m,
+        candidates_m, points, weights, before.budget, before.barriers, before.dim, noise_m,
         has_master=before.master is not None,
     )  # fmt: skip
     n = len(before.anchors_m)

@@ -30,7 +30,7 @@ from skyless.core.protocol1.snapshots import SnapshotMethod, bracketed_covarianc
 from skyless.core.site import Site
 from skyless.core.tag.receiver import estimator_settings
 from skyless.core.ticks import TICK_S
-from skyless.site.channel import ChannelModel, pack_walls
+from skyless.site.channel import ChannelModel, barriers_of
 from skyless.site.planning.anchor_clocks import (
     AnchorClocks,
     Relays,
@@ -393,14 +393,16 @@ class Predictor:
         self.anchors_m = anchor_positions(site)
         self.master = row_of_master(site) if site.schedule.needs_master else None
         """Row of the master; None where there is none."""
-        self.budget, self.walls = link_budget(settings.channel), pack_walls(site.walls, site.storeys)
+        self.budget, self.barriers = link_budget(settings.channel), barriers_of(site.walls, site.storeys)
         self.links: AnchorLinks = (
             AnchorLinks(np.ones(len(site.anchors)), np.zeros(len(site.anchors)))
             if self.master is None
-            else anchor_links(self.anchors_m, self.master, self.budget, self.walls)
+            else anchor_links(self.anchors_m, self.master, self.budget, self.barriers)
         )
         self.clocks = anchor_clocks(self.site, self.links.share)
-        self.scene = Scene(self.anchors_m, np.where(self.clocks.sends, self.clocks.kept, 0.0), self.budget, self.walls)
+        self.scene = Scene(
+            self.anchors_m, np.where(self.clocks.sends, self.clocks.kept, 0.0), self.budget, self.barriers
+        )
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
         if settings.method in FILTERS:
             self._fill = self._joint()
@@ -438,7 +440,7 @@ class Predictor:
         settings = estimator_settings(
             self.settings.qa, self.site.tags.height_m, *filter_pages_of(self.site), superframe_s(self.site)
         )
-        relays = relays_of(self.anchors_m, self.master, self.clocks, self.budget, self.walls)
+        relays = relays_of(self.anchors_m, self.master, self.clocks, self.budget, self.barriers)
         return settings, self.scene, self.clocks, relays, MAX_ANCHORS_IN_USE if self.master is None else None
 
     def at(self, points_m: Matrix, progress: Callable[[float], None] | None = None) -> Matrix:

@@ -4,6 +4,7 @@ A frame arrives if its power is above the sensitivity and exceeds that of each c
 """
 
 import math
+from math import exp, log10, sqrt
 from typing import Any, Final
 
 import msgspec
@@ -12,19 +13,22 @@ from msgspec import Struct
 
 from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
 from skyless.core.any_receiver import beacon_period_s
-from skyless.core.arrays import Array, Integers, Matrix, Vector
+from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.geometry import anchor_positions
+from skyless.core.native.arithmetic import square
+from skyless.core.native.library import KERNELS, compiled
+from skyless.core.native.records import Array, Reals
 from skyless.core.site import Site
 from skyless.site.channel import (
     FREE_SPACE_LOSS_1_M_DB,
+    Barrier,
     ChannelModel,
+    barriers_of,
     cross_walls,
     delivery_probability,
-    pack_walls,
     received_power_dbm,
 )
 from skyless.site.file.advice import warnings_of
-from skyless.site.kernels import threaded_kernel
 from skyless.site.planning.links import IN_VIEW, Floor, range_of
 from skyless.site.planning.maps import Grid, grid_of
 
@@ -73,46 +77,67 @@ def tag_rates(site: Site, points_m: Matrix, channel: ChannelModel, exponent: flo
         ]
     )
     table = np.zeros((len(points_m), 3))
-    _fill_rates(np.ascontiguousarray(points_m), anchors_m[order], settings, pack_walls(site.walls, site.storeys), table)
+    compiled(fill_rates, KERNELS)(
+        np.ascontiguousarray(points_m, np.float64).reshape(-1),
+        len(points_m),
+        anchors_m[order].reshape(-1),
+        len(anchors_m),
+        settings,
+        *barriers_of(site.walls, site.storeys),
+        np.empty(len(anchors_m)),
+        table.reshape(-1),
+    )
     return TagRates(table[:, 0] / period_s, table[:, 1].astype(np.int64), table[:, 2].astype(np.int64))
 
 
-@threaded_kernel
-def _fill_rates(points_m: Matrix, anchors_m: Matrix, settings: Vector, walls: Matrix, table: Matrix) -> None:
-    """Fill beacons per period, anchors in reach and anchors received; anchors in the order of x.
+def fill_rates(
+    points_m: Reals,
+    points: int,
+    anchors_m: Reals,
+    anchors: int,
+    settings: Reals,
+    barriers: Array[Barrier],
+    count: int,
+    powers_dbm: Reals,
+    table: Reals,
+) -> None:
+    """Fill beacons per period, anchors in reach and anchors received, point by point; anchors in the order of x.
 
     ``settings``: transmit power, sensitivity, its width, capture margin, share not lost at random, exponent, distance
     beyond which anchors are ignored, share of the time in which another anchor's frame would overlap, and share of an
-    anchor's frames that makes it count as received.
+    anchor's frames that makes it count as received. ``powers_dbm`` has room for one number of each anchor.
     """
     tx_dbm, sensitivity_dbm, width_db, capture_db = settings[0], settings[1], settings[2], settings[3]
     kept, exponent, farthest_m, overlap, useful = settings[4], settings[5], settings[6], settings[7], settings[8]
-    power_dbm = np.empty(len(anchors_m))
-    for i in range(len(points_m)):
-        x, y, z = points_m[i, 0], points_m[i, 1], points_m[i, 2]
-        count = 0
-        start, end = np.searchsorted(anchors_m[:, 0], x - farthest_m), np.searchsorted(anchors_m[:, 0], x + farthest_m)
-        for j in range(start, end):
-            dx, dy, dz = anchors_m[j, 0] - x, anchors_m[j, 1] - y, anchors_m[j, 2] - z
-            distance_m = math.sqrt(dx * dx + dy * dy + dz * dz)
+    for i in range(points):
+        x_m, y_m, z_m = points_m[3 * i], points_m[3 * i + 1], points_m[3 * i + 2]
+        near = 0
+        for j in range(anchors):
+            from_x_m, from_y_m, from_z_m = anchors_m[3 * j], anchors_m[3 * j + 1], anchors_m[3 * j + 2]
+            if from_x_m > x_m + farthest_m:
+                break
+            if from_x_m < x_m - farthest_m:
+                continue
+            distance_m = sqrt(square(from_x_m - x_m) + square(from_y_m - y_m) + square(from_z_m - z_m))
             if distance_m > farthest_m:
                 continue
-            loss_db = 10.0 * (exponent - 2.0) * math.log10(max(distance_m, 1.0))
-            if walls.shape[0] > 0:
-                loss_db += cross_walls(walls, anchors_m[j, 0], anchors_m[j, 1], anchors_m[j, 2], x, y, z)[0]
-            power_dbm[count] = received_power_dbm(tx_dbm, distance_m, loss_db)
-            count += 1
-        for k in range(count):
-            delivered = kept * delivery_probability(power_dbm[k], sensitivity_dbm, width_db)
+            loss_db = 10.0 * (exponent - 2.0) * log10(max(distance_m, 1.0))
+            walls_db, _delay_m = cross_walls(barriers, count, from_x_m, from_y_m, from_z_m, x_m, y_m, z_m)
+            powers_dbm[near] = received_power_dbm(tx_dbm, distance_m, loss_db + walls_db)
+            near += 1
+        for k in range(near):
+            power_dbm = powers_dbm[k]
+            delivered = kept * delivery_probability(power_dbm, sensitivity_dbm, width_db)
             if delivered < 1e-6:
                 continue
-            rivals = 0
-            for other in range(count):
-                rivals += other != k and power_dbm[k] - power_dbm[other] < capture_db
-            arrives = delivered * math.exp(-overlap * rivals)
-            table[i, 0] += arrives
-            table[i, 1] += delivered >= IN_VIEW * kept
-            table[i, 2] += arrives >= useful
+            rivals = -1  # itself
+            for other in range(near):
+                if power_dbm - powers_dbm[other] < capture_db:
+                    rivals += 1
+            arrives = delivered * exp(-overlap * rivals)
+            table[3 * i] += arrives
+            table[3 * i + 1] += 1.0 if delivered >= IN_VIEW * kept else 0.0
+            table[3 * i + 2] += 1.0 if arrives >= useful else 0.0
 
 
 class Distribution(Struct, frozen=True):
@@ -138,7 +163,7 @@ class RateMap(Struct, frozen=True):
     """Beacons per second at one point of each cell of a grid."""
 
     grid: Grid
-    beacons_per_s: Array
+    beacons_per_s: Matrix
     """Shape (heights, ny, nx); NaN outside the outline."""
     reception: Reception
 
