@@ -14,7 +14,6 @@ from typing import Any, Final, cast
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
-from scipy.special import expit, ndtri
 
 from skyless.core.air.almanac import Page, gap_ticks, period_code, suitable_period_s
 from skyless.core.air.beacon import Beacon
@@ -96,8 +95,9 @@ def uniforms(seed: int, purpose: int, *numbers: NDArray[np.int64] | int) -> Arra
 
 
 def normals(seed: int, purpose: int, *numbers: NDArray[np.int64] | int) -> Array:
-    """Standard normals, a function of the seed, the purpose and whole numbers."""
-    return np.asarray(ndtri(uniforms(seed, purpose, *numbers)))
+    """Standard normals, a function of the seed, the purpose and whole numbers (Box and Muller)."""
+    lengths = np.sqrt(-2.0 * np.log(uniforms(seed, purpose, *numbers)))
+    return np.asarray(lengths * np.cos(2.0 * np.pi * uniforms(seed, -purpose, *numbers)))
 
 
 @lru_cache(maxsize=4)
@@ -294,7 +294,8 @@ class Tape:
         sender = own.sender[frames]
         distances_m = _apart_m(points_m, self.true_positions_m[sender])
         powers_dbm = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - 20.0 * np.log10(np.maximum(distances_m, 0.01))
-        chances = expit((powers_dbm - channel.sensitivity_dbm) / channel.sensitivity_width_db)
+        margins = (powers_dbm - channel.sensitivity_dbm) / channel.sensitivity_width_db
+        chances = 1.0 / (1.0 + np.exp(np.minimum(-margins, 700.0)))
         chances *= (1.0 - channel.loss_probability) * (distances_m <= self._audible_m)
         arrives = uniforms(self._seed, _CHANCE, listener, self._ids[sender], own.number[frames]) < chances
         arrivals = own.ticks[frames] + distances_m / TICK_M

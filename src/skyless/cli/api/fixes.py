@@ -3,8 +3,7 @@
 from array import array
 from collections.abc import Iterator, Mapping
 from html import escape
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from msgspec import Struct
@@ -13,12 +12,8 @@ from skyless.arguments import wrong
 from skyless.core.air.masterless_packets import Packet, PairTdoa
 from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.core.fix import Fix
-from skyless.core.site import Site
 from skyless.machine import extra_module
 from skyless.sim.evaluation.figures import axes_std_m
-from skyless.site.planning.links import Floor
-from skyless.site.planning.maps import PlanMap
-from skyless.site.planning.rates import RateMap
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -298,37 +293,3 @@ class MeasurementRecorder:
             rx_ticks=rx_ticks,
             used=used > 0,
         )
-
-
-# Common to both kinds of plan: a site, its floor, and a map over it.
-
-FloorMap = TypeVar("FloorMap", PlanMap, RateMap)
-
-
-class FloorResult(Result, Generic[FloorMap], frozen=True, eq=False):
-    """A map over the floor of a site."""
-
-    site: Site
-    """The site as planned, with optimised anchors if requested."""
-    file: Path
-    floor: Floor
-    """Outline and region."""
-    map: FloorMap
-    """The full table of values."""
-    summary: dict[str, Any]
-    """The object that ``skyless plan --json`` writes, in SI units, without the version."""
-
-    @property
-    def x_m(self) -> Vector:
-        """Shape (nx,): centres of the map's cells."""
-        return self.map.grid.x_m
-
-    @property
-    def y_m(self) -> Vector:
-        """Shape (ny,)."""
-        return self.map.grid.y_m
-
-    @property
-    def heights_m(self) -> Vector:
-        """Shape (heights,): heights of the tags."""
-        return self.map.grid.heights_m

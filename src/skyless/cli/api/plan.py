@@ -3,15 +3,15 @@
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 
 from skyless.arguments import check_choice, check_whole, process_noise, python_function, wrong
-from skyless.cli.api.fixes import FloorResult, data_frame
+from skyless.cli.api.fixes import Result, data_frame
 from skyless.cli.api.options import PlanOptions
 from skyless.cli.common import cm
-from skyless.core.arrays import Array
+from skyless.core.arrays import Array, Vector
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import Box
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS
@@ -41,6 +41,38 @@ from skyless.site.planning.report import AfterMetre, Verification, described, pl
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+
+FloorMap = TypeVar("FloorMap", PlanMap, RateMap)
+
+
+class FloorResult(Result, Generic[FloorMap], frozen=True, eq=False):
+    """A map over the floor of a site."""
+
+    site: Site
+    """The site as planned, with optimised anchors if requested."""
+    file: Path
+    floor: Floor
+    """Outline and region."""
+    map: FloorMap
+    """The full table of values."""
+    summary: dict[str, Any]
+    """The object that ``skyless plan --json`` writes, in SI units, without the version."""
+
+    @property
+    def x_m(self) -> Vector:
+        """Shape (nx,): centres of the map's cells."""
+        return self.map.grid.x_m
+
+    @property
+    def y_m(self) -> Vector:
+        """Shape (ny,)."""
+        return self.map.grid.y_m
+
+    @property
+    def heights_m(self) -> Vector:
+        """Shape (heights,): heights of the tags."""
+        return self.map.grid.heights_m
 
 
 class RatePlanResult(FloorResult[RateMap], frozen=True, eq=False):

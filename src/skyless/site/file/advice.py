@@ -3,8 +3,6 @@
 from typing import Final
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from skyless.core.air.almanac import OFFERED_HZ, suitable_period_s
 from skyless.core.arrays import Array
@@ -163,8 +161,13 @@ def _neighbours(site: Site) -> list[str]:
     if len(points) < 2:
         return []
     ones, others = links_in_reach(site)
-    graph = coo_array((np.ones(len(ones)), (ones, others)), shape=(len(points), len(points)))
-    count, group = connected_components(graph, directed=False)
+    lowest, before = np.arange(len(points)), None
+    while before is None or (lowest != before).any():  # each anchor takes the lowest row among its neighbours'
+        before = lowest.copy()
+        np.minimum.at(lowest, ones, before[others])
+        np.minimum.at(lowest, others, before[ones])
+    rows, group = np.unique(lowest, return_inverse=True)
+    count = len(rows)
     sizes = np.bincount(group)
     alone = [site.anchors[row].id for row in np.flatnonzero(sizes[group] == 1)]
     found = []
