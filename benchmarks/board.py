@@ -31,7 +31,7 @@ from skyless.core.any_receiver import AnyReceiver
 from skyless.core.estimator.state import State
 from skyless.core.native.records import PACKED
 from skyless.core.tag.receiver import Receiver
-from skyless.research.studies import integrity, lab, room
+from skyless.research.studies import integrity, room
 from skyless.research.studies.runner import plan_of
 from skyless.research.studies.worlds import Heard, beacons_of, worlds
 from skyless.sim.evaluation.scenarios import Request, Room, trajectories_of, wanderers
@@ -95,7 +95,8 @@ def long_cases(seed, minutes):
 def float_cases(seed, seconds):
     """Those of ``--library float``."""
     plan = replace(plan_of("joint", seed, study="room"), worlds=1, tags=3, seconds=2.0 * seconds)
-    found = {case.name: case.runs[0] for study in (room, lab, lab, lab) for case in study.cases(plan)}
+    plans = [replace(plan, conditions=one) for one in ("usual", "loss", "nlos", "motion")]
+    found = {case.name: case.runs[0] for one in plans for case in room.cases(one)}
     yield from ((name, None, found[name]) for name in OF_FLOAT)
 
 

@@ -29,7 +29,7 @@ from skyless.research.benchmark import Found, recordings_below
 from skyless.research.foreign import datasets as muloc
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions
-from skyless.research.studies import lab, room
+from skyless.research.studies import room
 from skyless.research.studies.picture import Case
 from skyless.research.studies.runner import Plan, plan_of
 from skyless.research.studies.worlds import Run, beacons_of, judged, worlds
@@ -155,12 +155,11 @@ def constants() -> dict[str, dict[str, float]]:
 def cases(seed: int, count: int) -> list[Case]:
     """The simulated columns."""
     plan = structs.replace(plan_of("joint", seed, study="room"), worlds=4 * count, tags=4, seconds=15.0)
-    in_room = [case for case in room.cases(plan) if case.name in ROOM]
+    named = {ROOM[case.name]: case for case in room.cases(plan) if case.name in ROOM}
     plan = structs.replace(plan, worlds=count)
-    in_lab = [
-        case for case in (*lab.loss_cases(plan), *lab.nlos_cases(plan), *lab.motion_cases(plan)) if case.name in LAB
-    ]
-    named = {ROOM.get(case.name) or LAB[case.name]: case for case in (*in_room, *in_lab)}
+    for conditions in ("loss", "nlos", "motion"):
+        in_lab = room.cases(structs.replace(plan, conditions=conditions))
+        named |= {LAB[case.name]: case for case in in_lab if case.name in LAB}
     named |= {case.name: case for case in in_both_protocols(structs.replace(plan, tags=2, seconds=12.0))}
     named |= {case.name: case for case in starts(structs.replace(plan, tags=16, seconds=START_S))}
     return [structs.replace(case, name=name, runs=case.runs[:count]) for name, case in named.items()]

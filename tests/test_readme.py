@@ -188,7 +188,7 @@ ELSEWHERE = {
     "skyless survey --recording walk.mcap --at 3,4 --site hall.toml --out calibrated.toml": (
         "tests/cli/test_survey_with_a_known_tag.py::test_the_delays_of_a_site_are_found_and_written_back"
     ),
-    "skyless study nlos --quick --plot nlos.png": (
+    "skyless study room --conditions nlos --quick --plot nlos.png": (
         "tests/studies/test_study_command.py::test_a_study_tells_its_rows_and_writes_its_files"
     ),
     "skyless study room --plot room.png": (

@@ -19,8 +19,7 @@ from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.site import AccuracySite
 from skyless.research.calibration.options import Stay
 from skyless.research.studies import lab
-from skyless.research.studies.picture import Look
-from skyless.research.studies.run import STUDIES, _of_worlds
+from skyless.research.studies.room import CONDITIONS
 from skyless.research.studies.runner import MEASURED
 from skyless.sim.impairments import AnchorBias
 from skyless.sim.lab import paper_lab_site
@@ -48,10 +47,9 @@ def folder(tmp_path_factory):
 
 @pytest.fixture(scope="module", autouse=True)
 def short_study():
-    """Of the study ``motion`` two cases only."""
-    cases = _of_worlds("motion", "motion", lambda plan: lab.motion_cases(plan)[:2], Look("Motion", ("rmse", "nees")))
+    """Of the conditions ``motion`` two cases only."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(STUDIES, "motion", cases)
+        patch.setitem(CONDITIONS, "motion", lambda plan: lab.motion_cases(plan)[:2])
         yield
 
 
@@ -66,7 +64,9 @@ def results(folder):
         plan=skyless.plan(folder / "lab.toml", method="weighted", step_m=1.0, target_m=0.1),
         biases=skyless.survey_site(recording=folder / "tdoa-table", anchors=anchors, truth=truth),
         delays=skyless.survey_site(recording=folder / "stay.mcap", site=folder / "lab.toml", stays=((3.0, 4.0),)),
-        study=skyless.study("motion", quick=True, method="weighted", worlds=2, seconds=1.0, processes=1),
+        study=skyless.study(
+            "room", conditions="motion", quick=True, method="weighted", worlds=2, seconds=1.0, processes=1
+        ),
     )
 
 
@@ -77,7 +77,7 @@ COMMANDS = {
     "plan": "plan lab.toml --method weighted --step 1 --target 10",
     "biases": "survey --recording tdoa-table --anchors anchors.csv --truth truth.csv",
     "delays": "survey --recording stay.mcap --site lab.toml --at 3,4",
-    "study": "study motion --quick --method weighted --worlds 2 --seconds 1 --processes 1",
+    "study": "study room --conditions motion --quick --method weighted --worlds 2 --seconds 1 --processes 1",
 }
 """What each result is compared with."""
 
@@ -508,7 +508,7 @@ def test_a_lever_arm_without_a_truth_to_move_is_refused(folder, capsys):
 STUDY = [
     ({"name": "everything"}, "name is 'everything'; it should be one of efficiency"),
     ({"method": "best"}, "method is 'best'"),
-    ({"episodes": 3}, "it is for the studies efficiency and integrity; loss takes worlds and seconds"),
+    ({"episodes": 3}, "it is for the studies efficiency and integrity; room takes worlds and seconds"),
     ({"integrity_risk": 0.01}, "integrity_risk is 0.01; it should be left out: it is for the study integrity"),
     ({"worlds": 1}, "worlds is 1; it should be a whole number, at least 2"),
     ({"noise_ps": float("nan")}, "noise_ps is nan"),
@@ -519,4 +519,4 @@ STUDY = [
 
 @pytest.mark.parametrize(("arguments", "right"), STUDY, ids=[str(sorted(given)) for given, _ in STUDY])
 def test_mistakes_of_a_study_are_named(arguments, right):
-    refused(right, skyless.study, {"name": "loss"} | arguments)
+    refused(right, skyless.study, {"name": "room"} | arguments)

@@ -102,7 +102,7 @@ def test_rows_are_what_chunks_tell():
     found = {row.case: row for row in rows(PLAN, results)}
     assert len(found) == len(FAULTS) + 1
     clean, step = found["lab, clean"], found["lab, step 0.05 m"]
-    assert (clean.runs, clean.fixes, clean.available, clean.hmi, clean.limit) == (
+    assert (clean.runs, clean.fixes, clean.available, clean.hmi, clean.limits[0].most) == (
         100,
         10_000,
         0.9,

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.research.studies import efficiency, lab, large, room
+from skyless.research.studies import efficiency, lab
 from skyless.research.studies.picture import Case, interval, jackknife, world_cells, world_rows
-from skyless.research.studies.runner import Plan, plan_of, seed_of
+from skyless.research.studies.room import CONDITIONS
+from skyless.research.studies.runner import Limit, Plan, plan_of, seed_of
 from skyless.research.studies.worlds import RunResult, box, large_lab_site, run_world, walking
 from skyless.site.file.check import check_site
 
@@ -53,7 +54,7 @@ def test_rows_have_the_statistics_of_their_worlds():
     for _ in range(100):
         common = draw.normal(size=(10, 200, 2))
         clean, worse = worlds_of(common), worlds_of(1.5 * common + draw.normal(0.0, 0.5, common.shape))
-        cases = [Case("clean", "s", None, runs), Case("worse", "s", None, runs, "clean", 1.3)]
+        cases = [Case("clean", "s", None, runs), Case("worse", "s", None, runs, "clean", (Limit("ratio", most=1.3),))]
         rows = world_rows("study", SMALL, cases, [*clean, *worse])
         low, high = rows[0].nees_interval
         held += low <= rows[0].nees <= high
@@ -73,7 +74,7 @@ def test_a_case_without_a_fix_is_no_success():
     runs = walking(SMALL)
     nothing = worlds_of(np.ones((2, 1, 2)))
     nothing = [replace(one, fixes=0, squared_m2=0.0, variance_m2=0.0, nees=0.0) for one in nothing]
-    cases = [Case("clean", "s", None, runs), Case("worse", "s", None, runs, "clean", 1.3)]
+    cases = [Case("clean", "s", None, runs), Case("worse", "s", None, runs, "clean", (Limit("ratio", most=1.3),))]
     rows = world_rows("study", SMALL, cases, [*worlds_of(np.ones((2, 5, 2))), *nothing])
     assert (rows[1].rmse_m, rows[1].ratio, rows[1].passed, rows[1].available) == (None, None, False, 0.0)
 
@@ -89,7 +90,7 @@ def test_the_interval_is_students():
 def test_joint_in_the_lab_is_found_honest_and_as_good_as_it_is():
     """1.4 cm at 100 ps (``docs/studies.md``), walking at 1 m/s; it allows for turns that are few, so NEES is 0.8."""
     plan = Plan(method="joint", worlds=6, seconds=4.0, tags=2)
-    case = Case("clean", "s", None, walking(plan), "clean", 1.3)
+    case = Case("clean", "s", None, walking(plan), "clean", (Limit("ratio", most=1.3),))
     (row,) = world_rows("study", plan, [case], [run_world(run) for run in case.runs])
     assert row.rmse_m == pytest.approx(0.0143, rel=0.1)
     assert 0.0 < row.rmse_error_m < 0.1 * row.rmse_m
@@ -113,26 +114,25 @@ def test_messages_lost_at_tags_are_heard_by_anchors():
     assert results[0].squared_m2 / results[0].fixes < results[1].squared_m2 / results[1].fixes
 
 
-OF_THE_LAB = (lab.loss_cases, lab.motion_cases, lab.nlos_cases, lab.sync_cases)
-
-
 def test_worlds_of_one_number_are_the_same_in_all_cases():
-    for cases in OF_THE_LAB:
-        seeds = {tuple(run.seed for run in case.runs) for case in cases(SMALL)}
-        assert len(seeds) == 1
+    for cases in CONDITIONS.values():
+        pairs = {(number, run.seed) for case in cases(SMALL) for number, run in enumerate(case.runs)}
+        assert len({number for number, _ in pairs}) == len(pairs)
     assert len({seed_of(seed, number) for seed in range(20) for number in range(20)}) == 400
 
 
 @pytest.mark.parametrize("quick", [False, True])
-@pytest.mark.parametrize("cases_of", [*OF_THE_LAB, room.cases, large.scale_cases])
+@pytest.mark.parametrize("cases_of", CONDITIONS.values(), ids=CONDITIONS)
 def test_cases_can_be_told_apart_and_compared(cases_of, quick):
     plan = plan_of("joint", 1, quick=quick, worlds=2)
     cases = cases_of(plan)
     names = [case.name for case in cases]
     assert len(set(names)) == len(names)
     assert all(case.of is None or case.of in names for case in cases)
-    assert all(case.of is not None or case.biases is not None for case in cases if case.limit is not None)
-    assert len(world_cells(cases)) == sum(len(case.runs) for case in cases)
+    for case in cases:
+        assert "ratio" not in {one.figure for one in case.limits} or case.of is not None or case.biases is not None
+    cells = world_cells(cases)
+    assert [cell.function.func for cell in cells].count(run_world) == sum(len(case.runs) for case in cases)
     for case in cases:
         check_site(case.runs[0].site, None)
 
@@ -140,7 +140,8 @@ def test_cases_can_be_told_apart_and_compared(cases_of, quick):
 @pytest.mark.parametrize("quick", [False, True])
 def test_the_limits_that_were_asked_for_are_there(quick):
     plan = plan_of("joint", 1, quick=quick, worlds=2)
-    limits = {case.name: case.limit for case in (*lab.loss_cases(plan), *lab.nlos_cases(plan)) if case.limit}
+    cases = [case for case in (*lab.loss_cases(plan), *lab.nlos_cases(plan)) if case.limits]
+    limits = {case.name: limit.most for case in cases for limit in case.limits if limit.figure == "ratio"}
     for kind in (lab.AT_TAGS, lab.EVERYWHERE):
         assert (limits.pop(f"50 % {kind}"), limits.pop(f"90 % {kind}")) == (1.3, 2.5)
     late = {"20 % late by exp(1 m)", "one anchor +0.3 m", "one anchor +1.5 m in bursts"}
@@ -193,6 +194,6 @@ def test_rows_of_efficiency_are_those_of_the_episodes():
     row = efficiency.rows(plan, results * len(efficiency.EFFICIENCY_CASES))[0]
     assert (row.rmse_m, row.bound_m, row.ratio) == (found.rmse_m, found.bound_m, found.ratio)
     assert row.nees == found.nees
-    assert (row.mesh, row.noise_ps, row.limit, row.runs) == (False, 100.0, 1.02, 60)
+    assert (row.mesh, row.noise_ps, row.limits[0].most, row.runs) == (False, 100.0, 1.02, 60)
     kinds = {(case.mesh, case.noise_ps, case.random_walk_fm, case.qa) for case in efficiency.EFFICIENCY_CASES}
     assert len(kinds) == 16

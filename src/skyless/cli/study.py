@@ -37,9 +37,8 @@ if TYPE_CHECKING:
     from skyless.research.masterless.smoothing import OwnEstimator
     from skyless.research.studies.runner import Row
 
-_OF_ERRORS: Final = (
+_OF_EFFICIENCY: Final = (
     "Simulated. ± standard errors. NEES: per dimension, with the interval where 99 % of honest ones lie.",
-    "Fixes: superframes with one. CPU: of a tag for a message, measured.",
 )
 _OF_LEVELS: Final = (
     "Simulated. Level: share of fixes with a protection level. HPL, VPL: its median. Misleading, vertical: share of",
@@ -50,6 +49,7 @@ _OF_THE_ROOM: Final = (
     "Simulated. ± standard errors. NEES: per dimension. Fixes: superframes with one.",
     "Level: share of fixes with a protection level. HPL: its median. Exceeded: share of those whose error is larger,",
     "in 10⁻⁴, with the interval where it truly lies with 99 % (tags as units); unwarned: those without an alert.",
+    "CPU: of a tag for a message, measured.",
 )
 _OF_A_LARGE_SITE: Final = (
     "Simulated; every fix counts. ± standard errors. NEES: per dimension. First fix: from a tag's first beacon on,",
@@ -72,9 +72,9 @@ _OF_THE_WATCH: Final = (
     "has not. Alarms: findings while nothing happens.",
 )
 _LEGENDS: Final = {
+    "efficiency": _OF_EFFICIENCY,
     "integrity": _OF_LEVELS,
     "room": _OF_THE_ROOM,
-    "phase": _OF_THE_ROOM,
     "large": _OF_A_LARGE_SITE,
     "survey": _OF_SURVEYS,
     "survey-room": _OF_SURVEYED_ROOMS,
@@ -82,7 +82,7 @@ _LEGENDS: Final = {
 }
 
 
-app = App(name="study", help_epilogue="Example: skyless study loss --seed 7 --plot loss.png")
+app = App(name="study", help_epilogue="Example: skyless study room --conditions loss --plot loss.png")
 
 
 class _Output(JsonOptions, frozen=True, kw_only=True):
@@ -156,19 +156,16 @@ def print_rows(result: "StudyResult") -> None:
     caption = "RMSE, 95 %, max and σ: 2-D where the tags' height is given, else 3-D" if "95 %" in heads else ""
     rows = ([line[column] for column in used] for line in cells)
     print_table(result.title(), heads, rows, figures=True, caption=caption)
-    console().print(" ".join(_LEGENDS.get(result.name, _OF_ERRORS)))
+    console().print(" ".join(_LEGENDS[result.name]))
 
 
 def _limit(row: "Row") -> str:
-    """Missed limits in words; or the largest accepted ratio, else the levels' risk, and whether it was held."""
-    if row.limits:
-        return (
-            "missed: " + ", ".join(_NAMES.get(one, one.removesuffix("_m").removesuffix("_s")) for one in row.missed)
-            if row.missed
-            else "held"
-        )
-    limit = getattr(row, "risk", None) if row.limit is None else row.limit
-    return "" if limit is None else f"{limit:g} {'held' if row.passed else 'missed'}"
+    """Missed limits in words, or whether limits, or the levels' risk, were held."""
+    if row.missed:
+        return "missed: " + ", ".join(_NAMES.get(one, one.removesuffix("_m").removesuffix("_s")) for one in row.missed)
+    risk = getattr(row, "risk", None)
+    verdict = {None: "", True: "held", False: "missed"}[row.passed]
+    return verdict if risk is None else f"{risk:g} {verdict}"
 
 
 def _rare(share: float | None) -> str:
@@ -202,11 +199,6 @@ def _span(name: str, words: Callable[[float], str]) -> _Cell:
     return lambda row: "–".join(map(words, getattr(row, name, None) or ()))
 
 
-def _unless_wide(cell: _Cell) -> _Cell:
-    """Leave the cell empty in studies whose tables are wide enough without it."""
-    return lambda row: "" if row.study in {"room", "large", "survey-room"} else cell(row)
-
-
 _COLUMNS: Final[tuple[tuple[str, _Cell], ...]] = (
     ("case", lambda row: row.case),
     ("RMSE in cm", _number("rmse_m", 100.0, error="rmse_error_m")),
@@ -214,7 +206,7 @@ _COLUMNS: Final[tuple[tuple[str, _Cell], ...]] = (
     ("max", _number("max_m", 100.0)),
     ("σ", _number("said_m", 100.0)),
     ("NEES", _number("nees")),
-    ("", _unless_wide(_span("nees_interval", "{:.2f}".format))),
+    ("", lambda row: _span("nees_interval", "{:.2f}".format)(row) if row.study == "efficiency" else ""),
     ("fixes", lambda row: "" if row.study == "integrity" else _percent(row.available)),
     ("bound", _number("bound_m", 100.0)),
     ("level", lambda row: _percent(row.available if row.study == "integrity" else getattr(row, "level", None))),
@@ -250,7 +242,7 @@ _COLUMNS: Final[tuple[tuple[str, _Cell], ...]] = (
     ("wrong", _number("wrong_runs", digits=0)),
     ("these flagged", _share("wrong_flagged")),
     ("limit", _limit),
-    ("CPU in µs", _unless_wide(_number("cpu_us_per_message", digits=0))),
+    ("CPU in µs", lambda row: "" if row.x is None else _number("cpu_us_per_message", digits=0)(row)),
 )
 """Heads of the table's columns, and functions for their cells; columns that no row fills are left out."""
 

@@ -13,7 +13,6 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from skyless.core.arrays import Array, Integers, Mask, Matrix
@@ -384,8 +383,8 @@ def received_bound(
     """Posterior bound of the position after every frame, shape (frames, dims, dims), in m², where frames are lost.
 
     ``anchors_m``: shape (n, 3), in the order of their slots, the reference first. ``path_m``: where the tag is at each
-    frame, shape (frames, 3). ``known``: as of ``known_receptions``, shape (frames, n + 1); it, not the settings, states
-    what of the mesh is known. ``sendings``: who sends when, if not one anchor after the other in equal slots.
+    frame, shape (frames, 3). ``known``: as of ``relayed_receptions``, shape (frames, n + 1); it, not the settings,
+    states what of the mesh is known. ``sendings``: who sends when, if not one anchor after the other in equal slots.
 
     Raises:
         ValueError: there is not one row of ``known`` and one sending for each position.
@@ -399,29 +398,6 @@ def received_bound(
     if not len(sendings.senders) == len(sendings.times_s) == frames:
         raise ValueError(f"sendings has {len(sendings.senders)} frames; it should be {frames}")
     return _frame_bound(anchors, path, settings, known, sendings, biases, True)
-
-
-def known_receptions(
-    draw: Generator, frames: int, anchors: int, *, lost_at_tags: float, lost_at_anchors: float, mesh: bool
-) -> Mask:
-    """Which receptions of each frame the tag gets to know, shape (frames, anchors + 1); its own are the last column.
-
-    Anchors send in turn, the reference first. The information is what there is on the air at most. What an anchor
-    receives of the reference is known at once, whatever the tag receives of that anchor, as its next beacon states its
-    clock, in which all of it is. Other receptions among anchors are known where the tag has received the packet itself,
-    without whose stamp they give no information, and receives the listener before that has received a newer one; they
-    are known at once as well, so that no receiver can do better.
-    """
-    senders = np.arange(frames) % anchors
-    heard = draw.random((frames, anchors + 1)) >= np.append(np.full(anchors, lost_at_anchors), lost_at_tags)
-    own = heard[:, -1]
-    relay_share = (1.0 - lost_at_tags) / max(1.0 - lost_at_tags * lost_at_anchors, 1e-12)
-    relayed = draw.random((frames, anchors)) < relay_share
-    others = relayed & own[:, None] if mesh else np.zeros_like(relayed)
-    others[senders == 0] = True
-    heard[:, :-1] &= others
-    heard[np.arange(frames), senders] = False
-    return heard
 
 
 def relayed_receptions(

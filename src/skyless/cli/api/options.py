@@ -195,13 +195,18 @@ def _check_study(name: str, value: str) -> Any:  # noqa: ANN401 - the name
     return check_choice(name, value, tuple(STUDIES))
 
 
+def _check_conditions(name: str, value: str) -> Any:  # noqa: ANN401 - the conditions
+    from skyless.research.studies.room import CONDITIONS
+
+    return check_choice(name, value, tuple(CONDITIONS))
+
+
 class _Studied(ComputedOptions, frozen=True):
     name: Annotated[str, Rule(_check_study)]
-    """efficiency: RMSE over the Cramér–Rao bound. loss: lost messages. nlos: late ones. motion: speed and turns.
-    sync: masters that die, superframes, crystals. integrity: protection levels with a faulty anchor.
+    """efficiency: RMSE over the Cramér–Rao bound. integrity: protection levels with a faulty anchor.
     room: the errors of real rooms, and what goes wrong in them. large: 1,024 anchors without a master.
     survey: anchors that survey themselves. survey-room: tags in rooms whose site files a survey wrote.
-    watch: anchors that have moved. scale: numbers of tags and anchors."""
+    watch: anchors that have moved."""
 
 
 class StudyOptions(_Studied, frozen=True, kw_only=True):
@@ -213,6 +218,9 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
     """Same seed, same rows on every scheduler, except CPU times."""
     episodes: Annotated[int | None, whole(1, 10**6)] = None
     """Episodes of two seconds for each case (efficiency, integrity)."""
+    conditions: Annotated[str, Rule(_check_conditions)] = "usual"
+    """Cases of room: usual, as in real rooms; or loss: lost messages; nlos: late ones; motion: speed and turns;
+    sync: masters that die, superframes, crystals; phase: phases of the carrier; scale: numbers of tags and anchors."""
     worlds: Annotated[int | None, whole(2, 10**5)] = None
     """Independent worlds for each case (all others, but for the tags of scale; room: a quarter but for its first)."""
     seconds: Annotated[float | None, number(least=1.0, most=1e6)] = None
@@ -245,6 +253,8 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
             raise SkylessError("--processes are on this machine, --scheduler is for others; give either")
         if self.name != "integrity":
             self.leave_out("integrity_risk", "alert_limit_m", why="it is for the study integrity")
+        if self.name != "room":
+            self.leave_out("conditions", why="it is for the study room")
         if self.name not in OF_EPISODES:
             why = f"it is for the studies efficiency and integrity; {self.name} takes --worlds and --seconds"
             self.leave_out("episodes", why=why)

@@ -265,6 +265,7 @@ def run_study(asked: StudyOptions) -> StudyResult:
         asked.seed,
         study=asked.name,
         quick=asked.quick,
+        conditions=asked.conditions,
         noise_ps=asked.noise_ps or 100.0,
         qa=process_noise(asked.qa, asked.dynamics) or 0.3,
         worlds=asked.worlds,

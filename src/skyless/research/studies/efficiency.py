@@ -18,7 +18,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.research.studies.runner import Cell, Plan, Row
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, with_limits
 from skyless.research.uncertainty import BoundSettings, tracking_bound
 from skyless.sim.lab import paper_lab_site
 
@@ -255,7 +255,7 @@ def row_of(case: Case, rows: Array) -> Row:
     rmse_m, bound_m = squared**0.5, bound**0.5
     low, high = chi2.ppf([0.005, 0.995], 2 * episodes) / (2 * episodes)
     excess = rows[:, 0] - squared / bound * rows[:, 2]  # both errors and bound vary with the path
-    return Row(
+    row = Row(
         study="efficiency",
         method="joint",
         case=_name(case),
@@ -272,9 +272,8 @@ def row_of(case: Case, rows: Array) -> Row:
         bound_m=bound_m,
         ratio=rmse_m / bound_m,
         ratio_error=float(excess.std() / np.sqrt(episodes) / (2.0 * rmse_m * bound_m)),
-        limit=_MAX_RATIO,
-        passed=rmse_m / bound_m <= _MAX_RATIO,
     )
+    return with_limits(row, (Limit("ratio", most=_MAX_RATIO),))
 
 
 def _name(case: Case) -> str:

@@ -30,7 +30,7 @@ from skyless.research.studies.efficiency import (
     settings_of,
 )
 from skyless.research.studies.picture import clustered_interval
-from skyless.research.studies.runner import Cell, Plan, Row
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, with_limits
 from skyless.sim.lab import paper_lab_site
 
 _ONSETS: Final = (40, 67)
@@ -252,8 +252,8 @@ def _row(plan: Plan, fault: Fault, chunks: Sequence[Chunk]) -> IntegrityRow:
     if fault.size_m > 0.0:
         return row
     ratio = 1.0 / _quantile([chunk.top for chunk in chunks], plan.integrity_risk, row.fixes)
-    passed = bool(row.passed) and ratio <= MAX_LEVEL_RATIO
-    return replace(row, ratio=ratio, limit=MAX_LEVEL_RATIO, passed=passed)
+    judged = with_limits(replace(row, ratio=ratio), (Limit("ratio", most=MAX_LEVEL_RATIO),))
+    return replace(judged, passed=judged.passed and row.passed)
 
 
 def _pooled(

@@ -1,4 +1,8 @@
-"""The studies of the lab: ``loss``, ``nlos``, ``sync`` and ``motion``."""
+"""Cases of the study ``room`` in the paper's lab: ``loss``, ``nlos``, ``sync``, ``motion`` and ``scale``.
+
+Ranges are right on average there, and tags walk, drive or lie still. A case's ratio is that to the RMSE of another
+case, in worlds of the same seeds.
+"""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,18 +14,24 @@ from msgspec.structs import replace
 from numpy.random import Generator
 
 from skyless.core.arrays import Array
-from skyless.core.site import Site
-from skyless.research.studies.picture import RAW_METHODS, Case, world_cells, world_rows
-from skyless.research.studies.runner import Cell, Plan, Row, seed_of
+from skyless.core.site import AnchorSite, Site
+from skyless.research.studies.picture import Case
+from skyless.research.studies.runner import Limit, Plan
 from skyless.research.studies.worlds import LAB_WARMUP_S, Run, anchor_of, box, large_lab_site, walking, worlds
-from skyless.research.uncertainty import BoundSettings, known_receptions, received_bound
 from skyless.sim.impairments import AnchorBias, AnchorOutage, Impairments, Outage
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.oscillator import Temperature
 from skyless.sim.trajectory import Piece, Static, Trajectory, Waypoints
 
+
+def _within(most: float | None) -> tuple[Limit, ...]:
+    """A limit on the ratio, or none."""
+    return () if most is None else (Limit("ratio", most=most),)
+
+
+# Condition ``loss``: messages that tags alone do not hear, or that anchors miss as well.
+
 _SHARES: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
-_QUICK_SHARES: Final = (0.3, 0.5, 0.7, 0.9)
 MAX_RATIOS: Final = {0.5: 1.3, 0.9: 2.5}
 _NOTHING_LOST: Final = "nothing lost"
 
@@ -31,99 +41,20 @@ EVERYWHERE: Final = "lost everywhere"
 
 def loss_cases(plan: Plan) -> list[Case]:
     """Both kinds of loss, one case for each share."""
-    nothing_lost = walking(plan)
-    shares = _QUICK_SHARES if plan.quick else _SHARES
+    clean = Case(_NOTHING_LOST, AT_TAGS, 0.0, walking(plan), _NOTHING_LOST)
+    shares = _SHARES[::2] if plan.quick else _SHARES
+    at_tags = [(AT_TAGS, share, walking(plan, lost_at_tags=share)) for share in shares]
+    everywhere = [(EVERYWHERE, share, walking(plan, loss=share)) for share in shares]
     return [
-        Case(_NOTHING_LOST, AT_TAGS, 0.0, nothing_lost, _NOTHING_LOST),
+        clean,
         *(
-            Case(_name(s, AT_TAGS), AT_TAGS, s, walking(plan, lost_at_tags=s), _NOTHING_LOST, MAX_RATIOS.get(s))
-            for s in shares
-        ),
-        *(
-            Case(_name(s, EVERYWHERE), EVERYWHERE, s, walking(plan, loss=s), _NOTHING_LOST, MAX_RATIOS.get(s))
-            for s in shares
+            Case(f"{100 * share:.0f} % {kind}", kind, share, runs, clean.name, _within(MAX_RATIOS.get(share)))
+            for kind, share, runs in (*at_tags, *everywhere)
         ),
     ]
 
 
-def _name(share: float, kind: str) -> str:
-    return f"{100 * share:.0f} % {kind}"
-
-
-_BOUND_S: Final = 9.0
-_BOUND_FROM_S: Final = 3.0
-_BOUND_EPISODES: Final = 24
-"""Episodes from which the bound is computed."""
-_BOUND_COST_S: Final = 1.0
-"""About what the bound of a case takes to compute."""
-
-_SPEED_STD_MPS: Final = 1.0
-_BOUND_KEY: Final = 17
-"""Key of the stream of random numbers that decides what is lost."""
-
-
-def loss_cells(plan: Plan) -> list[Cell]:
-    """The worlds of all cases, then the bound of each case."""
-    each = loss_cases(plan)
-    bounds = [Cell(case.name, partial(bound_m, case.runs, plan), _BOUND_COST_S) for case in each]
-    return [*world_cells(each), *bounds]
-
-
-def loss_rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
-    """A row for each case, with the bound of all receptions in such worlds."""
-    each = loss_cases(plan)
-    worlds = world_rows("loss", plan, each, results[: -len(each)])
-    return [replace(row, bound_m=bound) for row, bound in zip(worlds, results[-len(each) :], strict=True)]
-
-
-def bound_m(runs: Sequence[Run], plan: Plan) -> float | None:
-    """Root mean square of the posterior bound when the tags make the fixes that are judged.
-
-    Of tags that accelerate at random with the process noise that filters assume, at the positions where tags of the
-    worlds walk: these themselves keep their speed, which filters do not know.
-    """
-    variances = [_variances(runs[number % len(runs)], plan, number) for number in range(_BOUND_EPISODES)]
-    judged = np.concatenate(variances)
-    return float(np.sqrt(judged.mean())) if len(judged) else None
-
-
-def _variances(run: Run, plan: Plan, number: int) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """Traces of the bound at the first frame of each superframe that the tag receives."""
-    site, noise = run.site, run.site.noise
-    anchors_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
-    n, slot_s = len(anchors_m), site.schedule.slot_s
-    superframes = int(_BOUND_S / (n * slot_s))
-    tag = run.trajectories[number % len(run.trajectories)]
-    times = run.warmup_s + slot_s * np.arange(n * superframes)
-    path_m = np.array([tag.position(float(t)) for t in times])
-    everywhere = run.impairments.channel.loss_probability
-    known = known_receptions(
-        np.random.default_rng(seed_of(plan.seed, number, _BOUND_KEY)),
-        len(times),
-        n,
-        lost_at_tags=1.0 - (1.0 - run.lost_at_tags) * (1.0 - everywhere),
-        lost_at_anchors=everywhere,
-        mesh=run.method in RAW_METHODS,
-    )
-    settings = BoundSettings(
-        noise.rx_stamp_ps * 1e-12,
-        white_fm=noise.white_fm,
-        random_walk_fm=noise.random_walk_fm,
-        qa=run.qa,
-        slot_s=slot_s,
-        speed_std_mps=_SPEED_STD_MPS,
-        mesh=True,
-        height_known=site.tags.height_m is not None,
-    )
-    traces = np.trace(received_bound(anchors_m, path_m, settings, known), axis1=1, axis2=2).reshape(superframes, n)
-    heard = known[:, -1].reshape(superframes, n)
-    begin = int(_BOUND_FROM_S / (n * slot_s))
-    firsts = traces[np.arange(superframes), heard.argmax(axis=1)]
-    judged: np.ndarray[Any, np.dtype[np.float64]] = firsts[begin:][heard[begin:].any(axis=1)]
-    return judged
-
-
-# The study ``nlos``: messages that come late: single ones, or all of an anchor, always or in bursts.
+# Condition ``nlos``: messages that come late: single ones, or all of an anchor, always or in bursts.
 
 _MAX_RATIO: Final = 1.3
 _BURST_S: Final = 5.0
@@ -135,43 +66,35 @@ _NOTHING_LATE: Final = "clean"
 
 def nlos_cases(plan: Plan) -> list[Case]:
     """Single messages, then anchors, each world another one, and some of both with radios that report powers."""
-    messages: list[tuple[str, dict[str, Any], float | None]] = [
-        ("5 % late by exp(1 m)", {"nlos": 0.05}, None),
-        ("20 % late by exp(1 m)", {"nlos": 0.2}, _MAX_RATIO),
-        ("40 % late by exp(1 m)", {"nlos": 0.4}, None),
-        ("20 % late by exp(0.2 m)", {"nlos": 0.2, "nlos_mean_m": 0.2}, None),
+    single, anchor, reported = "single messages", "one anchor", "reported by the first path"
+    late: list[tuple[str, str, dict[str, Any], float | None]] = [
+        (single, _NOTHING_LATE, {}, None),
+        (single, "5 % late by exp(1 m)", {"nlos": 0.05}, None),
+        (single, "20 % late by exp(1 m)", {"nlos": 0.2}, _MAX_RATIO),
+        (single, "40 % late by exp(1 m)", {"nlos": 0.4}, None),
+        (single, "20 % late by exp(0.2 m)", {"nlos": 0.2, "nlos_mean_m": 0.2}, None),
+        (anchor, "one anchor +0.1 m", {"biases": partial(_late, plan, 0.1, None)}, None),
+        (anchor, "one anchor +0.3 m", {"biases": partial(_late, plan, 0.3, None)}, _MAX_RATIO),
+        (anchor, "one anchor +1.5 m", {"biases": partial(_late, plan, 1.5, None)}, None),
+        (anchor, "one anchor +1.5 m in bursts", {"biases": partial(_late, plan, 1.5, _BURST_S)}, _MAX_RATIO),
     ]
-    anchors: list[tuple[str, dict[str, Any], float | None]] = [
-        ("one anchor +0.1 m", {"biases": partial(_late, plan, 0.1, None)}, None),
-        ("one anchor +0.3 m", {"biases": partial(_late, plan, 0.3, None)}, _MAX_RATIO),
-        ("one anchor +1.5 m", {"biases": partial(_late, plan, 1.5, None)}, None),
-        ("one anchor +1.5 m in bursts", {"biases": partial(_late, plan, 1.5, _BURST_S)}, _MAX_RATIO),
+    late += [
+        (reported, f"{name}, reported", {**faults, "diagnostics": True}, None)
+        for _, name, faults, _ in (*late[2:5], late[7], late[6])
     ]
-    reported = [
-        (f"{name}, reported", {**faults, "diagnostics": True}, None)
-        for name, faults, _ in (*messages[1:], anchors[2], anchors[1])
-    ]
-    late = [
-        (name, series, faults, limit)
-        for series, cases_of in (
-            ("single messages", [(_NOTHING_LATE, {}, None), *messages]),
-            ("one anchor", anchors),
-            ("reported by the first path", reported),
-        )
-        for name, faults, limit in cases_of
-    ]
-    if plan.quick:
-        late = [case for case in late if case[0] == _NOTHING_LATE or case[3] is not None]
     seconds = max(plan.seconds, _MIN_S)
     return [
-        Case(name, series, None, walking(plan, seconds=seconds, **faults), _NOTHING_LATE, limit)
-        for name, series, faults, limit in late
+        Case(name, series, None, walking(plan, seconds=seconds, **faults), _NOTHING_LATE, _within(limit))
+        for series, name, faults, limit in late
+        if not plan.quick or limit is not None or name == _NOTHING_LATE
     ]
 
 
 def _late(plan: Plan, bias_m: float, burst_s: float | None, number: int) -> tuple[AnchorBias, ...]:
     return (AnchorBias(anchor_of(paper_lab_site(plan.noise_ps), number).id, bias_m, burst_s),)
 
+
+# Condition ``sync``: anchors and masters that come and go, crystals, temperatures, superframes.
 
 _STEADY: Final = "steady"
 _SUPERFRAMES_MS: Final = (15.0, 30.0, 60.0, 120.0, 300.0, 1000.0)
@@ -185,21 +108,25 @@ def sync_cases(plan: Plan) -> list[Case]:
 
 
 def _outages(plan: Plan) -> list[Case]:
+    """Nothing wrong, then the last anchor of the site file or each one in its turn as the master."""
     every_s = 5.0
     lab = paper_lab_site(plan.noise_ps)
-    rounds = int(plan.seconds / every_s)
-    masters = tuple(_off(lab, number, LAB_WARMUP_S + 1.0 + every_s * number, 2.0) for number in range(rounds or 1))
-    last = tuple(_off(lab, 5, LAB_WARMUP_S + 1.0 + every_s * number, 2.0) for number in range(rounds or 1))
+    begins_s = [LAB_WARMUP_S + 1.0 + every_s * number for number in range(int(plan.seconds / every_s) or 1)]
+    masters = tuple(_off(lab, number, off_s) for number, off_s in enumerate(begins_s))
+    last = tuple(_off(lab, len(lab.anchors) - 1, off_s) for off_s in begins_s)
     return [
-        Case(_STEADY, "outages", None, walking(plan), _STEADY),
-        Case("an anchor gone for 2 s of every 5 s", "outages", None, walking(plan, outages=last), _STEADY),
-        Case("the master gone for 2 s of every 5 s", "outages", None, walking(plan, outages=masters), _STEADY),
+        Case(name, "outages", None, walking(plan, outages=outages), _STEADY)
+        for name, outages in (
+            (_STEADY, ()),
+            ("an anchor gone for 2 s of every 5 s", last),
+            ("the master gone for 2 s of every 5 s", masters),
+        )
     ]
 
 
-def _off(site: Site, number: int, off_s: float, length_s: float) -> AnchorOutage:
-    """In the order of the file, in which anchors become masters."""
-    return AnchorOutage(site.anchors[number % len(site.anchors)].id, Outage(off_s, off_s + length_s))
+def _off(site: Site, number: int, off_s: float) -> AnchorOutage:
+    """An outage of 2 s of an anchor, counted in the order of the file, in which anchors become masters."""
+    return AnchorOutage(anchor_of(site, number).id, Outage(off_s, off_s + 2.0))
 
 
 def _crystals(plan: Plan) -> list[Case]:
@@ -246,7 +173,7 @@ def _slow(plan: Plan, superframe_s: float) -> Site:
     return replace(lab, anchors=anchors, schedule=schedule)
 
 
-# The study ``motion``: how the error grows with speed and turns; fixes are judged when they are made.
+# Condition ``motion``: how the error grows with speed and turns; fixes are judged when they are made.
 #
 # Paths for tags that move hard: turns, zigzags, stop and go, all at a given acceleration.
 
@@ -373,3 +300,56 @@ def _path(
     placed = corners + draw.uniform(np.minimum(least, most), np.maximum(least, most))
     turned = np.roll(placed, int(draw.integers(len(placed))), axis=0)[:: int(draw.choice((-1, 1)))]
     return Waypoints(turned, speed_mps, loop=True, corner_s=turn_s(speed_mps, acceleration_mps2))
+
+
+# Condition ``scale``: growing numbers of tags in the lab, and of anchors on a ring; all tags lie still.
+
+_FLEET_WARMUP_S: Final = 1.0
+_FLEET_S: Final = 0.5
+"""Fleets of all sizes are judged in the same stretch of time, short enough for ten thousand tags."""
+_FLEETS: Final = ((1, 48), (10, 24), (100, 12), (1_000, 4), (10_000, 2))
+"""Numbers of tags, and of worlds with them."""
+_ANCHORS: Final = (4, 6, 8, 12, 20, 30, 45, 60)
+_RING_ROOM_M: Final = (12.0, 16.0)
+
+
+def scale_cases(plan: Plan) -> list[Case]:
+    """Growing fleets, then growing rings of anchors; a quick study has half of the worlds and no fleet of 10,000."""
+    lab = paper_lab_site(plan.noise_ps)
+    in_lab = partial(worlds, plan, lab, warmup_s=_FLEET_WARMUP_S, seconds=_FLEET_S)
+    fleets = [(tags, count // 2) for tags, count in _FLEETS[:-1]] if plan.quick else _FLEETS
+    rings = [(count, ring(plan, count)) for count in (_ANCHORS[::2] if plan.quick else _ANCHORS)]
+    return [
+        *(
+            Case(
+                f"{tags} tag{'s' if tags > 1 else ''}",
+                "tags",
+                float(tags),
+                in_lab(paths=partial(_still_tags, lab, tags), count=count),
+            )
+            for tags, count in fleets
+        ),
+        *(
+            Case(
+                f"{count} anchors",
+                "anchors in view",
+                float(count),
+                worlds(plan, site, partial(_still_tags, site, plan.tags), seconds=min(plan.seconds, 10.0)),
+            )
+            for count, site in rings
+        ),
+    ]
+
+
+def _still_tags(site: Site, tags: int, seed: int) -> Sequence[Trajectory]:
+    draw = np.random.default_rng(seed)
+    return [still(draw, *box(site)) for _ in range(tags)]
+
+
+def ring(plan: Plan, count: int) -> Site:
+    """A site of ``count`` anchors, all in radio range of each other, evenly spread on an ellipse."""
+    lab = paper_lab_site(plan.noise_ps)
+    angles = 2.0 * np.pi * (np.arange(count) + 0.5) / count
+    positions = ((1.0 + np.column_stack([np.cos(angles), np.sin(angles)])) * np.array(_RING_ROOM_M) / 2.0).tolist()
+    anchors = tuple(AnchorSite(id=number, x_m=x, y_m=y) for number, (x, y) in enumerate(positions, start=1))
+    return replace(lab, name=f"ring of {count}", anchors=anchors)

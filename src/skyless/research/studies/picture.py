@@ -16,8 +16,8 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 
 from skyless.core.arrays import Array
-from skyless.research.studies.runner import Cell, Limit, Plan, Row
-from skyless.research.studies.worlds import Run, RunResult, run_world
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, with_limits
+from skyless.research.studies.worlds import Run, RunResult, bound_m2, run_world
 from skyless.research.uncertainty import Biases
 from skyless.site.report import BLUE, GREEN, GRID, INK, MUTED, ORANGE, RED, report_style
 
@@ -26,6 +26,8 @@ _BAR_IN: Final = 0.24
 _CURVE_IN: Final = 2.6
 _WIDE_RATIO: Final = 15.0
 """Values that lie farther apart are drawn on a logarithmic axis."""
+_WIDE_X_RATIO: Final = 10.0
+"""The same of the numbers of a series."""
 
 
 # Which side of a limit is the safe one
@@ -98,79 +100,56 @@ class Look(Struct, frozen=True):
     """Names of ``_PANELS``, side by side."""
     x: str = ""
     """What the numbers of a series mean; by default the series says it."""
-    log: bool = False
 
 
 class _Panel(Struct, frozen=True):
     label: str
-    value: Callable[[Any], float | None]
-    """A figure of a study's row."""
-    error: Callable[[Row], float | None] = lambda _: None
+    figure: str
+    """Field of a row that is drawn, ``scale`` times as large, with its own limits."""
+    scale: float = 1.0
+    error: str = ""
+    """Field with its standard error."""
     target: float | None = None
     """What a good receiver has; the values are then points about it, not lengths."""
-    limits: bool = False
-    """Whether limits on the ratio are drawn as limits on the RMSE."""
-    figure: str = ""
-    """Field of a row whose own limits are drawn, ``scale`` times as large."""
-    scale: float = 1.0
+    floor: float | None = None
+    """Smaller values, which a logarithmic axis does not have, are drawn here."""
     sides: Sides | None = None
     """What the two sides of the target mean, or of the stated risk."""
     log: bool | None = None
     """Whether the axis of bars is logarithmic; None for where values lie far apart."""
 
-
-def _times(factor: float, value: float | None) -> float | None:
-    return None if value is None else factor * value
-
-
-_MIN_DRAWN_SHARE: Final = 1e-6
-"""Smaller shares of exceeded levels, and none, are drawn here."""
+    def values(self, rows: Sequence[Row], figure: str) -> Array:
+        """One field of all rows, scaled; NaN where a row does not have it."""
+        values = np.array([getattr(row, figure, None) for row in rows], np.float64)
+        return self.scale * (values if self.floor is None else np.maximum(values, self.floor))
 
 
-def _parts(share: float | None) -> float | None:
-    return None if share is None else 1e4 * max(share, _MIN_DRAWN_SHARE)
-
+_RARE: Final = 1e-6
+"""Smallest share of exceeded levels that is drawn."""
 
 _PANELS: Final = {
-    "rmse": _Panel(
-        "RMSE in cm",
-        lambda row: _times(100.0, row.rmse_m),
-        lambda row: _times(100.0, row.rmse_error_m),
-        limits=True,
-        figure="rmse_m",
-        scale=100.0,
-    ),
-    "ratio": _Panel("RMSE over bound", lambda row: row.ratio, lambda row: row.ratio_error, 1.0, sides=BOUND),
-    "nees": _Panel("NEES per dimension", lambda row: row.nees, target=1.0, figure="nees", sides=CONFIDENCE),
+    "rmse": _Panel("RMSE in cm", "rmse_m", 100.0, error="rmse_error_m"),
+    "ratio": _Panel("RMSE over bound", "ratio", error="ratio_error", target=1.0, sides=BOUND),
+    "nees": _Panel("NEES per dimension", "nees", target=1.0, sides=CONFIDENCE),
     "level": _Panel(
         "fixes with a level in %",
-        lambda row: _times(100.0, row.level),
-        figure="level",
-        scale=100.0,
+        "level",
+        100.0,
         sides=Sides("fewer fixes with a level", "more: better, if they hold", "above"),
         log=False,
     ),
-    "exceeded": _Panel(
-        "levels exceeded in 10⁻⁴",
-        lambda row: _parts(row.exceeded),
-        figure="exceeded",
-        scale=1e4,
-        sides=STATED_RISK,
-        log=True,
-    ),
-    "hpl": _Panel("median HPL in cm", lambda row: _times(100.0, row.hpl_m)),
-    "available": _Panel("fixes with a level in %", lambda row: _times(100.0, row.available), log=False),
-    "misleading": _Panel("misleading fixes in 10⁻⁴", lambda row: _parts(row.hmi), sides=STATED_RISK, log=True),
+    "exceeded": _Panel("levels exceeded in 10⁻⁴", "exceeded", 1e4, floor=_RARE, sides=STATED_RISK, log=True),
+    "hpl": _Panel("median HPL in cm", "hpl_m", 100.0),
+    "available": _Panel("fixes with a level in %", "available", 100.0, log=False),
+    "misleading": _Panel("misleading fixes in 10⁻⁴", "hmi", 1e4, floor=_RARE, sides=STATED_RISK, log=True),
     "found": _Panel(
         "events found in %",
-        lambda row: _times(100.0, row.found),
-        figure="found",
-        scale=100.0,
+        "found",
+        100.0,
         sides=Sides("events missed: unsafe", "events found: safe side", "above"),
         log=False,
     ),
-    "found_s": _Panel("seconds to the finding, 99 %", lambda row: row.found_s, log=True),
-    "cpu": _Panel("CPU in µs a message", lambda row: row.cpu_us_per_message),
+    "found_s": _Panel("seconds to the finding, 99 %", "found_s", log=True),
 }
 
 
@@ -197,7 +176,7 @@ def draw(look: Look, rows: Sequence[Row]) -> Figure:
 
 def _has_values(rows: Sequence[Row], look: Look) -> bool:
     """Whether any panel shows something of these rows; cold starts, for one, have no errors."""
-    return any(_PANELS[panel].value(row) is not None for panel in look.panels for row in rows)
+    return any(getattr(row, _PANELS[panel].figure, None) is not None for panel in look.panels for row in rows)
 
 
 def _is_curve(rows: Sequence[Row]) -> bool:
@@ -205,11 +184,10 @@ def _is_curve(rows: Sequence[Row]) -> bool:
 
 
 def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
-    values = np.array([_or_nan(panel.value(row)) for row in rows])
-    errors = np.nan_to_num(np.array([_or_nan(panel.error(row)) for row in rows]))
+    values, errors = panel.values(rows, panel.figure), np.nan_to_num(panel.values(rows, panel.error))
     curve = _is_curve(rows)
     if curve:
-        _curve(axes, np.array([row.x for row in rows], dtype=np.float64), values, errors, look, rows[0].series)
+        _curve(axes, np.array([row.x for row in rows], dtype=np.float64), values, errors, look.x or rows[0].series)
         if panel.target is not None:
             axes.set_ylim(top=max(axes.get_ylim()[1], 1.3 * panel.target))
         axes.set(ylabel=panel.label)
@@ -220,10 +198,7 @@ def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
         (axes.axhline if curve else axes.axvline)(panel.target, color=MUTED, linewidth=1.0, linestyle="--", zorder=1.5)
     if panel is _PANELS["nees"]:
         _intervals(axes, rows, curve=curve)
-    if panel.limits:
-        _limits(axes, rows)
-    if panel.figure and not curve:
-        _own_limits(axes, panel, rows)
+    _limits(axes, panel, rows, curve=curve)
     if panel.sides is not None:
         limit = panel.target
         if limit is None:
@@ -232,16 +207,14 @@ def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
             shade_sides(axes, panel.sides, limit, along="y" if curve else "x")
 
 
-def _or_nan(value: float | None) -> float:
-    return np.nan if value is None else value
-
-
-def _curve(axes: Axes, x: Array, values: Array, errors: Array, look: Look, series: str) -> None:
-    if look.log:  # a logarithmic axis has no 0
-        x, values, errors = x[x > 0.0], values[x > 0.0], errors[x > 0.0]
+def _curve(axes: Axes, x: Array, values: Array, errors: Array, label: str) -> None:
+    positive = x > 0.0  # a logarithmic axis has no 0
+    logarithmic = bool(positive.any()) and x.max() > _WIDE_X_RATIO * x[positive].min()
+    if logarithmic:
+        x, values, errors = x[positive], values[positive], errors[positive]
     axes.errorbar(x, values, errors, fmt="o-", color=BLUE, markersize=4, capsize=2, zorder=3)
-    axes.set(xlabel=look.x or series)
-    if look.log:
+    axes.set(xlabel=label)
+    if logarithmic:
         axes.set_xscale("log")
         axes.set_xticks(x, [f"{value:g}" for value in x])
         axes.set_xticks([], minor=True)
@@ -289,25 +262,18 @@ def _intervals(axes: Axes, rows: list[Row], *, curve: bool) -> None:
         axes.plot(*ends, color=GRID, linewidth=7.0, solid_capstyle="butt", zorder=1.2, scalex=False, scaley=False)
 
 
-def _limits(axes: Axes, rows: list[Row]) -> None:
-    """Mark the largest RMSE that is accepted."""
+def _limits(axes: Axes, panel: _Panel, rows: list[Row], *, curve: bool) -> None:
+    """Mark what a figure should be at least or at most; on the RMSE also the limit on its ratio."""
     for row_y, row in enumerate(rows):
-        if row.limit is None or row.ratio is None or row.rmse_m is None:
-            continue
-        limit_cm = 100.0 * row.rmse_m / row.ratio * row.limit
-        x, y, mark = (limit_cm, row_y, "|") if row.x is None else (row.x, limit_cm, "_")
-        (line,) = axes.plot(x, y, mark, color=RED, markersize=14, markeredgewidth=1.6, linestyle="none", label="limit")
-        axes.legend(handles=[line])
-
-
-def _own_limits(axes: Axes, panel: _Panel, rows: list[Row]) -> None:
-    """Mark what a figure should be at least or at most."""
-    for row_y, row in enumerate(rows):
-        ends = [end for one in row.limits if one.figure == panel.figure for end in (one.least, one.most)]
-        values = [panel.scale * end for end in ends if end is not None]
+        factors = {panel.figure: panel.scale}
+        if panel.figure == "rmse_m" and row.rmse_m is not None and row.ratio:
+            factors["ratio"] = panel.scale * row.rmse_m / row.ratio
+        limits = [one for one in row.limits if one.figure in factors]
+        values = [factors[one.figure] * end for one in limits for end in (one.least, one.most) if end is not None]
         if values:
-            rows_y = [float(row_y)] * len(values)
-            (line,) = axes.plot(values, rows_y, "|", color=RED, markersize=14, markeredgewidth=1.6, label="limit")
+            along, mark = [row.x if curve and row.x is not None else row_y] * len(values), "_" if curve else "|"
+            ends = (along, values) if curve else (values, along)
+            (line,) = axes.plot(*ends, mark, color=RED, markersize=14, markeredgewidth=1.6, label="limit")
             axes.legend(handles=[line])
 
 
@@ -315,6 +281,8 @@ def _own_limits(axes: Axes, panel: _Panel, rows: list[Row]) -> None:
 
 _MESSAGE_S: Final = 40e-6
 """About what a tag takes for a message, and an anchor with all that is simulated around it."""
+_BOUND_TAG_S: Final = 0.03
+"""About what simulation and bound take for a second of a tag."""
 
 RAW_METHODS: Final = ("joint",)
 """Methods that use what anchors hear of each other."""
@@ -334,9 +302,7 @@ class Case(Struct, frozen=True):
     runs: tuple[Run, ...]
     of: str | None = None
     """Case over whose RMSE this one's is the ratio, in worlds of the same seeds; it may have more of them."""
-    limit: float | None = None
     limits: tuple[Limit, ...] = ()
-    """On other figures than the ratio."""
     biases: Biases | None = None
     """What the worlds' ranges and anchors are off by, for the Cramér–Rao bound over which the ratio is then; None for
     cases without a bound."""
@@ -352,11 +318,28 @@ class WorldRow(Row, frozen=True, kw_only=True):
     cpu_us_per_message: float | None = None
     cpu_ms_per_tag_s: float | None = None
     """Time of one core for each second of a tag."""
+    level: float | None = None
+    """Share of the judged fixes that give a horizontal protection level; None for methods without levels."""
+    exceeded: float | None = None
+    """Share of those whose horizontal error is larger than it."""
+    exceeded_interval: tuple[float, float] | None = None
+    """Where that share truly lies, with 99 %, with tags as independent units."""
+    exceeded_unwarned: float | None = None
+    """Share of the fixes with a level whose error is larger, and which carry no alert."""
+    hpl_m: float | None = None
+    """Median horizontal level of the fixes that give one."""
 
 
 def world_cells(cases: Sequence[Case]) -> list[Cell]:
-    """One cell for each world."""
-    return [Cell(case.name, partial(run_world, run), _weight_s(run)) for case in cases for run in case.runs]
+    """One cell for each world of all cases, then one for the bound of each world that has one."""
+    worlds = [Cell(case.name, partial(run_world, run), _weight_s(run)) for case in cases for run in case.runs]
+    bounds = [
+        Cell(case.name, partial(bound_m2, run, case.biases), _BOUND_TAG_S * len(run.trajectories) * run.until_s)
+        for case in cases
+        if case.biases is not None
+        for run in case.runs
+    ]
+    return [*worlds, *bounds]
 
 
 def _weight_s(run: Run) -> float:
@@ -364,23 +347,21 @@ def _weight_s(run: Run) -> float:
     return frames * _MESSAGE_S * (len(run.trajectories) + len(run.site.anchors))
 
 
-def world_rows(study: str, plan: Plan, cases: Sequence[Case], results: Sequence[RunResult]) -> list[WorldRow]:
-    """A row for each case; the results stand in the order of ``world_cells``."""
-    worlds = {case.name: own for case, own in zip(cases, by_case(cases, results), strict=True)}
-    return [
-        case_row(study, plan, case, worlds[case.name], worlds[case.of][: len(case.runs)] if case.of else None)
-        for case in cases
-    ]
-
-
-def by_case(cases: Sequence[Case], results: Sequence[Any]) -> list[list[Any]]:
-    """The results of each case's worlds, of those in the order of ``world_cells``."""
-    rest = iter(results)
-    return [[next(rest) for _ in case.runs] for case in cases]
+def world_rows(study: str, plan: Plan, cases: Sequence[Case], results: Sequence[Any]) -> list[WorldRow]:
+    """A row for each case, with its limits; the results stand in the order of ``world_cells``."""
+    rest, found = iter(results), []
+    worlds = {case.name: [next(rest) for _ in case.runs] for case in cases}
+    for case in cases:
+        own = worlds[case.name]
+        row = case_row(study, plan, case, own, worlds[case.of][: len(own)] if case.of else None)
+        if case.biases is not None:
+            row = _with_bound(row, own, [next(rest) for _ in own])
+        found.append(with_limits(row, case.limits))
+    return found
 
 
 def case_row(
-    study: str, plan: Plan, case: Case, worlds: list[RunResult], reference: list[RunResult] | None
+    study: str, plan: Plan, case: Case, worlds: Sequence[RunResult], reference: Sequence[RunResult] | None
 ) -> WorldRow:
     """The row of a case's worlds; ``reference``: those of the case over whose RMSE its ratio is."""
     cpu_s = sum(world.cpu_s for world in worlds)
@@ -395,21 +376,18 @@ def case_row(
         noise_ps=plan.noise_ps,
         runs=len(worlds),
         fixes=fixes,
-        rmse_m=None,
         available=fixes / max(sum(world.superframes for world in worlds), 1),
         of=case.of,
-        limit=case.limit,
-        passed=None if case.limit is None else False,
         cpu_us_per_message=1e6 * cpu_s / max(sum(world.messages for world in worlds), 1),
         cpu_ms_per_tag_s=1e3 * cpu_s / max(sum(world.tag_s for world in worlds), 1e-9),
     )
     if fixes == 0:
         return row
-    row = _with_errors(row, worlds)
+    row = _with_levels(_with_errors(row, worlds), worlds)
     return row if reference is None else _with_ratio(row, worlds, reference)
 
 
-def _with_errors(row: WorldRow, worlds: list[RunResult]) -> WorldRow:
+def _with_errors(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
     sums = np.array([(world.fixes, world.squared_m2, world.nees) for world in worlds])
     rmse_m, rmse_error_m = jackknife(sums, _rmse)
     nees, nees_error = jackknife(sums, _nees)
@@ -426,21 +404,58 @@ def _with_errors(row: WorldRow, worlds: list[RunResult]) -> WorldRow:
     )
 
 
-def _with_ratio(row: WorldRow, worlds: list[RunResult], reference: list[RunResult]) -> WorldRow:
+def _with_levels(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
+    """The row with its protection levels, tags as units; none of them where the method gives none."""
+    counts = [world.levels for world in worlds if world.levels is not None]
+    if not counts:
+        return row
+    levels, exceeded, unwarned = (
+        np.concatenate([getattr(one, name) for one in counts]) for name in ("levels", "exceeded", "unwarned")
+    )
+    count = levels.sum()
+    row = replace(row, level=count / row.fixes)
+    if not count:
+        return row
+    low, high = clustered_interval(exceeded, count)
+    return replace(
+        row,
+        exceeded=exceeded.sum() / count,
+        exceeded_interval=(min(low, 1.0), min(high, 1.0)),
+        exceeded_unwarned=unwarned.sum() / count,
+        hpl_m=float(np.median(np.concatenate([one.hpl_m for one in counts]))),
+    )
+
+
+def _with_ratio(row: WorldRow, worlds: Sequence[RunResult], reference: Sequence[RunResult]) -> WorldRow:
     """Worlds and reference worlds of the same number share their seed, so they are left out together."""
     pairs = zip(worlds, reference, strict=True)
     sums = np.array([(a.fixes, a.squared_m2, b.fixes, b.squared_m2) for a, b in pairs])
     if sums[:, 2].sum() == 0:
         return row
     ratio, ratio_error = jackknife(sums, lambda rows: _rmse(rows) / _rmse(rows[:, 2:]))
-    passed = None if row.limit is None else ratio <= row.limit
-    return replace(row, ratio=ratio, ratio_error=ratio_error, passed=passed)
+    return replace(row, ratio=ratio, ratio_error=ratio_error)
+
+
+def _with_bound(row: WorldRow, worlds: Sequence[RunResult], variances_m2: Sequence[float]) -> WorldRow:
+    """The row with the bound of its worlds, and the RMSE over it."""
+    row = replace(row, bound_m=float(np.sqrt(np.mean(variances_m2))))
+    if row.fixes == 0:
+        return row
+    sums = np.array([(a.fixes, a.squared_m2, variance) for a, variance in zip(worlds, variances_m2, strict=True)])
+    ratio, ratio_error = jackknife(sums, _over_bound)
+    return replace(row, ratio=ratio, ratio_error=ratio_error)
 
 
 def _rmse(sums: Array) -> float:
     """From columns of counts and sums of squares."""
     fixes, squared = sums[:, 0].sum(), sums[:, 1].sum()
     return float(np.sqrt(squared / fixes)) if fixes else np.nan
+
+
+def _over_bound(sums: Array) -> float:
+    """From columns of counts, sums of squares and variances of the bound."""
+    fixes = sums[:, 0].sum()
+    return float(np.sqrt(sums[:, 1].sum() / fixes / sums[:, 2].mean())) if fixes else np.nan
 
 
 def _nees(sums: Array) -> float:

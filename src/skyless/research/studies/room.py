@@ -1,7 +1,7 @@
 """The study ``room``: a method judged where the errors of real rooms are, and where one thing more is wrong.
 
 The room is the lab with anchors, ranges and motions as in ``sim/evaluation/scenarios.py``. Each other case changes one
-thing in it. The worlds do not depend on the method.
+thing in it. The worlds do not depend on the method. ``CONDITIONS`` has further cases, most of them in the paper's lab.
 
 Cases whose errors of survey and ranges are all that is wrong, and whose tags accelerate at random, have a Cramér–Rao
 bound: that of all receptions that a tag's beacons state, counted as known when they happened, for errors with the
@@ -15,32 +15,19 @@ from functools import partial
 from typing import Any, Final
 
 import numpy as np
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
-from skyless.core.air.beacon import Beacon, decode_cached
-from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import AnchorSite, Site, TagsSite, WallSite
-from skyless.research.studies.lab import laps
-from skyless.research.studies.picture import (
-    Case,
-    WorldRow,
-    by_case,
-    clustered_interval,
-    jackknife,
-    world_cells,
-    world_rows,
-)
-from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.studies.worlds import Run, RunResult, anchor_of, box, worlds
-from skyless.research.uncertainty import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
-from skyless.sim.evaluation.figures import LevelCounts
-from skyless.sim.evaluation.fleet import world_of
-from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room, wanderer, wanderers
-from skyless.sim.impairments import AnchorBias, Body, RangeErrorModel, WarmUp
-from skyless.sim.lab import lab_site
+from skyless.research.studies import lab
+from skyless.research.studies.picture import Case, world_cells, world_rows
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of
+from skyless.research.studies.worlds import Run, anchor_of, box, walking, worlds
+from skyless.research.uncertainty import Biases
+from skyless.sim.evaluation.scenarios import Room, wanderer, wanderers
+from skyless.sim.impairments import AnchorBias, Body, CarrierModel, Impairments, RangeErrorModel, WarmUp
+from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.trajectory import Static, Trajectory, Waypoints
-from skyless.sim.world import Broadcast
 
 BASE: Final = "the room"
 AIR: Final = "unbiased air"
@@ -110,21 +97,27 @@ _TURNING_MPS: Final = 3.0
 _STATED_MPS2: Final = 10.0
 """Turns that are also driven with the tag's largest acceleration stated."""
 
+_PHASE_WARMUP_S: Final = 2.5
+_PHASE_RATIO: Final = 1.05
+"""Largest ratio of the RMSE with phases to that by stamps alone."""
+_HANDS_QA_M2PS3: Final = 3.0
+_HANDS: Final = ((20.0, 5e-9), (10.0, 5e-9), (20.0, 1e-9))
+"""Beacons of each anchor a second, and random-walk FM of the crystals, 1/√s; plain ones have 5·10⁻⁹."""
+
 _LATE_KEY: Final = 23
 _PATH_KEY: Final = 29
 _CRYSTAL_KEY: Final = 31
 """Keys of streams of random numbers, next to the worlds' own."""
 
-_BOUND_SPEED_STD_MPS: Final = 1.0
-"""Before the first frame; after the second and a half for which nothing is judged nothing of it is left."""
-
-_BOUND_TAG_S: Final = 0.03
-"""About what simulation and bound take for a second of a tag."""
-
 Paths = Callable[[int], Sequence[Trajectory]]
 
 
 def cases(plan: Plan) -> list[Case]:
+    """The cases under the plan's conditions."""
+    return CONDITIONS[plan.conditions](plan)
+
+
+def _usual(plan: Plan) -> list[Case]:
     """The room, and what differs from it in one thing; of a quick study the first case of each series."""
     changes = (*_crystals(plan), *_power_cuts(plan), *_turns(plan))
     each = [*_rooms(plan), *_rests(plan), *_errors(plan), *_fields(plan), *_obstacles(plan), *_late(plan), *changes]
@@ -165,7 +158,7 @@ def _rooms(plan: Plan) -> list[Case]:
         Limit("hpl_m", most=0.30),
     )
     return [
-        replace(_case(plan, BASE, "rooms", *usual, bounded=True), limit=_BOUND_RATIO),
+        _case(plan, BASE, "rooms", *usual, Limit("ratio", most=_BOUND_RATIO), bounded=True),
         _case(plan, AIR, "rooms", Limit("rmse_m", most=0.019), room=None, bounded=True),
         _case(plan, "hall, 8 anchors", "rooms", *hall, site=hall_site(plan.noise_ps), bounded=True),
         *(
@@ -201,7 +194,7 @@ def _rests(plan: Plan) -> list[Case]:
         later = _case(
             plan, f"{name}, later", "rest", *limits, site=site, paths=resting, room=room, long=True, warmup_s=later_s
         )
-        found += [first, replace(later, of=name, limit=_LATER_RATIO)]
+        found += [first, replace(later, of=name, limits=(*limits, Limit("ratio", most=_LATER_RATIO)))]
     return found
 
 
@@ -314,7 +307,7 @@ def _crystals(plan: Plan) -> list[Case]:
         for ppm, tau_s in _CRYSTALS
     ]
     return [
-        replace(case, of=BASE, limit=1.3)
+        replace(case, of=BASE, limits=(Limit("ratio", most=1.3),))
         for case in (*tags, _case(plan, "an anchor's crystal +1 ppm", "crystals", warm_ups=of_an_anchor))
     ]
 
@@ -360,7 +353,82 @@ def _turns(plan: Plan) -> list[Case]:
 def turning(plan: Plan, acceleration_mps2: float, seed: int) -> Sequence[Trajectory]:
     """Tags that go round and round the lab; all accelerations have the same rounds."""
     draw, (low_m, high_m) = np.random.default_rng(seed_of(seed, _PATH_KEY)), box(lab_site(plan.noise_ps))
-    return [laps(draw, low_m, high_m, _TURNING_MPS, acceleration_mps2) for _ in range(plan.tags)]
+    return [lab.laps(draw, low_m, high_m, _TURNING_MPS, acceleration_mps2) for _ in range(plan.tags)]
+
+
+def _losses(plan: Plan) -> list[Case]:
+    """Losses in the paper's lab, and in unbiased air with a bound."""
+    air = [
+        _case(plan, f"{100 * share:.0f} % lost, {AIR}", "lost in unbiased air", room=None, loss=share, bounded=True)
+        for share in lab.MAX_RATIOS
+    ]
+    return [*lab.loss_cases(plan), *air]
+
+
+def _phases(plan: Plan) -> list[Case]:
+    """Scenes without and with phases of the carrier: the same stamps, then the phases of the tag's own receptions."""
+    exceeded = _exceeded(1e-3)
+    honest = (Limit("nees", most=1.5), exceeded)
+    in_site, usual = lab_site(plan.noise_ps), CarrierModel()
+    quiet = replace(usual, reflections=RangeErrorModel())
+    stronger = replace(usual, reflections=RangeErrorModel(changing_m=0.008, correlation_m=0.05))
+    relaying = replace(in_site, schedule=replace(in_site.schedule, carrier_phase=True))
+    wander = partial(wanderers, in_site, plan.tags)
+    in_room = partial(worlds, plan, in_site, wander, room=Room())
+    in_lab = partial(walking, plan, paper_lab_site(plan.noise_ps))
+    walled = replace(in_site, walls=(WALL,))
+    past = partial(worlds, plan, walled, partial(past_wall, plan.tags), room=Room(), walls_between_anchors=False)
+    scenes: list[tuple[str, CarrierModel, Callable[..., tuple[Run, ...]], tuple[Limit, ...]]] = [
+        ("lab, no reflections", quiet, in_lab, (Limit("rmse_m", most=0.005), *honest)),
+        (BASE, usual, in_room, (Limit("rmse_m", most=0.022), Limit("nees", 0.7, 1.3), exceeded)),
+        (f"{BASE}, phases relayed", usual, partial(worlds, plan, relaying, wander, room=Room()), honest),
+        ("at rest", usual, partial(worlds, plan, in_site, partial(still, in_site, plan.tags), room=Room()), honest),
+        ("reflections of 8 mm", stronger, in_room, honest),
+        ("1 % slips", replace(usual, slips=0.01), in_room, (Limit("nees", most=1.7), exceeded)),
+        ("10 % wild", replace(usual, wild=0.1), in_room, honest),
+        ("past a wall", usual, past, (exceeded,)),
+        ("a body", usual, partial(in_room, body=Body()), (exceeded,)),
+        *((f"hands, {rate:g}/s, {walk:g}", usual, partial(_hands, plan, rate, walk), honest) for rate, walk in _HANDS),
+    ]
+    found, never_worse = [], Limit("ratio", most=_PHASE_RATIO)
+    for name, carrier, runs_of, limits in scenes:
+        stamps, phases = (
+            runs_of(warmup_s=_PHASE_WARMUP_S, change=partial(_with_carrier, one)) for one in (None, carrier)
+        )
+        alone = f"{name}, stamps alone"
+        found += [Case(alone, name, None, stamps), Case(name, name, None, phases, alone, (*limits, never_worse))]
+    return found
+
+
+def _with_carrier(carrier: CarrierModel | None, impairments: Impairments) -> Impairments:
+    return replace(impairments, carrier=carrier)
+
+
+def _hands(plan: Plan, rate_hz: float, random_walk_fm: float, **options: Any) -> tuple[Run, ...]:  # noqa: ANN401 - of ``worlds``
+    """Tags in hands, with filters that know how hands move, at this rate of beacons of each anchor."""
+    site = lab_site(plan.noise_ps)
+    noise, schedule = replace(site.noise, random_walk_fm=random_walk_fm), replace(site.schedule, rate_hz=rate_hz)
+    site = replace(site, noise=noise, schedule=schedule)
+    return worlds(
+        replace(plan, qa=_HANDS_QA_M2PS3), site, partial(_hand_paths, site, plan.tags), room=Room(), **options
+    )
+
+
+def _hand_paths(site: Site, tags: int, seed: int) -> list[Trajectory]:
+    low_m, high_m = box(site)
+    return [wanderer(low_m, high_m, seed, tag, _HANDS_QA_M2PS3) for tag in range(tags)]
+
+
+CONDITIONS: Final[dict[str, Callable[[Plan], list[Case]]]] = {
+    "usual": _usual,
+    "loss": _losses,
+    "nlos": lab.nlos_cases,
+    "motion": lab.motion_cases,
+    "sync": lab.sync_cases,
+    "phase": _phases,
+    "scale": lab.scale_cases,
+}
+"""The cases of the study by ``--conditions``."""
 
 
 def past_wall(tags: int, seed: int) -> Sequence[Trajectory]:
@@ -408,60 +476,12 @@ def _around(x_m: float, y_m: float) -> list[tuple[float, float]]:
 
 def cells(plan: Plan) -> list[Cell]:
     """The worlds of all cases, then their bounds where there are some."""
-    each = cases(plan)
-    return [*world_cells(each), *bound_cells(each)]
+    return world_cells(cases(plan))
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
     """A row for each case; the results stand in the order of ``cells``."""
-    each = cases(plan)
-    count = sum(len(case.runs) for case in each)
-    worlds, bounds = results[:count], iter(results[count:])
-    found = []
-    for case, row, own in zip(each, world_rows("room", plan, each, worlds), by_case(each, worlds), strict=True):
-        bounded = row if case.biases is None else with_bound(row, own, [next(bounds) for _ in case.runs])
-        found.append(with_limits(with_levels(bounded, own), case.limits))
-    return found
-
-
-class LevelRow(WorldRow, frozen=True, kw_only=True):
-    """Results of worlds with the protection levels of their fixes."""
-
-    level: float | None = None
-    """Share of the judged fixes that give a horizontal protection level."""
-    exceeded: float | None = None
-    """Share of those whose horizontal error is larger than it."""
-    exceeded_interval: tuple[float, float] | None = None
-    """Where that share truly lies, with 99 %, with tags as independent units."""
-    exceeded_unwarned: float | None = None
-    """Share of the fixes with a level whose error is larger, and which carry no alert."""
-    hpl_m: float | None = None
-    """Median horizontal level of the fixes that give one."""
-
-
-def with_levels(world_row: WorldRow, own: Sequence[RunResult]) -> LevelRow:
-    """The row with its protection levels, tags as units; none of them where the method gives none."""
-    row = LevelRow(**asdict(world_row))
-    counts = [world.levels for world in own if world.levels is not None]
-    if not counts:
-        return row
-    levels, exceeded = _total(counts, "levels"), _total(counts, "exceeded")
-    row = replace(row, level=levels.sum() / row.fixes)
-    if not levels.any():
-        return row
-    low, high = clustered_interval(exceeded, levels.sum())
-    return replace(
-        row,
-        exceeded=exceeded.sum() / levels.sum(),
-        exceeded_interval=(min(low, 1.0), min(high, 1.0)),
-        exceeded_unwarned=_total(counts, "unwarned").sum() / levels.sum(),
-        hpl_m=float(np.median(np.concatenate([one.hpl_m for one in counts]))),
-    )
-
-
-def _total(counts: Sequence[LevelCounts], name: str) -> np.ndarray[Any, np.dtype[np.float64]]:
-    """A count of every tag of all worlds."""
-    return np.concatenate([getattr(one, name) for one in counts])
+    return world_rows("room", plan, cases(plan), results)
 
 
 def biases_of(room: Room | None) -> Biases:
@@ -477,81 +497,3 @@ def biases_of(room: Room | None) -> Biases:
         correlation_s=ranges.correlation_s or math.inf,
         correlation_m=ranges.correlation_m or math.inf,
     )
-
-
-def bound_cells(cases: Sequence[Case]) -> list[Cell]:
-    """One cell for each world of the cases that have a bound."""
-    return [
-        Cell(
-            case.name,
-            partial(bound_variance_m2, run, case.biases),
-            _BOUND_TAG_S * len(run.trajectories) * run.until_s,
-        )
-        for case in cases
-        if case.biases is not None
-        for run in case.runs
-    ]
-
-
-def bound_variance_m2(run: Run, biases: Biases) -> float:
-    """Trace of the bound, its mean over all tags of a world and the superframes in which fixes are judged."""
-    site, noise = run.site, run.impairments
-    off_m = {one.anchor: (one.x_m, one.y_m, one.z_m) for one in noise.anchor_displacements}
-    anchors_m = np.array(
-        [np.add((one.x_m, one.y_m, one.z_m), off_m.get(one.id, (0.0, 0.0, 0.0))) for one in site.anchors]
-    )
-    settings = BoundSettings(
-        noise.rx_stamp_ps * 1e-12,
-        white_fm=noise.oscillator.white_fm,
-        random_walk_fm=noise.oscillator.random_walk_fm,
-        qa=ROOM_QA_M2PS3,
-        slot_s=1.0,  # of no use here: the frames state when they were sent
-        speed_std_mps=_BOUND_SPEED_STD_MPS,
-        mesh=True,
-        height_known=site.tags.height_m is not None,
-    )
-    means = []
-    for received in _received(run):
-        times_s = np.array([broadcast.emission_s for broadcast, _ in received])
-        path_m = np.array([position_m for _, position_m in received])
-        known, senders = _known(site, [broadcast.frame for broadcast, _ in received])
-        bound = received_bound(anchors_m, path_m, settings, known, Sendings(senders, times_s), biases)
-        means.append(np.trace(bound, axis1=1, axis2=2)[times_s >= run.warmup_s].mean())
-    return float(np.mean(means))
-
-
-def _received(run: Run) -> list[list[tuple[Broadcast, Array]]]:
-    """What each tag of a world received, and where it was then."""
-    received: list[list[tuple[Broadcast, Array]]] = [[] for _ in run.trajectories]
-    for broadcast in world_of(run.site, run.trajectories, run.impairments, run.seed).run(run.until_s):
-        for tag, position_m in zip(broadcast.tags.tolist(), broadcast.positions_m, strict=True):
-            received[tag].append((broadcast, position_m))
-    return received
-
-
-def _known(site: Site, frames: Sequence[bytes]) -> tuple[Mask, Integers]:
-    """Which receptions the frames of a tag tell it of, as ``relayed_receptions``, and the frames' senders."""
-    index_of = {one.id: row for row, one in enumerate(site.anchors)}
-    beacons = [beacon for frame in frames if isinstance(beacon := decode_cached(frame), Beacon)]
-    senders = np.array([index_of[one.anchor] for one in beacons])
-    sequences = np.array([one.sequence for one in beacons])
-    relays = [[(index_of[entry.anchor], entry.sequence) for entry in one.heard] for one in beacons]
-    return relayed_receptions(senders, sequences, relays, len(index_of)), senders
-
-
-def with_bound(row: WorldRow, worlds: Sequence[RunResult], variances_m2: Sequence[float]) -> WorldRow:
-    """The row with the bound of its worlds, and the RMSE over it."""
-    sums = np.array(
-        [(a.fixes, a.squared_m2, variance) for a, variance in zip(worlds, variances_m2, strict=True)], np.float64
-    )
-    row = replace(row, bound_m=float(np.sqrt(np.mean(variances_m2))))
-    if row.fixes == 0:
-        return row
-    ratio, ratio_error = jackknife(sums, _ratio)
-    passed = None if row.limit is None else ratio <= row.limit
-    return replace(row, ratio=ratio, ratio_error=ratio_error, passed=passed)
-
-
-def _ratio(sums: Array) -> float:
-    fixes = sums[:, 0].sum()
-    return float(np.sqrt(sums[:, 1].sum() / fixes / sums[:, 2].mean())) if fixes else np.nan

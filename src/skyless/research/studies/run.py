@@ -6,13 +6,11 @@ from pathlib import Path
 from typing import Any, Final
 
 from msgspec import Struct
-from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
-from skyless.research.studies import efficiency, integrity, lab, large, phase, room, survey, survey_room, watch
-from skyless.research.studies.picture import Case, Look, draw, world_cells, world_rows
+from skyless.research.studies import efficiency, integrity, large, room, survey, survey_room, watch
+from skyless.research.studies.picture import Look, draw
 from skyless.research.studies.runner import (
-    Cell,
     KeptResults,
     Plan,
     Row,
@@ -89,88 +87,26 @@ def way_on(resume: str | Path | None) -> str:
 # The studies by name.
 
 
-def _of_worlds(name: str, title: str, cases: Callable[[Plan], list[Case]], look: Look) -> Study:
-    def cells(plan: Plan) -> list[Cell]:
-        return world_cells(cases(plan))
-
-    def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
-        return world_rows(name, plan, cases(plan), results)
-
-    return Study(name, title, cells, rows, partial(draw, look))
+def _study(name: str, title: str, module: Any, *panels: str, x: str = "") -> Study:  # noqa: ANN401 - a module
+    look = Look(title[0].upper() + title[1:], panels, x)
+    return Study(name, title, module.cells, module.rows, partial(draw, look))
 
 
 STUDIES: Final = {
     study.name: study
     for study in (
-        Study(
-            "efficiency",
-            "RMSE over the Cramér–Rao bound",
-            efficiency.cells,
-            efficiency.rows,
-            partial(draw, Look("RMSE over the Cramér–Rao bound", ("ratio", "nees"))),
-        ),
-        replace(
-            _of_worlds(
-                "loss", "lost messages", lab.loss_cases, Look("Lost messages", ("rmse", "nees"), x="share lost")
-            ),
-            cells=lab.loss_cells,
-            rows=lab.loss_rows,
-        ),
-        _of_worlds("nlos", "late messages", lab.nlos_cases, Look("Late messages", ("rmse", "nees"))),
-        _of_worlds("motion", "motion", lab.motion_cases, Look("Speed and turns at 3 m/s²", ("rmse", "nees"))),
-        _of_worlds(
-            "sync",
-            "synchronisation",
-            lab.sync_cases,
-            Look("Synchronisation", ("rmse", "nees"), x="superframe in ms", log=True),
-        ),
-        Study(
+        _study("efficiency", "RMSE over the Cramér–Rao bound", efficiency, "ratio", "nees"),
+        _study(
             "integrity",
             "protection levels with one faulty anchor",
-            integrity.cells,
-            integrity.rows,
-            partial(
-                draw,
-                Look("One faulty anchor", ("hpl", "available", "misleading"), x="size of the fault in m", log=True),
-            ),
+            integrity,
+            *("hpl", "available", "misleading"),
+            x="size of the fault in m",
         ),
-        replace(
-            _of_worlds("room", "the room", room.cases, Look("The room", ("rmse", "nees", "level", "exceeded"))),
-            cells=room.cells,
-            rows=room.rows,
-        ),
-        replace(
-            _of_worlds("phase", "phases of the carrier", phase.cases, Look("Phases of the carrier", ("rmse", "nees"))),
-            rows=phase.rows,
-        ),
-        Study(
-            "large",
-            "a site of 1,024 anchors without a master",
-            large.cells,
-            large.rows,
-            partial(draw, Look("1,024 anchors, no master", ("rmse", "nees"))),
-        ),
-        Study(
-            "survey",
-            "anchors that survey themselves",
-            survey.cells,
-            survey.rows,
-            partial(draw, Look("Anchors that survey themselves", ("rmse", "nees"))),
-        ),
-        Study(
-            "survey-room",
-            "tags by surveyed anchors",
-            survey_room.cells,
-            survey_room.rows,
-            partial(draw, Look("Tags by surveyed anchors", ("rmse", "nees"))),
-        ),
-        Study(
-            "watch",
-            "the watch of the anchors",
-            watch.cells,
-            watch.rows,
-            partial(draw, Look("The watch of the anchors", ("found", "found_s"))),
-        ),
-        _of_worlds("scale", "numbers of tags and anchors", large.scale_cases, Look("Scale", ("rmse", "cpu"), log=True)),
+        _study("room", "the room", room, "rmse", "nees", "level", "exceeded"),
+        _study("large", "a site of 1,024 anchors without a master", large, "rmse", "nees"),
+        _study("survey", "anchors that survey themselves", survey, "rmse", "nees"),
+        _study("survey-room", "tags by surveyed anchors", survey_room, "rmse", "nees"),
+        _study("watch", "the watch of the anchors", watch, "found", "found_s"),
     )
 }

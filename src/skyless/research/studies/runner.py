@@ -42,6 +42,8 @@ class Plan(Struct, frozen=True):
     method: str = "joint"
     seed: int = 1
     quick: bool = False
+    conditions: str = "usual"
+    """Which cases the study ``room`` has."""
     noise_ps: float = 100.0
     """Noise of every TX and RX stamp, which filters know."""
     qa: float = 0.3
@@ -71,13 +73,15 @@ _USUAL: Final = {
     "survey-room": Plan(worlds=8, seconds=15.0, tags=8),
     "watch": Plan(worlds=20),
 }
-"""Amounts of studies that need others than the usual ones; ``room`` has fewer in all but its main cases."""
+"""Amounts of studies that need others than those of ``Plan``; ``room`` has fewer worlds in all but its first case."""
 
 
 def plan_of(method: str, seed: int, *, study: str = "", quick: bool = False, **given: Any) -> Plan:  # noqa: ANN401 - of Plan
     """The usual amounts, or with ``quick`` few, where none are given."""
-    usual = _QUICK_PLANS.get(study, _QUICK_PLAN) if quick else _USUAL.get(study, Plan())
     known = {name: value for name, value in given.items() if value is not None}
+    if known.get("conditions", "usual") != "usual":
+        study = ""
+    usual = _QUICK_PLANS.get(study, _QUICK_PLAN) if quick else _USUAL.get(study, Plan())
     return replace(usual, method=method, seed=seed, quick=quick, **known)
 
 
@@ -143,10 +147,7 @@ class Row(Struct, frozen=True, kw_only=True):
     ratio: float | None = None
     """RMSE over the bound, or over the RMSE of another case."""
     ratio_error: float | None = None
-    limit: float | None = None
-    """Largest ``ratio`` that is accepted."""
     limits: tuple[Limit, ...] = ()
-    """All limits of rows with more than one."""
     missed: tuple[str, ...] = ()
     """Figures outside of them."""
     passed: bool | None = None
@@ -157,8 +158,6 @@ AnyRow = TypeVar("AnyRow", bound=Row)
 
 def with_limits(row: AnyRow, limits: Sequence[Limit]) -> AnyRow:
     """The row with its limits and the figures that miss them; without a fix all but that no level is given."""
-    if row.limit is not None:
-        limits = (*limits, Limit("ratio", most=row.limit))
     if not limits:
         return row
     without = () if row.fixes else tuple(one.figure for one in limits if one.figure not in {"level", "exceeded"})

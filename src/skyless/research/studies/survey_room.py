@@ -13,7 +13,6 @@ from msgspec import Struct
 
 from skyless.core.site import Site
 from skyless.research.studies.picture import Case, case_row
-from skyless.research.studies.room import with_levels
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.studies.worlds import Run, RunResult, run_world
 from skyless.research.surveys.rooms import (
@@ -163,5 +162,5 @@ def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
             limits = () if plan.quick else limits_of(group, file)
             case = Case(f"{group.name}, {file}", group.name, None, (), of=None if file == TRUTH else TRUTH)
             row = case_row("survey-room", plan, case, own, None if file == TRUTH else truth)
-            found.append(with_limits(with_levels(row, own), limits))
+            found.append(with_limits(row, limits))
     return found

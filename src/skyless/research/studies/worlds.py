@@ -14,20 +14,23 @@ from msgspec import Struct
 from msgspec.structs import replace
 from scipy.stats import chi2
 
+from skyless.core.air.beacon import Beacon, decode_cached
 from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver
-from skyless.core.arrays import Array
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.fix import Fix
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import AnchorSite, Site
 from skyless.research.studies.runner import Plan, seed_of
+from skyless.research.uncertainty import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
 from skyless.sim.evaluation.figures import EvenSample, FirstFixes, LevelCounts, LevelTally
 from skyless.sim.evaluation.fleet import world_of
-from skyless.sim.evaluation.scenarios import WALL_MARGIN_M, Request, impairments_of, trajectories_of
+from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, WALL_MARGIN_M, Request, impairments_of, trajectories_of
 from skyless.sim.impairments import Impairments
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.streams import stream
 from skyless.sim.trajectory import Trajectory
+from skyless.sim.world import Broadcast
 
 LAB_WARMUP_S: Final = 4.0
 """No fix is judged before; cold starts of the lab take a tenth of a second, those with 90 % loss some seconds."""
@@ -38,6 +41,9 @@ _OUTSIDE: Final = 0.999
 """Probability of the ellipse outside of which fixes are counted."""
 
 _SAMPLE_ROWS: Final = 1 << 13
+
+_BOUND_SPEED_STD_MPS: Final = 1.0
+"""Of tags before the first frame, in the bound; when the judging begins nothing of it is left."""
 
 _LOSS_KEY: Final = 3
 """Key of the stream of random numbers, next to the keys of the simulated world."""
@@ -170,6 +176,52 @@ def judged(run: Run, beacons: Iterable[Heard]) -> RunResult:
             if fix is not None:
                 tally.add(tag, beacon.end_s, fix, truth_m)
     return tally.result(messages, run.until_s * len(receivers), cpu_s)
+
+
+def bound_m2(run: Run, biases: Biases) -> float:
+    """Trace of the bound, its mean over all tags of a world and the superframes in which fixes are judged."""
+    site, noise = run.site, run.impairments
+    off_m = {one.anchor: (one.x_m, one.y_m, one.z_m) for one in noise.anchor_displacements}
+    anchors_m = np.array(
+        [np.add((one.x_m, one.y_m, one.z_m), off_m.get(one.id, (0.0, 0.0, 0.0))) for one in site.anchors]
+    )
+    settings = BoundSettings(
+        noise.rx_stamp_ps * 1e-12,
+        white_fm=noise.oscillator.white_fm,
+        random_walk_fm=noise.oscillator.random_walk_fm,
+        qa=ROOM_QA_M2PS3,
+        slot_s=1.0,  # of no use here: the frames state when they were sent
+        speed_std_mps=_BOUND_SPEED_STD_MPS,
+        mesh=True,
+        height_known=site.tags.height_m is not None,
+    )
+    means = []
+    for received in _received(run):
+        times_s = np.array([broadcast.emission_s for broadcast, _ in received])
+        path_m = np.array([position_m for _, position_m in received])
+        known, senders = _known(site, [broadcast.frame for broadcast, _ in received])
+        bound = received_bound(anchors_m, path_m, settings, known, Sendings(senders, times_s), biases)
+        means.append(np.trace(bound, axis1=1, axis2=2)[times_s >= run.warmup_s].mean())
+    return float(np.mean(means))
+
+
+def _received(run: Run) -> list[list[tuple[Broadcast, Array]]]:
+    """What each tag of a world received, and where it was then."""
+    received: list[list[tuple[Broadcast, Array]]] = [[] for _ in run.trajectories]
+    for broadcast in world_of(run.site, run.trajectories, run.impairments, run.seed).run(run.until_s):
+        for tag, position_m in zip(broadcast.tags.tolist(), broadcast.positions_m, strict=True):
+            received[tag].append((broadcast, position_m))
+    return received
+
+
+def _known(site: Site, frames: Sequence[bytes]) -> tuple[Mask, Integers]:
+    """Which receptions the frames of a tag tell it of, as ``relayed_receptions``, and the frames' senders."""
+    index_of = {one.id: row for row, one in enumerate(site.anchors)}
+    beacons = [beacon for frame in frames if isinstance(beacon := decode_cached(frame), Beacon)]
+    senders = np.array([index_of[one.anchor] for one in beacons])
+    sequences = np.array([one.sequence for one in beacons])
+    relays = [[(index_of[entry.anchor], entry.sequence) for entry in one.heard] for one in beacons]
+    return relayed_receptions(senders, sequences, relays, len(index_of)), senders
 
 
 def large_lab_site(noise_ps: float) -> Site:
