@@ -17,7 +17,6 @@ from skyless.core.fix import NoFixReason
 from skyless.core.site import GeoreferenceSite
 from skyless.core.tag.receiver import NOT_DROPS, Receiver
 from skyless.core.ticks import from_seconds, wrap
-from skyless.run.recordings.reception_log import load, save
 
 pytestmark = pytest.mark.site
 
@@ -262,26 +261,26 @@ def test_another_height_makes_another_method():
     assert receiver.method.course.settings.height_m == 0.2 != before_m
 
 
-def test_a_tag_from_a_checkpoint_goes_on_with_the_same_bits():
+def test_a_copy_goes_on_with_the_same_bits():
     heard, whole = free_tape(), Receiver()
     for cut in (3, 12, 40, 400):
         whole = Receiver()
         for one in heard[:cut]:
             whole.hear(one.reception)
-        again = load(save(whole))
+        again = whole.copied()
         rest = heard[cut : cut + 60]
         assert fixes_of(again, rest) == fixes_of(whole, rest)
         assert again.counters == whole.counters
 
 
-def test_a_checkpoint_after_a_change_of_the_period_goes_on_with_the_same_bits():
+def test_a_copy_after_a_change_of_the_period_goes_on_with_the_same_bits():
     """The method goes on as it was made, also where anchors are silent for longer than it allows."""
     slower = period_code(1.0)
     changed = [with_beacon(one, period_code=slower) if one.host_s > 1.0 else one for one in free_tape(seconds=4.0)]
     cut = next(k for k, one in enumerate(changed) if one.host_s > 1.5)
     whole = Receiver()
     fixes_of(whole, changed[:cut])
-    again = load(save(whole))
+    again = whole.copied()
     silent = {anchor.id for anchor in FREE.anchors[:2]}
     rest = [one for one in changed[cut:] if one.anchor not in silent or one.host_s > 2.8]
     assert fixes_of(again, rest) == fixes_of(whole, rest)

@@ -1,7 +1,5 @@
 """What a tag of protocol 2 keeps when its counter restarts, an anchor's row is lost, or strangers were there first."""
 
-from zlib import compress
-
 import numpy as np
 import pytest
 from bench import ROOM, tape
@@ -12,8 +10,6 @@ from skyless.core.air.frame import Heard
 from skyless.core.air.neighbours import RELAYED_TICKS, Neighbour, find_neighbour, is_confirmed, neighbour_of
 from skyless.core.estimator.state import find_anchor
 from skyless.core.native.library import compiled
-from skyless.core.native.records import unpacked
-from skyless.core.tag.acquisition import Acquisition
 from skyless.core.tag.hearing import wake
 from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import fix_time_ticks, from_seconds, to_seconds, wrap
@@ -86,20 +82,6 @@ def test_strangers_that_were_first_do_not_keep_the_anchors_out(strangers, every_
             fixes += receiver.hear(replace(one, host_s=None)) is not None
             last = rx_ticks
     assert fixes > 100
-
-
-@pytest.mark.parametrize("byte", [2, 128, 255])
-def test_a_state_with_a_bool_that_is_none_is_refused(byte):
-    """C takes one with another value than 0 or 1 for any number."""
-    receiver, heard = Receiver(), iter(free_room(30.0, 2.0))
-    while receiver.method is None:
-        receiver.hear(next(heard))
-    assert receiver.method.is_starting
-    state = receiver.state()
-    content = bytearray(bytes(unpacked(Acquisition, state.method.start)))
-    content[Acquisition.is_contradicted.offset] = byte
-    with pytest.raises(ValueError, match="neither true nor false"):
-        Receiver.from_state(replace(state, method=replace(state.method, start=compress(bytes(content), 1))))
 
 
 def test_a_tag_that_has_slept_begins_again_within_three_rounds():

@@ -14,14 +14,13 @@ from core_build import NATIVE, disturbed, has, input_of, library_of_all, rows_an
 sys.path.insert(0, str(Path(__file__).parents[1] / "positioning"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
-from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, one_by_one, settings_of
+from estimator_builders import LAB_M, MESH, ROOM_M, begun, bytes_in_use, episode_of, one_by_one, settings_of
 
 import wasm_core
 from make_core import EXPORTS, FILES
 from skyless.core.air.almanac import GeoreferencePage, NoisePage, SitePage
 from skyless.core.air.beacon import Beacon, StatedPosition, encode
 from skyless.core.air.frame import Heard, fcs
-from skyless.core.estimator.estimator import packed_state
 from skyless.core.estimator.process import BatchPacket, BatchRow, Packet, Place, Relay
 from skyless.core.estimator.state import WORK_ROWS, State
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay
@@ -220,7 +219,7 @@ def hints(function):
 
 def bits(value):
     if isinstance(value, State):
-        return packed_state(value) + view(value.levels).tobytes() + view(value.U).tobytes() + view(value.G).tobytes()
+        return bytes_in_use(value) + view(value.levels).tobytes() + view(value.U).tobytes() + view(value.G).tobytes()
     if isinstance(value, ctypes.Structure | ctypes.Array):
         return np.frombuffer(value, np.uint8)[contents(type(value))].tobytes()
     return value

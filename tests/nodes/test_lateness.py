@@ -44,8 +44,8 @@ class SlowHost:
         )
         self.node.fix_log.unix_less_host_s = UNIX_S
 
-    def _before(self, receiver, reception, serial):
-        self.log.add(receiver, reception, serial)
+    def _before(self, receiver, reception):
+        self.log.add(receiver, reception)
         self.processed.append(reception)
         self.now_s += self.work_s
 

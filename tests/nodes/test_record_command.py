@@ -151,7 +151,7 @@ def replayed(path):
 
 
 @pytest.mark.statistical
-def test_a_recording_replays_bit_by_bit_and_ctrl_c_closes_it(broker, tmp_path):
+def test_a_recording_replays_and_ctrl_c_closes_it(broker, tmp_path):
     recorder = Recorder(broker.address, tmp_path / "live.mcap", "--json")
 
     async def scenario():
@@ -170,10 +170,8 @@ def test_a_recording_replays_bit_by_bit_and_ctrl_c_closes_it(broker, tmp_path):
     assert told["receptions"] == sum(report.receptions for report in reports)
     assert told["drops"] == summary.drops == {}
     for report in reports:
-        assert report.identical.compared > 50
-        assert report.identical.different == 0
+        assert report.fixes > 50
         assert report.segments == 1
-        assert report.cold_starts == 0
 
 
 @both
@@ -196,12 +194,11 @@ def test_a_broker_that_dies_and_returns_costs_no_reception_that_it_kept(broker, 
     gaps = json.loads(out)["drops"].get("gap-in-receptions", 0)
     if isinstance(broker, Embedded):
         assert gaps == 0
-    after_gap = {"receptions-after-a-gap"} if gaps else set()  # mosquitto saves what it has acknowledged once a second
     for report in reports:
-        assert report.identical.different == 0
-        assert report.identical.compared > 50
-        assert report.drops.keys() <= {"receptions-without-beginning"} | after_gap
-        assert report.cold_starts == 0
+        assert report.fixes > 50
+        # mosquitto saves what it has acknowledged once a second
+        assert report.drops.get("gap-in-receptions", 0) <= gaps
+        assert report.drops.keys() <= {"receptions-without-beginning", "gap-in-receptions"}
     spans_s = [report.receptions / 400.0 for report in reports]
     assert min(spans_s) > 1.5
 
@@ -224,7 +221,7 @@ def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_o
     reports, summary = replayed(first.path)
     assert not summary.finished
     assert killed_s - summary.end_s < 1.0
-    assert all(report.identical.different == 0 and report.identical.compared > 50 for report in reports)
+    assert all(report.fixes > 50 for report in reports)
     assert code == 0
     assert json.loads(out)["receptions"] > 400
 
@@ -266,7 +263,7 @@ def test_mistakes_are_reported_in_one_line(tmp_path, capsys):
 
 
 ONE = RawReception(b"frame", 5, 1.0)
-START = SegmentStart(0, {"method": "joint"}, None)
+START = SegmentStart({"method": "joint"})
 
 
 @pytest.fixture
@@ -296,20 +293,22 @@ def test_whole_runs_and_repetitions_ask_for_nothing(node):
     assert node.recorder.drops == {}
 
 
-def test_a_gap_is_counted_and_asked_about_under_another_name_but_not_in_a_rush(node):
+def test_a_gap_within_a_run_is_counted(node):
     hear(node, "s-1", 0, 10, START)
     hear(node, "s-1", 20, 5)
     hear(node, "s-1", 30, 5)
     assert node.recorder.drops == {"gap-in-receptions": 2}
+    assert node.asked == []
+
+
+def test_a_run_without_its_beginning_is_asked_about_under_another_name_but_not_in_a_rush(node):
+    for number in range(3):
+        hear(node, "s-1", 400 + 10 * number, 10)
+    assert node.recorder.drops == {"receptions-without-beginning": 30}
     assert len(node.asked) == 1
     node.now_s += 2.0
-    hear(node, "s-1", 40, 5)
+    hear(node, "s-1", 430, 10)
     assert len(set(node.asked)) == 2
-
-
-def test_a_run_without_its_beginning_is_asked_about(node):
-    hear(node, "s-1", 400, 10)
-    assert len(node.asked) == 1
 
 
 def test_a_tag_that_comes_is_asked_at_once(node):

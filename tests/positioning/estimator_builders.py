@@ -12,7 +12,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.lib.recfunctions import repack_fields
 
-from skyless.core.estimator.estimator import Estimator, Packets, packed_state
+from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import FAULT_KINDS, covariances
 from skyless.core.native.views import view
@@ -223,14 +223,20 @@ def seen(state):
     )
 
 
+def bytes_in_use(state):
+    """The bytes of all that is in use of a state."""
+    parts = vars(seen(state)) | {"record": np.array((state.dim, state.count))}
+    return b"".join(map(bits, parts.values()))
+
+
 def same(one, other):
     """Whether two states are the same to the bit."""
-    return packed_state(one) == packed_state(other)
+    return bytes_in_use(one) == bytes_in_use(other)
 
 
 def bits(array):
     """The bytes of numbers, or of records without what lies between their fields."""
-    return (repack_fields(array) if array.dtype.names else array).tobytes()
+    return (repack_fields(array, recurse=True) if array.dtype.names else array).tobytes()
 
 
 def where(estimator):

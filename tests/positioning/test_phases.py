@@ -5,7 +5,6 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.core.any_receiver import AnyReceiver
-from skyless.core.estimator.estimator import packed_state, unpacked_state
 from skyless.research.studies.worlds import Heard, Run, beacons_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
 from skyless.sim.impairments import CarrierModel, RangeErrorModel
@@ -82,21 +81,6 @@ def test_a_reset_of_a_radio_is_found(beacons):
     after, state = fixes_of(with_phases(beacons, reset))
     assert state.status.phases_opened > before.status.phases_opened
     assert np.nanmax(np.abs(after - as_they_are)) < 0.03
-
-
-def test_a_saved_state_continues_with_the_same_bits(beacons):
-    receptions = with_phases(beacons, lambda _, one: one.carrier_phase_cycles)
-    middle, receiver = len(receptions) // 2, AnyReceiver()
-    fixes_of(receptions[:middle], receiver)
-    estimator = receiver.receiver.method.estimator
-    assert estimator.state.status.has_phases
-    packed = packed_state(estimator.state)
-    assert packed_state(unpacked_state(estimator.settings, packed)) == packed
-    with pytest.raises(ValueError, match="the estimator's state"):
-        unpacked_state(estimator.settings, packed[:4] + b"\0" + packed[5:])
-    restored = AnyReceiver.from_state(receiver.state())
-    one, other = (fixes_of(receptions[middle:], each)[0] for each in (receiver, restored))
-    assert np.array_equal(one, other, equal_nan=True)
 
 
 @pytest.mark.statistical

@@ -39,7 +39,7 @@ def _of_tag(tag, seconds, method, join_s, publish_every, integrity, faults):
         host_s = one.host_s
         if host_s >= join_s:
             log.request(RequestMessage("test", ("*",), 10.0), host_s)
-        log.add(receiver, one.reception, serial)
+        log.add(receiver, one.reception)
         fix = receiver.hear(one.reception)
         if fix is not None:
             serial += 1

@@ -6,8 +6,6 @@ from functools import partial
 from statistics import median
 from typing import Any, Final, Protocol
 
-from msgspec import Struct
-
 from skyless.core.air.almanac import suitable_period_s
 from skyless.core.air.beacon import VERSION_2, Beacon, decode_cached
 from skyless.core.air.frame import Malformed, Reception, Transmission, has_version
@@ -24,7 +22,7 @@ from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.snapshots import Snapshots
 from skyless.core.site import Site
 from skyless.core.tag.joint import Estimation
-from skyless.core.tag.receiver import HeardSite, Receiver, ReceiverState
+from skyless.core.tag.receiver import HeardSite, Receiver
 
 # The two protocols: what depends on which of them a site uses is asked for here, and nowhere by its mode.
 
@@ -106,13 +104,6 @@ def superframe_s(site: Site) -> float:
     return 1.0 / schedule_of(site).superframe_rate_hz if site.schedule.needs_master else beacon_period_s(site)
 
 
-class AnyReceiverState(Struct, frozen=True, tag="any"):
-    """The saved state of an ``AnyReceiver``."""
-
-    receiver: ReceiverState | protocol1.ReceiverState
-    others: int
-
-
 MAX_OTHERS: Final = 200
 """A tag changes to the other protocol after this many beacons of it without a fix in between."""
 
@@ -146,35 +137,6 @@ class AnyReceiver:
         self._receiver: Receiver | protocol1.Receiver = self._new() if self._may_change else self._new_1()
         self._others = 0
         """Beacons of the other protocol since the last fix."""
-
-    def state(self) -> AnyReceiverState:
-        """The present state. Shares memory with the receiver: use or encode it before its next frame."""
-        return AnyReceiverState(self._receiver.state(), self._others)
-
-    @classmethod
-    def from_state(cls, state: AnyReceiverState | ReceiverState) -> "AnyReceiver":
-        """Restore a receiver that continues bit by bit as the saved one would; also from a ``Receiver``'s state.
-
-        Raises:
-            ValueError: the state is invalid.
-        """
-        state = AnyReceiverState(state, 0) if isinstance(state, ReceiverState) else state
-        admission = state.receiver.admission
-        options = admission.options
-        made = cls(
-            options.method,
-            site=admission.only_site,
-            qa=options.qa,
-            z_bounds_m=options.z_bounds_m,
-            integrity=options.integrity,
-        )
-        saved = state.receiver
-        if isinstance(saved, ReceiverState):
-            made._receiver = Receiver.from_state(saved)
-        else:
-            made._receiver = protocol1.Receiver.from_state(saved)
-        made._others = state.others
-        return made
 
     @property
     def receiver(self) -> Receiver | protocol1.Receiver:

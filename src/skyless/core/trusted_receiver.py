@@ -204,7 +204,7 @@ class TrustedReceiver:
 
     def _return_live(self) -> list[tuple[int, GivenFix]]:
         """Continue the live receiver from the verified one with the plausible frames that wait. Returns its fixes."""
-        self._live = Receiver.from_state(copy.deepcopy(self._verified.state()))
+        self._live = self._verified.copied()
         self._used, self._live_ticks = 0, None
         return [given for one in self.verifier.waiting() for given in self._use(one)]
 

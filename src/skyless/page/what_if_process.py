@@ -23,7 +23,7 @@ from skyless.core.tag.admission import Tag
 from skyless.core.tag.receiver import Receiver
 from skyless.page.tasks import WhatIfTask, serve_tasks
 from skyless.run.mqtt.messages import RawReception, SegmentStart
-from skyless.run.recordings.reception_log import RefusedError, load
+from skyless.run.recordings.reception_log import receiver_of
 from skyless.run.recordings.recording import McapRecording
 
 _PAGE_BYTES: Final = 1024
@@ -85,7 +85,7 @@ class _Tables:
                 if start is not None:
                     if self._state is not None:
                         break  # after a gap the clock is another one
-                    receiver = _receiver_of(start)
+                    receiver = receiver_of(start.settings) or AnyReceiver()
                 if receiver is not None and unix_s <= task.begin_unix_s + self._begin_s + task.seconds:
                     self._hear(receiver, _reception_of(raw), unix_s)
         if self._state is None:
@@ -156,16 +156,6 @@ def _receptions(recording: McapRecording, tag: str) -> Iterator[tuple[SegmentSta
 def _reception_of(raw: RawReception) -> Reception:
     diagnostics = Diagnostics(raw.rx_power_dbm, raw.first_path_power_dbm, raw.carrier_offset_ppm)
     return Reception(raw.frame, raw.rx_ticks, raw.host_s, diagnostics, raw.carrier_phase_cycles)
-
-
-def _receiver_of(start: SegmentStart) -> AnyReceiver:
-    """The receiver in its recorded state, or a new one."""
-    if start.state is None:
-        return AnyReceiver()
-    try:
-        return load(start.state)
-    except RefusedError as error:
-        raise SkylessError(f"the recording's state of the tag cannot be used: {error.reason}") from None
 
 
 def _state_at(estimator: Estimator, rx_ticks: int) -> State:

@@ -167,7 +167,7 @@ class BoardProbe:
             self._troubles[event.reason if isinstance(event, Gone) else event.text] = None
         self._node.on_event(event)
 
-    def _note(self, _receiver: TagReceiver, reception: Reception, _fixes: int) -> None:
+    def _note(self, _receiver: TagReceiver, reception: Reception) -> None:
         beacon = decode_any(reception.frame)
         if not isinstance(beacon, Malformed):
             self._heard[beacon.anchor] += 1

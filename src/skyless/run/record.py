@@ -29,7 +29,7 @@ _FLUSH_S: Final = 0.8  # so that a recorder that is killed loses less than a sec
 
 _MAX_RECORDERS: Final = 1000
 
-_NEW_RUN_S: Final = 1.0  # shortest time between new runs after losses, as each begins with a checkpoint
+_NEW_RUN_S: Final = 1.0  # shortest time between new runs
 
 
 class RecorderState(Struct, frozen=True):
@@ -110,7 +110,7 @@ class RecorderNode:
             self._request()
 
     def _begin_new_run(self) -> None:
-        """Request under another name after a loss, so that the tags begin new segments with checkpoints."""
+        """Request under another name after a segment's beginning was lost, so that the tags begin new ones."""
         now_s = time.monotonic()
         if now_s - self._new_run_s >= _NEW_RUN_S:
             self._new_run_s = now_s
@@ -125,19 +125,18 @@ class RecorderNode:
             self._request()
 
     def _check_sequence(self, message: ReceptionsMessage) -> None:
-        """Count a gap if receptions are missing. A message may come twice after a broken connection."""
+        """Count what is missing. A message may come twice after a broken connection."""
         self.receptions += len(message.receptions)
         segment, following = self._next.get(message.tag, ("", 0))
-        end = message.first + len(message.receptions)
-        if message.segment == segment:
-            lost = message.first > following
-            end = max(end, following)
-        else:
-            lost = message.start is None
-        self._next[message.tag] = (message.segment, end)
-        if lost:
+        if message.segment != segment:
+            if message.start is None:
+                self.recorder.drops["receptions-without-beginning"] += len(message.receptions)
+                self._begin_new_run()
+                return
+            following = 0
+        if message.first > following:
             self.recorder.drops["gap-in-receptions"] += 1
-            self._begin_new_run()
+        self._next[message.tag] = (message.segment, max(following, message.first + len(message.receptions)))
 
     async def _write(self) -> None:
         """Close chunks at intervals and sync them to the disk, until the file has ended."""

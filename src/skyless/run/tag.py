@@ -64,11 +64,11 @@ class TagNode:
         radio: Radio,
         publish: FixListener,
         log: Log,
-        before: Callable[[TagReceiver, Reception, int], None] | None = None,
+        before: Callable[[TagReceiver, Reception], None] | None = None,
         clock: Callable[[], float] | None = None,
         memory: TagMemory | None = None,
     ) -> None:
-        """``before`` is called before each reception with receiver, reception and number of fixes.
+        """``before`` is called before each reception with receiver and reception.
 
         ``clock`` gives the host's monotonic time in s, as ``host_s`` of the receptions; None for ``time.monotonic``.
         ``memory``: the site's keys known from earlier runs.
@@ -196,7 +196,7 @@ class TagNode:
         if reception.host_s is not None and not self.fix_log.lateness.admits(reception.host_s, self._clock()):
             return
         if self._before is not None:
-            self._before(self._hearing, reception, self.fix_log.serial)
+            self._before(self._hearing, reception)
         given = self._fixes_of(reception)
         done_s = self._heard_s = self._clock()
         due_s = done_s if reception.host_s is None else reception.host_s

@@ -111,9 +111,6 @@ class ReplayResult(Result, frozen=True, eq=False):
         report = self.reports[tag]
         if isinstance(report, TagReport):
             yield "tag", tag
-            yield "recorded fixes", _same(report)
-            starts = "as the tag was" if report.cold_starts == 0 else f"{report.cold_starts} of {report.segments} cold"
-            yield "starts", starts
         yield "receptions", f"{report.receptions}"
         yield "fixes", f"{report.fixes}" if report.reason is None else f"none: {report.reason}"
         yield "method", f"{report.method}" + (f", given {report.measurements}" if report.measurements else "")
@@ -169,18 +166,6 @@ def _judged_facts(report: ReplayReport) -> Iterator[tuple[str, str]]:
 
 def _share(value: float | None) -> str:
     return "–" if value is None else f"{100.0 * value:.1f} %"
-
-
-def _same(report: TagReport) -> str:
-    """Compare the fixes of a replay with the recorded ones, in words."""
-    found = report.identical
-    if found is None:
-        return "–"
-    if found.compared == 0:
-        return "nothing to compare"
-    if found.different == 0:
-        return f"identical, all {found.compared} of them"
-    return f"{found.different} of {found.compared} differ"
 
 
 def _triple(values_m: tuple[float, float, float] | None) -> str:

@@ -2,12 +2,10 @@
 
 from collections.abc import Sequence
 from math import sqrt
-from struct import Struct as Format
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
 import numpy as np
-from msgspec import Meta, Struct
-from numpy.lib.recfunctions import repack_fields
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from skyless.core.arrays import Integers, Matrix, Vector
@@ -26,95 +24,15 @@ from skyless.core.estimator.process import (
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
-    FAULT_KINDS,
-    NO_RANGE_ERRORS,
     State,
     at,
     covariances,
     make_uncertain,
     new_state,
-    set_layout,
 )
-from skyless.core.native.records import MAX_ANCHORS, MAX_RELAYS
+from skyless.core.native.records import MAX_RELAYS
 from skyless.core.native.views import records, view
 from skyless.core.ticks import NEVER
-
-# The estimator's state as bytes of a version, and back.
-
-VERSION: Final = 4
-"""Changes with the fields of ``State`` and of its records."""
-_HEAD: Final = Format("<HBBB")
-"""Version, dimensions, number of anchors, and whether there are ambiguities."""
-
-
-def packed_state(s: State) -> bytes:
-    """Encode a state: a head, then the part of each array that is in use."""
-    return _HEAD.pack(VERSION, s.dim, s.count, s.status.has_phases) + b"".join(
-        _packed(part).tobytes() for part in _parts(s)
-    )
-
-
-def unpacked_state(settings: EstimatorSettings, packed: bytes) -> State:
-    """Decode a state from ``packed_state``, or from any other source.
-
-    Everything that the estimator uses as an index is checked or recomputed; other numbers are not.
-
-    Raises:
-        ValueError: the bytes have another version, settings or length, or contain an anchor twice.
-    """
-    if len(packed) < _HEAD.size or _HEAD.unpack_from(packed)[:2] != (VERSION, settings.dim):
-        raise ValueError("the estimator's state is of another version or of other settings")
-    s, place = new_state(settings), _HEAD.size
-    s.count, has_phases = _HEAD.unpack_from(packed)[2:]
-    s.status.has_phases = has_phases == 1
-    if s.count > MAX_ANCHORS:
-        raise ValueError(f"the estimator's state has {s.count} anchors; it can have {MAX_ANCHORS}")
-    set_layout(s)
-    for part in _parts(s):
-        size, dtype = part.size * _packed(part).itemsize, _packed(part).dtype
-        part[...] = np.frombuffer(packed[place : place + size].ljust(size, b"\0"), dtype).reshape(part.shape)
-        if any((flags.view(np.uint8) > 1).any() for flags in _flags(part)):
-            raise ValueError("the estimator's state has a field that is neither true nor false")
-        place += size
-    identifiers = {s.anchors[anchor].identifier for anchor in range(s.count)}
-    if s.status.has_phases is not (has_phases == 1):
-        raise ValueError("the estimator's state has ambiguities and has none")
-    if place != len(packed) or len(identifiers) != s.count:
-        raise ValueError("the estimator's state is incomplete or holds an anchor twice")
-    if not NO_RANGE_ERRORS <= s.status.range_errors <= ALL_RANGE_ERRORS:
-        raise ValueError("the estimator's state has range errors of no kind")
-    set_layout(s)
-    return s
-
-
-def _flags(part: NDArray[Any]) -> list[NDArray[Any]]:
-    """All boolean fields of records and of nested records."""
-    fields = [part[name] for name in part.dtype.names or ()]
-    return [one for one in fields if one.dtype == np.bool_] + [flags for one in fields for flags in _flags(one)]
-
-
-def _packed(part: NDArray[Any]) -> NDArray[Any]:
-    """The records without padding between fields."""
-    return repack_fields(part, recurse=True) if part.dtype.names else part
-
-
-def _parts(s: State) -> list[NDArray[Any]]:
-    """The counters of a state and the parts of its arrays that are in use."""
-    n, count, faults = s.layout.end, s.count, FAULT_KINDS * s.count
-    return [
-        view(s.status),
-        view(s.x)[:n],
-        covariances(s)[:n, :n],
-        view(s.V)[:n, : faults + s.dim],
-        view(s.information)[:faults, :faults],
-        view(s.evidence)[:faults],
-        view(s.lasting_covariance)[:count, :count],
-        view(s.lasting_m)[:count],
-        view(s.anchors)[:count],
-        view(s.packets)[:count],
-        view(s.links)[:count, :count],
-    ]
-
 
 MAX_ANCHORS_KNOWN: Final = 256
 """Beyond this number, each new anchor replaces one that is not in the state."""
@@ -151,14 +69,6 @@ class Packets(Struct, frozen=True):
     """Carrier phases as the tag received them, shape (n,); negative if unknown."""
 
 
-class SavedEstimator(Struct, frozen=True):
-    """The saved state of an ``Estimator``: its known anchors, and the encoded state."""
-
-    anchors: Annotated[tuple[tuple[int, float, float, float], ...], Meta(max_length=MAX_ANCHORS_KNOWN)]
-    """Identifier and position of each anchor."""
-    state: bytes | None
-
-
 class Estimator:
     """The filter of one tag."""
 
@@ -171,28 +81,9 @@ class Estimator:
         for anchor, position_m in enumerate([] if anchors_m is None else anchors_m):
             self.know_anchor(anchor, position_m)
 
-    def save(self, has_state: bool) -> SavedEstimator:
-        """Everything that ``restore`` needs to continue with the same bits; ``has_state``: whether it has started."""
-        places = (place for _, place in self._known.values())
-        anchors = tuple((one.anchor, *one.position_m) for one in places)
-        return SavedEstimator(anchors, packed_state(self._state) if has_state else None)
-
-    def restore(self, saved: SavedEstimator, settings: EstimatorSettings) -> None:
-        """Continue from what an estimator with these settings has saved.
-
-        Raises:
-            ValueError: the saved state is invalid.
-        """
-        for anchor, *position_m in saved.anchors:
-            self.know_anchor(anchor, np.array(position_m))
-        if len(self._known) != len(saved.anchors):
-            raise ValueError("the estimator knows an anchor twice")
-        if saved.state is not None:
-            self._state = unpacked_state(settings, saved.state)
-
     @property
     def state(self) -> State:
-        """The state; another object after ``restore``."""
+        """The state."""
         return self._state
 
     @property

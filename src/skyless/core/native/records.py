@@ -17,9 +17,7 @@ An element that is itself an array or a record is a reference: ``row = P[one]`` 
 
 import ctypes
 from collections.abc import Iterator
-from functools import cache
 from math import nan
-from struct import Struct as Format
 from typing import (
     Annotated,
     Any,
@@ -32,8 +30,6 @@ from typing import (
     get_origin,
     get_type_hints,
 )
-from zlib import compress, decompressobj
-from zlib import error as zlib_error
 
 Value = TypeVar("Value")
 Read_co = TypeVar("Read_co", covariant=True)
@@ -46,10 +42,6 @@ Count = Annotated[int, ctypes.c_int64]
 """The same, for counters that grow for years."""
 
 Byte = Annotated[int, ctypes.c_uint8]
-
-LARGEST_TICKS: Final = 1 << 62
-"""Differences of two integers up to this fit into 64 bits."""
-_TICKS: Final = Format("<q")
 
 REAL: Final = ctypes.c_double
 """The type of a record's ``float``; C's ``real``."""
@@ -161,43 +153,6 @@ def c_type(hint: Any) -> Any:  # noqa: ANN401 - types have no type
 def first(array: Array[Value], count: int) -> list[Value]:
     """The first elements of an array; records are references."""
     return [array[index] for index in range(count)]
-
-
-def packed(one: Record) -> bytes:
-    """A record's bytes, compressed: unused parts are zeros."""
-    return compress(bytes(one), level=1)
-
-
-def unpacked(made: type[Made], data: bytes) -> Made:
-    """Decode a record from ``packed``.
-
-    Raises:
-        ValueError: the bytes are no such record, or contain values that are invalid in C.
-    """
-    size, reader = ctypes.sizeof(made), decompressobj()
-    try:
-        content = reader.decompress(data, size + 1)
-    except zlib_error as error:
-        raise ValueError(f"the bytes of {made.__name__} are damaged: {error}") from None
-    if len(content) != size or not reader.eof or reader.unused_data:
-        raise ValueError(f"{made.__name__} has {size} bytes, not what these are")
-    if any(content[at] > 1 for at in _offsets(made, ctypes.c_bool)):
-        raise ValueError(f"{made.__name__} has a field that is neither true nor false")
-    if any(abs(_TICKS.unpack_from(content, at)[0]) > LARGEST_TICKS for at in _offsets(made, ctypes.c_int64)):
-        raise ValueError(f"{made.__name__} has ticks whose differences do not fit 64 bits")
-    return made.from_buffer_copy(content)
-
-
-@cache
-def _offsets(made: Any, kind: type) -> tuple[int, ...]:  # noqa: ANN401 - types have no type
-    """Offsets of the numbers of a type in a record or an array."""
-    if made is kind:
-        return (0,)
-    if issubclass(made, ctypes.Array):
-        size, inner = ctypes.sizeof(made._type_), _offsets(made._type_, kind)
-        return tuple(size * index + at for index in range(made._length_) for at in inner)
-    fields = made._fields_ if issubclass(made, Record) else ()
-    return tuple(getattr(made, name).offset + at for name, field in fields for at in _offsets(field, kind))
 
 
 # Sizes of records on a computer; a board has others (``firmware/source/core_sizes.h``), which its compiler gives C.

@@ -1,10 +1,9 @@
 """A site's almanac in protocol 1: its pages, which of them each frame carries, and their assembly by a listener."""
 
 from functools import lru_cache
-from typing import Annotated, Final
+from typing import Final
 from zlib import crc32
 
-from msgspec import Meta, Struct
 from msgspec.structs import asdict
 
 from skyless.core.air.almanac import (
@@ -17,8 +16,7 @@ from skyless.core.air.almanac import (
     SchedulePage,
     SitePage,
 )
-from skyless.core.air.frame import Malformed
-from skyless.core.air.site_pages import PAGE_BYTES, decode_page, encode_page
+from skyless.core.air.site_pages import encode_page
 from skyless.core.anchor import filter_pages_of, georeference_page_of
 from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import AccuracySite, Site
@@ -86,20 +84,6 @@ def _rotation(pages: int) -> tuple[int, int]:
     return positions, round(positions * (5**0.5 - 1) / 2)
 
 
-_PageBytes = Annotated[bytes, Meta(min_length=PAGE_BYTES, max_length=PAGE_BYTES)]
-
-
-class AlmanacState(Struct, frozen=True):
-    """The saved state of an ``AlmanacAssembly``, pages encoded as on the air."""
-
-    issue: int | None
-    pages: tuple[_PageBytes, ...]
-    unconfirmed: tuple[_PageBytes, ...]
-    next_issue: int | None
-    next_frames: int
-    next_pages: tuple[_PageBytes, ...]
-
-
 class AlmanacAssembly:
     """Collects the pages of one site from its beacons.
 
@@ -126,27 +110,6 @@ class AlmanacAssembly:
         self.accuracy = _ASSUMED_ACCURACY
         """How good survey and ranges are. Some sites never send it."""
         self.georeference: GeoreferencePage | None = None
-
-    def state(self) -> AlmanacState:
-        """Save the present state."""
-        pages, unconfirmed, next_pages = (
-            tuple(map(encode_page, group))
-            for group in (self._pages.values(), self._unconfirmed.values(), self._next_pages)
-        )
-        return AlmanacState(self.issue, pages, unconfirmed, self._next_issue, self._next_frames, next_pages)
-
-    def restore(self, state: AlmanacState) -> None:
-        """Continue from a saved state.
-
-        Raises:
-            ValueError: it contains something that is not a page.
-        """
-        self._clear()
-        for page in _decoded(state.pages):
-            self._add(_page_key(page), page)
-        self._unconfirmed = {_page_key(page): page for page in _decoded(state.unconfirmed)}
-        self.issue, self._next_issue, self._next_frames = state.issue, state.next_issue, state.next_frames
-        self._next_pages = _decoded(state.next_pages)
 
     def slot_of(self, anchor: int | None) -> int | None:
         """First slot of an anchor, once its page was received."""
@@ -214,13 +177,6 @@ class AlmanacAssembly:
             case GeoreferencePage():
                 self.georeference = page
         return True
-
-
-def _decoded(pages: tuple[bytes, ...]) -> list[Page]:
-    found = [page for page in map(decode_page, pages) if page is not None and page is not Malformed.BAD_PAGE]
-    if len(found) < len(pages):
-        raise ValueError("a page of the almanac is damaged")
-    return found
 
 
 def _page_key(page: Page) -> object:

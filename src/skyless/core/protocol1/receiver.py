@@ -18,16 +18,14 @@ from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.core.native.library import compiled
-from skyless.core.native.records import packed, unpacked
 from skyless.core.observation import Observation
-from skyless.core.protocol1.almanac import AlmanacAssembly, AlmanacState
+from skyless.core.protocol1.almanac import AlmanacAssembly
 from skyless.core.protocol1.beacon import Beacon, Schedule, decode_cached, packed_relays, schedule_from_page
 from skyless.core.protocol1.clock import FollowedMaster, MasterScale, master_term_of
-from skyless.core.protocol1.snapshots import SnapshotMethod, Snapshots, SnapshotSettings, SnapshotsState
+from skyless.core.protocol1.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.core.tag.admission import ADMITTED, SITE_CHANGED, Admission, admit_sender, admit_stamp
-from skyless.core.tag.joint import Estimation, EstimationState
+from skyless.core.tag.joint import Estimation
 from skyless.core.tag.receiver import (
-    AdmissionState,
     BeaconReceiver,
     HeardSite,
     MethodOptions,
@@ -36,22 +34,6 @@ from skyless.core.tag.receiver import (
     stamp_variances,
 )
 from skyless.core.ticks import FLIGHT_SLACK_TICKS, SUBTICKS, TICK_M, may_elapse, nearest, to_seconds
-
-
-class ReceiverState(Struct, frozen=True, tag="protocol-1"):
-    """The saved state of a ``Receiver``."""
-
-    admission: AdmissionState
-    admitted: bytes
-    almanac: AlmanacState
-    followed: FollowedMaster
-    master: int | None
-    time_scale: tuple[int, int] | None
-    master_scale: MasterScale
-    superframe_ticks: int
-    has_method_key: bool
-    """Whether a method has been chosen since stamps were forgotten."""
-    method: EstimationState | SnapshotsState | None
 
 
 class Receiver(BeaconReceiver):
@@ -91,48 +73,6 @@ class Receiver(BeaconReceiver):
         self._master: int | None = None
         self._positions: dict[int, Array] = {}
         self._positions_issue: int | None = None
-
-    def state(self) -> ReceiverState:
-        """The present state. Shares memory with the receiver: use or encode it before its next frame."""
-        return ReceiverState(
-            admission=self._admission_state(),
-            admitted=packed(self._admission),
-            almanac=self.almanac.state(),
-            followed=self._followed,
-            master=self._master,
-            time_scale=self._scale,
-            master_scale=self._master_scale,
-            superframe_ticks=self._superframe_ticks,
-            has_method_key=self._method_key is not None,
-            method=None if self._method is None else self._method.state(),
-        )
-
-    @classmethod
-    def from_state(cls, state: ReceiverState) -> "Receiver":
-        """Restore a receiver that continues bit by bit as the saved one would.
-
-        Raises:
-            ValueError: the state is invalid.
-        """
-        made = cls(state.admission.options.method)
-        made._admission = unpacked(Admission, state.admitted)
-        made._restore_admission(state.admission)
-        made._superframe_ticks, made._followed = state.superframe_ticks, state.followed
-        made.almanac.restore(state.almanac)
-        made._read_positions()
-        made._master, made._scale, made._master_scale = state.master, state.time_scale, state.master_scale
-        if state.has_method_key:
-            made._choose_method()
-        match made._method, state.method:
-            case Estimation() as method, EstimationState() as saved:
-                method.restore(saved)
-            case Snapshots() as method, SnapshotsState() as saved:
-                method.restore(saved)
-            case None, None:
-                pass
-            case other, saved:
-                raise ValueError(f"{type(saved).__name__} is not a state of {type(other).__name__}")
-        return made
 
     @property
     def admission(self) -> Admission:

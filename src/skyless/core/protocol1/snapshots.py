@@ -172,8 +172,8 @@ class SnapshotSettings(Struct, frozen=True):
     z_bounds_m: tuple[float, float] | None = None
 
 
-class SnapshotsState(Struct, tag="snapshots"):
-    """The saved state of ``Snapshots``: the observations of two rounds, by anchor."""
+class _Rounds(Struct):
+    """The observations of two rounds, by anchor."""
 
     round: int | None = None
     previous: dict[int, Observation] = {}
@@ -187,16 +187,8 @@ class Snapshots:
         """``fix_time``: the receiver's, if it outlives this object."""
         self._method = method
         self._settings = settings
-        self._kept = SnapshotsState()
+        self._kept = _Rounds()
         self._time = fix_time or FixTime()
-
-    def state(self) -> SnapshotsState:
-        """Save the present state."""
-        return self._kept
-
-    def restore(self, state: SnapshotsState) -> None:
-        """Continue from a saved state."""
-        self._kept = state
 
     def update(self, observation: Observation) -> Fix | NoFixReason:
         """Process an observation. It gives a fix if it completes its round or is the first of the next one."""

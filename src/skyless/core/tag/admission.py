@@ -3,7 +3,6 @@
 from math import log as _log
 from typing import Annotated, Final
 
-from skyless.core.air.almanac import LONGEST_PERIOD_CODE
 from skyless.core.air.beacon import BeaconFields
 from skyless.core.air.frame import HEARD_BYTES, SHORT_BITS, two_bytes, unsigned
 from skyless.core.air.neighbours import (
@@ -30,7 +29,7 @@ from skyless.core.estimator.process import Packet, Relays
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import AXES, State, find_anchor
 from skyless.core.native.arithmetic import log, sqrt, square
-from skyless.core.native.records import MAX_COUNTED, MAX_NEIGHBOURS, MAX_SITES, Integers, Record, Ticks, first, record
+from skyless.core.native.records import Integers, Record, Ticks, record
 from skyless.core.tag.following import Course
 from skyless.core.ticks import (
     FLIGHT_SLACK_TICKS,
@@ -116,29 +115,6 @@ def admit_stamp(a: Admission, anchor: int, sequence: int, tx_counter: Ticks, per
     else:
         a.own = a.former
     return stamp
-
-
-def check(a: Admission) -> None:
-    """Check the indices that compiled functions use, in a record from any source.
-
-    Raises:
-        ValueError: an index is beyond its table.
-    """
-    limits = [
-        ("anchors", a.neighbours.count, MAX_NEIGHBOURS),
-        ("rows", a.neighbours.row + 1, MAX_NEIGHBOURS),
-        ("sites", a.choice.count, MAX_SITES),
-        ("failed sites", a.choice.failed_count, MAX_SITES),
-        *(("bits other than a radio's", abs(one.bits - TICK_BITS), 0) for one in (a.own, a.former)),
-        *(("anchors of a site", one.count, MAX_COUNTED) for one in first(a.choice.sites, MAX_SITES)),
-        *(
-            ("as a period's code", one.period_code, LONGEST_PERIOD_CODE)
-            for one in first(a.neighbours.rows, MAX_NEIGHBOURS)
-        ),
-    ]
-    for name, number, most in limits:
-        if not 0 <= number <= most:
-            raise ValueError(f"the receiver's state has {number} {name}; it can have up to {most}")
 
 
 # Which anchors of a large site a tag uses: the strongest of those that other anchors receive too

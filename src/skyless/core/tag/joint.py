@@ -1,15 +1,13 @@
 """``joint``: the estimator as a positioning method, with cold start, updates by packet, and restarts when lost."""
 
-import ctypes
 from typing import Final
 
 import numpy as np
-from msgspec import Struct
 
 from skyless.core.air.frame import two_bytes, unsigned
 from skyless.core.air.site_pages import STD_STEPS_PER_M, STEPS_PER_M, STEPS_PER_S
 from skyless.core.arrays import Array
-from skyless.core.estimator.estimator import NO_REPORT, Estimator, Report, SavedEstimator
+from skyless.core.estimator.estimator import NO_REPORT, Estimator, Report
 from skyless.core.estimator.process import ACCEPTED, Packet, Relays
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import AXES
@@ -17,10 +15,10 @@ from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement, limits_of
 from skyless.core.native.arithmetic import square
 from skyless.core.native.library import compiled
-from skyless.core.native.records import MAX_ANCHORS, RELAYS_KEPT, Bytes, packed, unpacked
+from skyless.core.native.records import Bytes
 from skyless.core.native.views import view
 from skyless.core.observation import Observation
-from skyless.core.tag.acquisition import MAX_LINKS, Acquisition
+from skyless.core.tag.acquisition import Acquisition
 from skyless.core.tag.following import (
     BAD_GEOMETRY,
     FIX,
@@ -39,14 +37,6 @@ from skyless.core.tag.following import (
     settle,
 )
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S, FixTime
-
-
-class EstimationState(Struct, frozen=True, tag="joint"):
-    """The saved state of an ``Estimation``."""
-
-    estimator: SavedEstimator
-    start: bytes | None
-    course: bytes
 
 
 class Estimation:
@@ -83,31 +73,6 @@ class Estimation:
             course.horizontal_k, course.vertical_k = limits_of(settings.integrity_risk)
             _begin_course(course, self.search)
         self.course = course
-
-    def state(self) -> EstimationState:
-        """Save the present state."""
-        start = packed(self.search) if self.is_starting else None
-        return EstimationState(self._estimator.save(not self.is_starting), start, packed(self.course))
-
-    def restore(self, state: EstimationState) -> None:
-        """Continue from a state saved with the same settings.
-
-        Raises:
-            ValueError: the saved arrays are not valid.
-        """
-        course = unpacked(Course, state.course)
-        if not 0 <= course.count <= MAX_ANCHORS:
-            raise ValueError(f"{course.count} anchors are in use; there can be {MAX_ANCHORS}")
-        if (state.start is None) is (state.estimator.state is None):
-            raise ValueError("there is a start beside the filter's state, or neither")
-        for setting in _COURSE_SETTINGS:
-            setattr(course, setting, getattr(self.course, setting))
-        course.is_starting = state.start is not None
-        ctypes.pointer(self.course)[0] = course
-        self._listed = -1
-        if state.start is not None:
-            _restore_search(self.search, state.start)
-        self._estimator.restore(state.estimator, course.settings)
 
     @property
     def estimator(self) -> Estimator:
@@ -217,54 +182,9 @@ REASONS: Final = {
     IS_UNSETTLED: NoFixReason.NOT_CONVERGED,
 }
 
-_COURSE_SETTINGS: Final = (
-    "settings",
-    "tuning",
-    "dim",
-    "horizontal_k",
-    "vertical_k",
-    "superframe_s",
-    "most_anchors",
-    "in_use_s",
-)
-"""Fields of a course that follow from the settings."""
-_SEARCH_SETTINGS: Final = (
-    "knows_height",
-    "height_m",
-    "variance_m2",
-    "max_age_s",
-    "speed_std_mps",
-    "error_variance_m2",
-    "tuning",
-)
-"""The same for a search; height bounds are not among them because they may come from a sensor."""
-
 _begin_course: Final = compiled(begin_course)
 _begin_again: Final = compiled(begin_again)
 _follow: Final = compiled(follow)
-
-
-def _restore_search(fresh: Acquisition, data: bytes) -> None:
-    """Restore a search from untrusted bytes, checking everything that compiled functions use as an index.
-
-    ``fresh``: a search with the settings of this site.
-
-    Raises:
-        ValueError: the bytes are no search, or an index is beyond its table.
-    """
-    made = unpacked(Acquisition, data)
-    for setting in _SEARCH_SETTINGS:
-        setattr(made, setting, getattr(fresh, setting))
-    packets = [one for heard in made.heard for one in (heard.older, heard.newer)]
-    counts = [
-        (made.count, MAX_ANCHORS),
-        (made.link_count, MAX_LINKS),
-        *((heard.count, 2) for heard in made.heard),
-        *((packet.relay_count, RELAYS_KEPT) for packet in packets),
-    ]
-    if not all(0 <= count <= most for count, most in counts):
-        raise ValueError("the start's state has more anchors, links or relays than there can be")
-    ctypes.pointer(fresh)[0] = made
 
 
 # What the estimator assumes at a site, from its pages of noise and accuracy

@@ -3,7 +3,7 @@
 It needs only beacons of protocol 2: anchors state their positions, the site's common pages everything else.
 """
 
-import ctypes
+import copy
 from abc import ABC, abstractmethod
 from collections import Counter
 from math import inf, isfinite, nan
@@ -15,7 +15,7 @@ from skyless.core.air.almanac import AccuracyPage, GeoreferencePage, NoisePage
 from skyless.core.air.beacon import FAULTS, Beacon, fields_of
 from skyless.core.air.frame import Reception, phase_of, powers_dbm
 from skyless.core.air.site_choice import NO_SITE
-from skyless.core.air.site_pages import NO_ISSUE, encode_page, is_possible_page
+from skyless.core.air.site_pages import encode_page
 from skyless.core.anchor import LocalAlmanac
 from skyless.core.clock_filter import stamp_variance_m2
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
@@ -23,8 +23,7 @@ from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.native.library import compiled
-from skyless.core.native.records import MAX_PAGES, MAX_SENDERS, packed, unpacked
-from skyless.core.tag.admission import COUNTER_JUMPED, DROP_COUNTERS, SITE_CHANGED, Admission, Tag, check
+from skyless.core.tag.admission import COUNTER_JUMPED, DROP_COUNTERS, SITE_CHANGED, Admission, Tag
 from skyless.core.tag.following import FIX
 from skyless.core.tag.hearing import (
     MALFORMED,
@@ -33,12 +32,11 @@ from skyless.core.tag.hearing import (
     NO_POSITION,
     UNCONFIRMED_ANCHOR,
     WEAKER_ANCHOR,
-    begin_here,
     begin_tag,
     hear_fields,
     hear_frame,
 )
-from skyless.core.tag.joint import DROP_S, Estimation, EstimationState, fill_ages, fill_noise
+from skyless.core.tag.joint import DROP_S, Estimation, fill_ages, fill_noise
 from skyless.core.ticks import FixTime
 
 # Common to the receivers of both protocols
@@ -103,18 +101,6 @@ class TagReceiver(SiteListener, Protocol):
 
     def hear(self, reception: Reception) -> Fix | None:
         """Process a frame from the air. Returns a fix if it made one, otherwise sets ``reason``."""
-
-    def state(self) -> Struct:
-        """The present state. Shares memory with the receiver: use or encode it before its next frame."""
-
-
-class AdmissionState(Struct, frozen=True):
-    """The saved state of a ``BeaconReceiver`` itself."""
-
-    options: MethodOptions
-    only_site: int | None
-    counters: dict[str, int]
-    reason: NoFixReason
 
 
 class BeaconReceiver(ABC):
@@ -199,25 +185,12 @@ class BeaconReceiver(ABC):
             self.counters["outlier"] += 1
         return None
 
-    def _admission_state(self) -> AdmissionState:
-        only_site = _site_of(self.admission.choice.only_site)
-        return AdmissionState(self._options, only_site, dict(self.counters), self.reason)
-
-    def _restore_admission(self, state: AdmissionState) -> None:
-        """Restore counters and options. Raises ValueError if the restored admission is invalid or of another site."""
-        check(self.admission)
-        if state.only_site != _site_of(self.admission.choice.only_site):
-            raise ValueError(f"the receiver's state is of site {state.only_site}, and listens to another one")
-        self._options = state.options
-        self.counters.update(state.counters)
-        self.reason = state.reason
-
 
 def _site_of(site: int) -> int | None:
     return None if site == NO_SITE else site
 
 
-# Settings of a tag's filter from pages and options; a receiver's state as values
+# Settings of a tag's filter from pages and options
 
 
 def as_required(settings: EstimatorSettings, options: MethodOptions) -> EstimatorSettings:
@@ -252,14 +225,6 @@ def estimator_settings(
     fill_noise(settings, noise.tx_stamp_s, noise.rx_stamp_s, noise.white_fm, noise.random_walk_fm)
     fill_ages(settings, superframe_s, DROP_S)
     return settings
-
-
-class ReceiverState(Struct, frozen=True, tag="protocol-2"):
-    """The saved state of a ``Receiver``. Shares memory with it: use or encode it before its next frame."""
-
-    admission: AdmissionState
-    tag: bytes
-    method: EstimationState
 
 
 _UNUSED: Final = {
@@ -303,29 +268,10 @@ class Receiver(BeaconReceiver):
         self._tag.course.tuning = TUNING
         self._method = Estimation(self._tag.owner, course=self._tag.course)
 
-    def state(self) -> ReceiverState:
-        """The present state. Shares memory with the receiver: use or encode it before its next frame."""
-        return ReceiverState(self._admission_state(), packed(self._tag), self._method.state())
-
-    @classmethod
-    def from_state(cls, state: ReceiverState) -> "Receiver":
-        """Restore a receiver that continues bit by bit as the saved one would.
-
-        Raises:
-            ValueError: the state is invalid.
-        """
-        made, kept = cls(), unpacked(Tag, state.tag)
-        _check(kept)
-        made._options = state.admission.options
-        made._begin(NO_SITE)
-        kept.owner, kept.course = made._tag.owner, made._tag.course
-        ctypes.pointer(made._tag)[0] = kept
-        if kept.has_settings:
-            _begin_here(made._tag, made._method.search)
-        elif state.method.start is None:
-            raise ValueError("a receiver without the pages of its site has no method")
-        made._method.restore(state.method)
-        made._restore_admission(state.admission)
+    def copied(self) -> "Receiver":
+        """A copy that continues with the same bits as this receiver would."""
+        made = copy.deepcopy(self)
+        made._method.course = made._tag.course
         return made
 
     @property
@@ -414,20 +360,5 @@ class Receiver(BeaconReceiver):
 
 
 _begin_tag: Final = compiled(begin_tag)
-_begin_here: Final = compiled(begin_here)
 _hear_frame: Final = compiled(hear_frame)
 _hear_fields: Final = compiled(hear_fields)
-
-
-def _check(t: Tag) -> None:
-    """Check everything in a record from any source that compiled functions use as an index, and the pages.
-
-    Raises:
-        ValueError: an index is beyond its table, or a page is damaged.
-    """
-    pages = [*t.pages.used, *t.pages.collected]
-    senders = [one.sender_count for one in t.pages.collected]
-    if not 0 <= t.pages.count <= MAX_PAGES or min(senders) < 0 or max(senders) > MAX_SENDERS:
-        raise ValueError("the receiver's state has more pages than there can be")
-    if (t.has_settings and t.pages.issue == NO_ISSUE) or not all(is_possible_page(one.contents, 0) for one in pages):
-        raise ValueError("a page of the receiver's state is damaged")

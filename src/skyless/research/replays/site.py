@@ -1,10 +1,10 @@
-"""Replay of a running site: every tag's receptions again, judged against the truth and the recorded fixes."""
+"""Replay of a running site: every tag's receptions again, judged against the truth."""
 
 import time
-from collections import Counter, OrderedDict, defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Annotated, Any, Final, TypeVar, cast
+from typing import Any, Final, cast
 
 import msgspec
 import numpy as np
@@ -16,78 +16,19 @@ from skyless.core.air.masterless_packets import Packet
 from skyless.core.any_receiver import AnyReceiver, decode_any
 from skyless.core.errors import ConfigurationError
 from skyless.core.fix import Fix
-from skyless.core.integrity import RISK, IntegrityRequirement
-from skyless.core.method_names import DEFAULT_METHOD, METHODS
+from skyless.core.integrity import IntegrityRequirement
+from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.protocol1 import beacon as protocol1_codec
 from skyless.core.site import Site
 from skyless.core.tag.receiver import NOT_DROPS
 from skyless.core.ticks import WRAP_TICKS, wrap
 from skyless.files import Drops
 from skyless.research.replays.captures import ReplayReport, common_figures
-from skyless.run.mqtt.messages import FixMessage, RawReception, ReceptionsMessage, SegmentStart, fix_message
-from skyless.run.recordings.reception_log import RefusedError, load
-from skyless.run.recordings.recording import HostClock, McapRecording, Recorded, tags_to_replay
+from skyless.run.mqtt.messages import RawReception, ReceptionsMessage, SegmentStart
+from skyless.run.recordings.reception_log import receiver_of
+from skyless.run.recordings.recording import HostClock, McapRecording, tags_to_replay
 from skyless.sim.evaluation.figures import FixSamples, Judged, figures_of
 from skyless.site.tables import Truth
-
-# Recorded fixes against those of a replay: whether they are the same, bit by bit.
-
-_T = TypeVar("_T")
-
-_MAX_WAITING: Final = 20_000
-"""Most fixes that wait for their counterpart; those missing in the recording never get one."""
-
-SAME_FIX_S: Final = 2.0
-"""Serial numbers restart with the tag; fixes of one number farther apart than this are different ones."""
-
-
-class Identical(Struct, frozen=True):
-    """Bitwise comparison of recorded and replayed fixes."""
-
-    compared: int
-    different: int
-
-
-class Comparison:
-    """Matches recorded and replayed fixes by serial number and time, whichever comes first."""
-
-    def __init__(self, tag: str) -> None:
-        self._tag = tag
-        self._recorded: OrderedDict[int, FixMessage] = OrderedDict()
-        self._replayed: OrderedDict[int, tuple[Fix, float]] = OrderedDict()
-        self._compared = self._different = 0
-
-    def result(self) -> Identical:
-        """The comparison so far."""
-        return Identical(self._compared, self._different)
-
-    def recorded(self, message: FixMessage) -> None:
-        """Add a recorded fix."""
-        found = self._replayed.pop(message.serial, None)
-        if found is None or abs(found[1] - message.unix_s) > SAME_FIX_S:
-            _keep(self._recorded, message.serial, message)
-        else:
-            self._judge(found[0], message)
-
-    def replayed(self, serial: int, fix: Fix, unix_s: float) -> None:
-        """Add a replayed fix."""
-        found = self._recorded.pop(serial, None)
-        if found is None or abs(found.unix_s - unix_s) > SAME_FIX_S:
-            _keep(self._replayed, serial, (fix, unix_s))
-        else:
-            self._judge(fix, found)
-
-    def _judge(self, fix: Fix, message: FixMessage) -> None:
-        again = fix_message(self._tag, message.serial, fix, message.unix_s, message.latency_s)
-        self._compared += 1
-        self._different += msgspec.json.encode(again) != msgspec.json.encode(message)
-
-
-def _keep(waiting: OrderedDict[int, _T], serial: int, value: _T) -> None:
-    waiting[serial] = value
-    if len(waiting) > _MAX_WAITING:
-        waiting.popitem(last=False)
-
 
 # A recorded site once more, as if its anchors had had other antenna delays.
 #
@@ -145,15 +86,14 @@ def _relay(heard: Heard, own: DelayChange) -> Heard:
     return structs.replace(heard, rx_ticks=wrap(heard.rx_ticks - own.rx_ticks))
 
 
-# One tag of a recording once more: its receptions through its receiver, bit by bit as it was.
+# One tag of a recording once more: its receptions through a receiver with its settings.
 
 
 class _Heard(Struct, frozen=True):
-    """A reception whose time is unknown so far, its fix if it made one, and the fix's number if known."""
+    """A reception whose time is unknown so far, and its fix if it made one."""
 
     reception: Reception
     fix: Fix | None
-    serial: int | None
 
 
 class Replayed(Struct, frozen=True):
@@ -165,7 +105,7 @@ class Replayed(Struct, frozen=True):
 
 
 class TagReplay:
-    """Processes the receptions of one tag in the order of the recording."""
+    """Processes the receptions of one tag in the order of the recording; each segment begins with a new receiver."""
 
     def __init__(
         self,
@@ -175,17 +115,16 @@ class TagReplay:
         integrity: IntegrityRequirement | None = None,
         stamps_only: bool = False,
     ) -> None:
-        """``method`` and ``integrity``: instead of the tag's own; ``delays``: other antenna delays. All start cold.
+        """``method`` and ``integrity``: instead of the tag's own; ``delays``: other antenna delays.
 
-        ``stamps_only``: without phases, cold too.
+        ``stamps_only``: without phases.
         """
         self._delays, self._stamps_only = delays, stamps_only
         self._integrity = integrity
-        self._is_as_it_was = method is None and delays is None and integrity is None and not stamps_only
         self.tag = tag
         self.method = method
         """As recorded, once known, or as requested."""
-        self.receptions = self.fixes = self.segments = self.cold_starts = 0
+        self.receptions = self.fixes = self.segments = 0
         self.begun_s: float | None = None
         """Unix time of the first reception."""
         self.drops: Drops = Counter()
@@ -193,15 +132,13 @@ class TagReplay:
         """The last reason for no fix."""
         self._asked = method
         self._receiver: AnyReceiver | None = None
-        self._serial: int | None = None
-        """Serial of the last fix; None if the receiver did not continue the tag's state."""
-        self._restored = False
+        self._former: Counter[str] = Counter()
+        """Counters of the receivers of earlier segments."""
         self._segment = ""
         self._next = 0
         self._clock: HostClock[_Heard] = HostClock()
         self.on_measured: Callable[[float, Packet, bool], None] | None = None
         """Gets the Unix time of each beacon, the beacon as a packet without relays, and whether it made a fix."""
-        self._comparison = Comparison(tag)
 
     def process(self, message: ReceptionsMessage) -> Iterator[Replayed]:
         """Process a run of receptions. Yields the fixes that they, or earlier runs, make."""
@@ -219,20 +156,15 @@ class TagReplay:
                 reception = with_delays(reception, self._delays)
             if self._stamps_only:
                 reception = structs.replace(reception, carrier_phase_cycles=None)
-            made = self._made(reception)
-            yield from self._timed(self._clock.add(reception, message.unix_less_host_s, made))
+            assert self._receiver is not None
+            fix = self._receiver.hear(reception)
+            self.fixes += fix is not None
+            self.reason = str(self._receiver.reason)
+            yield from self._timed(self._clock.add(reception, message.unix_less_host_s, _Heard(reception, fix)))
 
     def rest(self) -> Iterator[Replayed]:
         """The last fixes, at the end of the recording."""
         yield from self._timed(self._clock.rest())
-
-    def _made(self, reception: Reception) -> _Heard:
-        fix = self._fix(reception)
-        if fix is not None:
-            self.fixes += 1
-            if self._serial is not None:
-                self._serial += 1
-        return _Heard(reception, fix, self._serial)
 
     def _timed(self, found: list[tuple[_Heard, float]]) -> Iterator[Replayed]:
         """Fixes of receptions whose Unix time is now known."""
@@ -240,11 +172,8 @@ class TagReplay:
             self.begun_s = unix_s if self.begun_s is None else self.begun_s
             if self.on_measured is not None:
                 self._tell(self.on_measured, made, unix_s)
-            if made.fix is None:
-                continue
-            if made.serial is not None:
-                self._comparison.replayed(made.serial, made.fix, unix_s)
-            yield Replayed(made.fix, unix_s)
+            if made.fix is not None:
+                yield Replayed(made.fix, unix_s)
 
     @staticmethod
     def _tell(on_measured: Callable[[float, Packet, bool], None], made: _Heard, unix_s: float) -> None:
@@ -253,18 +182,9 @@ class TagReplay:
             packet = Packet(None, beacon.anchor, beacon.sequence, beacon.tx_ticks, rx_ticks, ())
             on_measured(unix_s, packet, made.fix is not None)
 
-    def compare(self, recorded: FixMessage) -> None:
-        """Add a recorded fix."""
-        self._comparison.recorded(recorded)
-
-    @property
-    def identical(self) -> Identical | None:
-        """The comparison of fixes; None with another method than the tag's own, or other antenna delays."""
-        return self._comparison.result() if self._is_as_it_was else None
-
     def all_drops(self) -> dict[str, int]:
         """What could not be used, by reason, including the receiver's own."""
-        own: Counter[str] = Counter() if self._receiver is None else self._receiver.counters
+        own = self._former if self._receiver is None else self._former + self._receiver.counters
         total = self.drops + Counter({reason: n for reason, n in own.items() if reason not in NOT_DROPS})
         return {str(reason): number for reason, number in sorted(total.items()) if number}
 
@@ -277,59 +197,21 @@ class TagReplay:
             self._begin(message.segment, message.start)
         skip = self._next - message.first
         if skip < 0:
-            self.drops["receptions-after-a-gap"] += len(message.receptions)
-            return ()
+            self.drops["gap-in-receptions"] += 1
         self._next = max(self._next, message.first + len(message.receptions))
-        return message.receptions[skip:]
+        return message.receptions[max(skip, 0) :]
 
     def _begin(self, segment: str, start: SegmentStart) -> None:
         self._segment, self._next = segment, 0
         self.segments += 1
-        if not self._is_as_it_was:
-            if self._receiver is None:
-                self._start_cold(start)
-            return
         self._clock = HostClock()
-        if start.state is None:
-            if start.serial:
-                self.drops["no-checkpoint"] += 1
-            self._start_cold(start)
-            self._serial = None if start.serial else 0
-            return
-        try:
-            self._receiver = load(start.state)
-        except RefusedError as refused:
-            self.drops[refused.reason] += 1
-            self._start_cold(start)
-            return
-        self.method = str(start.settings.get("method"))
-        self._serial, self._restored = start.serial, True
-        # what it had counted before belongs to no replay
-        self._receiver.counters.clear()
-
-    def _start_cold(self, start: SegmentStart) -> None:
-        self.cold_starts += 1
-        self._serial, self._restored = None, False
-        receiver = _receiver_of(start, self._asked, self._integrity)
-        if receiver is None:
+        if self._receiver is not None:
+            self._former.update(self._receiver.counters)
+        self._receiver = receiver_of(start.settings, self._asked, self._integrity)
+        if self._receiver is None:
             self.drops["impossible-settings"] += 1
-            receiver = AnyReceiver(self._asked or DEFAULT_METHOD, integrity=self._integrity)
-        self._receiver = receiver
+            self._receiver = AnyReceiver(self._asked or DEFAULT_METHOD, integrity=self._integrity)
         self.method = self._asked or str(start.settings.get("method"))
-
-    def _fix(self, reception: Reception) -> Fix | None:
-        assert self._receiver is not None
-        if not self._restored:
-            fix = self._receiver.hear(reception)
-        else:
-            try:
-                fix = self._receiver.hear(reception)
-            except Exception:  # noqa: BLE001 - a forged checkpoint can make a receiver that fails in any way
-                self.drops["checkpoint-damaged"] += 1
-                self._start_cold(SegmentStart(0, {"method": self.method}, None))
-                return None
-        self.reason = str(self._receiver.reason)
-        return fix
 
 
 def reception_of(raw: RawReception) -> Reception | None:
@@ -344,37 +226,7 @@ def reception_of(raw: RawReception) -> Reception | None:
     return Reception(raw.frame, raw.rx_ticks, raw.host_s, measured, phase_cycles)
 
 
-class _TagSettings(Struct, frozen=True):
-    """Settings of a tag's program, with defaults for those that a recording lacks."""
-
-    method: str | None = None
-    site: int | None = None
-    qa: Annotated[float, msgspec.Meta(gt=0.0, lt=1e6)] = 0.3
-    z_low_m: float | None = None
-    z_high_m: float | None = None
-    integrity_risk: float = RISK
-    alert_limit_m: float | None = None
-    max_acceleration_mps2: float = 0.0
-    height_std_m: float = 0.0
-
-
-def _receiver_of(start: SegmentStart, method: str | None, integrity: IntegrityRequirement | None) -> AnyReceiver | None:
-    """A fresh receiver with the tag's settings; None if they are invalid."""
-    try:
-        settings = msgspec.convert(start.settings, _TagSettings)
-        integrity = integrity or IntegrityRequirement(
-            settings.integrity_risk, settings.alert_limit_m, settings.max_acceleration_mps2, settings.height_std_m
-        )
-    except (msgspec.ValidationError, ValueError, TypeError):
-        return None
-    name = method or settings.method
-    if name not in METHODS:
-        return None
-    bounds_m = None if settings.z_low_m is None or settings.z_high_m is None else (settings.z_low_m, settings.z_high_m)
-    return AnyReceiver(name, site=settings.site, qa=settings.qa, z_bounds_m=bounds_m, integrity=integrity)
-
-
-# Replay of a running site: every tag's receptions once more, judged against the truth and the recorded fixes.
+# Replay of a running site: every tag's receptions once more, judged against the truth.
 
 SITE_FORMAT: Final = "skyless-mcap"
 
@@ -383,12 +235,8 @@ class TagReport(ReplayReport, frozen=True, kw_only=True):
     """Result of a tag's replay; times are Unix seconds."""
 
     tag: str
-    identical: Identical | None
-    """Comparison with the published fixes; None with another method than the tag's own."""
     segments: int
     """Runs of receptions without a gap."""
-    cold_starts: int
-    """How many of them did not begin where the tag's receiver was."""
     mean_anchors: float | None
     """Number of anchors in a fix."""
     most_anchors: int
@@ -451,22 +299,15 @@ class SiteReplay:
         if on_measured is not None:
             for tag, replay in self.tags.items():
                 replay.on_measured = partial(on_measured, tag)
-        for number, found in enumerate(self._recording.messages({"receptions", "fix"})):
-            if found.channel.name in self.tags:
-                self._process(found, on_fix)
+        for number, found in enumerate(self._recording.messages({"receptions"})):
+            if (heard := self.tags.get(found.channel.name)) is not None:
+                self._add(heard, heard.process(cast("ReceptionsMessage", found.message)), on_fix)
             if number % 256 == 0:
                 on_progress(found.time_s - self._begin_s)
         for replay in self.tags.values():
             self._add(replay, replay.rest(), on_fix)
         wall_s = time.perf_counter() - begun_s
         return [self._report(tag, wall_s) for tag in self.tags]
-
-    def _process(self, found: Recorded, on_fix: Callable[[str, Replayed], None] | None) -> None:
-        replay = self.tags[found.channel.name]
-        if found.channel.kind == "fix":
-            replay.compare(cast("FixMessage", found.message))
-        else:
-            self._add(replay, replay.process(cast("ReceptionsMessage", found.message)), on_fix)
 
     def _add(
         self, replay: TagReplay, fixes: Iterable[Replayed], on_fix: Callable[[str, Replayed], None] | None
@@ -505,9 +346,7 @@ class SiteReplay:
             reason=None if replay.fixes else replay.reason,
             tag=tag,
             method=replay.method,
-            identical=replay.identical,
             segments=replay.segments,
-            cold_starts=replay.cold_starts,
             mean_anchors=sum(count * fixes for count, fixes in anchors.items()) / replay.fixes
             if replay.fixes
             else None,
@@ -519,17 +358,11 @@ def summary_of(reports: Sequence[TagReport]) -> dict[str, Any]:
     """One tag's report like that of any other recording; for several tags, sums and the reports by tag."""
     if len(reports) == 1:
         return {**msgspec.to_builtins(reports[0]), "height_note": "from the site"}
-    compared = [report.identical for report in reports if report.identical is not None]
-    identical = {
-        "compared": sum(one.compared for one in compared),
-        "different": sum(one.different for one in compared),
-    }
     return {
         "format": reports[0].format,
         "receptions": sum(report.receptions for report in reports),
         "fixes": sum(report.fixes for report in reports),
         "dropped": sum(report.dropped for report in reports),
-        "identical": identical if compared else None,
         "wall_s": reports[0].wall_s,
         "tags": {report.tag: msgspec.to_builtins(report) for report in reports},
     }

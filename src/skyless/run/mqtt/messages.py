@@ -331,14 +331,10 @@ class ReceptionsMessage(Struct, frozen=True):
 
 
 class SegmentStart(Struct, frozen=True):
-    """The receiver's state when a segment began."""
+    """What a receiver of a segment's receptions needs besides them."""
 
-    serial: int
-    """Number of fixes made before."""
     settings: dict[str, str | float | int | None]
     """Arguments of the receiver."""
-    state: bytes | None
-    """The receiver's state (``skyless.run.recordings.reception_log``); None if it could not be saved."""
 
 
 class Zone(Struct, frozen=True):

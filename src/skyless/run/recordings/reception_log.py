@@ -1,86 +1,21 @@
-"""A tag's receptions for recorders, in segments that begin with the receiver's state.
+"""A tag's receptions for recorders, in segments that begin with the receiver's settings.
 
-A segment begins when a new requester asks, and after every gap; within it nothing is missing. The state lets a replay
-start in the middle of a tag's life and continue bit for bit. No I/O and no clock: times are passed in, by any monotonic
-clock.
+A segment begins when a new requester asks, and after every gap; within it nothing is missing. No I/O and no clock:
+times are passed in, by any monotonic clock.
 """
 
 from collections import Counter, deque
-from importlib.metadata import version
-from typing import Final
+from typing import Annotated, Final
 
 import msgspec
-import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.frame import Diagnostics, Reception
-from skyless.core.any_receiver import AnyReceiver, AnyReceiverState
-from skyless.core.arrays import Array
-from skyless.core.integrity import IntegrityRequirement
-from skyless.core.tag.receiver import ReceiverState, TagReceiver
+from skyless.core.any_receiver import AnyReceiver
+from skyless.core.integrity import RISK, IntegrityRequirement
+from skyless.core.method_names import METHODS
+from skyless.core.tag.receiver import TagReceiver
 from skyless.run.mqtt.messages import Leases, RawReception, ReceptionsMessage, RequestMessage, SegmentStart
-
-_FORMAT: Final = 21
-_MAX_BYTES: Final = 1 << 23
-"""Size limit of a checkpoint; enough for an estimator of a hundred anchors."""
-
-
-class _Header(Struct, frozen=True):
-    """Header of every checkpoint."""
-
-    format: int
-    version: str
-
-
-class _Checkpoint(_Header, frozen=True):
-    receiver: AnyReceiverState | ReceiverState
-
-
-class RefusedError(Exception):
-    """A checkpoint cannot be used. ``reason`` is the key under which it is counted."""
-
-    def __init__(self, reason: str) -> None:
-        super().__init__(reason)
-        self.reason = reason
-
-
-def save(receiver: TagReceiver) -> bytes:
-    """Serialise the receiver's whole state."""
-    checkpoint = _Checkpoint(_FORMAT, version("skyless"), receiver.state())  # type: ignore[arg-type]  # of these two
-    return _ENCODER.encode(checkpoint)
-
-
-def load(state: bytes) -> AnyReceiver:
-    """Restore the receiver from ``state``.
-
-    Raises:
-        RefusedError: ``checkpoint-of-another-version``, ``checkpoint-damaged``.
-    """
-    if len(state) > _MAX_BYTES:
-        raise RefusedError("checkpoint-damaged")
-    try:
-        header = msgspec.msgpack.decode(state, type=_Header)
-        if header.format != _FORMAT or header.version != version("skyless"):
-            raise RefusedError("checkpoint-of-another-version")
-        return AnyReceiver.from_state(_DECODER.decode(state).receiver)
-    except (msgspec.MsgspecError, ValueError, ArithmeticError, LookupError, AssertionError, RecursionError):
-        raise RefusedError("checkpoint-damaged") from None
-
-
-def _encode_array(value: object) -> bytes:
-    """Encode a position, the only array in a state that is not bytes already."""
-    assert isinstance(value, np.ndarray)
-    return value.tobytes()
-
-
-def _decode_array(_: type, data: object) -> Array:
-    if not isinstance(data, bytes) or len(data) != 24:
-        raise ValueError("a position is three numbers")
-    return np.frombuffer(data, np.float64).copy()
-
-
-_ENCODER: Final = msgspec.msgpack.Encoder(enc_hook=_encode_array)
-_DECODER: Final = msgspec.msgpack.Decoder(_Checkpoint, dec_hook=_decode_array)
 
 EVERY_TAG: Final = "*"
 INTERVAL_S: Final = 0.1
@@ -128,8 +63,8 @@ class ReceptionLog:
         elif is_new:
             self.interrupt()
 
-    def add(self, receiver: TagReceiver, reception: Reception, serial: int) -> None:
-        """Add a reception before the receiver hears it; ``serial`` is the number of fixes made so far."""
+    def add(self, receiver: TagReceiver, reception: Reception) -> None:
+        """Add a reception before the receiver hears it."""
         if not self._leases.are_held:
             return
         if len(self._pending) >= MAX_PENDING_RECEPTIONS:
@@ -140,7 +75,9 @@ class ReceptionLog:
             self.interrupt()
             self._receiver = receiver
         if not self._open:
-            self._begin(receiver, serial)
+            self._open, self._first = True, 0
+            self._segments += 1
+            self._start = SegmentStart(self._settings)
         self._pending.append(raw(reception))
 
     def collect(self, now_s: float, unix_less_host_s: float) -> ReceptionsMessage | None:
@@ -159,17 +96,6 @@ class ReceptionLog:
         """End the segment, because a message was lost or a requester joined."""
         self._close_message()
         self._open = False
-
-    def _begin(self, receiver: TagReceiver, serial: int) -> None:
-        self._open = True
-        self._segments += 1
-        self._first = 0
-        try:
-            state = save(receiver)
-        except TypeError:  # a bug: the replay lacks its beginning, but the tag goes on
-            self.counters["no-checkpoint"] += 1
-            state = None
-        self._start = SegmentStart(serial, self._settings, state)
 
     def _close_message(self) -> None:
         """Make a message from the pending receptions."""
@@ -215,6 +141,38 @@ def receiver_settings(
         "max_acceleration_mps2": integrity.max_acceleration_mps2,
         "height_std_m": integrity.height_std_m,
     }
+
+
+class _TagSettings(Struct, frozen=True):
+    """Settings of a tag's program, with defaults for those that a recording lacks."""
+
+    method: str | None = None
+    site: int | None = None
+    qa: Annotated[float, msgspec.Meta(gt=0.0, lt=1e6)] = 0.3
+    z_low_m: float | None = None
+    z_high_m: float | None = None
+    integrity_risk: float = RISK
+    alert_limit_m: float | None = None
+    max_acceleration_mps2: float = 0.0
+    height_std_m: float = 0.0
+
+
+def receiver_of(
+    settings: Settings, method: str | None = None, integrity: IntegrityRequirement | None = None
+) -> AnyReceiver | None:
+    """A receiver with the settings of a segment, or this method and requirement; None if they are invalid."""
+    try:
+        known = msgspec.convert(settings, _TagSettings)
+        integrity = integrity or IntegrityRequirement(
+            known.integrity_risk, known.alert_limit_m, known.max_acceleration_mps2, known.height_std_m
+        )
+    except (msgspec.ValidationError, ValueError, TypeError):
+        return None
+    name = method or known.method
+    if name not in METHODS:
+        return None
+    bounds_m = None if known.z_low_m is None or known.z_high_m is None else (known.z_low_m, known.z_high_m)
+    return AnyReceiver(name, site=known.site, qa=known.qa, z_bounds_m=bounds_m, integrity=integrity)
 
 
 def raw(reception: Reception) -> RawReception:
