@@ -102,9 +102,7 @@ ELSEWHERE = {
     "skyless dashboard --assets assets.csv": HTTP,
     "curl http://127.0.0.1:8080/api/v1/assets.csv > assets.csv": HTTP,
     "curl -T assets.csv http://127.0.0.1:8080/api/v1/assets.csv": HTTP,
-    "skyless record walk.mcap": (
-        "tests/nodes/test_record_command.py::test_a_recording_replays_and_ctrl_c_closes_it"
-    ),
+    "skyless record walk.mcap": ("tests/nodes/test_record_command.py::test_a_recording_replays_and_ctrl_c_closes_it"),
     "skyless board tag1 --link /tmp/tag1": (
         "tests/cli/test_node_commands.py::test_a_board_tells_where_it_is_and_takes_its_link_with_it"
     ),

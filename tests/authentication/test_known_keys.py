@@ -19,7 +19,7 @@ from skyless.core.keys.chain import (
     read_certificate,
     section_signatures,
 )
-from skyless.core.keys.known_keys import CertificateUse, KeyUse, KnownKeys
+from skyless.core.keys.known_keys import KeyUse, KnownKeys
 
 SITE = 42
 TIMING = ChainTiming()
@@ -48,7 +48,7 @@ def at_s(interval):
 
 def known():
     made = KnownKeys(SITE, PUBLIC)
-    assert made.on_certificate(SENT, at_s(FIRST)) is CertificateUse.NEW
+    assert made.on_certificate(SENT, at_s(FIRST)) is KeyUse.NEW
     return made
 
 
@@ -57,20 +57,20 @@ def known():
 def test_no_bit_of_a_certificate_can_be_changed(bit):
     made = KnownKeys(SITE, PUBLIC)
     altered = (int.from_bytes(SENT, "big") ^ 1 << bit).to_bytes(len(SENT), "big")
-    assert made.on_certificate(altered, at_s(FIRST)) is CertificateUse.FORGED
+    assert made.on_certificate(altered, at_s(FIRST)) is KeyUse.FORGED
     assert made.certificates == ()
     assert made.timing is None
 
 
 @given(st.binary(min_size=94, max_size=94))
 def test_any_bytes_are_a_forged_certificate(sent):
-    assert KnownKeys(SITE, PUBLIC).on_certificate(sent, at_s(FIRST)) is CertificateUse.FORGED
+    assert KnownKeys(SITE, PUBLIC).on_certificate(sent, at_s(FIRST)) is KeyUse.FORGED
 
 
 def test_certificates_of_other_sites_and_owners_are_forged():
     for other in (chain(site=43), chain(private=Ed25519PrivateKey.generate())):
         sent = ChainKeys(other).certificate(FIRST)
-        assert KnownKeys(SITE, PUBLIC).on_certificate(sent, at_s(FIRST)) is CertificateUse.FORGED
+        assert KnownKeys(SITE, PUBLIC).on_certificate(sent, at_s(FIRST)) is KeyUse.FORGED
 
 
 @given(st.lists(st.integers(0, 3000), min_size=1, max_size=8))
@@ -101,20 +101,24 @@ def test_a_key_of_another_interval_is_forged():
     assert made.on_key(KEYS.key(FIRST + 11), FIRST + 10, at_s(FIRST), 1) is KeyUse.FORGED
 
 
-def test_forged_keys_far_ahead_cost_a_bounded_number_of_steps(monkeypatch):
-    steps = 0
+def count_steps(monkeypatch, module):
+    """The steps of each hash from now on."""
+    steps = []
 
     def counted(key, name, number=1):
-        nonlocal steps
-        steps += number
+        steps.append(number)
         return earlier_key(key, name, number)
 
-    monkeypatch.setattr(known_keys, "earlier_key", counted)
+    monkeypatch.setattr(module, "earlier_key", counted)
+    return steps
+
+
+def test_forged_keys_far_ahead_cost_a_bounded_number_of_steps(monkeypatch):
+    steps = count_steps(monkeypatch, known_keys)
     made, interval = known(), FIRST + SECTION_INTERVALS - 1
     for number in range(1000):  # within a second
         made.on_key(secrets.token_bytes(16), interval, at_s(FIRST) + 1e-3 * number, 1)
-    assert steps <= known_keys.MAX_STEPS + known_keys.STEPS_PER_S
-    steps = 0
+    assert sum(steps) <= known_keys.MAX_STEPS + known_keys.STEPS_PER_S
     assert made.on_key(KEYS.key(FIRST + 3), FIRST + 3, at_s(FIRST) + 1.0, 1) is KeyUse.NEW  # the expected ones are free
 
 
@@ -131,19 +135,19 @@ def test_forged_certificates_cost_a_bounded_number_of_checks():
     for number in range(400):
         sent = SENT[:-2] + number.to_bytes(2, "big")
         uses.append(made.on_certificate(sent, at_s(FIRST) + 1e-3 * number))
-    assert uses.count(CertificateUse.FORGED) <= known_keys.MAX_CHECKS + 0.4 * known_keys.CHECKS_PER_S
-    assert uses[-1] is CertificateUse.IGNORED
-    assert made.on_certificate(SENT, at_s(FIRST) + 2.0) is CertificateUse.NEW
+    assert uses.count(KeyUse.FORGED) <= known_keys.MAX_CHECKS + 0.4 * known_keys.CHECKS_PER_S
+    assert uses[-1] is KeyUse.IGNORED
+    assert made.on_certificate(SENT, at_s(FIRST) + 2.0) is KeyUse.NEW
 
 
 def test_the_next_section_and_the_next_chain_go_on():
     made, last = known(), FIRST + SECTION_INTERVALS - 1
-    assert made.on_certificate(KEYS.certificate(last + 1), at_s(last)) is CertificateUse.NEW
+    assert made.on_certificate(KEYS.certificate(last + 1), at_s(last)) is KeyUse.NEW
     for interval in (last, last + 1, last + 5):
         assert made.on_key(KEYS.key(interval), interval, at_s(last), 1) is KeyUse.NEW
         assert made.mac_key(interval) == KEYS.mac_key(interval)
     second = ChainKeys(chain(serial=2, first=last + 100, sections=2))
-    assert made.on_certificate(second.certificate(last + 100), at_s(last)) is CertificateUse.NEW
+    assert made.on_certificate(second.certificate(last + 100), at_s(last)) is KeyUse.NEW
     assert made.serial == 1  # it does not count yet
     assert made.on_key(KEYS.key(last + 99), last + 99, at_s(last), 1) is KeyUse.NEW
     assert made.on_key(KEYS.key(last + 100), last + 100, at_s(last), 1) is KeyUse.FORGED
@@ -151,7 +155,7 @@ def test_the_next_section_and_the_next_chain_go_on():
     assert made.mac_key(last + 100) == second.mac_key(last + 100)
     assert made.mac_key(last + 99) == KEYS.mac_key(last + 99)
     assert made.serial == 2
-    assert made.on_certificate(KEYS.certificate(last + 1), at_s(last + 110)) is CertificateUse.REVOKED
+    assert made.on_certificate(KEYS.certificate(last + 1), at_s(last + 110)) is KeyUse.REVOKED
 
 
 def test_old_certificates_make_way():
@@ -159,7 +163,7 @@ def test_old_certificates_make_way():
     long = ChainKeys(chain(sections=12))
     for section in range(12):
         interval = FIRST + section * SECTION_INTERVALS
-        assert made.on_certificate(long.certificate(interval), at_s(interval)) is CertificateUse.NEW
+        assert made.on_certificate(long.certificate(interval), at_s(interval)) is KeyUse.NEW
         assert len(made.certificates) <= known_keys.MAX_CERTIFICATES
         assert read_certificate(SITE, made.certificates[-1])[0].name.section == SECTION + section
         assert made.on_key(long.key(interval), interval, at_s(interval), 1) is KeyUse.NEW
@@ -169,8 +173,5 @@ def test_old_certificates_make_way():
     "damage", [lambda sent: sent[:-1] + b"\0", lambda sent: bytes(94), lambda sent: sent[:40], lambda sent: sent[::-1]]
 )
 def test_damaged_certificates_of_an_earlier_run_are_ignored(damage):
-    made = KnownKeys(SITE, PUBLIC)
-    made.restore([damage(SENT)])
-    assert made.certificates == ()
-    made.restore([SENT])
-    assert made.certificates == (SENT,)
+    assert KnownKeys(SITE, PUBLIC, certificates=[damage(SENT)]).certificates == ()
+    assert KnownKeys(SITE, PUBLIC, certificates=[damage(SENT), SENT]).certificates == (SENT,)

@@ -143,7 +143,7 @@ def rotate(asked: _KeysOptions, made: _StartOptions) -> None:
     _write(asked.folder, chain, {})
     warnings = []
     last = chains[-1]
-    ends_s = _ends_s(last)
+    ends_s = last.ends_s
     if ends_s < starts_s:
         warnings.append(f"chain {last.serial} ends {_when(ends_s)}: until {_when(starts_s)} beacons carry no codes")
     _report_new(
@@ -200,7 +200,7 @@ def _report_new(asked: _KeysOptions, chain: Chain, next_steps: str, warnings: Se
         report = _report(asked.folder, *_present(asked), time.time())
         print_json({**report, "warnings": [*warnings, *report["warnings"]]})
         return
-    span = f"from {_when(chain.timing.start_s(chain.first))} to {_when(_ends_s(chain))}"
+    span = f"from {_when(chain.begins_s)} to {_when(chain.ends_s)}"
     made = f"wrote chain {chain.serial} to {asked.folder}: it counts {span}"
     console().print(made + next_steps, markup=False, soft_wrap=True)
     print_warnings(warnings)
@@ -208,10 +208,9 @@ def _report_new(asked: _KeysOptions, chain: Chain, next_steps: str, warnings: Se
 
 def _report(folder: Path, public: SitePublic, chains: list[Chain], now_s: float) -> dict[str, Any]:
     """Report on the key chains."""
-    ring = ChainRing(chains)
-    at = None if ring.timing is None else ring.at(ring.timing.interval_at(now_s))
-    present = None if at is None or at.chain.serial < public.least_serial else at.chain.serial
-    left_s = _ends_s(chains[-1]) - now_s
+    present = ChainRing(chains).serial_at(now_s)
+    present = None if present is None or present < public.least_serial else present
+    left_s = chains[-1].ends_s - now_s
     warnings = []
     if left_s < _LITTLE_LEFT_S:
         end = f"ends in {left_s / _DAY_S:.0f} days" if left_s > 0.0 else "has ended"
@@ -228,8 +227,8 @@ def _report(folder: Path, public: SitePublic, chains: list[Chain], now_s: float)
         "chains": [
             {
                 "serial": chain.serial,
-                "begins_unix_s": chain.timing.start_s(chain.first),
-                "ends_unix_s": _ends_s(chain),
+                "begins_unix_s": chain.begins_s,
+                "ends_unix_s": chain.ends_s,
                 "sections": chain.sections,
                 "is_revoked": chain.serial < public.least_serial,
                 "has_seed": chain_seed_file(folder, chain.serial).exists(),
@@ -291,10 +290,6 @@ def _planned(text: str) -> float:
         side = "past" if starts_s < now_s else "far future"
         raise SkylessError(f"--starts is {text!r}, which is in the {side}; it should be within the next 20 years")
     return starts_s
-
-
-def _ends_s(chain: Chain) -> float:
-    return chain.timing.start_s(chain.end)
 
 
 def _when(unix_s: float) -> str:

@@ -282,6 +282,10 @@ class BeaconAuthentication:
             self.faults[beacon.anchor] = (fault, unix_s)
         return fault
 
+    def recent_faults(self, unix_s: float) -> dict[int, Fault]:
+        """Faults of other anchors within the last seconds."""
+        return {anchor: fault for anchor, (fault, when_s) in self.faults.items() if abs(unix_s - when_s) <= RECENT_S}
+
     def _fault_of(self, beacon: Beacon, frame: bytes, unix_s: float, timing: ChainTiming) -> Fault | None:
         present = timing.interval_at(unix_s)
         stated = beacon.authentication

@@ -20,7 +20,7 @@ from skyless.core.air.frame import Malformed, Reception
 from skyless.core.any_receiver import decode_any
 from skyless.core.fix import Fix
 from skyless.core.keys.chain import public_key
-from skyless.core.keys.fault import Fault
+from skyless.core.keys.fault import NOT_FORGED, Fault
 from skyless.core.keys.verifier import LONGEST_WAIT_TICKS, ReceivedFrame, Verifier
 from skyless.core.tag.receiver import Receiver
 from skyless.core.ticks import TICK_S, FixTime, from_seconds
@@ -37,8 +37,6 @@ MAX_IN_SHARE: Final = 4096
 MAX_FORGED: Final = 0.1
 """Largest ratio of forged to genuine plausible frames at which live fixes are given. So few are left to the gates and
 consistency checks of the estimator; with more, only verified frames give fixes."""
-
-_NOT_FORGED: Final = (Fault.NO_KEY, Fault.FIRST)
 
 
 class Trust(StrEnum):
@@ -167,7 +165,7 @@ class TrustedReceiver:
                 self._used -= 1
             is_other |= one.is_plausible is not (fault is None)
             if fault is not None:
-                if one.is_plausible and fault not in _NOT_FORGED:
+                if one.is_plausible and fault not in NOT_FORGED:
                     self._forged_ticks.append(one.rx_ticks)
                 continue
             if self._verified_ticks is None:

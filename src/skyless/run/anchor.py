@@ -20,7 +20,7 @@ from skyless.core.site import Site, is_same_but_placed, largest_change_m, site_d
 from skyless.core.ticks import TICK_RATE_HZ, difference
 from skyless.radio.interface import Gone, Late, Radio, RadioEvent, Restarted, Sent
 from skyless.radio.tag_reports import Reported
-from skyless.run.keys import KEYS_S, AnchorKeys, AnchorReport, recent_faults
+from skyless.run.keys import KEYS_S, AnchorKeys, AnchorReport
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -211,7 +211,7 @@ class AnchorNode:
             chain_ends_unix_s=keys.ends_s,
             code_fault=None if fault is None else fault.value,
             faults={
-                str(other): why.value for other, why in sorted(recent_faults(authentication, health.unix_s).items())
+                str(other): why.value for other, why in sorted(authentication.recent_faults(health.unix_s).items())
             },
         )
 

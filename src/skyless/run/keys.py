@@ -23,7 +23,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.beacon import CERTIFICATE_BYTES
-from skyless.core.anchor import BeaconAuthentication
+from skyless.core.anchor import RECENT_S, BeaconAuthentication
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.keys.chain import (
     CERTIFICATE_SIGNATURE_BYTES,
@@ -31,14 +31,13 @@ from skyless.core.keys.chain import (
     PUBLIC_KEY_BYTES,
     SECTION_BITS,
     SEED_BYTES,
-    Certificate,
     Chain,
+    ChainKeys,
     ChainRing,
     ChainTiming,
-    SectionName,
     is_signed,
     public_key,
-    root_of,
+    read_certificate,
 )
 from skyless.core.keys.fault import Fault
 from skyless.core.trusted_receiver import SiteTrust, TrustedReceiver
@@ -281,9 +280,8 @@ def parse_seeds(text: str) -> dict[int, bytes]:
 
 def _check_chain(folder: Path, chain: Chain, public: SitePublic) -> None:
     """Check that seed, signatures and public key belong together. Raises SkylessError."""
-    name = SectionName(chain.site, chain.serial, chain.first >> SECTION_BITS)
-    certificate = Certificate(name, chain.timing, chain.first, root_of(chain.seed, name))
-    if not is_signed(certificate, chain.signatures[:CERTIFICATE_SIGNATURE_BYTES], public_key(public.public)):
+    read = read_certificate(chain.site, ChainKeys(chain).certificate(chain.first))
+    if read is None or not is_signed(*read, public_key(public.public)):
         raise SkylessError(
             f"{chain_public_file(folder, chain.serial)} does not belong to its seed or to {SITE_PUBLIC}; all three "
             "should be copied from one folder of keys"
@@ -329,9 +327,6 @@ def _read(file: Path, *, is_secret: bool = False) -> bytes:
 
 KEYS_S: Final = 3.0
 """Interval at which files are checked for changes."""
-
-RECENT_S: Final = 2.0
-"""Faults older than this are ignored."""
 
 LASTING_S: Final = 4.0
 """Faults that last for less than this, as after a start, are not logged."""
@@ -418,14 +413,12 @@ class AnchorKeys:
 
     def present(self, unix_s: float) -> int | None:
         """Serial number of the chain in use at a Unix time; None if there is none."""
-        timing = self._ring.timing
-        keys = None if timing is None else self._ring.at(timing.interval_at(unix_s))
-        return None if keys is None else keys.chain.serial
+        return self._ring.serial_at(unix_s)
 
     @property
     def ends_s(self) -> float:
         """Unix time at which the last chain ends."""
-        return max(chain.timing.start_s(chain.end) for chain in self.chains)
+        return max(chain.ends_s for chain in self.chains)
 
     def warn(self, unix_s: float) -> None:
         """Log once a day when the last chain ends soon."""
@@ -467,7 +460,7 @@ class AnchorReport:
         present, both by the host's monotonic clock.
         """
         self._on_own(authentication.fault(), serial)
-        faults = recent_faults(authentication, unix_s)
+        faults = authentication.recent_faults(unix_s)
         is_alone = now_s - accepted_s > RECENT_S and any(fault in _WRONG for fault in faults.values())
         if is_alone and not self._is_alone:
             self._log(f"{self._name}: no other anchor's code fits: the own seed or this host's clock is probably wrong")
@@ -485,12 +478,6 @@ class AnchorReport:
         if line != self._logged:
             self._logged = line
             self._log(f"{self._name}: {line}")
-
-
-def recent_faults(authentication: BeaconAuthentication, unix_s: float) -> dict[int, Fault]:
-    """Faults of other anchors within the last seconds."""
-    faults = authentication.faults.items()
-    return {anchor: fault for anchor, (fault, when_s) in faults if abs(unix_s - when_s) <= RECENT_S}
 
 
 # A tag

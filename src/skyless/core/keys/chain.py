@@ -245,6 +245,16 @@ class Chain(Struct, frozen=True, repr_omit_defaults=True):
         """The first interval after its last section."""
         return (self.first >> SECTION_BITS) + self.sections << SECTION_BITS
 
+    @property
+    def begins_s(self) -> float:
+        """Unix time at which it begins."""
+        return self.timing.start_s(self.first)
+
+    @property
+    def ends_s(self) -> float:
+        """Unix time at which it ends."""
+        return self.timing.start_s(self.end)
+
     def holds(self, interval: int) -> bool:
         """Whether the chain has a key for an interval."""
         return self.first <= interval < self.end
@@ -319,6 +329,11 @@ class ChainRing:
         """The chain valid in an interval: the newest of those that have begun; None if that one has ended."""
         begun = next((keys for keys in self._chains if keys.chain.first <= interval), None)
         return begun if begun is not None and begun.chain.holds(interval) else None
+
+    def serial_at(self, unix_s: float) -> int | None:
+        """Serial number of the chain valid at a Unix time."""
+        keys = None if self.timing is None else self.at(self.timing.interval_at(unix_s))
+        return None if keys is None else keys.chain.serial
 
     def revoked(self, interval: int) -> tuple[ChainKeys, ...]:
         """Chains with a key for an interval in which they are no longer valid."""

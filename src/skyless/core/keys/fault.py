@@ -1,6 +1,7 @@
 """Why a beacon is not accepted, or an anchor sends without a code."""
 
 from enum import StrEnum
+from typing import Final
 
 
 class Fault(StrEnum):
@@ -30,3 +31,7 @@ class Fault(StrEnum):
     """The anchor has no valid key chain: none has begun, or the last has ended."""
     CLOCK_WRONG = "clock-wrong"
     """The host's clock differs from those of the site's anchors."""
+
+
+NOT_FORGED: Final = (Fault.NO_KEY, Fault.FIRST)
+"""Faults of frames that may be genuine."""

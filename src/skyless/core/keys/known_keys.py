@@ -18,6 +18,7 @@ from skyless.core.keys.chain import (
     mac_key,
     read_certificate,
 )
+from skyless.core.keys.fault import Fault
 from skyless.core.ticks import MAX_DRIFT, difference, from_seconds
 
 if TYPE_CHECKING:
@@ -41,25 +42,17 @@ MAX_CHECKS: Final = 100.0
 """The same for signatures, of which each takes 0.1 to 0.4 ms."""
 
 
-class CertificateUse(Enum):
-    """Outcomes of a certificate."""
+class KeyUse(Enum):
+    """Outcomes of a certificate or a disclosed key."""
 
     KNOWN = auto()
+    """It was known already; of a key also: it cannot be checked yet."""
     NEW = auto()
     FORGED = auto()
     IGNORED = auto()
-    """The allowance for checks was used up."""
+    """A certificate beyond the allowance for checks."""
     REVOKED = auto()
-    """Signed by the site, but replaced by a later chain."""
-
-
-class KeyUse(Enum):
-    """Outcomes of a disclosed key."""
-
-    KNOWN = auto()
-    """It was known already, or cannot be checked yet."""
-    NEW = auto()
-    FORGED = auto()
+    """A certificate signed by the site, but replaced by a later chain."""
 
 
 class _Section(Struct):
@@ -76,8 +69,13 @@ class _Section(Struct):
 class KnownKeys:
     """The known chains of a site. Nothing forged is kept."""
 
-    def __init__(self, site: int, public: "Ed25519PublicKey", least_serial: int = 0) -> None:
-        """``least_serial``: chains with lower serial numbers are revoked."""
+    def __init__(
+        self, site: int, public: "Ed25519PublicKey", least_serial: int = 0, certificates: Iterable[bytes] = ()
+    ) -> None:
+        """``least_serial``: chains with lower serial numbers are revoked.
+
+        ``certificates``: those of an earlier run, whose signatures are checked again.
+        """
         self._site, self._public = site, public
         self.serial = least_serial
         """The highest serial number of a chain known to be valid."""
@@ -92,38 +90,36 @@ class KnownKeys:
         self._checks, self._refilled_s = MAX_CHECKS, 0.0
         self._senders: dict[bytes, int] = {}
         """The anchor that first sent each far key."""
+        for sent in certificates:
+            read = read_certificate(site, sent)
+            if read is not None and is_signed(*read, public):
+                self._add(read[0], sent)
 
     @property
     def certificates(self) -> tuple[bytes, ...]:
         """Encoded certificates, with which a listener can start at once the next time."""
         return tuple(section.sent for section in self._sections.values())
 
-    def restore(self, certificates: Iterable[bytes]) -> None:
-        """Add certificates of an earlier run, after checking their signatures again."""
-        for sent in certificates:
-            read = read_certificate(self._site, sent)
-            if read is not None and is_signed(*read, self._public):
-                self._add(read[0], sent)
-
-    def on_certificate(self, sent: bytes, now_s: float) -> CertificateUse:
+    def on_certificate(self, sent: bytes, now_s: float) -> KeyUse:
         """Process a certificate received at ``now_s``, as far as the time is known."""
-        if any(section.sent == sent for section in self._sections.values()):
-            return CertificateUse.REVOKED if self._is_revoked(sent, now_s) else CertificateUse.KNOWN
+        known = next((one.certificate for one in self._sections.values() if one.sent == sent), None)
+        if known is not None:
+            return KeyUse.REVOKED if self._is_replaced(known, now_s) else KeyUse.KNOWN
         read = read_certificate(self._site, sent)
         if read is None:
-            return CertificateUse.FORGED
+            return KeyUse.FORGED
         self._refill(now_s)
         if self._checks < 1.0:
-            return CertificateUse.IGNORED
+            return KeyUse.IGNORED
         self._checks -= 1.0
         certificate, signature = read
         if not is_signed(certificate, signature, self._public):
-            return CertificateUse.FORGED
+            return KeyUse.FORGED
         if certificate.name.serial < self.serial:
-            return CertificateUse.REVOKED
+            return KeyUse.REVOKED
         self._present = certificate.timing.interval_at(now_s) >> SECTION_BITS
         self._add(certificate, sent)
-        return CertificateUse.NEW
+        return KeyUse.NEW
 
     def on_key(self, key: bytes, interval: int, now_s: float, anchor: int, *, is_expected: bool = True) -> KeyUse:
         """Process the key of an interval that somebody disclosed in an anchor's name.
@@ -174,11 +170,11 @@ class KnownKeys:
         serial = max(serials, default=0)
         return self._sections.get(SectionName(self._site, serial, interval >> SECTION_BITS))
 
-    def _is_revoked(self, sent: bytes, now_s: float) -> bool:
-        """Whether a later chain has replaced that of a known certificate at this time."""
-        own = next(one.certificate for one in self._sections.values() if one.sent == sent)
-        later = [one.certificate for one in self._sections.values() if one.certificate.name.serial > own.name.serial]
-        return any(one.first <= own.timing.interval_at(now_s) - own.timing.lag for one in later)
+    def _is_replaced(self, own: Certificate, now_s: float) -> bool:
+        """Whether a later chain has replaced that of a certificate at this time."""
+        disclosed = own.timing.interval_at(now_s) - own.timing.lag
+        others = (one.certificate for one in self._sections.values())
+        return any(one.name.serial > own.name.serial and one.first <= disclosed for one in others)
 
     def _add(self, certificate: Certificate, sent: bytes) -> None:
         name = certificate.name
@@ -222,15 +218,6 @@ class Stamps(Struct, frozen=True, gc=False):
     """The anchor's, 40 bits."""
 
 
-class Arrival(Enum):
-    """How a frame's time of arrival compares with others."""
-
-    IN_TIME = auto()
-    FIRST = auto()
-    """Unconfirmed: no other frame of its anchor agrees with it."""
-    LATE = auto()
-
-
 class _Reference(Struct):
     """An anchor's last frame that agrees with its earliest one by both counters."""
 
@@ -256,10 +243,11 @@ class Arrivals:
             return not self._references
         return not _delay_ticks(last, one)
 
-    def of(self, frames: Sequence[Stamps]) -> list[Arrival]:
+    def faults(self, frames: Sequence[Stamps]) -> list[Fault | None]:
         """Judge the arrival of genuine frames that become known together, in order of reception.
 
-        Nobody can send a frame before its anchor does. So if two of an anchor disagree, the later one is late.
+        The fault is ``FIRST`` while no other frame of the anchor agrees, ``LATE``, or None. Nobody can send a frame
+        before its anchor does. So if two of an anchor disagree, the later one is late.
         """
         references, late = self._references, set[int]()
         for number, one in enumerate(frames):
@@ -276,10 +264,8 @@ class Arrivals:
             else:
                 late.update(before for before in range(number) if frames[before].anchor == one.anchor)
                 references[one.anchor] = _Reference(one.rx_ticks, one.tx_ticks, 1)
-        if not late and all(references[one.anchor].frames > 1 for one in frames):
-            return [Arrival.IN_TIME] * len(frames)
-        known = [Arrival.IN_TIME if references[one.anchor].frames > 1 else Arrival.FIRST for one in frames]
-        return [Arrival.LATE if number in late else arrival for number, arrival in enumerate(known)]
+        confirmed = [None if references[one.anchor].frames > 1 else Fault.FIRST for one in frames]
+        return [Fault.LATE if number in late else fault for number, fault in enumerate(confirmed)]
 
 
 def _delay_ticks(last: _Reference, one: Stamps) -> int:

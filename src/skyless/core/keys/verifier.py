@@ -15,8 +15,8 @@ from skyless.core.air.almanac import KeyPage
 from skyless.core.air.beacon import INTERVAL_BITS, Authentication, Beacon, signed_bytes
 from skyless.core.air.frame import Reception
 from skyless.core.keys.chain import SECTION_BITS, SECTION_INTERVALS, ChainTiming, is_mac, section_of
-from skyless.core.keys.fault import Fault
-from skyless.core.keys.known_keys import Arrival, Arrivals, CertificateUse, KeyUse, KnownKeys, Stamps
+from skyless.core.keys.fault import NOT_FORGED, Fault
+from skyless.core.keys.known_keys import Arrivals, KeyUse, KnownKeys, Stamps
 from skyless.core.ticks import TICK_S, Unwrapper, from_seconds, nearest
 
 if TYPE_CHECKING:
@@ -142,8 +142,6 @@ CODES_KEPT: Final = 2048
 MAX_FAULTY_ANCHORS: Final = 64
 """Most anchors with remembered faults: forged frames can name any."""
 
-_ARRIVAL_FAULTS: Final = {Arrival.IN_TIME: None, Arrival.FIRST: Fault.FIRST, Arrival.LATE: Fault.LATE}
-
 
 class ReceivedFrame(Struct, frozen=True, gc=False):
     """A frame with a code, waiting for its key or decided."""
@@ -185,8 +183,7 @@ class Verifier:
 
         ``certificates``: those of an earlier run.
         """
-        self.keys = KnownKeys(site, public, least_serial)
-        self.keys.restore(certificates)
+        self.keys = KnownKeys(site, public, least_serial, certificates)
         self.clock = SiteClock(clock_bound_s, offsets_s=deque())
         self._counters = counters
         self._own_ticks = Unwrapper()
@@ -251,13 +248,13 @@ class Verifier:
     def decided(self) -> list[tuple[ReceivedFrame, Fault | None]]:
         """Newly decided frames in order of reception, each once.
 
-        The fault is None for a genuine frame. ``NO_KEY`` and ``FIRST`` do not mean that it was forged.
+        The fault is None for a genuine frame.
         """
-        decided: list[tuple[ReceivedFrame, Fault | None]] = []
+        by_code: list[tuple[ReceivedFrame, Fault | None]] = []
         waiting = self._waiting
         oldest = self.newest_ticks - LONGEST_WAIT_TICKS
         if not self._has_new_key and (not waiting or waiting[0].rx_ticks > oldest):
-            return decided
+            return []
         self._has_new_key, timing = False, self.keys.timing
         can_decide = timing is not None and not self.clock.is_late
         while waiting:
@@ -266,30 +263,17 @@ class Verifier:
             if fault is Fault.NO_KEY and one.rx_ticks > oldest and not self._is_key_lost(one):
                 break
             waiting.popleft()
-            decided.append((one, fault))
-            if fault is Fault.NO_KEY:
+            by_code.append((one, fault))
+        genuine = [one for one, fault in by_code if fault is None]
+        stamps = [Stamps(one.beacon.anchor, one.rx_ticks, one.beacon.tx_ticks) for one in genuine]
+        arrivals = iter(self._arrivals.faults(stamps))
+        decided = [(one, next(arrivals) if fault is None else fault) for one, fault in by_code]
+        for one, fault in decided:
+            if fault in NOT_FORGED:
                 self._counters[fault] += 1
             elif fault is not None:
                 self._refuse(one.beacon.anchor, fault, one.rx_ticks)
-        return self._without_delayed(decided)
-
-    def _without_delayed(
-        self, decided: list[tuple[ReceivedFrame, Fault | None]]
-    ) -> list[tuple[ReceivedFrame, Fault | None]]:
-        """The decisions, with genuine frames refused that arrived late by the counters."""
-        genuine = [one for one, fault in decided if fault is None]
-        arrivals = self._arrivals.of([Stamps(one.beacon.anchor, one.rx_ticks, one.beacon.tx_ticks) for one in genuine])
-        if all(arrival is Arrival.IN_TIME for arrival in arrivals):
-            return decided
-        faults = []
-        for one, arrival in zip(genuine, arrivals, strict=True):
-            faults.append(_ARRIVAL_FAULTS[arrival])
-            if arrival is Arrival.LATE:
-                self._refuse(one.beacon.anchor, Fault.LATE, one.rx_ticks)
-            elif arrival is Arrival.FIRST:
-                self._counters[Fault.FIRST] += 1
-        answers = iter(faults)
-        return [(one, next(answers) if fault is None else fault) for one, fault in decided]
+        return decided
 
     def _fault(self, one: ReceivedFrame, timing: ChainTiming) -> Fault | None:
         """The fault of a frame; ``NO_KEY`` while the key of its interval is unknown."""
@@ -320,13 +304,13 @@ class Verifier:
 
     def _on_certificate(self, anchor: int, sent: bytes, rx_ticks: int) -> None:
         use = self.keys.on_certificate(sent, self.clock.present_s)
-        if use is CertificateUse.FORGED:
+        if use is KeyUse.FORGED:
             self._counters["forged-certificate"] += 1
             return
         timing = self.keys.timing
-        if use is CertificateUse.REVOKED:
+        if use is KeyUse.REVOKED:
             self._refuse(anchor, Fault.REVOKED_CHAIN, rx_ticks)
-        elif use is not CertificateUse.IGNORED and timing is not None:
+        elif use is not KeyUse.IGNORED and timing is not None:
             self.clock.on_section(section_of(sent), timing)
 
     def _on_key(self, key: bytes, interval: int, anchor: int, timing: ChainTiming, *, is_early: bool) -> None:
