@@ -20,6 +20,7 @@ EXTRA_OF: Final = {
     "mcap": "site",
     "nats": "gather",
     "pandas": "pandas",
+    "prometheus_client": "prometheus",
     "pyarrow": "history",
     "rosbags": "ros2",
     "scipy": "site",

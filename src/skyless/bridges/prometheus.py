@@ -1,18 +1,19 @@
 """``prometheus:``: serves the figures of a site at ``/metrics``, in Prometheus's text format, version 0.0.4.
 
 Counters only rise, even if a tag or an anchor restarts. Ages are those at the scrape. Other gauges are given while
-their source is fresh, so that nothing old looks current. Format:
-https://prometheus.io/docs/instrumenting/exposition_formats/#text-based-format.
+their source is fresh, so that nothing old looks current.
 """
 
 import asyncio
 import time
-from bisect import bisect_left
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from email.parser import BytesHeaderParser
-from math import inf, isinf, isnan
-from typing import Final, Literal
+from typing import Final, TypeVar
+
+from prometheus_client import CONTENT_TYPE_PLAIN_0_0_4, Histogram, generate_latest
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
 
 from skyless.bridges.target import TAG_NAME, BridgeContext, BridgedSite, Target, TargetUrl, cannot_listen
 from skyless.core.version import installed_version
@@ -21,11 +22,11 @@ from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, T
 from skyless.run.web import BRIDGES as LIMITS
 from skyless.run.web import is_own_host, own_names
 
-CONTENT_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+_T = TypeVar("_T")
 
 Labels = Mapping[str, str]
-Sample = tuple[Labels, float]
-"""Labels by name, and the value."""
+Samples = Iterable[tuple[Labels, float | None]]
+"""Labels by name, and the value; None is omitted."""
 
 GAUGE_AGE_S: Final = 5.0
 """Gauges of older fixes or health messages are omitted."""
@@ -92,48 +93,6 @@ _LINK_COUNTERS: Final[_Plain] = (
     ("skyless_mqtt_reconnects_total", "reconnects", "Connections that the node has made again."),
 )
 
-_ESCAPES: Final = str.maketrans({"\\": "\\\\", '"': '\\"', "\n": "\\n"})
-
-
-def family(name: str, kind: Literal["counter", "gauge"], text: str, samples: Iterable[Sample]) -> list[str]:
-    """Lines of one metric; none without samples. ``text`` is one line of help."""
-    lines = [_sample(name, labels, value) for labels, value in samples]
-    return [*_header(name, kind, text), *lines] if lines else []
-
-
-def histograms(
-    name: str, text: str, bounds: Sequence[float], samples: Iterable[tuple[Labels, Sequence[int], float]]
-) -> list[str]:
-    """Lines of a histogram: for each sample its labels, counts of the buckets, and the sum of values.
-
-    ``bounds``: upper limits of the buckets, ascending; one more count is for values above them all.
-    """
-    lines = []
-    for labels, counts, total in samples:
-        below = 0
-        for bound, count in zip((*bounds, inf), counts, strict=True):
-            below += count
-            lines.append(_sample(f"{name}_bucket", {**labels, "le": _number(bound)}, below))
-        lines += [_sample(f"{name}_sum", labels, total), _sample(f"{name}_count", labels, below)]
-    return [*_header(name, "histogram", text), *lines] if lines else []
-
-
-def _header(name: str, kind: str, text: str) -> list[str]:
-    return [f"# HELP {name} {text}", f"# TYPE {name} {kind}"]
-
-
-def _sample(name: str, labels: Labels, value: float) -> str:
-    inside = ",".join(f'{key}="{text.translate(_ESCAPES)}"' for key, text in labels.items())
-    return f"{name}{{{inside}}} {_number(value)}" if inside else f"{name} {_number(value)}"
-
-
-def _number(value: float) -> str:
-    if isnan(value):
-        return "NaN"
-    if isinf(value):
-        return "+Inf" if value > 0 else "-Inf"
-    return repr(value)
-
 
 class Rising:
     """A node's counter, which restarts at 0 with the node."""
@@ -168,8 +127,6 @@ class _Node:
         self.fix: FixMessage | None = None
         self.fix_s = 0.0
         """End of its last fix, on the clock of arrivals."""
-        self.latency_counts = [0] * (len(LATENCY_BOUNDS_S) + 1)
-        self.latency_sum_s = 0.0
 
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
         """Process the counters of its health message."""
@@ -185,7 +142,7 @@ class _Node:
                 self.dropped.setdefault(reason, Rising()).update(value, restarted=restarted)
 
 
-_Nodes = list[tuple[Labels, _Node]]
+_Nodes = Sequence[tuple[Labels, _Node]]
 
 
 class SiteMetrics:
@@ -197,6 +154,10 @@ class SiteMetrics:
         """Messages of uncounted nodes, by reason."""
         self.site: BridgedSite | None = None
         self._positions = positions
+        text = "From the end of a fix's last frame to the fix; of those fixes that came to the bridge."
+        self._latencies = Histogram(
+            "skyless_tag_latency_seconds", text, ["tag"], buckets=LATENCY_BOUNDS_S, registry=None
+        )
         self._tags: dict[str, _Node] = {}
         self._anchors: dict[str, _Node] = {}
 
@@ -208,8 +169,7 @@ class SiteMetrics:
         latency_s = max(fix.latency_s, 0.0)
         tag.fix, tag.fix_s = fix, now_s - latency_s
         tag.counters.setdefault(_FIXES, Rising()).update(fix.serial)
-        tag.latency_counts[bisect_left(LATENCY_BOUNDS_S, latency_s)] += 1
-        tag.latency_sum_s += latency_s
+        self._latencies.labels(fix.tag).observe(latency_s)
 
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
         """State of a tag or an anchor."""
@@ -239,137 +199,135 @@ class SiteMetrics:
 
     def text(self, now_s: float) -> str:
         """Everything in Prometheus's format."""
+        return generate_latest(_Scrape(self._families(now_s))).decode()
+
+    def _families(self, now_s: float) -> Iterator[Metric]:
+        if self.site is not None:
+            simulated = str(self.site.simulated).lower()
+            labels = {"site": str(self.site.id), "name": self.site.name, "simulated": simulated}
+            labels["version"] = installed_version()
+            yield from _gauge("skyless_site_info", "The site, as labels; the value is 1.", [(labels, 1)])
         tags: _Nodes = [({"tag": name}, tag) for name, tag in sorted(self._tags.items())]
         anchors: _Nodes = [({"anchor": name}, anchor) for name, anchor in sorted(self._anchors.items())]
-        groups = (("tag", self._tags), ("anchor", self._anchors))
-        links: _Nodes = [({"kind": kind, "name": name}, one) for kind, of in groups for name, one in sorted(of.items())]
-        lines = [
-            *self._site_lines(),
-            *self._tag_lines(tags, now_s),
-            *self._anchor_lines(anchors, now_s),
-            *_totals(_LINK_COUNTERS, links),
+        yield from _node_families("tag", _TAG_COUNTERS, tags)
+        yield from self._tag_families(tags, now_s)
+        yield from _node_families("anchor", _ANCHOR_COUNTERS, anchors)
+        yield from _anchor_families(anchors, now_s)
+        links: _Nodes = [
+            ({"kind": kind, "name": name}, node) for labels, node in (*tags, *anchors) for kind, name in labels.items()
         ]
-        return "\n".join([*lines, ""])
+        yield from _totals(_LINK_COUNTERS, links)
 
-    def _site_lines(self) -> list[str]:
-        if self.site is None:
-            return []
-        labels = {
-            "site": str(self.site.id),
-            "name": self.site.name,
-            "simulated": str(self.site.simulated).lower(),
-            "version": installed_version(),
-        }
-        return family("skyless_site_info", "gauge", "The site, as labels; the value is 1.", [(labels, 1)])
-
-    def _tag_lines(self, tags: _Nodes, now_s: float) -> Iterator[str]:
+    def _tag_families(self, tags: _Nodes, now_s: float) -> Iterator[Metric]:
         fixed = [(labels, fix, now_s - tag.fix_s) for labels, tag in tags if (fix := tag.fix) is not None]
         fresh = [(labels, fix) for labels, fix, age_s in fixed if age_s <= GAUGE_AGE_S]
-        yield from family("skyless_tag_online", "gauge", "Whether the tag's program is connected.", _online(tags))
-        yield from _totals(_TAG_COUNTERS, tags)
-        text = "Frames that the tag has dropped, by reason."
-        yield from family("skyless_tag_dropped_frames_total", "counter", text, _dropped(tags))
-        text = "From the end of a fix's last frame to the fix; of those fixes that came to the bridge."
-        latencies = [(labels, tag.latency_counts, tag.latency_sum_s) for labels, tag in tags if tag.fix is not None]
-        yield from histograms("skyless_tag_latency_seconds", text, LATENCY_BOUNDS_S, latencies)
-        text = "Time since the tag's last usable fix."
+        for latencies in self._latencies.collect():
+            latencies.samples = [one for one in latencies.samples if not one.name.endswith("_created")]
+            if latencies.samples:
+                yield latencies
         ages = [(labels, max(age_s, 0.0)) for labels, _, age_s in fixed]
-        yield from _gauge("skyless_tag_fix_age_seconds", text, ages)
+        yield from _gauge("skyless_tag_fix_age_seconds", "Time since the tag's last usable fix.", ages)
         yield from _gauges(_FIX_GAUGES, fresh)
-        text = "Anchors that the tag's last fix used."
-        yield from _gauge("skyless_tag_anchors", text, [(labels, len(fix.anchors)) for labels, fix in fresh])
+        used = [(labels, len(fix.anchors)) for labels, fix in fresh]
+        yield from _gauge("skyless_tag_anchors", "Anchors that the tag's last fix used.", used)
         text = "Protection level of the tag's last fix, horizontal or vertical."
-        levels = [
-            ({**labels, "axis": axis}, value)
-            for labels, fix in fresh
-            for axis, value in (("horizontal", fix.hpl_m), ("vertical", fix.vpl_m))
-        ]
+        levels = _by("axis", fresh, lambda fix: {"horizontal": fix.hpl_m, "vertical": fix.vpl_m})
         yield from _gauge("skyless_tag_protection_level_metres", text, levels)
-        healthy = [(labels, health) for labels, health in _fresh(tags, now_s) if isinstance(health, TagHealth)]
-        yield from _gauges(_TAG_GAUGES, healthy)
-        yield from _trust_lines([(labels, health) for labels, health in healthy if health.trust is not None], fresh)
         if self._positions:
             text = "Position of the tag's last fix in the site's frame."
-            positions = [
-                ({**labels, "axis": axis}, value)
-                for labels, fix in fresh
-                for axis, value in zip("xyz", fix.position_m, strict=True)
-            ]
+            positions = _by("axis", fresh, lambda fix: dict(zip("xyz", fix.position_m, strict=True)))
             yield from _gauge("skyless_tag_position_metres", text, positions)
+        healthy = [(labels, health) for labels, health in _fresh(tags, now_s) if isinstance(health, TagHealth)]
+        yield from _gauges(_TAG_GAUGES, healthy)
+        trusting = [(labels, health) for labels, health in healthy if health.trust is not None]
+        yield from _gauges(_KEY_GAUGES, trusting)
+        names = {labels["tag"] for labels, _ in trusting}
+        shares = [(labels, 1.0 - fix.unverified) for labels, fix in fresh if labels["tag"] in names]
+        text = "Share of the last second's beacons that were verified when the tag's last fix was made."
+        yield from _gauge("skyless_tag_verified_ratio", text, shares)
+        text = "Anchors whose beacons the tag has recently not accepted, by fault."
+        yield from _gauge("skyless_tag_not_accepted", text, _by("reason", trusting, _faults))
 
-    def _anchor_lines(self, anchors: _Nodes, now_s: float) -> Iterator[str]:
-        fresh = [(labels, health) for labels, health in _fresh(anchors, now_s) if isinstance(health, AnchorHealth)]
-        text = "Whether the anchor's program is connected."
-        yield from family("skyless_anchor_online", "gauge", text, _online(anchors))
-        yield from _totals(_ANCHOR_COUNTERS, anchors)
-        text = "Frames that the anchor has dropped, by reason."
-        yield from family("skyless_anchor_dropped_frames_total", "counter", text, _dropped(anchors))
-        text = "Time since the anchor's last health message."
-        ages = [(labels, max(now_s - one.health_s, 0.0)) for labels, one in anchors if one.health is not None]
-        yield from _gauge("skyless_anchor_health_age_seconds", text, ages)
-        yield from _gauges(_ANCHOR_GAUGES, fresh)
-        text = "Rate of the anchor's clock against the site's time, as a share."
-        rates = [(labels, None if h.rate_ppm is None else h.rate_ppm * 1e-6) for labels, h in fresh]
-        yield from _gauge("skyless_anchor_rate_ratio", text, rates)
-        text = "Whether the beacons of an anchor with keys have codes."
-        keyed = [(labels, h) for labels, h in fresh if h.chain is not None or h.code_fault is not None]
-        yield from _gauge("skyless_anchor_codes", text, [(labels, h.code_fault is None) for labels, h in keyed])
-        text = "Other anchors whose beacons an anchor with keys has recently not accepted, by fault."
-        yield from _gauge("skyless_anchor_not_accepted", text, _faults([(labels, h.faults) for labels, h in keyed]))
+
+def _anchor_families(anchors: _Nodes, now_s: float) -> Iterator[Metric]:
+    fresh = [(labels, health) for labels, health in _fresh(anchors, now_s) if isinstance(health, AnchorHealth)]
+    ages = [(labels, max(now_s - one.health_s, 0.0)) for labels, one in anchors if one.health is not None]
+    yield from _gauge("skyless_anchor_health_age_seconds", "Time since the anchor's last health message.", ages)
+    yield from _gauges(_ANCHOR_GAUGES, fresh)
+    text = "Rate of the anchor's clock against the site's time, as a share."
+    rates = [(labels, None if h.rate_ppm is None else h.rate_ppm * 1e-6) for labels, h in fresh]
+    yield from _gauge("skyless_anchor_rate_ratio", text, rates)
+    keyed = [(labels, h) for labels, h in fresh if h.chain is not None or h.code_fault is not None]
+    text = "Whether the beacons of an anchor with keys have codes."
+    yield from _gauge("skyless_anchor_codes", text, [(labels, h.code_fault is None) for labels, h in keyed])
+    text = "Other anchors whose beacons an anchor with keys has recently not accepted, by fault."
+    yield from _gauge("skyless_anchor_not_accepted", text, _by("reason", keyed, _faults))
+
+
+def _node_families(kind: str, counters: _Plain, nodes: _Nodes) -> Iterator[Metric]:
+    """What tags and anchors have in common."""
+    online = [(labels, node.online) for labels, node in nodes]
+    yield from _gauge(f"skyless_{kind}_online", f"Whether the {kind}'s program is connected.", online)
+    yield from _totals(counters, nodes)
+    text = f"Frames that the {kind} has dropped, by reason."
+    dropped = _by("reason", nodes, lambda node: {why: one.total for why, one in sorted(node.dropped.items())})
+    yield from _family(CounterMetricFamily, f"skyless_{kind}_dropped_frames_total", text, dropped)
 
 
 def _fresh(nodes: _Nodes, now_s: float) -> list[tuple[Labels, TagHealth | AnchorHealth]]:
     return [(labels, one.health) for labels, one in nodes if one.health and now_s - one.health_s <= GAUGE_AGE_S]
 
 
-def _trust_lines(
-    trusting: Sequence[tuple[Labels, TagHealth]], fresh: Iterable[tuple[Labels, FixMessage]]
-) -> Iterator[str]:
-    """Figures of tags with the site's public key."""
-    names = {labels["tag"] for labels, _ in trusting}
-    yield from _gauges(_KEY_GAUGES, trusting)
-    text = "Share of the last second's beacons that were verified when the tag's last fix was made."
-    shares = [(labels, 1.0 - fix.unverified) for labels, fix in fresh if labels["tag"] in names]
-    yield from _gauge("skyless_tag_verified_ratio", text, shares)
-    text = "Anchors whose beacons the tag has recently not accepted, by fault."
-    yield from _gauge("skyless_tag_not_accepted", text, _faults([(labels, h.faults) for labels, h in trusting]))
-
-
-def _faults(nodes: Iterable[tuple[Labels, Mapping[str, str]]]) -> list[tuple[Labels, float]]:
+def _faults(health: TagHealth | AnchorHealth) -> dict[str, int]:
     """Number of anchors for each fault stated by a node."""
-    return [
-        ({**labels, "reason": fault}, count)
-        for labels, faults in nodes
-        for fault, count in sorted(Counter(faults.values()).items())[:_MAX_REASONS]
-    ]
+    return dict(sorted(Counter(health.faults.values()).items())[:_MAX_REASONS])
 
 
-def _gauge(name: str, text: str, values: Iterable[tuple[Labels, float | None]]) -> list[str]:
-    samples = [(labels, float(value)) for labels, value in values if value is not None]
-    return family(name, "gauge", text, samples)
+def _by(
+    label: str, sources: Iterable[tuple[Labels, _T]], read: Callable[[_T], Mapping[str, float | None]]
+) -> Iterator[tuple[Labels, float | None]]:
+    """Samples of each source by one more label."""
+    for labels, source in sources:
+        for key, value in read(source).items():
+            yield {**labels, label: key}, value
 
 
-def _gauges(plain: _Plain, messages: Sequence[tuple[Labels, object]]) -> Iterator[str]:
+def _family(
+    kind: type[GaugeMetricFamily] | type[CounterMetricFamily], name: str, text: str, samples: Samples
+) -> Iterator[Metric]:
+    """One metric; none without samples. ``text`` is one line of help."""
+    given = [(labels, float(value)) for labels, value in samples if value is not None]
+    if given:
+        family = kind(name, text, labels=list(given[0][0]))
+        for labels, value in given:
+            family.add_metric(list(labels.values()), value)
+        yield family
+
+
+def _gauge(name: str, text: str, samples: Samples) -> Iterator[Metric]:
+    return _family(GaugeMetricFamily, name, text, samples)
+
+
+def _gauges(plain: _Plain, messages: Iterable[tuple[Labels, object]]) -> Iterator[Metric]:
     for name, field, text in plain:
         yield from _gauge(name, text, [(labels, getattr(message, field)) for labels, message in messages])
 
 
-def _totals(plain: _Plain, nodes: _Nodes) -> Iterator[str]:
+def _totals(plain: _Plain, nodes: _Nodes) -> Iterator[Metric]:
     for name, _, text in plain:
         totals = [(labels, one.counters[name].total) for labels, one in nodes if name in one.counters]
-        yield from family(name, "counter", text, totals)
+        yield from _family(CounterMetricFamily, name, text, totals)
 
 
-def _online(nodes: _Nodes) -> list[Sample]:
-    return [(labels, int(node.online)) for labels, node in nodes if node.online is not None]
+class _Scrape(Collector):
+    """The metrics of one scrape."""
 
+    def __init__(self, families: Iterable[Metric]) -> None:
+        self._families = families
 
-def _dropped(nodes: _Nodes) -> list[Sample]:
-    return [
-        ({**labels, "reason": reason}, counter.total)
-        for labels, node in nodes
-        for reason, counter in sorted(node.dropped.items())
-    ]
+    def collect(self) -> Iterable[Metric]:
+        """Return them."""
+        return self._families
 
 
 class Prometheus(Target):
@@ -453,7 +411,7 @@ class Prometheus(Target):
         if method not in (b"GET", b"HEAD"):
             return _response("405 Method Not Allowed", "only GET is answered here\n")
         if path == b"/metrics":
-            whole = _response("200 OK", self.metrics.text(time.monotonic()), CONTENT_TYPE)
+            whole = _response("200 OK", self.metrics.text(time.monotonic()), CONTENT_TYPE_PLAIN_0_0_4)
         else:
             whole = _response("404 Not Found", "the figures are at /metrics\n")
         return whole if method == b"GET" else whole.partition(b"\r\n\r\n")[0] + b"\r\n\r\n"
