@@ -11,26 +11,29 @@ import asyncio
 import os
 import queue
 import re
-import struct
 import threading
-from functools import cache
+from functools import cache, partial
 from importlib import import_module
 from math import floor, isfinite, nan
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
 from msgspec import Struct
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl, floored
+from skyless.core.arrays import Array
 from skyless.core.earth import geodetic, rotated
 from skyless.core.errors import SkylessError
 from skyless.machine import what_to_install
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, Matrix, TagHealth, Vector
 
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
+
 # From fixes to messages of ROS 2: names of topics, types, and the bytes of each message.
 #
 # Definitions of the messages and the meaning of their fields: the packages ``common_interfaces`` and ``geometry2`` of
-# ROS 2; names of topics: REP 144 and https://design.ros2.org/articles/topic_and_service_names.html. The bytes are
-# little endian CDR (OMG DDSI-RTPS 2.5, section 10; DDS-XTypes 1.3, section 7.4.1, XCDR version 1 of final types), the
+# ROS 2; names of topics: REP 144 and https://design.ros2.org/articles/topic_and_service_names.html. The bytes are the
 # same in DDS and in a bag.
 
 SITE_FRAME: Final = "site"
@@ -45,8 +48,6 @@ FRAME_RULE: Final = "a frame's name: letters, digits, _, - and /, not a / first"
 UNKNOWN_VARIANCE: Final = 1e6
 """Variance of each angle [rad²] and of its rate: a tag does not know its orientation."""
 
-_NO_TURN: Final = (0.0, 0.0, 0.0, 1.0)
-_ANGLES: Final = 3
 _STATUS_NO_FIX, _STATUS_FIX = -1, 0
 _SERVICE_UNKNOWN: Final = 0
 """No satellite system: a figure that ROS gave a name after Humble."""
@@ -54,8 +55,8 @@ _SERVICE_UNKNOWN: Final = 0
 _COVARIANCE_UNKNOWN, _COVARIANCE_KNOWN = 0, 3
 _OK, _WARN, _ERROR = 0, 1, 2
 _CUBE, _TEXT_VIEW_FACING = 1, 9
+_ADD: Final = 0
 _ANCHOR_SIZE_M: Final = 0.15
-_LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
 
 
 # Types of messages, ``package/msg/Name``.
@@ -134,9 +135,8 @@ class RosEncoder:
 
     def on_truth(self, tag: str, unix_s: float, position_m: Vector) -> list[RosMessage]:
         """True pose of a simulated tag."""
-        writer = _stamped(unix_s, self._settings.frame)
-        writer.add("d", *position_m, *_NO_TURN)
-        return [RosMessage(self._topic(tag, "truth"), TRUE_POSE, writer.message())]
+        data = _cdr(TRUE_POSE, _header(unix_s, self._settings.frame), _pose_at(position_m))
+        return [RosMessage(self._topic(tag, "truth"), TRUE_POSE, data)]
 
     def _topic(self, tag: str, what: str) -> str:
         return f"/{self._settings.namespace}/{self._name(tag)}/{what}"
@@ -168,49 +168,46 @@ def stamp_of(unix_s: float) -> tuple[int, int]:
     return seconds + nanoseconds // 1_000_000_000, nanoseconds % 1_000_000_000
 
 
-class CdrWriter:
-    """Collects the fields of one message in order, each aligned to its own size after the header."""
-
-    def __init__(self) -> None:
-        self._data = bytearray()
-
-    def add(self, code: str, *values: float) -> None:
-        """Add numbers of one of ``struct``'s types: ``B b H h I i f d``; ``?`` for flags. Raises struct.error."""
-        size = struct.calcsize(f"<{code}")
-        self._data += bytes(-len(self._data) % size)
-        self._data += struct.pack(f"<{len(values)}{code}", *values)
-
-    def add_text(self, text: str) -> None:
-        """Add a string: its length with the final NUL, then both. Other NULs are omitted."""
-        data = text.replace("\0", "").encode() + b"\0"
-        self.add("I", len(data))
-        self._data += data
-
-    def message(self) -> bytes:
-        """The whole message with its header."""
-        return _LITTLE_ENDIAN + bytes(self._data)
+@cache
+def type_store() -> "Typestore":
+    """Definitions of ROS 2's messages, the same in all releases served. Raises ImportError without rosbags."""
+    typesys = import_module("rosbags.typesys")
+    store: Typestore = typesys.get_typestore(typesys.Stores.ROS2_KILTED)
+    return store
 
 
-def _stamped(unix_s: float, frame: str) -> CdrWriter:
-    """A message that begins with ``std_msgs/Header``."""
-    writer = CdrWriter()
-    _add_header(writer, unix_s, frame)
-    return writer
+def _made(name: str, *fields: object) -> object:
+    """A message or a part of one, from its fields in order."""
+    kind: Any = type_store().types[name]
+    made: object = kind(*fields)
+    return made
 
 
-def _add_header(writer: CdrWriter, unix_s: float, frame: str) -> None:
-    seconds, nanoseconds = stamp_of(unix_s)
-    writer.add("i", seconds)
-    writer.add("I", nanoseconds)
-    writer.add_text(frame)
+def _cdr(name: str, *fields: object) -> bytes:
+    """A whole message as CDR."""
+    return bytes(type_store().serialize_cdr(_made(name, *fields), name))
+
+
+_point: Final = partial(_made, "geometry_msgs/msg/Point")
+_vector: Final = partial(_made, "geometry_msgs/msg/Vector3")
+
+
+def _header(unix_s: float, frame: str) -> object:
+    return _made("std_msgs/msg/Header", _made("builtin_interfaces/msg/Time", *stamp_of(unix_s)), frame)
+
+
+def _no_turn() -> object:
+    return _made("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+
+
+def _pose_at(position_m: Vector) -> object:
+    return _made("geometry_msgs/msg/Pose", _point(*position_m), _no_turn())
 
 
 def _pose(fix: FixMessage, covariance_m2: Matrix, frame: str) -> bytes:
     """``geometry_msgs/PoseWithCovarianceStamped``: 36 entries in the order x, y, z and rotations about them."""
-    writer = _stamped(fix.unix_s, frame)
-    writer.add("d", *fix.position_m, *_NO_TURN)
-    writer.add("d", *_with_angles(covariance_m2))
-    return writer.message()
+    pose = _made("geometry_msgs/msg/PoseWithCovariance", _pose_at(fix.position_m), _with_angles(covariance_m2))
+    return _cdr(POSE, _header(fix.unix_s, frame), pose)
 
 
 def _velocity(fix: FixMessage, frame: str) -> bytes | None:
@@ -219,17 +216,16 @@ def _velocity(fix: FixMessage, frame: str) -> bytes | None:
         return None
     if not all(map(isfinite, (*fix.velocity_mps, *fix.velocity_covariance))):
         return None
-    writer = _stamped(fix.unix_s, frame)
-    writer.add("d", *fix.velocity_mps, *(0.0,) * _ANGLES)
-    writer.add("d", *_with_angles(fix.velocity_covariance))
-    return writer.message()
+    twist = _made("geometry_msgs/msg/Twist", _vector(*fix.velocity_mps), _vector(0.0, 0.0, 0.0))
+    covariance = _with_angles(fix.velocity_covariance)
+    return _cdr(TWIST, _header(fix.unix_s, frame), _made("geometry_msgs/msg/TwistWithCovariance", twist, covariance))
 
 
-def _with_angles(covariance: Matrix) -> list[float]:
+def _with_angles(covariance: Matrix) -> Array:
     """A 6 × 6 covariance row by row: the given 3 × 3 and unknown angles."""
-    rows = [[*covariance[3 * row : 3 * row + 3], *(0.0,) * _ANGLES] for row in range(3)]
-    angles = [[UNKNOWN_VARIANCE * (row == column) for column in range(3, 6)] for row in range(3, 6)]
-    return [value for row in (*rows, *([0.0, 0.0, 0.0, *angle] for angle in angles)) for value in row]
+    whole = np.diag((0.0, 0.0, 0.0, *(UNKNOWN_VARIANCE,) * 3))
+    whole[:3, :3] = np.reshape(covariance, (3, 3))
+    return whole.ravel()
 
 
 def _nav_sat_fix(frame: str, unix_s: float, earth: Vector | None, covariance_m2: Matrix | None) -> bytes:
@@ -237,23 +233,18 @@ def _nav_sat_fix(frame: str, unix_s: float, earth: Vector | None, covariance_m2:
 
     Without a position: status no fix, NaN, unknown covariance.
     """
-    writer = _stamped(unix_s, frame)
-    writer.add("b", _STATUS_NO_FIX if earth is None else _STATUS_FIX)
-    writer.add("H", _SERVICE_UNKNOWN)
-    writer.add("d", *((nan, nan, nan) if earth is None else earth))
-    writer.add("d", *((0.0,) * 9 if covariance_m2 is None else covariance_m2))
-    writer.add("B", _COVARIANCE_UNKNOWN if covariance_m2 is None else _COVARIANCE_KNOWN)
-    return writer.message()
+    status = _made("sensor_msgs/msg/NavSatStatus", _STATUS_NO_FIX if earth is None else _STATUS_FIX, _SERVICE_UNKNOWN)
+    place = (nan, nan, nan) if earth is None else earth
+    covariance = np.zeros(9) if covariance_m2 is None else np.array(covariance_m2)
+    kind = _COVARIANCE_UNKNOWN if covariance_m2 is None else _COVARIANCE_KNOWN
+    return _cdr(NAV_SAT_FIX, _header(unix_s, frame), status, *place, covariance, kind)
 
 
 def _transform(fix: FixMessage, frame: str, child: str) -> bytes:
     """``tf2_msgs/TFMessage`` with one transform."""
-    writer = CdrWriter()
-    writer.add("I", 1)
-    _add_header(writer, fix.unix_s, frame)
-    writer.add_text(child)
-    writer.add("d", *fix.position_m, *_NO_TURN)
-    return writer.message()
+    transform = _made("geometry_msgs/msg/Transform", _vector(*fix.position_m), _no_turn())
+    stamped = _made("geometry_msgs/msg/TransformStamped", _header(fix.unix_s, frame), child, transform)
+    return _cdr(TRANSFORMS, [stamped])
 
 
 def _diagnostics(health: TagHealth | AnchorHealth) -> bytes:
@@ -276,53 +267,39 @@ def _diagnostics(health: TagHealth | AnchorHealth) -> bytes:
         message = health.role if health.synchronised else "not synchronised"
         values = {"master": health.master, "offset_std_m": health.offset_std_m, "sent": health.sent}
     values |= {f"dropped {reason}": count for reason, count in sorted(health.counters.items())}
-    writer = _stamped(health.unix_s, "")
-    writer.add("I", 1)
-    writer.add("B", level)
-    for text in (f"skyless: {name}", message, name):
-        writer.add_text(text)
-    writer.add("I", len(values))
-    for key, value in values.items():
-        writer.add_text(key)
-        writer.add_text("" if value is None else str(value))
-    return writer.message()
+    pairs = [
+        _made("diagnostic_msgs/msg/KeyValue", _text(key), "" if value is None else _text(str(value)))
+        for key, value in values.items()
+    ]
+    texts = map(_text, (f"skyless: {name}", message, name))
+    status = _made("diagnostic_msgs/msg/DiagnosticStatus", level, *texts, pairs)
+    return _cdr(DIAGNOSTICS, _header(health.unix_s, ""), [status])
+
+
+def _text(text: str) -> str:
+    """Text without NULs, which end a string."""
+    return text.replace("\0", "")
 
 
 def _markers(site: BridgedSite, frame: str) -> bytes:
     """``visualization_msgs/MarkerArray``: a cube and its number for each anchor."""
-    writer = CdrWriter()
-    writer.add("I", 2 * len(site.anchors_m))
+    markers = []
     for number, (x, y, z) in sorted(site.anchors_m.items()):
         above = (x, y, z + 2.0 * _ANCHOR_SIZE_M)
-        _add_marker(writer, frame, "anchors", number, _CUBE, (x, y, z), "")
-        _add_marker(writer, frame, "anchor_numbers", number, _TEXT_VIEW_FACING, above, str(number))
-    return writer.message()
+        markers.append(_marker(frame, "anchors", number, _CUBE, (x, y, z), ""))
+        markers.append(_marker(frame, "anchor_numbers", number, _TEXT_VIEW_FACING, above, str(number)))
+    return _cdr(MARKERS, markers)
 
 
-def _add_marker(
-    writer: CdrWriter, frame: str, kind: str, number: int, shape: int, position_m: Vector, text: str
-) -> None:
-    _add_header(writer, 0.0, frame)
-    writer.add_text(kind)
-    writer.add("i", number, shape, 0)  # action 0: add or change
-    writer.add("d", *position_m, *_NO_TURN)
-    writer.add("d", *(_ANCHOR_SIZE_M,) * 3)
-    writer.add("f", 1.0, 0.6, 0.0, 1.0)
-    writer.add("i", 0)  # lifetime: for ever
-    writer.add("I", 0)
-    writer.add("?", True)  # follows its frame
-    writer.add("I", 0)  # points
-    writer.add("I", 0)  # colours
-    writer.add_text("")  # texture: name, and an image of none
-    _add_header(writer, 0.0, "")
-    writer.add_text("")
-    writer.add("I", 0)
-    writer.add("I", 0)  # texture coordinates
-    writer.add_text(text)
-    writer.add_text("")  # mesh: name, and a file of none
-    writer.add_text("")
-    writer.add("I", 0)
-    writer.add("?", False)
+def _marker(frame: str, kind: str, number: int, shape: int, position_m: Vector, text: str) -> object:
+    """One that lasts for ever and follows its frame."""
+    size = _vector(*(_ANCHOR_SIZE_M,) * 3)
+    colour = _made("std_msgs/msg/ColorRGBA", 1.0, 0.6, 0.0, 1.0)
+    lifetime = _made("builtin_interfaces/msg/Duration", 0, 0)
+    texture = _made("sensor_msgs/msg/CompressedImage", _header(0.0, ""), "", np.zeros(0, np.uint8))
+    mesh = _made("visualization_msgs/msg/MeshFile", "", np.zeros(0, np.uint8))
+    at = _header(0.0, frame), kind, number, shape, _ADD, _pose_at(position_m), size, colour, lifetime, True
+    return _made("visualization_msgs/msg/Marker", *at, [], [], "", texture, [], text, "", mesh, False)
 
 
 DEPTH: Final = 10
@@ -344,9 +321,8 @@ class DdsTypes:
     def __init__(self) -> None:
         self._idl: Any = import_module("cyclonedds.idl")
         self._kinds: Any = import_module("cyclonedds.idl.types")
-        typesys = import_module("rosbags.typesys")
         self._node = import_module("rosbags.interfaces").Nodetype
-        self._store: Any = typesys.get_typestore(typesys.Stores.ROS2_KILTED)
+        self._store: Any = type_store()
         self._made: dict[str, Any] = {}
 
     def hash(self, name: str) -> str:

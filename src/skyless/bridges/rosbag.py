@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final, Literal, cast
 
 from msgspec import Struct
 
-from skyless.bridges.ros2 import RosEncoder, RosMessage, RosSettings
+from skyless.bridges.ros2 import RosEncoder, RosMessage, RosSettings, type_store
 from skyless.bridges.target import bridged_site, is_usable
 from skyless.core.errors import ConfigurationError, SkylessError, writing
 from skyless.machine import extra_module
@@ -25,7 +25,6 @@ from skyless.run.recordings.recording import NS, McapRecording, Recorded
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection, Qos
     from rosbags.rosbag2 import Writer
-    from rosbags.typesys.store import Typestore
 
 BagVersion = Literal[8, 9]
 """Version of the folder's metadata: 8 for Humble and Iron, 9 from Jazzy on."""
@@ -137,10 +136,9 @@ class _BagWriter:
 
     def __init__(self, folder: Path, version: BagVersion) -> None:
         """Raises SkylessError if the package that writes bags is missing."""
-        rosbag2, typesys = (extra_module(f"rosbags.{part}", "a bag of ROS 2") for part in ("rosbag2", "typesys"))
+        rosbag2 = extra_module("rosbags.rosbag2", "a bag of ROS 2")
         self._writer: Writer = rosbag2.Writer(folder, version=version, storage_plugin=rosbag2.StoragePlugin.MCAP)
         self._writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
-        self._types: Typestore = typesys.get_typestore(typesys.Stores.ROS2_KILTED)
         self._topics: dict[str, Connection] = {}
 
     def __enter__(self) -> "_BagWriter":
@@ -160,7 +158,7 @@ class _BagWriter:
             topic = self._topics[message.topic] = self._writer.add_connection(
                 message.topic,
                 message.type,
-                typestore=self._types,
+                typestore=type_store(),
                 offered_qos_profiles=[_quality(lasting=message.lasting)],
             )
         self._writer.write(topic, round(time_s * NS), message.data)
