@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from skyless.cli.api.replay import open_recording as open_recording
     from skyless.cli.api.replay import replay as replay
     from skyless.cli.api.simulate import SimulationResult as SimulationResult
-    from skyless.cli.api.simulate import StudyResult as StudyResult
     from skyless.cli.api.simulate import simulate as simulate
-    from skyless.cli.api.simulate import study as study
+    from skyless.cli.api.study import StudyResult as StudyResult
+    from skyless.cli.api.study import study as study
     from skyless.cli.api.survey import BiasResult as BiasResult
     from skyless.cli.api.survey import SurveyResult as SurveyResult
     from skyless.cli.api.survey import survey_site as survey_site
@@ -62,7 +62,7 @@ _MODULES: Final = {
     "Site": "skyless.core.site",
     "SkylessError": "skyless.core.errors",
     "SiteTrust": "skyless.core.trusted_receiver",
-    "StudyResult": "skyless.cli.api.simulate",
+    "StudyResult": "skyless.cli.api.study",
     "SurveyResult": "skyless.cli.api.survey",
     "Transmission": "skyless.core.air.frame",
     "Trust": "skyless.core.trusted_receiver",
@@ -75,7 +75,7 @@ _MODULES: Final = {
     "plan": "skyless.cli.api.plan",
     "replay": "skyless.cli.api.replay",
     "simulate": "skyless.cli.api.simulate",
-    "study": "skyless.cli.api.simulate",
+    "study": "skyless.cli.api.study",
     "survey_site": "skyless.cli.api.survey",
 }
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.cli.api.simulate import StudyResult
+from skyless.cli.api.study import StudyResult
 from skyless.cli.study import print_rows
 from skyless.core.alert import Alert
 from skyless.core.integrity import Integrity

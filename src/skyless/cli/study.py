@@ -33,7 +33,7 @@ from skyless.files import write_whole
 from skyless.research.replays.options import check_estimator, read_estimator
 
 if TYPE_CHECKING:
-    from skyless.cli.api.simulate import StudyResult
+    from skyless.cli.api.study import StudyResult
     from skyless.research.masterless.smoothing import OwnEstimator
     from skyless.research.studies.runner import Row
 
@@ -97,7 +97,7 @@ class _Output(JsonOptions, frozen=True, kw_only=True):
 def study(asked: StudyOptions, output: _Output) -> None:
     """Measure errors over many simulated runs: a table with standard errors, a picture, JSON."""
     check_picture(output.plot)
-    from skyless.cli.api.simulate import run_study
+    from skyless.cli.api.study import run_study
     from skyless.research.studies.run import way_on
 
     try:
