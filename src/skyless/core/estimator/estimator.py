@@ -1,7 +1,7 @@
 """The estimator of one tag for Python: packet by packet, or many in one compiled loop, with the same bits."""
 
 from collections.abc import Sequence
-from math import sqrt
+from math import isfinite, sqrt
 from typing import Any, Final
 
 import numpy as np
@@ -227,7 +227,7 @@ class Estimator:
 
     def process_difference(self, a: int, b: int, rx_ticks: int, difference_m: float) -> int:
         """Process a ready-made difference of ranges, to anchor b minus to anchor a, as ``process`` does."""
-        if not np.isfinite(difference_m):
+        if not isfinite(difference_m):
             return REJECTED
         return compiled.process_difference(self._state, self._known[a][1], self._known[b][1], rx_ticks, difference_m)
 

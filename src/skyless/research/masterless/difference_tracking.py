@@ -41,6 +41,8 @@ DIFFERENCES: Final = EstimatorSettings(
 """Settings from recorded flights of DW1000s (docs/recordings.md): reflections change within half a metre, by amounts
 that differ between anchors."""
 
+_XX, _YY, _ZZ = (at(axis, axis) for axis in range(3))
+
 
 class DifferenceTracking:
     """Tracks one tag from differences of its ranges to pairs of anchors."""
@@ -75,6 +77,8 @@ class DifferenceTracking:
         self._window: deque[PairTdoa] = deque(maxlen=int(TUNING.window))
         self._begin_s = self._newest_s = 0.0
         self._received_s: dict[int, float] = {}
+        self._in_use: tuple[tuple[int, ...], Array] = ((), np.empty((0, 3)))
+        """The anchors of the newest fix, and their positions."""
         self._tried_s = -np.inf
         self._start: Start | None = None
         self._is_confirmed = False
@@ -111,10 +115,10 @@ class DifferenceTracking:
     def _update_positions(self, pair: PairTdoa) -> bool:
         """Take positions from a difference. Returns whether the positions of both anchors are known."""
         positions_m = self._positions_m
-        if pair.a_m is not None:
-            positions_m[pair.anchor_a] = np.array(pair.a_m)
-        if pair.b_m is not None:
-            positions_m[pair.anchor_b] = np.array(pair.b_m)
+        for anchor, place_m in ((pair.anchor_a, pair.a_m), (pair.anchor_b, pair.b_m)):
+            if place_m is not None:
+                positions_m[anchor] = np.array(place_m)
+                self._in_use = ((), self._in_use[1])
         return pair.anchor_a in positions_m and pair.anchor_b in positions_m
 
     def _add(self, pair: PairTdoa) -> bool:
@@ -160,14 +164,14 @@ class DifferenceTracking:
     def _is_plausible(self) -> bool:
         """Whether the state is near the anchors, where differences have information, and accurate enough."""
         start, state, dim = self._start, self._estimator.state, self._estimator.dim
-        if start is None or not start.holds(self._estimator.position_m()):
+        if start is None or not is_within(start.corners_m, self.position_m[:dim]):
             self.reason = NoFixReason.NOT_CONVERGED
             self._stop()
             return False
-        if state.P[at(0, 0)] + state.P[at(1, 1)] > TUNING.most_horizontal_std_m**2:
+        if state.P[_XX] + state.P[_YY] > TUNING.most_horizontal_std_m**2:
             self.reason = NoFixReason.ACQUIRING
             return False
-        if dim == 3 and state.P[at(2, 2)] > TUNING.most_horizontal_std_m**2:
+        if dim == 3 and state.P[_ZZ] > TUNING.most_horizontal_std_m**2:
             self.reason = NoFixReason.BAD_GEOMETRY
             return False
         return True
@@ -175,15 +179,17 @@ class DifferenceTracking:
     @property
     def position_m(self) -> tuple[float, float, float]:
         """The newest position."""
-        x, y, *z = self._estimator.position_m().tolist()
-        return x, y, z[0] if z else self._settings.height_m
+        x = self._estimator.state.x
+        return x[0], x[1], x[2] if self._estimator.dim == 3 else self._settings.height_m
 
     def fix(self) -> Fix:
         """The newest fix; only after an ``update`` that gave one."""
-        used = [anchor for anchor, when_s in self._received_s.items() if self._newest_s - when_s <= TUNING.start_age_s]
-        anchors_m = np.array([self._positions_m[anchor] for anchor in used]).reshape(-1, 3)
+        now_s, age_s = self._newest_s, TUNING.start_age_s
+        used = tuple([anchor for anchor, when_s in self._received_s.items() if now_s - when_s <= age_s])
+        if used != self._in_use[0]:
+            self._in_use = used, np.array([self._positions_m[anchor] for anchor in used]).reshape(-1, 3)
         rows, known = self._estimator.rows, self._settings.known_height_m is not None
-        return Fix(self._newest_s, rows, tuple(used), anchors_m, "joint", known, 1, self._asked)
+        return Fix(self._newest_s, rows, used, self._in_use[1], "joint", known, 1, self._asked)
 
     def _stop(self) -> None:
         """Forget the state, so that a new start is searched for."""
@@ -245,6 +251,10 @@ class DifferenceTracking:
 JOINING_STEPS: Final = 4  # iterations of reweighted least squares
 
 
+Corners = tuple[tuple[float, ...], tuple[float, ...]]
+"""Opposite corners of a space, x, y and z each."""
+
+
 class Start(Struct, frozen=True):
     """Initial state of a filter."""
 
@@ -256,26 +266,22 @@ class Start(Struct, frozen=True):
     """Expected lateness of each anchor, and its variance."""
     is_ambiguous: bool
     """Whether another position fits nearly as well, or some anchor is late."""
-    corners_m: Array
-    """Opposite corners of the neighbourhood of the anchors, shape (2, 3)."""
-
-    def holds(self, position_m: Array) -> bool:
-        """Whether a position, of two or three coordinates, is in the neighbourhood of the anchors."""
-        return is_within(self.corners_m, position_m)
+    corners_m: Corners
+    """Of the neighbourhood of the anchors."""
 
 
-def neighbourhood_m(anchors_m: Array) -> Array:
-    """Opposite corners of the space around the anchors in which time differences have information, shape (2, 3)."""
+def neighbourhood_m(anchors_m: Array) -> Corners:
+    """Corners of the space around the anchors in which time differences have information."""
     low, high = anchors_m.min(axis=0), anchors_m.max(axis=0)
     reach_m = TUNING.neighbourhood * np.linalg.norm((high - low)[:2])
-    corners_m: Array = (low + high) / 2.0 + np.outer((-reach_m, reach_m), np.ones(3))
-    return corners_m
+    middle_m = (low + high) / 2.0
+    return tuple((middle_m - reach_m).tolist()), tuple((middle_m + reach_m).tolist())
 
 
-def is_within(corners_m: Array, position_m: Array) -> bool:
+def is_within(corners_m: Corners, position_m: Sequence[float]) -> bool:
     """Whether a position, of two or three coordinates, is between two corners."""
-    low_m, high_m = corners_m[:, : len(position_m)]
-    return bool(np.all((low_m <= position_m) & (position_m <= high_m)))
+    low_m, high_m = corners_m
+    return all(low <= at_m <= high for low, at_m, high in zip(low_m, position_m, high_m, strict=False))
 
 
 def find_start(
@@ -336,7 +342,7 @@ def find_start(
     late = dict(zip(anchors, np.tensordot(weights, lates, 1).T.tolist(), strict=True))
     is_ambiguous = bool(has_rival) or sum(variance for _, variance in late.values()) > 0.5 * TUNING.late_std_m**2
     start = Start(position_m, covariance_m2, late, is_ambiguous, neighbourhood_m(anchors_m))
-    if not start.holds(position_m[:dim]):
+    if not is_within(start.corners_m, position_m[:dim].tolist()):
         return NoSolution(NoFixReason.NOT_CONVERGED, "the position lies far from all anchors")
     return start
 

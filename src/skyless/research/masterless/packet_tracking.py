@@ -28,7 +28,7 @@ from skyless.core.ticks import (
     fix_time_s,
     nearest,
 )
-from skyless.research.masterless.difference_tracking import DIFFERENCES, is_within, neighbourhood_m
+from skyless.research.masterless.difference_tracking import DIFFERENCES, Corners, is_within, neighbourhood_m
 from skyless.research.masterless.pair_engine import MAX_ANCHORS, remember
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
 
@@ -136,7 +136,7 @@ class PacketTracking:
         self._pairs: set[tuple[int, int]] | None = None if one_way is None else set()
         """Pairs of listener and sender in relays, until two anchors have relayed each other."""
         self._tracking = self._new_tracking()
-        self._area_m = np.zeros((2, 3))
+        self._area_m: Corners = ((), ())
         self._drops: Counter[str] = Counter()
         self._rejected_before = self._rejected_now = 0
 
@@ -233,7 +233,7 @@ class PacketTracking:
             x_m, y_m, z_m = fix.position_m.tolist()
             self.position_m, self.time_s = (x_m, y_m, z_m), fix.time_s
             covariance = fix.covariance_m2
-            if not is_within(self._area_m, fix.position_m[:2]):
+            if not is_within(self._area_m, fix.position_m[:2].tolist()):
                 fix = NoFixReason.NOT_CONVERGED
                 self._tracking = self._new_tracking()
             elif covariance.item(0) + covariance.item(4) > TUNING.most_horizontal_std_m**2:

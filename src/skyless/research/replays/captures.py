@@ -2,7 +2,7 @@
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from itertools import islice
 from pathlib import Path
@@ -128,8 +128,8 @@ class Pipeline:
 
     def __init__(self, engine: PairEngine | None, noise: NoiseByPair) -> None:
         self._engine, self._noise = engine, noise
-        self.measured: Sequence[Measured] = ()
-        """Input of the estimator in the last ``process`` or ``rest``."""
+        self.measured: Iterable[Measured] = ()
+        """Input of the estimator in the last ``process`` or ``rest``; to be read once."""
 
     def process(self, record: Record) -> tuple[float | None, Fix | None]:
         """Process one record. Returns the time of its differences, and a fix if it made one."""
@@ -160,8 +160,8 @@ class Pipeline:
         return found
 
 
-def _measured(pairs: Iterable[PairTdoa], used: Iterable[bool]) -> Sequence[Measured]:
-    return [(pair.time_s, pair, is_used) for pair, is_used in zip(pairs, used, strict=True)]
+def _measured(pairs: Iterable[PairTdoa], used: Iterable[bool]) -> Iterator[Measured]:
+    return ((pair.time_s, pair, is_used) for pair, is_used in zip(pairs, used, strict=True))
 
 
 class ByPairs(Pipeline):
