@@ -21,7 +21,6 @@ EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
     admission.admit_sender,
     admission.admit_stamp,
     hearing.begin_tag,
-    hearing.begin_here,
     hearing.wake,
     hearing.hear_frame,
     hearing.hear_fields,

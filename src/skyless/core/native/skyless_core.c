@@ -409,6 +409,7 @@ INTERNAL real float_at(uint8_t *data, int32_t at);
 INTERNAL void handle_events(Tag *t, Acquisition *q);
 INTERNAL void forget_stamps(Tag *t, Acquisition *q);
 INTERNAL void read_pages(Tag *t);
+INTERNAL void begin_here(Tag *t, Acquisition *q);
 INTERNAL void begin_with_pages(Tag *t, Acquisition *q);
 INTERNAL void forget_unconfirmed(Tag *t, Acquisition *q);
 INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame);
@@ -6896,7 +6897,7 @@ INTERNAL void forget_stamps(Tag *t, Acquisition *q) {
     forget_all(q);
     forget_moves(t);
     if (t->pages.issue != NO_ISSUE) {
-        skyless_begin_here(t, q);
+        begin_here(t, q);
     }
 }
 
@@ -6918,7 +6919,7 @@ INTERNAL void read_pages(Tag *t) {
 }
 
 /* Start with the pages in use. */
-SKYLESS_EXPORT void skyless_begin_here(Tag *t, Acquisition *q) {
+INTERNAL void begin_here(Tag *t, Acquisition *q) {
     read_pages(t);
     skyless_begin_course(&t->course, q);
     t->has_settings = true;
@@ -6943,7 +6944,7 @@ INTERNAL void begin_with_pages(Tag *t, Acquisition *q) {
     if (t->course.is_starting) {
         forget_unconfirmed(t, q);
     }
-    skyless_begin_here(t, q);
+    begin_here(t, q);
 }
 
 /* Forget the packets of anchors that no other anchor confirms. */

@@ -921,146 +921,6 @@ typedef struct Tag {
     int32_t events;  /* Its events (``COUNTER_JUMPED`` and others). */
 } Tag;
 
-/* A received packet with the relays that it carried. */
-typedef struct HeardPacket {
-    Packet packet;
-    int32_t relay_count;
-    Relay relays[RELAYS_KEPT];
-    ScaledTime scaled;  /* TX time on the common scale of the current attempt. */
-} HeardPacket;
-
-/* An anchor's two newest packets. */
-typedef struct HeardAnchor {
-    int32_t count;
-    int64_t fitted_ticks;  /* Tag time when the anchor was last on the common scale with a plausible clock rate. */
-    HeardPacket older;
-    HeardPacket newer;
-} HeardAnchor;
-
-/* Listener's clock minus sender's clock at the tag's time ``rx_ticks_tag``. */
-typedef struct ClockLink {
-    int32_t listener;
-    int32_t sender;
-    int64_t rx_ticks_tag;
-    int64_t ticks;
-    real fraction_ticks;
-} ClockLink;
-
-/* A start: the first position and its covariance. */
-typedef struct Start {
-    int64_t rx_ticks_tag;
-    int32_t count;
-    int32_t used[MAX_ANCHORS];  /* Indices into ``heard`` of the anchors used. */
-    real position_m[3];
-    real covariance_m2[3][3];
-    bool is_contradicted;  /* Whether the packets of all anchors are inconsistent with each other. */
-    bool has_misfit;
-    int32_t misfit;  /* The excluded anchor; the others agree without it. */
-} Start;
-
-/* Tree of links that lead from each anchor's clock to the reference anchor's. */
-typedef struct Reach {
-    int32_t count;
-    int32_t order[MAX_ANCHORS];  /* Pairs in breadth-first order; the first is the reference. */
-    int32_t is_reached[MAX_ANCHORS];
-    int32_t parent[MAX_ANCHORS];
-    int32_t link[MAX_ANCHORS];
-    int32_t sign[MAX_ANCHORS];
-} Reach;
-
-/* A local minimum of the cost, in the problem's axes. */
-typedef struct Minimum {
-    int32_t iterations;
-    real cost;
-    real chi2;  /* rᵀΣ⁻¹r, even if the cost is not weighted by Σ⁻¹. */
-    real state[3];
-    real covariance[10];  /* Lower triangle; zeros for a given height. */
-} Minimum;
-
-/* A set of TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``, and the state of its solution. */
-typedef struct LocateProblem {
-    int32_t anchors;
-    bool knows_height;
-    bool is_weighted;
-    bool has_bounds;  /* Whether the height is between ``low_m`` and ``high_m``. */
-    real height_m;
-    real low_m;
-    real high_m;
-    real residual_tail;  /* Residuals with a smaller tail probability are not noise. */
-    real anchors_m[MAX_ANCHORS][3];  /* The reference first; ``choose_axes`` transforms them into its axes. */
-    real tdoa_m[MAX_ANCHORS];
-    real covariance[TRIANGLE];  /* Lower triangle of Σ, later of its factor L. */
-    int32_t kind;
-    int32_t dims;  /* Number of unknowns. */
-    real extent_m;  /* Distance of the farthest anchor from the reference. */
-    real origin_m[3];
-    real axes[3][3];  /* In rows; a position is origin + axesᵀ·state. */
-    real scale[3];  /* Scale of each unknown: the extent, or its square for s. */
-    int32_t start_count;
-    int32_t minimum_count;
-    real starts[9][3];
-    Minimum minima[9];  /* Ascending in cost. */
-    int32_t iterations;
-    real state[3];
-    real trial[3];
-    real step[3];
-    real system[MAX_ANCHORS][4];  /* Rows [∂TDoA/∂state, measured − predicted]. */
-    real normal[10];  /* Lower triangle of systemᵀ·system. */
-    real next_normal[10];
-    real factor[10];
-} LocateProblem;
-
-/* A position and its uncertainty. Metres, site frame. */
-typedef struct Found {
-    bool has_mirror;
-    int32_t dof;
-    int32_t iterations;
-    real chi2;
-    real position_m[3];
-    real mirror_m[3];  /* The other position that fits equally well. */
-    real covariance_m2[3][3];
-    real residuals_m[MAX_ANCHORS];  /* Measured minus predicted TDoAs. */
-} Found;
-
-/* Gathers packets until a start is possible. */
-typedef struct Acquisition {
-    bool knows_height;
-    real height_m;
-    bool has_bounds;
-    real low_m;
-    real high_m;
-    real variance_m2;  /* Variance of a TX and an RX timestamp together. */
-    real max_age_s;
-    real speed_std_mps;  /* Assumed standard deviation of the tag's speed. */
-    real error_variance_m2;  /* Variance of survey and range errors. */
-    Tuning tuning;
-    int32_t count;
-    HeardAnchor heard[MAX_ANCHORS];  /* In the order in which they were first heard. */
-    int32_t link_count;
-    ClockLink links[MAX_LINKS];
-    bool has_been_wide;
-    int64_t wide_ticks;  /* Time of the first start that was too wide to use. */
-    bool is_linked;  /* Whether the common scale comes from relays rather than from the anchors' stated times. */
-    bool is_contradicted;
-    int64_t contradicted_ticks;  /* When packets first contradicted each other. */
-    /* Number of anchors when two positions last fitted equally well; the same number is retried once a superframe. */
-    int32_t rival_count;
-    Start start;
-    int32_t pair_count;
-    int32_t pairs[MAX_ANCHORS];  /* Indices into ``heard`` of the anchors with two packets. */
-    real rates[MAX_ANCHORS];
-    real rate_variances[MAX_ANCHORS];
-    /* Rate of the tag's clock against the common scale, measured with each anchor; ``_solve_start`` sorts them. */
-    real clock_rates_mps[MAX_ANCHORS];
-    Reach reach;
-    Reach best;
-    Start found_alone;
-    real ranges_m[MAX_ANCHORS];
-    real variances_m2[MAX_ANCHORS];
-    LocateProblem problem;
-    Found found;
-} Acquisition;
-
 /* Index of the first state of each block. */
 typedef struct Layout {
     int32_t offset;  /* That of the first anchor; the others follow, as in all blocks. */
@@ -1237,6 +1097,146 @@ typedef struct State {
     real fix[10][3];  /* Rows of a fix (``POSITION`` and the following). */
 } State;
 
+/* A received packet with the relays that it carried. */
+typedef struct HeardPacket {
+    Packet packet;
+    int32_t relay_count;
+    Relay relays[RELAYS_KEPT];
+    ScaledTime scaled;  /* TX time on the common scale of the current attempt. */
+} HeardPacket;
+
+/* An anchor's two newest packets. */
+typedef struct HeardAnchor {
+    int32_t count;
+    int64_t fitted_ticks;  /* Tag time when the anchor was last on the common scale with a plausible clock rate. */
+    HeardPacket older;
+    HeardPacket newer;
+} HeardAnchor;
+
+/* Listener's clock minus sender's clock at the tag's time ``rx_ticks_tag``. */
+typedef struct ClockLink {
+    int32_t listener;
+    int32_t sender;
+    int64_t rx_ticks_tag;
+    int64_t ticks;
+    real fraction_ticks;
+} ClockLink;
+
+/* A start: the first position and its covariance. */
+typedef struct Start {
+    int64_t rx_ticks_tag;
+    int32_t count;
+    int32_t used[MAX_ANCHORS];  /* Indices into ``heard`` of the anchors used. */
+    real position_m[3];
+    real covariance_m2[3][3];
+    bool is_contradicted;  /* Whether the packets of all anchors are inconsistent with each other. */
+    bool has_misfit;
+    int32_t misfit;  /* The excluded anchor; the others agree without it. */
+} Start;
+
+/* Tree of links that lead from each anchor's clock to the reference anchor's. */
+typedef struct Reach {
+    int32_t count;
+    int32_t order[MAX_ANCHORS];  /* Pairs in breadth-first order; the first is the reference. */
+    int32_t is_reached[MAX_ANCHORS];
+    int32_t parent[MAX_ANCHORS];
+    int32_t link[MAX_ANCHORS];
+    int32_t sign[MAX_ANCHORS];
+} Reach;
+
+/* A local minimum of the cost, in the problem's axes. */
+typedef struct Minimum {
+    int32_t iterations;
+    real cost;
+    real chi2;  /* rᵀΣ⁻¹r, even if the cost is not weighted by Σ⁻¹. */
+    real state[3];
+    real covariance[10];  /* Lower triangle; zeros for a given height. */
+} Minimum;
+
+/* A set of TDoAs ``tdoa_m[i] = |p − anchors_m[i + 1]| − |p − anchors_m[0]|``, and the state of its solution. */
+typedef struct LocateProblem {
+    int32_t anchors;
+    bool knows_height;
+    bool is_weighted;
+    bool has_bounds;  /* Whether the height is between ``low_m`` and ``high_m``. */
+    real height_m;
+    real low_m;
+    real high_m;
+    real residual_tail;  /* Residuals with a smaller tail probability are not noise. */
+    real anchors_m[MAX_ANCHORS][3];  /* The reference first; ``choose_axes`` transforms them into its axes. */
+    real tdoa_m[MAX_ANCHORS];
+    real covariance[TRIANGLE];  /* Lower triangle of Σ, later of its factor L. */
+    int32_t kind;
+    int32_t dims;  /* Number of unknowns. */
+    real extent_m;  /* Distance of the farthest anchor from the reference. */
+    real origin_m[3];
+    real axes[3][3];  /* In rows; a position is origin + axesᵀ·state. */
+    real scale[3];  /* Scale of each unknown: the extent, or its square for s. */
+    int32_t start_count;
+    int32_t minimum_count;
+    real starts[9][3];
+    Minimum minima[9];  /* Ascending in cost. */
+    int32_t iterations;
+    real state[3];
+    real trial[3];
+    real step[3];
+    real system[MAX_ANCHORS][4];  /* Rows [∂TDoA/∂state, measured − predicted]. */
+    real normal[10];  /* Lower triangle of systemᵀ·system. */
+    real next_normal[10];
+    real factor[10];
+} LocateProblem;
+
+/* A position and its uncertainty. Metres, site frame. */
+typedef struct Found {
+    bool has_mirror;
+    int32_t dof;
+    int32_t iterations;
+    real chi2;
+    real position_m[3];
+    real mirror_m[3];  /* The other position that fits equally well. */
+    real covariance_m2[3][3];
+    real residuals_m[MAX_ANCHORS];  /* Measured minus predicted TDoAs. */
+} Found;
+
+/* Gathers packets until a start is possible. */
+typedef struct Acquisition {
+    bool knows_height;
+    real height_m;
+    bool has_bounds;
+    real low_m;
+    real high_m;
+    real variance_m2;  /* Variance of a TX and an RX timestamp together. */
+    real max_age_s;
+    real speed_std_mps;  /* Assumed standard deviation of the tag's speed. */
+    real error_variance_m2;  /* Variance of survey and range errors. */
+    Tuning tuning;
+    int32_t count;
+    HeardAnchor heard[MAX_ANCHORS];  /* In the order in which they were first heard. */
+    int32_t link_count;
+    ClockLink links[MAX_LINKS];
+    bool has_been_wide;
+    int64_t wide_ticks;  /* Time of the first start that was too wide to use. */
+    bool is_linked;  /* Whether the common scale comes from relays rather than from the anchors' stated times. */
+    bool is_contradicted;
+    int64_t contradicted_ticks;  /* When packets first contradicted each other. */
+    /* Number of anchors when two positions last fitted equally well; the same number is retried once a superframe. */
+    int32_t rival_count;
+    Start start;
+    int32_t pair_count;
+    int32_t pairs[MAX_ANCHORS];  /* Indices into ``heard`` of the anchors with two packets. */
+    real rates[MAX_ANCHORS];
+    real rate_variances[MAX_ANCHORS];
+    /* Rate of the tag's clock against the common scale, measured with each anchor; ``_solve_start`` sorts them. */
+    real clock_rates_mps[MAX_ANCHORS];
+    Reach reach;
+    Reach best;
+    Start found_alone;
+    real ranges_m[MAX_ANCHORS];
+    real variances_m2[MAX_ANCHORS];
+    LocateProblem problem;
+    Found found;
+} Acquisition;
+
 /* Candidates for each page of an issue. */
 typedef struct Choices {
     int32_t counts[4];
@@ -1348,7 +1348,6 @@ SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t
 SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest_m, real highest_m, real height_std_m,
         real max_acceleration_mps2, real integrity_risk, real alert_limit_m);
 SKYLESS_EXPORT void skyless_wake(Tag *t, State *s, Acquisition *q, int64_t rx_counter, real slept_s);
-SKYLESS_EXPORT void skyless_begin_here(Tag *t, Acquisition *q);
 SKYLESS_EXPORT int32_t skyless_hear_frame(Tag *t, State *s, Acquisition *q, uint8_t *frame, int32_t length, int64_t
         rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles);
 SKYLESS_EXPORT int32_t skyless_hear_fields(Tag *t, State *s, Acquisition *q, uint8_t *frame, int64_t rx_counter, real

@@ -134,7 +134,7 @@ def _forget_stamps(t: Tag, q: Acquisition) -> None:
     forget_all(q)
     _forget_moves(t)
     if t.pages.issue != NO_ISSUE:
-        begin_here(t, q)
+        _begin_here(t, q)
 
 
 # The site's pages
@@ -152,7 +152,7 @@ def _read_pages(t: Tag) -> None:
         c.settings.height_m, c.dim = signed(site, HEIGHT_FLAG_AT + 1) / MM_PER_M, AXES - 1
 
 
-def begin_here(t: Tag, q: Acquisition) -> None:
+def _begin_here(t: Tag, q: Acquisition) -> None:
     """Start with the pages in use."""
     _read_pages(t)
     begin_course(t.course, q)
@@ -173,7 +173,7 @@ def _begin_with_pages(t: Tag, q: Acquisition) -> None:
             t.period_ticks = max(t.period_ticks, period_ticks(n.period_code))
     if t.course.is_starting:
         _forget_unconfirmed(t, q)
-    begin_here(t, q)
+    _begin_here(t, q)
 
 
 def _forget_unconfirmed(t: Tag, q: Acquisition) -> None:
