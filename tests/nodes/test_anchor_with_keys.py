@@ -25,7 +25,7 @@ from skyless.run.keys import (
     SEEDS_VARIABLE,
     AnchorKeys,
     AnchorReport,
-    FaultLines,
+    KeyLines,
     chain_public_file,
     chain_seed_file,
     seed_bytes,
@@ -211,7 +211,7 @@ def test_another_anchor_that_is_refused_is_named():
 
 def test_lines_of_faults_come_once_and_are_few():
     said = []
-    lines = FaultLines("x", said.append)
+    lines = KeyLines("x", said.append)
     for now_s in range(60):
         lines.update(dict.fromkeys(range(100), Fault.BAD_CODE) if now_s < 20 else {}, float(now_s))
     assert len(said) == 2 * MAX_NAMED

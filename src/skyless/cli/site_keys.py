@@ -34,6 +34,8 @@ from skyless.core.site import Site
 from skyless.files import replace_files
 from skyless.machine import cores
 from skyless.run.keys import (
+    DAY_S,
+    LITTLE_LEFT_S,
     MAX_SERIAL,
     SITE_PRIVATE,
     SITE_PUBLIC,
@@ -50,12 +52,10 @@ from skyless.run.keys import (
     site_public_bytes,
 )
 
-_DAY_S: Final = 86_400.0
-_YEAR_S: Final = 365.25 * _DAY_S
+_YEAR_S: Final = 365.25 * DAY_S
 _LATEST_S: Final = 20.0 * _YEAR_S
 """Latest begin of a chain, from now."""
 
-_LITTLE_LEFT_S: Final = 60.0 * _DAY_S
 _OVERLAP_S: Final = 5.0
 """A chain that starts at once begins this long ago, as the clocks of hosts differ."""
 
@@ -138,7 +138,7 @@ def new(asked: _KeysOptions, made: _StartOptions) -> None:
 def rotate(asked: _KeysOptions, made: _StartOptions) -> None:
     """Make the next key chain of a site, which counts from a planned time on; until then the present one does."""
     public, chains = _present(asked)
-    starts_s = time.time() + _DAY_S if made.starts is None else _planned(made.starts)
+    starts_s = time.time() + DAY_S if made.starts is None else _planned(made.starts)
     chain = _successor(asked.folder, public, chains, starts_s, made.years)
     _write(asked.folder, chain, {})
     warnings = []
@@ -212,8 +212,8 @@ def _report(folder: Path, public: SitePublic, chains: list[Chain], now_s: float)
     present = None if present is None or present < public.least_serial else present
     left_s = chains[-1].ends_s - now_s
     warnings = []
-    if left_s < _LITTLE_LEFT_S:
-        end = f"ends in {left_s / _DAY_S:.0f} days" if left_s > 0.0 else "has ended"
+    if left_s < LITTLE_LEFT_S:
+        end = f"ends in {left_s / DAY_S:.0f} days" if left_s > 0.0 else "has ended"
         warnings.append(f"the last chain {end}: run skyless site keys rotate, and copy its files to all anchors")
     if present is None and left_s > 0.0:
         warnings.append("no chain counts at present: beacons carry no codes")
@@ -223,7 +223,7 @@ def _report(folder: Path, public: SitePublic, chains: list[Chain], now_s: float)
         "fingerprint": public.fingerprint,
         "least_serial": public.least_serial,
         "present": present,
-        "days_left": max(left_s, 0.0) / _DAY_S,
+        "days_left": max(left_s, 0.0) / DAY_S,
         "chains": [
             {
                 "serial": chain.serial,

@@ -340,8 +340,8 @@ MAX_NAMED: Final = 8
 UNVERIFIED_S: Final = 10.0
 """After this time without verified beacons the cause is logged; a certificate comes every second or so."""
 
-_DAY_S: Final = 86_400.0
-_LITTLE_LEFT_S: Final = 60.0 * _DAY_S
+DAY_S: Final = 86_400.0
+LITTLE_LEFT_S: Final = 60.0 * DAY_S
 _MAX_MEMORY_BYTES: Final = 1 << 16
 _WRONG: Final = (Fault.BAD_CODE, Fault.LATE, Fault.EARLY)
 
@@ -423,8 +423,8 @@ class AnchorKeys:
     def warn(self, unix_s: float) -> None:
         """Log once a day when the last chain ends soon."""
         left_s = self.ends_s - unix_s
-        day = int(left_s // _DAY_S)
-        if left_s > _LITTLE_LEFT_S or day == self._warned_day:
+        day = int(left_s // DAY_S)
+        if left_s > LITTLE_LEFT_S or day == self._warned_day:
             return
         self._warned_day = day
         until = time.strftime("%Y-%m-%d %H:%M:%S", time.localtime(self.ends_s))
@@ -446,10 +446,7 @@ class AnchorReport:
     """Logs when an anchor's codes start and stop, and whose beacons are not accepted."""
 
     def __init__(self, anchor: int, log: Log) -> None:
-        self._name, self._log = f"anchor {anchor}", log
-        self._lines = FaultLines(self._name, log)
-        self._logged: str | None = None
-        self._is_alone = False
+        self._lines = KeyLines(f"anchor {anchor}", log)
 
     def update(
         self, authentication: BeaconAuthentication, serial: int | None, accepted_s: float, unix_s: float, now_s: float
@@ -459,25 +456,16 @@ class AnchorReport:
         ``serial`` is the chain in use, ``accepted_s`` when a beacon of another anchor was last accepted, ``now_s`` the
         present, both by the host's monotonic clock.
         """
-        self._on_own(authentication.fault(), serial)
+        fault = authentication.fault()
+        if fault is None:
+            self._lines.say("codes", f"beacons carry codes of key chain {serial}")
+        elif fault is not Fault.NO_TIME:  # normal for a moment after each start
+            self._lines.say("codes", f"beacons carry no codes: {_WITHOUT_CODES.get(fault, fault)}")
         faults = authentication.recent_faults(unix_s)
         is_alone = now_s - accepted_s > RECENT_S and any(fault in _WRONG for fault in faults.values())
-        if is_alone and not self._is_alone:
-            self._log(f"{self._name}: no other anchor's code fits: the own seed or this host's clock is probably wrong")
-        self._is_alone = is_alone
+        alone = "no other anchor's code fits: the own seed or this host's clock is probably wrong"
+        self._lines.say("alone", alone if is_alone else None)
         self._lines.update({} if is_alone else faults, now_s)
-
-    def _on_own(self, fault: Fault | None, serial: int | None) -> None:
-        if fault is Fault.NO_TIME:
-            return  # normal for a moment after each start
-        line = (
-            f"beacons carry codes of key chain {serial}"
-            if fault is None
-            else f"beacons carry no codes: {_WITHOUT_CODES.get(fault, fault)}"
-        )
-        if line != self._logged:
-            self._logged = line
-            self._log(f"{self._name}: {line}")
 
 
 # A tag
@@ -541,40 +529,33 @@ class TagReport:
     """Logs why a tag verifies no beacons, and which anchors it does not accept."""
 
     def __init__(self, tag: str, site: int, log: Log) -> None:
-        self._name, self._site, self._log = f"tag {tag}", site, log
-        self._lines = FaultLines(self._name, log)
-        self._serial: int | None = None
-        self._clock_s: float | None = None
+        self._site = site
+        self._lines = KeyLines(f"tag {tag}", log)
+        self._is_clock_wrong = False
         self._unverified_s: float | None = None
-        self._logged = ""
 
     def update(self, trusted: TrustedReceiver, now_s: float, *, is_verified: bool) -> None:
         """Log changes; call this once a second. ``now_s`` is the host's monotonic clock."""
         self._on_clock(trusted)
         if is_verified:
-            self._unverified_s, self._logged = None, ""
-            if trusted.verifier.keys.serial != self._serial:
-                self._serial = trusted.verifier.keys.serial
-                self._log(f"{self._name}: beacons of site {self._site} are verified (key chain {self._serial})")
+            self._unverified_s = None
+            chain = f"key chain {trusted.verifier.keys.serial}"
+            self._lines.say("beacons", f"beacons of site {self._site} are verified ({chain})")
             self._lines.update(trusted.faults(), now_s)
             return
         reason = trust_reason(trusted)
         self._unverified_s = now_s if self._unverified_s is None else self._unverified_s
-        if reason in _NOT_VERIFIED and reason != self._logged and now_s - self._unverified_s >= UNVERIFIED_S:
-            self._logged, self._serial = reason, None
-            self._log(f"{self._name}: no beacon is verified: {_NOT_VERIFIED[reason]}")
+        if reason in _NOT_VERIFIED and now_s - self._unverified_s >= UNVERIFIED_S:
+            self._lines.say("beacons", f"no beacon is verified: {_NOT_VERIFIED[reason]}")
 
     def _on_clock(self, trusted: TrustedReceiver) -> None:
         error_s = trusted.verifier.clock.error_s
-        if error_s is not None and self._clock_s is None:
-            side = "ahead of" if error_s > 0.0 else "behind"
-            self._log(
-                f"{self._name}: this host's clock is {abs(error_s):.1f} s {side} site {self._site}'s: set it "
-                "with chrony or NTP"
-            )
-        elif error_s is None and self._clock_s is not None:
-            self._log(f"{self._name}: this host's clock agrees with site {self._site} again")
-        self._clock_s = error_s
+        if error_s is not None and not self._is_clock_wrong:
+            off = f"{abs(error_s):.1f} s {'ahead of' if error_s > 0.0 else 'behind'} site {self._site}'s"
+            self._lines.say("clock", f"this host's clock is {off}: set it with chrony or NTP")
+        elif error_s is None and self._is_clock_wrong:
+            self._lines.say("clock", f"this host's clock agrees with site {self._site} again")
+        self._is_clock_wrong = error_s is not None
 
 
 # Both
@@ -589,13 +570,20 @@ class _Known(Struct):
     is_logged: bool = False
 
 
-class FaultLines:
-    """Logs whose beacons are not accepted: one line when that begins, one when it ends."""
+class KeyLines:
+    """Logs what changes: each line once, and whose beacons are not accepted when that begins and ends."""
 
     def __init__(self, name: str, log: Log) -> None:
         """``name`` is the name of the anchor or tag that logs."""
         self._name, self._log = name, log
+        self._said: dict[str, str | None] = {}
         self._known: dict[int, _Known] = {}
+
+    def say(self, about: str, line: str | None) -> None:
+        """Log a line unless it is the last one of its subject; None: there is nothing to say of it now."""
+        if line is not None and line != self._said.get(about):
+            self._log(f"{self._name}: {line}")
+        self._said[about] = line
 
     def update(self, faults: Mapping[int, Fault], now_s: float) -> None:
         """Log changes. ``faults`` are those of the last seconds; ``now_s`` is the host's monotonic clock."""
