@@ -5,8 +5,14 @@ import math
 import numpy as np
 import pytest
 
-from skyless.research.paper._checks import CHECKED_ANCHORS, NOISES, QUANTITY_NAMES, paper_chain, paper_checks
-from skyless.research.paper._distributions import lambda_distributions
+from skyless.research.paper.claims import (
+    CHECKED_ANCHORS,
+    NOISES,
+    QUANTITIES,
+    lambda_distributions,
+    paper_chain,
+    paper_checks,
+)
 
 pytestmark = pytest.mark.statistical
 
@@ -34,7 +40,7 @@ def test_every_quantity_of_ten_anchors_is_checked_for_both_noises(checks):
     assert {(c.noise, c.quantity, c.anchor) for c in checks} == {
         (noise, quantity, anchor)
         for noise in NOISES
-        for quantity in QUANTITY_NAMES
+        for quantity in QUANTITIES
         for anchor in range(1, CHECKED_ANCHORS + 1)
     }
     assert {c.draws for c in checks} == {DRAWS}
@@ -54,7 +60,7 @@ def test_the_standard_error_is_that_of_so_many_draws(checks):
     assert all(0.7 * gaussian < c.standard_error_pct < gaussian for c in checks if c.noise == "uniform")
 
 
-@pytest.mark.parametrize("quantity", QUANTITY_NAMES)
+@pytest.mark.parametrize("quantity", QUANTITIES)
 def test_printed_standard_deviations_are_off(checks, quantity):
     low, high = PRINTED_PCT[quantity]
     errors = [c.printed_error_pct for c in checks if c.quantity == quantity]

@@ -1,6 +1,7 @@
 """What the figures of the report share: amounts, positions, noises, and the pieces that a figure consists of."""
 
 import math
+import time
 from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -15,6 +16,7 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
+from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.snapshots import (
@@ -26,13 +28,15 @@ from skyless.core.protocol1.snapshots import (
     to_master,
 )
 from skyless.core.site import Site
-from skyless.core.ticks import TICK_M, TICK_S
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.machine import cores
 from skyless.research.uncertainty import Chain, Reference
 from skyless.sim.evaluation.figures import FirstFixes
 from skyless.sim.evaluation.fleet import world_of
-from skyless.sim.impairments import Impairments
+from skyless.sim.impairments import Impairments, lab_impairments
+from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Trajectory
+from skyless.sim.world import World
 from skyless.site.report import page, svg_figure, table, text
 
 Point = tuple[float, float]
@@ -482,3 +486,38 @@ def listen(
         {method: log.track() for method, (_, log, _) in zip(methods, own, strict=True)}
         for (_, methods), own in zip(tags, listeners, strict=True)
     ]
+
+
+class TimedReception(Struct, frozen=True):
+    """One reception of one tag, by one method."""
+
+    tag: int
+    method: str
+    anchor: int
+    arrival_s: float
+    """True time at which the frame's RMARKER arrived."""
+    end_s: float
+    """True time at which the frame ended."""
+    fixed: bool
+    processing_s: float
+    """CPU time of the reception, measured on this machine."""
+
+
+def receptions(
+    site: Site, tags: Sequence[TagSpec], methods: Sequence[str], seed: int, until_s: float
+) -> list[TimedReception]:
+    """All receptions of tags until a true time, and by which methods they gave a fix."""
+    world = World(site, lambda anchor: Anchor(site, anchor), tags, lab_impairments(RADIO_PS), seed)
+    receivers = [{method: Receiver(method) for method in methods} for _ in tags]
+    anchors_m = {anchor.id: np.array((anchor.x_m, anchor.y_m, anchor.z_m)) for anchor in site.anchors}
+    heard = []
+    for broadcast in world.run(until_s):
+        for tag, reception, truth_m in broadcast.receptions():
+            flight_s = float(np.linalg.norm(truth_m - anchors_m[broadcast.anchor])) / SPEED_OF_LIGHT_MPS
+            at_s = broadcast.emission_s + flight_s, broadcast.end_s
+            for method, receiver in receivers[tag].items():
+                begun_s = time.perf_counter()
+                has_fix = receiver.hear(reception) is not None
+                spent_s = time.perf_counter() - begun_s
+                heard.append(TimedReception(tag, method, broadcast.anchor, *at_s, has_fix, spent_s))
+    return heard

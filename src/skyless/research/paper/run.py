@@ -4,29 +4,18 @@ import tempfile
 from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import msgspec
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
 from skyless.files import replace_files
-from skyless.research.paper import _checks as checks
-from skyless.research.paper import _claim as claim
-from skyless.research.paper import _distributions as distributions
-from skyless.research.paper import _dop_map as dop_map
-from skyless.research.paper import _rate as rate
 from skyless.research.paper import _scale as scale
-from skyless.research.paper import _scenario as scenario
-from skyless.research.paper import _static as static
-from skyless.research.paper import _timeline as timeline
-from skyless.research.paper import _walk as walk
+from skyless.research.paper.claims import CLAIMS
 from skyless.research.paper.plan import Heading, Plan, Section, report_page
 from skyless.research.studies.runner import run_cells
 from skyless.site.report import picture, report_style
-
-_FIGURES: Final = (scenario, checks, distributions, static, walk, dop_map, timeline, rate, claim, scale)
-"""In the order of the report."""
 
 
 class Report(Struct, frozen=True):
@@ -59,10 +48,11 @@ def write_report(plan: Plan, out: Path, reached: Callable[[float], None], proces
     except OSError as error:
         raise SkylessError(f"--out is {str(out)!r}, where no folder can be written: {error.strerror}") from None
     try:
-        cells = [cell for figure in _FIGURES for cell in figure.cells(plan)]
+        cells = [*(cell for claim in CLAIMS for cell in claim.cells(plan)), *scale.cells(plan)]
         results = dict(zip((cell.name for cell in cells), run_cells(cells, reached, processes), strict=True))
         with report_style():
-            return _written(plan, [figure.section(plan, results) for figure in _FIGURES], results, out)
+            sections = [*(claim.section(plan, results) for claim in CLAIMS), scale.section(plan, results)]
+            return _written(plan, sections, results, out)
     except BaseException:
         if is_new:
             out.rmdir()
