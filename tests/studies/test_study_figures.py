@@ -153,7 +153,7 @@ def test_the_limits_that_were_asked_for_are_there(quick):
     [
         *((lab.rounds, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
         *((lab.zigzag, speed_mps) for speed_mps in (1.0, 3.0)),
-        *((lab.stop_and_go, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
+        *((lab.to_and_fro, speed_mps) for speed_mps in (1.0, 3.0, 5.0)),
     ],
 )
 def test_paths_keep_to_speed_acceleration_and_room(kind, speed_mps):

@@ -221,7 +221,7 @@ class Variances:
 
 
 class PrintedVariances(Variances):
-    """What is printed otherwise; some of these variances can be negative."""
+    """The variances as printed, where they differ; some can be negative."""
 
     def gamma_first(self, chain: Chain) -> Array:
         """``eq:Gamma``; erratum E1."""
@@ -271,7 +271,7 @@ RATE_STD_MPS: Final = 10e-6 * SPEED_OF_LIGHT_MPS
 
 
 class Biases(Struct, frozen=True):
-    """Standard deviations of errors that nobody knows, in metres; each has a normal prior with mean zero.
+    """Standard deviations of unknown errors, in metres; each has a normal prior with mean zero.
 
     They are states behind the clocks, and every measurement updates all of them: what anchors receive of each other
     informs about their positions as well. For priors that are not normal the bound is the least mean square error

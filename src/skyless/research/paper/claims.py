@@ -70,13 +70,13 @@ from skyless.site.report import (
 )
 
 Figures = dict[str, Any]
-"""What is judged of a claim, and what its texts state."""
+"""Figures that the rules and texts of a claim refer to."""
 Table = list[tuple[str, ...]]
 """Rows of cells, the first one the heads."""
 
 
 class Found(NamedTuple):
-    """What the results of a claim's cells say."""
+    """Evaluation of the results of a claim's cells."""
 
     figures: Figures
     table: Table
@@ -108,7 +108,7 @@ class Claim(Struct, frozen=True, forbid_unknown_fields=True):
     """Reproduces the central number."""
 
     def cells(self, plan: Plan) -> list[Cell]:
-        """What has to be simulated."""
+        """Work to simulate."""
         return _WORK[self.key][0](plan)
 
     def judge(self, figures: Figures) -> tuple[Verdict, str]:
@@ -152,7 +152,7 @@ def _in_the_lab(name: str, title: str, caption: str, lines: Sequence[Line]) -> P
 
 
 def _bars(spans: dict[str, tuple[float, str]]) -> tuple[list[Line], dict[str, Any]]:
-    """Lines of a bar for each name, with its value and colour; and the axis that they need."""
+    """Lines that draw a bar for each name, with its value and colour, and arguments for the axis."""
     style = {"linewidth": 14.0, "solid_capstyle": "butt"}
     lines: list[Line] = [((0, end), (-row, -row), {**style, "color": c}) for row, (end, c) in enumerate(spans.values())]
     labels = [f"{name}: {end:.0f}" for name, (end, _) in spans.items()]
@@ -187,7 +187,7 @@ def _scenario_cells(plan: Plan) -> list[Cell]:
 
 
 def scenario_figures(alone: dict[str, int], many: dict[str, int], tags: int) -> Figures:
-    """How the frames on the air, and those that tags receive, grow with the tags."""
+    """Frames on the air, and received by each tag, over those with one tag."""
     heard = many["heard_by_tags"] / alone["heard_by_tags"] / tags
     return {"alone": alone, "many": many, "tags": tags, "sent": many["sent"] / alone["sent"], "heard": heard}
 
@@ -211,7 +211,7 @@ NOISES: Final = {"gaussian": TICK_S / 3.0, "uniform": TICK_S / 3.0**0.5}
 """Noise of every stamp: "plus/minus 15.65 ps" read as three sigma, or as the half width of the uniform noise."""
 
 CHECKED_ANCHORS: Final = 10
-"""As many as in the paper's numerical analysis."""
+"""Number of anchors in the paper's numerical analysis."""
 
 _Variance = Callable[[Chain], Array]
 QUANTITIES: Final[dict[str, tuple[str, Quantity, _Variance, _Variance]]] = {
@@ -347,7 +347,7 @@ def _gamma_cells(plan: Plan) -> list[Cell]:
 
 
 def gamma_figures(checks: Sequence[PaperCheck]) -> Figures:
-    """The largest errors of the deviations, printed and corrected, over what the draws allow; what is wrong."""
+    """Largest errors of the printed and corrected deviations, over the errors that the draws allow."""
     printed = {check.name: _excess(check.printed_error_pct, check) for check in checks}
     wrong = {check.quantity for check in checks if printed[check.name] > 1.0}
     worst = max(checks, key=lambda check: check.corrected_error_pct / check.standard_error_pct)
@@ -364,7 +364,7 @@ def gamma_figures(checks: Sequence[PaperCheck]) -> Figures:
 
 
 def _excess(error_pct: float | None, check: PaperCheck) -> float:
-    """An error over the scatter of the draws, or over the terms of second order."""
+    """An error over the largest that scatter and terms of second order explain."""
     return math.inf if error_pct is None else error_pct / max(_SIGMAS * check.standard_error_pct, _SECOND_ORDER_PCT)
 
 
@@ -463,7 +463,7 @@ def _distribution_cells(plan: Plan) -> list[Cell]:
 
 
 def distribution_figures(normal: LambdaDistribution, uniform: LambdaDistribution) -> Figures:
-    """The error of the theory for uniform stamps over what the draws allow."""
+    """Error of the theory for uniform stamps, over the largest that the draws allow."""
     standard_error_pct = 100.0 / (2.0 * uniform.draws) ** 0.5
     return {
         "excess": abs(uniform.corrected_error_pct) / max(_SIGMAS * standard_error_pct, _SECOND_ORDER_PCT),
@@ -558,7 +558,7 @@ def biased_impairments(name: str, seed: int) -> Impairments:
 
 
 def delay_errors(seed: int) -> tuple[DelayError, ...]:
-    """Antenna delays that nobody calibrated: normal, ``_DELAY_STD_M`` for TX and for RX of every anchor."""
+    """Errors of uncalibrated antenna delays: normal, ``_DELAY_STD_M`` for TX and for RX of every anchor."""
     anchors = paper_lab_site().anchors
     errors = np.random.default_rng([seed, 4]).normal(0.0, _DELAY_STD_M / TICK_M, (len(anchors), 2)).tolist()
     return tuple(DelayError(anchor.id, tx, rx) for anchor, (tx, rx) in zip(anchors, errors, strict=True))
@@ -601,7 +601,7 @@ def moments_of(error_m: Array) -> Moments:
 
 
 def static_figures(noise_only: Sequence[Moments], biased: Sequence[Moments]) -> Figures:
-    """Means in standard errors, and how far the errors' moments are from a Gaussian's over what these scatter.
+    """Means in standard errors, and the higher moments over their scatter in Gaussian errors.
 
     Those scatter by √(6/n) and √(24/n).
     """
@@ -798,7 +798,7 @@ def _dop_map(plan: Plan, results: Results) -> Found:  # noqa: ARG001
 
 
 def map_figures(correlation: float, asymmetry: float) -> Figures:
-    """How PDoP and predicted deviation correlate over the floor; what mirrored positions differ by."""
+    """Correlation of PDoP and predicted deviation over the floor, and how mirrored positions differ."""
     return {"correlation": correlation, "asymmetry_pct": 100.0 * asymmetry}
 
 
@@ -886,7 +886,7 @@ def _timeline(plan: Plan, results: Results) -> Found:  # noqa: ARG001
 
 
 def timeline_figures(receivers: int, of: int, fixes: int, possible: int) -> Figures:
-    """Receivers with fixes, and fixes, over those that there could be."""
+    """Receivers with fixes, and fixes, also as shares of the possible ones."""
     shares = {"receivers_share": receivers / of, "fixes_share": fixes / possible}
     return {"receivers": receivers, "of": of, "fixes": fixes, "possible": possible, **shares}
 
@@ -1003,7 +1003,7 @@ def _claim_seed(plan: Plan, noise_ps: float) -> int:
 
 
 def _worst_of(method: str, noise_ps: float, seed: int, error_m: Array) -> Worst:
-    """Sum the errors of a run up, shape (n, 2)."""
+    """Summary of the errors of a run, shape (n, 2)."""
     squared = (error_m**2).sum(axis=1)
     covariance_m2 = np.cov(error_m.T)
     low, middle, high = (largest_of_m(covariance_m2, _CLAIM_FIXES, q) for q in (0.05, 0.5, 0.95))
@@ -1135,7 +1135,7 @@ _WORK: Final[dict[str, tuple[Callable[[Plan], list[Cell]], Callable[[Plan, Resul
     "update-rate": (_rate_cells, _rate),
     "largest-error": (_claim_cells, _claim),
 }
-"""The cells of each claim, and what their results say."""
+"""Cells of each claim, and their evaluation."""
 
 CLAIMS: Final = msgspec.toml.decode(
     Path(__file__).with_suffix(".toml").read_bytes(), type=dict[str, tuple[Claim, ...]]

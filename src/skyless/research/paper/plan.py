@@ -1,4 +1,4 @@
-"""What the figures of the report share: amounts, positions, noises, and the pieces that a figure consists of."""
+"""Shared parts of the paper's figures: amounts, positions, noises, sections of the report, and simulations."""
 
 import math
 import time
@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from enum import IntEnum, StrEnum
 from functools import reduce
 from html import escape
+from importlib.metadata import version
 from typing import Any, Final
 
 import numpy as np
@@ -58,10 +59,10 @@ CLAIM_M: Final = 0.20
 """The paper's bound on the position error."""
 
 P1_METHODS: Final = ("literal", "weighted", "bracketed", "joint")
-"""What the tag at P1 computes with: figure 4 shows some of them, figure 9 all."""
+"""Methods of the tag at P1: figure 4 shows some of them, figure 9 all."""
 
 Results = Mapping[str, Any]
-"""What the tasks returned, by their names."""
+"""Results of the cells by their names."""
 
 
 class Plan(Struct, frozen=True):
@@ -84,7 +85,7 @@ class Plan(Struct, frozen=True):
 
 
 def plan_of(seed: int, *, quick: bool) -> Plan:
-    """The whole report, or one that is ready in seconds and scatters more."""
+    """Amounts of the whole report, or of a quick one, which scatters more."""
     if not quick:
         return Plan(seed)
     return Plan(
@@ -118,7 +119,7 @@ class Panel(Struct, frozen=True):
 
 
 class Section(Struct, frozen=True):
-    """A figure and the statement that it tests."""
+    """A section of the report: a figure and the statement that it tests."""
 
     key: str
     title: str
@@ -154,39 +155,30 @@ def grouped(count: int) -> str:
 _CLASSES: Final = {Verdict.HOLDS: "good", Verdict.CORRECTED: "mixed", Verdict.FAILS: "bad"}
 
 
-class Heading(Struct, frozen=True):
-    """What stands above the figures."""
-
-    seed: int
-    quick: bool
-    version: str
-    command: str
-
-
-def report_page(heading: Heading, sections: Sequence[Section], pictures: dict[str, bytes]) -> str:
+def report_page(command: str, sections: Sequence[Section], pictures: dict[str, bytes], *, quick: bool) -> str:
     """The whole page; ``pictures`` are the panels' SVG files by their names."""
-    parts = [_introduction(heading), _summary(sections)]
+    parts = [_introduction(command, quick=quick), _summary(sections)]
     parts += [_section(number, section, pictures) for number, section in enumerate(sections, start=1)]
     return page("The paper, reproduced and corrected", parts)
 
 
-def _introduction(heading: Heading) -> str:
-    quick = (
+def _introduction(command: str, *, quick: bool) -> str:
+    note = (
         "<p><strong>This is the quick report</strong>: it simulates a fraction of what the full one does, so its "
         "numbers scatter more and its largest errors are smaller. Leave out <code>--quick</code> for the full "
         "one.</p>"
-        if heading.quick
+        if quick
         else ""
     )
     return (
-        "<header>\n<p class='label'>Skyless " + escape(heading.version) + "</p>\n"
+        "<header>\n<p class='label'>Skyless " + escape(version("skyless")) + "</p>\n"
         "<h1>The paper, reproduced and corrected</h1>\n<p>Every figure and claim of L. Santoro, M. Nardello, D. "
         "Brunelli and D. Fontanelli, <cite>Scale up to infinity: the UWB Indoor Global Positioning System</cite> "
         "(ROSE 2021), reproduced in a simulated radio world and by Monte Carlo, each with the statement that it "
         "tests. Anchors and tags run the programs that would run on radios; clocks, noise, air and motion are "
         "simulated, and no radio was measured. Claims are in other words, with the paper’s labels.</p>\n<p>Made by "
-        f"<code>{escape(heading.command)}</code>. The same seed gives the same numbers, times measured on this "
-        f"machine apart.</p>\n{quick}\n</header>"
+        f"<code>{escape(command)}</code>. The same seed gives the same numbers, times measured on this "
+        f"machine apart.</p>\n{note}\n</header>"
     )
 
 
@@ -231,7 +223,7 @@ def _verdict(verdict: Verdict) -> str:
 CHUNK_DRAWS: Final = 1 << 14
 """Draws with one key, which one thread sums up at a time."""
 _BATCH_DRAWS: Final = 1 << 10
-"""Draws that are computed at a time: they stay in the processor's cache."""
+"""Draws that are computed at a time, few enough for the processor's cache."""
 
 _SHARED_NOISES: Final = 4
 """Noises of a draw: the master's two synchronisation messages, its reference message, the tag's reception of it."""
@@ -240,7 +232,7 @@ _ANCHOR_NOISES: Final = 6
 
 
 class Quantity(IntEnum):
-    """What each draw gives for each anchor; the rows of ``errors``."""
+    """Quantities of a draw for each anchor: the rows of ``errors``."""
 
     BETA = 0
     GAMMA_FIRST = 1
@@ -408,7 +400,7 @@ def _sums(errors: Array) -> tuple[Array, ...]:
 
 
 def _total(parts: Iterable[tuple[Array, ...]]) -> tuple[Array, ...]:
-    """Sums added up one after the other."""
+    """Element-wise sums of all parts, in order."""
     return reduce(lambda whole, part: tuple(map(np.add, whole, part)), parts)
 
 

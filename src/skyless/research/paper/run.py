@@ -2,7 +2,6 @@
 
 import tempfile
 from collections.abc import Callable
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from skyless.core.errors import SkylessError
 from skyless.files import replace_files
 from skyless.research.paper import _scale as scale
 from skyless.research.paper.claims import CLAIMS
-from skyless.research.paper.plan import Heading, Plan, Section, report_page
+from skyless.research.paper.plan import Plan, Section, report_page
 from skyless.research.studies.runner import run_cells
 from skyless.site.report import picture, report_style
 
@@ -75,7 +74,7 @@ def _written(plan: Plan, sections: list[Section], results: dict[str, Any], out: 
         sections=tuple(_as_fields(section) for section in sections),
     )
     numbers = msgspec.json.format(msgspec.json.encode(report, enc_hook=_json_value), indent=1)
-    page = report_page(Heading(plan.seed, plan.quick, version("skyless"), command), sections, pictures)
+    page = report_page(command, sections, pictures, quick=plan.quick)
     replace_files({**files, out / "numbers.json": numbers, out / "report.html": page.encode()})
     return report
 

@@ -1,4 +1,4 @@
-"""The study ``efficiency``: how near ``joint`` comes to the Cramér–Rao bound in matched episodes in the lab.
+"""The study ``efficiency``: RMSE of ``joint`` over the Cramér–Rao bound in matched episodes in the lab.
 
 Each episode lasts two seconds; errors count after each of its last 20 superframes, as the bound does. The filter
 assumes the very noise that the episodes have. The bound is that of the receptions that the tag knew of by then.
@@ -28,7 +28,7 @@ from skyless.sim.lab import paper_lab_site
 # share, every RX stamp its own. Stamps are whole ticks.
 
 EPISODE_SUPERFRAMES: Final = 134
-"""Two seconds, after which nothing of what was known before the first frame is left."""
+"""Two seconds, after which the state before the first frame no longer matters."""
 EPISODE_SPEED_STD_MPS: Final = 0.4
 """Standard deviation of each component of a tag's velocity at the start."""
 WHITE_FM: Final = 2e-11
@@ -149,14 +149,14 @@ def _relays(rx_ticks: Integers, senders: Integers, n: int, case: Case) -> tuple[
 _JUDGED_SUPERFRAMES: Final = 20
 """At the end of an episode."""
 
-_START_STD_M: Final = 0.3
-"""Error of the filter's start, per axis; after two seconds nothing of it is left."""
+START_STD_M: Final = 0.3
+"""Error of the filter's start, per axis; it no longer matters after two seconds."""
 
 _CHUNK_EPISODES: Final = 50
 """Episodes in a chunk of a cell."""
 
 _EPISODE_COST_S: Final = 0.02
-"""About what an episode and its bounds take."""
+"""Approximate CPU time of an episode and its bounds."""
 
 _MAX_RATIO: Final = 1.02
 
@@ -184,10 +184,11 @@ def _run(case: Case, draw: np.random.Generator) -> list[float]:
     site = paper_lab_site()
     anchors = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
     episode = draw_episode(draw, anchors, site.schedule.slot_s, case)
-    positions_m, covariances_m2 = _filtered(case, anchors, episode, draw)
-    ends = np.arange(len(anchors) - 1, len(positions_m), len(anchors))[-_JUDGED_SUPERFRAMES:]
-    errors = positions_m[ends] - episode.path_m[ends, :2]
-    covariances = covariances_m2[ends]
+    start_m = episode.path_m[0, :2] + draw.normal(0.0, START_STD_M, 2)
+    rows = tracked(settings_of(case, height_m=0.0), anchors, episode.packets, start_m)
+    ends = np.arange(len(anchors) - 1, len(rows), len(anchors))[-_JUDGED_SUPERFRAMES:]
+    errors = rows["position_m"][ends, :2] - episode.path_m[ends, :2]
+    covariances = rows["covariance_m2"][ends, :2, :2]
     return [
         float(np.square(errors).sum(axis=1).mean()),
         float(np.trace(covariances, axis1=1, axis2=2).mean()),
@@ -196,12 +197,14 @@ def _run(case: Case, draw: np.random.Generator) -> list[float]:
     ]
 
 
-def _filtered(case: Case, anchors: Array, episode: Episode, draw: np.random.Generator) -> tuple[Array, Array]:
-    estimator = Estimator(settings_of(case, height_m=0.0), anchors)
-    start = episode.path_m[0, :2] + draw.normal(0.0, _START_STD_M, 2)
-    estimator.start(int(episode.packets.rx_ticks[0]), start, _START_STD_M**2 * np.eye(2), EPISODE_SPEED_STD_MPS**2)
-    rows = estimator.track(episode.packets)
-    return rows["position_m"][:, :2], rows["covariance_m2"][:, :2, :2]
+def tracked(
+    settings: EstimatorSettings, anchors_m: Array, packets: Packets, start_m: Array, *, has_levels: bool = False
+) -> Any:  # noqa: ANN401 - rows of the estimator
+    """The filter's rows after every packet, from a start with a standard deviation of ``START_STD_M`` per axis."""
+    estimator = Estimator(settings, anchors_m)
+    dim = estimator.dim
+    estimator.start(int(packets.rx_ticks[0]), start_m[:dim], START_STD_M**2 * np.eye(dim), EPISODE_SPEED_STD_MPS**2)
+    return estimator.track(packets, has_levels=has_levels)
 
 
 def _bound(case: Case, anchors: Array, episode: Episode, slot_s: float) -> float:

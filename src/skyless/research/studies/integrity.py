@@ -17,17 +17,18 @@ from numpy.typing import NDArray
 
 from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
-from skyless.core.estimator.estimator import Estimator, Packets
+from skyless.core.estimator.estimator import Packets
 from skyless.core.estimator.process import ACCEPTED, JOINED
 from skyless.core.integrity import CONTRADICTED, HPL, VPL
 from skyless.core.ticks import TICK_M
 from skyless.research.studies.efficiency import (
-    EPISODE_SPEED_STD_MPS,
     EPISODE_SUPERFRAMES,
+    START_STD_M,
     Case,
     Episode,
     draw_episode,
     settings_of,
+    tracked,
 )
 from skyless.research.studies.picture import clustered_interval
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, with_limits
@@ -36,10 +37,9 @@ from skyless.sim.lab import paper_lab_site
 _ONSETS: Final = (40, 67)
 """Superframes between which the fault begins; the filter has settled long before."""
 
-_START_STD_M: Final = 0.3
 _CHUNK_EPISODES: Final = 50
 _EPISODE_COST_S: Final = 0.008
-"""About what an episode takes."""
+"""Approximate CPU time of an episode."""
 
 _MIN_LARGEST: Final = 100
 """A chunk returns at least this number of its largest errors, and ten times its epochs times the risk."""
@@ -73,20 +73,20 @@ class IntegrityRow(Row, frozen=True, kw_only=True):
     risk: float
     """Stated probability that a fix's error exceeds its protection level."""
     hmi: float
-    """Share of fixes whose horizontal error does, while they promise a level."""
+    """Share of fixes with a level whose horizontal error exceeds it."""
     hmi_interval: tuple[float, float]
-    """Where that share truly lies, with 99 %."""
+    """99 % confidence interval of that share."""
     hmi_vertical: float | None = None
     hmi_vertical_interval: tuple[float, float] | None = None
     hpl_m: float | None = None
-    """Horizontal level of the fixes that promise one: mean of the chunks' medians."""
+    """Horizontal level of the fixes with one: mean of the chunks' medians."""
     vpl_m: float | None = None
     smallest_m: float
     """Horizontal error that the share ``risk`` of fixes exceeds, with or without a level."""
 
 
 class Fault(Struct, frozen=True):
-    """What is wrong with one anchor in all episodes of a case: late or early messages, or wrong delays."""
+    """The fault of one anchor in all episodes of a case: late or early messages, or wrong delays."""
 
     scene: str
     """``lab``, with the height given, or ``room``, where it is a state."""
@@ -133,7 +133,7 @@ def faulty(episode: Episode, fault: Fault, anchor: int, onset: int, slot_s: floa
 
 
 def _share(since_s: NDArray[np.floating[Any]], kind: Kind) -> Array:
-    """How much of the fault there is, from −1 to 1."""
+    """Share of the fault at each time, from −1 to 1."""
     if kind == "ramp":
         return np.asarray(np.clip(since_s / _RAMP_S, 0.0, 1.0), np.float64)
     on = since_s >= 0.0
@@ -217,7 +217,10 @@ def _run(setting: Setting, draw: Generator) -> tuple[NDArray[Any], ...]:
     episode = draw_episode(draw, anchors_m, slot_s, setting.case, EPISODE_SUPERFRAMES)
     onset = int(draw.integers(*_ONSETS)) * len(anchors_m)
     packets = faulty(episode, setting.fault, int(draw.integers(len(anchors_m))), onset, slot_s)
-    dim, rows = _filtered(setting, anchors_m, packets, episode.path_m[0] + draw.normal(0.0, _START_STD_M, 3))
+    height_m = 0.0 if setting.fault.scene == "lab" else None
+    settings, dim = settings_of(setting.case, height_m).changed(integrity_risk=setting.risk), 3 - (height_m is not None)
+    start_m = episode.path_m[0] + draw.normal(0.0, START_STD_M, 3)
+    rows = tracked(settings, anchors_m, packets, start_m, has_levels=True)
     fixes = np.flatnonzero(np.isin(rows["outcome"][onset:], (ACCEPTED, JOINED))) + onset
     errors, given = np.zeros((len(fixes), 3)), rows["levels"][fixes]
     errors[:, :dim] = rows["position_m"][fixes, :dim] - episode.path_m[fixes, :dim]
@@ -226,16 +229,6 @@ def _run(setting: Setting, draw: Generator) -> tuple[NDArray[Any], ...]:
     if setting.alert_limit_m is not None:
         available &= given[:, HPL] <= setting.alert_limit_m
     return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2]), given[:, HPL], vpl, available
-
-
-def _filtered(setting: Setting, anchors_m: Array, packets: Packets, start_m: Array) -> tuple[int, Any]:
-    """Dimensions, and the filter's rows after every packet."""
-    height_m = 0.0 if setting.fault.scene == "lab" else None
-    settings = settings_of(setting.case, height_m).changed(integrity_risk=setting.risk)
-    estimator = Estimator(settings, anchors_m)
-    dim = estimator.dim
-    estimator.start(int(packets.rx_ticks[0]), start_m[:dim], _START_STD_M**2 * np.eye(dim), EPISODE_SPEED_STD_MPS**2)
-    return dim, estimator.track(packets, has_levels=True)
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> list[IntegrityRow]:

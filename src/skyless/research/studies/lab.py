@@ -21,7 +21,7 @@ from skyless.research.studies.worlds import LAB_WARMUP_S, Run, anchor_of, box, l
 from skyless.sim.impairments import AnchorBias, AnchorOutage, Impairments, Outage
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.oscillator import Temperature
-from skyless.sim.trajectory import Piece, Static, Trajectory, Waypoints
+from skyless.sim.trajectory import Static, Trajectory, Waypoints
 
 
 def _within(most: float | None) -> tuple[Limit, ...]:
@@ -99,7 +99,7 @@ def _late(plan: Plan, bias_m: float, burst_s: float | None, number: int) -> tupl
 _STEADY: Final = "steady"
 _SUPERFRAMES_MS: Final = (15.0, 30.0, 60.0, 120.0, 300.0, 1000.0)
 _LONGEST_SLOT_S: Final = 0.06
-"""A site file may say 67 ms."""
+"""Longest slot here; a site file allows 67 ms."""
 
 
 def sync_cases(plan: Plan) -> list[Case]:
@@ -175,7 +175,7 @@ def _slow(plan: Plan, superframe_s: float) -> Site:
 
 # Condition ``motion``: how the error grows with speed and turns; fixes are judged when they are made.
 #
-# Paths for tags that move hard: turns, zigzags, stop and go, all at a given acceleration.
+# Paths for tags that move hard: turns, zigzags, stops, all at a given acceleration.
 
 _ACCELERATION_MPS2: Final = 3.0
 _STILL: Final = "still"
@@ -191,7 +191,7 @@ In the lab, a right angle at 3 m/s takes 4.2 m of a leg with 3 m/s², and the sh
 
 
 def motion_cases(plan: Plan) -> list[Case]:
-    """Still, rounds at three speeds, zigzags, stop and go, all in the large lab."""
+    """Still, rounds at three speeds, zigzags, to and fro, all in the large lab."""
     site = large_lab_site(plan.noise_ps)
     low_m, high_m = box(site)
 
@@ -208,52 +208,12 @@ def motion_cases(plan: Plan) -> list[Case]:
         "rounds at 3 m/s": moving(rounds, 3.0),
         "rounds at 5 m/s": moving(rounds, 5.0),
         "zigzag at 3 m/s": moving(zigzag, 3.0),
-        "stop and go, 3 m/s": moving(stop_and_go, 3.0),
-        "stop and go, 5 m/s": moving(stop_and_go, 5.0),
+        "to and fro at 3 m/s": moving(to_and_fro, 3.0),
+        "to and fro at 5 m/s": moving(to_and_fro, 5.0),
     }
     return [
         Case(name, "motion", None, worlds(plan, site, partial(paths, kind)), _STILL) for name, kind in kinds.items()
     ]
-
-
-class StopAndGo(Trajectory):
-    """From point to point and round again: speeding up, driving, braking, resting."""
-
-    def __init__(self, points_m: Array, speed_mps: float, acceleration_mps2: float, rest_s: float) -> None:
-        """``points_m`` has shape (n, 3), n ≥ 2, neighbours apart; short legs do not reach the speed."""
-        self._pieces: list[Piece] = []
-        now_s = 0.0
-        for start, end in zip(points_m, np.roll(points_m, -1, axis=0), strict=True):
-            now_s = self._leg(start, end, now_s, speed_mps, acceleration_mps2, rest_s)
-        self._lap_s = now_s
-
-    def _leg(self, start: Array, end: Array, now_s: float, speed: float, acceleration: float, rest_s: float) -> float:
-        length = float(np.linalg.norm(end - start))
-        way = (end - start) / length
-        top = min(speed, math.sqrt(acceleration * length))
-        ramp_s, cruise_s = top / acceleration, length / top - top / acceleration
-        still = np.zeros(3)
-        for duration_s, at_mps, push in (
-            (rest_s, 0.0, 0.0),
-            (ramp_s, 0.0, acceleration),
-            (cruise_s, top, 0.0),
-            (ramp_s, top, -acceleration),
-        ):
-            until_s = now_s + duration_s
-            if duration_s > 0.0:
-                self._pieces.append(Piece(now_s, until_s, now_s, start, at_mps * way + still, push * way))
-            start = start + way * (at_mps * duration_s + 0.5 * push * duration_s**2)
-            now_s = until_s
-        return now_s
-
-    def piece(self, t_s: float) -> Piece:
-        """See ``Trajectory``."""
-        lap = math.floor(t_s / self._lap_s)
-        within_s, passed_s = t_s - lap * self._lap_s, lap * self._lap_s
-        found = next((one for one in self._pieces if within_s < one.end_s), self._pieces[-1])
-        return found._replace(
-            start_s=found.start_s + passed_s, end_s=found.end_s + passed_s, origin_s=found.origin_s + passed_s
-        )
 
 
 def still(draw: Generator, low_m: Array, high_m: Array) -> Trajectory:
@@ -263,15 +223,19 @@ def still(draw: Generator, low_m: Array, high_m: Array) -> Trajectory:
 
 def rounds(draw: Generator, low_m: Array, high_m: Array, speed_mps: float, acceleration_mps2: float) -> Trajectory:
     """Round a rectangle somewhere in the box, every corner turned at the acceleration."""
-    size = np.append(speed_mps * draw.uniform(*_LEG_S, 2), 0.0)
-    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]) * size
-    return _path(draw, low_m, high_m, corners, speed_mps, acceleration_mps2)
+    return _rectangle(draw, low_m, high_m, speed_mps * draw.uniform(*_LEG_S, 2), speed_mps, acceleration_mps2)
 
 
 def laps(draw: Generator, low_m: Array, high_m: Array, speed_mps: float, acceleration_mps2: float) -> Trajectory:
     """Round a rectangle that takes more than 0.86 of the box each way, every corner turned at the acceleration."""
-    size = np.append((high_m - low_m)[:2] * draw.uniform(*_LAP_SHARE, 2), 0.0)
-    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]) * size
+    sides_m = (high_m - low_m)[:2] * draw.uniform(*_LAP_SHARE, 2)
+    return _rectangle(draw, low_m, high_m, sides_m, speed_mps, acceleration_mps2)
+
+
+def _rectangle(
+    draw: Generator, low_m: Array, high_m: Array, sides_m: Array, speed_mps: float, acceleration_mps2: float
+) -> Trajectory:
+    corners = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]) * np.append(sides_m, 0.0)
     return _path(draw, low_m, high_m, corners, speed_mps, acceleration_mps2)
 
 
@@ -282,9 +246,13 @@ def zigzag(draw: Generator, low_m: Array, high_m: Array, speed_mps: float, accel
     return _path(draw, low_m, high_m, step * corners, speed_mps, acceleration_mps2)
 
 
-def stop_and_go(draw: Generator, low_m: Array, high_m: Array, speed_mps: float, acceleration_mps2: float) -> Trajectory:
-    """To eight points in the box, with rests of a second."""
-    return StopAndGo(draw.uniform(low_m, high_m, (8, 3)), speed_mps, acceleration_mps2, 1.0)
+def to_and_fro(draw: Generator, low_m: Array, high_m: Array, speed_mps: float, acceleration_mps2: float) -> Trajectory:
+    """Along the box and back: speeding up, driving, braking to a stop at both ends."""
+    ends = np.tile(draw.uniform(low_m, high_m), (2, 1))
+    ends[:, 1] = low_m[1], high_m[1]
+    return Waypoints(
+        ends[:: int(draw.choice((-1, 1)))], speed_mps, loop=True, corner_s=2.0 * speed_mps / acceleration_mps2
+    )
 
 
 def turn_s(speed_mps: float, acceleration_mps2: float) -> float:

@@ -27,7 +27,7 @@ _CURVE_IN: Final = 2.6
 _WIDE_RATIO: Final = 15.0
 """Values that lie farther apart are drawn on a logarithmic axis."""
 _WIDE_X_RATIO: Final = 10.0
-"""The same of the numbers of a series."""
+"""The same for the numbers of a series."""
 
 
 # Which side of a limit is the safe one
@@ -110,11 +110,11 @@ class _Panel(Struct, frozen=True):
     error: str = ""
     """Field with its standard error."""
     target: float | None = None
-    """What a good receiver has; the values are then points about it, not lengths."""
+    """The ideal value; values are then drawn as points instead of bars."""
     floor: float | None = None
-    """Smaller values, which a logarithmic axis does not have, are drawn here."""
+    """Smaller values are drawn here, as a logarithmic axis has no 0."""
     sides: Sides | None = None
-    """What the two sides of the target mean, or of the stated risk."""
+    """Meaning of the two sides of the target or of the stated risk."""
     log: bool | None = None
     """Whether the axis of bars is logarithmic; None for where values lie far apart."""
 
@@ -280,17 +280,17 @@ def _limits(axes: Axes, panel: _Panel, rows: list[Row], *, curve: bool) -> None:
 # From the worlds of a case to a row: standard errors from the scatter between worlds, intervals of rare shares.
 
 _MESSAGE_S: Final = 40e-6
-"""About what a tag takes for a message, and an anchor with all that is simulated around it."""
+"""Approximate CPU time for a message, of a tag or of a simulated anchor."""
 _BOUND_TAG_S: Final = 0.03
-"""About what simulation and bound take for a second of a tag."""
+"""Approximate CPU time of simulation and bound for a second of a tag."""
 
 RAW_METHODS: Final = ("joint",)
-"""Methods that use what anchors hear of each other."""
+"""Methods that use anchors' receptions of each other."""
 
 
 _ALPHA: Final = 0.01
 CLUSTER_FIXES: Final = 25.0
-"""Fixes that may be misleading together, as neighbours share their errors, even if no such cluster was observed."""
+"""Assumed size of a cluster of misleading fixes where none larger is observed: neighbours share their errors."""
 
 
 class Case(Struct, frozen=True):
@@ -301,7 +301,7 @@ class Case(Struct, frozen=True):
     x: float | None
     runs: tuple[Run, ...]
     of: str | None = None
-    """Case over whose RMSE this one's is the ratio, in worlds of the same seeds; it may have more of them."""
+    """The reference case of the ratio of RMSEs, in worlds of the same seeds; it may have more worlds."""
     limits: tuple[Limit, ...] = ()
     biases: Biases | None = None
     """What the worlds' ranges and anchors are off by, for the Cramér–Rao bound over which the ratio is then; None for
@@ -314,16 +314,16 @@ class WorldRow(Row, frozen=True, kw_only=True):
     outside: float | None = None
     """Share of fixes that lie outside of their own 99.9 % ellipse; 0.001 for true ones with Gaussian errors."""
     of: str | None = None
-    """The case over whose RMSE ``ratio`` is."""
+    """The reference case of ``ratio``."""
     cpu_us_per_message: float | None = None
     cpu_ms_per_tag_s: float | None = None
-    """Time of one core for each second of a tag."""
+    """CPU time for each second of a tag."""
     level: float | None = None
     """Share of the judged fixes that give a horizontal protection level; None for methods without levels."""
     exceeded: float | None = None
     """Share of those whose horizontal error is larger than it."""
     exceeded_interval: tuple[float, float] | None = None
-    """Where that share truly lies, with 99 %, with tags as independent units."""
+    """99 % confidence interval of that share, with tags as independent units."""
     exceeded_unwarned: float | None = None
     """Share of the fixes with a level whose error is larger, and which carry no alert."""
     hpl_m: float | None = None
@@ -363,7 +363,7 @@ def world_rows(study: str, plan: Plan, cases: Sequence[Case], results: Sequence[
 def case_row(
     study: str, plan: Plan, case: Case, worlds: Sequence[RunResult], reference: Sequence[RunResult] | None
 ) -> WorldRow:
-    """The row of a case's worlds; ``reference``: those of the case over whose RMSE its ratio is."""
+    """The row of a case's worlds; ``reference``: worlds of the reference case."""
     cpu_s = sum(world.cpu_s for world in worlds)
     fixes = sum(world.fixes for world in worlds)
     row = WorldRow(
@@ -405,7 +405,7 @@ def _with_errors(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
 
 
 def _with_levels(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
-    """The row with its protection levels, tags as units; none of them where the method gives none."""
+    """Add protection levels, with tags as units, where the method gives some."""
     counts = [world.levels for world in worlds if world.levels is not None]
     if not counts:
         return row
@@ -427,7 +427,7 @@ def _with_levels(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
 
 
 def _with_ratio(row: WorldRow, worlds: Sequence[RunResult], reference: Sequence[RunResult]) -> WorldRow:
-    """Worlds and reference worlds of the same number share their seed, so they are left out together."""
+    """Add the ratio of RMSEs. Worlds of the same number share their seed, so the jackknife leaves them out together."""
     pairs = zip(worlds, reference, strict=True)
     sums = np.array([(a.fixes, a.squared_m2, b.fixes, b.squared_m2) for a, b in pairs])
     if sums[:, 2].sum() == 0:
@@ -437,7 +437,7 @@ def _with_ratio(row: WorldRow, worlds: Sequence[RunResult], reference: Sequence[
 
 
 def _with_bound(row: WorldRow, worlds: Sequence[RunResult], variances_m2: Sequence[float]) -> WorldRow:
-    """The row with the bound of its worlds, and the RMSE over it."""
+    """Add the bound of the worlds, and the RMSE over it."""
     row = replace(row, bound_m=float(np.sqrt(np.mean(variances_m2))))
     if row.fixes == 0:
         return row
@@ -477,7 +477,7 @@ def jackknife(rows: Array, figure: Callable[[Array], float]) -> tuple[float, flo
 
 
 def interval(standard_error: float | None, runs: int) -> tuple[float, float] | None:
-    """Where a mean of 1 would be measured with a probability of 99 %, by Student's distribution."""
+    """Interval in which a mean of 1 is measured with a probability of 99 % (Student's distribution)."""
     if standard_error is None:
         return None
     reach = float(student.ppf(0.995, runs - 1)) * standard_error
@@ -485,7 +485,7 @@ def interval(standard_error: float | None, runs: int) -> tuple[float, float] | N
 
 
 def clustered_interval(events: Array, count: float) -> tuple[float, float]:
-    """Where the true share of rare events lies, with 99 %, for ``count`` cases with ``events`` in each independent run.
+    """99 % confidence interval of the share of rare events, for ``count`` cases; ``events``: of each independent run.
 
     Runs with events are taken as a Poisson process of clusters: Fay and Feuer (Statistics in Medicine 16, 1997,
     791-801), whose interval ends where Garwood's exact one does, below, if all clusters have one event.

@@ -34,16 +34,16 @@ AIR: Final = "unbiased air"
 _WARMUP_S: Final = 1.5
 
 _BOUND_RATIO: Final = 1.15
-"""Over the Cramér–Rao bound, at most, in the room itself."""
+"""Largest ratio of the RMSE to the Cramér–Rao bound in the room itself."""
 
 _LATER_RATIO: Final = 1.2
 """Largest ratio of the RMSE of tags after a long rest to their RMSE at first."""
 
 _SHARE: Final = 0.25
-"""Worlds of each case but the room itself, of those that the room has."""
+"""Worlds of each other case, as a share of those of the room."""
 
 _CHANGING_M: Final = 0.029
-"""As large as constants that are uniform within 5 cm."""
+"""The standard deviation of constants that are uniform within 5 cm."""
 
 _HALL_M: Final = (12.0, 16.0)
 _ROOM_3D_M: Final = (8.0, 6.0)
@@ -64,24 +64,24 @@ _PAST_WALL_Y_M: Final = (0.3, 7.7)
 
 _SMALL_M: Final = (0.1, 0.4)
 _LARGE_M: Final = (0.5, 2.0)
-"""By how much anchors are late, each by its own draw."""
+"""Ranges from which each late anchor's delay is drawn."""
 _LATE_S: Final = (_WARMUP_S + 3.0, _WARMUP_S + 9.0)
 
 _CRYSTALS: Final = ((1.0, 20.0), (-1.0, 20.0), (2.0, 20.0), (-2.0, 20.0), (5.0, 60.0))
-"""What tags' crystals gain in the end in ppm, and the time constant in s."""
+"""Final change of the tags' crystals in ppm, and its time constant in s."""
 
 _POWER_CUT_PPM: Final = (0.5, 3.0)
 _POWER_CUT_TAU_S: Final = 60.0
-"""By how much the crystals of anchors that were all cold warm up, each by its own draw and with its own sign."""
+"""Change of each anchor's crystal from cold: its magnitude is drawn from this range, its sign is random."""
 _DRAUGHTS_PPMPS: Final = ((0.01, 0.03), (0.03, 0.1))
-"""By how much the frequencies of all anchors change in a second."""
+"""Ranges of the change of each anchor's frequency in a second."""
 _DRAUGHT_TAU_S: Final = 1e4
 """Long enough for a warm-up to be a straight line in a study."""
 
 _FIELDS_M: Final = ((0.05, 0.075), (0.10, 0.12))
 """Standard deviations of multipath, and the largest RMSE with each."""
 _FIELD_LENGTH_M: Final = 0.1
-"""Way in which the correlation of multipath falls to 1/e."""
+"""Distance over which the correlation of multipath falls to 1/e."""
 
 _CREEP_MPS: Final = 0.05
 _CREEPS_S: Final = (5.0, 20.0, 60.0)
@@ -107,13 +107,13 @@ _HANDS: Final = ((20.0, 5e-9), (10.0, 5e-9), (20.0, 1e-9))
 _LATE_KEY: Final = 23
 _PATH_KEY: Final = 29
 _CRYSTAL_KEY: Final = 31
-"""Keys of streams of random numbers, next to the worlds' own."""
+"""Keys of streams of random numbers, beside those of the worlds."""
 
 Paths = Callable[[int], Sequence[Trajectory]]
 
 
 def cases(plan: Plan) -> list[Case]:
-    """The cases under the plan's conditions."""
+    """The cases of the plan's conditions."""
     return CONDITIONS[plan.conditions](plan)
 
 
@@ -135,7 +135,7 @@ def _case(
     long: bool = False,
     **faults: Any,  # noqa: ANN401 - of ``worlds``
 ) -> Case:
-    """``bounded``: nothing is wrong but what the room's errors of survey and ranges are, so that there is a bound."""
+    """``bounded``: errors of survey and ranges are the only ones, so there is a bound."""
     in_site = site or lab_site(plan.noise_ps)
     count = plan.worlds if name == BASE else max(2, _LONG_WORLDS if long else round(_SHARE * plan.worlds))
     trajectories = paths or partial(wanderers, in_site, plan.tags)
@@ -180,7 +180,7 @@ def _rooms(plan: Plan) -> list[Case]:
 
 
 def _rests(plan: Plan) -> list[Case]:
-    """Tags that lie still from the start on: judged at first, and a second time when they have lain for long."""
+    """Tags at rest: judged at first, and again after a long rest."""
     later_s = _WARMUP_S + (_REST_SPANS - 1) * plan.seconds
     limits = (Limit("nees", most=2.0), _exceeded(0.0))
     found = []
@@ -199,7 +199,7 @@ def _rests(plan: Plan) -> list[Case]:
 
 
 def still(site: Site, tags: int, seed: int) -> Sequence[Trajectory]:
-    """Tags that stay where those that wander begin."""
+    """Tags at rest where those that wander begin."""
     return [Static(*path.position(0.0).tolist()) for path in wanderers(site, tags, seed)]
 
 
@@ -209,7 +209,7 @@ def _beside_the_line(tags: int, seed: int) -> Sequence[Trajectory]:
 
 
 def _errors(plan: Plan) -> list[Case]:
-    """Constants of the ranges, then anchors that stand elsewhere than their room's survey accounts for."""
+    """Constants of the ranges, then anchors farther off than the survey accounts for."""
     ranges = {
         "constants change in 10 s": {"constant_m": 0.0, "changing_m": _CHANGING_M, "correlation_s": 10.0},
         "constants change within 1 m": {"constant_m": 0.0, "changing_m": _CHANGING_M, "correlation_m": 1.0},
@@ -281,7 +281,7 @@ def _late(plan: Plan) -> list[Case]:
 
 
 def creeping_anchor(plan: Plan, creep_s: float, number: int) -> tuple[AnchorBias, ...]:
-    """Another anchor in each world, whose range creeps from the start of the judging on and is then right again."""
+    """Another anchor in each world, whose range error grows from the start of the judging and then ends."""
     anchor = anchor_of(lab_site(plan.noise_ps), number).id
     return (AnchorBias(anchor, 0.0, from_s=_WARMUP_S, to_s=_WARMUP_S + creep_s, creep_mps=_CREEP_MPS),)
 
@@ -289,7 +289,7 @@ def creeping_anchor(plan: Plan, creep_s: float, number: int) -> tuple[AnchorBias
 def late_anchors(
     plan: Plan, count: int, span_m: tuple[float, float], from_s: float, to_s: float, number: int
 ) -> tuple[AnchorBias, ...]:
-    """Other anchors in each world; those that are late in twos are among those in threes, by the same amounts."""
+    """Other anchors in each world; the pairs are among the triples, late by the same amounts."""
     draw = np.random.default_rng(seed_of(plan.seed, number, _LATE_KEY))
     anchors = lab_site(plan.noise_ps).anchors
     chosen, amounts_m = draw.permutation(len(anchors))[:count], draw.uniform(*span_m, len(anchors))
@@ -332,7 +332,7 @@ def _power_cuts(plan: Plan) -> list[Case]:
 
 
 def warming_anchors(plan: Plan, low_ppm: float, high_ppm: float, tau_s: float, number: int) -> tuple[WarmUp, ...]:
-    """Each anchor's crystal by its own amount and sign, from before the tags are switched on."""
+    """A drift of each anchor's crystal with its own amount and sign, from before the tags are switched on."""
     anchors = lab_site(plan.noise_ps).anchors
     draw = np.random.default_rng(seed_of(plan.seed, number, _CRYSTAL_KEY))
     gains_ppm = draw.uniform(low_ppm, high_ppm, len(anchors)) * draw.choice((-1.0, 1.0), len(anchors))
@@ -405,7 +405,7 @@ def _with_carrier(carrier: CarrierModel | None, impairments: Impairments) -> Imp
 
 
 def _hands(plan: Plan, rate_hz: float, random_walk_fm: float, **options: Any) -> tuple[Run, ...]:  # noqa: ANN401 - of ``worlds``
-    """Tags in hands, with filters that know how hands move, at this rate of beacons of each anchor."""
+    """Tags in hands, with filters set to that motion, at this rate of beacons of each anchor."""
     site = lab_site(plan.noise_ps)
     noise, schedule = replace(site.noise, random_walk_fm=random_walk_fm), replace(site.schedule, rate_hz=rate_hz)
     site = replace(site, noise=noise, schedule=schedule)
@@ -462,7 +462,7 @@ def _site_3d(noise_ps: float, name: str, floor_m: tuple[float, float], heights_m
 
 
 def line_site(noise_ps: float) -> Site:
-    """Six anchors along one wall, every second one a little off it: all tags are on one side, which ranges hide."""
+    """Six anchors along one wall, every second one a little off it: ranges do not show on which side tags are."""
     (length_m, off_m), lab = _LINE_M, lab_site(noise_ps)
     places = enumerate(np.linspace(0.0, length_m, len(lab.anchors)).tolist())
     anchors = tuple(AnchorSite(id=k + 1, x_m=x_m, y_m=off_m * (k % 2)) for k, x_m in places)

@@ -22,14 +22,14 @@ from skyless.research.studies.runner import (
 )
 
 OF_EPISODES: Final = ("efficiency", "integrity")
-"""Studies of the filter ``joint`` itself."""
+"""Studies of episodes, which have no worlds."""
 
 WITHOUT_POSITIONS: Final = ("watch",)
-"""Studies in which nobody computes positions."""
+"""Studies without positions of tags."""
 
 
 class Parts(Struct, frozen=True):
-    """Where the results of a study's cells came from."""
+    """How many cells of a study were computed, and how many resumed."""
 
     computed: int
     resumed: int
@@ -78,7 +78,7 @@ def run_study(
 
 
 def way_on(resume: str | Path | None) -> str:
-    """What to do after a study has ended early."""
+    """Advice for going on after a study has ended early."""
     if resume is None:
         return "nothing was written; --resume FOLDER keeps what is finished"
     return f"the same command with --resume {resume} goes on"

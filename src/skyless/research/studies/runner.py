@@ -43,7 +43,7 @@ class Plan(Struct, frozen=True):
     seed: int = 1
     quick: bool = False
     conditions: str = "usual"
-    """Which cases the study ``room`` has."""
+    """Cases of the study ``room``, a key of ``CONDITIONS``."""
     noise_ps: float = 100.0
     """Noise of every TX and RX stamp, which filters know."""
     qa: float = 0.3
@@ -77,7 +77,7 @@ _USUAL: Final = {
 
 
 def plan_of(method: str, seed: int, *, study: str = "", quick: bool = False, **given: Any) -> Plan:  # noqa: ANN401 - of Plan
-    """The usual amounts, or with ``quick`` few, where none are given."""
+    """The plan: default amounts, or few with ``quick``, where none are given."""
     known = {name: value for name, value in given.items() if value is not None}
     if known.get("conditions", "usual") != "usual":
         study = ""
@@ -86,14 +86,14 @@ def plan_of(method: str, seed: int, *, study: str = "", quick: bool = False, **g
 
 
 class Cell(Struct, frozen=True):
-    """Work that shares nothing with the other cells: it may run in any process of any machine."""
+    """Independent work, which may run in any process of any machine."""
 
     name: str
     """Name of the case to which it belongs."""
     function: Callable[[], Any]
     """A function defined at the top of a module, with its arguments."""
     weight_s: float
-    """About how long it takes: the longest are begun first."""
+    """Approximate duration: the longest cells begin first."""
 
 
 class Limit(Struct, frozen=True):
@@ -121,9 +121,9 @@ class Row(Struct, frozen=True, kw_only=True):
     series: str
     """Cases of a series differ in one thing."""
     x: float | None = None
-    """How much of that thing, where it is a number."""
+    """The amount of that thing, where it is a number."""
     mesh: bool | None = None
-    """None for methods that make no use of what anchors hear of each other."""
+    """None for methods that do not use anchors' receptions of each other."""
     noise_ps: float
     runs: int
     """Independent runs: worlds, or episodes."""
@@ -135,7 +135,7 @@ class Row(Struct, frozen=True, kw_only=True):
     p95_m: float | None = None
     max_m: float | None = None
     said_m: float | None = None
-    """Predicted by the fixes: the root of the mean trace of their covariances."""
+    """Predicted by the fixes: root of the mean trace of their covariances."""
     nees: float | None = None
     """Mean normalised error squared over the degrees of freedom: 1 for fixes whose covariances are right."""
     nees_interval: tuple[float, float] | None = None
@@ -157,7 +157,7 @@ AnyRow = TypeVar("AnyRow", bound=Row)
 
 
 def with_limits(row: AnyRow, limits: Sequence[Limit]) -> AnyRow:
-    """The row with its limits and the figures that miss them; without a fix all but that no level is given."""
+    """Add limits and the figures that miss them to a row. Without a fix, only limits on levels can hold."""
     if not limits:
         return row
     without = () if row.fixes else tuple(one.figure for one in limits if one.figure not in {"level", "exceeded"})
@@ -167,7 +167,7 @@ def with_limits(row: AnyRow, limits: Sequence[Limit]) -> AnyRow:
 
 
 def missed_limits(row: Row, limits: Sequence[Limit]) -> tuple[str, ...]:
-    """Figures outside of their limits. What does not exist exceeds nothing (levels that no fix gives)."""
+    """Figures outside of their limits. A missing value exceeds nothing (levels that no fix gives)."""
     return tuple(limit.figure for limit in limits if not _holds(getattr(row, limit.figure), limit))
 
 
@@ -178,7 +178,7 @@ def _holds(value: float | None, limit: Limit) -> bool:
 
 
 class Study(Struct, frozen=True):
-    """A study by its parts."""
+    """A study: its cells, their rows, and its picture."""
 
     name: str
     title: str
@@ -190,11 +190,11 @@ class Study(Struct, frozen=True):
 
 
 MEASURED: Final = ("cpu_us_per_message", "cpu_ms_per_tag_s")
-"""Fields of a row that are not the same the next time."""
+"""Fields of a row that differ between runs of the same plan."""
 
 
 def seed_of(seed: int, *numbers: int) -> int:
-    """A seed for one of many runs, independent of those of others."""
+    """A seed for one of many independent runs."""
     return int(np.random.SeedSequence([seed, *numbers]).generate_state(1, np.uint64)[0])
 
 
@@ -329,7 +329,7 @@ def _uninterrupted() -> Iterator[None]:
 
 @contextmanager
 def _pool(processes: int) -> Iterator[ProcessPoolExecutor]:
-    """Processes that end when the block is left by an exception, or this process is no more."""
+    """Processes that end when the block is left by an exception, or when this process ends."""
     context = multiprocessing.get_context("spawn")
     reader, writer = context.Pipe(duplex=False)
     pool = ProcessPoolExecutor(processes, context, _start_worker, (reader,))
@@ -361,7 +361,7 @@ def _start_worker(parent: Connection) -> None:
 
 @contextmanager
 def _cluster(scheduler: str) -> Iterator[tuple[Any, Executor]]:
-    """A Dask client, and what it computes with, once all workers have said that they run this program."""
+    """A Dask client and its executor, once all workers have confirmed that they run this program."""
     if not _ADDRESS.fullmatch(scheduler):
         raise SkylessError(f"--scheduler is {scheduler!r}; it should be an address such as tcp://127.0.0.1:8786")
     connect = extra_module("distributed", "--scheduler").Client
@@ -416,7 +416,7 @@ class KeptResults:
         self._write(head, self._head)
 
     def read(self, cells: int) -> tuple[dict[int, Any], tuple[str, ...]]:
-        """The results that are there, by the numbers of their cells; and the files that are damaged."""
+        """The kept results by the numbers of their cells, and the names of damaged files."""
         results, damaged = {}, []
         for number in range(cells):
             file = self._file(number)

@@ -34,9 +34,9 @@ from skyless.site.survey.facts import Facts, Point, Tape
 from skyless.site.survey.solve import run_survey
 
 NEAR_M: Final = 0.1
-"""A result whose anchors are farther off (rms) is wrong."""
+"""Results whose anchors are farther off than this (rms) may be wrong."""
 _WRONG_SIGMAS: Final = 4.0
-"""It should say so, if it is also farther off than this many of its own standard deviations."""
+"""They are wrong if they are also farther off than this many of their own standard deviations."""
 
 _RUNS_IN_A_CELL: Final = 5
 _LATE_S: Final = 2.0
@@ -48,7 +48,7 @@ class Variant(Struct, frozen=True):
 
     name: str
     delay_std_m: float
-    """What the survey expects."""
+    """Standard deviation of delays that the survey assumes."""
     tapes: int = 0
     """Distances that the survey without them asked for."""
     keeps: bool = False
@@ -233,7 +233,7 @@ def _facts(
     tape_m: Array,
     off_m: tuple[Array, Array],
 ) -> Facts:
-    """What a survey is given; ``off_m``: errors of positions by hand and of a sketch."""
+    """Facts for a survey; ``off_m``: errors of positions by hand and of a sketch."""
     at_m = dict(zip(layout.anchors, layout.position_m, strict=True))
     sketch: dict[int, Point] = {}
     if variant.keeps or variant.sketched:

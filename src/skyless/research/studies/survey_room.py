@@ -1,4 +1,4 @@
-"""The study ``survey-room``: tags in a room, with site files that a survey, a person and one who knows the truth wrote.
+"""The study ``survey-room``: tags in a room, with site files from a survey, by hand and from the truth.
 
 A world is one room: its anchors survey themselves through its air, and the same tags then walk there with each file.
 The files differ in nothing else: seeds, ways and errors of ranges are the same. Two more cases have no errors but noise
@@ -45,7 +45,7 @@ _AT_REST_M: Final = (3.0, 4.0, 0.0)
 _DELAY_STD_M: Final = 0.07
 _PAIR_STDS_M: Final = (0.0, 0.02, 0.05)
 _RUN_S: Final = 0.018
-"""About what a tag takes for a second of a world."""
+"""Approximate CPU time of a tag for a second of a world."""
 
 
 class Group(Struct, frozen=True):
@@ -55,7 +55,7 @@ class Group(Struct, frozen=True):
     layout: str
     errors: RoomErrors = RoomErrors()
     files: tuple[str, ...] = (TRUTH, SURVEYED)
-    """The first one is the reference of the others."""
+    """The first one is the reference for the others."""
     at_rest: bool = False
     """Tags at rest, delays known and no errors but noise; the survey knows that."""
 
@@ -110,7 +110,7 @@ def _weight_s(run: RoomRun) -> float:
 
 
 def room_results(run: RoomRun) -> tuple[RunResult, ...]:
-    """What the tags made of each file of a room."""
+    """Results of the tags with each file of a room."""
     plan, seed = run.plan, seed_of(run.plan.seed, run.world)
     room = drawn_room(survey_layouts()[run.group.layout], run.group.errors, plan.noise_ps, seed)
     paths = _paths(run, room)

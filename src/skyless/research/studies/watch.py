@@ -1,4 +1,4 @@
-"""The study ``watch``: how surely and how fast it is found that anchors have moved, and what else is found.
+"""The study ``watch``: how reliably and how fast moved anchors are found, and how many findings are wrong.
 
 Ranges are drawn: noise of the stamps, and drift of each pair (a Gauss–Markov process) as real rooms have it. Events
 come one after another, each on another anchor or link, and end when they are found.
@@ -55,28 +55,28 @@ class _Case(Struct, frozen=True):
     limits: tuple[Limit, ...] = ()
 
     def run(self, events: int, seed: int) -> WatchRun:
-        """Some of its events, or windows without any."""
+        """Run some of its events, or windows without any."""
         drift = (self.drift_m, self.drift_s, self.lively_m)
         return WatchRun(survey_layouts()[self.layout], self.event, self.size_m, *drift, self.missing, events, seed)
 
 
 class WatchRow(Row, frozen=True, kw_only=True):
-    """What the watch of the anchors found of the events of a case."""
+    """Findings of the watch of the anchors in the events of a case."""
 
     found: float | None = None
     """Share of events that were found in time."""
     named: float | None = None
     """Share of those found whose anchors or links were named, and no others."""
     kind: float | None = None
-    """Share of those found of which it was right as well what had happened to them."""
+    """Share of those found that also have the right kind of event."""
     wrong: float | None = None
-    """Share of events in which an anchor was said to have moved, or its delay to have changed, that has not."""
+    """Share of events with a false report that an anchor has moved or its delay has changed."""
     found_s: float | None = None
-    """From the event to the finding, which 99 % of those found do not exceed."""
+    """Time from the event to the finding, 99th percentile."""
     alarms_per_day: float | None = None
     """Findings while nothing happened."""
     alarms: int | None = None
-    """How many of them there were, or how many windows struck."""
+    """Number of these findings, or of windows with an alarm."""
 
 
 def _cases() -> list[_Case]:

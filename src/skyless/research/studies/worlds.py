@@ -1,4 +1,4 @@
-"""Worlds of the studies: a site on the simulated air, its tags judged against the truth; most are the lab.
+"""Simulated worlds of the studies: a site on the air, and its tags judged against the truth.
 
 ``run_world`` is the work of one cell; ``worlds`` makes the worlds of a case.
 """
@@ -43,7 +43,7 @@ _OUTSIDE: Final = 0.999
 _SAMPLE_ROWS: Final = 1 << 13
 
 _BOUND_SPEED_STD_MPS: Final = 1.0
-"""Of tags before the first frame, in the bound; when the judging begins nothing of it is left."""
+"""Speed of tags before the first frame that the bound assumes; it no longer matters when the judging begins."""
 
 _LOSS_KEY: Final = 3
 """Key of the stream of random numbers, next to the keys of the simulated world."""
@@ -67,7 +67,7 @@ class Run(Struct, frozen=True):
 
 
 class RunResult(Struct, frozen=True):
-    """Sums over the judged fixes of a world: of each tag the first of every superframe."""
+    """Sums over the judged fixes of a world: each tag's first fix of every superframe."""
 
     fixes: int
     superframes: int
@@ -81,13 +81,13 @@ class RunResult(Struct, frozen=True):
     outside: int
     max_m: float
     sample_m: Array
-    """Errors, an even sample of them."""
+    """An even sample of the errors."""
     messages: int
-    """Heard by all tags."""
+    """Number of messages that all tags together received."""
     tag_s: float
     """Seconds of all tags together."""
     cpu_s: float
-    """That the tags took, measured."""
+    """CPU time of the tags, measured."""
     levels: LevelCounts | None = None
     """None for methods that give no protection levels."""
 
@@ -179,7 +179,7 @@ def judged(run: Run, beacons: Iterable[Heard]) -> RunResult:
 
 
 def bound_m2(run: Run, biases: Biases) -> float:
-    """Trace of the bound, its mean over all tags of a world and the superframes in which fixes are judged."""
+    """Mean trace of the bound over all tags of a world and the time in which fixes are judged."""
     site, noise = run.site, run.impairments
     off_m = {one.anchor: (one.x_m, one.y_m, one.z_m) for one in noise.anchor_displacements}
     anchors_m = np.array(
@@ -215,7 +215,7 @@ def _received(run: Run) -> list[list[tuple[Broadcast, Array]]]:
 
 
 def _known(site: Site, frames: Sequence[bytes]) -> tuple[Mask, Integers]:
-    """Which receptions the frames of a tag tell it of, as ``relayed_receptions``, and the frames' senders."""
+    """Receptions that a tag learns from its frames, as by ``relayed_receptions``, and the frames' senders."""
     index_of = {one.id: row for row, one in enumerate(site.anchors)}
     beacons = [beacon for frame in frames if isinstance(beacon := decode_cached(frame), Beacon)]
     senders = np.array([index_of[one.anchor] for one in beacons])
@@ -292,5 +292,5 @@ def box(site: Site) -> tuple[Array, Array]:
 
 
 def anchor_of(site: Site, number: int) -> AnchorSite:
-    """Another anchor for each world in turn, the master among them."""
+    """The anchor of a world: each one in turn, including the master."""
     return site.anchors[number % len(site.anchors)]
