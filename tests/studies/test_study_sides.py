@@ -1,31 +1,27 @@
 """Pictures of studies say which side of a limit is safe."""
 
+from types import SimpleNamespace
+
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from skyless.research.studies.integrity import IntegrityRow
-from skyless.research.studies.large import LargeRow
-from skyless.research.studies.picture import CONFIDENCE, STATED_RISK, WorldRow, shade_sides
+from skyless.research.studies.picture import CONFIDENCE, STATED_RISK, shade_sides
 from skyless.research.studies.run import STUDIES
-from skyless.research.studies.runner import Row
-from skyless.research.studies.survey import SurveyRow
-from skyless.research.studies.watch import WatchRow
-
-ROWS = {"integrity": IntegrityRow, "large": LargeRow, "room": WorldRow, "survey": SurveyRow, "watch": WatchRow}
+from skyless.research.studies.runner import Limit
 
 
-def row(study, number, case, series, x=None, **more):
-    given = {
-        "study": study, "method": "joint", "case": case, "series": series, "x": x, "mesh": True, "noise_ps": 100.0,
-        "runs": 10, "fixes": 1000, "rmse_m": 0.03 + 0.01 * number, "nees": 0.7 + 0.25 * number, "ratio": 1.0,
-        "ratio_error": 0.02, "level": 0.9, "exceeded": 1e-4, "found": 0.9, "found_s": 3.0, "hpl_m": 0.1,
-        "available": 0.9, "risk": 1e-4, "hmi": 1e-5 * number, "hmi_interval": (0.0, 1e-4), "first_fix_s": 0.1,
-        "smallest_m": 0.1, "near": 1.0, "undetermined": 0.0, "flagged": 0.0, "wrong_runs": 0, "wrong_flagged": None,
-        "found_late": None, "excluded_wrongly": None, "delay_m": None, "tag_m": None, "hand_tag_m": None,
+def row(study, number, case, series, x=None):
+    """A row with all figures that pictures show."""
+    figures = {
+        "rmse_m": 0.03 + 0.01 * number, "rmse_error_m": 0.001, "nees": 0.7 + 0.25 * number, "nees_interval": (0.9, 1.1),
+        "ratio": 1.0, "ratio_error": 0.02, "level": 0.9, "exceeded": 1e-4, "found": 0.9, "found_s": 3.0, "hpl_m": 0.1,
+        "available": 0.9, "hmi": 1e-5 * number,
     }  # fmt: skip
-    kind = ROWS.get(study, Row)
-    return kind(**{name: value for name, value in (given | more).items() if name in kind.__struct_fields__})
+    limits = (Limit("nees", 0.7, 1.3), Limit("ratio", most=1.2))
+    return SimpleNamespace(
+        study=study, method="joint", case=case, series=series, x=x, limits=limits, passed=True, **figures
+    )
 
 
 def words_of(figure):
