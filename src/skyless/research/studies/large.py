@@ -1,4 +1,4 @@
-"""The studies ``large`` and ``scale``: sites of a thousand anchors, and growing sites.
+"""The study ``large``: a site of a thousand anchors.
 
 The anchors are a tape (``sim/tape``); each tag gets the beacons that it receives, and nothing else.
 """
@@ -15,18 +15,15 @@ from msgspec.structs import replace
 
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
-from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site
+from skyless.core.site import EXACT, AccuracySite, Site
 from skyless.core.tag.joint import Estimation
 from skyless.core.tag.receiver import Receiver
-from skyless.research.studies.lab import still
-from skyless.research.studies.picture import Case, interval, jackknife
+from skyless.research.studies.picture import interval, jackknife
 from skyless.research.studies.room import biases_of
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.studies.worlds import box, worlds
 from skyless.research.uncertainty import BoundSettings, Sendings, received_bound, relayed_receptions
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room
 from skyless.sim.impairments import Impairments, RangeErrorModel
-from skyless.sim.lab import paper_lab_site
 from skyless.sim.tape import Heard, Tape
 from skyless.sim.trajectory import Roaming, Trajectory, Waypoints
 from skyless.site.channel import ChannelModel
@@ -390,62 +387,3 @@ def row_of(plan: Plan, case: LargeCase, each: list[LargeResult]) -> Row:
         return row
     ratio, ratio_error = jackknife(sums, lambda part: math.sqrt(part[:, 1].sum() / part[:, 3].sum()))
     return replace(row, bound_m=math.sqrt(whole.bound_m2 / whole.fixes), ratio=ratio, ratio_error=ratio_error)
-
-
-_FLEET_WARMUP_S: Final = 1.0
-_FLEET_S: Final = 0.5
-"""Fleets of all sizes are judged in the same stretch of time, short enough for ten thousand tags."""
-
-_FLEETS: Final = ((1, 48), (10, 24), (100, 12), (1_000, 4), (10_000, 2))
-"""Numbers of tags, and of worlds with them."""
-_QUICK_FLEETS: Final = ((1, 24), (10, 12), (100, 4), (1_000, 2))
-
-_ANCHORS: Final = (4, 6, 8, 12, 20, 30, 45, 60)
-_QUICK_ANCHORS: Final = (4, 8, 20, 60)
-_RING_ROOM_M: Final = (12.0, 16.0)
-
-
-def scale_cases(plan: Plan) -> list[Case]:
-    """Tags that lie still, in the lab, and in a room with anchors on a ring."""
-    return [*_fleets(plan), *_rings(plan)]
-
-
-def _fleets(plan: Plan) -> list[Case]:
-    lab = paper_lab_site(plan.noise_ps)
-    return [
-        Case(
-            f"{tags} tag{'s' if tags > 1 else ''}",
-            "tags",
-            float(tags),
-            worlds(plan, lab, partial(_still_tags, lab, tags), warmup_s=_FLEET_WARMUP_S, seconds=_FLEET_S, count=count),
-        )
-        for tags, count in (_QUICK_FLEETS if plan.quick else _FLEETS)
-    ]
-
-
-def _rings(plan: Plan) -> list[Case]:
-    seconds = min(plan.seconds, 10.0)
-    return [
-        Case(
-            f"{count} anchors",
-            "anchors in view",
-            float(count),
-            worlds(plan, ring(plan, count), partial(_still_tags, ring(plan, count), plan.tags), seconds=seconds),
-        )
-        for count in (_QUICK_ANCHORS if plan.quick else _ANCHORS)
-    ]
-
-
-def _still_tags(site: Site, tags: int, seed: int) -> Sequence[Trajectory]:
-    draw = np.random.default_rng(seed)
-    low_m, high_m = box(site)
-    return [still(draw, low_m, high_m) for _ in range(tags)]
-
-
-def ring(plan: Plan, count: int) -> Site:
-    """A site of ``count`` anchors, all in radio range of each other, evenly spread on an ellipse."""
-    lab = paper_lab_site(plan.noise_ps)
-    angles = 2.0 * np.pi * (np.arange(count) + 0.5) / count
-    positions = ((1.0 + np.column_stack([np.cos(angles), np.sin(angles)])) * np.array(_RING_ROOM_M) / 2.0).tolist()
-    anchors = tuple(AnchorSite(id=number, x_m=x, y_m=y) for number, (x, y) in enumerate(positions, start=1))
-    return replace(lab, name=f"ring of {count}", anchors=anchors)
