@@ -12,12 +12,13 @@ from skyless.core.air.site_pages import (
     MAX_NOISE,
     PRESENT_TICKS,
     SAME_PAGES,
+    LocalAlmanac,
     SitePages,
     decode_page,
     encode_page,
     note_page,
 )
-from skyless.core.anchor import LocalAlmanac, site_issue, site_page_for, site_pages_of
+from skyless.core.anchor import site_issue, site_page_for, site_pages_of
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.native.records import MAX_NEIGHBOURS, MAX_PAGES
 from skyless.core.site import GeoreferenceSite

@@ -40,12 +40,11 @@ from skyless.core.air.beacon import (
     with_authentication,
 )
 from skyless.core.air.frame import Heard, Malformed, Reception, Transmission, is_weak_first_path, phase_of
-from skyless.core.air.neighbours import STAMP_COUNTERS, STAMP_FITS, Neighbours, StatedPlace, unwrap_stamp
-from skyless.core.air.site_pages import NO_ISSUE, SitePages, decode_page, encode_page
+from skyless.core.air.neighbours import STAMP_COUNTERS, STAMP_FITS, Neighbours, unwrap_stamp
+from skyless.core.air.site_pages import encode_page
 from skyless.core.keys.chain import Chain, ChainKeys, ChainRing, ChainTiming, is_mac, mac_of
 from skyless.core.keys.fault import Fault
 from skyless.core.native.library import compiled
-from skyless.core.native.records import first
 from skyless.core.site import AnchorSite, Site, UnplacedAnchor
 from skyless.core.ticks import (
     DELAYED_TX_GRANULARITY_TICKS,
@@ -101,47 +100,6 @@ def site_issue(pages: Iterable[Page]) -> int:
     """A 16-bit checksum of the contents of all pages."""
     checksum = crc32(b"".join(sorted(map(encode_page, pages))))
     return (checksum ^ checksum >> 16) & 0xFFFF
-
-
-class CommonPages(Struct, frozen=True):
-    """The complete pages of a site."""
-
-    site: SitePage
-    noise: NoisePage
-    accuracy: AccuracyPage
-    georeference: GeoreferencePage | None = None
-
-
-class LocalAlmanac:
-    """What a tag has learnt about a site of protocol 2."""
-
-    def __init__(self, site_pages: SitePages, neighbours: Neighbours) -> None:
-        """The site's pages and the anchors' statements, both of which keep changing."""
-        self._site_pages, self._neighbours = site_pages, neighbours
-
-    @property
-    def issue(self) -> int | None:
-        """Issue of the pages in use."""
-        return None if self._site_pages.issue == NO_ISSUE else self._site_pages.issue
-
-    @property
-    def pages(self) -> CommonPages | None:
-        """The pages in use; None until they are complete."""
-        if self._site_pages.issue == NO_ISSUE:
-            return None
-        noise, earth, accuracy, site = (decode_page(bytes(one.contents)) for one in self._site_pages.used)
-        return CommonPages(site, noise, accuracy, earth)  # type: ignore[arg-type]  # in the order of their types
-
-    def points_m(self) -> dict[int, tuple[float, float, float]]:
-        """Position of each anchor that has stated one."""
-        rows = first(self._neighbours.rows, self._neighbours.count)
-        return {row.anchor: _point_m(row.place) for row in rows if row.has_place}
-
-
-def _point_m(place: StatedPlace) -> tuple[float, float, float]:
-    """The position that an anchor states."""
-    x_m, y_m, z_m = (one_mm / 1000 for one_mm in place.position_mm)
-    return x_m, y_m, z_m
 
 
 # What an anchor with keys adds to its frames, and how it verifies those of others: it knows all keys, so at once.

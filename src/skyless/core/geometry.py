@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from msgspec import UNSET, Struct
@@ -10,7 +10,9 @@ from numpy.typing import ArrayLike
 
 from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.core.native.arithmetic import SINGULAR_PIVOT
-from skyless.core.site import Site
+
+if TYPE_CHECKING:
+    from skyless.core.site import Site
 
 _DIRECTION: Final = np.array([0.8164, 0.5211, 0.2489])
 """Slightly shorter than one, and along no street of a grid, so that few points share a projection."""
@@ -20,7 +22,7 @@ RADIO_REACH_M: Final = 31.0
 """Open-air range of the planner's and the simulation's link budget, at which half of the frames arrive."""
 
 
-def anchor_positions(site: Site) -> Matrix:
+def anchor_positions(site: "Site") -> Matrix:
     """Positions of a site's placed anchors in the order of the file, shape (n, 3)."""
     return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]).reshape(-1, 3)
 
@@ -46,13 +48,13 @@ def pairs_within(points_m: Matrix, distance_m: float) -> Iterator[tuple[Integers
         yield np.minimum(one, other), np.maximum(one, other), apart_m[near]
 
 
-def anchors_in_reach(site: Site) -> Integers:
+def anchors_in_reach(site: "Site") -> Integers:
     """Number of placed anchors within open-air range of each placed anchor, itself included; shape (n,)."""
     ones, others = links_in_reach(site)
     return np.bincount(np.concatenate([ones, others]), minlength=len(site.anchors)) + 1
 
 
-def links_in_reach(site: Site) -> tuple[Integers, Integers]:
+def links_in_reach(site: "Site") -> tuple[Integers, Integers]:
     """Links between anchors within radio reach of each other: the indices of both ends."""
     pairs = [(one, other) for one, other, _ in pairs_within(anchor_positions(site), RADIO_REACH_M)]
     nothing = np.empty(0, np.int64)
@@ -67,12 +69,12 @@ OUTSIDE_M: Final = 0.5
 """Anchors this far outside an outline count as inside: it may leave out the walls that they hang on."""
 
 
-def outline_of(site: Site) -> Matrix | None:
+def outline_of(site: "Site") -> Matrix | None:
     """Corners of the site's room, shape (k, 2); None without an outline."""
     return None if site.outline_m is UNSET else np.array(site.outline_m, dtype=np.float64)
 
 
-def rectangle_of(site: Site) -> Box | None:
+def rectangle_of(site: "Site") -> Box | None:
     """The site's room if it is a rectangle along the axes, otherwise None."""
     outline_m = outline_of(site)
     if outline_m is None:

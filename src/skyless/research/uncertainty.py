@@ -16,10 +16,14 @@ from msgspec import Struct
 from numpy.typing import ArrayLike
 
 from skyless.core.arrays import Array, Integers, Mask, Matrix
-from skyless.core.estimator.compiled import add_anchor, process_known
+from skyless.core.estimator.compiled import add_anchor
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import State, covariances, new_state
+from skyless.core.estimator.steady_state import process_known
+from skyless.core.native.library import compiled
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S
+
+_process_known = compiled(process_known)
 
 
 @dataclass(frozen=True, slots=True)
@@ -441,7 +445,7 @@ def _frame_bound(
         sender = senders[frame]
         before = newest[sender]
         elapsed_s, way_m = (ticks[frame] - ticks[before]) * TICK_S, walked_m[frame] - walked_m[before]
-        process_known(state, sender, ticks[frame], path[frame], heard[frame], first, elapsed_s, way_m)
+        _process_known(state, sender, ticks[frame], path[frame], heard[frame], first, elapsed_s, way_m)
         if known[frame, n]:
             newest[sender] = frame
 

@@ -66,6 +66,12 @@ class ChannelModel(Record):
     carrier_noise_ppm: float = 0.03
     """Noise of the reported carrier offset (assumed: the resolution of RX_TTCKO)."""
 
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, ChannelModel) and self.values() == other.values()
+
+    def __hash__(self) -> int:
+        return hash(tuple(self.values().values()))
+
 
 @record
 class Barrier(Record):

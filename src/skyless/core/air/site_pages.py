@@ -5,6 +5,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Annotated, Any, Final, Literal
 
+from msgspec import Struct
+
 from skyless.core.air.almanac import (
     AccuracyPage,
     AnchorPage,
@@ -16,8 +18,19 @@ from skyless.core.air.almanac import (
     SitePage,
 )
 from skyless.core.air.frame import SIGN, Malformed, signed, unsigned
-from skyless.core.air.neighbours import Neighbours
-from skyless.core.native.records import MAX_PAGES, MAX_SENDERS, Array, Byte, Bytes, Integers, Record, Ticks, record
+from skyless.core.air.neighbours import Neighbours, StatedPlace
+from skyless.core.native.records import (
+    MAX_PAGES,
+    MAX_SENDERS,
+    Array,
+    Byte,
+    Bytes,
+    Integers,
+    Record,
+    Ticks,
+    first,
+    record,
+)
 from skyless.core.ticks import from_seconds
 
 # Checks of page contents (``docs/protocol.md``, "Pages"): frames may carry any values.
@@ -484,3 +497,47 @@ _DECODERS: Final[dict[int, Callable[[bytes], Page]]] = {
     SITE_PAGE: _decode_site,
     KEY_PAGE: lambda data: KeyPage(data[1:]),
 }
+
+
+# What a tag has learnt
+
+
+class CommonPages(Struct, frozen=True):
+    """The complete pages of a site."""
+
+    site: SitePage
+    noise: NoisePage
+    accuracy: AccuracyPage
+    georeference: GeoreferencePage | None = None
+
+
+class LocalAlmanac:
+    """What a tag has learnt about a site of protocol 2."""
+
+    def __init__(self, site_pages: SitePages, neighbours: Neighbours) -> None:
+        """The site's pages and the anchors' statements, both of which keep changing."""
+        self._site_pages, self._neighbours = site_pages, neighbours
+
+    @property
+    def issue(self) -> int | None:
+        """Issue of the pages in use."""
+        return None if self._site_pages.issue == NO_ISSUE else self._site_pages.issue
+
+    @property
+    def pages(self) -> CommonPages | None:
+        """The pages in use; None until they are complete."""
+        if self._site_pages.issue == NO_ISSUE:
+            return None
+        noise, earth, accuracy, site = (decode_page(bytes(one.contents)) for one in self._site_pages.used)
+        return CommonPages(site, noise, accuracy, earth)  # type: ignore[arg-type]  # in the order of their types
+
+    def points_m(self) -> dict[int, tuple[float, float, float]]:
+        """Position of each anchor that has stated one."""
+        rows = first(self._neighbours.rows, self._neighbours.count)
+        return {row.anchor: _point_m(row.place) for row in rows if row.has_place}
+
+
+def _point_m(place: StatedPlace) -> tuple[float, float, float]:
+    """The position that an anchor states."""
+    x_m, y_m, z_m = (one_mm / 1000 for one_mm in place.position_mm)
+    return x_m, y_m, z_m

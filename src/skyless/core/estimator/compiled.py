@@ -1,6 +1,6 @@
 """The estimator's functions as compiled in the library."""
 
-from skyless.core.estimator import levels, process, state, steady_state
+from skyless.core.estimator import levels, process, state
 from skyless.core.native.library import compiled
 
 add_anchor = compiled(state.add_anchor)
@@ -12,6 +12,3 @@ process_frame = compiled(process.process_frame)
 process_difference = compiled(process.process_difference)
 process_height = compiled(process.process_height)
 track = compiled(process.track)
-find_steady_state = compiled(steady_state.find_steady_state)
-find_walked = compiled(steady_state.find_walked)
-process_known = compiled(steady_state.process_known)

@@ -15,8 +15,7 @@ from skyless.core.air.almanac import AccuracyPage, GeoreferencePage, NoisePage
 from skyless.core.air.beacon import FAULTS, Beacon, fields_of
 from skyless.core.air.frame import Reception, phase_of, powers_dbm
 from skyless.core.air.site_choice import NO_SITE
-from skyless.core.air.site_pages import encode_page
-from skyless.core.anchor import LocalAlmanac
+from skyless.core.air.site_pages import LocalAlmanac, encode_page
 from skyless.core.clock_filter import stamp_variance_m2
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason

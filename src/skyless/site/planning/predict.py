@@ -17,12 +17,14 @@ from skyless.core.anchor import filter_pages_of
 from skyless.core.any_receiver import superframe_s
 from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.core.clock_filter import ClockNoise, clock_noise
-from skyless.core.estimator.compiled import add_anchor, find_steady_state, find_walked
+from skyless.core.estimator import steady_state
+from skyless.core.estimator.compiled import add_anchor
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import State, at, new_state
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay, SteadyState
 from skyless.core.geometry import anchor_positions, inverses
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS
+from skyless.core.native.library import compiled
 from skyless.core.native.records import MAX_ANCHORS, MAX_ANCHORS_IN_USE
 from skyless.core.native.views import records, view
 from skyless.core.protocol1.beacon import first_slots, schedule_of
@@ -65,6 +67,9 @@ _MAX_SUPERFRAMES: Final = 20
 _RESTED_S: Final = 2.0  # before a walk; phases count from a second after the start
 
 _START_VARIANCE: Final = 1.0  # of position and velocity, m² and m²/s²; the steady state does not depend on it
+
+_find_steady_state = compiled(steady_state.find_steady_state)
+_find_walked = compiled(steady_state.find_walked)
 
 
 def fill_joint_sigma(
@@ -130,7 +135,7 @@ def walked_sigma(
     columns, found, superframe_s = _planned(clocks, relays, share, delay_m, in_view), SteadyState(), clocks.gap_s.sum()
     walked = max(1, round(1.0 / superframe_s))
     velocity = np.ascontiguousarray(velocity_mps / (walked * superframe_s))
-    find_walked(s, *columns, len(clocks.sender), math.ceil(_RESTED_S / superframe_s), velocity, walked, found)
+    _find_walked(s, *columns, len(clocks.sender), math.ceil(_RESTED_S / superframe_s), velocity, walked, found)
     return math.sqrt(sum(found.variance_m2) / found.fixes)
 
 
@@ -158,7 +163,7 @@ def _steady_state(
     most = max(_MAX_SUPERFRAMES, math.ceil(_MAX_S / superframe_s))
     step = max(1, math.ceil(_COMPLETE_OVER_S / superframe_s))
     columns = _planned(clocks, relays, share, delay_m, in_view)
-    find_steady_state(s, *columns, len(clocks.sender), most, step, found)
+    _find_steady_state(s, *columns, len(clocks.sender), most, step, found)
     return found
 
 
