@@ -177,14 +177,14 @@ ELSEWHERE = {
         "tests/examples/test_examples.py::test_own_estimator"
     ),
     "skyless survey --mqtt mqtt://127.0.0.1 --site site.toml --duration 30 --anchor-height 2.6 --anchor-height 3=0.5"
-    " --origin 1 --x-axis 4 --left 6 --out surveyed.toml": (
+    " --axes 1,4,6 --out surveyed.toml": (
         "tests/nodes/test_live_survey.py::test_a_site_without_positions_is_surveyed_and_serves_tags"
     ),
     "skyless survey --recording walk.mcap --site hall.toml --walk tag1 --out walked.toml": (
         "tests/survey_inputs/test_walk_of.py::test_the_command_uses_the_walk"
     ),
-    "skyless survey --recording walk.mcap --at 3,4 --site hall.toml --out calibrated.toml": (
-        "tests/cli/test_survey_with_a_known_tag.py::test_the_delays_of_a_site_are_found_and_written_back"
+    "skyless calibrate walk.mcap --at 3,4 --site hall.toml --out calibrated.toml": (
+        "tests/cli/test_calibrate_command.py::test_the_delays_of_a_site_are_found_and_written_back"
     ),
     "skyless study room --conditions nlos --quick --plot nlos.png": (
         "tests/studies/test_study_command.py::test_a_study_tells_its_rows_and_writes_its_files"

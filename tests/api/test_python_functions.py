@@ -62,8 +62,8 @@ def results(folder):
         replay=skyless.replay(folder / "tdoa-table", anchors=anchors, truth=truth, settle_s=0.5),
         recorded=skyless.replay(folder / "stay.mcap"),
         plan=skyless.plan(folder / "lab.toml", method="weighted", step_m=1.0, target_m=0.1),
-        biases=skyless.survey_site(recording=folder / "tdoa-table", anchors=anchors, truth=truth),
-        delays=skyless.survey_site(recording=folder / "stay.mcap", site=folder / "lab.toml", stays=((3.0, 4.0),)),
+        biases=skyless.calibrate(folder / "tdoa-table", anchors=anchors, truth=truth),
+        delays=skyless.calibrate(folder / "stay.mcap", site=folder / "lab.toml", stays=((3.0, 4.0),)),
         study=skyless.study(
             "room", conditions="motion", quick=True, method="weighted", worlds=2, seconds=1.0, processes=1
         ),
@@ -75,8 +75,8 @@ COMMANDS = {
     "replay": "replay tdoa-table --anchors anchors.csv --truth truth.csv --settle 0.5",
     "recorded": "replay stay.mcap",
     "plan": "plan lab.toml --method weighted --step 1 --target 10",
-    "biases": "survey --recording tdoa-table --anchors anchors.csv --truth truth.csv",
-    "delays": "survey --recording stay.mcap --site lab.toml --at 3,4",
+    "biases": "calibrate tdoa-table --anchors anchors.csv --truth truth.csv",
+    "delays": "calibrate stay.mcap --site lab.toml --at 3,4",
     "study": "study room --conditions motion --quick --method weighted --worlds 2 --seconds 1 --processes 1",
 }
 """What each result is compared with."""
@@ -250,7 +250,7 @@ def test_arrays_and_files_of_surveys(results, folder, tmp_path, capsys):
     assert delays.anchors.tolist() == [1, 2, 3, 4, 5, 6]
     out = tmp_path / "out.csv"
     recording, table, truth = (str(folder / name) for name in ("tdoa-table", "anchors.csv", "truth.csv"))
-    assert main(["survey", "--recording", recording, "--anchors", table, "--truth", truth, "--out", str(out)]) in {
+    assert main(["calibrate", recording, "--anchors", table, "--truth", truth, "--out", str(out)]) in {
         None,
         0,
     }
@@ -477,15 +477,25 @@ def test_mistakes_of_a_plan_are_named(arguments, right):
     refused(right, skyless.plan, {"site": paper_lab_site(accuracy=AccuracySite()), "method": "weighted"} | arguments)
 
 
-SURVEY = [
+CALIBRATE = [
     ({"stays": ((1,),)}, r"stays\[0\] is \(1,\); it should be 2 or 3 finite numbers"),
     ({"stays": ((1, 2),)}, "lacks its height"),
     ({"stays": (Stay(1.0, 2.0, 3.0, 5.0, 4.0),)}, r"stays\[0\].to_s is 4.0; it should be above from_s"),
     ({"stays": ((1, 2, 3),), "truth": [[0, 1, 2, 3]]}, "stays says where the antenna was"),
     ({"stays": ((1, 2, 3),), "first": "200%"}, "first is '200%'; it should be a number of differences"),
-    ({}, "one with stamps of anchors"),
+    ({}, "truth or stays should say where the tag was"),
     ({"stays": ((1, 2, 3),), "tag": "tag1"}, "tag is 'tag1'; it should be left out"),
-    ({"recording": None}, r"anchors is .*; it should be left out: it is for recordings"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "right"), CALIBRATE, ids=[str(sorted(given)) for given, _ in CALIBRATE])
+def test_mistakes_of_a_calibration_are_named(folder, arguments, right):
+    refused(right, skyless.calibrate, {"file": folder / "tdoa-table", "anchors": synthetic.ANCHORS_M} | arguments)
+
+
+SURVEY = [
+    ({}, "one with stamps of anchors"),
+    ({"recording": None}, "recording is missing"),
     ({"distances": ((1, 2, 3.0),)}, r"distances\[0\] is \(1, 2, 3.0\); it should be a skyless.site.survey.facts.Tape"),
     ({"points_m": {3: (1.0,)}}, r"points_m\[3\] is \(1.0,\); it should be 2 or 3 finite numbers"),
 ]
@@ -493,15 +503,13 @@ SURVEY = [
 
 @pytest.mark.parametrize(("arguments", "right"), SURVEY, ids=[str(sorted(given)) for given, _ in SURVEY])
 def test_mistakes_of_a_survey_are_named(folder, arguments, right):
-    refused(
-        right, skyless.survey_site, {"recording": folder / "tdoa-table", "anchors": synthetic.ANCHORS_M} | arguments
-    )
+    refused(right, skyless.survey_site, {"recording": folder / "tdoa-table"} | arguments)
 
 
 def test_a_lever_arm_without_a_truth_to_move_is_refused(folder, capsys):
     with pytest.raises(skyless.SkylessError, match=r"lever_arm_m is .*; it should be left out: it moves the truth"):
-        skyless.survey_site(recording=folder / "stay.mcap", recorded_truth=True, lever_arm_m=(0.0, 0.0, 0.1))
-    assert main(["survey", "--recording", str(folder / "stay.mcap"), "--recorded-truth", "--lever-arm", "0,0,0.1"]) == 2
+        skyless.calibrate(folder / "stay.mcap", recorded_truth=True, lever_arm_m=(0.0, 0.0, 0.1))
+    assert main(["calibrate", str(folder / "stay.mcap"), "--recorded-truth", "--lever-arm", "0,0,0.1"]) == 2
     assert "--lever-arm is (0.0, 0.0, 0.1); it should be left out" in capsys.readouterr().err
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec import structs
 
 from machines.bench import LAB
 from recordings import live_site
@@ -98,7 +99,7 @@ def aligned_rmse_m(report):
 
 
 def test_a_table_of_ranges_and_heights_with_default_options(hall, capsys):
-    report = run(capsys, "--ranges", hall / "ranges.csv", "--anchor-heights", hall / "heights.csv")
+    report = run(capsys, "--recording", hall / "ranges.csv", "--anchor-height", hall / "heights.csv")
     assert {"id", "x_m", "y_m", "z_m", "std_m", "determined"} <= report["anchors"][0].keys()
     assert [one["id"] for one in report["anchors"]] == list(range(1, 12))
     assert all(one["determined"] for one in report["anchors"])
@@ -112,7 +113,7 @@ def test_a_table_of_ranges_and_heights_with_default_options(hall, capsys):
 
 
 def test_the_report_for_people(hall, capsys):
-    assert main(["survey", "--ranges", str(hall / "ranges.csv"), "--anchor-heights", str(hall / "heights.csv")]) == 0
+    assert main(["survey", "--recording", str(hall / "ranges.csv"), "--anchor-height", str(hall / "heights.csv")]) == 0
     out = " ".join(capsys.readouterr().out.split())
     assert out.index("11 anchors, 54 of 55 pairs, 30 unknowns: 24 ranges check the result") < out.index("anchors ┏")
     assert re.search(r"left out as late: 1–10 \(\+0\.[45]\d m\), 3–6 \(\+0\.[45]\d m\)", out)
@@ -132,7 +133,7 @@ def test_a_full_disk_leaves_all_files_as_they_were(hall, capsys, tmp_path, monke
         return write_bytes(path, data)
 
     monkeypatch.setattr(Path, "write_bytes", until_the_disk_is_full)
-    command = ("--ranges", hall / "ranges.csv", "--site", hall / "site.toml", "--out", out, "--force")
+    command = ("--recording", hall / "ranges.csv", "--site", hall / "site.toml", "--out", out, "--force")
     assert main(["survey", *map(str, command)]) == 2
     said = capsys.readouterr().err
     assert "cannot be written: No space left on device" in " ".join(said.split())
@@ -145,7 +146,7 @@ def test_a_full_disk_leaves_all_files_as_they_were(hall, capsys, tmp_path, monke
 def test_an_anchor_that_nobody_receives_is_not_determined_and_stays(hall, capsys, tmp_path):
     out = tmp_path / "new.toml"
     out.write_text("what was there")
-    command = ("--ranges", hall / "ranges.csv", "--site", hall / "site.toml", "--out", out)
+    command = ("--recording", hall / "ranges.csv", "--site", hall / "site.toml", "--out", out)
     assert "--force overwrites it" in complaint(capsys, *command)
     assert out.read_text() == "what was there"
     report = run(capsys, *command, "--force")
@@ -170,9 +171,9 @@ def test_an_anchor_that_nobody_receives_is_not_determined_and_stays(hall, capsys
 def test_anchors_without_positions_get_theirs(hall, capsys, tmp_path):
     out = tmp_path / "placed.toml"
     report = run(
-        capsys, "--ranges", hall / "ranges.csv", "--anchor-heights", hall / "heights.csv",
+        capsys, "--recording", hall / "ranges.csv", "--anchor-height", hall / "heights.csv",
         "--site", hall / "blank.toml",
-        "--origin", 1, "--x-axis", 4, "--left", 9, "--out", out,
+        "--axes", "1,4,9", "--out", out,
     )  # fmt: skip
     site = load_site(out)
     assert [anchor.id for anchor in site.unplaced] == [12]
@@ -189,7 +190,7 @@ def test_anchors_without_positions_get_theirs(hall, capsys, tmp_path):
 def test_only_delays_with_positions_kept(hall, capsys, tmp_path):
     out = tmp_path / "delays.toml"
     report = run(
-        capsys, "--ranges", hall / "ranges.csv", "--site", hall / "site.toml", "--keep-positions", "--out", out
+        capsys, "--recording", hall / "ranges.csv", "--site", hall / "site.toml", "--keep-positions", "--out", out
     )
     old, new = load_site(hall / "site.toml"), load_site(out)
     at = lambda site: [(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors]  # noqa: E731
@@ -203,7 +204,7 @@ def test_only_delays_with_positions_kept(hall, capsys, tmp_path):
 def test_a_table_of_anchors_with_their_delays(hall, capsys, tmp_path):
     out = tmp_path / "anchors.csv"
     report = run(
-        capsys, "--ranges", hall / "ranges.csv", "--anchor-heights", hall / "heights.csv", "--out", out,
+        capsys, "--recording", hall / "ranges.csv", "--anchor-height", hall / "heights.csv", "--out", out,
         "--plot", tmp_path / "hall.png",
     )  # fmt: skip
     assert read_anchors(out)[3][:2] == pytest.approx([report["anchors"][2][axis] for axis in ("x_m", "y_m")], abs=1e-4)
@@ -213,7 +214,7 @@ def test_a_table_of_anchors_with_their_delays(hall, capsys, tmp_path):
 
 def test_nothing_determined_writes_nothing_and_ends_with_1(capsys, tmp_path):
     (tmp_path / "one.csv").write_text("anchor_a,anchor_b,range_m\n1,2,5.0\n")
-    report = run(capsys, "--ranges", tmp_path / "one.csv", "--out", tmp_path / "a.csv", code=1)
+    report = run(capsys, "--recording", tmp_path / "one.csv", "--out", tmp_path / "a.csv", code=1)
     assert not report["usable"]
     assert report["not_determined"]
     assert report["written"] == []
@@ -230,8 +231,9 @@ def test_delays_from_a_recording_and_twice_is_once(capsys, tmp_path):
     ids = sorted(anchor.id for anchor in LAB.anchors)
     errors = tuple(DelayError(anchor, *OFF_TICKS[number]) for number, anchor in enumerate(ids, start=1))
     live_site.record(tmp_path / "stay.mcap", live_site.messages(5.0, join_s=0.0, delay_errors=errors))
-    (tmp_path / "site.toml").write_text(site_template(LAB))
-    exact = ("--keep-positions", "--sketch-std", "0.0005", "--delay-std", "0.5", "--pair-std", "0")
+    measured = structs.replace(LAB, accuracy=structs.replace(LAB.accuracy, survey_std_m=0.0005))
+    (tmp_path / "site.toml").write_text(site_template(measured))
+    exact = ("--keep-positions", "--delay-std", "0.5", "--pair-std", "0")
     first, second = tmp_path / "first.toml", tmp_path / "second.toml"
     report = run(
         capsys, "--recording", tmp_path / "stay.mcap", "--site", tmp_path / "site.toml", *exact, "--out", first
@@ -247,7 +249,7 @@ def test_delays_from_a_recording_and_twice_is_once(capsys, tmp_path):
     run(capsys, "--recording", tmp_path / "stay.mcap", "--site", first, *exact, "--out", second)
     again = {anchor.id: anchor.tx_antenna_delay_ticks for anchor in load_site(second).anchors}
     assert all(abs(again[anchor] - after[anchor]) <= 1 for anchor in after)
-    whole = run(capsys, "--recording", tmp_path / "stay.mcap", "--delays-known", "--pair-std", "0.1")
+    whole = run(capsys, "--recording", tmp_path / "stay.mcap", "--delay-std", "0", "--pair-std", "0.1")
     assert len(whole["anchors"]) == len(LAB.anchors)
     assert whole["drops"] == []
 
@@ -285,37 +287,28 @@ def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
     ("arguments", "words"),
     [
         ((), "needs a recording"),
-        (
-            ("--recording", "{hall}/ranges.csv"),
-            'the header is "anchor_a,anchor_b,range_m"; it should be a known table',
-        ),
         (("--recording", "{hall}/none.mcap"), "it should be a file, and there is none"),
         (("--recording", "{hall}/pipe"), "a pipe"),
-        (("--ranges", "{hall}/heights.csv"), "a header with anchor_a,anchor_b,range_m"),
-        (("--ranges", "{hall}/ranges.csv", "--anchor-heights", "{hall}/ranges.csv"), "a header with id,z_m"),
+        (("--recording", "{hall}/heights.csv"), 'the header is "id,z_m"; it should be a known table'),
+        (("--recording", "{hall}/ranges.csv", "--walk", "a"), "a recording of skyless record"),
+        (("--recording", "{hall}/ranges.csv", "--anchor-height", "{hall}/ranges.csv"), "a header with id,z_m"),
         (("--out", "a.toml"), "a site file needs --site"),
         (("--out", "a.txt"), "its ending should be .toml"),
         (("--out", "no/such/a.csv"), "a folder that exists"),
         (("--out", "{hall}/folder.csv", "--force"), "should be a file in a folder"),
         (("--out", "{hall}/ranges.csv", "--force"), "would destroy it"),
-        (("--format", "avalue"), "it is for recordings"),
         (("--force",), "nothing is written without --out"),
         (("--plot", "a.txt"), "its ending should be one of"),
         (("--keep-positions",), "needs positions to keep"),
         (("--site", "{hall}/blank.toml", "--keep-positions"), "needs positions to keep"),
-        (("--site", "{hall}/site.toml", "--keep-positions", "--no-sketch"), "give either"),
-        (("--site", "{hall}/site.toml", "--keep-positions", "--delays-known"), "give either"),
-        (("--sketch-std", "0.2"), "it needs the positions of --site"),
-        (("--delays-known", "--delay-std", "0.1"), "--delay-std is 0.1"),
-        (("--delays-known", "--common-delay-std", "0.1"), "--common-delay-std is 0.1"),
-        (("--anchor-height-std", "0.1"), "it is for --dimensions 3"),
+        (("--site", "{hall}/site.toml", "--keep-positions", "--delay-std", "0"), "give either"),
         (("--anchor-height", "tall"), "--anchor-height is 'tall'"),
         (("--anchor-height", "77=2"), "there is no anchor 77; there are 1, 2"),
         (("--anchor-height", "1=nan"), "--anchor-height is '1=nan'; 'nan' should be a number"),
         (("--anchor-height", "2", "--anchor-height", "3"), "given once"),
         (("--anchor-height", "1=2", "--anchor-height", "1=3"), "the height of anchor 1 should be given once"),
-        (("--anchor-heights", "{hall}/elsewhere.csv"), 'column id is "77, 78"; it should be anchors among 1, 2'),
-        (("--anchor-heights", "{hall}/pipe"), "a pipe"),
+        (("--anchor-height", "{hall}/elsewhere.csv"), 'column id is "77, 78"; it should be anchors among 1, 2'),
+        (("--anchor-height", "{hall}/pipe"), "a pipe"),
         (("--site", "/dev/zero"), "not a pipe or a device"),
         (("--distance", "1-2"), "--distance is '1-2'; it should be like"),
         (("--distance", "1-1=3"), "between two anchors"),
@@ -325,10 +318,9 @@ def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
         (("--distance", "1-2=3", "--distance", "2-1=4"), "that between 2 and 1 should be given once"),
         (("--point", "1=3"), "2 or 3 numbers"),
         (("--point", "x=3,4"), "'x' should be the identifier of an anchor"),
-        (("--origin", "1"), "--origin and --x-axis"),
-        (("--origin", "1", "--x-axis", "1"), "different anchors"),
-        (("--origin", "1", "--x-axis", "77"), "no anchor 77"),
-        (("--dimensions", "4"), "dimensions"),
+        (("--axes", "1"), "--axes is '1'; it should be two or three different anchors"),
+        (("--axes", "1,77"), "no anchor 77"),
+        (("--axes", "1,x"), "'x' should be the identifier of an anchor"),
         (("--delay-std", "1e300"), "--delay-std"),
         (("--pair-std", "1e308"), "--pair-std"),
         (("--anchor-height", "1=1e300"), "metres, at most"),
@@ -340,8 +332,8 @@ def test_walks_that_cannot_be_used(capsys, tmp_path, walks, words):
 )
 def test_what_the_user_can_mend_is_named(hall, capsys, arguments, words):
     given = [one.format(hall=hall) for one in arguments]
-    if given and given[0].startswith("--") and given[0] not in {"--ranges", "--recording"}:
-        given = ["--ranges", str(hall / "ranges.csv"), *given]
+    if given and given[0].startswith("--") and given[0] != "--recording":
+        given = ["--recording", str(hall / "ranges.csv"), *given]
     assert words in complaint(capsys, *given)
     assert (hall / "ranges.csv").read_text().startswith("anchor_a")
 
@@ -354,7 +346,7 @@ def test_facts_from_options(hall):
             anchor_height_m={None: 2.5, 3: 2.4},
             distances=(Tape(1, 4, 7.21), Tape(1, 5, 8.0, 0.01), Tape(2, 3, 4.0, 0.02)),
             points_m={7: (1, -2, 3), 8: (0, 0)},
-            delay_std_m=0.15, pair_std_m=0.0, origin=1, x_axis=4,
+            delay_std_m=0.15, pair_std_m=0.0, axes=(1, 4),
         ),
         everybody,
         site,
@@ -366,13 +358,11 @@ def test_facts_from_options(hall):
     assert (facts.sketch_std_m, facts.delay_std_m, facts.pair_std_m) == (0.3, 0.15, 0.0)
     assert facts.gauge == Gauge(1, 4)
     assert facts_of(SurveyOptions(), everybody, None) == Facts()
-    bare = facts_of(SurveyOptions(no_sketch=True, delays_known=True), everybody, site)
-    assert (bare.sketch_m, bare.delay_std_m, bare.heights_m[1]) == ({}, 0.0, site.anchors[0].z_m)
+    bare = facts_of(SurveyOptions(delay_std_m=0.0), everybody, site)
+    assert (bare.delay_std_m, bare.heights_m[1]) == (0.0, site.anchors[0].z_m)
     kept = facts_of(SurveyOptions(keep_positions=True), everybody, site)
     assert (kept.keep_positions, kept.sketch_std_m) == (True, pytest.approx(site.accuracy.survey_std_m))
-    free = facts_of(
-        SurveyOptions(dimensions=3, anchor_heights=hall / "heights.csv", anchor_height_std_m=0.1), (1, 2, 99), site
-    )
+    free = facts_of(SurveyOptions(anchor_height_m=hall / "heights.csv", anchor_height_std_m=0.1), (1, 2, 99), site)
     assert (free.dimensions, sorted(free.heights_m), free.height_std_m) == (3, [1, 2], 0.1)
 
 
@@ -380,17 +370,17 @@ def test_facts_from_options(hall):
 def test_missing_heights_are_those_of_the_others_and_said(hall, capsys):
     """They are neither typed nor measured, so the reader of the result has to know."""
     heights = [part for k in range(1, 11) for part in ("--anchor-height", f"{k}={3 if k < 10 else 5}")]
-    report = run(capsys, "--ranges", hall / "ranges.csv", *heights)
+    report = run(capsys, "--recording", hall / "ranges.csv", *heights)
     assert report["assumed_heights"] == "no height is given for anchor 11: 3 m is assumed, the median of the others"
     assert report["anchors"][10]["z_m"] == 3.0
-    report = run(capsys, "--ranges", hall / "ranges.csv")
+    report = run(capsys, "--recording", hall / "ranges.csv")
     assert {one["z_m"] for one in report["anchors"]} == {0.0}
     assert "no heights are given: all anchors are taken to be on the floor" in report["assumed_heights"]
-    assert main(["survey", "--ranges", str(hall / "ranges.csv")]) == 0
+    assert main(["survey", "--recording", str(hall / "ranges.csv")]) == 0
     assert "all anchors are taken to be on the floor" in " ".join(capsys.readouterr().out.split())
-    whole = ("--ranges", hall / "ranges.csv", "--anchor-heights", hall / "heights.csv")
+    whole = ("--recording", hall / "ranges.csv", "--anchor-height", hall / "heights.csv")
     assert run(capsys, *whole)["assumed_heights"] is None
-    estimated = run(capsys, "--ranges", hall / "ranges.csv", "--dimensions", 3, code=1)
+    estimated = run(capsys, "--recording", hall / "ranges.csv", "--anchor-height-std", 0.1, code=1)
     assert estimated["assumed_heights"] is None
 
 

@@ -31,9 +31,7 @@ def tables(recordings, name):
 def trained(skyless, recordings, tmp_path, name):
     out = tmp_path / "calibrated.csv"
     anchors = recordings / "util_flights" / f"anchors_{name.split('-')[0]}.csv"
-    return skyless(
-        "survey", "--recording", *tables(recordings, name), "--anchors", anchors, "--out", out, "--force"
-    ), out
+    return skyless("calibrate", *tables(recordings, name), "--anchors", anchors, "--out", out, "--force"), out
 
 
 @pytest.mark.parametrize("trial", [1, 2, 3])
@@ -75,7 +73,7 @@ def test_a_static_listener_by_its_first_thirty_samples(recordings, skyless, tmp_
     """All its fixes: it stands still, and the filter averages for as long as it does. Without calibration 0.21 m."""
     file = recordings / "miluv_passive" / "cirObstaclesOneTag_1_static_0" / "ifo001" / "passive_ticks_u32.csv"
     out = tmp_path / "anchors.csv"
-    report = skyless("survey", "--recording", file, "--first", "30", "--out", out)
+    report = skyless("calibrate", file, "--first", "30", "--out", out)
     assert report["used"] + report["rejected"] == 30
     before, after = (skyless("replay", file, *more) for more in ((), ("--anchors", out)))
     assert 0.15 < before["rmse_2d_m"] <= 0.25
@@ -94,8 +92,6 @@ def test_a_log_by_its_first_half(recordings, skyless, tmp_path, place):
     anchors.write_text("\n".join(("id,x_m,y_m,z_m", *lines)) + "\n")
     out, truth = tmp_path / "calibrated.csv", ("--truth", folder / "log05_lighthouse.csv")
     known = truth if place == "truth" else ("--at", "0,0,0")
-    skyless(
-        "survey", "--recording", folder / "log05_tdoa.csv", "--anchors", anchors, *known, "--first", "50%", "--out", out
-    )
+    skyless("calibrate", folder / "log05_tdoa.csv", "--anchors", anchors, *known, "--first", "50%", "--out", out)
     judged = skyless("replay", folder / "log05_tdoa.csv", "--anchors", out, *truth, "--settle", "5.5")
     assert judged["rmse_3d_m"] <= 0.10

@@ -189,7 +189,7 @@ def test_real_anchors_are_within_5_cm_and_10_cm_from_any_5_seconds(recordings):
 def test_the_command_surveys_real_anchors_without_further_options(recordings, tmp_path, capsys):
     table = tmp_path / "heights.csv"
     table.write_text("id,z_m\n" + "".join(f"{anchor},{position[2]}\n" for anchor, position in KUIPMAN_M.items()))
-    known = ["--anchor-heights", str(table), "--distance", f"1-4={math.dist(KUIPMAN_M[1], KUIPMAN_M[4])}", "--json"]
+    known = ["--anchor-height", str(table), "--distance", f"1-4={math.dist(KUIPMAN_M[1], KUIPMAN_M[4])}", "--json"]
     assert main(["survey", "--recording", str(recordings / KUIPMAN), *known]) == 0
     found = msgspec.json.decode(capsys.readouterr().out)["anchors"]
     assert _rmse_m({one["id"]: (one["x_m"], one["y_m"], one["z_m"]) for one in found}) < 0.05

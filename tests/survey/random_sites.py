@@ -6,8 +6,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from skyless.sim.lab import lab_site
+from skyless.site.survey.fit import redundancy
 from skyless.site.survey.problem import Problem
-from skyless.site.survey.robust import redundancy
 
 GRID = [[x, y, 6.0] for x in (0.0, 12.0, 24.0, 36.0) for y in (0.0, 12.0, 24.0)]
 CORNERS = [[0, 0, 0.4], [8, 0, 2.6], [8, 6, 0.4], [0, 6, 2.6], [4, 0, 2.6], [8, 3, 0.4], [4, 6, 2.6], [0, 3, 0.4]]

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from random_sites import HALL_J, LAB, ROOM_J, aligned_error_m, draw, is_unchecked, problem_of, rms
 
-from skyless.site.survey.problem import start_positions
-from skyless.site.survey.robust import aligned_std_m, aligned_to, find_ambiguities, fit_robustly
+from skyless.site.survey.fit import aligned_std_m, aligned_to, find_ambiguities, fit_robustly
+from skyless.site.survey.shape import start_positions
 
 pytestmark = pytest.mark.site
 

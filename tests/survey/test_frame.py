@@ -10,7 +10,7 @@ from msgspec import structs
 
 from skyless.research.surveys.rooms import SurveyLayout, survey_layouts
 from skyless.site.survey.facts import Facts, Gauge, PairRange, PairRanges
-from skyless.site.survey.frame import align, axes_through
+from skyless.site.survey.shape import align, axes_through
 from skyless.site.survey.solve import run_survey
 from support.drawn_ranges import drawn_ranges
 

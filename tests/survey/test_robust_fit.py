@@ -10,8 +10,9 @@ from msgspec.structs import replace
 from random_sites import HALL_J, LAB, ROOM_J, aligned_error_m, draw, draw_plant, is_unchecked, problem_of, rms
 
 from skyless.site.survey.facts import Facts, PairRange, PairRanges
-from skyless.site.survey.problem import delay_weights, residuals_m, solve_least_squares, solve_many, start_positions
-from skyless.site.survey.robust import aligned_std_m, find_ambiguities, fit_robustly
+from skyless.site.survey.fit import aligned_std_m, find_ambiguities, fit_robustly
+from skyless.site.survey.problem import delay_weights, residuals_m, solve_least_squares, solve_many
+from skyless.site.survey.shape import start_positions
 from skyless.site.survey.solve import run_survey
 
 pytestmark = pytest.mark.site

@@ -92,7 +92,7 @@ def test_what_the_recording_lacks(walk, tag, span, words):
 
 
 def test_a_walk_whose_truth_is_known_shows_the_delays(walk):
-    survey = skyless.survey_site(recording=walk, recorded_truth=True).survey
+    survey = skyless.calibrate(walk, recorded_truth=True).survey
     assert any("a at known positions" in note for note in survey.notes)
     for one in survey.anchors:
         assert abs(one.delay_m - DELAYS_M[one.id]) < 3.0 * one.delay_std_m
@@ -100,10 +100,7 @@ def test_a_walk_whose_truth_is_known_shows_the_delays(walk):
 
 
 def test_the_command_uses_the_walk(walk, capsys):
-    assert (
-        main(["survey", "--recording", str(walk), "--no-sketch", "--walk", "a@2:20", "--walk-height", "0", "--json"])
-        == 0
-    )
+    assert main(["survey", "--recording", str(walk), "--walk", "a=0@2:20", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert any("of the walk of a were used" in note for note in report["notes"] + report.get("warnings", []))
 
@@ -113,7 +110,7 @@ def test_the_command_uses_the_walk(walk, capsys):
     [
         (("--walk", "b"), "tag"),
         (("--walk", "a@9:4"), "later one last"),
-        (("--walk-height", "1"), "walk"),
+        (("--walk", "a=x"), "--walk is 'a=x'"),
         (("--walk", "a@90:99"), "90:99"),
     ],
 )

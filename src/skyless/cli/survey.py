@@ -21,13 +21,11 @@ from skyless.cli.common import (
     command,
     console,
     number,
-    print_facts,
     print_json,
     print_table,
     print_warnings,
     progress_bar,
     with_status,
-    write_file,
     write_picture,
 )
 from skyless.cli.nodes.options import MqttCa, SiteId, log, run_until_stopped
@@ -36,16 +34,15 @@ from skyless.core.site import Site
 from skyless.research.calibration.options import SurveyOptions
 from skyless.run.find_site import find_site
 from skyless.run.mqtt.address import mqtt_address
-from skyless.run.open_radio import open_radios
 from skyless.run.process import run
 from skyless.site.file.load import load_site
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from skyless.cli.api.survey import BiasResult, SurveyResult
+    from skyless.cli.api.survey import SurveyResult
     from skyless.run.survey.program import SurveyNode
-    from skyless.site.survey.facts import Facts, PairRanges, Survey, SurveyedPair, TapeAdvice
+    from skyless.site.survey.facts import Count, Facts, PairRanges, Survey, SurveyedPair, TapeAdvice
     from skyless.site.survey.pair_ranger import PairRanger
 
 
@@ -68,10 +65,6 @@ class LiveOptions(Options, frozen=True, kw_only=True):
     """Broker to survey the running site of: its anchors publish their stamps."""
     mqtt_ca: MqttCa = None
     """Certificates (PEM) to trust for mqtts."""
-    radio: str | None = None
-    """Radio of a listener, to survey with what it receives instead, as skyless tag --radio; needs --site."""
-    radio_name: str = "survey"
-    """Name of that listener on an ether, one of its tags, such as tag1."""
     site_id: SiteId | None = None
     """Number of the site; by default that of --site, or the one whose programs are online."""
     duration: Positive | None = None
@@ -79,61 +72,80 @@ class LiveOptions(Options, frozen=True, kw_only=True):
     serve: bool = False
     """Stay until Ctrl-C: survey all the while, serve the page, save on its request, and watch the anchors."""
 
-    @property
-    def is_live(self) -> bool:
-        """Whether to survey a running site."""
-        return self.mqtt is not None or self.radio is not None
-
     def check(self) -> None:
         """Check that the options are compatible. Raises SkylessError."""
-        if not self.is_live:
-            why = "a running site is surveyed by --mqtt or --radio"
-            self.leave_out("duration", "serve", "site_id", why=why)
+        if self.mqtt is None:
+            self.leave_out("duration", "serve", "site_id", why="a running site is surveyed by --mqtt")
         if self.serve:
             self.leave_out("duration", why="with --serve the survey does not end")
 
 
-class _Output(JsonOptions, frozen=True, kw_only=True):
+class Output(JsonOptions, frozen=True, kw_only=True):
+    """What a survey or a calibration writes."""
+
     out: Path | None = None
     """Write the result here: the site file of --site with the survey in it (.toml), or a table of anchors (.csv)."""
     force: bool = False
     """Overwrite what is there, if --out exists; what was there is kept under another name."""
     plot: Path | None = None
-    """Draw the picture into this file (PNG, SVG or PDF): the anchors from above."""
+    """Draw the picture into this file (PNG, SVG or PDF): the anchors from above, or their constants."""
+
+    def check_files(self, site: object, *inputs: object) -> None:
+        """Check before the work that outputs can be written. Raises SkylessError."""
+        files = [Path(one) for one in inputs if isinstance(one, str | Path)]
+        sites = [Path(site)] if isinstance(site, str | Path) else []
+        out = self.out
+        check_output("out", out, *files)
+        check_output("plot", self.plot, *files, *sites, out)
+        check_picture(self.plot)
+        if out is None:
+            self.leave_out("force", why="nothing is written without --out")
+            return
+        check_folder("--out", out)
+        if out.suffix.lower() not in {".toml", ".csv"}:
+            raise SkylessError(f"--out is {str(out)!r}; its ending should be .toml for a site or .csv for a table")
+        if out.suffix.lower() == ".toml" and site is None:
+            raise SkylessError(
+                f"--out is {str(out)!r}; a site file needs --site to start from (skyless site new --unplaced makes one)"
+            )
+        check_new(out, force=self.force)
+
+    def on_count(self, counted: "Count") -> None:
+        """Print the numbers of measurements and unknowns."""
+        if not self.json:
+            console().print(counted.sentence)
 
 
 @app.default
 @command
-def survey(*, asked: SurveyOptions, live: LiveOptions, output: _Output) -> int:
+def survey(*, asked: SurveyOptions, live: LiveOptions, output: Output) -> int:
     """Find the anchors' positions and the errors of their antenna delays, and what the ranges cannot determine.
 
     From a recording of skyless record, or of another system whose anchors relay their stamps; from a table of ranges;
-    or from a running site (--mqtt, --radio). With a tag at known positions (--at, --truth) only delays are found; in a
-    recording of another system it shows by how much each anchor seems late, which skyless replay then takes off.
+    or from a running site (--mqtt).
 
     Ends with exit code 1 if no anchor is determined.
     """
-    _check(asked, live, output)
+    if (asked.recording is None) == (live.mqtt is None):
+        raise SkylessError("a survey needs a recording or a table of ranges (--recording), or a running site (--mqtt)")
+    heights = asked.anchor_height_m.values() if isinstance(asked.anchor_height_m, dict) else ()
+    output.check_files(asked.site, asked.recording, *heights)
     if live.serve:
         _serve_live(live, asked)
         return 0
-    from skyless.cli.api.survey import BiasResult, Gathered, gathered, is_of_biases, run_survey_site, surveyed
+    from skyless.cli.api.survey import Gathered, gathered, surveyed
 
-    if is_of_biases(asked):
-        if output.out is not None and output.out.suffix.lower() != ".csv":
-            raise SkylessError(
-                f"--out is {str(output.out)!r}; it should be a table, .csv: a site file holds antenna delays, which "
-                "only a recording of skyless record can correct"
-            )
-        with progress_bar("surveying") as reach:
-            biases = run_survey_site(replace(asked, progress=reach))
-        assert isinstance(biases, BiasResult)
-        _report_biases(biases, output)
-        return 0
     with progress_bar("surveying") as reach:
-        asked = replace(asked, progress=reach)
-        given = Gathered(*_gather_live(live, asked)) if live.is_live else gathered(asked)
-        found = surveyed(asked, given, lambda counted: None if output.json else console().print(counted.sentence))
+        if asked.recording is None:
+            given = Gathered(*_gather_live(live, asked))
+        else:
+            given = gathered(asked.recording, asked.site, None, reach)
+        found = surveyed(asked, given, output.on_count)
+    return report(found, output)
+
+
+def report(found: "SurveyResult", output: Output) -> int:
+    """Write and print a survey. Returns the exit code."""
     written, more = ((), ()) if output.out is None or not found.usable else _written(found, output.out)
     found = replace(found, warnings=(*found.warnings, *more))
     if output.plot is not None:
@@ -144,34 +156,6 @@ def survey(*, asked: SurveyOptions, live: LiveOptions, output: _Output) -> int:
     else:
         _show(found, written)
     return 0 if found.usable else NOTHING_DETERMINED
-
-
-def _check(asked: SurveyOptions, live: LiveOptions, output: _Output) -> None:
-    """Check before the work that inputs and options are compatible and outputs can be written. Raises SkylessError."""
-    if (asked.recording is not None) + (asked.ranges is not None) + live.is_live != 1:
-        raise SkylessError(
-            "a survey needs a recording (--recording), or else a table of ranges (--ranges), or else a running site "
-            "(--mqtt or --radio)"
-        )
-    if live.radio is not None and asked.site is None:
-        raise SkylessError("--radio needs --site: the listener does not know which anchors there are")
-    inputs = [Path(str(one)) for one in (asked.recording, asked.ranges, asked.anchor_heights, asked.truth) if one]
-    site = [Path(str(asked.site))] if asked.site else []
-    out = output.out
-    check_output("out", out, *inputs)
-    check_output("plot", output.plot, *inputs, *site, out)
-    check_picture(output.plot)
-    if out is None:
-        output.leave_out("force", why="nothing is written without --out")
-        return
-    check_folder("--out", out)
-    if out.suffix.lower() not in {".toml", ".csv"}:
-        raise SkylessError(f"--out is {str(out)!r}; its ending should be .toml for a site or .csv for a table")
-    if out.suffix.lower() == ".toml" and asked.site is None:
-        raise SkylessError(
-            f"--out is {str(out)!r}; a site file needs --site to start from (skyless site new --unplaced makes one)"
-        )
-    check_new(out, force=output.force)
 
 
 # Files
@@ -222,19 +206,6 @@ def _table(result: "Survey") -> str:
 
 
 # Reports
-
-
-def _report_biases(found: "BiasResult", output: _Output) -> None:
-    if output.out is not None:
-        write_file(output.out, found.corrected_file().encode())
-    if output.plot is not None:
-        write_picture(output.plot, found.plot())
-    if output.json:
-        print_json({**found.summary, "written": output.out})
-        return
-    print_facts(found.title(), found.facts())
-    if output.out is not None:
-        console().print(f"wrote {output.out}", markup=False)
 
 
 def _show(found: "SurveyResult", written: tuple[str, ...]) -> None:
@@ -325,9 +296,8 @@ def _gather_live(asked: LiveOptions, known: SurveyOptions) -> "tuple[Site, Calla
     if live is None:
         raise SkylessError(f"no site was found at {asked.mqtt}: its anchors are not there, or have not begun yet")
     if not found[0].final_ranges().pairs:
-        where = asked.mqtt or asked.radio
         raise SkylessError(
-            f"the anchors of site {live.site.name!r} have no ranges at {where} yet; they should be running"
+            f"the anchors of site {live.site.name!r} have no ranges at {asked.mqtt} yet; they should be running"
         )
     return live.site, found[0].final_ranges, live.finish()
 
@@ -356,7 +326,8 @@ async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "S
     from skyless.run.survey.program import SurveyNode, SurveySettings
     from skyless.site.survey.solve import run_survey
 
-    address = None if asked.mqtt is None else mqtt_address(asked.mqtt, asked.mqtt_ca)
+    assert asked.mqtt is not None
+    address = mqtt_address(asked.mqtt, asked.mqtt_ca)
     file = None if known.site is None else Path(str(known.site))
     site = None if file is None else load_site(file)
     site_id = site.id if asked.site_id is None and site is not None else asked.site_id
@@ -365,11 +336,9 @@ async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "S
         if site_id != site.id:
             raise SkylessError(f"--site-id is {site_id}; the site of {known.site} is number {site.id}")
     if site_id is None:
-        assert address is not None  # a radio needs a site file
         site_id = await find_site(address)
-    radio = None if asked.radio is None else open_radios(asked.radio, "tag", (asked.radio_name,))[0]
     settings = SurveySettings(site_id, site, file, serves)
-    return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, log, radio)
+    return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, log)
 
 
 def _facts(known: SurveyOptions, site: Site) -> "Facts":

@@ -29,7 +29,7 @@ from skyless.core.native.records import Reals, Record, record
 from skyless.core.native.views import view
 from skyless.files import replace_files, write_whole
 from skyless.research.calibration.biases import biases_of, tdoas_of
-from skyless.research.calibration.options import SurveyOptions
+from skyless.research.calibration.options import CalibrateOptions
 from skyless.research.foreign.formats import format_of, open_recording
 from skyless.research.masterless.smoothing import OwnEstimator
 from skyless.research.replays.captures import CaptureReplay
@@ -477,7 +477,7 @@ def _options(found: Found, asked: Asked) -> ReplayOptions:
 
 
 def _calibrations(found: Sequence[Found], asked: Asked) -> dict[Path, DifferenceCalibration]:
-    """What ``skyless survey`` finds on the named recordings, by their tables of anchors."""
+    """What ``skyless calibrate`` finds on the named recordings, by their tables of anchors."""
     calibrations: dict[Path, DifferenceCalibration] = {}
     for one in found:
         if asked.is_calibrated_on(one) and one.anchors is not None:
@@ -485,8 +485,8 @@ def _calibrations(found: Sequence[Found], asked: Asked) -> dict[Path, Difference
             truth = known_truth(one.path, options)
             assert truth is not None
             rows = np.column_stack([truth.t_s, truth.position_m])
-            survey = SurveyOptions(recording=one.path, truth=rows, anchors=known_anchors(one.anchors, None)[0])
-            calibrations.setdefault(one.anchors, biases_of(survey).estimate.calibration())
+            known = CalibrateOptions(file=one.path, truth=rows, anchors=known_anchors(one.anchors, None)[0])
+            calibrations.setdefault(one.anchors, biases_of(known).estimate.calibration())
     return calibrations
 
 

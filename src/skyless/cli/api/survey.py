@@ -1,6 +1,6 @@
 """``skyless.survey_site``: positions and antenna delays of anchors from their receptions of one another."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -12,25 +12,24 @@ from matplotlib.patches import Ellipse
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.arguments import python_function
+from skyless.arguments import Progress, python_function
 from skyless.cli.api.fixes import Result, data_frame, figures
 from skyless.cli.common import cm
 from skyless.core.arrays import Integers, Vector
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site
-from skyless.research.calibration.biases import Biases, biases_of, known_tags, ranges_of, walks_of
-from skyless.research.calibration.options import SurveyOptions, facts_of
-from skyless.research.foreign.formats import format_of
-from skyless.research.replays.inputs import known_truth
+from skyless.files import has_columns, read_head
+from skyless.research.calibration.biases import ranges_of, walk_of
+from skyless.research.calibration.options import SurveyOptions, Walk, facts_of
 from skyless.run.recordings.recording import McapRecording, is_mcap
 from skyless.site.file.load import site_of
 from skyless.site.report import BLUE, GRID, INK, MUTED, ORANGE, RED, panel, report_style
-from skyless.site.survey.facts import Count, PairRanges, Survey, SurveyedAnchor, count
+from skyless.site.survey.facts import Count, Facts, PairRanges, Survey, SurveyedAnchor, count
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.solve import run_survey
 from skyless.site.survey.surveyed_site import delay_differences_m, surveyed_text, unchanged_anchors
 from skyless.site.survey.watch import drop_moved, with_changes
-from skyless.site.tables import read_ranges
+from skyless.site.tables import RANGE_COLUMNS, read_ranges
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -59,17 +58,6 @@ def survey_figure(survey: Survey) -> Figure:
                 axes.plot(x_m, y_m, "s", color=ORANGE, markerfacecolor="none")
         axes.set(xlabel="x in m", ylabel="y in m", aspect="equal")
         axes.set_title(_legend(survey, at_m, scale), loc="right", fontsize=7.0, color=MUTED)
-    return figure
-
-
-def bias_figure(name: str, anchors: Integers, bias_m: Vector, std_m: Vector) -> Figure:
-    """Draw anchors' constants with their standard errors, one bar per anchor."""
-    with report_style():
-        figure, axes = panel(f"{name}: constants of the anchors, zero is their mean")
-        at = np.arange(len(anchors))
-        axes.bar(at, 100.0 * bias_m, yerr=100.0 * std_m, color=BLUE, capsize=3.0)
-        axes.set_xticks(at, [str(anchor) for anchor in anchors])
-        axes.set(xlabel="anchor", ylabel="signals seem late by, in cm")
     return figure
 
 
@@ -129,8 +117,14 @@ class Gathered(Struct, frozen=True):
     """Unusable parts of a recording, by reason."""
     is_foreign: bool = False
     """Whether the recording is of another system."""
-    recorded: Site | None = None
-    """The site of the recording."""
+    delays_m: Mapping[int, float] = {}
+    """By how much half an anchor's delays differ between the recording and the site."""
+
+    def with_all_anchors(self) -> PairRanges:
+        """The ranges, and the site's anchors without ranges, as the survey reports them, too."""
+        ranges = self.ranges()
+        of_site: Sequence[int] = () if self.site is None else [anchor.id for anchor in self.site.all_anchors]
+        return replace(ranges, anchors=tuple(sorted({*ranges.anchors, *of_site})))
 
 
 class SurveyResult(Result, frozen=True, eq=False):
@@ -221,101 +215,23 @@ class SurveyResult(Result, frozen=True, eq=False):
             yield "warning", warning
 
 
-class BiasResult(Result, frozen=True, eq=False):
-    """Constants of n anchors of another system, ordered by identifier; NaN where not determined."""
-
-    path: Path
-    found: Biases
-    """All estimates."""
-    table: Path | None
-    """The table of anchors to correct; None for a new one."""
-
-    @property
-    def anchors(self) -> Integers:
-        """Shape (n,): identifiers."""
-        return np.array([one.anchor for one in self.found.estimate.anchors], dtype=np.int64)
-
-    @property
-    def bias_m(self) -> Vector:
-        """Shape (n,): apparent lateness of each anchor's signals, relative to the mean."""
-        return figures(one.bias_m for one in self.found.estimate.anchors)
-
-    @property
-    def std_m(self) -> Vector:
-        """Shape (n,): standard error of ``bias_m``."""
-        return figures(one.std_m for one in self.found.estimate.anchors)
-
-    @property
-    def summary(self) -> dict[str, Any]:
-        """The object that ``skyless survey --json`` writes, in SI units, without the version and the file written."""
-        return self.found.report()
-
-    def corrected_file(self) -> str:
-        """The table of anchors with the biases in it, as ``skyless survey --out`` writes it. Raises SkylessError."""
-        return self.found.table(self.table)
-
-    def to_dataframe(self) -> "DataFrame":
-        """One row per anchor: ``anchor``, ``bias_m``, ``std_m``, ``noise_m``, ``count``.
-
-        Raises:
-            SkylessError: pandas is not installed.
-        """
-        found = self.found.estimate.anchors
-        columns = {"anchor": self.anchors, "bias_m": self.bias_m, "std_m": self.std_m}
-        return data_frame(
-            columns | {"noise_m": figures(one.noise_m for one in found), "count": [o.count for o in found]}
-        )
-
-    def plot(self) -> "Figure":
-        """Draw the constants with their standard errors, one bar per anchor."""
-        return bias_figure(self.path.name, self.anchors, self.bias_m, self.std_m)
-
-    def title(self) -> str:
-        """Title of the calibration."""
-        found = self.found.estimate
-        return f"{self.found.format}: {found.used} differences used, {found.rejected} outliers"
-
-    def facts(self) -> Iterator[tuple[str, str]]:
-        """The main figures: name, and value with its unit."""
-        found = self.found.estimate
-        for one in found.anchors:
-            value = "not determined" if one.bias_m is None else f"{cm(one.bias_m)} ± {cm(one.std_m)}"
-            yield f"anchor {one.anchor}", f"{value}; noise {cm(one.noise_m)}, {one.count} differences"
-        yield "zero", "of biases only differences can be seen; the zero is the mean of the constants"
-        yield "noise of a difference", f"{cm(found.noise_before_m)} before, {cm(found.noise_m)} after"
-        if found.slope_m is not None:
-            slope = f"{found.slope_m:.3f} ± {found.slope_std_m or 0.0:.3f} m while the range grows by the factor e"
-            yield "range bias (received power)", slope
-        for note in self.found.notes:
-            yield "note", note
-        for reason, number in self.found.samples.drops.items():
-            yield f"left out: {reason}", str(number)
-
-
-def is_of_biases(asked: SurveyOptions) -> bool:
-    """Whether to estimate biases: a recording of another system, with a tag at known positions."""
-    if asked.recording is None or is_mcap(asked.recording):
-        return False
-    return asked.knows_tag or format_of(asked.recording, asked.format).name == "miluv"
-
-
-def gathered(asked: SurveyOptions) -> Gathered:
-    """Read the ranges of a table or recording, and the site if known. Raises SkylessError."""
-    site = None if asked.site is None else site_of(asked.site)[0]
-    if asked.ranges is not None:
-        table = read_ranges(asked.ranges)
-        return Gathered(site, lambda: table)
-    if asked.recording is None:
-        raise SkylessError("a survey needs a recording (--recording), or a table of ranges (--ranges)")
+def gathered(
+    recording: str | Path, site: Site | str | Path | None, format_name: str | None, on_progress: Progress
+) -> Gathered:
+    """Read the ranges of a recording or table, and the site if known. Raises SkylessError."""
+    present = None if site is None else site_of(site)[0]
+    if has_columns(RANGE_COLUMNS, read_head(recording)):
+        table = read_ranges(recording)
+        return Gathered(present, lambda: table)
     found = ranges_of(
-        asked.recording, asked.format, identifier=None if site is None else site.id, on_progress=asked.progress
+        recording, format_name, identifier=None if present is None else present.id, on_progress=on_progress
     )
     drops = tuple(f"left out: {number} × {reason}" for reason, number in found.drops.items())
     recorded, ranger = found.site, found.ranger
-    if site is None or recorded is None:
-        return Gathered(site or recorded, ranger.ranges, ranger, drops, recorded is None, recorded)
-    half_m = delay_differences_m(recorded, site)
-    return Gathered(site, lambda: ranger.ranges().without_delays(half_m), ranger, drops, recorded=recorded)
+    if present is None or recorded is None:
+        return Gathered(present or recorded, ranger.ranges, ranger, drops, recorded is None)
+    half_m = delay_differences_m(recorded, present)
+    return Gathered(present, lambda: ranger.ranges().without_delays(half_m), ranger, drops, delays_m=half_m)
 
 
 def surveyed(asked: SurveyOptions, given: Gathered, on_count: Callable[[Count], None]) -> SurveyResult:
@@ -323,56 +239,55 @@ def surveyed(asked: SurveyOptions, given: Gathered, on_count: Callable[[Count], 
 
     Raises SkylessError.
     """
-    site = given.site
-    ranges = _with_all_anchors(given.ranges(), site)
-    facts = facts_of(asked, ranges.anchors, site, is_foreign=given.is_foreign)
-    before_m: dict[int, float] = {}
-    if asked.recording is not None and (asked.walks or asked.knows_tag):
-        if given.recorded is None or site is None:
-            raise SkylessError("--walk, --at and --truth name a tag of a recording of skyless record")
+    facts = facts_of(asked, given.with_all_anchors().anchors, given.site, is_foreign=given.is_foreign)
+    if asked.walks:
+        if asked.recording is None or given.site is None or not is_mcap(asked.recording):
+            raise SkylessError("--walk names a tag of a recording of skyless record")
         with McapRecording(asked.recording) as recording:
-            if asked.truth is None:
-                asked.leave_out("lever_arm_m", why="it moves the truth, which --truth must give")
-            if asked.knows_tag:
-                before_m = delay_differences_m(given.recorded, site)
-                truth = None if asked.truth is None else known_truth(Path(asked.recording), asked)
-                facts = replace(facts, tags=known_tags(recording, given.recorded, asked, truth))
-            facts = replace(facts, tags=(*facts.tags, *walks_of(recording, site.id, asked)))
+            walks = [
+                walk_of(recording, given.site.id, walk.tag, (walk.from_s, walk.to_s), walk.height_m)
+                for walk in asked.walks
+                if isinstance(walk, Walk)
+            ]
+        facts = replace(facts, tags=tuple(walks))
+    return solved(given, facts, asked.site, on_count)
+
+
+def solved(
+    given: Gathered, facts: Facts, file: object, on_count: Callable[[Count], None], before_m: Mapping[int, float] = {}
+) -> SurveyResult:
+    """Solve for what the facts leave open; ``before_m``: changes of delays by anchor that the tags' differences lack.
+
+    ``file``: the site's file, if it is a path.
+    """
+    ranges = given.with_all_anchors()
     changes = () if given.ranger is None else drop_moved(given.ranger, facts, run_survey)
     if changes:
-        ranges = _with_all_anchors(given.ranges(), site)
+        ranges = given.with_all_anchors()
     counted = count(ranges, facts)
     on_count(counted)
-    # A tag's differences include the delays of the recording, so the ranges must, too; delays are relative to these.
     result = run_survey(ranges.without_delays({anchor: -half_m for anchor, half_m in before_m.items()}), facts)
     result = replace(result, anchors=tuple(_less(one, before_m.get(one.id, 0.0)) for one in result.anchors))
-    warnings = () if counted.warning is None else (counted.warning,)
-    file = Path(asked.site) if isinstance(asked.site, str | Path) else None
-    found = with_changes(result, changes, ranges.duration_s)
-    return SurveyResult(found, counted, warnings, given.drops, site, file, ranges)
+    return SurveyResult(
+        survey=with_changes(result, changes, ranges.duration_s),
+        count=counted,
+        warnings=() if counted.warning is None else (counted.warning,),
+        drops=given.drops,
+        site=given.site,
+        file=Path(file) if isinstance(file, str | Path) else None,
+        ranges=ranges,
+    )
 
 
 def _less(anchor: SurveyedAnchor, half_m: float) -> SurveyedAnchor:
     return anchor if anchor.delay_m is None or not half_m else replace(anchor, delay_m=anchor.delay_m - half_m)
 
 
-def _with_all_anchors(ranges: PairRanges, site: Site | None) -> PairRanges:
-    """Add the site's anchors without ranges, as the survey reports them, too."""
-    of_site: Sequence[int] = () if site is None else [anchor.id for anchor in site.all_anchors]
-    return replace(ranges, anchors=tuple(sorted({*ranges.anchors, *of_site})))
-
-
-def run_survey_site(asked: SurveyOptions) -> SurveyResult | BiasResult:
-    """Find the anchors' positions and the errors of their antenna delays, as ``skyless survey`` does.
-
-    With a tag at known positions (``stays``, ``truth``, ``recorded_truth``) the anchors' positions are kept. In a
-    recording of another system such a tag shows each anchor's apparent lateness, up to a common constant: a
-    ``BiasResult``.
-    """
-    if is_of_biases(asked):
-        table = Path(asked.anchors) if isinstance(asked.anchors, str | Path) else None
-        return BiasResult(Path(str(asked.recording)), biases_of(asked), table)
-    return surveyed(asked, gathered(asked), lambda _: None)
+def run_survey_site(asked: SurveyOptions) -> SurveyResult:
+    """Find the anchors' positions and the errors of their antenna delays, as ``skyless survey`` does."""
+    if asked.recording is None:
+        raise SkylessError("--recording is missing; it should be a recording, or a table of ranges")
+    return surveyed(asked, gathered(asked.recording, asked.site, None, asked.progress), lambda _: None)
 
 
 survey_site = python_function(SurveyOptions, run_survey_site)

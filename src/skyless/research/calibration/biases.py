@@ -20,7 +20,7 @@ from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_BITS, Unwrapper, to_seconds
 from skyless.files import Drops, open_source
-from skyless.research.calibration.options import First, Stay, SurveyOptions
+from skyless.research.calibration.options import CalibrateOptions, First, Stay
 from skyless.research.foreign import datasets
 from skyless.research.foreign.formats import FORMATS, Recording, format_of, open_recording
 from skyless.research.masterless.pair_engine import PairEngine
@@ -82,20 +82,8 @@ def position_of_stays(stays: Sequence[Stay], height_m: float | None, begin_s: fl
     return position_at
 
 
-def walks_of(recording: McapRecording, site: int, asked: SurveyOptions) -> tuple[TagEpochs, ...]:
-    """Differences of the tags of --walk while they were carried around. Raises SkylessError."""
-    return tuple(
-        replace(
-            walk_of(recording, site, walk.tag, (walk.from_s, walk.to_s), asked.walk_height_m),
-            name=f"the walk of {walk.tag}",
-        )
-        for walk in asked.walks
-        if not isinstance(walk, str)
-    )
-
-
 def known_tags(
-    recording: McapRecording, site: Site, asked: SurveyOptions, truth: Truth | None
+    recording: McapRecording, site: Site, asked: CalibrateOptions, truth: Truth | None
 ) -> tuple[TagEpochs, ...]:
     """Differences of tags while at known positions.
 
@@ -104,7 +92,7 @@ def known_tags(
     raw = tags_to_replay(recording.summary())
     names, recorded = ", ".join(raw), recorded_truth(recording)
     if asked.tag is not None and asked.tag not in raw:
-        raise ConfigurationError(asked.recording or "", "tag", asked.tag, f"one of {names}")
+        raise ConfigurationError(asked.file, "tag", asked.tag, f"one of {names}")
     if asked.tag is None and len(raw) > 1 and not asked.recorded_truth:
         raise SkylessError(f"--tag is missing; it should name the tag whose position is known, one of {names}")
     found = []
@@ -167,7 +155,7 @@ def walk_of(
             if span[0] <= unix_s - begin_s <= span[1]:
                 for one in differences.add(reception):
                     collector.add(unix_s - one.age_s, one.first, one.second, one.difference_m)
-    epochs = collector.epochs()
+    epochs = replace(collector.epochs(), name=f"the walk of {tag}")
     if not len(epochs.t_s):
         raise SkylessError(f"the receptions of {tag} give no differences between anchors in {span[0]:g}:{span[1]:g} s")
     if height_m is None:
@@ -277,14 +265,14 @@ class Biases(Struct, frozen=True):
         return new_table(self.samples.anchors_m, known) if anchors is None else calibrated_table(anchors, known)
 
 
-def biases_of(asked: SurveyOptions) -> Biases:
+def biases_of(asked: CalibrateOptions) -> Biases:
     """Estimate constants of another system's anchors, relative to their mean.
 
     Raises:
         SkylessError: the recording cannot be used, or has no differences at a known position.
     """
-    asked.leave_out("tag", "recorded_truth", "walks", why="it is for recordings of skyless record")
-    path, first = Path(str(asked.recording)), asked.first if isinstance(asked.first, First) else First()
+    asked.leave_out("tag", "recorded_truth", why="it is for recordings of skyless record")
+    path, first = Path(asked.file), asked.first if isinstance(asked.first, First) else First()
     truth = None if asked.stays else known_truth(path, asked)
     above_m, (anchors_m, height_m) = flight_height(asked.above_m, truth), known_anchors(asked.anchors, asked.site)
 

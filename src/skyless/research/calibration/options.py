@@ -1,15 +1,16 @@
-"""Options of ``skyless survey``, arguments of ``skyless.survey_site``, and the facts that follow for the survey."""
+"""Options of ``skyless survey`` and ``skyless calibrate``, and the facts that follow for the survey."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from math import inf
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 
 from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.arguments import (
+    ComputedOptions,
     Option,
     Rule,
     Text,
@@ -25,7 +26,7 @@ from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import Site
 from skyless.research.replays.options import RecordingOptions
-from skyless.site.survey.facts import Facts, Gauge, Point, Tape
+from skyless.site.survey.facts import Facts, Gauge, Point, TagReceived, Tape
 from skyless.site.tables import read_heights
 
 _MAX_STD_M: Final = 100.0
@@ -52,6 +53,8 @@ class Walk(Struct, frozen=True):
     tag: str
     from_s: float = 0.0
     to_s: float = inf
+    height_m: float | None = None
+    """Height at which it was carried, within some 0.1 m. None if free."""
 
 
 class First(Struct, frozen=True):
@@ -78,22 +81,30 @@ def _anchor(name: str, text: str, part: str) -> int:
         raise SkylessError(f"{name} is {text!r}; {part!r} should be the identifier of an anchor") from None
 
 
-def _read_height(name: str, text: str) -> tuple[int | None, float]:
+def _read_height(name: str, text: str) -> tuple[int | None, float | Path]:
     anchor, mark, value = text.rpartition("=")
-    (z_m,) = _metres(name, text, (1,), value if mark else None)
+    try:
+        float(value)
+    except ValueError:
+        if not mark:
+            return None, existing_file(name, text)
+    (z_m,) = _metres(name, text, (1,), value)
     return (_anchor(name, text, anchor) if mark else None), z_m
 
 
-def _check_heights(name: str, given: Any) -> dict[int | None, float]:  # noqa: ANN401 - what a user gives
-    if isinstance(given, float | int):
+def _check_heights(name: str, given: Any) -> dict[int | None, float | Path]:  # noqa: ANN401 - what a user gives
+    if isinstance(given, float | int | str | Path):
         given = {None: given}
-    heights_m: dict[int | None, float] = {}
-    for anchor, z_m in given.items() if isinstance(given, Mapping) else given:
-        if anchor in heights_m:
+    heights: dict[int | None, float | Path] = {}
+    for anchor, one in given.items() if isinstance(given, Mapping) else given:
+        if anchor in heights:
             which = "all anchors" if anchor is None else f"anchor {anchor}"
             raise SkylessError(f"{name} is given twice; the height of {which} should be given once")
-        heights_m[anchor] = check_number(f"{name}[{anchor}]", z_m, least=-MAX_COORDINATE_M, most=MAX_COORDINATE_M)
-    return heights_m
+        if anchor is None and isinstance(one, str | Path):
+            heights[None] = existing_file(name, one)
+        else:
+            heights[anchor] = check_number(f"{name}[{anchor}]", one, least=-MAX_COORDINATE_M, most=MAX_COORDINATE_M)
+    return heights
 
 
 def _read_tape(name: str, text: str) -> Tape:
@@ -167,8 +178,23 @@ def _check_stays(name: str, given: Any) -> tuple[Stay, ...]:  # noqa: ANN401 - w
 
 
 def _read_walk(name: str, text: str) -> Walk:
-    tag, mark, span = text.partition("@")
-    return Walk(tag, *_read_span(name, text, span)) if mark else Walk(tag)
+    walked, mark, span = text.partition("@")
+    tag, of_height, height = walked.partition("=")
+    height_m = _metres(name, text, (1,), height)[0] if of_height else None
+    return Walk(tag, *(_read_span(name, text, span) if mark else (0.0, inf)), height_m)
+
+
+def _read_axes(name: str, text: str) -> tuple[int, ...]:
+    return tuple(_anchor(name, text, part) for part in text.split(","))
+
+
+def _check_axes(name: str, given: Any) -> Gauge:  # noqa: ANN401 - what a user gives
+    if isinstance(given, Gauge):
+        return given
+    anchors = sequence(name, given, "anchors")
+    if len(anchors) not in (2, 3) or len(set(anchors)) < len(anchors):
+        raise wrong(name, ",".join(map(str, anchors)), "two or three different anchors")
+    return Gauge(*anchors)
 
 
 def _check_walks(name: str, given: Any) -> tuple[Walk, ...]:  # noqa: ANN401 - what a user gives
@@ -201,57 +227,34 @@ def _check_first(name: str, text: Any) -> First:  # noqa: ANN401 - what a user g
     raise wrong(name, text, "a number of differences, seconds (60s) or a part (50%)")
 
 
-class SurveyOptions(RecordingOptions, frozen=True, kw_only=True):
+class SurveyOptions(ComputedOptions, frozen=True, kw_only=True):
     """Options of ``skyless survey``."""
 
     recording: Annotated["str | Path | None", Path, Rule(existing_file)] = None
-    """The recording, plain or gzip: of skyless record, or of another system."""
-    ranges: Annotated["str | Path | None", Path, Rule(existing_file)] = None
-    """A table of ranges instead of a recording: anchor_a,anchor_b,range_m, each pair any number of times."""
+    """The recording, plain or gzip: of skyless record, or of another system; or a table of ranges:
+    anchor_a,anchor_b,range_m, each pair any number of times."""
     walks: Annotated[
-        Sequence[str | Walk], Option("walk"), Text(_read_walk, "TAG or TAG@FROM:TO", many=True), Rule(_check_walks)
+        Sequence[str | Walk],
+        Option("walk"),
+        Text(_read_walk, "TAG, TAG=HEIGHT or TAG=HEIGHT@FROM:TO", many=True),
+        Rule(_check_walks),
     ] = ()
-    """A tag of the recording that was carried around, and when in seconds since its first reception. Used only where
-    it fits the ranges."""
-    walk_height_m: Annotated[
-        float | None, Option("walk-height"), number(least=-MAX_COORDINATE_M, most=MAX_COORDINATE_M)
-    ] = None
-    """Height at which it was carried, metres, within some 0.1 m; by default it is free."""
-    stays: Annotated[
-        Sequence[Stay | Sequence[float]],
-        Option("at"),
-        Text(_read_stay, "x,y,z or x,y,z@FROM:TO", many=True),
-        Rule(_check_stays),
-    ] = ()
-    """Where the tag stood still, in metres, x,y where the site knows its tags' height; its times in seconds since the
-    beginning, for several positions. The anchors' positions are then kept, and delays found."""
-    recorded_truth: bool = False
-    """Use where a simulated site's recording says its tags were, as --truth."""
-    first: Annotated[str | None, Rule(_check_first)] = None
-    """Use only the beginning at known positions: a number of differences (30), seconds (60s) or a part (50%).
-    """
+    """A tag of the recording that was carried around, if known at which height in metres (within some 0.1 m), and when
+    in seconds since its first reception. Used only where it fits the ranges."""
     site: Annotated["Site | str | Path | None", Path] = None
     """Site file of the present: its anchors, heights, and rough positions; in Python also a site."""
-    no_sketch: bool = False
-    """Do not use the positions of --site, only its anchors and heights."""
-    sketch_std_m: Annotated[_Std | None, Option("sketch-std")] = None
-    """How well the positions of --site are known, metres per axis; 0.3 by default, with --keep-positions what the file
-    states."""
     keep_positions: bool = False
     """Keep the positions of --site, or of the recording, and find delays only."""
-    dimensions: Literal[2, 3] | None = None
-    """2 (default): heights are given; 3: heights are estimated."""
     anchor_height_m: Annotated[
-        "float | Mapping[int | None, float] | None",
+        "float | Mapping[int | None, float] | str | Path | None",
         Option("anchor-height"),
-        Text(_read_height, "METRES or ANCHOR=METRES", many=True),
+        Text(_read_height, "METRES, ANCHOR=METRES or TABLE", many=True),
         Rule(_check_heights),
     ] = None
-    """Height of all anchors, or of one; in Python a number, or heights by anchor."""
-    anchor_heights: Annotated["str | Path | None", Path] = None
-    """Table of heights: id,z_m."""
+    """Height of all anchors, or of one, or a table of heights: id,z_m; in Python a number, heights by anchor, or a
+    table."""
     anchor_height_std_m: Annotated[_Std | None, Option("anchor-height-std")] = None
-    """How well given heights are known, metres (--dimensions 3); 0.02 by default."""
+    """Estimate heights, too; those given are known this well, metres. Without it they are exact."""
     distances: Annotated[
         Sequence[Tape],
         Option("distance"),
@@ -266,56 +269,47 @@ class SurveyOptions(RecordingOptions, frozen=True, kw_only=True):
         Rule(_check_points),
     ] = {}
     """An anchor whose position is known, metres."""
-    delays_known: bool = False
-    """The antenna delays are right; do not estimate them."""
-    delay_std_m: Annotated[_Std | None, Option("delay-std")] = None
-    """How much antenna delays are expected to be off, each for itself, metres; 0.07 by default, 0.15 with a tag at
-    known positions, for boards that were never calibrated, 0.03 for recordings of other systems."""
-    common_delay_std_m: Annotated[_StdOrZero | None, Option("common-delay-std")] = None
-    """How much all of them are expected to be off together, more than that; 0.1 by default, 1 for recordings of other
-    systems, whose stamps may lack any correction."""
+    delay_std_m: Annotated[_StdOrZero | None, Option("delay-std")] = None
+    """How much antenna delays are expected to be off, each for itself, metres; 0.07 by default, 0.03 for recordings of
+    other systems; 0: they are right, and not estimated."""
     pair_std_m: Annotated[_StdOrZero | None, Option("pair-std")] = None
     """Constant error expected of each pair's range, metres; 0.03 by default."""
-    origin: int | None = None
-    """The anchor at (0, 0)."""
-    x_axis: int | None = None
-    """An anchor on the positive x axis; best the farthest from --origin."""
-    left: int | None = None
-    """An anchor on the left of the x axis (y > 0)."""
-
-    @property
-    def knows_tag(self) -> bool:
-        """Whether the options tell where a tag of the recording was."""
-        return bool(self.stays or self.truth is not None or self.recorded_truth)
+    axes: Annotated[Gauge | Sequence[int] | None, Text(_read_axes, "ORIGIN,X or ORIGIN,X,LEFT"), Rule(_check_axes)] = (
+        None
+    )
+    """The anchor at (0, 0), one on the positive x axis, best the farthest, and one on the left of it (y > 0) where the
+    side is not known otherwise."""
 
     def check(self) -> None:
         """Check that the options are compatible. Raises SkylessError."""
         if self.recording is None:
-            self.leave_out(
-                *("format", "walks", "stays", "truth", "recorded_truth", "first", "anchors", "listener", "tag"),
-                why="it is for recordings",
-            )
-        elif self.ranges is not None:
-            raise SkylessError("give either --recording or --ranges")
-        if not self.walks:
-            self.leave_out("walk_height_m", why="it is the height of a tag that --walk names")
+            self.leave_out("walks", why="it is for recordings")
+        if self.keep_positions and self.delay_std_m == 0.0:
+            raise SkylessError("--keep-positions finds delays, and --delay-std 0 says that they are known; give either")
+
+
+class CalibrateOptions(RecordingOptions, frozen=True, kw_only=True):
+    """Options of ``skyless calibrate``."""
+
+    site: Annotated["Site | str | Path | None", Path] = None
+    """Site file of the present, whose positions are kept; in Python also a site."""
+    stays: Annotated[
+        Sequence[Stay | Sequence[float]],
+        Option("at"),
+        Text(_read_stay, "x,y,z or x,y,z@FROM:TO", many=True),
+        Rule(_check_stays),
+    ] = ()
+    """Where the tag stood still, in metres, x,y where the site knows its tags' height; its times in seconds since the
+    beginning, for several positions."""
+    recorded_truth: bool = False
+    """Use where a simulated site's recording says its tags were, as --truth."""
+    first: Annotated[str | None, Rule(_check_first)] = None
+    """Use only the beginning at known positions: a number of differences (30), seconds (60s) or a part (50%)."""
+
+    def check(self) -> None:
+        """Check that the options are compatible. Raises SkylessError."""
         if self.stays and (self.truth is not None or self.recorded_truth or self.lever_arm_m is not None):
             raise SkylessError("--at says where the antenna was; it should be given without --truth and --lever-arm")
-        if self.delays_known:
-            self.leave_out("delay_std_m", "common_delay_std_m", why="--delays-known says that delays are right")
-        if self.anchor_height_std_m is not None and self.dimensions != 3:
-            self.leave_out("anchor_height_std_m", why="it is for --dimensions 3, else heights are exact")
-        if self.keep_positions and self.no_sketch:
-            raise SkylessError("--keep-positions keeps what --no-sketch would leave out; give either")
-        if (self.keep_positions or self.knows_tag) and self.delays_known:
-            raise SkylessError(
-                "--keep-positions finds delays, and --delays-known says that they are known; give either"
-            )
-        named = [anchor for anchor in (self.origin, self.x_axis, self.left) if anchor is not None]
-        if named and (self.origin is None or self.x_axis is None):
-            raise SkylessError("the axes need --origin and --x-axis, and --left where the side is not known otherwise")
-        if len(set(named)) < len(named):
-            raise SkylessError(f"--x-axis is {self.x_axis}; --origin, --x-axis and --left should be different anchors")
 
 
 _SKETCH_STD_M: Final = 0.3
@@ -333,44 +327,55 @@ def facts_of(asked: SurveyOptions, anchors: Iterable[int], site: Site | None, *,
 
     ``site``: of --site or of the recording. ``is_foreign``: the ranges are from a recording of another system.
     """
-    known, keep = set(anchors), asked.keep_positions or asked.knows_tag
+    known, keep = set(anchors), asked.keep_positions
     if keep and (site is None or not site.anchors):
         raise SkylessError("--keep-positions needs positions to keep; --site should be a file that has them")
-    if asked.sketch_std_m is not None and (site is None or not site.anchors or asked.no_sketch):
-        raise SkylessError(f"--sketch-std is {asked.sketch_std_m:g}; it needs the positions of --site")
     _require_known("--distance", (anchor for tape in asked.distances for anchor in (tape.a, tape.b)), known)
     points: dict[int, Point] = {}
     for anchor, (x_m, y_m, *z_m) in asked.points_m.items():
         points[anchor] = (x_m, y_m, z_m[0] if z_m else None)
     _require_known("--point", points, known)
-    placed = () if site is None else site.anchors
-    sketch: dict[int, Point] = {}
-    if not asked.no_sketch:
-        sketch = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in placed}
-    dimensions = asked.dimensions or (3 if asked.knows_tag else 2)
+    gauge = asked.axes if isinstance(asked.axes, Gauge) else None
+    if gauge is not None:
+        _require_known("--axes", (one for one in (gauge.origin, gauge.x_axis, gauge.left) if one is not None), known)
     given = _heights(asked, known) | {anchor: point[2] for anchor, point in points.items() if point[2] is not None}
-    if dimensions == 2:
-        given = {anchor.id: anchor.z_m for anchor in placed} | given
+    if asked.anchor_height_std_m is None and site is not None:
+        given = {anchor.id: anchor.z_m for anchor in site.anchors} | given
     usual = Facts()
     if is_foreign:
         usual = replace(usual, delay_std_m=_FOREIGN_DELAY_STD_M, common_delay_std_m=_FOREIGN_COMMON_DELAY_STD_M)
-    elif asked.knows_tag:
-        usual = replace(usual, delay_std_m=_UNCALIBRATED_DELAY_STD_M)
-    common_std_m = asked.common_delay_std_m
-    return Facts(
-        dimensions=dimensions,
+    return replace(
+        usual,
+        dimensions=2 if asked.anchor_height_std_m is None else 3,
         heights_m=given,
         height_std_m=asked.anchor_height_std_m or usual.height_std_m,
         tapes=tuple(asked.distances),
         points=points,
-        sketch_m=sketch,
-        sketch_std_m=asked.sketch_std_m or (_SKETCH_STD_M if site is None or not keep else _stated_std_m(site)),
+        sketch_m=_sketch_m(site),
+        sketch_std_m=_stated_std_m(site) if site is not None and keep else _SKETCH_STD_M,
         keep_positions=keep,
-        delay_std_m=0.0 if asked.delays_known else asked.delay_std_m or usual.delay_std_m,
-        common_delay_std_m=usual.common_delay_std_m if common_std_m is None else common_std_m,
+        delay_std_m=usual.delay_std_m if asked.delay_std_m is None else asked.delay_std_m,
         pair_std_m=usual.pair_std_m if asked.pair_std_m is None else asked.pair_std_m,
-        gauge=_gauge(asked, known),
+        gauge=gauge,
     )
+
+
+def calibration_facts(site: Site, tags: tuple[TagReceived, ...]) -> Facts:
+    """The facts for finding a site's delays from tags at known positions. Raises SkylessError."""
+    if not site.anchors:
+        raise SkylessError("a calibration needs the anchors' positions; --site should be a file that has them")
+    return Facts(
+        dimensions=3,
+        sketch_m=_sketch_m(site),
+        sketch_std_m=_stated_std_m(site),
+        keep_positions=True,
+        delay_std_m=_UNCALIBRATED_DELAY_STD_M,
+        tags=tags,
+    )
+
+
+def _sketch_m(site: Site | None) -> dict[int, Point]:
+    return {} if site is None else {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
 
 
 def _stated_std_m(site: Site) -> float:
@@ -379,27 +384,17 @@ def _stated_std_m(site: Site) -> float:
 
 
 def _heights(asked: SurveyOptions, known: set[int]) -> dict[int, float]:
-    """Heights by anchor: single options override the table, and the table the height of all. Raises SkylessError."""
+    """Heights by anchor: those of single anchors override the table, or the height of all. Raises SkylessError."""
     given = asked.anchor_height_m
     by_anchor = dict(given) if isinstance(given, dict) else {}
     of_all = by_anchor.pop(None, None)
     _require_known("--anchor-height", by_anchor, known)
-    table: dict[int, float] = {}
-    if asked.anchor_heights is not None:
-        table = read_heights(Path(asked.anchor_heights))
-        if known.isdisjoint(table):
-            right = f"anchors among {_names(known)}"
-            raise ConfigurationError(asked.anchor_heights, "column id", _names(table), right)
-    heights_m = {} if of_all is None else dict.fromkeys(known, of_all)
-    return heights_m | {anchor: z_m for anchor, z_m in table.items() if anchor in known} | by_anchor
-
-
-def _gauge(asked: SurveyOptions, known: set[int]) -> Gauge | None:
-    if asked.origin is None or asked.x_axis is None:
-        return None
-    for option, anchor in (("origin", asked.origin), ("x-axis", asked.x_axis), ("left", asked.left)):
-        _require_known(f"--{option}", () if anchor is None else (anchor,), known)
-    return Gauge(asked.origin, asked.x_axis, asked.left)
+    if not isinstance(of_all, Path):
+        return ({} if of_all is None else dict.fromkeys(known, of_all)) | by_anchor
+    table = read_heights(of_all)
+    if known.isdisjoint(table):
+        raise ConfigurationError(of_all, "column id", _names(table), f"anchors among {_names(known)}")
+    return {anchor: z_m for anchor, z_m in table.items() if anchor in known} | by_anchor
 
 
 def _require_known(option: str, anchors: Iterable[int], known: set[int]) -> None:

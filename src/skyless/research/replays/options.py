@@ -1,4 +1,4 @@
-"""Options of ``skyless replay``, some of which a survey of a recording shares."""
+"""Options of ``skyless replay``, some of which ``skyless calibrate`` shares."""
 
 from functools import partial
 from pathlib import Path
@@ -80,11 +80,13 @@ def _check_bounds(name: str, value: Any) -> tuple[float, float]:  # noqa: ANN401
     return low_m, high_m
 
 
-class RecordingOptions(ComputedOptions, frozen=True, kw_only=True):
-    """What is known of a recording."""
+class RecordingOptions(ComputedOptions, frozen=True):
+    """A recording, and what is known of it."""
 
+    file: Annotated["str | Path", Path, Rule(existing_file)]
+    """The recording, plain or gzip."""
     anchors: Annotated["Anchors | None", Path] = None
-    """Table of anchors: id,x_m,y_m,z_m, with bias_m where skyless survey has found that; in Python also positions by
+    """Table of anchors: id,x_m,y_m,z_m, with bias_m where skyless calibrate has found that; in Python also positions by
     identifier."""
     truth: Annotated["AnyTruth | None", Path] = None
     """Table of true positions: t_s,x_m,y_m,z_m, with qx,qy,qz,qw if the body turns; t_s in the recording's time, in
@@ -102,18 +104,11 @@ class RecordingOptions(ComputedOptions, frozen=True, kw_only=True):
     """Name of the format, if the content should not decide."""
     listener: str | None = None
     """Which receiver, in recordings with several."""
-    channel: int | None = None
-    """Which radio channel, in recordings of several; by default the first for packets, and all for differences."""
     above_m: Annotated[float | None, Option("above")] = None
     """Judge only while the true height exceeds this, in metres; by default 0.3 for a table of differences that starts
     below it and later flies, as tags on the floor hear reflections only."""
     tag: str | None = None
     """Name of the tag, in recordings of skyless record; by default all."""
-
-
-class _Recording(RecordingOptions, frozen=True):
-    file: Annotated["str | Path", Path, Rule(existing_file)]
-    """The recording, plain or gzip."""
 
 
 def read_estimator(name: str, text: str) -> Any:  # noqa: ANN401 - any class
@@ -136,12 +131,14 @@ def check_estimator(name: str, value: Any) -> Any:  # noqa: ANN401 - any class
     return value
 
 
-class ReplayOptions(_Recording, frozen=True, kw_only=True):
+class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     """Options of ``skyless replay``."""
 
     site: Annotated["Site | str | Path | None", Path] = None
     """Site file instead of --anchors, for its anchors and its tags' height; in Python also a site. With a recording of
     skyless record: replay as if its anchors had had the antenna delays of this site, as skyless survey writes them."""
+    channel: int | None = None
+    """Which radio channel, in recordings of several; by default the first for packets, and all for differences."""
     tag_height_m: Annotated[
         float | str, Option("tag-height"), Text(partial(read_height, words=HEIGHT_WORDS)), Rule(_check_height)
     ] = "auto"

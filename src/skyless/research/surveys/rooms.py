@@ -33,8 +33,8 @@ from skyless.sim.impairments import (
 from skyless.sim.lab import lab_site
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
-from skyless.site.survey.determined import aligned_covariance
 from skyless.site.survey.facts import Facts, PairRanges, Point, Survey, Tape
+from skyless.site.survey.fit import aligned_covariance
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.problem import Problem, jacobian, superimposed
 from skyless.site.survey.solve import run_survey

@@ -86,11 +86,6 @@ class LiveSurvey:
                 ticks, phase_cycles = (stamp.tx_ticks, stamp.rx_ticks), stamp.carrier_phase_cycles
                 self._add(AnchorLeg(stamp.anchor, message.anchor, *ticks, t_s, phase_cycles), now_s)
 
-    def add_leg(self, leg: AnchorLeg, now_s: float) -> None:
-        """Process a relayed reception."""
-        if leg.sender in self._known and leg.receiver in self._known and not now_s < self._pause_until_s:
-            self._add(leg, now_s)
-
     def set_facts(self, facts: Facts) -> None:
         """Replace the known facts. Those about anchors not in the site are dropped."""
         known = self._known

@@ -10,10 +10,8 @@ from typing import Final
 from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
-from skyless.core.air.frame import Reception
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site, is_same_but_placed, site_digest
-from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -39,7 +37,6 @@ from skyless.run.mqtt.topics import (
     survey_topic,
     watch_topic,
 )
-from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import Log, every, keep, outlasting, reader, together
 from skyless.run.survey.files import (
     BadFactsError,
@@ -53,7 +50,6 @@ from skyless.run.survey.files import (
 from skyless.run.survey.live_survey import FactsOf, LiveSurvey
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, PairRanges, Survey
-from skyless.site.survey.legs import LegCollector
 from skyless.site.survey.surveyed_site import delay_differences_m
 from skyless.site.survey.watch import change_of
 
@@ -100,7 +96,7 @@ class SurveySettings(Struct, frozen=True):
 
 
 class SurveyNode:
-    """The survey program of one site, with stamps from MQTT or from its own radio."""
+    """The survey program of one site, with stamps from MQTT."""
 
     def __init__(
         self,
@@ -109,20 +105,16 @@ class SurveyNode:
         solve: Solve,
         address: MqttAddress | None,
         log: Log,
-        radio: Radio | None = None,
     ) -> None:
         """``facts_of``: facts about a site known without a user's help. ``solve``: ``survey.solve.run_survey``."""
         self.live: LiveSurvey | None = None  # None before the site is known
         self.problems = 0  # messages that could not be read
         self.saved: Saved | None = None
-        self._settings, self._facts_of, self._solve, self._log, self._radio = settings, facts_of, solve, log, radio
+        self._settings, self._facts_of, self._solve, self._log = settings, facts_of, solve, log
         self._given: SurveyFactsMessage | None = None
         self._running: Site | None = None  # the site of the anchors, as they publish it
         self._placement: PlacementMessage | None = None  # the newest on MQTT
         self._image: bytes | None = None
-        self._legs = LegCollector(settings.site_id)
-        self._monitor = None if radio is None else RadioMonitor(NAME, "listening", log, radio.advice)
-        self._received = 0
         self._facts_changed = False
         self._solving: asyncio.Task[None] | None = None
         self._watching: asyncio.Task[None] | None = None
@@ -148,11 +140,8 @@ class SurveyNode:
             await outlasting(keep(self.link, self._log), self._work())  # the last messages are still sent
 
     async def _work(self) -> None:
-        parts = [every(_UPDATE_S, self.update), every(_REQUEST_S, self._request)]
-        if self._radio is not None:
-            parts.append(self._radio.run(self.on_event))
         try:
-            await together(*parts)
+            await together(every(_UPDATE_S, self.update), every(_REQUEST_S, self._request))
         finally:
             for task in (self._solving, self._watching):
                 if task is not None:
@@ -175,10 +164,9 @@ class SurveyNode:
         site_id = self._settings.site_id
         link.on_state.append(lambda connected: self._request() if connected else None)
         topics: list[tuple[str, type[Struct], Callable[..., None], int]] = [
-            (site_topic(site_id), SiteMessage, self._on_site, 1)
+            (site_topic(site_id), SiteMessage, self._on_site, 1),
+            (stamps_topic(site_id, EVERY_NODE), StampsMessage, self._on_stamps, 0),
         ]
-        if self._radio is None:
-            topics.append((stamps_topic(site_id, EVERY_NODE), StampsMessage, self._on_stamps, 0))
         if self._settings.serves:
             topics += [
                 (survey_facts_topic(site_id), SurveyFactsMessage, self._on_facts, 1),
@@ -194,7 +182,7 @@ class SurveyNode:
         self.problems += 1
 
     def _request(self) -> None:
-        if self.link is not None and self._radio is None:
+        if self.link is not None:
             message = RequestMessage(self._name, (), LEASE_S, stamps=True)
             self.link.publish(request_topic(self._settings.site_id), message, qos=1)
 
@@ -214,19 +202,6 @@ class SurveyNode:
     def _on_stamps(self, message: StampsMessage) -> None:
         if self.live is not None:
             self.live.add_stamps(message, time.monotonic())
-
-    def on_event(self, event: RadioEvent) -> None:
-        """Process an event of the own radio."""
-        if isinstance(event, Reception):
-            self._received += 1
-            for leg in self._legs.add(event):
-                if self.live is not None:
-                    self.live.add_leg(leg, time.monotonic())
-        elif isinstance(event, Restarted | Gone | Hint):
-            if isinstance(event, Restarted) and self._received:
-                self._legs = LegCollector(self._settings.site_id)
-            if self._monitor is not None:
-                self._monitor.on_event(event)
 
     def _on_facts(self, message: SurveyFactsMessage) -> None:
         try:
@@ -294,8 +269,6 @@ class SurveyNode:
     def update(self) -> None:
         """Start computing another result if one is due, and publish what is due."""
         live, now_s, unix_s = self.live, time.monotonic(), time.time()
-        if self._monitor is not None and self._radio is not None:
-            self._monitor.check(now_s, self._received, self._legs.counters["legs"], self._legs.counters)
         if live is None or not self._settings.serves or self._waits():
             return
         is_due = now_s >= self._next_solve_s and (live.state(now_s) != "no data" or self._facts_changed)

@@ -154,7 +154,7 @@ class Count(Struct, frozen=True):
             return None
         return (
             "too few ranges check this survey, so a range that comes late would not be noticed: add links, measured "
-            "distances (--distance), known points (--point) or known delays (--delays-known)"
+            "distances (--distance), known points (--point) or known delays (--delay-std 0)"
         )
 
 

@@ -1,51 +1,696 @@
-"""The shape of a site, from a fit of all anchors with enough ranges, and sentences on what remains undetermined."""
+"""The shape of a site: the problem of its ranges and facts, starts, the fit, and the frame to which it is moved.
+
+Ranges determine a shape only up to rotation, shift and reflection. The frame is that of named anchors, known points, a
+sketch or a default.
+"""
 
 import math
-import re
-from collections.abc import Iterable
+import zlib
 from typing import Final
 
 import numpy as np
 from msgspec import Struct, structs
+from scipy.sparse.csgraph import connected_components
 from scipy.special import chdtri
 
 from skyless.core.arrays import Array, Integers, Mask
-from skyless.site.survey import determined as determination
-from skyless.site.survey.determined import Links, TapeChoice, best_tapes, mending_tapes
-from skyless.site.survey.facts import (
-    MIN_CHECKS,
-    Facts,
-    PairRange,
-    SurveyedAnchor,
-    TapeAdvice,
-    anchors_named,
-    are,
-    distances_named,
-    joined,
-)
-from skyless.site.survey.frame import (
-    Framed,
-    Measured,
-    Motion,
-    align,
-    as_array,
-    build_problem,
-    fitting_points,
-    levels,
-    own_variance_m2,
-    with_free_delays,
+from skyless.core.errors import SkylessError
+from skyless.site.survey.facts import Facts, Gauge, PairRange, PairRanges, Point, Tape, anchors_named, joined
+from skyless.site.survey.fit import (
+    OtherFit,
+    RobustFit,
+    aligned_covariance,
+    determined_core,
+    fit_robustly,
+    folds,
+    may_be_flat,
+    position_stds_m,
+    rank,
+    weak_directions,
 )
 from skyless.site.survey.problem import (
     MoreRows,
     Problem,
     Solution,
-    delay_weights,
+    distances_m,
     jacobian,
     solve_least_squares,
-    start_positions,
+    superimposed,
 )
-from skyless.site.survey.robust import OtherFit, RobustFit, fit_robustly
 from skyless.site.survey.walk import TagEpochs, fit_with_tag
+
+# From ranges and facts to a ``Problem`` of some of the site's anchors.
+
+MIN_RANGE_STD_M: Final = 1e-5
+_UNKNOWN_DELAY_STD_M: Final = 1e3  # standard deviation of a delay about which nothing is known
+_LARGEST_M: Final = 1e5
+"""Limit of ranges, distances and standard deviations; with far larger ones the fit would not converge."""
+
+_STDS: Final = (
+    "height_std_m", "point_std_m", "sketch_std_m", "delay_std_m", "common_delay_std_m", "pair_std_m",
+)  # fmt: skip
+"""Names of the standard deviations in ``Facts``."""
+
+_OFTEN_LATE_STD_M: Final = 0.15
+"""Extra standard deviation of a pair's range per share of late ranges, as an object near the path may also have delayed
+the earliest ones."""
+
+
+class Measured(Struct, frozen=True, eq=False):
+    """The usable ranges and facts, with sentences about the others."""
+
+    anchors: tuple[int, ...]
+    pairs: tuple[PairRange, ...]
+    tapes: tuple[Tape, ...]
+    tx_std_m: dict[int, float]
+    facts: Facts
+    notes: tuple[str, ...]
+
+
+def usable(ranges: PairRanges, facts: Facts) -> Measured:
+    """Leave out, with a sentence about each, ranges and facts that are not finite or name anchors without ranges.
+
+    Raises:
+        SkylessError: a standard deviation of the facts is negative, not finite or too large.
+    """
+    for name in _STDS:
+        if not _is_std(getattr(facts, name)):
+            raise SkylessError(f"{name} is {getattr(facts, name)}; it should be a standard deviation in metres")
+    notes = []
+    anchors = tuple(dict.fromkeys(ranges.anchors))
+    known = set(anchors)
+    best: dict[tuple[int, int], PairRange] = {}
+    for pair in ranges.pairs:
+        ends = (min(pair.a, pair.b), max(pair.a, pair.b))
+        if not (abs(pair.range_m) < _LARGEST_M and _is_std(pair.std_m) and 0.0 <= pair.late_share <= 1.0):
+            notes.append(f"the range of anchors {ends[0]} and {ends[1]} is not a possible figure: not used")
+        elif pair.a == pair.b or not known.issuperset(ends) or ends in best:
+            notes.append(
+                f"the range of anchors {pair.a} and {pair.b} is not of a pair of this site, or is there twice: not used"
+            )
+        else:
+            best[ends] = structs.replace(pair, a=ends[0], b=ends[1])
+    tapes = []
+    for tape in facts.tapes:
+        is_possible = 0.0 < tape.distance_m < _LARGEST_M and _is_std(tape.std_m)
+        if is_possible and tape.a != tape.b and {tape.a, tape.b} <= known:
+            tapes.append(tape)
+        else:
+            why = "fits no pair of this site" if is_possible else "is not a possible figure"
+            notes.append(f"the measured distance of anchors {tape.a} and {tape.b} {why}: not used")
+    points = _finite(facts.points)
+    heights_m = {anchor: z for anchor, z in facts.heights_m.items() if math.isfinite(z)}
+    delays = [item for item in facts.delays if abs(item.delay_m) < _LARGEST_M and _is_std(item.std_m)]
+    for kind, given, finite in (
+        ("point", set(facts.points), set(points)),
+        ("height", set(facts.heights_m), set(heights_m)),
+        ("delay", {item.anchor for item in facts.delays}, {item.anchor for item in delays}),
+    ):
+        notes += [
+            f"a {kind} is given for anchor {anchor}, which has no ranges: not used" for anchor in sorted(given - known)
+        ]
+        notes += [
+            f"the {kind} of anchor {anchor} is not a possible figure: not used"
+            for anchor in sorted(given & known - finite)
+        ]
+    kept = structs.replace(
+        facts,
+        points={anchor: point for anchor, point in points.items() if anchor in known},
+        heights_m={anchor: z for anchor, z in heights_m.items() if anchor in known},
+        sketch_m=_finite({anchor: point for anchor, point in facts.sketch_m.items() if anchor in known}),
+        delays=tuple(item for item in delays if item.anchor in known),
+    )
+    tx_std_m = {anchor: std for anchor, std in ranges.tx_std_m.items() if _is_std(std)}
+    return Measured(anchors, tuple(best.values()), tuple(tapes), tx_std_m, kept, tuple(notes))
+
+
+def _is_std(value_m: float) -> bool:
+    return 0.0 <= value_m < _LARGEST_M
+
+
+def _finite(points: dict[int, Point]) -> dict[int, Point]:
+    return {
+        anchor: (x, y, z if z is not None and math.isfinite(z) else None)
+        for anchor, (x, y, z) in points.items()
+        if math.isfinite(x) and math.isfinite(y)
+    }
+
+
+def fixed_heights_m(measured: Measured) -> Array:
+    """Heights of all anchors in two dimensions, shape (n,): as given, else the median of the given ones, else 0."""
+    given_m = _given_heights_m(measured.facts)
+    common_m = _common_height_m(given_m)
+    return np.array([given_m.get(anchor, common_m) for anchor in measured.anchors])
+
+
+def assumed_heights(measured: Measured) -> str | None:
+    """A sentence about the anchors whose heights ``fixed_heights_m`` assumes; None if there are none."""
+    if measured.facts.dimensions == 3 and not measured.facts.keep_positions:
+        return None
+    given_m = _given_heights_m(measured.facts)
+    missing = [anchor for anchor in measured.anchors if anchor not in given_m]
+    if not missing:
+        return None
+    if not given_m:
+        return "no heights are given: all anchors are taken to be on the floor, at z = 0 m"
+    common = f"{_common_height_m(given_m):g} m is assumed, the median of the others"
+    return f"no height is given for {anchors_named(missing)}: {common}"
+
+
+def _given_heights_m(facts: Facts) -> dict[int, float]:
+    given = {anchor: point[2] for source in (facts.sketch_m, facts.points) for anchor, point in source.items()}
+    given.update(facts.heights_m)
+    return {anchor: z for anchor, z in given.items() if z is not None}
+
+
+def _common_height_m(given_m: dict[int, float]) -> float:
+    return float(np.median(list(given_m.values()))) if given_m else 0.0
+
+
+def levels(measured: Measured) -> bool:
+    """Whether the vertical is known: in two dimensions, or by heights of three anchors or more."""
+    return measured.facts.dimensions == 2 or len(measured.facts.heights_m) >= 3
+
+
+def as_array(points: dict[int, Point], anchors: tuple[int, ...]) -> Array:
+    """Points of these anchors as an array of shape (n, 3), NaN where a coordinate is not given."""
+    nothing = (math.nan, math.nan, math.nan)
+    rows = [points.get(anchor, nothing) for anchor in anchors]
+    return np.array([[math.nan if value is None else value for value in row] for row in rows]).reshape(-1, 3)
+
+
+def indices_of(measured: Measured, kept: Integers) -> dict[int, int]:
+    """Index of each kept anchor among the kept ones, by identifier."""
+    return {measured.anchors[index]: number for number, index in enumerate(kept)}
+
+
+def build_problem(
+    measured: Measured, kept: Integers, pair_std_m: float, point_m: Array | None, sketch_m: Array | None
+) -> tuple[Problem, list[PairRange]]:
+    """Build the problem of the kept anchors (indices). Returns it with the pairs of its ranges, in order.
+
+    ``point_m``, ``sketch_m``: known and rough coordinates of the kept anchors, shape (k, 3), NaN where there are none.
+    """
+    facts, index = measured.facts, indices_of(measured, kept)
+    n = len(kept)
+    pairs = [pair for pair in measured.pairs if pair.a in index and pair.b in index]
+    tapes = [tape for tape in measured.tapes if tape.a in index and tape.b in index]
+    is_free = np.ones((n, 3), bool)
+    coordinate = np.zeros((n, 3))
+    variance = np.full((n, 3), np.inf)
+    for source, std in ((sketch_m, facts.sketch_std_m), (_heights(measured, kept), facts.height_std_m)):
+        _add(coordinate, variance, source, std)
+    _add(coordinate, variance, point_m, facts.point_std_m)
+    if facts.dimensions == 2:
+        is_free[:, 2] = False
+        coordinate[:, 2], variance[:, 2] = fixed_heights_m(measured)[kept], np.inf
+    delay = np.zeros(n)
+    delay_variance = np.full(n, facts.delay_std_m**2, np.float64)
+    common = np.full(n, facts.common_delay_std_m if facts.delay_std_m > 0.0 else 0.0, np.float64)
+    for item in facts.delays:
+        if item.anchor in index:
+            delay[index[item.anchor]], delay_variance[index[item.anchor]] = item.delay_m, item.std_m**2
+            common[index[item.anchor]] = 0.0
+    delay_variance += np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in index]).reshape(n)
+    problem = Problem(
+        is_free=is_free,
+        first=np.array([index[pair.a] for pair in pairs], np.int64),
+        second=np.array([index[pair.b] for pair in pairs], np.int64),
+        range_m=np.array([pair.range_m for pair in pairs], np.float64),
+        variance_m2=np.array([own_variance_m2(pair) + pair_std_m**2 for pair in pairs], np.float64),
+        delay_m=delay,
+        delay_variance_m2=delay_variance,
+        common_delay_m=common if common.any() else None,
+        coordinate_m=coordinate,
+        coordinate_variance_m2=variance,
+        tape_first=np.array([index[tape.a] for tape in tapes], np.int64),
+        tape_second=np.array([index[tape.b] for tape in tapes], np.int64),
+        tape_m=np.array([tape.distance_m for tape in tapes], np.float64),
+        tape_variance_m2=np.array([tape.std_m**2 for tape in tapes], np.float64),
+    )
+    return problem, pairs
+
+
+def own_variance_m2(pair: PairRange) -> float:
+    """Variance of a range without the constant error of a pair."""
+    return pair.std_m**2 + (_OFTEN_LATE_STD_M * pair.late_share) ** 2 + MIN_RANGE_STD_M**2
+
+
+def with_free_delays(problem: Problem) -> tuple[Problem, Mask]:
+    """The problem without delay priors that are coarser than a range, to see what the measurements alone determine.
+
+    Also returns which delays have no prior then, shape (n,).
+    """
+    typical = float(np.median(problem.variance_m2)) if len(problem.variance_m2) else 0.0
+    own, common = problem.delay_variance_m2, problem.common_delay_m
+    free = structs.replace(problem, delay_variance_m2=np.where(own > typical, np.inf, own))
+    if common is None:
+        return free, np.asarray(own > typical)
+    shared = common**2 > typical
+    free = structs.replace(free, common_delay_m=np.where(shared, _UNKNOWN_DELAY_STD_M, common))
+    return free, np.asarray((own > typical) | shared)
+
+
+def own_delays(
+    measured: Measured, anchors: tuple[int, ...], problem: Problem, delay_m: Array, covariance_m2: Array
+) -> tuple[Array, Array]:
+    """Delays without the shared error of an anchor's TX stamps, and their standard deviations, shape (k,) each.
+
+    ``delay_m``, ``covariance_m2``: delay and stamp error together, as fitted; the priors tell how to divide them.
+    """
+    shared = np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in anchors])
+    common = np.zeros(len(anchors)) if problem.common_delay_m is None else problem.common_delay_m
+    own = np.diag(np.maximum(problem.delay_variance_m2 - shared, 0.0)) + np.outer(common, common)
+    whole = np.diag(np.maximum(problem.delay_variance_m2, 1e-10)) + np.outer(common, common)
+    part = own @ np.linalg.inv(whole)
+    own_m = problem.delay_m + part @ (delay_m - problem.delay_m)
+    variance = np.diag(part @ covariance_m2 @ part.T + own - part @ own)
+    return np.asarray(own_m), np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _heights(measured: Measured, kept: Integers) -> Array:
+    """Known heights as points, shape (k, 3); all NaN if they do not level the site."""
+    known = np.full((len(kept), 3), np.nan)
+    if levels(measured):
+        known[:, 2] = [measured.facts.heights_m.get(measured.anchors[index], math.nan) for index in kept]
+    return known
+
+
+def _add(coordinate: Array, variance: Array, known_m: Array | None, std_m: float) -> None:
+    if known_m is not None:
+        given = np.isfinite(known_m)
+        coordinate[given], variance[given] = known_m[given], std_m**2
+
+
+# Alignments, and frames through anchors
+
+
+_DECIDED: Final = 16.0
+"""Least difference between the costs of an alignment and its mirror image that decides for the better one."""
+
+_OFF_AXIS: Final = 0.1  # least distance from the x axis, as a share of its length, that makes an anchor's side clear
+_MAX_SIGMA: Final = 3.0
+
+
+class Motion(Struct, frozen=True, eq=False):
+    """A rotation, possibly with a reflection, followed by a shift."""
+
+    rotation: Array
+    """Shape (3, 3)."""
+    shift_m: Array
+    """Shape (3,)."""
+
+    def moved(self, position_m: Array) -> Array:
+        """Apply the motion to positions of shape (..., 3)."""
+        return np.asarray(position_m @ self.rotation.T + self.shift_m)
+
+
+class Alignment(Struct, frozen=True, eq=False):
+    """The motion that best fits one set of positions to another."""
+
+    motion: Motion
+    mirror_decided: bool
+    """Whether the mirror image fits clearly worse."""
+
+
+def align(position_m: Array, other_m: Array, std_m: float, axes: int) -> Alignment:
+    """Least squares alignment without scale, of positions of shape (k, 3).
+
+    ``axes`` 2: rotate about the vertical and keep z. ``std_m``: standard deviation of the sets' difference per axis,
+    used only to decide about mirror images.
+    """
+    own, other = position_m[:, :axes], other_m[:, :axes]
+    centre, goal = own.mean(axis=0), other.mean(axis=0)
+    left, _, right = np.linalg.svd((own - centre).T @ (other - goal))
+    found = []
+    for sign in (1.0, -1.0):
+        flip = np.ones(axes)
+        flip[-1] = sign
+        turn = (left * flip) @ right
+        residual = (own - centre) @ turn + goal - other
+        rotation = np.eye(3)
+        rotation[:axes, :axes] = turn.T
+        shift = np.zeros(3)
+        shift[:axes] = goal - turn.T @ centre
+        cost = float(np.sum(residual**2)) / max(std_m, 1e-9) ** 2
+        found.append((cost, float(np.linalg.det(turn)), Motion(rotation, shift)))
+    plain = next(item for item in found if item[1] > 0.0)
+    mirrored = next(item for item in found if item[1] < 0.0)
+    decided = abs(plain[0] - mirrored[0]) > _DECIDED
+    best = mirrored if decided and mirrored[0] < plain[0] else plain
+    return Alignment(best[2], decided)
+
+
+def fitting_points(position_m: Array, covariance_m2: Array, point_m: Array, point_std_m: float) -> Mask:
+    """Mask of the points whose mutual distances agree with the positions, shape (k,).
+
+    The point that contradicts most others is removed until none does, but the last two stay. ``covariance_m2``: shape
+    (3 k, 3 k).
+    """
+    k = len(position_m)
+    apart = position_m[:, None] - position_m[None]
+    unit = apart / np.maximum(distances_m(position_m), 1e-9)[:, :, None]
+    blocks = covariance_m2.reshape(k, 3, k, 3).transpose(0, 2, 1, 3)
+    own = blocks[np.arange(k), np.arange(k)]
+    spread = own[:, None] + own[None] - blocks - blocks.transpose(1, 0, 2, 3)
+    variance = np.einsum("ija,ijab,ijb->ij", unit, spread, unit) + 2.0 * point_std_m**2
+    sigma = np.abs(distances_m(position_m) - distances_m(point_m)) / np.sqrt(variance)
+    np.fill_diagonal(sigma, 0.0)
+    fits = np.ones(k, bool)
+    while True:
+        against = np.where(np.outer(fits, fits), sigma, 0.0)
+        wrong = against > _MAX_SIGMA
+        if not wrong.any() or fits.sum() <= 2:
+            return fits
+        order = np.lexsort((against.sum(axis=1), wrong.sum(axis=1)))
+        fits[order[-1]] = False
+
+
+class Axes(Struct, frozen=True, eq=False):
+    """A frame through anchors, by indices."""
+
+    motion: Motion
+    origin: int
+    x_axis: int
+    left: int | None
+    side_decided: bool
+    """Whether an anchor is clearly on the left."""
+
+
+def axes_through(
+    position_m: Array, usable: Mask, axes: int, origin: int, x_axis: int | None = None, left: int | None = None
+) -> Axes:
+    """The frame with anchor ``origin`` at 0, ``x_axis`` on +x and ``left`` at y > 0; needs two usable anchors.
+
+    By default the farthest anchor defines the x axis, and the first one clearly off it the left. ``axes`` 2: z is kept;
+    3: the three anchors are at z = 0, and the first anchor clearly off their plane is above it.
+    """
+    arm = position_m - position_m[origin]
+    if axes == 2:
+        arm = arm * [1.0, 1.0, 0.0]
+    length = np.where(usable, np.linalg.norm(arm, axis=1), -1.0)
+    if x_axis is None:
+        x_axis = int(np.argmax(length))
+    along = arm[x_axis] / max(float(length[x_axis]), 1e-9)
+    off = arm - np.outer(arm @ along, along)
+    distance = np.linalg.norm(off, axis=1)
+    clear = _first(usable & (distance > _OFF_AXIS * length[x_axis]))
+    chosen = clear if left is None else left
+    decided = chosen is not None and bool(distance[chosen] > _OFF_AXIS * _OFF_AXIS * length[x_axis])
+    across = off[chosen] / distance[chosen] if chosen is not None and decided else _perpendicular(along, axes)
+    up = np.array([0.0, 0.0, 1.0])
+    if axes == 3:
+        up = np.cross(along, across)
+        height = arm @ up
+        above = _first(usable & (np.abs(height) > _OFF_AXIS * length[x_axis]))
+        up = up if above is None or height[above] > 0.0 else -up
+    rotation = np.stack([along, across, up])
+    shift = -rotation @ position_m[origin]
+    if axes == 2:
+        shift[2] = 0.0
+    return Axes(Motion(rotation, shift), origin, x_axis, chosen if decided else None, decided)
+
+
+def _first(chosen: Mask) -> int | None:
+    found = np.flatnonzero(chosen)
+    return int(found[0]) if found.size else None
+
+
+def _perpendicular(along: Array, axes: int) -> Array:
+    if axes == 2:
+        return np.array([-along[1], along[0], 0.0])
+    other = np.cross(along, np.eye(3)[int(np.argmin(np.abs(along)))])
+    return np.asarray(other / np.linalg.norm(other))
+
+
+# The frame that the facts define
+
+
+_NEAR: Final = 0.5
+"""Advise another anchor if the x axis's is nearer to the origin than this share of the farthest one's distance."""
+
+
+class Framed(Struct, frozen=True, eq=False):
+    """A shape of ``k`` anchors in its frame."""
+
+    motion: Motion
+    position_m: Array
+    """Shape (k, 3)."""
+    covariance_m2: Array
+    """Shape (k, 3, 3)."""
+    sentence: str
+    gauge: Gauge | None
+    notes: tuple[str, ...]
+
+
+def in_frame(
+    measured: Measured,
+    kept: Integers,
+    position_m: Array,
+    covariance_m2: Array,
+    core: Mask,
+    points_used: tuple[int, ...],
+) -> Framed:
+    """Move positions, shape (k, 3), and their covariance, shape (4 k, 4 k), to the frame that the facts define."""
+    anchors = np.array([measured.anchors[index] for index in kept])
+    motion, sentence, gauge, notes = _motion(measured, anchors, position_m, core, points_used)
+    k = len(kept)
+    blocks = covariance_m2[: 3 * k, : 3 * k].reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
+    rotated = motion.rotation @ blocks @ motion.rotation.T
+    return Framed(motion, motion.moved(position_m), rotated, sentence, gauge, tuple(notes))
+
+
+def _motion(
+    measured: Measured, anchors: Integers, position_m: Array, core: Mask, points_used: tuple[int, ...]
+) -> tuple[Motion, str, Gauge | None, list[str]]:
+    axes = 2 if levels(measured) else 3
+    still = Motion(np.eye(3), np.zeros(3))
+    facts = measured.facts
+    by_points, points_decide = _best(facts.points, max(facts.point_std_m, 0.03), anchors, position_m, core, axes)
+    by_sketch, sketch_decides = _best(facts.sketch_m, facts.sketch_std_m, anchors, position_m, core, axes)
+    decided = points_decide or sketch_decides
+    notes: list[str] = []
+    if axes == 3:
+        notes.append("the site may be tilted: give the heights of three anchors that are not on one line")
+    gauge = facts.gauge
+    if gauge is not None:
+        index = {int(anchor): number for number, anchor in enumerate(anchors) if core[number]}
+        named = [gauge.origin, gauge.x_axis, *([] if gauge.left is None else [gauge.left])]
+        missing = [anchor for anchor in dict.fromkeys(named) if anchor not in index]
+        if not missing and len(set(named)) == len(named):
+            chosen = [index[anchor] for anchor in named]
+            return _by_gauge(anchors, position_m, core, axes, chosen, by_points or by_sketch, decided, notes)
+        has = "has" if len(missing) == 1 else "have"
+        why = f"{anchors_named(missing)} {has} no position" if missing else "one anchor is named twice"
+        notes.append(f"the frame cannot be defined by anchors {joined(named)}: {why}")
+    mirror = "" if decided else "; the ranges do not show whether this is a mirror image: name an anchor on the left"
+    if by_points is not None:
+        motion = still if points_used else by_points
+        if not decided and axes == 2:
+            motion = _left_of_points(measured, anchors, motion, position_m, core)
+        return motion, f"axes follow the known points{mirror}", None, notes
+    if by_sketch is not None:
+        return by_sketch, f"axes fit the sketch best{mirror}", None, notes
+    lowest = int(np.flatnonzero(core)[0])
+    if core.sum() < 2:
+        return Motion(np.eye(3), -position_m[lowest] * ([1, 1, 0] if axes == 2 else [1, 1, 1])), "", None, notes
+    found = axes_through(position_m, core, axes, lowest)
+    return found.motion, f"{_sentence(anchors, found, axes)}; {_MIRROR}", _gauge_of(found, anchors), notes
+
+
+_MIRROR = "no anchors are named for the origin and the axes, and the result may be a mirror image"
+
+
+def _by_gauge(
+    anchors: Integers,
+    position_m: Array,
+    core: Mask,
+    axes: int,
+    chosen: list[int],
+    known: Motion | None,
+    decided: bool,
+    notes: list[str],
+) -> tuple[Motion, str, Gauge | None, list[str]]:
+    """Frame through named anchors; if none is named for the left, points or the sketch decide the mirror image."""
+    origin, x_axis = chosen[:2]
+    if known is not None:
+        position_m = known.moved(position_m)
+    length = np.linalg.norm((position_m - position_m[origin])[:, :axes], axis=1)
+    far = int(np.argmax(np.where(core, length, 0.0)))
+    if length[x_axis] < _NEAR * length[far]:
+        notes.append(
+            f"anchor {anchors[x_axis]} defines the x axis from only {length[x_axis]:.1f} m away; "
+            f"choose anchor {anchors[far]}, {length[far]:.1f} m away"
+        )
+    found = axes_through(position_m, core, axes, origin, x_axis, chosen[2] if len(chosen) > 2 else None)
+    mirror = ""
+    if len(chosen) > 2 and not found.side_decided:
+        notes.append(f"anchor {anchors[chosen[2]]} stands on the x axis, so it cannot show which side is left")
+    if len(chosen) < 3 and known is not None and decided and axes == 2:
+        motion = found.motion
+        if np.linalg.det(motion.rotation) < 0.0:
+            motion = Motion(motion.rotation * [[1.0], [-1.0], [1.0]], motion.shift_m * [1.0, -1.0, 1.0])
+        found = Axes(motion, found.origin, found.x_axis, None, True)
+    elif len(chosen) < 3 or not found.side_decided:
+        mirror = "; no anchor on the left is named, so the result may be a mirror image"
+    sentence = _sentence(anchors, found, axes) + mirror
+    if known is not None:
+        whole = Motion(found.motion.rotation @ known.rotation, found.motion.moved(known.shift_m))
+        return whole, sentence, _gauge_of(found, anchors), notes
+    return found.motion, sentence, _gauge_of(found, anchors), notes
+
+
+def _left_of_points(measured: Measured, anchors: Integers, motion: Motion, position_m: Array, core: Mask) -> Motion:
+    """The motion, mirrored if need be so that the first anchor clearly off the points' line is on its left."""
+    given = [number for number, anchor in enumerate(anchors) if int(anchor) in measured.facts.points and core[number]]
+    moved = motion.moved(position_m)
+    found = axes_through(moved, core, 2, given[0], given[1])
+    if np.linalg.det(found.motion.rotation) > 0.0:
+        return motion
+    along = found.motion.rotation[0]
+    mirror = 2.0 * np.outer(along, along) - np.eye(3)
+    mirror[2, 2] = 1.0
+    origin = moved[given[0]]
+    whole = Motion(mirror, origin - mirror @ origin)
+    return Motion(mirror @ motion.rotation, whole.moved(motion.shift_m))
+
+
+def _best(
+    points: dict[int, Point], std_m: float, anchors: Integers, position_m: Array, core: Mask, axes: int
+) -> tuple[Motion | None, bool]:
+    """The best motion to these points, None if they are too few, and whether they exclude the mirror image."""
+    there_m = as_array(points, tuple(anchors.tolist()))
+    known = core & np.isfinite(there_m[:, :axes]).all(axis=1)
+    if known.sum() < axes:
+        return None, False
+    there_m = np.where(np.isfinite(there_m), there_m, position_m)
+    alignment = align(position_m[known], there_m[known], std_m, axes)
+    return alignment.motion, alignment.mirror_decided
+
+
+def _sentence(anchors: Integers, found: Axes, axes: int) -> str:
+    left = f", anchor {anchors[found.left]} on the left (y > 0)" if found.left is not None else ""
+    level = "" if axes == 2 else "; these three lie at z = 0, as fewer than three heights are given"
+    return f"anchor {anchors[found.origin]} is the origin, anchor {anchors[found.x_axis]} on the x axis{left}{level}"
+
+
+def _gauge_of(axes: Axes, anchors: Integers) -> Gauge:
+    left = None if axes.left is None else int(anchors[axes.left])
+    return Gauge(int(anchors[axes.origin]), int(anchors[axes.x_axis]), left)
+
+
+# Starts of a fit: the layout of ranges completed by shortest paths, the sketch, and perturbed layouts.
+#
+# Late ranges and paths around corners are too long, never too short, and so are completed distances. The starts differ
+# enough that one of them unfolds. The random seed is derived from the data, so that equal data give equal starts.
+
+_PERTURBED: Final = 6
+_KEPT_SHARE: Final = 0.75  # ranges kept in a perturbed start; paths replace the others
+_MOVED_SHARE: Final = 0.1  # standard deviation of a perturbed start's positions, as a share of the site's size
+
+
+def start_positions(problem: Problem, sketch_m: Array | None = None) -> list[Array]:
+    """Starting positions for a fit, each of shape (n, 3).
+
+    ``sketch_m``: rough positions, shape (n, 3), NaN where there is none. Starts are aligned with the sketch and known
+    coordinates. Coordinates that are not estimated are those of ``coordinate_m``.
+    """
+    axes = np.flatnonzero(problem.is_free.any(axis=0))
+    distance_m = _known_distances(problem, axes)
+    known_m = np.where(np.isfinite(problem.coordinate_variance_m2), problem.coordinate_m, np.nan)
+    if sketch_m is not None:
+        known_m = np.where(np.isnan(known_m), sketch_m, known_m)
+    rng = np.random.default_rng(zlib.crc32(problem.range_m.tobytes()))
+    laid_out = [_layout(_completed(distance_m), len(axes))]
+    for _ in range(_PERTURBED):
+        kept = np.triu(rng.random(distance_m.shape) < _KEPT_SHARE, 1)
+        fewer_m = np.where(kept | kept.T, distance_m, np.inf)
+        parts, _ = connected_components(np.isfinite(fewer_m), directed=False)
+        position_m = _layout(_completed(fewer_m if parts == 1 else distance_m), len(axes))
+        moved_m = _MOVED_SHARE * max(float(position_m.std()), 0.1)
+        laid_out.append(position_m + rng.normal(0.0, moved_m, position_m.shape))
+    starts = []
+    if sketch_m is not None:
+        nearby_m = _moved_to(laid_out[0], known_m, axes)
+        starts.append(np.where(np.isnan(sketch_m), nearby_m, sketch_m))
+    starts += [_moved_to(position_m, known_m, axes) for position_m in laid_out]
+    fixed_m = np.where(np.isfinite(problem.coordinate_m), problem.coordinate_m, 0.0)
+    return [np.where(problem.is_free, position_m, fixed_m) for position_m in starts]
+
+
+def _known_distances(problem: Problem, axes: Integers) -> Array:
+    """Distances along the estimated axes, shape (n, n); infinite where there is no range."""
+    n = len(problem.delay_m)
+    first = np.concatenate([problem.first, problem.tape_first])
+    second = np.concatenate([problem.second, problem.tape_second])
+    delays = problem.delay_m[problem.first] + problem.delay_m[problem.second]
+    length_m = np.maximum(np.concatenate([problem.range_m - delays, problem.tape_m]), 0.0)
+    others = np.setdiff1d(np.arange(3), axes)
+    apart = np.nan_to_num(problem.coordinate_m[:, others])
+    across = np.sum((apart[first] - apart[second]) ** 2, axis=1)
+    along_m = np.sqrt(np.maximum(length_m**2 - across, 1e-4 * length_m**2))
+    distance_m = np.full((n, n), np.inf)
+    np.minimum.at(distance_m, (first, second), along_m)
+    distance_m = np.minimum(distance_m, distance_m.T)
+    np.fill_diagonal(distance_m, 0.0)
+    return np.asarray(distance_m)
+
+
+def _completed(distance_m: Array) -> Array:
+    """Lengths of the shortest paths; unconnected parts of the site are as far apart as the longest path."""
+    path_m = distance_m.copy()
+    for middle in range(len(path_m)):
+        np.minimum(path_m, path_m[:, middle, None] + path_m[middle], out=path_m)
+    finite = np.isfinite(path_m)
+    return np.asarray(np.where(finite, path_m, path_m[finite].max(initial=1.0)))
+
+
+def _layout(distance_m: Array, dimensions: int) -> Array:
+    """Classical multidimensional scaling, shape (n, dimensions)."""
+    squared = distance_m**2
+    centred = squared - squared.mean(axis=0) - squared.mean(axis=1)[:, None] + squared.mean()
+    value, vector = np.linalg.eigh(-0.5 * centred)
+    largest = np.argsort(value)[::-1][:dimensions]
+    position_m = np.zeros((len(distance_m), dimensions))
+    position_m[:, : len(largest)] = vector[:, largest] * np.sqrt(np.maximum(value[largest], 0.0))
+    return position_m
+
+
+def _moved_to(layout_m: Array, known_m: Array, axes: Integers) -> Array:
+    """The layout, shape (n, dimensions), rotated, reflected and shifted to known coordinates; shape (n, 3)."""
+    position_m = np.zeros((len(layout_m), 3))
+    position_m[:, axes] = layout_m
+    if 2 in axes and np.count_nonzero(np.isfinite(known_m[:, 2])) > 3:
+        position_m = _levelled(position_m, known_m[:, 2])
+    whole = np.isfinite(known_m[:, axes]).all(axis=1)
+    flat = axes if np.count_nonzero(whole) > len(axes) else axes[axes < 2]
+    return _aligned(position_m, known_m, flat) if flat.size else position_m
+
+
+def _levelled(position_m: Array, height_m: Array) -> Array:
+    """Positions rotated so that z best fits the known heights."""
+    known = np.isfinite(height_m)
+    centre = position_m[known].mean(axis=0)
+    upwards = np.linalg.lstsq(position_m[known] - centre, height_m[known] - height_m[known].mean(), rcond=None)[0]
+    if np.linalg.norm(upwards) < 1e-6:
+        return position_m
+    axes = np.linalg.qr(np.column_stack([upwards, np.eye(3)]))[0]
+    axes = axes * np.sign(axes[:, 0] @ upwards)
+    return np.asarray((position_m - centre) @ axes[:, [1, 2, 0]] + [0.0, 0.0, height_m[known].mean()])
+
+
+def _aligned(position_m: Array, known_m: Array, axes: Integers) -> Array:
+    """Positions moved rigidly, or reflected, in these axes to fit the anchors whose coordinates are known in all."""
+    known: Mask = np.asarray(np.isfinite(known_m[:, axes]).all(axis=1))
+    if not known.any():
+        return position_m
+    moved_m = position_m.copy()
+    moved_m[:, axes] = superimposed(position_m[:, axes], np.nan_to_num(known_m[:, axes]), known.astype(np.float64))
+    return moved_m
+
+
+# The shape: a fit of all anchors with enough ranges
+
 
 _MIN_REDUNDANCY: Final = 4  # spare ranges needed to judge the ranges by their residuals
 _FALSE_ALARM: Final = 0.01
@@ -139,15 +784,13 @@ def _determined(
     surveyed = structs.replace(problem, coordinate_variance_m2=_without_sketch(measured, kept, point))
     rows = jacobian(surveyed, solution.position_m, weight)
     least = 1 if point is not None else 3 if levels(measured) else 4
-    core = determination.determined_core(surveyed, rows, solution.position_m, least)
+    core = determined_core(surveyed, rows, solution.position_m, least)
     aligned_over = core if core.any() else np.ones(len(kept), bool)
-    covariance = determination.aligned_covariance(surveyed, rows, solution.position_m, aligned_over)
-    for direction in determination.weak_directions(surveyed, covariance, core, 0.02, 4):
-        if determination.folds(surveyed, solution.position_m, solution.delay_m, weight, direction):
+    covariance = aligned_covariance(surveyed, rows, solution.position_m, aligned_over)
+    for direction in weak_directions(surveyed, covariance, core, 0.02, 4):
+        if folds(surveyed, solution.position_m, solution.delay_m, weight, direction):
             core = core & ~direction.anchors
-    flat = determination.may_be_flat(
-        surveyed, solution.position_m, solution.delay_m, weight, 2 if levels(measured) else 3
-    )
+    flat = may_be_flat(surveyed, solution.position_m, solution.delay_m, weight, 2 if levels(measured) else 3)
     if core.sum() < least or flat:
         core = np.zeros(len(kept), bool)
     if core.any():
@@ -163,11 +806,11 @@ def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Ma
 
     def covariance_at(at_m: Array) -> Array:
         rows = jacobian(problem, at_m, weight)
-        return determination.aligned_covariance(problem, rows, at_m, core)
+        return aligned_covariance(problem, rows, at_m, core)
 
     covariance = covariance_at(position_m)
     found = [covariance]
-    for direction in determination.weak_directions(problem, covariance, core, _BENDS_M, 1):
+    for direction in weak_directions(problem, covariance, core, _BENDS_M, 1):
         steps = (sigma * direction.std_m * direction.shift_m for sigma in _BENT_SIGMAS)
         found += [covariance_at(position_m + step) for step in steps]
     return max(found, key=lambda one: float(np.trace(one[: 3 * len(core), : 3 * len(core)])))
@@ -213,7 +856,7 @@ def _held_by_points(
     covariance = free.covariance_m2[np.ix_(columns, columns)]
     fits = fitting_points(position[tested], covariance, there, facts.point_std_m)
     good = tested[fits]
-    stds = determination.position_stds_m(free.problem, free.covariance_m2)
+    stds = position_stds_m(free.problem, free.covariance_m2)
     std = math.hypot(facts.point_std_m, float(np.median(stds[tested])))
     motion = align(position[good], there[fits], std, axes).motion
     moved = np.where(free.problem.is_free, motion.moved(position), position)
@@ -250,7 +893,7 @@ def _shown_std_m(fitted: Fitted) -> float:
     problem, used = fitted.problem, fitted.used
     full = jacobian(problem, fitted.solution.position_m, used.astype(np.float64))
     everyone = np.ones(len(fitted.kept), bool)
-    covariance = determination.aligned_covariance(problem, full, fitted.solution.position_m, everyone)
+    covariance = aligned_covariance(problem, full, fitted.solution.position_m, everyone)
     rows = full[: len(used)]
     freedom = float(used.sum()) - float(np.einsum("ij,jk,ik->", rows, covariance, rows, optimize=True))
     squares = fitted.solution.residual_m[used] ** 2
@@ -270,7 +913,7 @@ def redundancy(fitted: Fitted) -> int:
     """Measurements in use less the unknowns that they determine; delays known as well as a range are no unknowns."""
     problem, _ = with_free_delays(surveyed_problem(fitted))
     rows = jacobian(problem, fitted.solution.position_m, fitted.used.astype(np.float64))
-    return int(np.any(rows != 0.0, axis=1).sum()) - determination.rank(rows)
+    return int(np.any(rows != 0.0, axis=1).sum()) - rank(rows)
 
 
 def surveyed_problem(fitted: Fitted) -> Problem:
@@ -304,252 +947,3 @@ def with_tags(fitted: Fitted, others: tuple[OtherFit, ...]) -> tuple[Fitted, tup
             others = tuple(others[number - 1] for number in joint.possible if number and number != joint.chosen)
         fitted = structs.replace(fitted, notes=notes)
     return fitted, others
-
-
-# Sentences: what a survey does not determine, why, and which distances to measure.
-
-_FLAT: Final = 0.3  # a site is flat if its smallest extent is a smaller share of its largest one
-_ONE_AXIS: Final = 0.7
-"""Positions change along one direction if at least this share of their squared changes is along it."""
-
-_NOTABLE_BEND_M: Final = 0.01
-_BENT_SIGMA: Final = 3.0
-"""A shape with at least this standard deviation is also examined when bent, by up to this multiple of it."""
-
-_AXIS_PART: Final = 0.9  # a direction is along an axis if the squared cosine between both is larger
-_UNLIKELY_SIGMAS: Final = 3.0
-
-
-def unlikely_delays(anchors: Iterable[SurveyedAnchor], facts: Facts) -> tuple[str, ...]:
-    """Sentences about unexpectedly large delays, a sign of an anchor's wrong height, tape or point."""
-    expected_m = math.hypot(facts.delay_std_m, facts.common_delay_std_m if facts.delay_std_m > 0.0 else 0.0)
-    return tuple(
-        f"the delay of anchor {one.id} is off by {100.0 * one.delay_m:.0f} cm, where ±{100.0 * expected_m:.0f} cm is "
-        "expected: is its height, its position or a distance mistyped?"
-        for one in anchors
-        if one.delay_m is not None and expected_m > 0.0 and abs(one.delay_m) > _UNLIKELY_SIGMAS * expected_m
-    )
-
-
-def anchor_reasons(measured: Measured, links: Links, fitted: Fitted | None) -> dict[int, str]:
-    """Why each anchor, by identifier, is not determined."""
-    names = measured.anchors
-    inside = set() if fitted is None else set(fitted.kept.tolist())
-    reasons = {}
-    for index, anchor in enumerate(names):
-        others = [names[other] for other in np.flatnonzero(links.adjacent[index])]
-        group = next((group for group in links.groups if index in group), ())
-        if index in inside:
-            continue
-        if group and len(links.groups) > 1:
-            rest = [names[other] for other in range(len(names)) if other not in group]
-            own = anchors_named([names[other] for other in group])
-            reasons[anchor] = f"the group of {own} has too few ranges to {anchors_named(rest)}"
-        elif not others:
-            reasons[anchor] = "no range to any other anchor"
-        elif len(others) < links.needed[index]:
-            reasons[anchor] = f"only {_links_named(others)}; it needs {links.needed[index]}"
-        else:
-            reasons[anchor] = _LEADS_NOWHERE
-    if fitted is not None:
-        reasons.update(_loose(fitted))
-    return reasons
-
-
-_LEADS_NOWHERE: Final = "its ranges lead to anchors that are not determined themselves"
-
-
-def _links_named(others: list[int]) -> str:
-    return f"one range, to {others[0]}" if len(others) == 1 else f"{len(others)} ranges, to {joined(others)}"
-
-
-def _loose(fitted: Fitted) -> dict[int, str]:
-    anchors = [anchor for anchor, fixed in zip(fitted.anchors, fitted.core, strict=True) if not fixed]
-    if not anchors:
-        return {}
-    position = fitted.solution.position_m - fitted.solution.position_m.mean(axis=0)
-    axes = 2 if levels(fitted.measured) else 3
-    extent = np.linalg.svd(position[:, :axes], compute_uv=False)
-    vague = f"its ranges give a standard deviation above {determination.max_std_m(fitted.problem):.2f} m"
-    if (not fitted.core.any() and len(extent) and extent[-1] < _FLAT * extent[0]) or len(extent) < axes:
-        shape = "on one line" if axes == 2 or extent[1] < _FLAT * extent[0] else "nearly in one plane"
-        why = f"all anchors are {shape}, and no measurement determines their positions across it"
-    elif levels(fitted.measured) and fitted.measured.facts.dimensions == 2:
-        why = vague
-    else:
-        why = f"{vague}; give heights of anchors, if they are known"
-    return dict.fromkeys(anchors, why)
-
-
-def missing_sentences(measured: Measured, links: Links, fitted: Fitted | None) -> tuple[str, ...]:
-    """One sentence per reason: which anchors are not determined, why, and which distances to measure."""
-    if not measured.anchors:
-        return ("no anchor is determined: there are no anchors",)
-    reasons = anchor_reasons(measured, links, fitted)
-    by_reason: dict[str, list[int]] = {}
-    for anchor, reason in reasons.items():
-        # Anchors with equally few ranges share a sentence, which then does not say to whom the ranges are.
-        by_reason.setdefault(re.sub(r", to .*;", ";", reason), []).append(anchor)
-    by_reason = {reasons[anchors[0]] if len(anchors) == 1 else reason: anchors for reason, anchors in by_reason.items()}
-    sentences = []
-    for reason, anchors in by_reason.items():
-        named = f"{anchors_named(anchors)} {are(anchors)} not determined: {_plural(reason, anchors)}"
-        sentences.append(named + _distances_to_measure(measured, links, fitted, anchors))
-    return tuple(sentences)
-
-
-def _plural(reason: str, anchors: list[int]) -> str:
-    return (
-        reason if len(anchors) == 1 else reason.replace("it needs", "each needs").replace("its ranges", "their ranges")
-    )
-
-
-def _distances_to_measure(measured: Measured, links: Links, fitted: Fitted | None, anchors: list[int]) -> str:
-    """Which measured distances would determine these anchors."""
-    if fitted is None or len(fitted.anchors) < 3:
-        return ""
-    placed = [index for index, fixed in zip(fitted.kept.tolist(), fitted.core, strict=True) if fixed]
-    if not placed:
-        chosen = mending_tapes(surveyed_problem(fitted), fitted.solution.position_m, fitted.covariance_m2, ~fitted.core)
-        pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in chosen]
-        return f"; {_advised(pairs)}" if pairs else ""
-    pairs = []
-    for anchor in anchors:
-        index = measured.anchors.index(anchor)
-        near = [other for other in placed if not links.adjacent[index, other]]
-        lacking = int(links.needed[index]) - sum(bool(links.adjacent[index, other]) for other in placed)
-        if index in fitted.kept or lacking > len(near):
-            return ""
-        pairs += [(anchor, measured.anchors[other]) for other in _far_apart(near, placed, fitted, lacking)]
-    return f"; {_advised(pairs)}" if pairs else ""
-
-
-def _far_apart(near: list[int], placed: list[int], fitted: Fitted, count: int) -> list[int]:
-    """Choose ``count`` anchors of ``near`` that are far from one another."""
-    number = {index: k for k, index in enumerate(fitted.kept.tolist())}
-    position = fitted.solution.position_m
-    chosen: list[int] = []
-    centre = position[[number[index] for index in placed]].mean(axis=0)
-    while len(chosen) < count:
-        anchors_m = position[[number[index] for index in chosen]] if chosen else centre[None]
-        left = [index for index in near if index not in chosen]
-        chosen.append(
-            max(left, key=lambda index: float(np.linalg.norm(position[number[index]] - anchors_m, axis=1).min()))
-        )
-    return sorted(chosen)
-
-
-def _advised(pairs: list[tuple[int, int]]) -> str:
-    return f"measure {distances_named(pairs)}"
-
-
-def held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
-    """A sentence if only the expected delays separate delays from positions."""
-    surveyed, unknown = with_free_delays(surveyed_problem(fitted))
-    if not unknown.any():
-        return ()
-    position, covariance = _least_held(fitted, surveyed)
-    stds = determination.position_stds_m(surveyed, covariance)
-    least_m = determination.max_std_m(surveyed)
-    if not np.any(fitted.core & (stds > least_m)):
-        return ()
-    most = 3 * len(position)
-    directions = determination.weak_directions(surveyed, covariance, fitted.core, least_m, most)
-    if not directions:
-        return ()
-    delays = np.sqrt(sum((direction.delay_m * direction.std_m) ** 2 for direction in directions))
-    chosen = _touched(np.asarray(delays), unknown & fitted.core)
-    anchors = [anchor for anchor, is_one in zip(fitted.anchors, chosen, strict=True) if is_one]
-    against = _axis(fitted, framed, directions)
-    expected = max(_expected_m(fitted.problem, direction.delay_m) for direction in directions)
-    mending = mending_tapes(surveyed, position, covariance, fitted.core)
-    pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in mending]
-    return (
-        f"ranges alone do not separate the antenna delays of {anchors_named(anchors)} from {against}: longer delays "
-        f"look like anchors farther apart, and only the usual size of delays (±{expected:.2f} m) limits the error"
-        + (f"; {_advised(pairs)}" if pairs else ""),
-    )
-
-
-def _expected_m(problem: Problem, delay_m: Array) -> float:
-    """Expected error of one delay in a joint change of delays."""
-    along = float(np.sum((delay_weights(problem) @ delay_m) ** 2))
-    common = 0.0 if problem.common_delay_m is None else float(np.median(problem.common_delay_m))
-    one = math.sqrt(float(np.median(problem.delay_variance_m2)) + common**2)
-    return min(one, math.sqrt(float(np.sum(delay_m**2)) / max(along, 1e-12)))
-
-
-def _least_held(fitted: Fitted, surveyed: Problem) -> tuple[Array, Array]:
-    """Possible positions that ranges alone hold least, with their covariance.
-
-    If a shape is held only by expected delays, their errors bend it, and a bent shape seems to be held by its ranges
-    although the true one is not. So shapes along the least certain direction are examined, up to 3 σ.
-    """
-    weight = fitted.used.astype(np.float64)
-    start = fitted.solution.position_m
-
-    def covariance_at(position_m: Array) -> tuple[float, Array]:
-        rows = jacobian(surveyed, position_m, weight)
-        covariance = determination.aligned_covariance(surveyed, rows, position_m, fitted.core)
-        return float(determination.position_stds_m(surveyed, covariance)[fitted.core].max()), covariance
-
-    worst, covariance = covariance_at(start)
-    least_held = start
-    for direction in determination.weak_directions(surveyed, fitted.covariance_m2, fitted.core, _NOTABLE_BEND_M, 1):
-        middle = 0.0
-        for half, step in ((_BENT_SIGMA, 0.5), (0.5, 0.1)):
-            for sigma in np.arange(middle - half, middle + half + 0.01, step).tolist():
-                position = start + sigma * direction.std_m * direction.shift_m
-                std, found = covariance_at(position)
-                if std > worst:
-                    worst, covariance, least_held, middle = std, found, position, sigma
-    return least_held, covariance
-
-
-def _touched(size: Array, allowed: Mask) -> Mask:
-    limit = determination.TOUCHED * float(size[allowed].max()) if allowed.any() else 0.0
-    return np.asarray(allowed & (size > limit))
-
-
-def _axis(fitted: Fitted, framed: Framed, directions: list[determination.Direction]) -> str:
-    """Direction in which the positions change, in words: an axis, or the most parallel pair of anchors."""
-    shift = np.concatenate([direction.shift_m @ framed.motion.rotation.T for direction in directions])
-    values, vectors = np.linalg.eigh(shift.T @ shift)
-    if values[-1] < _ONE_AXIS * values.sum():
-        return "the anchors' positions"
-    along = vectors[:, -1]
-    axis = int(np.argmax(np.abs(along)))
-    if along[axis] ** 2 > _AXIS_PART:
-        return f"positions along {'xyz'[axis]}"
-    first, second = np.triu_indices(int(fitted.core.sum()), 1)
-    core = np.flatnonzero(fitted.core)
-    apart = framed.position_m[core[first]] - framed.position_m[core[second]]
-    best = int(np.argmax(np.abs(apart @ along) / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)))
-    return f"positions along the line from {fitted.anchors[core[first[best]]]} to {fitted.anchors[core[second[best]]]}"
-
-
-def unchecked(fitted: Fitted) -> str | None:
-    """A sentence if too few ranges check the result."""
-    checks, excluded = redundancy(fitted), int((~fitted.used).sum())
-    if checks <= 0:
-        return "nothing checks this survey: there are as many unknowns as ranges"
-    if checks < MIN_CHECKS:
-        return f"too little checks this survey: only {checks} range{'s' if checks > 1 else ''} more than unknowns"
-    if excluded > checks:
-        return (
-            f"{excluded} ranges were left out as late, more than half of the {checks + excluded} that could check "
-            "this survey"
-        )
-    return None
-
-
-def advised_tapes(fitted: Fitted) -> tuple[TapeAdvice, ...]:
-    """The three distances that would help most, each given those before it."""
-    problem = fitted.problem
-    chosen = best_tapes(problem, fitted.solution.position_m, fitted.covariance_m2, fitted.core)
-    return tuple(_advice(fitted, item) for item in chosen)
-
-
-def _advice(fitted: Fitted, choice: TapeChoice) -> TapeAdvice:
-    a, b = sorted((fitted.anchors[choice.first], fitted.anchors[choice.second]))
-    return TapeAdvice(a, b, choice.std_before_m, choice.std_after_m)

@@ -18,9 +18,9 @@ from scipy.special import chdtri
 
 from skyless.core.arrays import Array, Integers, Mask, Vector
 from skyless.site.survey.facts import TagReceived
+from skyless.site.survey.fit import LATE_CUTOFF
 from skyless.site.survey.legs import STD_OVER_MAD
 from skyless.site.survey.problem import Problem, Solution, distances_m, solve_least_squares, unknown_columns
-from skyless.site.survey.robust import LATE_CUTOFF
 
 # Differences, averaged over epochs of half a second
 

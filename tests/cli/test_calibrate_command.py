@@ -1,4 +1,4 @@
-"""``skyless survey`` with a tag at known positions: sites with known wrong delays, tables, and what goes wrong."""
+"""``skyless calibrate``: sites with known wrong delays, tables, and what goes wrong."""
 
 import csv
 import gzip
@@ -37,14 +37,14 @@ def site_recording(tmp_path_factory):
 
 
 def run(capsys, *arguments):
-    code = main(["survey", "--recording", *map(str, arguments), "--json"])
+    code = main(["calibrate", *map(str, arguments), "--json"])
     out, err = capsys.readouterr()
     assert (code, err) == (0, "")
     return json.loads(out)
 
 
 def complaint(capsys, *arguments):
-    assert main(["survey", "--recording", *map(str, arguments)]) == 2
+    assert main(["calibrate", *map(str, arguments)]) == 2
     out, err = capsys.readouterr()
     assert out == ""
     assert err.count("\n") == 1
@@ -161,7 +161,7 @@ def test_only_the_beginning(stay, capsys, first, used):
 
 def test_the_report_for_people(stay, capsys):
     folder, _ = stay
-    command = ["survey", "--recording", folder / "stay.csv", "--anchors", folder / "anchors.csv", "--at", "2,3,1@0:9"]
+    command = ["calibrate", folder / "stay.csv", "--anchors", folder / "anchors.csv", "--at", "2,3,1@0:9"]
     assert main([*map(str, command)]) == 0
     out = capsys.readouterr().out
     assert "only differences can be seen" in out
@@ -195,7 +195,8 @@ def test_a_wrong_place_is_noticed(stay, capsys):
         (("--at", "1,2,3", "--first", "120%"), "--first is"),
         (("--at", "1,2,3", "--lever-arm", "0,0,1"), "without --truth"),
         (("--at", "1,2,3", "--tag", "a"), "--tag"),
-        ((), "one with stamps of anchors"),
+        ((), "--truth or --at should say where the tag was"),
+        (("--at", "1,2,3", "--site", "{folder}/site.toml", "--out", "x.toml"), "it should be a table, .csv"),
         (("--at", "1,2,3", "--out", "x.toml"), "needs --site"),
         (("--at", "1,2,3", "--out", "{folder}/anchors.csv"), "--force overwrites it"),
         (("--at", "1,2,3", "--force", "--out", "{folder}/stay.csv"), "would destroy it"),
@@ -230,7 +231,6 @@ def test_a_table_may_be_calibrated_in_its_place_when_asked(stay, capsys):
         (("--at", "3,4", "--site", "{folder}/other.toml"), "site's id"),
         (("--at", "3,4", "--site", "{folder}/site.toml", "--out", "{folder}/site.toml"), "--force overwrites it"),
         (("--at", "3,4", "--lever-arm", "0,0,1"), "without --truth and --lever-arm"),
-        (("--at", "3,4", "--delays-known"), "give either"),
     ],
 )
 def test_what_a_recording_of_a_site_does_not_take(site_recording, capsys, arguments, words):
