@@ -23,7 +23,8 @@ from skyless.sim.impairments import DelayError
 from skyless.sim.lab import lab_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
-from skyless.site.survey.facts import Facts, Gauge, KnownDelay, Survey, Tape, count, read_record
+from skyless.site.survey.facts import Facts, Gauge, KnownDelay, Survey, Tape, count
+from skyless.site.survey.surveyed_site import read_record
 from skyless.site.tables import read_anchors, read_calibration, read_ranges
 
 pytestmark = pytest.mark.site

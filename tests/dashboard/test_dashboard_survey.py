@@ -19,7 +19,7 @@ from skyless.page.tasks import OverlayTask
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress, Role
 from skyless.run.mqtt.messages import SurveyFactsMessage, SurveyMessage, WatchFinding, WatchMessage
-from skyless.run.survey.files import BadFactsError
+from skyless.run.survey.checked_facts import BadFactsError
 from skyless.run.web import PAGE as LIMITS
 from skyless.site.survey.facts import Facts, Gauge, Survey, SurveyedAnchor, Tape, TapeAdvice
 

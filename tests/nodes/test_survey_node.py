@@ -31,7 +31,6 @@ from skyless.run.mqtt.messages import (
     WatchMessage,
 )
 from skyless.run.survey import program as program_module
-from skyless.run.survey.files import FloorImage, is_record_of, save_survey
 from skyless.run.survey.live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey
 from skyless.run.survey.program import FindingsLog, SurveyNode, SurveySettings
 from skyless.sim.impairments import AnchorDisplacement, CarrierModel, DelayError, lab_impairments
@@ -39,7 +38,8 @@ from skyless.sim.lab import lab_site
 from skyless.sim.world import World
 from skyless.site.file.check import image_size
 from skyless.site.file.load import load_site
-from skyless.site.survey.facts import Facts, Gauge, PairRanges, Survey, SurveyedAnchor, Tape, read_record, record_path
+from skyless.site.survey.facts import Facts, Gauge, PairRanges, Survey, SurveyedAnchor, Tape
+from skyless.site.survey.surveyed_site import FloorImage, is_record_of, read_record, record_path, save_survey
 
 pytestmark = pytest.mark.site
 

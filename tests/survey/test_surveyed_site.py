@@ -17,18 +17,18 @@ from skyless.sim.lab import paper_lab_site
 from skyless.site.file.check import check_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
-from skyless.site.survey.facts import (
-    PairRange,
-    PairRanges,
-    Survey,
-    SurveyedAnchor,
+from skyless.site.survey.facts import PairRange, PairRanges, Survey, SurveyedAnchor
+from skyless.site.survey.surveyed_site import (
     SurveyRecord,
     baseline,
+    delay_changes_ticks,
     encode_record,
     read_record,
     record_path,
+    surveyed_site,
+    surveyed_text,
+    unchanged_anchors,
 )
-from skyless.site.survey.surveyed_site import delay_changes_ticks, surveyed_site, surveyed_text, unchanged_anchors
 
 pytestmark = pytest.mark.site
 

@@ -29,7 +29,7 @@ from skyless.cli.common import (
     write_picture,
 )
 from skyless.cli.nodes.options import MqttCa, SiteId, log, run_until_stopped
-from skyless.core.errors import SkylessError, writing
+from skyless.core.errors import SkylessError
 from skyless.core.site import Site
 from skyless.research.calibration.options import SurveyOptions
 from skyless.run.find_site import find_site
@@ -163,33 +163,17 @@ def report(found: "SurveyResult", output: Output) -> int:
 
 def _written(found: "SurveyResult", out: Path) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Write --out. Returns the written files, and warnings about anchors left out. Raises SkylessError."""
-    if out.suffix.lower() == ".csv":
-        return _write(out, {out: _table(found.survey).encode()}), ()
-    from skyless.site.survey.facts import SurveyRecord, encode_record, record_path
-    from skyless.site.survey.surveyed_site import delay_changes_ticks
+    from skyless.site.survey.surveyed_site import save_survey, write_keeping
 
-    site, text = found.site, found.corrected_file()
-    assert site is not None
-    changes = delay_changes_ticks(site, found.survey)
-    record = SurveyRecord(site.name, site.id, time.time(), found.ranges, found.survey, changes)
-    known = {anchor.id for anchor in site.all_anchors}
+    if out.suffix.lower() == ".csv":
+        return tuple(map(str, write_keeping(out, {out: _table(found.survey).encode()}))), ()
+    assert found.site is not None
+    assert found.file is not None
+    saved = save_survey(found.file, found.survey, found.ranges, time.time(), out=out)
+    known = {anchor.id for anchor in found.site.all_anchors}
     strangers = [one.id for one in found.survey.anchors if one.determined and one.id not in known]
     more = tuple(f"anchor {one} is not in {found.file} and was not written" for one in strangers)
-    return _write(out, {record_path(out): encode_record(record), out: text.encode()}), more
-
-
-def _write(out: Path, files: dict[Path, bytes]) -> tuple[str, ...]:
-    """Write files, and the previous content of ``out`` under another name: all of them or none.
-
-    Returns that copy, then the files in reverse order. Raises SkylessError.
-    """
-    from skyless.files import replace_files
-    from skyless.run.survey.files import kept_path
-
-    with writing(out):
-        before = {kept_path(out): out.read_bytes()} if out.exists() else {}
-        replace_files(before | files)
-    return tuple(map(str, (*before, *reversed(files))))
+    return tuple(map(str, saved.written)), more
 
 
 def _table(result: "Survey") -> str:

@@ -55,7 +55,7 @@ from skyless.page.state import PageRequest, read_request
 from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, TaskProcess, WhatIfTask
 from skyless.run.mqtt.messages import WrongMessageError
 from skyless.run.process import ending_signals, reserve
-from skyless.run.survey.files import BadFactsError
+from skyless.run.survey.checked_facts import BadFactsError
 from skyless.run.web import PAGE as LIMITS
 from skyless.run.zones import read_zones
 from skyless.site.alarm_rules import BadAlarmRulesError

@@ -29,7 +29,7 @@ from skyless.run.mqtt.messages import (
     read_message,
 )
 from skyless.run.mqtt.topics import survey_topic, watch_topic
-from skyless.run.survey.files import BadFactsError, check_facts
+from skyless.run.survey.checked_facts import BadFactsError, check_facts
 
 EXPIRY_S: Final = 600.0
 """Fixes and health messages older than this are dropped."""

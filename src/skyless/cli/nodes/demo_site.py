@@ -77,15 +77,8 @@ from skyless.sim.evaluation.figures import ErrorStatistics
 from skyless.sim.evaluation.request import ProtectionOptions
 from skyless.sim.lab import lab_site
 from skyless.site.file.template import rectangle, site_template
-from skyless.site.survey.facts import (
-    PairRange,
-    PairRanges,
-    Survey,
-    SurveyedAnchor,
-    SurveyRecord,
-    encode_record,
-    record_path,
-)
+from skyless.site.survey.facts import PairRange, PairRanges, Survey, SurveyedAnchor
+from skyless.site.survey.surveyed_site import SurveyRecord, encode_record, record_path
 
 # Figures of a demo: errors of its fixes against the truth, rates, alerts and latencies.
 

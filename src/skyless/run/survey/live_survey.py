@@ -13,9 +13,10 @@ from msgspec.structs import replace
 from skyless.core.site import Site
 from skyless.run.mqtt.messages import StampsMessage, SurveyMessage, SurveyProgress, WatchFinding, WatchMessage
 from skyless.site.survey.explain import Finding, PhaseWatch
-from skyless.site.survey.facts import Facts, PairBlock, PairRanges, Survey, SurveyRecord, baseline
+from skyless.site.survey.facts import Facts, PairBlock, PairRanges, Survey
 from skyless.site.survey.legs import AnchorLeg
 from skyless.site.survey.pair_ranger import PairRanger, StepTable
+from skyless.site.survey.surveyed_site import SurveyRecord, baseline
 from skyless.site.survey.watch import AnchorWatch, Change, with_changes
 
 NO_DATA_S: Final = 5.0

@@ -38,19 +38,18 @@ from skyless.run.mqtt.topics import (
     watch_topic,
 )
 from skyless.run.process import Log, every, keep, outlasting, reader, together
-from skyless.run.survey.files import (
-    BadFactsError,
+from skyless.run.survey.checked_facts import BadFactsError, check_facts
+from skyless.run.survey.live_survey import FactsOf, LiveSurvey
+from skyless.site.file.load import load_site
+from skyless.site.survey.facts import Facts, PairRanges, Survey
+from skyless.site.survey.surveyed_site import (
     FloorImage,
     Saved,
-    check_facts,
+    delay_differences_m,
     record_of,
     save_survey,
     saved_without_file,
 )
-from skyless.run.survey.live_survey import FactsOf, LiveSurvey
-from skyless.site.file.load import load_site
-from skyless.site.survey.facts import Facts, PairRanges, Survey
-from skyless.site.survey.surveyed_site import delay_differences_m
 from skyless.site.survey.watch import change_of
 
 NAME: Final = "survey"

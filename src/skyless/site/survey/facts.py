@@ -1,15 +1,9 @@
 """Input and output of a survey: ranges, facts given by the user, positions and delays."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from os import PathLike
-from pathlib import Path
 from typing import Final, Literal
 
-import msgspec
 from msgspec import Struct, structs
-
-from skyless.core.errors import ConfigurationError
-from skyless.core.ticks import TICK_M
 
 
 class TagReceived(Struct, frozen=True, eq=False):
@@ -180,7 +174,7 @@ def _given(facts: Facts, anchor: int) -> int:
     return int(facts.dimensions == 3 and anchor in facts.heights_m)
 
 
-# Result of a survey, and its record.
+# Result of a survey
 
 
 class SurveyedAnchor(Struct, frozen=True):
@@ -258,59 +252,6 @@ class Survey(Struct, frozen=True):
     """Sentences, for instance on facts that do not fit."""
     assumed_heights: str | None = None
     """A sentence if heights are assumed, being neither given nor estimated; otherwise None."""
-
-
-# Record next to the site's file, ``NAME.survey.json``, for the watch
-
-
-FORMAT: Final = "skyless survey 1"
-
-
-class SurveyRecord(Struct, frozen=True, tag=FORMAT, tag_field="format"):
-    """Record of a survey that was written into a site's file."""
-
-    site: str
-    site_id: int
-    unix_s: float
-    ranges: PairRanges
-    """Ranges measured with the antenna delays before the survey."""
-    survey: Survey
-    delay_changes_ticks: dict[int, int]
-    """Changes of the TX antenna delays."""
-
-
-def record_path(site_file: str | PathLike[str]) -> Path:
-    """Path of the survey record of a site's file."""
-    return Path(site_file).with_suffix(".survey.json")
-
-
-def encode_record(record: SurveyRecord) -> bytes:
-    """Encode a survey record as JSON."""
-    return msgspec.json.format(msgspec.json.encode(record), indent=1) + b"\n"
-
-
-def read_record(path: str | PathLike[str]) -> SurveyRecord:
-    """Read a survey record.
-
-    Raises:
-        ConfigurationError: the file cannot be read, or is not the record of a survey.
-    """
-    try:
-        return msgspec.json.decode(Path(path).read_bytes(), type=SurveyRecord)
-    except OSError as error:
-        raise ConfigurationError(path, "", None, f"a file that can be read ({error.strerror})") from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigurationError(path, "", None, f"the record of a survey: {error}") from None
-
-
-def baseline(record: SurveyRecord) -> PairRanges:
-    """The ranges expected with the new antenna delays, as the reference of the watch.
-
-    A range holds half of each anchor's TX delay.
-    """
-    return record.ranges.without_delays(
-        {anchor: ticks * TICK_M / 2.0 for anchor, ticks in record.delay_changes_ticks.items()}
-    )
 
 
 # Lists of anchors in sentences

@@ -1,4 +1,4 @@
-"""Write a survey's result into a site: positions, TX antenna delays, and their accuracy.
+"""Write a survey's result into a site and its files: positions, TX antenna delays, and their accuracy.
 
 Rules (``docs/survey.md``, "What is written"):
 
@@ -13,18 +13,24 @@ Rules (``docs/survey.md``, "What is written"):
 """
 
 import math
+from collections.abc import Callable
+from math import dist
 from os import PathLike
 from pathlib import Path
 from typing import Final
+from zlib import crc32
 
-from msgspec import structs
+import msgspec
+from msgspec import Struct
+from msgspec.structs import asdict, replace
 
-from skyless.core.errors import SkylessError
-from skyless.core.site import AccuracySite, AnchorSite, Site, UnplacedAnchor
+from skyless.core.errors import ConfigurationError, SkylessError, writing
+from skyless.core.site import AccuracySite, AnchorSite, FloorPlanSite, Site, UnplacedAnchor
 from skyless.core.ticks import TICK_M
-from skyless.site.file.check import SITE_LIMITS, check_site
-from skyless.site.file.load import with_values
-from skyless.site.survey.facts import Survey, SurveyedAnchor
+from skyless.files import replace_files
+from skyless.site.file.check import SITE_LIMITS, check_site, image_size
+from skyless.site.file.load import load_site, with_values
+from skyless.site.survey.facts import PairRanges, Survey, SurveyedAnchor
 
 _DELAY: Final = SITE_LIMITS["anchors.tx_antenna_delay_ticks"]
 _MAX_STATED_M: Final = SITE_LIMITS["anchors.std_m"].high
@@ -47,8 +53,8 @@ def surveyed_site(site: Site, survey: Survey) -> Site:
     accuracy = _accuracy(site, found, survey.range_std_m)
     delays = {anchor.id: anchor.tx_antenna_delay_ticks for anchor in site.all_anchors}
     if accuracy == site.accuracy and any(anchor.tx_antenna_delay_ticks != delays[anchor.id] for anchor in known):
-        accuracy = structs.replace(accuracy, range_std_m=_another_std(accuracy.range_std_m))
-    return structs.replace(
+        accuracy = replace(accuracy, range_std_m=_another_std(accuracy.range_std_m))
+    return replace(
         site,
         anchors=tuple(anchor for anchor in known if isinstance(anchor, AnchorSite)),
         unplaced=tuple(anchor for anchor in known if isinstance(anchor, UnplacedAnchor)),
@@ -116,10 +122,10 @@ def _placed(
 ) -> AnchorSite | UnplacedAnchor:
     if found is None or found.x_m is None or found.y_m is None:
         return anchor
-    old = anchor if isinstance(anchor, AnchorSite) else AnchorSite(x_m=0.0, y_m=0.0, **structs.asdict(anchor))
+    old = anchor if isinstance(anchor, AnchorSite) else AnchorSite(x_m=0.0, y_m=0.0, **asdict(anchor))
     z_m = old.z_m if found.z_m is None else found.z_m
     stated = old.std_m if site.schedule.needs_master or found.std_m is None else _up(found.std_m, 1e3)
-    return structs.replace(
+    return replace(
         old,
         x_m=_rounded(found.x_m),
         y_m=_rounded(found.y_m),
@@ -148,7 +154,7 @@ def _accuracy(site: Site, found: dict[int, SurveyedAnchor], range_std_m: float) 
         survey_std_m = (
             _up(math.sqrt(sum(one**2 for one in each) / len(each)), _STD_STEPS_PER_M) if each else old.survey_std_m
         )
-    return structs.replace(
+    return replace(
         old,
         survey_std_m=survey_std_m,
         range_std_m=_up(range_std_m, _STD_STEPS_PER_M) if range_std_m > old.range_std_m else old.range_std_m,
@@ -178,3 +184,179 @@ def _rounded(value_m: float) -> float:
 def _up(value_m: float, steps_per_m: float) -> float:
     """Round up to whole steps, so that no stated accuracy is too good."""
     return math.ceil(value_m * steps_per_m - 1e-6) / steps_per_m
+
+
+# Record next to the site's file, ``NAME.survey.json``, for the watch
+
+
+FORMAT: Final = "skyless survey 1"
+
+
+class SurveyRecord(Struct, frozen=True, tag=FORMAT, tag_field="format"):
+    """Record of a survey that was written into a site's file."""
+
+    site: str
+    site_id: int
+    unix_s: float
+    ranges: PairRanges
+    """Ranges measured with the antenna delays before the survey."""
+    survey: Survey
+    delay_changes_ticks: dict[int, int]
+    """Changes of the TX antenna delays."""
+
+
+def record_path(site_file: str | PathLike[str]) -> Path:
+    """Path of the survey record of a site's file."""
+    return Path(site_file).with_suffix(".survey.json")
+
+
+def encode_record(record: SurveyRecord) -> bytes:
+    """Encode a survey record as JSON."""
+    return msgspec.json.format(msgspec.json.encode(record), indent=1) + b"\n"
+
+
+def read_record(path: str | PathLike[str]) -> SurveyRecord:
+    """Read a survey record.
+
+    Raises:
+        ConfigurationError: the file cannot be read, or is not the record of a survey.
+    """
+    try:
+        return msgspec.json.decode(Path(path).read_bytes(), type=SurveyRecord)
+    except OSError as error:
+        raise ConfigurationError(path, "", None, f"a file that can be read ({error.strerror})") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigurationError(path, "", None, f"the record of a survey: {error}") from None
+
+
+def baseline(record: SurveyRecord) -> PairRanges:
+    """The ranges expected with the new antenna delays, as the reference of the watch.
+
+    A range holds half of each anchor's TX delay.
+    """
+    return record.ranges.without_delays(
+        {anchor: ticks * TICK_M / 2.0 for anchor, ticks in record.delay_changes_ticks.items()}
+    )
+
+
+# Files: the site file, the record next to it, and the image of the floor.
+
+_NEAR_M: Final = 1e-3
+_ENDINGS: Final = {b"\x89PNG": ".png"}
+
+
+class FloorImage(Struct, frozen=True):
+    """Placement of the floor's image, and its bytes; None means the image of the site file."""
+
+    plan: FloorPlanSite
+    image: bytes | None
+
+
+class Saved(Struct, frozen=True):
+    """The site after a survey."""
+
+    site: Site
+    record: SurveyRecord
+    written: tuple[Path, ...] = ()
+
+
+def saved_without_file(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> Saved:
+    """Return the site after a survey where there is no file to write.
+
+    Raises:
+        SkylessError: the result is not a valid site.
+    """
+    placed = surveyed_site(site, survey)
+    check_site(placed, Path("the survey's result"))
+    return Saved(placed, _record(site, survey, ranges, unix_s))
+
+
+def record_of(file: Path | None, site: Site, log: Callable[[str], None]) -> SurveyRecord | None:
+    """Read the record of the survey that made a site file. Without one the watch learns the usual ranges."""
+    if file is None or not record_path(file).exists():
+        return None
+    try:
+        record = read_record(record_path(file))
+    except SkylessError as error:
+        log(f"not used: {error}")
+        return None
+    if is_record_of(record, site):
+        return record
+    log(f"not used: {record_path(file)} is of other positions than those in {file}")
+    return None
+
+
+def is_record_of(record: SurveyRecord, site: Site) -> bool:
+    """Whether a site still has the positions that a survey gave it."""
+    known = {anchor.id for anchor in site.all_anchors}
+    placed = {anchor.id: (anchor.x_m, anchor.y_m) for anchor in site.anchors}
+    found = {
+        one.id: (one.x_m, one.y_m)
+        for one in record.survey.anchors
+        if one.determined and one.id in known and one.x_m is not None and one.y_m is not None
+    }
+    return record.site_id == site.id and all(
+        anchor in placed and dist(placed[anchor], place_m) < _NEAR_M for anchor, place_m in found.items()
+    )
+
+
+def save_survey(
+    file: Path,
+    survey: Survey,
+    ranges: PairRanges,
+    unix_s: float,
+    floor: FloorImage | None = None,
+    out: Path | None = None,
+) -> Saved:
+    """Write a result into a site's file, or another one, ``out``, and its record next to it.
+
+    Raises:
+        SkylessError: a file cannot be read or written, or the result is not a valid site.
+    """
+    site, out = load_site(file), out or file
+    record, image = _record(site, survey, ranges, unix_s), dict[Path, bytes]()
+    with writing(file):
+        text = surveyed_text(file.read_bytes().decode("utf-8-sig"), survey, site, file)
+        if floor is not None:
+            image_name, image = _floor_image(file, site, floor)
+            if image_name is not None:
+                values = asdict(replace(floor.plan, image=image_name))
+                text = with_values(text, {}, {"floor_plan": values}, file, "the floor plan")
+    written = write_keeping(out, {out: text.encode(), record_path(out): encode_record(record), **image})
+    return Saved(load_site(out), record, written)
+
+
+def write_keeping(out: Path, files: dict[Path, bytes]) -> tuple[Path, ...]:
+    """Write files, and what ``out`` held under another name: all of them or none. Returns all, that copy first.
+
+    Raises SkylessError.
+    """
+    with writing(out):
+        before = {_kept_path(out): out.read_bytes()} if out.exists() else {}
+        replace_files(before | dict(reversed(files.items())))
+    return (*before, *files)
+
+
+def _record(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> SurveyRecord:
+    return SurveyRecord(site.name, site.id, unix_s, ranges, survey, delay_changes_ticks(site, survey))
+
+
+def _kept_path(file: Path) -> Path:
+    """Path under which to keep the previous site file: ``NAME.before-survey-1.toml``, with the first free number."""
+    number = 1
+    while (kept := file.with_name(f"{file.stem}.before-survey-{number}{file.suffix}")).exists():
+        number += 1
+    return kept
+
+
+def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None, dict[Path, bytes]]:
+    """Name of the image in the site file (None without one), and the file to write if the image is new."""
+    present = None if site.floor_plan is None else site.floor_plan.image
+    if floor.image is None or image_size(floor.image) is None:
+        return present, {}
+    if present is not None and (file.parent / present).read_bytes() == floor.image:
+        return present, {}
+    path = file.with_name(f"{file.stem}.floor{_ENDINGS.get(floor.image[:4], '.jpg')}")
+    if path.exists() and path.read_bytes() != floor.image:
+        path = path.with_stem(f"{path.stem}-{crc32(floor.image):08x}")
+    return path.name, {path: floor.image}
