@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 from textbook_bound import LAB, RAISED, SLOT_S, positions, settings_of, textbook, walk
 
-from skyless.core.estimator.compiled import process_known
 from skyless.core.estimator.state import covariances
+from skyless.core.estimator.steady_state import process_known
+from skyless.core.native.library import compiled
 from skyless.core.ticks import TICK_S
 from skyless.research.uncertainty import Biases, Sendings, _prior, received_bound, tracking_bound
 
@@ -41,7 +42,7 @@ def last_of(path, settings):
     for frame, place in enumerate(path):
         known = np.ones(7, np.uint8)
         known[frame % 6] = 0
-        process_known(s, frame % 6, round(frame * SLOT_S / TICK_S), place, known, 0, 6 * SLOT_S, 0.0)
+        compiled(process_known)(s, frame % 6, round(frame * SLOT_S / TICK_S), place, known, 0, 6 * SLOT_S, 0.0)
     tag = [0, 1, s.layout.velocity, s.layout.velocity + 1]
     return covariances(s)[np.ix_(tag, tag)].copy()
 
