@@ -23,7 +23,7 @@ from skyless.sim.impairments import DelayError
 from skyless.sim.lab import lab_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
-from skyless.site.survey.facts import Facts, Gauge, KnownDelay, Survey, Tape, count
+from skyless.site.survey.facts import Facts, Gauge, Survey, Tape, count
 from skyless.site.survey.surveyed_site import read_record
 from skyless.site.tables import read_anchors, read_calibration, read_ranges
 
@@ -394,7 +394,7 @@ def test_ranges_are_counted_before(hall):
     ranges = read_ranges(hall / "ranges.csv")
     assert count(ranges, Facts(delay_std_m=0.0)).spare == 54 - 19
     assert count(ranges, Facts(dimensions=3)).spare == 54 - 27 - 11
-    assert count(ranges, Facts(tapes=(Tape(1, 2, 3.0),), delays=(KnownDelay(1, 0.0, 0.01),))).spare == 54 - 30 + 2
+    assert count(ranges, Facts(tapes=(Tape(1, 2, 3.0),))).spare == 54 - 30 + 1
     assert count(ranges, Facts(points={1: (0.0, 0.0, None), 2: (1.0, 0.0, None)})).spare == 54 - 30 + 1
     assert count(ranges, Facts(keep_positions=True)).spare == 54 - 11
     lab = lab_site()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from skyless.research.surveys.rooms import stamps_of
+from skyless.research.studies.surveyed_rooms import stamps_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import lab_site
 

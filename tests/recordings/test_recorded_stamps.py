@@ -14,7 +14,7 @@ from skyless.core.any_receiver import new_anchor
 from skyless.core.errors import ConfigurationError
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.research.calibration.biases import ranges_of
-from skyless.research.surveys.rooms import RecordedAnchor
+from skyless.research.studies.surveyed_rooms import RecordedAnchor
 from skyless.run.mqtt.messages import SiteMessage, Stamp, StampsMessage
 from skyless.run.mqtt.topics import site_topic, stamps_topic
 from skyless.sim.impairments import AnchorOutage, Outage, lab_impairments

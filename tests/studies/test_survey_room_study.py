@@ -8,7 +8,7 @@ from skyless.research.studies import survey_room as study
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import Plan
 from skyless.research.studies.survey_room import SURVEYED, TRUTH, Group, groups, limits_of
-from skyless.research.surveys.rooms import (
+from skyless.research.studies.surveyed_rooms import (
     ROOM_RANGES,
     RoomErrors,
     air_of,

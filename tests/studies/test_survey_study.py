@@ -7,7 +7,7 @@ from skyless.research.studies import survey as study
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import Plan
 from skyless.research.studies.survey import GROUPS, Group, Variant, limits_of
-from skyless.research.surveys.rooms import AirErrors, aligned, drawn_errors, survey_layouts, tag_error_m
+from skyless.research.studies.surveyed_rooms import AirErrors, aligned, drawn_errors, survey_layouts, tag_error_m
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site

@@ -5,8 +5,8 @@ import pytest
 from skyless.research.studies import watch
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import Plan
-from skyless.research.surveys.drawn_faults import WatchResult, WatchRun, run_watch
-from skyless.research.surveys.rooms import survey_layouts
+from skyless.research.studies.surveyed_rooms import survey_layouts
+from skyless.research.studies.watch import WatchResult, WatchRun, run_watch
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site

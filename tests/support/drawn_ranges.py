@@ -6,7 +6,7 @@ from itertools import combinations
 import numpy as np
 
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.research.surveys.rooms import SLOT_S
+from skyless.research.studies.surveyed_rooms import SLOT_S
 from skyless.site.survey.facts import PairRange, PairRanges
 
 

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.research.calibration.biases import ranges_of
-from skyless.research.surveys.drawn_faults import WatchRun, run_watch, striking_windows
-from skyless.research.surveys.rooms import survey_layouts
+from skyless.research.studies.surveyed_rooms import survey_layouts
+from skyless.research.studies.watch import WatchRun, run_watch, striking_windows
 from skyless.site.survey.explain import sentence_of
 from skyless.site.survey.facts import PairBlock
 from skyless.site.survey.watch import AnchorWatch

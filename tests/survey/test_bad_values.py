@@ -7,7 +7,7 @@ import pytest
 from msgspec import structs
 
 from skyless.core.errors import SkylessError
-from skyless.site.survey.facts import Facts, KnownDelay, PairRange, PairRanges, Tape
+from skyless.site.survey.facts import Facts, PairRange, PairRanges, Tape
 from skyless.site.survey.legs import mean_ranges
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.solve import run_survey
@@ -27,8 +27,6 @@ POSITIONS_GIVEN = [{}, {"keep_positions": True, "sketch_m": POSITIONS_M}]
     [
         ({"tapes": (Tape(1, 3, 7.81, math.nan),)}, "the measured distance of anchors 1 and 3 is not a possible figure"),
         ({"tapes": (Tape(1, 3, 1e9),)}, "the measured distance of anchors 1 and 3 is not a possible figure"),
-        ({"delays": (KnownDelay(1, 0.1, math.nan),)}, "the delay of anchor 1 is not a possible figure"),
-        ({"delays": (KnownDelay(9, 0.1, 0.01),)}, "a delay is given for anchor 9, which has no ranges"),
         ({"points": {1: (math.nan, 0.0, 0.0)}}, "the point of anchor 1 is not a possible figure"),
         ({"heights_m": {1: math.inf}}, "the height of anchor 1 is not a possible figure"),
     ],

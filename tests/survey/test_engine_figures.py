@@ -7,7 +7,7 @@ import pytest
 from msgspec import structs
 from scipy.stats import chi2
 
-from skyless.research.surveys.rooms import survey_layouts
+from skyless.research.studies.surveyed_rooms import survey_layouts
 from skyless.site.survey.facts import Facts, Tape
 from skyless.site.survey.fit import aligned_covariance
 from skyless.site.survey.problem import jacobian, solve_least_squares

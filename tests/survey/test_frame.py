@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
 
-from skyless.research.surveys.rooms import SurveyLayout, survey_layouts
+from skyless.research.studies.surveyed_rooms import SurveyLayout, survey_layouts
 from skyless.site.survey.facts import Facts, Gauge, PairRange, PairRanges
 from skyless.site.survey.shape import align, axes_through
 from skyless.site.survey.solve import run_survey

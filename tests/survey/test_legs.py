@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from skyless.core.air.frame import Heard, Reception
 from skyless.core.any_receiver import new_anchor
 from skyless.core.ticks import from_seconds, wrap
-from skyless.research.surveys.rooms import RecordedAnchor
+from skyless.research.studies.surveyed_rooms import RecordedAnchor
 from skyless.sim.impairments import AnchorOutage, Outage, lab_impairments
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.listening import TagSpec

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from skyless.research.surveys.rooms import survey_layouts
+from skyless.research.studies.surveyed_rooms import survey_layouts
 from skyless.site.survey.facts import Facts, PairRange, PairRanges, Tape
 from skyless.site.survey.solve import run_survey
 from support.drawn_ranges import drawn_ranges

@@ -15,7 +15,7 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.surveys.rooms import (
+from skyless.research.studies.surveyed_rooms import (
     HAND_STD_M,
     SKETCH_STD_M,
     TAPE_STD_M,

@@ -14,8 +14,7 @@ from msgspec import Struct
 from skyless.core.site import Site
 from skyless.research.studies.picture import Case, case_row
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.studies.worlds import Run, RunResult, run_world
-from skyless.research.surveys.rooms import (
+from skyless.research.studies.surveyed_rooms import (
     ROOM_RANGES,
     DrawnRoom,
     RoomErrors,
@@ -30,6 +29,7 @@ from skyless.research.surveys.rooms import (
     surveyed_room,
     true_site,
 )
+from skyless.research.studies.worlds import Run, RunResult, run_world
 from skyless.sim.evaluation.scenarios import wanderers
 from skyless.sim.trajectory import Static, Trajectory
 

@@ -27,7 +27,7 @@ def check_facts(message: SurveyFactsMessage) -> None:
     facts = message.facts
     if facts.tags:
         raise BadFactsError(f"facts.tags has {len(facts.tags)} entries; what tags received comes from recordings only")
-    for name in ("heights_m", "tapes", "points", "sketch_m", "delays"):
+    for name in ("heights_m", "tapes", "points", "sketch_m"):
         count = len(getattr(facts, name))
         if count > MAX_FACTS:
             raise BadFactsError(f"facts.{name} has {count} entries; at most {MAX_FACTS} are allowed")
@@ -57,9 +57,6 @@ def _limited(message: SurveyFactsMessage) -> Iterator[tuple[str, float, Limits]]
             for axis, value in zip("xyz", point, strict=True):
                 if value is not None:
                     yield f"facts.{name} of anchor {anchor}, {axis}", value, _COORDINATE
-    for index, delay in enumerate(facts.delays):
-        yield f"facts.delays[{index}].delay_m", delay.delay_m, _COORDINATE
-        yield f"facts.delays[{index}].std_m", delay.std_m, _POSITIVE_STD
     for name in ("height_std_m", "point_std_m", "sketch_std_m"):
         yield f"facts.{name}", getattr(facts, name), _POSITIVE_STD
     for name in ("delay_std_m", "common_delay_std_m", "pair_std_m"):

@@ -98,7 +98,6 @@ class LiveSurvey:
             tapes=tuple(one for one in facts.tapes if {one.a, one.b} <= known and one.a != one.b),
             points={anchor: one for anchor, one in facts.points.items() if anchor in known},
             sketch_m={anchor: one for anchor, one in facts.sketch_m.items() if anchor in known},
-            delays=tuple(one for one in facts.delays if one.anchor in known),
             gauge=gauge if named <= known else None,
         )
 

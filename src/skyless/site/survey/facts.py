@@ -72,14 +72,6 @@ class Tape(Struct, frozen=True):
     std_m: float = 0.005
 
 
-class KnownDelay(Struct, frozen=True):
-    """Delay ``h`` of an anchor: half the error of its TX and RX antenna delays together, found by a tag."""
-
-    anchor: int
-    delay_m: float
-    std_m: float
-
-
 class Gauge(Struct, frozen=True):
     """Anchors that define the frame: one at the origin, one on the positive x axis, one on its left (y > 0)."""
 
@@ -110,7 +102,6 @@ class Facts(Struct, frozen=True):
     """Standard deviation of the part of the delays that all anchors share; not used if delays are known."""
     pair_std_m: float = 0.03
     """Constant error of each pair's range, which averaging does not remove."""
-    delays: tuple[KnownDelay, ...] = ()
     gauge: Gauge | None = None
     tags: tuple[TagReceived, ...] = ()
     """Tags that were carried around or stood at known positions."""
@@ -165,7 +156,7 @@ def count(ranges: PairRanges, facts: Facts) -> Count:
         unknowns = max(facts.dimensions * n - rigid, 0) + delays
         known = len(facts.tapes) + max(coordinates - rigid, 0)
     pairs = len(ranges.pairs)
-    return Count(n, pairs, n * (n - 1) // 2, unknowns, pairs + known + len(facts.delays) - unknowns)
+    return Count(n, pairs, n * (n - 1) // 2, unknowns, pairs + known - unknowns)
 
 
 def _given(facts: Facts, anchor: int) -> int:

@@ -259,6 +259,9 @@ class LegCollector:
 STD_OVER_MAD: Final = 1.4826
 """Ratio of the standard deviation to the median absolute deviation of a normal distribution."""
 
+MEDIAN_VARIANCE: Final = math.pi / 2.0
+"""Ratio of the variance of a median to that of the mean of normal values."""
+
 MIN_CLUSTER_SHARE: Final = 0.1
 """An early cluster with a smaller share of all exchanges is taken as an error."""
 

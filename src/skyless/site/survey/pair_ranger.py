@@ -16,7 +16,7 @@ from msgspec.structs import astuple, replace
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.ticks import TICK_BITS, TICK_M, TICK_RATE_HZ, Unwrapper
 from skyless.site.survey.facts import PairBlock, PairRange, PairRanges
-from skyless.site.survey.legs import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS, STD_OVER_MAD, earliest_cluster
+from skyless.site.survey.legs import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS, MEDIAN_VARIANCE, STD_OVER_MAD, earliest_cluster
 
 _KEPT_S: Final = 5.0  # how long legs wait for the other direction, which another anchor may publish later
 _LONGEST_BRACKET_S: Final = 0.5  # between the two frames of a bracket; at most half a wrap
@@ -136,7 +136,6 @@ def _first_of_equals(pair: Integers, ticks: Integers, reply: Mask) -> Mask:
 
 STEP_S: Final = 3.0
 _MAX_STEPS: Final = 64  # with more, the older half is merged in pairs
-_MEDIAN_VARIANCE: Final = math.pi / 2.0
 
 
 class StepTable(Struct, frozen=True, eq=False):
@@ -185,7 +184,7 @@ class RangeSteps:
         ranges = {
             pair: (
                 float(np.median([one.mean_m for one in blocks])),
-                _MEDIAN_VARIANCE * float(np.mean([one.std_m**2 for one in blocks])) / len(blocks),
+                MEDIAN_VARIANCE * float(np.mean([one.std_m**2 for one in blocks])) / len(blocks),
             )
             for pair, blocks in gathered.items()
         }

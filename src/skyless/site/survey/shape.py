@@ -100,11 +100,9 @@ def usable(ranges: PairRanges, facts: Facts) -> Measured:
             notes.append(f"the measured distance of anchors {tape.a} and {tape.b} {why}: not used")
     points = _finite(facts.points)
     heights_m = {anchor: z for anchor, z in facts.heights_m.items() if math.isfinite(z)}
-    delays = [item for item in facts.delays if abs(item.delay_m) < _LARGEST_M and _is_std(item.std_m)]
     for kind, given, finite in (
         ("point", set(facts.points), set(points)),
         ("height", set(facts.heights_m), set(heights_m)),
-        ("delay", {item.anchor for item in facts.delays}, {item.anchor for item in delays}),
     ):
         notes += [
             f"a {kind} is given for anchor {anchor}, which has no ranges: not used" for anchor in sorted(given - known)
@@ -118,7 +116,6 @@ def usable(ranges: PairRanges, facts: Facts) -> Measured:
         points={anchor: point for anchor, point in points.items() if anchor in known},
         heights_m={anchor: z for anchor, z in heights_m.items() if anchor in known},
         sketch_m=_finite({anchor: point for anchor, point in facts.sketch_m.items() if anchor in known}),
-        delays=tuple(item for item in delays if item.anchor in known),
     )
     tx_std_m = {anchor: std for anchor, std in ranges.tx_std_m.items() if _is_std(std)}
     return Measured(anchors, tuple(best.values()), tuple(tapes), tx_std_m, kept, tuple(notes))
@@ -179,11 +176,6 @@ def as_array(points: dict[int, Point], anchors: tuple[int, ...]) -> Array:
     return np.array([[math.nan if value is None else value for value in row] for row in rows]).reshape(-1, 3)
 
 
-def indices_of(measured: Measured, kept: Integers) -> dict[int, int]:
-    """Index of each kept anchor among the kept ones, by identifier."""
-    return {measured.anchors[index]: number for number, index in enumerate(kept)}
-
-
 def build_problem(
     measured: Measured, kept: Integers, pair_std_m: float, point_m: Array | None, sketch_m: Array | None
 ) -> tuple[Problem, list[PairRange]]:
@@ -191,26 +183,26 @@ def build_problem(
 
     ``point_m``, ``sketch_m``: known and rough coordinates of the kept anchors, shape (k, 3), NaN where there are none.
     """
-    facts, index = measured.facts, indices_of(measured, kept)
+    facts, index = measured.facts, {measured.anchors[at]: number for number, at in enumerate(kept)}
     n = len(kept)
     pairs = [pair for pair in measured.pairs if pair.a in index and pair.b in index]
     tapes = [tape for tape in measured.tapes if tape.a in index and tape.b in index]
     is_free = np.ones((n, 3), bool)
     coordinate = np.zeros((n, 3))
     variance = np.full((n, 3), np.inf)
-    for source, std in ((sketch_m, facts.sketch_std_m), (_heights(measured, kept), facts.height_std_m)):
-        _add(coordinate, variance, source, std)
-    _add(coordinate, variance, point_m, facts.point_std_m)
+    height_m = np.full((n, 3), np.nan)
+    if levels(measured):
+        height_m[:, 2] = [facts.heights_m.get(anchor, math.nan) for anchor in index]
+    stds_m = (facts.sketch_std_m, facts.height_std_m, facts.point_std_m)
+    for known_m, std_m in zip((sketch_m, height_m, point_m), stds_m, strict=True):
+        if known_m is not None:
+            given = np.isfinite(known_m)
+            coordinate[given], variance[given] = known_m[given], std_m**2
     if facts.dimensions == 2:
         is_free[:, 2] = False
         coordinate[:, 2], variance[:, 2] = fixed_heights_m(measured)[kept], np.inf
-    delay = np.zeros(n)
     delay_variance = np.full(n, facts.delay_std_m**2, np.float64)
     common = np.full(n, facts.common_delay_std_m if facts.delay_std_m > 0.0 else 0.0, np.float64)
-    for item in facts.delays:
-        if item.anchor in index:
-            delay[index[item.anchor]], delay_variance[index[item.anchor]] = item.delay_m, item.std_m**2
-            common[index[item.anchor]] = 0.0
     delay_variance += np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in index]).reshape(n)
     problem = Problem(
         is_free=is_free,
@@ -218,7 +210,7 @@ def build_problem(
         second=np.array([index[pair.b] for pair in pairs], np.int64),
         range_m=np.array([pair.range_m for pair in pairs], np.float64),
         variance_m2=np.array([own_variance_m2(pair) + pair_std_m**2 for pair in pairs], np.float64),
-        delay_m=delay,
+        delay_m=np.zeros(n),
         delay_variance_m2=delay_variance,
         common_delay_m=common if common.any() else None,
         coordinate_m=coordinate,
@@ -266,20 +258,6 @@ def own_delays(
     own_m = problem.delay_m + part @ (delay_m - problem.delay_m)
     variance = np.diag(part @ covariance_m2 @ part.T + own - part @ own)
     return np.asarray(own_m), np.asarray(np.sqrt(np.maximum(variance, 0.0)))
-
-
-def _heights(measured: Measured, kept: Integers) -> Array:
-    """Known heights as points, shape (k, 3); all NaN if they do not level the site."""
-    known = np.full((len(kept), 3), np.nan)
-    if levels(measured):
-        known[:, 2] = [measured.facts.heights_m.get(measured.anchors[index], math.nan) for index in kept]
-    return known
-
-
-def _add(coordinate: Array, variance: Array, known_m: Array | None, std_m: float) -> None:
-    if known_m is not None:
-        given = np.isfinite(known_m)
-        coordinate[given], variance[given] = known_m[given], std_m**2
 
 
 # Alignments, and frames through anchors

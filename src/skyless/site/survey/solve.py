@@ -37,7 +37,6 @@ from skyless.site.survey.fit import (
     Links,
     OtherFit,
     RobustFit,
-    TapeChoice,
     aligned_covariance,
     best_tapes,
     count_links,
@@ -448,19 +447,13 @@ def _anchor_reasons(measured: Measured, links: Links, fitted: Fitted | None) -> 
         elif not others:
             reasons[anchor] = "no range to any other anchor"
         elif len(others) < links.needed[index]:
-            reasons[anchor] = f"only {_links_named(others)}; it needs {links.needed[index]}"
+            few = "one range" if len(others) == 1 else f"{len(others)} ranges"
+            reasons[anchor] = f"only {few}, to {joined(others)}; it needs {links.needed[index]}"
         else:
-            reasons[anchor] = _LEADS_NOWHERE
+            reasons[anchor] = "its ranges lead to anchors that are not determined themselves"
     if fitted is not None:
         reasons.update(_loose(fitted))
     return reasons
-
-
-_LEADS_NOWHERE: Final = "its ranges lead to anchors that are not determined themselves"
-
-
-def _links_named(others: list[int]) -> str:
-    return f"one range, to {others[0]}" if len(others) == 1 else f"{len(others)} ranges, to {joined(others)}"
 
 
 def _loose(fitted: Fitted) -> dict[int, str]:
@@ -493,15 +486,11 @@ def _missing_sentences(measured: Measured, links: Links, fitted: Fitted | None) 
     by_reason = {reasons[anchors[0]] if len(anchors) == 1 else reason: anchors for reason, anchors in by_reason.items()}
     sentences = []
     for reason, anchors in by_reason.items():
-        named = f"{anchors_named(anchors)} {are(anchors)} not determined: {_plural(reason, anchors)}"
+        named = f"{anchors_named(anchors)} {are(anchors)} not determined: {reason}"
+        if len(anchors) > 1:
+            named = named.replace("it needs", "each needs").replace("its ranges", "their ranges")
         sentences.append(named + _distances_to_measure(measured, links, fitted, anchors))
     return tuple(sentences)
-
-
-def _plural(reason: str, anchors: list[int]) -> str:
-    return (
-        reason if len(anchors) == 1 else reason.replace("it needs", "each needs").replace("its ranges", "their ranges")
-    )
 
 
 def _distances_to_measure(measured: Measured, links: Links, fitted: Fitted | None, anchors: list[int]) -> str:
@@ -558,7 +547,8 @@ def _held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
     if not directions:
         return ()
     delays = np.sqrt(sum((direction.delay_m * direction.std_m) ** 2 for direction in directions))
-    chosen = _touched(np.asarray(delays), unknown & fitted.core)
+    allowed = unknown & fitted.core
+    chosen = allowed & (delays > TOUCHED * float(np.max(delays, where=allowed, initial=0.0)))
     anchors = [anchor for anchor, is_one in zip(fitted.anchors, chosen, strict=True) if is_one]
     against = _axis(fitted, framed, directions)
     expected = max(_expected_m(fitted.problem, direction.delay_m) for direction in directions)
@@ -606,11 +596,6 @@ def _least_held(fitted: Fitted, surveyed: Problem) -> tuple[Array, Array]:
     return least_held, covariance
 
 
-def _touched(size: Array, allowed: Mask) -> Mask:
-    limit = TOUCHED * float(size[allowed].max()) if allowed.any() else 0.0
-    return np.asarray(allowed & (size > limit))
-
-
 def _axis(fitted: Fitted, framed: Framed, directions: list[Direction]) -> str:
     """Direction in which the positions change, in words: an axis, or the most parallel pair of anchors."""
     shift = np.concatenate([direction.shift_m @ framed.motion.rotation.T for direction in directions])
@@ -645,11 +630,8 @@ def _unchecked(fitted: Fitted) -> str | None:
 
 def _advised_tapes(fitted: Fitted) -> tuple[TapeAdvice, ...]:
     """The three distances that would help most, each given those before it."""
-    problem = fitted.problem
-    chosen = best_tapes(problem, fitted.solution.position_m, fitted.covariance_m2, fitted.core)
-    return tuple(_advice(fitted, item) for item in chosen)
-
-
-def _advice(fitted: Fitted, choice: TapeChoice) -> TapeAdvice:
-    a, b = sorted((fitted.anchors[choice.first], fitted.anchors[choice.second]))
-    return TapeAdvice(a, b, choice.std_before_m, choice.std_after_m)
+    found = []
+    for one in best_tapes(fitted.problem, fitted.solution.position_m, fitted.covariance_m2, fitted.core):
+        a, b = sorted((fitted.anchors[one.first], fitted.anchors[one.second]))
+        found.append(TapeAdvice(a, b, one.std_before_m, one.std_after_m))
+    return tuple(found)

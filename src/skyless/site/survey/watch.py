@@ -26,7 +26,7 @@ from skyless.site.survey.explain import (
     weight_of,
 )
 from skyless.site.survey.facts import Facts, PairBlock, PairRange, PairRanges, Survey
-from skyless.site.survey.legs import STD_OVER_MAD
+from skyless.site.survey.legs import MEDIAN_VARIANCE, STD_OVER_MAD
 from skyless.site.survey.pair_ranger import PairRanger, StepTable
 
 _USUAL_WINDOWS: Final = 60  # windows in the median that is the usual range
@@ -146,7 +146,6 @@ _KNOWN_WINDOWS: Final = 12
 
 _FARTHEST_M: Final = 1e5  # longest range, delays included
 _MEDIAN_BLOCKS: Final = 3  # blocks needed to use their median, which short obstacles do not change
-_MEDIAN_VARIANCE: Final = math.pi / 2.0
 
 _JUMP_WINDOWS: Final = 1000  # a block older than this many windows means that the clock was set back
 
@@ -308,8 +307,7 @@ class AnchorWatch:
         start_s = window * self._window_s
         range_m, exchanges = self._ranges(blocks)
         is_present = np.isfinite(range_m)
-        is_held = self._touched(one.finding for one in self._held)
-        is_touched = is_held.copy()
+        is_touched = self._touched(one.finding for one in self._held)
         known = np.flatnonzero(is_present & self._is_known())
         if len(known):
             drift_m = self._history.drift_m()
@@ -332,7 +330,7 @@ class AnchorWatch:
             count = sum(block.exchanges for block in blocks)
             if len(blocks) >= _MEDIAN_BLOCKS:
                 range_m[row] = float(np.median([block.mean_m for block in blocks]))
-                exchanges[row] = count / _MEDIAN_VARIANCE
+                exchanges[row] = count / MEDIAN_VARIANCE
             else:
                 range_m[row] = sum(block.mean_m * block.exchanges for block in blocks) / count
                 exchanges[row] = count

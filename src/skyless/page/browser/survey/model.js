@@ -26,7 +26,6 @@ const NO_FACTS = {
   delay_std_m: 0.07,
   common_delay_std_m: 0.1,
   pair_std_m: 0.03,
-  delays: [],
   gauge: null,
 };
 

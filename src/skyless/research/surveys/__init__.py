@@ -1,1 +1,0 @@
-"""Surveys in simulated rooms, and their errors."""
