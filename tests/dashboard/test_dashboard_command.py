@@ -135,7 +135,7 @@ def test_the_site_file_and_the_number_must_agree(capsys, tmp_path):
 
 
 def test_the_server_loads_nothing_heavy():
-    """Overlays have a process of their own; NumPy and Numba in this one would cost its start a second and 150 MB."""
+    """Overlays have a process of their own; NumPy in this one would cost its start time and memory."""
     look = "import skyless.page.app, skyless.page.playback, sys; print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True).stdout.split()
     assert "skyless.page.app" in loaded

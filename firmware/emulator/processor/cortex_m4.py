@@ -167,7 +167,7 @@ class Core:
         uc.mem_map_ptr(RAM_BASE, RAM_BYTES, UC_PROT_ALL, ctypes.addressof(self.ram))
         for base, size in self._windows:
             self._map_window(base, size)
-        hook_blocks(uc, c.on_block.address, self.state.ctypes.data)
+        hook_blocks(uc, c.block_hook(), self.state.ctypes.data)
         uc.hook_add(UC_HOOK_INTR, self._on_exception)
         uc.hook_add(UC_HOOK_MEM_INVALID, self._on_invalid_access)
         self._error: Exception | None = None

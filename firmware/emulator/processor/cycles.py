@@ -14,14 +14,16 @@ kB and is mapped directly; loads of constant tables cost no waits; each access t
 about ±25 %.
 """
 
+import ctypes
 import re
+import subprocess
+import tempfile
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numba import carray, cfunc, njit, types
 from numpy.typing import NDArray
 
 from emulator.processor.elf import Instruction, instructions_of
@@ -125,39 +127,20 @@ def _has_to_wait(one: Instruction, behind: Instruction) -> bool:
     return int(result[1]) in read
 
 
-@njit
-def charge(state, address, size):  # noqa: ANN001, ANN201
-    """Add the cycles of a block of ``size`` bytes that is about to be executed."""
-    refill = _REFILL_CYCLES if address != state[BLOCK_END] else 0
-    if (address + size) >> 1 > state[CODE_HALFWORDS]:
-        cost = (size >> 1) + refill  # code in RAM
-    else:
-        cost = state[_COSTS + ((address + size) >> 1)] - state[_COSTS + (address >> 1)]
-        if cost >= _USES_FPU and state[FPU] != FPU_ON:
-            state[FPU] = FPU_REFUSED
-            return
-        cost = (cost & (_USES_FPU - 1)) + refill
-        for line in range(address >> _LINE_SHIFT, ((address + size - 1) >> _LINE_SHIFT) + 1):
-            if state[CACHE_ON]:
-                if state[_TAGS + line % CACHE_LINES] != line:
-                    state[_TAGS + line % CACHE_LINES] = line
-                    cost += _WAITS_MISSED
-            elif state[LAST_LINE] != line:
-                state[LAST_LINE] = line
-                cost += _WAITS_UNCACHED
-        state[_COSTS + state[CODE_HALFWORDS] + 1 + (address >> 1)] += cost
-    state[BLOCK_END] = address + size
-    state[CYCLES] += cost
+@cache
+def block_hook() -> int:
+    """Address of Unicorn's block hook (``cycles.c``), compiled at its first use in a process.
 
-
-@cfunc(types.void(types.voidptr, types.uint64, types.uint32, types.voidptr))
-def on_block(engine, address, size, data):  # noqa: ANN001, ANN201
-    """Unicorn's block hook; a block before which the processor stops is not charged."""
-    head = carray(data, (_COSTS,), np.int64)
-    if head[CYCLES] >= head[LIMIT]:
-        stop_engine(engine)
-        return
-    state = carray(data, (_COSTS + 2 * head[CODE_HALFWORDS] + 1,), np.int64)
-    charge(state, np.int64(address), np.int64(size))
-    if head[FPU] == FPU_REFUSED:
-        stop_engine(engine)
+    A block before which the processor stops is not charged.
+    """
+    columns = {name.lstrip("_"): value for name, value in globals().items() if isinstance(value, int)}
+    defines = [f"-D{name}={value}" for name, value in columns.items() if name.isupper()]
+    source = Path(__file__).with_suffix(".c")
+    with tempfile.TemporaryDirectory() as folder:
+        made = Path(folder) / "cycles.so"
+        subprocess.run(["cc", "-O2", "-shared", "-fPIC", *defines, source, "-o", made], check=True)
+        hooks = ctypes.CDLL(str(made))
+    ctypes.c_void_p.in_dll(hooks, "stop_engine").value = ctypes.cast(stop_engine, ctypes.c_void_p).value
+    address = ctypes.cast(hooks.on_block, ctypes.c_void_p).value
+    assert address is not None
+    return address
