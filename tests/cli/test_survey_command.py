@@ -26,6 +26,7 @@ from skyless.site.file.template import site_template
 from skyless.site.survey.facts import Facts, Gauge, Survey, Tape, count
 from skyless.site.survey.surveyed_site import read_record
 from skyless.site.tables import read_anchors, read_calibration, read_ranges
+from support.alignment import aligned_rms_m
 
 pytestmark = pytest.mark.site
 
@@ -92,11 +93,7 @@ def complaint(capsys, *arguments):
 def aligned_rmse_m(report):
     """Of the positions that were found, horizontal, after the best rigid alignment."""
     found = [one for one in report["anchors"] if one["determined"]]
-    at_m = np.array([(one["x_m"], one["y_m"]) for one in found])
-    true_m = np.array([HALL_M[one["id"] - 1, :2] for one in found])
-    at_m, true_m = at_m - at_m.mean(axis=0), true_m - true_m.mean(axis=0)
-    u, _, vt = np.linalg.svd(at_m.T @ true_m)
-    return np.sqrt(((at_m @ u @ vt - true_m) ** 2).sum(axis=1).mean())
+    return aligned_rms_m([(one["x_m"], one["y_m"]) for one in found], [HALL_M[one["id"] - 1, :2] for one in found])
 
 
 def test_a_table_of_ranges_and_heights_with_default_options(hall, capsys):

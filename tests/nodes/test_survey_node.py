@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import math
 from errno import ENOSPC
 from functools import cache
 from pathlib import Path
@@ -455,7 +456,8 @@ def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch, faili
 
 async def test_a_finding_is_logged_once_although_its_size_wavers():
     said, again = [], []
-    node = SurveyNode(SurveySettings(1), lambda _: Facts(), None, None, said.append)
+    node = SurveyNode(SurveySettings(1), lambda _: Facts(), None, MqttAddress("127.0.0.1", 1), said.append)
+    node._next_publish_s = math.inf
     found = []
     node.live = SimpleNamespace(
         state=lambda _: "no data",
@@ -508,7 +510,7 @@ def test_what_phases_show_is_found_beside_what_stamps_show():
 
 
 def test_ranges_count_from_the_delays_of_the_file_although_the_anchors_run_with_others():
-    node = SurveyNode(SurveySettings(1, FRESH), lambda _: Facts(), None, None, lambda _: None)
+    node = SurveyNode(SurveySettings(1, FRESH), lambda _: Facts(), None, MqttAddress("127.0.0.1", 1), lambda _: None)
     node.live = live_after(3.0)
     before = {(pair.a, pair.b): pair.range_m for pair in node.final_ranges().pairs}
     more = replace(FRESH, unplaced=tuple(replace(one, tx_antenna_delay_ticks=16536) for one in FRESH.unplaced))

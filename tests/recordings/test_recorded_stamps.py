@@ -21,6 +21,7 @@ from skyless.sim.impairments import AnchorOutage, Outage, lab_impairments
 from skyless.sim.world import World
 from skyless.site.survey.facts import Facts, Tape
 from skyless.site.survey.solve import run_survey
+from support.alignment import aligned_rms_m
 
 pytestmark = pytest.mark.site
 
@@ -158,11 +159,7 @@ FOREIGN = Facts(
 
 def _rmse_m(found_m):
     """3-D, after the best rigid alignment; positions by anchor."""
-    own = np.array([found_m[anchor] for anchor in KUIPMAN_M])
-    true = np.array(list(KUIPMAN_M.values()))
-    own, true = own - own.mean(axis=0), true - true.mean(axis=0)
-    left, _, right = np.linalg.svd(own.T @ true)
-    return math.sqrt(np.mean(np.sum((own @ left @ right - true) ** 2, axis=1)))
+    return aligned_rms_m([found_m[anchor] for anchor in KUIPMAN_M], list(KUIPMAN_M.values()))
 
 
 def _surveyed_rmse_m(ranges, dimensions):

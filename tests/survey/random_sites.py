@@ -8,6 +8,7 @@ from msgspec.structs import replace
 from skyless.sim.lab import lab_site
 from skyless.site.survey.fit import redundancy
 from skyless.site.survey.problem import Problem
+from support.alignment import aligned_errors_m
 
 GRID = [[x, y, 6.0] for x in (0.0, 12.0, 24.0, 36.0) for y in (0.0, 12.0, 24.0)]
 CORNERS = [[0, 0, 0.4], [8, 0, 2.6], [8, 6, 0.4], [0, 6, 2.6], [4, 0, 2.6], [8, 3, 0.4], [4, 6, 2.6], [0, 3, 0.4]]
@@ -106,10 +107,7 @@ def draw_plant(seed, *, delay_std_m=0.07, std_m=0.03):
 
 def aligned_error_m(position_m, truth_m, dimensions=2):
     """Distance of each anchor from its true position after the best rigid motion or reflection, shape (n,)."""
-    a = position_m[:, :dimensions] - position_m[:, :dimensions].mean(axis=0)
-    b = truth_m[:, :dimensions] - truth_m[:, :dimensions].mean(axis=0)
-    u, _, v = np.linalg.svd(a.T @ b)
-    return np.linalg.norm(a @ u @ v - b, axis=1)
+    return np.linalg.norm(aligned_errors_m(position_m[:, :dimensions], truth_m[:, :dimensions]), axis=1)
 
 
 def is_unchecked(fit):

@@ -26,7 +26,7 @@ def aligned_error_m(layout, position_m):
     errors = []
     for sign in (1.0, -1.0):
         mirrored = position_m * [1.0, sign, 1.0]
-        motion = align(mirrored, layout.position_m, 1.0, layout.dimensions).motion
+        motion, _ = align(mirrored, layout.position_m, 1.0, layout.dimensions)
         errors.append(motion.moved(mirrored) - layout.position_m)
     return min(errors, key=lambda error: float(np.sum(error**2)))
 

@@ -9,6 +9,7 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
+from skyless.run.mqtt.address import MqttAddress
 from skyless.run.survey.live_survey import LiveSurvey
 from skyless.run.survey.program import SurveyNode, SurveySettings
 from skyless.sim.lab import lab_site
@@ -148,7 +149,8 @@ def test_a_live_survey_goes_on_with_the_time_since_the_motion():
 
 def test_the_program_and_the_command_use_the_time_since_the_motion(monkeypatch, capsys):
     ranger, site, lines = PairRanger(), lab_site(), []
-    node = SurveyNode(SurveySettings(site.id, site), lambda _: Facts(), run_survey, None, lines.append)
+    address = MqttAddress("127.0.0.1", 1)
+    node = SurveyNode(SurveySettings(site.id, site), lambda _: Facts(), run_survey, address, lines.append)
     live = node.live = LiveSurvey(site, Facts(heights_m=dict.fromkeys(LAB, 0.0)))
     for sender, receiver, tx_ticks, rx_ticks, t_s in legs(LAB, 30.0, hung_elsewhere):
         live._add(AnchorLeg(sender, receiver, tx_ticks, rx_ticks, t_s), t_s)

@@ -19,6 +19,7 @@ from skyless.sim.world import World
 from skyless.site.survey.legs import RelayedDifferences
 from skyless.site.survey.problem import Problem, solve_least_squares
 from skyless.site.survey.walk import TAG_STD_M, EpochCollector, TagEpochs, WalkRows, fit_with_tag, tag_ranges
+from support.alignment import aligned_errors_m
 
 RANGE_STD_M, DELAY_STD_M = 0.03, 0.15
 LAB_M = np.array([(anchor.x_m, anchor.y_m, 0.0) for anchor in LAB.anchors])
@@ -85,9 +86,7 @@ def epochs_of(rng, positions_m, delay_m, path_m, known_height=False, noise_m=0.0
 
 def errors_m(found_m, true_m):
     """Horizontal and vertical rms after the best rigid alignment."""
-    found_m, true_m = found_m - found_m.mean(axis=0), true_m - true_m.mean(axis=0)
-    u, _, vt = np.linalg.svd(found_m.T @ true_m)
-    error_m = found_m @ (u @ vt) - true_m
+    error_m = aligned_errors_m(found_m, true_m)
     return np.sqrt((error_m[:, :2] ** 2).sum(axis=1).mean()), np.sqrt((error_m[:, 2] ** 2).mean())
 
 

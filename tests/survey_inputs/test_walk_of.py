@@ -23,6 +23,7 @@ from skyless.sim.trajectory import Waypoints
 from skyless.sim.world import World
 from skyless.site.survey.facts import Facts
 from skyless.site.survey.solve import run_survey
+from support.alignment import aligned_rms_m
 
 pytestmark = pytest.mark.site
 
@@ -56,10 +57,7 @@ def walk(tmp_path_factory):
 def rms_m(survey):
     """Of the positions, after the best rigid alignment."""
     true_m = np.array([(anchor.x_m, anchor.y_m) for anchor in LAB.anchors])
-    found_m = np.array([(anchor.x_m, anchor.y_m) for anchor in survey.anchors])
-    true_m, found_m = true_m - true_m.mean(axis=0), found_m - found_m.mean(axis=0)
-    u, _, vt = np.linalg.svd(found_m.T @ true_m)
-    return np.sqrt((((found_m @ (u @ vt)) - true_m) ** 2).sum(axis=1).mean())
+    return aligned_rms_m([(anchor.x_m, anchor.y_m) for anchor in survey.anchors], true_m)
 
 
 @pytest.mark.statistical

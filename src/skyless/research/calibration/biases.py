@@ -483,21 +483,15 @@ def _of_site(path: str | PathLike[str], identifier: int | None, part: _Part) -> 
                     part.add(leg)
                 else:
                     drops["unknown-anchor"] += 1
-        damage = _damage(recording)
+        summary = recording.summary()
+    damage = Counter(summary.drops)
+    if summary.unread_bytes:
+        damage["unfinished-record"] += 1
     for collector in collectors.values():
         drops += _drops(collector.counters)
     return RecordedRanges(
         part.finish(), part.ranger, SITE_FORMAT, site, dict(damage + drops + part.drops()), dict(damage)
     )
-
-
-def _damage(recording: McapRecording) -> Counter[str]:
-    """Unreadable parts of the file, after reading it."""
-    summary = recording.summary()
-    damage = Counter(summary.drops)
-    if summary.unread_bytes:
-        damage["unfinished-record"] += 1
-    return damage
 
 
 def _of_anchor(message: StampsMessage, ranger: PairRanger, runs: dict[int, str]) -> list[AnchorLeg]:

@@ -102,7 +102,7 @@ class SurveyNode:
         settings: SurveySettings,
         facts_of: FactsOf,
         solve: Solve,
-        address: MqttAddress | None,
+        address: MqttAddress,
         log: Log,
     ) -> None:
         """``facts_of``: facts about a site known without a user's help. ``solve``: ``survey.solve.run_survey``."""
@@ -125,18 +125,14 @@ class SurveyNode:
         self._logged: set[str] = set()  # lines that are logged once
         self._precedence = Precedence(time.time())
         self._name = NAME if settings.serves else f"{NAME}-{secrets.token_hex(4)}"
-        self.link = None if address is None else Link(address, self._name, site=settings.site_id, kind=NAME)
-        if self.link is not None:
-            self._subscribe(self.link)
+        self.link = Link(address, self._name, site=settings.site_id, kind=NAME)
+        self._subscribe(self.link)
         if settings.site is not None:
             self._begin(settings.site)
 
     async def run(self) -> None:
         """Serve until cancelled."""
-        if self.link is None:
-            await self._work()
-        else:
-            await outlasting(keep(self.link, self._log), self._work())  # the last messages are still sent
+        await outlasting(keep(self.link, self._log), self._work())  # the last messages are still sent
 
     async def _work(self) -> None:
         try:
@@ -150,8 +146,6 @@ class SurveyNode:
     def _withdraw(self) -> None:
         """End the lease, and clear the topics that are retained only while this program runs."""
         link, site_id = self.link, self._settings.site_id
-        if link is None:
-            return
         link.publish(request_topic(site_id), RequestMessage(self._name, (), 0.0), qos=1)
         if self._settings.serves and not self._waits():
             for topic in (survey_topic(site_id), watch_topic(site_id)):
@@ -181,9 +175,8 @@ class SurveyNode:
         self.problems += 1
 
     def _request(self) -> None:
-        if self.link is not None:
-            message = RequestMessage(self._name, (), LEASE_S, stamps=True)
-            self.link.publish(request_topic(self._settings.site_id), message, qos=1)
+        message = RequestMessage(self._name, (), LEASE_S, stamps=True)
+        self.link.publish(request_topic(self._settings.site_id), message, qos=1)
 
     def _on_site(self, message: SiteMessage) -> None:
         self._running = message.site
@@ -235,9 +228,8 @@ class SurveyNode:
 
     def _forget(self, *topics: Callable[[int], str]) -> None:
         """Stop repeating the own messages on topics that another program now publishes."""
-        if self.link is not None:
-            for topic in topics:
-                self.link.forget(topic(self._settings.site_id))
+        for topic in topics:
+            self.link.forget(topic(self._settings.site_id))
 
     def _begin(self, site: Site) -> None:
         """Start surveying a site."""
@@ -279,8 +271,7 @@ class SurveyNode:
         watch = live.watch_message(now_s, unix_s)
         if watch is not None:
             self._log_findings(live, watch)
-        if self.link is not None:
-            self._publish(self.link, live, now_s, unix_s, watch)
+        self._publish(self.link, live, now_s, unix_s, watch)
 
     async def _make_result(self, live: LiveSurvey) -> None:
         """Compute one result, in a thread so that the event loop goes on."""
@@ -412,8 +403,7 @@ class SurveyNode:
         self._placement = PlacementMessage(
             unix_s, site_digest(before), replace(saved.site, outline_m=UNSET, alarms=UNSET), earlier
         )
-        if self.link is not None:
-            self.link.publish(placement_topic(self._settings.site_id), self._placement, qos=1, retain=True)
+        self.link.publish(placement_topic(self._settings.site_id), self._placement, qos=1, retain=True)
         self._running = None  # until the anchors publish it
         self.saved = saved
         live.place(saved.site, saved.record, serial, time.monotonic(), unix_s)

@@ -283,16 +283,8 @@ class Motion(Struct, frozen=True, eq=False):
         return np.asarray(position_m @ self.rotation.T + self.shift_m)
 
 
-class Alignment(Struct, frozen=True, eq=False):
-    """The motion that best fits one set of positions to another."""
-
-    motion: Motion
-    mirror_decided: bool
-    """Whether the mirror image fits clearly worse."""
-
-
-def align(position_m: Array, other_m: Array, std_m: float, axes: int) -> Alignment:
-    """Least squares alignment without scale, of positions of shape (k, 3).
+def align(position_m: Array, other_m: Array, std_m: float, axes: int) -> tuple[Motion, bool]:
+    """Least squares alignment without scale, of positions of shape (k, 3); whether its mirror image is clearly worse.
 
     ``axes`` 2: rotate about the vertical and keep z. ``std_m``: standard deviation of the sets' difference per axis,
     used only to decide about mirror images.
@@ -316,7 +308,7 @@ def align(position_m: Array, other_m: Array, std_m: float, axes: int) -> Alignme
     mirrored = next(item for item in found if item[1] < 0.0)
     decided = abs(plain[0] - mirrored[0]) > _DECIDED
     best = mirrored if decided and mirrored[0] < plain[0] else plain
-    return Alignment(best[2], decided)
+    return best[2], decided
 
 
 def fitting_points(position_m: Array, covariance_m2: Array, point_m: Array, point_std_m: float) -> Mask:
@@ -542,8 +534,7 @@ def _best(
     if known.sum() < axes:
         return None, False
     there_m = np.where(np.isfinite(there_m), there_m, position_m)
-    alignment = align(position_m[known], there_m[known], std_m, axes)
-    return alignment.motion, alignment.mirror_decided
+    return align(position_m[known], there_m[known], std_m, axes)
 
 
 def _sentence(anchors: Integers, found: Axes, axes: int) -> str:
@@ -807,8 +798,7 @@ def _in_sketch_frame(problem: Problem, solution: Solution, weight: Array, sketch
         return solution
     axes = 3 if problem.is_free[:, 2].all() and np.isfinite(sketch[known]).all() and known.sum() > 2 else 2
     there = np.where(np.isfinite(sketch), sketch, solution.position_m)
-    alignment = align(solution.position_m[known], there[known], 0.3, axes)
-    moved = alignment.motion.moved(solution.position_m)
+    moved = align(solution.position_m[known], there[known], 0.3, axes)[0].moved(solution.position_m)
     moved = np.where(problem.is_free, moved, solution.position_m)
     return solve_least_squares(problem, moved, weight)
 
@@ -836,7 +826,7 @@ def _held_by_points(
     good = tested[fits]
     stds = position_stds_m(free.problem, free.covariance_m2)
     std = math.hypot(facts.point_std_m, float(np.median(stds[tested])))
-    motion = align(position[good], there[fits], std, axes).motion
+    motion, _ = align(position[good], there[fits], std, axes)
     moved = np.where(free.problem.is_free, motion.moved(position), position)
     notes = []
     error = np.linalg.norm((moved[tested] - there)[:, :axes], axis=1)
