@@ -40,7 +40,7 @@ from skyless.sim.trajectory import Trajectory, Waypoints
 from skyless.site.file.template import rectangular_site
 
 OFF = 1e12
-DIFFERENCES = "skyless.research.masterless.difference_tracking:"
+DIFFERENCES = "skyless.run.masterless.difference_tracking:"
 
 MECHANISMS: dict[str, dict[str, float]] = {
     "": {},

@@ -18,7 +18,7 @@ import numpy as np
 from skyless.core.arrays import Array
 from skyless.core.ticks import CARRIER_CYCLES
 from skyless.research.foreign import datasets as muloc
-from skyless.research.masterless.packet_tracking import MASTERLESS, PacketTracking
+from skyless.run.masterless.packet_tracking import MASTERLESS, PacketTracking
 
 MARGINS_S: Final = (0.3, 0.4)
 """Of each stop, at its begin and its end: the tag is still moving."""

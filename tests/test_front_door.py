@@ -44,7 +44,7 @@ def test_a_value_loads_no_estimator():
     modules = "fix, integrity, observation"
     script = f"import sys; from skyless import Fix; from skyless.core import {modules}; print(*sys.modules)"
     loaded = subprocess.check_output([sys.executable, "-c", script], text=True).split()
-    below = ("skyless.core.estimator", "skyless.core.tag", "skyless.research.masterless")
+    below = ("skyless.core.estimator", "skyless.core.tag", "skyless.run.masterless")
     assert [name for name in loaded if name.startswith(below)] == []
 
 

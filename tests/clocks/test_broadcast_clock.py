@@ -5,7 +5,7 @@ from hypothesis import strategies as st
 from scipy.linalg import solve_discrete_are
 
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S
-from skyless.research.masterless.pair_engine import (
+from skyless.run.masterless.pair_engine import (
     ACCELERATION_M2PS3,
     BROADCAST_WALK_FM,
     RESTART_AFTER,

@@ -14,7 +14,7 @@ from skyless.core.air.frame import Reception, fcs
 from skyless.core.any_receiver import AnyReceiver, new_anchor
 from skyless.core.ticks import wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust
-from skyless.research.masterless.smoothing import OwnReceiver
+from skyless.run.masterless.smoothing import OwnReceiver
 from skyless.sim.evaluation.scenarios import Request
 from skyless.sim.impairments import CarrierModel
 from skyless.site.survey.legs import RelayedDifferences

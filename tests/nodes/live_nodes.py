@@ -6,10 +6,10 @@ import contextlib
 import numpy as np
 
 from skyless.radio.interface import AntennaDelays
-from skyless.research.masterless.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.run.anchor import AnchorNode
 from skyless.run.board import Board
 from skyless.run.ether import Ether
+from skyless.run.masterless.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.run.open_radio import open_radios, open_sniffers
 from skyless.run.tag import TagNode, TagSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of

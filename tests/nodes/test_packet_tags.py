@@ -9,8 +9,8 @@ import masterless_world as hall
 from skyless.core.air.masterless_packets import Packet
 from skyless.radio.foreign.bitcraze import decode_payload
 from skyless.radio.interface import Gone, Restarted
-from skyless.research.masterless import packet_tags
-from skyless.research.masterless.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
+from skyless.run.masterless import packet_tags
+from skyless.run.masterless.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
 from skyless.run.mqtt.messages import FixMessage, SiteMessage, TagHealth
 from skyless.run.open_radio import is_simulated, open_sniffers
 

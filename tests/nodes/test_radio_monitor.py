@@ -10,8 +10,8 @@ import masterless_world as hall
 from skyless.core.air.masterless_packets import Packet
 from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio
 from skyless.radio.interface import Gone, Restarted
-from skyless.research.masterless.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.run.anchor import AnchorNode
+from skyless.run.masterless.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.run.open_radio import REPEAT_S, UNUSABLE_S, RadioMonitor
 from skyless.run.tag import TagNode, TagSettings
 

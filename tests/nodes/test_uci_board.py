@@ -13,8 +13,8 @@ from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.foreign_radios import UciRadio
 from skyless.radio.foreign.uci import UciReader, decode_session_info, location_of
 from skyless.radio.interface import Restarted
-from skyless.research.masterless.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.run.board import UciProtocol
+from skyless.run.masterless.packet_tags import PacketTagNode, PacketTagSettings
 from skyless.run.open_radio import open_sniffers
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import paper_lab_site

@@ -14,7 +14,7 @@ from skyless.core.alert import Alert
 from skyless.core.estimator.kalman import is_stationary
 from skyless.core.estimator.settings import TUNING
 from skyless.core.fix import NoFixReason
-from skyless.research.masterless.difference_tracking import (
+from skyless.run.masterless.difference_tracking import (
     DIFFERENCES,
     DifferenceTracking,
     Start,

@@ -9,7 +9,7 @@ from msgspec import structs
 
 from skyless.core.air.masterless_packets import Packet, Relay
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
-from skyless.research.masterless.pair_engine import MAX_ANCHORS, PairEngine
+from skyless.run.masterless.pair_engine import MAX_ANCHORS, PairEngine
 
 ANCHORS_M = {1: (0.0, 0.0, 1.0), 2: (0.0, 4.5, 1.0), 3: (4.5, 0.0, 1.2), 4: (4.5, 4.5, 1.5)}
 DELAY_TICKS = 16_475

@@ -10,7 +10,7 @@ from msgspec import structs
 import masterless_world as hall
 from skyless.core.fix import NoFixReason
 from skyless.radio.foreign.bitcraze import decode_payload
-from skyless.research.masterless.packet_tracking import MASTERLESS, PacketTracking
+from skyless.run.masterless.packet_tracking import MASTERLESS, PacketTracking
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 
 pytestmark = pytest.mark.site

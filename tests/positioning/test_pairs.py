@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from skyless.core.estimator.settings import TUNING
 from skyless.core.tag.position import Solution, locate
-from skyless.research.masterless.difference_tracking import joined_tdoas
+from skyless.run.masterless.difference_tracking import joined_tdoas
 
 pytestmark = pytest.mark.site
 

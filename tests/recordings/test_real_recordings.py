@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from skyless.research.foreign.formats import open_recording
-from skyless.research.masterless.pair_engine import PairEngine
+from skyless.run.masterless.pair_engine import PairEngine
 from skyless.site.tables import read_anchors, read_truth
 
 pytestmark = pytest.mark.site

@@ -7,8 +7,8 @@ import skyless
 import synthetic_recordings as synthetic
 from skyless.core.air.masterless_packets import PairTdoa
 from skyless.core.estimator.settings import EstimatorSettings
-from skyless.research.masterless.difference_tracking import DifferenceTracking
-from skyless.research.masterless.smoothing import CHUNK, smoothed
+from skyless.run.masterless.difference_tracking import DifferenceTracking
+from skyless.run.masterless.smoothing import CHUNK, smoothed
 from skyless.site.survey.anchor_errors import DifferenceCalibration
 
 ANCHORS_M = {1: (0.0, 0.0, 0.2), 2: (8.0, 0.0, 2.8), 3: (8.0, 6.0, 0.2), 4: (0.0, 6.0, 2.8), 5: (4.0, 0.0, 1.5)}

@@ -16,8 +16,8 @@ from skyless.core.site import AccuracySite
 from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign.fira import DtTag
 from skyless.radio.foreign.uci import UciReader
-from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, PacketTracking
 from skyless.run.board import UciProtocol
+from skyless.run.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, PacketTracking
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
 from skyless.sim.impairments import RangeErrorModel

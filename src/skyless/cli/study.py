@@ -34,8 +34,8 @@ from skyless.research.replays.options import check_estimator, read_estimator
 
 if TYPE_CHECKING:
     from skyless.cli.api.study import StudyResult
-    from skyless.research.masterless.smoothing import OwnEstimator
     from skyless.research.studies.runner import Row
+    from skyless.run.masterless.smoothing import OwnEstimator
 
 _OF_EFFICIENCY: Final = (
     "Simulated. ± standard errors. NEES: per dimension, with the interval where 99 % of honest ones lie.",

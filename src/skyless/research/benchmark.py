@@ -31,11 +31,11 @@ from skyless.files import replace_files, write_whole
 from skyless.research.calibration.biases import biases_of, tdoas_of
 from skyless.research.calibration.options import CalibrateOptions
 from skyless.research.foreign.formats import format_of, open_recording
-from skyless.research.masterless.smoothing import OwnEstimator
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.inputs import known_anchors, known_truth
 from skyless.research.replays.options import ReplayOptions
 from skyless.research.replays.site import SITE_FORMAT, SiteReplay
+from skyless.run.masterless.smoothing import OwnEstimator
 from skyless.run.recordings.recording import McapRecording, is_mcap
 from skyless.sim.evaluation.figures import Figures, FixTable, Judged, figures_of, truth_at
 from skyless.site.report import bullets, page, panel, picture, report_style, svg_figure, table

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from skyless.core.site import Site
-    from skyless.research.masterless.smoothing import OwnEstimator
+    from skyless.run.masterless.smoothing import OwnEstimator
 
 _USUAL_DURATION_S = 60.0
 """Duration of a simulation without a goal."""

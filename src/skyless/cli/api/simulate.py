@@ -14,7 +14,7 @@ from skyless.cli.common import cm
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import FILTERS
 from skyless.core.site import Site
-from skyless.research.masterless.smoothing import OwnReceiver
+from skyless.run.masterless.smoothing import OwnReceiver
 from skyless.sim.evaluation.figures import dimensions
 from skyless.sim.evaluation.fleet import FleetReport, JudgedFix, TagFleet, report
 from skyless.sim.evaluation.request import Conditions

@@ -42,7 +42,7 @@ from skyless.sim.evaluation.request import ProtectionOptions
 
 if TYPE_CHECKING:
     from skyless.core.air.masterless_packets import Point
-    from skyless.research.masterless.packet_tags import PacketTagSettings
+    from skyless.run.masterless.packet_tags import PacketTagSettings
 
 # Fixes as lines on standard output: for people, as CSV, or as JSON.
 #
@@ -336,7 +336,7 @@ def _on_sniffers(
     bridge: TagBridge | None,
 ) -> Coroutine[Any, Any, None]:
     """Run tags that receive the packets of another system."""
-    from skyless.research.masterless.packet_tags import PacketTags
+    from skyless.run.masterless.packet_tags import PacketTags
 
     settings = _system(asked)
     radios = open_sniffers(asked.radio, names, settings.anchors_m)
@@ -364,7 +364,7 @@ def _on_sniffers(
 def _system(asked: TagOptions) -> "PacketTagSettings":
     """Settings that sniffers, and some FiRa boards, cannot receive from the air. Raises SkylessError."""
     from skyless.core.geometry import GUESSED_STD_M, plane_height_m
-    from skyless.research.masterless.packet_tags import TDOA_SITE, PacketTagSettings
+    from skyless.run.masterless.packet_tags import TDOA_SITE, PacketTagSettings
     from skyless.site.tables import read_anchors, read_calibration
 
     if asked.anchors is None and not hears_positions(asked.radio):

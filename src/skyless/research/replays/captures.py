@@ -19,10 +19,6 @@ from skyless.core.fix import Fix, NoFixReason
 from skyless.core.ticks import CARRIER_CYCLES
 from skyless.research.foreign.datasets import anchor_distances_m
 from skyless.research.foreign.formats import Format, Recording, format_of, open_recording
-from skyless.research.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
-from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
-from skyless.research.masterless.pair_engine import PairEngine
-from skyless.research.masterless.smoothing import Event, Height, OwnEstimator, heard, smoothed
 from skyless.research.replays.inputs import (
     YAML_SUFFIXES,
     flight_height,
@@ -32,6 +28,10 @@ from skyless.research.replays.inputs import (
     known_truth,
 )
 from skyless.research.replays.options import DIFFERENCES_MADE, PACKETS, ReplayOptions
+from skyless.run.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
+from skyless.run.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
+from skyless.run.masterless.pair_engine import PairEngine
+from skyless.run.masterless.smoothing import Event, Height, OwnEstimator, heard, smoothed
 from skyless.sim.evaluation.figures import (
     EvenSample,
     Figures,

@@ -18,8 +18,8 @@ from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.geometry import GUESSED_STD_M, plane_height_m
 from skyless.core.site import Site
 from skyless.research.foreign.formats import format_of
-from skyless.research.masterless.smoothing import Height
 from skyless.research.replays.options import BAROMETER, RECORDED, RecordingOptions, ReplayOptions
+from skyless.run.masterless.smoothing import Height
 from skyless.sim.evaluation.figures import FLIGHT_M, antenna_truth, flies, shifted
 from skyless.site.file.load import site_of
 from skyless.site.tables import HEIGHT_STD_M, Truth, read_anchors, read_height_readings, read_truth

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from skyless.core.integrity import IntegrityRequirement
-    from skyless.research.masterless.smoothing import OwnEstimator
+    from skyless.run.masterless.smoothing import OwnEstimator
 
     Anchors = Mapping[int, tuple[float, float, float]] | str | Path
     """Positions by identifier in metres, or the path of a table."""

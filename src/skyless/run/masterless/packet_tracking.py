@@ -28,8 +28,8 @@ from skyless.core.ticks import (
     fix_time_s,
     nearest,
 )
-from skyless.research.masterless.difference_tracking import DIFFERENCES, Corners, is_within, neighbourhood_m
-from skyless.research.masterless.pair_engine import MAX_ANCHORS, remember
+from skyless.run.masterless.difference_tracking import DIFFERENCES, Corners, is_within, neighbourhood_m
+from skyless.run.masterless.pair_engine import MAX_ANCHORS, remember
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
 
 MASTERLESS_RANDOM_WALK_FM: Final = 5e-9

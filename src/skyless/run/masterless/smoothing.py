@@ -32,8 +32,8 @@ from skyless.core.fix import POSITION, VELOCITY, Fix, NoFixReason
 from skyless.core.native.views import view
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_BITS, TICK_S
-from skyless.research.masterless.difference_tracking import DifferenceTracking
-from skyless.research.masterless.pair_engine import PairEngine
+from skyless.run.masterless.difference_tracking import DifferenceTracking
+from skyless.run.masterless.pair_engine import PairEngine
 
 CHUNK: Final = 2_000
 """Events between two copies of the filter, from which it is rerun; limits the covariances in memory."""

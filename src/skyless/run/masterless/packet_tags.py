@@ -19,8 +19,8 @@ from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign.bitcraze import STAMP_BITS
 from skyless.radio.foreign.foreign_radios import SnifferRadio, UciRadio
 from skyless.radio.interface import Gone, Restarted
-from skyless.research.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog
+from skyless.run.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth
 from skyless.run.mqtt.topics import fix_topic, health_topic
