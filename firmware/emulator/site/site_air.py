@@ -24,9 +24,9 @@ class NodeAir:
     def now_ticks(self) -> int:
         """The node's counter, from its last instant by its present rate: reading it draws no noise."""
         clock = self._medium.clocks[self.node]
-        passed = self._medium.timeline.now_ticks - int(clock["true_ticks"]) - float(clock["true_fraction"])
-        gain = passed * clock_rate(self._medium.clocks, self.node)
-        return wrap(int(clock["local_ticks"]) + round(float(clock["local_fraction"]) + passed + gain))
+        passed = self._medium.timeline.now_ticks - clock.true_ticks - clock.true_fraction
+        gain = passed * clock_rate(clock)
+        return wrap(clock.local_ticks + round(clock.local_fraction + passed + gain))
 
     def now_s(self) -> float:
         """True time."""

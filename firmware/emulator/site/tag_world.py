@@ -46,7 +46,7 @@ class TagWorld:
 
         def wake() -> None:
             medium.switch_on(node)
-            medium.clocks[node]["rate"] += 1e-6 * jumps.gauss(0.0, jump_ppm)
+            medium.clocks[node].rate += 1e-6 * jumps.gauss(0.0, jump_ppm)
 
         self.chip.on_wake = wake
         self.board = make_board(Seat(medium.timeline, self.chip, lambda data: said(medium.now_s, data)))
