@@ -48,6 +48,12 @@ def test_a_value_loads_no_estimator():
     assert [name for name in loaded if name.startswith(below)] == []
 
 
+def test_a_robots_tag_loads_no_simulation():
+    script = "import sys, skyless.run.tag; print(*sys.modules)"
+    loaded = subprocess.check_output([sys.executable, "-c", script], text=True).split()
+    assert [name for name in loaded if name.startswith("skyless.sim")] == []
+
+
 def test_a_position_from_a_notebook():
     """Five anchors, ideal differences: the position comes back without a guess."""
     import numpy as np

@@ -17,7 +17,6 @@ from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio, Uc
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Radio, Restarted
 from skyless.radio.serial.serial_port import check_path
 from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, SerialRadio
-from skyless.run.dw1000_model import ModelPort
 from skyless.run.process import Log
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
@@ -80,6 +79,8 @@ def open_radios(
     settings = delays or [AntennaDelays()] * len(names)
     phases = kind == "tag" if phases is None else phases
     if driver == "model":
+        from skyless.run.dw1000_model import ModelPort  # noqa: PLC0415 - a robot does not load a simulation
+
         host, port = host_and_port(spec, where, DEFAULT_PORT)
         nodes = EtherConnection(host, port, join).radios
         return tuple(
