@@ -30,8 +30,8 @@ from skyless.site.planning.links import (
     SIGMA_Y,
     SIGMA_Z,
     TDOP,
-    link,
     link_budget,
+    links,
     range_of,
     with_range,
 )
@@ -153,11 +153,12 @@ def test_anchor_clocks_settle_where_riccati_says():
 def test_links_are_the_simulations():
     channel = with_range(ChannelModel(), 20.0)
     assert range_of(channel) == pytest.approx(20.0)
-    budget, walls = link_budget(channel), barriers_of((WallSite(5.0, -1.0, 5.0, 1.0, loss_db=6.0206, delay_m=0.3),))
-    origin = np.zeros(3)
-    assert link(budget, walls, origin, np.array([0.0, 20.0, 0.0])) == pytest.approx((0.5, 0.0))
-    assert link(budget, walls, origin, np.array([10.0, 0.0, 0.0])) == pytest.approx((0.5, 0.3), abs=1e-4)
-    assert link(budget, walls, origin, np.array([4.0, 0.0, 0.0]))[0] > 0.999
+    walls = barriers_of((WallSite(5.0, -1.0, 5.0, 1.0, loss_db=6.0206, delay_m=0.3),))
+    points_m = np.array([(0.0, 20.0, 0.0), (10.0, 0.0, 0.0), (4.0, 0.0, 0.0)])
+    share, delay_m = links(np.zeros((1, 3)), points_m, link_budget(channel), walls)
+    np.testing.assert_allclose(share[:2, 0], 0.5, atol=1e-4)
+    assert share[2, 0] > 0.999
+    np.testing.assert_allclose(delay_m[:, 0], [0.0, 0.3, 0.0])
 
 
 def test_without_enough_anchors_there_is_no_fix():

@@ -60,7 +60,7 @@ def round_planned_m(site, settings):
     """The same where tags receive a round's messages only, which relay the poll, or the responses in the final one."""
     planner = Predictor(site, PlanSettings(qa=QA))
     clocks, master = planner.clocks, planner.master
-    relays = relays_of(planner.anchors_m, master, clocks, planner.budget, planner.walls)
+    relays = relays_of(planner.anchors_m, master, clocks, planner.budget, planner.barriers)
     messages = len(site.anchors) + site.schedule.frames_per_node - 1
     begins, ends, kept = [0, *relays.ends[:-1].tolist()], [], []
     for k in range(messages):
