@@ -107,9 +107,11 @@ def test_a_number_that_is_none_is_refused_by_every_option(options, capsys):
             assert (err.count("\n"), name in err, "Traceback" in err) == (1, True, False), err
 
 
-_POSITIONAL = dict.fromkeys(("benchmark", "plan", "replay", "site new", "site check", "board"), (__file__,))
+_POSITIONAL = dict.fromkeys(
+    ("benchmark", "calibrate", "plan", "replay", "site new", "site check", "board"), (__file__,)
+)
 _POSITIONAL |= dict.fromkeys(("site keys new", "site keys rotate", "site keys revoke"), ("x",))
-_POSITIONAL["study"] = ("loss",)
+_POSITIONAL["study"] = ("room",)
 _POSITIONAL |= dict.fromkeys(("history track", "history contacts"), ("x",))
 _POSITIONAL["history run"] = ("--to", "x")
 _POSITIONAL["hub init"] = ("x",)
