@@ -75,22 +75,22 @@ class Page(HTMLParser):
 
 @pytest.mark.statistical
 def test_every_picture_is_there_twice_and_nothing_is_left_over(made):
-    folder, told = made
-    assert all(section["pictures"] for section in told["sections"])
-    assert len(told["figures"]) == 2 * sum(len(section["pictures"]) for section in told["sections"])
-    for path in told["figures"]:
+    folder, printed = made
+    assert all(section["pictures"] for section in printed["sections"])
+    assert len(printed["figures"]) == 2 * sum(len(section["pictures"]) for section in printed["sections"])
+    for path in printed["figures"]:
         data = (folder / path.rsplit("/", 1)[-1]).read_bytes()
         if path.endswith(".png"):
             assert data.startswith(b"\x89PNG")
         else:
             assert ElementTree.fromstring(data).tag.endswith("svg")
-    expected = {path.rsplit("/", 1)[-1] for path in told["figures"]} | {"report.html", "numbers.json", "notes.txt"}
+    expected = {path.rsplit("/", 1)[-1] for path in printed["figures"]} | {"report.html", "numbers.json", "notes.txt"}
     assert {file.name for file in folder.iterdir()} == expected
     assert [entry.name for entry in folder.parent.iterdir()] == [folder.name]
 
 
 def test_the_page_is_valid_and_needs_nothing_else(made):
-    folder, told = made
+    folder, printed = made
     text = (folder / "report.html").read_text(encoding="utf-8")
     page = Page(text)
     assert len(page.ids) == len(set(page.ids))
@@ -99,21 +99,21 @@ def test_the_page_is_valid_and_needs_nothing_else(made):
     assert not {"script", "link", "iframe", "object"} & set(page.tags)
     assert not re.search(r"https?://", text)
     assert all(target in page.ids for target in re.findall(r"url\(#([^)]*)\)", text))
-    assert page.tags.count("svg") == len(told["figures"]) // 2
-    for section in told["sections"]:
+    assert page.tags.count("svg") == len(printed["figures"]) // 2
+    for section in printed["sections"]:
         assert section["key"] in page.ids
         assert section["label"] in text
 
 
-def test_the_numbers_are_told_twice_alike(made):
-    folder, told = made
+def test_the_printed_numbers_are_those_written(made):
+    folder, printed = made
     written = json.loads((folder / "numbers.json").read_bytes())
-    assert {key: told[key] for key in written} == written
-    assert len(told["sections"]) == 10
-    assert told["sections"][0]["key"] == "scenario"
-    names = {check["name"] for check in told["checks"]}
+    assert {key: printed[key] for key in written} == written
+    assert len(printed["sections"]) == 10
+    assert printed["sections"][0]["key"] == "scenario"
+    names = {check["name"] for check in printed["checks"]}
     assert len(names) == 2 * 10 * len(QUANTITIES)
-    for check in told["checks"]:
+    for check in printed["checks"]:
         assert check["draws"] == TINY.draws
         assert check["corrected_error_pct"] < 5.0 * check["standard_error_pct"]
 
@@ -153,10 +153,10 @@ def test_biased_stamps_move_the_mean_where_theory_says(made):
 def test_a_file_is_no_place_for_a_report(tmp_path, capsys, below):
     (tmp_path / "taken").write_text("mine")
     assert main(["paper", "--out", f"{tmp_path}/taken{below}", "--quick"]) == 2
-    told = capsys.readouterr().err
-    assert "--out" in told
-    assert "taken" in told
-    assert told.count("\n") == 1
+    printed = capsys.readouterr().err
+    assert "--out" in printed
+    assert "taken" in printed
+    assert printed.count("\n") == 1
     assert (tmp_path / "taken").read_text() == "mine"
 
 

@@ -187,6 +187,13 @@ def test_changing_range_errors_have_their_size(correlation):
     assert abs(np.mean(errors_m)) < 0.05
 
 
+def test_changing_range_errors_are_not_drawn_backwards():
+    own = tape(Impairments(range_errors=RangeErrorModel(changing_m=0.3, correlation_s=0.5)))
+    own.hear(0, 2.0, 2.5)
+    with pytest.raises(ValueError, match="in the order of time"):
+        own.hear(0, 1.0, 1.5)
+
+
 def test_random_numbers_are_uniform_and_independent_of_their_neighbours():
     numbers = np.arange(20_000)
     drawn = uniforms(7, 1, 3, numbers)

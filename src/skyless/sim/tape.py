@@ -229,7 +229,11 @@ class Tape:
         self._frames: _Frames
 
     def hear(self, tag: int, from_s: float, to_s: float) -> list[Heard]:
-        """The beacons emitted in [from_s, to_s) that a tag receives, in order; cheapest in the order of time."""
+        """The beacons emitted in [from_s, to_s) that a tag receives, in order; cheapest in the order of time.
+
+        Raises:
+            ValueError: range errors change, and the span is before one that was asked for.
+        """
         frames = self._cover(from_s, to_s)
         begin, end = np.searchsorted(frames.ticks, (from_s * TICK_RATE_HZ, to_s * TICK_RATE_HZ))
         span = np.arange(begin, end)
@@ -402,6 +406,7 @@ class _RangeErrors:
         self._step = (model.correlation_s or model.correlation_m or math.inf) / _KNOTS
         self._first, self._knots = 0, self._draw.standard_normal((1, anchors))
         self._last: tuple[Array, float] | None = None
+        self._last_s = 0.0
 
     def at(self, times_s: Array, points_m: Array, sender: Integers, distances_m: Array) -> Array:
         """Errors in metres of frames in the order of time; the sender is a row of the anchors."""
@@ -409,6 +414,9 @@ class _RangeErrors:
         slopes_m = model.slope_m * np.clip(distances_m / SLOPE_MIDDLE_M - 1.0, -1.0, 1.0)
         errors_m = self._constant_m[sender] + slopes_m
         if model.changing_m > 0.0 and len(times_s):
+            if times_s[0] < self._last_s:
+                raise ValueError("range errors that change are drawn in the order of time; the span is an earlier one")
+            self._last_s = float(times_s[-1])
             passed = (times_s if model.correlation_s is not None else self._walk(points_m)) / self._step
             knot = passed.astype(np.int64)
             self._extend(int(knot[0]), int(knot[-1]) + 1)

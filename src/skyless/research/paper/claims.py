@@ -525,7 +525,6 @@ class Moments(Struct, frozen=True):
     """One axis of the errors at one position."""
 
     count: int
-
     mean_m: float
     mean_standard_error_m: float
     std_m: float
