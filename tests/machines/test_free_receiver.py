@@ -11,7 +11,8 @@ from msgspec.structs import replace
 from skyless.core.air.almanac import NoisePage, SitePage, period_code
 from skyless.core.air.beacon import StatedPosition, encode
 from skyless.core.air.frame import Heard as Relay
-from skyless.core.anchor import site_issue, site_page_for, site_pages_of
+from skyless.core.air.site_pages import site_issue
+from skyless.core.anchor import site_page_for, site_pages_of
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import NoFixReason
 from skyless.core.site import GeoreferenceSite
@@ -103,7 +104,7 @@ def undisturbed(falses, new_receiver=Receiver):
     return receiver.counters
 
 
-@pytest.mark.parametrize(("new_receiver", "counted"), [(Receiver, "unknown-version"), (AnyReceiver, "other-version")])
+@pytest.mark.parametrize(("new_receiver", "counted"), [(Receiver, "unknown-version"), (AnyReceiver, "foreign-site")])
 def test_a_master_of_protocol_1_has_no_effect(new_receiver, counted):
     masters = tape(seconds=1.9)[::30]
     first = min(one.host_s for one in free_tape())

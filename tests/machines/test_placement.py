@@ -70,7 +70,7 @@ def longest_gap_s(times_s, since_s):
 
 
 @pytest.mark.parametrize("stagger_s", [0.0, 0.1])
-@pytest.mark.parametrize(("mode", "without_fixes_s"), [("master", 0.3), ("free", 0.7)])
+@pytest.mark.parametrize(("mode", "without_fixes_s"), [("master", 0.5), ("free", 0.7)])
 def test_tags_go_over_to_the_new_positions_and_never_mix_them_with_the_old(mode, without_fixes_s, stagger_s):
     site = site_of(mode)
     fixes, sent, receiver = run(site, replace(site, anchors=tuple(map(turned, site.anchors))), 1, stagger_s)

@@ -16,7 +16,7 @@ from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import FAULT_KINDS, covariances
 from skyless.core.native.views import view
-from skyless.core.observation import Observation
+from skyless.core.tag.joint import Observation
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.research.studies.efficiency import EPISODE_SPEED_STD_MPS, WHITE_FM, random_path
 from skyless.sim.lab import paper_lab_site
@@ -197,10 +197,9 @@ def jumped(packets, anchor, begin, metres):
 
 def observations_of(packets, anchors_m=LAB_M):
     """What a receiver without any master would give its method."""
-    for k, (anchor, sequence, rx_ticks, tx_ticks, relays) in enumerate(one_by_one(packets)):
+    for anchor, sequence, rx_ticks, tx_ticks, relays in one_by_one(packets):
         heard = tuple(map(tuple, relays))
-        stamps = (k // len(anchors_m), sequence, rx_ticks, tx_ticks, None, None, None, 0.0, 0.0)
-        yield Observation(anchor, anchors_m[anchor], *stamps, heard)
+        yield Observation(anchor, anchors_m[anchor], sequence, rx_ticks, tx_ticks, heard)
 
 
 def seen(state):

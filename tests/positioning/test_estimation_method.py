@@ -24,7 +24,7 @@ from skyless.core.alert import Alert
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.protocol1.clock import MasterScale, MasterTerm
 from skyless.core.tag.joint import Estimation
-from skyless.core.ticks import SUBTICKS, TICK_M, TICK_MASK, TICK_RATE_HZ
+from skyless.core.ticks import SUBTICKS, TICK_MASK, TICK_RATE_HZ
 
 pytestmark = pytest.mark.site
 
@@ -354,53 +354,3 @@ def test_a_master_may_lead_the_sites_time_at_another_rate_than_its_own():
     assert scale.difference(MasterTerm(4, 7), site_at, 77) is None
     scale.update(master_term, site[3] + 3 * step, own[3] + step)
     assert scale.difference(master_term, site_at + step * SUBTICKS, 77) is None
-
-
-def with_reports(packets):
-    """Observations with what each anchor knows of its clock against the first anchor's, to 5 mm."""
-    relayed, ends = packets.relays, packets.ends
-    master = {int(packets.sequences[k]): int(packets.tx_ticks[k]) for k in np.flatnonzero(packets.anchors == 0)}
-    begins, lines = np.concatenate([[0], ends[:-1]]), {}
-    for k, observation in enumerate(observations_of(packets)):
-        anchor = observation.anchor
-        for listener, sender, sequence, stamp in relayed[begins[k] : ends[k]].tolist():
-            if sender == 0:
-                flight = np.linalg.norm(LAB_M[listener] - LAB_M[0]) / TICK_M
-                lines.setdefault(listener, []).append((stamp - flight, master[sequence]))
-        if anchor == 0:
-            ticks, fraction, variance = observation.tx_ticks_anchor, 0.0, 1e-6
-        elif len(lines.get(anchor, ())) > 8:
-            own, told = np.array(lines[anchor][-12:], dtype=object).T
-            base, zero = own[-1], told[-1]
-            slope, there = np.polyfit(
-                (own - base).astype(float), (told - zero).astype(float) - (own - base).astype(float), 1
-            )
-            elapsed = float(observation.tx_ticks_anchor - base)
-            site = there + elapsed * (1.0 + slope)
-            ticks, fraction = zero + int(np.floor(site)), site - np.floor(site)
-            variance = 9e-4
-        else:
-            yield observation
-            continue
-        ahead = (observation.tx_ticks_anchor - int(ticks)) * SUBTICKS - round(float(fraction) * SUBTICKS)
-        yield replace(observation, tx_variance_m2=variance, report=(0, ahead % MODULO))
-
-
-@pytest.mark.statistical
-def test_reports_help_where_most_packets_are_lost():
-    squares, used = np.zeros(2), 0
-    for seed in range(12):
-        episode = episode_of(replace(PLAIN, qa=0.3), 300, seed)
-        keep = np.random.default_rng(seed + 50).random(len(episode.path_m)) >= 0.85
-        keep[:30] = True
-        told = list(with_reports(episode.packets))
-        silent = [replace(o, report=None, tx_variance_m2=0.0) for o in told]
-        for k, observations in enumerate((silent, told)):
-            method = Estimation(settings_of(replace(PLAIN, qa=0.3)))
-            for n, observation in enumerate(observations):
-                fix = method.update(observation) if keep[n] else None
-                if isinstance(fix, Fix) and n > 200:
-                    squares[k] += np.square(fix.position_m - episode.path_m[n]).sum()
-        used += int(seen(method.estimator.state).status["reports_used"])
-    assert used > 100
-    assert squares[1] < 0.9 * squares[0]

@@ -7,18 +7,18 @@ from msgspec.structs import replace
 
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SitePage
 from skyless.core.air.beacon import Beacon, StatedPosition, fields_of
-from skyless.core.air.neighbours import Neighbours, find_neighbour, neighbour_of
+from skyless.core.air.neighbours import PRESENT_TICKS, Neighbours, find_neighbour, neighbour_of
 from skyless.core.air.site_pages import (
     MAX_NOISE,
-    PRESENT_TICKS,
     SAME_PAGES,
     LocalAlmanac,
     SitePages,
     decode_page,
     encode_page,
     note_page,
+    site_issue,
 )
-from skyless.core.anchor import site_issue, site_page_for, site_pages_of
+from skyless.core.anchor import site_page_for, site_pages_of
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.native.records import MAX_NEIGHBOURS, MAX_PAGES
 from skyless.core.site import GeoreferenceSite

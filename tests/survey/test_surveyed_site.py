@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.core.anchor import site_issue, site_pages_of
+from skyless.core.air.site_pages import site_issue
+from skyless.core.anchor import site_pages_of
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import EXACT, AccuracySite, ScheduleSite, UnplacedAnchor
 from skyless.core.ticks import TICK_M

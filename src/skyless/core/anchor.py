@@ -11,7 +11,6 @@ import math
 from collections import Counter
 from collections.abc import Iterable
 from typing import Final
-from zlib import crc32
 
 from msgspec import Struct
 from msgspec.structs import asdict
@@ -40,8 +39,8 @@ from skyless.core.air.beacon import (
     with_authentication,
 )
 from skyless.core.air.frame import Heard, Malformed, Reception, Transmission, is_weak_first_path, phase_of
-from skyless.core.air.neighbours import STAMP_COUNTERS, STAMP_FITS, Neighbours, unwrap_stamp
-from skyless.core.air.site_pages import encode_page
+from skyless.core.air.neighbours import PRESENT_TICKS, STAMP_COUNTERS, STAMP_FITS, Neighbours, unwrap_stamp
+from skyless.core.air.site_pages import site_issue
 from skyless.core.keys.chain import Chain, ChainKeys, ChainRing, ChainTiming, is_mac, mac_of
 from skyless.core.keys.fault import Fault
 from skyless.core.native.library import compiled
@@ -94,12 +93,6 @@ def stated_position(site: Site, anchor: AnchorSite) -> StatedPosition:
 def site_page_for(pages: tuple[Page, ...], sequence: int, anchor: int) -> Page:
     """The page that a frame carries: an anchor's successive frames cycle through them."""
     return pages[(sequence + anchor) % len(pages)]
-
-
-def site_issue(pages: Iterable[Page]) -> int:
-    """A 16-bit checksum of the contents of all pages."""
-    checksum = crc32(b"".join(sorted(map(encode_page, pages))))
-    return (checksum ^ checksum >> 16) & 0xFFFF
 
 
 # What an anchor with keys adds to its frames, and how it verifies those of others: it knows all keys, so at once.
@@ -300,8 +293,7 @@ MAX_RELAY_AGE_TICKS: Final = from_seconds(1.0)
 """Older stamps are not relayed: sequence numbers wrap after 256 frames, and then name another frame."""
 
 PRESENT_PERIODS: Final = 8
-PRESENT_TICKS: Final = from_seconds(1.0)
-"""An anchor is in reach if it was received within the last second and within this number of own periods."""
+"""An anchor is in reach if it was received within ``PRESENT_TICKS`` or within this number of own periods."""
 
 MIN_CODE_STEPS: Final = 2
 """Smaller changes of the period, up to 9 to 12 %, are not made, so that beacons stay predictable for long."""

@@ -1,24 +1,24 @@
 """Both protocols behind one interface: what depends on the protocol of a site, and a tag that detects it."""
 
 from collections import Counter
-from collections.abc import Callable
-from functools import partial
 from statistics import median
-from typing import Any, Final, Protocol
+from typing import Protocol
 
 from skyless.core.air.almanac import suitable_period_s
-from skyless.core.air.beacon import VERSION_2, Beacon, decode_cached
+from skyless.core.air.beacon import Beacon, decode_cached
 from skyless.core.air.frame import Malformed, Reception, Transmission, has_version
 from skyless.core.anchor import Anchor, BeaconAuthentication
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.geometry import anchors_in_reach
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.method_names import DEFAULT_METHOD, FILTERS
+from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
+from skyless.core.native.records import MAX_SITES
 from skyless.core.protocol1 import anchor as protocol1_anchor
 from skyless.core.protocol1 import beacon as protocol1_codec
 from skyless.core.protocol1 import receiver as protocol1
 from skyless.core.protocol1.beacon import Beacon as Protocol1Beacon
 from skyless.core.protocol1.beacon import schedule_of
+from skyless.core.protocol1.door import Door
 from skyless.core.protocol1.snapshots import Snapshots
 from skyless.core.site import Site
 from skyless.core.tag.joint import Estimation
@@ -104,15 +104,8 @@ def superframe_s(site: Site) -> float:
     return 1.0 / schedule_of(site).superframe_rate_hz if site.schedule.needs_master else beacon_period_s(site)
 
 
-MAX_OTHERS: Final = 200
-"""A tag changes to the other protocol after this many beacons of it without a fix in between."""
-
-
 class AnyReceiver:
-    """A listening tag at a site of either protocol. Bytes and ticks in, fixes out; no I/O, no clock.
-
-    It uses the protocol of its first beacon, and changes to the other one if it receives that and has no fixes.
-    """
+    """A listening tag at a site of either protocol. Bytes and ticks in, fixes out; no I/O, no clock."""
 
     def __init__(
         self,
@@ -130,17 +123,19 @@ class AnyReceiver:
         Raises:
             ValueError: there is no such method.
         """
-        options: Any = {"site": site, "qa": qa, "z_bounds_m": z_bounds_m, "integrity": integrity}
-        self._new: Callable[[], Receiver] = partial(Receiver, **options)
-        self._new_1: Callable[[], protocol1.Receiver] = partial(protocol1.Receiver, method, **options)
-        self._may_change = method in FILTERS
-        self._receiver: Receiver | protocol1.Receiver = self._new() if self._may_change else self._new_1()
-        self._others = 0
-        """Beacons of the other protocol since the last fix."""
+        if method not in METHODS:
+            raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")
+        if method in FILTERS:
+            joint = Receiver(site=site, qa=qa, z_bounds_m=z_bounds_m, integrity=integrity)
+            self._receiver: Receiver | protocol1.Receiver = joint
+        else:
+            self._receiver = protocol1.Receiver(method, site=site, z_bounds_m=z_bounds_m)
+        self._doors: dict[int, Door] = {}
+        """Of the sites of protocol 1 that ``joint`` hears, the one in use and those received last."""
 
     @property
     def receiver(self) -> Receiver | protocol1.Receiver:
-        """The receiver of the protocol in use."""
+        """The receiver of the method."""
         return self._receiver
 
     @property
@@ -151,8 +146,6 @@ class AnyReceiver:
     @property
     def reason(self) -> NoFixReason:
         """Why the last frame made no fix."""
-        if not self._may_change and self.counters["other-version"] and not self.counters["heard"]:
-            return NoFixReason.NO_MASTER
         return self._receiver.reason
 
     @property
@@ -190,11 +183,8 @@ class AnyReceiver:
         Unusable frames are counted in ``counters`` and dropped; no frame raises.
         """
         receiver, frame = self._receiver, reception.frame
-        if isinstance(receiver, Receiver) and has_version(frame, VERSION_2):
-            fix = receiver.hear(reception)
-            if fix is not None:
-                self._others = 0
-            return fix
+        if isinstance(receiver, Receiver) and not has_version(frame, protocol1_codec.VERSION_1):
+            return receiver.hear(reception)
         beacon = decode_any(frame)
         if isinstance(beacon, Malformed):
             self.counters[beacon] += 1
@@ -202,24 +192,22 @@ class AnyReceiver:
         return self.hear_beacon(beacon, reception)
 
     def hear_beacon(self, beacon: SiteBeacon, reception: Reception) -> Fix | None:
-        """Process a decoded beacon as ``hear`` does; for protocol 2, ``reception.frame`` may be empty."""
-        if isinstance(beacon, Beacon) is not isinstance(self._receiver, Receiver) and not self._change():
-            self.counters["other-version"] += 1
+        """Process a decoded beacon as ``hear`` does; ``reception.frame`` may be empty."""
+        receiver = self._receiver
+        if isinstance(beacon, Beacon):
+            if isinstance(receiver, Receiver):
+                return receiver.hear_beacon(beacon, reception)
+            receiver.hear_other()
             return None
-        fix = self._receiver.hear_beacon(beacon, reception)  # type: ignore[arg-type]  # it is of its protocol
-        if fix is not None:
-            self._others = 0
-        return fix
+        if not isinstance(receiver, Receiver):
+            return receiver.hear_beacon(beacon, reception)
+        door = self._door_of(beacon.site)
+        report = door.report(beacon, reception.rx_ticks)
+        return receiver.hear_beacon(door.translated(beacon), reception, report)
 
-    def _change(self) -> bool:
-        """Change to the other protocol, unless the present one gives fixes or still may. Returns True if changed."""
-        if not self._may_change:
-            return False
-        self._others += 1
-        if self.counters["heard"] and self._others <= MAX_OTHERS:
-            return False
-        counters = self.counters
-        self._receiver = self._new_1() if isinstance(self._receiver, Receiver) else self._new()
-        self._receiver.counters.update(counters)
-        self._others = 0
-        return True
+    def _door_of(self, site: int) -> Door:
+        door = self._doors.pop(site, None) or Door()
+        self._doors[site] = door
+        if len(self._doors) > MAX_SITES:
+            del self._doors[next(other for other in self._doors if other != self.site)]
+        return door

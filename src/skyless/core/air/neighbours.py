@@ -2,11 +2,16 @@
 
 from typing import Annotated, Final
 
+from skyless.core.air.almanac import period_ticks
 from skyless.core.native.records import MAX_NEIGHBOURS, Array, Integers, Record, Ticks, record
 from skyless.core.ticks import NEVER, NOISE_TICKS, TICK_MASK, from_seconds, may_elapse, nearest
 
 RELAYED_TICKS: Final = from_seconds(2.0)
 """How long a reception confirms its sender, if received by an anchor in use or by one that is confirmed itself."""
+PRESENT_TICKS: Final = from_seconds(1.0)
+"""Anchors received within this time are present."""
+LASTING_PERIODS: Final = 3
+"""Both last for at least this number of the anchor's mean times between beacons."""
 
 
 @record
@@ -114,7 +119,7 @@ def _least_important(t: Neighbours, rx_ticks: Ticks) -> int:
         n = t.rows[row]
         rank = 0
         if n.frames > 0:
-            is_used = rx_ticks - n.used_ticks < RELAYED_TICKS
+            is_used = rx_ticks - n.used_ticks < _lasting_ticks(n, RELAYED_TICKS)
             rank = 3 if is_used else 2 if is_confirmed(n, rx_ticks) else 1 if n.frames > 1 else 0
         is_less = least < 0 or rank < least_rank
         if not is_less and rank == least_rank:
@@ -126,12 +131,21 @@ def _least_important(t: Neighbours, rx_ticks: Ticks) -> int:
 
 def is_confirmed(n: Neighbour, rx_ticks: Ticks) -> bool:
     """Whether another anchor has recently received this one, or its own relays have fitted."""
-    return rx_ticks - max(n.relayed_ticks, n.own_relays_ticks) < RELAYED_TICKS
+    return rx_ticks - max(n.relayed_ticks, n.own_relays_ticks) < _lasting_ticks(n, RELAYED_TICKS)
 
 
 def is_relayed(n: Neighbour, rx_ticks: Ticks) -> bool:
     """Whether another anchor has recently received this one."""
-    return rx_ticks - n.relayed_ticks < RELAYED_TICKS
+    return rx_ticks - n.relayed_ticks < _lasting_ticks(n, RELAYED_TICKS)
+
+
+def is_present(n: Neighbour, rx_ticks: Ticks) -> bool:
+    """Whether the anchor has recently been received."""
+    return rx_ticks - n.rx_ticks < _lasting_ticks(n, PRESENT_TICKS)
+
+
+def _lasting_ticks(n: Neighbour, least_ticks: Ticks) -> Ticks:
+    return max(least_ticks, LASTING_PERIODS * period_ticks(n.period_code))
 
 
 def forget_times(t: Neighbours) -> None:

@@ -2,6 +2,7 @@
 
 from typing import Annotated, Final
 
+from skyless.core.air.neighbours import PRESENT_TICKS
 from skyless.core.air.site_pages import MIN_ANCHORS
 from skyless.core.native.records import MAX_COUNTED, MAX_SITES, Array, Integers, Record, Ticks, record
 from skyless.core.ticks import from_seconds
@@ -12,14 +13,14 @@ SITE_SILENCE_TICKS: Final = from_seconds(2.0)
 TRIAL_TICKS: Final = from_seconds(5.0)
 """A site that has given no fix for this long is left for another, whatever its number of anchors."""
 
-PRESENT_TICKS: Final = from_seconds(1.0)
-"""Anchors received within this time count."""
-
-
 FOREIGN, USED, CHANGED = range(3)
 """What a beacon's site is to the tag; with the last value it is in use from this beacon on."""
 
 NO_SITE: Final = -1
+
+SITE_MASK: Final = 0xFFFF
+OF_PROTOCOL_1: Final = SITE_MASK + 1
+"""Added to the identifier of a site of protocol 1, which is another one than a site of protocol 2."""
 
 
 @record
@@ -53,7 +54,7 @@ class SiteChoice(Record):
     only_site: int = NO_SITE
     """Configured site; ``NO_SITE`` if the tag may choose."""
     site: int = NO_SITE
-    """PAN identifier of the site in use."""
+    """The site in use: its PAN identifier, and ``OF_PROTOCOL_1``."""
     heard_ticks: Ticks
     """RX stamp of its last accepted beacon."""
     since_ticks: Ticks
@@ -70,7 +71,7 @@ class SiteChoice(Record):
 
 def choose_site(choice: SiteChoice, site: int, anchor: int, rx_ticks: Ticks) -> int:
     """Count an anchor of a site. Return whether its beacon is to be used."""
-    if choice.only_site not in (NO_SITE, site):
+    if choice.only_site not in (NO_SITE, site & SITE_MASK):
         return FOREIGN
     counted = _index_of(choice, site)
     choice.sites[counted].newest_ticks = rx_ticks

@@ -1,9 +1,10 @@
 """Choice of the pages in use, among those that beacons carry, by a majority of the anchors."""
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import lru_cache
 from typing import Annotated, Any, Final, Literal
+from zlib import crc32
 
 from msgspec import Struct
 
@@ -18,7 +19,7 @@ from skyless.core.air.almanac import (
     SitePage,
 )
 from skyless.core.air.frame import SIGN, Malformed, signed, unsigned
-from skyless.core.air.neighbours import Neighbours, StatedPlace
+from skyless.core.air.neighbours import PRESENT_TICKS, Neighbours, StatedPlace, is_present
 from skyless.core.native.records import (
     MAX_PAGES,
     MAX_SENDERS,
@@ -31,7 +32,6 @@ from skyless.core.native.records import (
     first,
     record,
 )
-from skyless.core.ticks import from_seconds
 
 # Checks of page contents (``docs/protocol.md``, "Pages"): frames may carry any values.
 
@@ -99,9 +99,6 @@ def _is_noise(data: Bytes, at: int) -> bool:
     bits = unsigned(data, at, 4)
     return bits <= _MAX_NOISE_BITS or bits == SIGN
 
-
-PRESENT_TICKS: Final = from_seconds(1.0)
-"""Anchors received within this time take part in the majority."""
 
 MIN_ANCHORS: Final = 3
 """With fewer anchors no majority counts, unless the tag receives no more for ``PRESENT_TICKS``."""
@@ -237,13 +234,13 @@ def _supporters(one: CollectedPage, t: Neighbours) -> int:
 
 def _is_majority(p: SitePages, t: Neighbours, issue: int, rx_ticks: Ticks) -> bool:
     """Whether most of the anchors present state this issue."""
-    oldest, present, stating = rx_ticks - PRESENT_TICKS, 0, 0
+    present, stating = 0, 0
     for row in range(t.count):
         n = t.rows[row]
-        if n.was_relayed and n.rx_ticks > oldest:
+        if n.was_relayed and is_present(n, rx_ticks):
             present += 1
             stating += 1 if n.almanac_issue == issue else 0
-    is_enough = present >= MIN_ANCHORS or (present > 0 and p.first_ticks <= oldest)
+    is_enough = present >= MIN_ANCHORS or (present > 0 and rx_ticks - p.first_ticks >= PRESENT_TICKS)
     return is_enough and 2 * stating > present
 
 
@@ -347,6 +344,12 @@ def decode_page(data: bytes) -> Page | Literal[Malformed.BAD_PAGE] | None:
     if decode is None:
         return None
     return decode(data) if is_possible_page(data, 0) else Malformed.BAD_PAGE
+
+
+def site_issue(pages: Iterable[Page]) -> int:
+    """A 16-bit checksum of the contents of all pages."""
+    checksum = crc32(b"".join(sorted(map(encode_page, pages))))
+    return (checksum ^ checksum >> 16) & 0xFFFF
 
 
 def _whole(name: str, value: int, low: int, high: int) -> int:

@@ -111,10 +111,6 @@ class Packet(Record):
     subticks: Ticks
     """The anchor's reading minus the master's at the packet's TX stamp, modulo 2⁴⁸."""
     report_variance_m2: float
-    is_stated: bool
-    """Whether the anchor states its TX time on the master's scale …"""
-    stated: ScaledTime
-    """… and that time, which only starts use."""
     relays_have_phases: bool
     """Whether its frame carries phases in its relays, and therefore short stamps."""
 

@@ -108,6 +108,8 @@ INTERNAL int32_t neighbour_of(Neighbours *t, int32_t anchor, int64_t rx_ticks);
 INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks);
 INTERNAL bool is_confirmed(Neighbour *n, int64_t rx_ticks);
 INTERNAL bool is_relayed(Neighbour *n, int64_t rx_ticks);
+INTERNAL bool is_present(Neighbour *n, int64_t rx_ticks);
+INTERNAL int64_t lasting_ticks(Neighbour *n, int64_t least_ticks);
 INTERNAL void forget_times(Neighbours *t);
 INTERNAL void wake_times(Neighbours *t, int64_t rx_ticks, int64_t rx_counter);
 INTERNAL void forget_row(Neighbour *n);
@@ -848,7 +850,7 @@ INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks) {
         Neighbour *n = &t->rows[row];
         int32_t rank = 0;
         if (n->frames > 0) {
-            bool is_used = rx_ticks - n->used_ticks < RELAYED_TICKS;
+            bool is_used = rx_ticks - n->used_ticks < lasting_ticks(n, RELAYED_TICKS);
             rank = is_used ? 3 : is_confirmed(n, rx_ticks) ? 2 : n->frames > 1 ? 1 : 0;
         }
         bool is_less = least < 0 || rank < least_rank;
@@ -865,12 +867,21 @@ INTERNAL int32_t least_important(Neighbours *t, int64_t rx_ticks) {
 
 /* Whether another anchor has recently received this one, or its own relays have fitted. */
 INTERNAL bool is_confirmed(Neighbour *n, int64_t rx_ticks) {
-    return rx_ticks - max_64(n->relayed_ticks, n->own_relays_ticks) < RELAYED_TICKS;
+    return rx_ticks - max_64(n->relayed_ticks, n->own_relays_ticks) < lasting_ticks(n, RELAYED_TICKS);
 }
 
 /* Whether another anchor has recently received this one. */
 INTERNAL bool is_relayed(Neighbour *n, int64_t rx_ticks) {
-    return rx_ticks - n->relayed_ticks < RELAYED_TICKS;
+    return rx_ticks - n->relayed_ticks < lasting_ticks(n, RELAYED_TICKS);
+}
+
+/* Whether the anchor has recently been received. */
+INTERNAL bool is_present(Neighbour *n, int64_t rx_ticks) {
+    return rx_ticks - n->rx_ticks < lasting_ticks(n, PRESENT_TICKS);
+}
+
+INTERNAL int64_t lasting_ticks(Neighbour *n, int64_t least_ticks) {
+    return max_64(least_ticks, LASTING_PERIODS * period_ticks(n->period_code));
 }
 
 /* Forget when each anchor was received, after a restart of the receiver's counter. */
@@ -1111,17 +1122,16 @@ INTERNAL int32_t supporters(CollectedPage *one, Neighbours *t) {
 
 /* Whether most of the anchors present state this issue. */
 INTERNAL bool is_majority(SitePages *p, Neighbours *t, int32_t issue, int64_t rx_ticks) {
-    int64_t oldest = rx_ticks - PRESENT_TICKS;
     int32_t present = 0;
     int32_t stating = 0;
     for (int32_t row = 0, row_end = t->count; row < row_end; row++) {
         Neighbour *n = &t->rows[row];
-        if (n->was_relayed && n->rx_ticks > oldest) {
+        if (n->was_relayed && is_present(n, rx_ticks)) {
             present += 1;
             stating += n->almanac_issue == issue ? 1 : 0;
         }
     }
-    bool is_enough = present >= MIN_ANCHORS || (present > 0 && p->first_ticks <= oldest);
+    bool is_enough = present >= MIN_ANCHORS || (present > 0 && rx_ticks - p->first_ticks >= PRESENT_TICKS);
     return is_enough && 2 * stating > present;
 }
 
@@ -1365,7 +1375,7 @@ INTERNAL int32_t checksum(uint8_t *data, int32_t length) {
 
 /* Count an anchor of a site. Return whether its beacon is to be used. */
 INTERNAL int32_t choose_site(SiteChoice *choice, int32_t site, int32_t anchor, int64_t rx_ticks) {
-    if (choice->only_site != NO_SITE && choice->only_site != site) {
+    if (choice->only_site != NO_SITE && choice->only_site != (site & SITE_MASK)) {
         return FOREIGN;
     }
     int32_t counted = index_of(choice, site);
@@ -5681,7 +5691,7 @@ INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum) {
  *
  * When anchor i relays its reception of a packet of anchor j that the tag received too, the offset between the two
  * anchors' clocks at that moment is known up to noise. Along such links all TX times are converted to the clock of one
- * anchor, unless more anchors state theirs on the master's scale. The tag's clock is up to 20 ppm off, so pseudoranges
+ * anchor. The tag's clock is up to 20 ppm off, so pseudoranges
  * drift by tens of metres within one superframe. Two packets of the same anchor measure that drift; the newest
  * pseudoranges of all anchors are then propagated to a common time and solved in closed form. */
 
@@ -5888,12 +5898,10 @@ INTERNAL int32_t anchor_of(Acquisition *q, int32_t pair) {
 
 /* One scale for all TX times */
 
-/* Convert TX times to the clock of the anchor that reaches most others, or to the master's if that covers more. */
+/* Convert TX times to the clock of the anchor that reaches most others; leave the others out. */
 INTERNAL void put_on_one_scale(Acquisition *q, int64_t now) {
-    int32_t stated = 0;
     for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
         HeardAnchor *one = &q->heard[q->pairs[pair]];
-        stated += one->older.packet.is_stated && one->newer.packet.is_stated ? 1 : 0;
         measure_rate(q, pair, &one->older.packet, &one->newer.packet);
     }
     forget_links_before(q, now);
@@ -5907,20 +5915,11 @@ INTERNAL void put_on_one_scale(Acquisition *q, int64_t now) {
         }
     }
     int32_t kept = 0;
-    q->is_linked = q->best.count >= stated;
     for (int32_t pair = 0, pair_end = q->pair_count; pair < pair_end; pair++) {
         HeardAnchor *one = &q->heard[q->pairs[pair]];
-        bool is_kept = one->older.packet.is_stated && one->newer.packet.is_stated;
-        one->older.scaled = one->older.packet.stated;
-        one->newer.scaled = one->newer.packet.stated;
-        if (q->is_linked) {
-            is_kept = q->best.is_reached[pair] == 1;
-            if (is_kept) {
-                convert(q, pair, &one->older);
-                convert(q, pair, &one->newer);
-            }
-        }
-        if (is_kept) {
+        if (q->best.is_reached[pair] == 1) {
+            convert(q, pair, &one->older);
+            convert(q, pair, &one->newer);
             q->clock_rates_mps[kept] = clock_rate_mps(one);
             q->pairs[kept] = q->pairs[pair];
             kept += 1;
@@ -6205,7 +6204,7 @@ INTERNAL int32_t settle(Course *c, State *s, FixTime *time, int64_t rx_ticks) {
     if (s->dim == AXES && s->P[at(2, 2)] > square(c->extent_m)) {
         return BAD_GEOMETRY;
     }
-    c->time_ticks = fix_time_ticks(time, rx_ticks + c->master_less_tag_ticks, rx_ticks);
+    c->time_ticks = fix_time_ticks(time, rx_ticks, rx_ticks);
     return FIX;
 }
 
@@ -6331,7 +6330,6 @@ SKYLESS_EXPORT void skyless_begin_course(Course *c, Acquisition *q) {
     c->checked_ticks = 0;
     c->newest_ticks = 0;
     c->started_ticks = 0;
-    c->master_less_tag_ticks = 0;
     c->extent_m = REAL(0.0);
     c->late_share = REAL(0.0);
     c->misfit = NOBODY;
@@ -6392,7 +6390,7 @@ SKYLESS_EXPORT int32_t skyless_follow(Course *c, State *s, Acquisition *q, FixTi
     }
     if (c->superframe_s > c->tuning.longest_superframe_s) {
         fill_alone(c, q);
-        c->time_ticks = fix_time_ticks(time, rx_ticks + c->master_less_tag_ticks, rx_ticks);
+        c->time_ticks = fix_time_ticks(time, rx_ticks, rx_ticks);
         return START_FIX;
     }
     return begin_filter(c, s, q, relays) ? settle(c, s, time, rx_ticks) : SEARCHING;
@@ -6548,7 +6546,7 @@ INTERNAL bool begin_filter(Course *c, State *s, Acquisition *q, Relays *relays) 
  * an older one may be late, so its variance is increased where relays determine the anchor's clock too. */
 INTERNAL void choose_packets(Course *c, Acquisition *q, Beginning *b) {
     real factor = REAL(1.0);
-    if (q->is_linked && q->is_contradicted && !q->start.is_contradicted) {
+    if (q->is_contradicted && !q->start.is_contradicted) {
         factor += square(c->tuning.lasting_std_m) / c->settings.rx_variance_m2;
     }
     for (int32_t place = 0, place_end = q->count; place < place_end; place++) {
@@ -6578,7 +6576,11 @@ INTERNAL void insert_packet(Beginning *b, HeardPacket *one, real factor) {
 /* Whether the filter starts with the anchor at index ``place`` of ``heard``. */
 INTERNAL bool is_chosen(Course *c, Acquisition *q, int32_t place) {
     Start *start = &q->start;
-    if (c->most_anchors == 0 || (start->has_misfit && q->heard[place].newer.packet.place.anchor == start->misfit)) {
+    bool is_slow = c->superframe_s > c->tuning.slow_superframe_s;  /* the start is from the anchors of half a second only */
+    if (c->most_anchors == 0 || (is_slow && q->count <= c->most_anchors)) {
+        return true;
+    }
+    if (start->has_misfit && q->heard[place].newer.packet.place.anchor == start->misfit) {
         return true;
     }
     real own_m = distance_m(c, q->heard[place].newer.packet.place.position_m, start->position_m);
@@ -6927,17 +6929,17 @@ INTERNAL void begin_here(Tag *t, Acquisition *q) {
 
 /* Start with the pages in use and the longest period of the anchors that are present. */
 INTERNAL void begin_with_pages(Tag *t, Acquisition *q) {
-    int64_t oldest_ticks = 0;
+    int64_t newest_ticks = 0;
     Neighbours *neighbours = &t->admission.neighbours;
     for (int32_t row = 0, row_end = neighbours->count; row < row_end; row++) {
         if (neighbours->rows[row].frames > 0) {
-            oldest_ticks = max_64(oldest_ticks, neighbours->rows[row].rx_ticks);
+            newest_ticks = max_64(newest_ticks, neighbours->rows[row].rx_ticks);
         }
     }
     t->period_ticks = 0;
     for (int32_t row = 0, row_end = neighbours->count; row < row_end; row++) {
         Neighbour *n = &neighbours->rows[row];
-        if (n->frames > 0 && n->rx_ticks >= oldest_ticks - PRESENT_TICKS) {
+        if (n->frames > 0 && is_present(n, newest_ticks)) {
             t->period_ticks = max_64(t->period_ticks, period_ticks(n->period_code));
         }
     }
@@ -7076,7 +7078,7 @@ INTERNAL bool have_most_moved(Tag *t) {
     int32_t moved = 0;
     for (int32_t row = 0, row_end = t->admission.neighbours.count; row < row_end; row++) {
         Neighbour *n = &t->admission.neighbours.rows[row];
-        if (n->has_place && n->was_relayed && n->rx_ticks > t->admission.rx_ticks - PRESENT_TICKS) {
+        if (n->has_place && n->was_relayed && is_present(n, t->admission.rx_ticks)) {
             present += 1;
             moved += n->has_moved ? 1 : 0;
         }
@@ -7091,6 +7093,7 @@ INTERNAL bool have_most_moved(Tag *t) {
 SKYLESS_EXPORT int32_t skyless_hear_frame(Tag *t, State *s, Acquisition *q, uint8_t *frame, int32_t length, int64_t
         rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles) {
     int32_t fault = skyless_read_frame(frame, length, &t->beacon);
+    t->packet.report_variance_m2 = REAL(0.0);  /* only protocol 1 has reports */
     if (fault != INTACT) {
         return MALFORMED + fault;
     }
@@ -7221,9 +7224,7 @@ INTERNAL void fill_packet(Tag *t, Neighbour *n, real factor) {
     packet->rx_ticks = t->admission.rx_ticks;
     packet->tx_ticks = n->tx_ticks;
     packet->variance_factor = factor;
-    packet->master = -1;
     t->relays.count = 0;
-    packet->report_variance_m2 = REAL(0.0);
     packet->relays_have_phases = t->beacon.has_phases;
 }
 

@@ -174,6 +174,8 @@ typedef double real;
 /* Limit in m or m². No site is larger, and nothing here overflows below it. */
 #define LARGEST REAL(1000000000.0)
 #define LASTING 0
+/* Both last for at least this number of the anchor's mean times between beacons. */
+#define LASTING_PERIODS 3
 /* A year of ticks, so that differences fit into 64 bits; a host's clock that jumps by more was set. */
 #define LAST_TICKS INT64_C(2305843009213693952)
 /* Numbers written by ``levels.protect``: ``HPL``, ``VPL``, and the test of each kind of faults. */
@@ -341,7 +343,7 @@ typedef double real;
 #define POSITION_BYTES 12
 /* Weight of the newest value in the running mean of an anchor's received power. */
 #define POWER_GAIN REAL(0.1)
-/* Anchors received within this time count. */
+/* Anchors received within this time are present. */
 #define PRESENT_TICKS INT64_C(63897600000)
 #define PROTECTED_ROWS 10
 /* The first three levels (``estimator/levels.py``); only of methods that compute them. */
@@ -389,6 +391,7 @@ typedef double real;
 #define SINGULAR_PIVOT REAL(1e-12)
 #define SITE_CHANGED 4
 #define SITE_KIND 3
+#define SITE_MASK 65535
 #define SITE_PAGE 6
 /* A tag that may choose its site leaves one that has been silent, or has given no fix, for this long. */
 #define SITE_SILENCE_TICKS INT64_C(127795200000)
@@ -551,7 +554,7 @@ typedef struct CountedSite {
  * foreign anchor cannot hold it. A site without fixes gives way to others and returns only after those have failed. */
 typedef struct SiteChoice {
     int32_t only_site;  /* Configured site; ``NO_SITE`` if the tag may choose. */
-    int32_t site;  /* PAN identifier of the site in use. */
+    int32_t site;  /* The site in use: its PAN identifier, and ``OF_PROTOCOL_1``. */
     int64_t heard_ticks;  /* RX stamp of its last accepted beacon. */
     int64_t since_ticks;  /* RX stamp of the beacon at which it was chosen. */
     bool has_fix;
@@ -837,7 +840,6 @@ typedef struct Course {
     bool relays_may_contradict;
     bool may_begin_again;  /* Whether a start with a poor fit may be abandoned: not twice in a row. */
     int32_t heights_rejected;
-    int64_t master_less_tag_ticks;
     int64_t started_ticks;
     int64_t newest_ticks;
     real in_use_s;  /* An anchor counts as in use while its last accepted packet is younger than this. */
@@ -857,13 +859,6 @@ typedef struct Place {
     bool is_open;  /* Whether it joins with range errors beyond those of the settings. */
 } Place;
 
-/* A TX time on a scale common to packets of several anchors. */
-typedef struct ScaledTime {
-    int64_t ticks;
-    real fraction_ticks;
-    real variance_m2;
-} ScaledTime;
-
 /* A packet received by the tag, with unwrapped stamps. */
 typedef struct Packet {
     Place place;
@@ -876,8 +871,6 @@ typedef struct Packet {
     int32_t master;  /* Identifier of the anchor against whose clock this one reports its own; −1 without a report. */
     int64_t subticks;  /* The anchor's reading minus the master's at the packet's TX stamp, modulo 2⁴⁸. */
     real report_variance_m2;
-    bool is_stated;  /* Whether the anchor states its TX time on the master's scale … */
-    ScaledTime stated;  /* … and that time, which only starts use. */
     bool relays_have_phases;  /* Whether its frame carries phases in its relays, and therefore short stamps. */
 } Packet;
 
@@ -1097,6 +1090,13 @@ typedef struct State {
     real fix[10][3];  /* Rows of a fix (``POSITION`` and the following). */
 } State;
 
+/* A TX time on a scale common to packets of several anchors. */
+typedef struct ScaledTime {
+    int64_t ticks;
+    real fraction_ticks;
+    real variance_m2;
+} ScaledTime;
+
 /* A received packet with the relays that it carried. */
 typedef struct HeardPacket {
     Packet packet;
@@ -1216,7 +1216,6 @@ typedef struct Acquisition {
     ClockLink links[MAX_LINKS];
     bool has_been_wide;
     int64_t wide_ticks;  /* Time of the first start that was too wide to use. */
-    bool is_linked;  /* Whether the common scale comes from relays rather than from the anchors' stated times. */
     bool is_contradicted;
     int64_t contradicted_ticks;  /* When packets first contradicted each other. */
     /* Number of anchors when two positions last fitted equally well; the same number is retried once a superframe. */

@@ -10,66 +10,47 @@ from typing import Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.air.almanac import AccuracyPage, NoisePage, SchedulePage
-from skyless.core.air.frame import Heard, Malformed, Reception, phase_of, variance_factor_of
+from skyless.core.air.frame import Heard, Malformed, Reception, variance_factor_of
 from skyless.core.air.site_choice import NO_SITE, note_fix
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix, NoFixReason
-from skyless.core.integrity import IntegrityRequirement
-from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.core.native.library import compiled
-from skyless.core.observation import Observation
 from skyless.core.protocol1.almanac import AlmanacAssembly
-from skyless.core.protocol1.beacon import Beacon, Schedule, decode_cached, packed_relays, schedule_from_page
-from skyless.core.protocol1.clock import FollowedMaster, MasterScale, master_term_of
-from skyless.core.protocol1.snapshots import SnapshotMethod, Snapshots, SnapshotSettings
+from skyless.core.protocol1.beacon import Beacon, Schedule, decode_cached, schedule_from_page
+from skyless.core.protocol1.clock import FollowedMaster
+from skyless.core.protocol1.snapshots import Observation, SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.core.tag.admission import ADMITTED, SITE_CHANGED, Admission, admit_sender, admit_stamp
-from skyless.core.tag.joint import Estimation
-from skyless.core.tag.receiver import (
-    BeaconReceiver,
-    HeardSite,
-    MethodOptions,
-    as_required,
-    estimator_settings,
-    stamp_variances,
-)
-from skyless.core.ticks import FLIGHT_SLACK_TICKS, SUBTICKS, TICK_M, may_elapse, nearest, to_seconds
+from skyless.core.tag.receiver import BeaconReceiver, HeardSite, stamp_variances
+from skyless.core.ticks import FLIGHT_SLACK_TICKS, SUBTICKS, TICK_M, may_elapse, nearest
 
 
 class Receiver(BeaconReceiver):
-    """One listening tag of protocol 1."""
+    """One listening tag of protocol 1 with one of the paper's methods; ``joint`` hears it through ``Door``."""
 
     def __init__(
         self,
-        method: str = DEFAULT_METHOD,
+        method: str,
         *,
         site: int | None = None,
-        qa: float = 0.3,
         z_bounds_m: tuple[float, float] | None = None,
-        integrity: IntegrityRequirement | None = None,
     ) -> None:
-        """Create a tag that has heard nothing.
-
-        ``method`` is one of ``METHODS``; the rest as for ``skyless.Receiver``, with ``qa`` and ``integrity`` for
-        ``joint`` only.
+        """Create a tag that has heard nothing. ``method``: one of ``SNAPSHOTS``; the rest as for ``skyless.Receiver``.
 
         Raises:
             ValueError: there is no such method.
         """
-        if method not in METHODS:
-            raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")
-        super().__init__(MethodOptions(method, qa, z_bounds_m, integrity or IntegrityRequirement()))
+        super().__init__()
+        self._method_name, self._z_bounds_m = SnapshotMethod(method), z_bounds_m
         self._admission = Admission()
         self._admission.choice.only_site = NO_SITE if site is None else site
         self.almanac = AlmanacAssembly()
         self._schedule: Schedule | None = None
         self._scale: tuple[int, int] | None = None
         """Master time and tag time, both unwrapped, when last compared."""
-        self._method: Estimation | Snapshots | None = None
+        self._method: Snapshots | None = None
         self._method_key: object = None
         self._superframe_ticks = 0
         self._followed = FollowedMaster()
-        self._master_scale = MasterScale()
         self._master: int | None = None
         self._positions: dict[int, Array] = {}
         self._positions_issue: int | None = None
@@ -80,13 +61,9 @@ class Receiver(BeaconReceiver):
         return self._admission
 
     @property
-    def method(self) -> Estimation | Snapshots | None:
+    def method(self) -> Snapshots | None:
         """The positioning method in use; None before the almanac is known."""
         return self._method
-
-    @property
-    def _estimation(self) -> Estimation | None:
-        return self._method if isinstance(self._method, Estimation) else None
 
     @property
     def heard_site(self) -> HeardSite | None:
@@ -154,35 +131,22 @@ class Receiver(BeaconReceiver):
             return NoFixReason.NO_ALMANAC
         return method.update(self._observation(beacon, reception, anchor_m, rx_ticks, tx_ticks))
 
+    def hear_other(self) -> None:
+        """Count a beacon of protocol 2, which has no master."""
+        self.counters["other-version"] += 1
+        if not self.counters["heard"]:
+            self.reason = NoFixReason.NO_MASTER
+
     def _observation(
         self, beacon: Beacon, reception: Reception, anchor_m: Array, rx_ticks: int, tx_ticks: int
     ) -> Observation:
-        """The observation of a beacon: filters get its relays, snapshots its round and the master's stamp."""
-        ticks_master, fraction, variance_m2 = self._master_time(beacon, rx_ticks)
-        factor = variance_factor_of(reception.diagnostics)
-        if self._options.method not in FILTERS:
-            heard = beacon.master_heard if beacon.master == self._master else None
-            master_sequence, master_rx_ticks = _stamp_of(heard, tx_ticks)
-            return Observation(
-                beacon.anchor, anchor_m, self._round(beacon), beacon.sequence, rx_ticks, tx_ticks, master_sequence,
-                master_rx_ticks, ticks_master, fraction, variance_m2, (), None, factor,
-            )  # fmt: skip
+        """The observation of a beacon, with its round and the master's stamp."""
+        heard = beacon.master_heard if beacon.master == self._master else None
+        master_sequence, master_rx_ticks = _stamp_of(heard, tx_ticks)
         return Observation(
-            beacon.anchor, anchor_m, 0, beacon.sequence, rx_ticks, tx_ticks, None, None, ticks_master, fraction,
-            variance_m2, (), self._report(beacon, tx_ticks, ticks_master), factor,
-            packed_relays(reception.frame, beacon), phase_of(reception),
+            beacon.anchor, anchor_m, self._round(beacon), beacon.sequence, rx_ticks, tx_ticks, master_sequence,
+            master_rx_ticks, *self._master_time(beacon, rx_ticks), variance_factor_of(reception.diagnostics),
         )  # fmt: skip
-
-    def _report(self, beacon: Beacon, tx_ticks: int, ticks_master: int | None) -> tuple[int, int] | None:
-        """An anchor's report of its clock against the master's (``Observation.report``)."""
-        if beacon.master_time is None or ticks_master is None:
-            return None
-        master_term, subticks = master_term_of(beacon), beacon.master_time.tx_subticks_master % SUBTICKS
-        site_subticks = ticks_master * SUBTICKS + subticks
-        if beacon.anchor == beacon.master:
-            self._master_scale.update(master_term, site_subticks, tx_ticks)
-        difference = self._master_scale.difference(master_term, site_subticks, tx_ticks)
-        return None if difference is None else (beacon.master, difference)
 
     def _round(self, beacon: Beacon) -> int:
         """Round of a frame, counted from the master's slot: what follows a frame of the master refers to it."""
@@ -214,14 +178,11 @@ class Receiver(BeaconReceiver):
 
     def _forget_stamps(self) -> None:
         self._scale = None
-        self._followed, self._master_scale = FollowedMaster(), MasterScale()
+        self._followed = FollowedMaster()
         self._method = self._method_key = None
 
     def _read_almanac(self, beacon: Beacon) -> None:
-        """Add the page. Another issue, schedule, noise or accuracy replaces the method.
-
-        So does another master if the method uses the master's own stamps; filters continue.
-        """
+        """Add the page. Another issue, schedule, noise or master replaces the method."""
         almanac, master = self.almanac, self._followed.master
         if almanac.add_page(beacon.almanac_issue, beacon.page):
             before, issue = self._positions, self._positions_issue
@@ -239,29 +200,17 @@ class Receiver(BeaconReceiver):
 
     def _choose_method(self) -> None:
         """Create the method that almanac and master require, unless it is in use already."""
-        almanac, options, master = self.almanac, self._options, self._master
-        method_master = None if options.method in FILTERS else master
-        schedule_page, noise, accuracy = almanac.schedule, almanac.noise, almanac.accuracy
-        method_key = (almanac.issue, schedule_page, noise, accuracy, method_master)
-        if method_key != self._method_key:
-            self._method_key, self._method = method_key, None
-            if master is not None and schedule_page is not None and noise is not None:
-                self._schedule = schedule_from_page(schedule_page)
-                self._superframe_ticks = self._schedule.superframe_ticks
-                self._method = self._new_method(master, schedule_page, noise, accuracy)
-
-    def _new_method(
-        self, master: int, schedule: SchedulePage, noise: NoisePage, accuracy: AccuracyPage
-    ) -> Estimation | Snapshots:
-        """Create the method for a site with this master, schedule and noise."""
-        options, height_m = self._options, schedule.tag_height_m
-        if options.method not in FILTERS:
-            variances = stamp_variances(noise)
-            settings = SnapshotSettings(master, schedule.anchors, *variances, height_m, options.z_bounds_m)
-            return Snapshots(SnapshotMethod(options.method), settings, self._admission.time)
-        superframe_s = to_seconds(self._superframe_ticks)
-        assumed = estimator_settings(options.qa, height_m, noise, accuracy, superframe_s)
-        return Estimation(as_required(assumed, options), options.z_bounds_m, self._admission.time, superframe_s)
+        almanac, master, schedule, noise = self.almanac, self._master, self.almanac.schedule, self.almanac.noise
+        method_key = (almanac.issue, schedule, noise, master)
+        if method_key == self._method_key:
+            return
+        self._method_key, self._method = method_key, None
+        if master is not None and schedule is not None and noise is not None:
+            self._schedule = schedule_from_page(schedule)
+            self._superframe_ticks = self._schedule.superframe_ticks
+            heights = schedule.tag_height_m, self._z_bounds_m
+            settings = SnapshotSettings(master, schedule.anchors, *stamp_variances(noise), *heights)
+            self._method = Snapshots(self._method_name, settings, self._admission.time)
 
 
 def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[None, None]:

@@ -13,9 +13,32 @@ from msgspec import Struct
 
 from skyless.core.arrays import Array, Matrix, Vector
 from skyless.core.fix import Fix, NoFixReason
-from skyless.core.observation import Observation
 from skyless.core.tag.position import NoSolution, Solution, locate
 from skyless.core.ticks import FLIGHT_SLACK_TICKS, TICK_M, FixTime, fix_time_s, may_elapse
+
+
+class Observation(Struct, frozen=True, gc=False):
+    """One beacon as the methods see it, every stamp unwrapped on its own clock."""
+
+    anchor: int
+    anchor_m: Array
+    """Shape (3,)."""
+    round: int
+    """Counts the frames that each node sends: the superframe, or a fraction of it with several frames per node."""
+    sequence: int
+    rx_ticks_tag: int
+    tx_ticks_anchor: int
+    master_sequence: int | None
+    """Sequence number of the last master beacon that the anchor received."""
+    master_rx_ticks_anchor: int | None
+    """The anchor's RX stamp of that beacon."""
+    tx_ticks_master: int | None
+    """TX time on the master's scale, whole ticks; None while the anchor does not know it."""
+    tx_fraction_ticks: float
+    tx_variance_m2: float
+    """Variance of the TX time on the master's scale, from the anchor's clock filter."""
+    rx_variance_factor: float = 1.0
+    """Factor on the variance of this reception, at least 1, from the radio's diagnostics (``variance_factor``)."""
 
 
 class SnapshotMethod(StrEnum):

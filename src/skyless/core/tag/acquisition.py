@@ -2,7 +2,7 @@
 
 When anchor i relays its reception of a packet of anchor j that the tag received too, the offset between the two
 anchors' clocks at that moment is known up to noise. Along such links all TX times are converted to the clock of one
-anchor, unless more anchors state theirs on the master's scale. The tag's clock is up to 20 ppm off, so pseudoranges
+anchor. The tag's clock is up to 20 ppm off, so pseudoranges
 drift by tens of metres within one superframe. Two packets of the same anchor measure that drift; the newest
 pseudoranges of all anchors are then propagated to a common time and solved in closed form.
 """
@@ -111,8 +111,6 @@ class Acquisition(Record):
     has_been_wide: bool
     wide_ticks: Ticks
     """Time of the first start that was too wide to use."""
-    is_linked: bool
-    """Whether the common scale comes from relays rather than from the anchors' stated times."""
     is_contradicted: bool
     contradicted_ticks: Ticks
     """When packets first contradicted each other."""
@@ -306,11 +304,9 @@ def _anchor_of(q: Acquisition, pair: int) -> int:
 
 
 def _put_on_one_scale(q: Acquisition, now: Ticks) -> None:
-    """Convert TX times to the clock of the anchor that reaches most others, or to the master's if that covers more."""
-    stated = 0
+    """Convert TX times to the clock of the anchor that reaches most others; leave the others out."""
     for pair in range(q.pair_count):
         one = q.heard[q.pairs[pair]]
-        stated += 1 if one.older.packet.is_stated and one.newer.packet.is_stated else 0
         _measure_rate(q, pair, one.older.packet, one.newer.packet)
     _forget_links_before(q, now)
     q.best.count = 0
@@ -320,17 +316,11 @@ def _put_on_one_scale(q: Acquisition, now: Ticks) -> None:
             if q.reach.count > q.best.count:
                 q.best = q.reach
     kept = 0
-    q.is_linked = q.best.count >= stated
     for pair in range(q.pair_count):
         one = q.heard[q.pairs[pair]]
-        is_kept = one.older.packet.is_stated and one.newer.packet.is_stated
-        one.older.scaled, one.newer.scaled = one.older.packet.stated, one.newer.packet.stated
-        if q.is_linked:
-            is_kept = q.best.is_reached[pair] == 1
-            if is_kept:
-                _convert(q, pair, one.older)
-                _convert(q, pair, one.newer)
-        if is_kept:
+        if q.best.is_reached[pair] == 1:
+            _convert(q, pair, one.older)
+            _convert(q, pair, one.newer)
             q.clock_rates_mps[kept] = _clock_rate_mps(one)
             q.pairs[kept] = q.pairs[pair]
             kept += 1

@@ -89,7 +89,6 @@ class Course(Record):
     may_begin_again: bool = True
     """Whether a start with a poor fit may be abandoned: not twice in a row."""
     heights_rejected: int
-    master_less_tag_ticks: Ticks
     started_ticks: Ticks
     newest_ticks: Ticks
     in_use_s: float
@@ -124,7 +123,7 @@ def settle(c: Course, s: State, time: FixTime, rx_ticks: Ticks) -> int:
     """Return FIX or BAD_GEOMETRY: a 3-D fix needs a height standard deviation within the extent of the anchors."""
     if s.dim == AXES and s.P[at(2, 2)] > square(c.extent_m):
         return BAD_GEOMETRY
-    c.time_ticks = fix_time_ticks(time, rx_ticks + c.master_less_tag_ticks, rx_ticks)
+    c.time_ticks = fix_time_ticks(time, rx_ticks, rx_ticks)
     return FIX
 
 
@@ -240,7 +239,7 @@ def begin_course(c: Course, q: Acquisition) -> None:
     c.open_range_errors = c.is_open = c.start_was_contradicted = False
     c.relays_may_contradict = c.may_begin_again = True
     c.heights_rejected = c.count = 0
-    c.master_less_tag_ticks = c.started_ticks = c.newest_ticks = c.checked_ticks = 0
+    c.started_ticks = c.newest_ticks = c.checked_ticks = 0
     c.late_share = c.extent_m = 0.0
     c.misfit = NOBODY
     c.changes += 1
@@ -298,7 +297,7 @@ def follow(
         return OUTLIER  # single packets are late; the next ones will not be
     if c.superframe_s > c.tuning.longest_superframe_s:
         _fill_alone(c, q)
-        c.time_ticks = fix_time_ticks(time, rx_ticks + c.master_less_tag_ticks, rx_ticks)
+        c.time_ticks = fix_time_ticks(time, rx_ticks, rx_ticks)
         return START_FIX
     return settle(c, s, time, rx_ticks) if _begin_filter(c, s, q, relays) else SEARCHING
 
@@ -429,7 +428,7 @@ def _choose_packets(c: Course, q: Acquisition, b: Beginning) -> None:
     an older one may be late, so its variance is increased where relays determine the anchor's clock too.
     """
     factor = 1.0
-    if q.is_linked and q.is_contradicted and not q.start.is_contradicted:
+    if q.is_contradicted and not q.start.is_contradicted:
         factor += square(c.tuning.lasting_std_m) / c.settings.rx_variance_m2
     for place in range(q.count):
         if _is_chosen(c, q, place):
@@ -453,7 +452,10 @@ def _insert_packet(b: Beginning, one: HeardPacket, factor: float) -> None:
 def _is_chosen(c: Course, q: Acquisition, place: int) -> bool:
     """Whether the filter starts with the anchor at index ``place`` of ``heard``."""
     start = q.start
-    if c.most_anchors == 0 or (start.has_misfit and q.heard[place].newer.packet.place.anchor == start.misfit):
+    is_slow = c.superframe_s > c.tuning.slow_superframe_s  # the start is from the anchors of half a second only
+    if c.most_anchors == 0 or (is_slow and q.count <= c.most_anchors):
+        return True
+    if start.has_misfit and q.heard[place].newer.packet.place.anchor == start.misfit:
         return True
     own_m = _distance_m(c, q.heard[place].newer.packet.place.position_m, start.position_m)
     is_used, nearer = False, 0

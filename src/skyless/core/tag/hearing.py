@@ -5,7 +5,15 @@ from typing import Final
 from skyless.core.air.almanac import period_ticks
 from skyless.core.air.beacon import INTACT, MAX_HEARD, read_frame
 from skyless.core.air.frame import HEARD_BYTES, signed, variance_factor
-from skyless.core.air.neighbours import Neighbour, StatedPlace, find_neighbour, is_confirmed, is_relayed, wake_times
+from skyless.core.air.neighbours import (
+    Neighbour,
+    StatedPlace,
+    find_neighbour,
+    is_confirmed,
+    is_present,
+    is_relayed,
+    wake_times,
+)
 from skyless.core.air.site_choice import note_fix, restart_choice
 from skyless.core.air.site_pages import (
     ACCURACY_KIND,
@@ -15,7 +23,6 @@ from skyless.core.air.site_pages import (
     NO_ISSUE,
     NOISE_KIND,
     OTHER_SETTINGS,
-    PRESENT_TICKS,
     SITE_KIND,
     SitePages,
     note_page,
@@ -161,15 +168,15 @@ def _begin_here(t: Tag, q: Acquisition) -> None:
 
 def _begin_with_pages(t: Tag, q: Acquisition) -> None:
     """Start with the pages in use and the longest period of the anchors that are present."""
-    oldest_ticks: Ticks = 0
+    newest_ticks: Ticks = 0
     neighbours = t.admission.neighbours
     for row in range(neighbours.count):
         if neighbours.rows[row].frames > 0:
-            oldest_ticks = max(oldest_ticks, neighbours.rows[row].rx_ticks)
+            newest_ticks = max(newest_ticks, neighbours.rows[row].rx_ticks)
     t.period_ticks = 0
     for row in range(neighbours.count):
         n = neighbours.rows[row]
-        if n.frames > 0 and n.rx_ticks >= oldest_ticks - PRESENT_TICKS:
+        if n.frames > 0 and is_present(n, newest_ticks):
             t.period_ticks = max(t.period_ticks, period_ticks(n.period_code))
     if t.course.is_starting:
         _forget_unconfirmed(t, q)
@@ -281,7 +288,7 @@ def _have_most_moved(t: Tag) -> bool:
     present, moved = 0, 0
     for row in range(t.admission.neighbours.count):
         n = t.admission.neighbours.rows[row]
-        if n.has_place and n.was_relayed and n.rx_ticks > t.admission.rx_ticks - PRESENT_TICKS:
+        if n.has_place and n.was_relayed and is_present(n, t.admission.rx_ticks):
             present += 1
             moved += 1 if n.has_moved else 0
     return 2 * moved > present
@@ -309,6 +316,7 @@ def hear_frame(
     If unknown, ``host_s`` and the powers are NaN and the phase is negative.
     """
     fault = read_frame(frame, length, t.beacon)
+    t.packet.report_variance_m2 = 0.0  # only protocol 1 has reports
     if fault != INTACT:
         return MALFORMED + fault
     return hear_fields(t, s, q, frame, rx_counter, host_s, rx_power_dbm, first_path_power_dbm, phase_cycles)
@@ -420,5 +428,4 @@ def _fill_packet(t: Tag, n: Neighbour, factor: float) -> None:
     for axis in range(AXES):
         place.position_m[axis] = place_m(n, t.origin_mm, axis)
     packet.sequence, packet.rx_ticks, packet.tx_ticks = n.sequence, t.admission.rx_ticks, n.tx_ticks
-    packet.variance_factor, packet.master, t.relays.count = factor, -1, 0
-    packet.report_variance_m2, packet.relays_have_phases = 0.0, t.beacon.has_phases
+    packet.variance_factor, t.relays.count, packet.relays_have_phases = factor, 0, t.beacon.has_phases

@@ -3,12 +3,13 @@
 from typing import Final
 
 import numpy as np
+from msgspec import Struct
 
 from skyless.core.air.frame import two_bytes, unsigned
 from skyless.core.air.site_pages import STD_STEPS_PER_M, STEPS_PER_M, STEPS_PER_S
-from skyless.core.arrays import Array
-from skyless.core.estimator.estimator import NO_REPORT, Estimator, Report
-from skyless.core.estimator.process import ACCEPTED, Packet, Relays
+from skyless.core.arrays import Array, Vector
+from skyless.core.estimator.estimator import NO_REPORT, Estimator
+from skyless.core.estimator.process import ACCEPTED
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import AXES
 from skyless.core.fix import Fix, NoFixReason
@@ -17,7 +18,6 @@ from skyless.core.native.arithmetic import square
 from skyless.core.native.library import compiled
 from skyless.core.native.records import Bytes
 from skyless.core.native.views import view
-from skyless.core.observation import Observation
 from skyless.core.tag.acquisition import Acquisition
 from skyless.core.tag.following import (
     BAD_GEOMETRY,
@@ -37,6 +37,23 @@ from skyless.core.tag.following import (
     settle,
 )
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S, FixTime
+
+
+class Observation(Struct, frozen=True, gc=False):
+    """A packet of a system without a master as the tag received it; integers never wrap."""
+
+    anchor: int
+    anchor_m: Vector
+    """Shape (3,)."""
+    sequence: int
+    rx_ticks_tag: int
+    tx_ticks_anchor: int
+    relays: tuple[tuple[int, int, int], ...]
+    """The anchor's receptions of others: (anchor, sequence number, own RX stamp, unwrapped)."""
+    phase_cycles: float = -1.0
+    """Carrier phase as the tag received it, negative if unknown."""
+    relay_phases: tuple[float, ...] = ()
+    """Phases of ``relays``, as anchors received each other."""
 
 
 class Estimation:
@@ -95,11 +112,14 @@ class Estimation:
 
     def update(self, observation: Observation) -> Fix | NoFixReason:
         """Process one observation. Once started, every accepted packet gives a fix."""
-        if observation.tx_ticks_master is not None:
-            self.course.master_less_tag_ticks = observation.tx_ticks_master - observation.rx_ticks_tag
-        given, relays = self._packet(observation), observation.packed_relays
-        state = self._estimator.state
-        return self.result_of(_follow(self.course, state, self.search, self._time, *given, relays, len(relays)))
+        o, state = observation, self._estimator.state
+        self._estimator.know_anchor(o.anchor, o.anchor_m)
+        packet, relays = self._estimator.packet_of(
+            o.anchor, o.sequence, o.rx_ticks_tag, o.tx_ticks_anchor, o.relays, NO_REPORT, 1.0, o.phase_cycles,
+            o.relay_phases,
+        )  # fmt: skip
+        packet.place.is_open = o.anchor == self.course.misfit
+        return self.result_of(_follow(self.course, state, self.search, self._time, packet, relays, b"", 0))
 
     def result_of(self, outcome: int) -> Fix | NoFixReason:
         """Convert a packet's outcome to a fix or a reason."""
@@ -143,32 +163,6 @@ class Estimation:
         if self.is_starting:
             return NoFixReason.RESIDUALS
         return self.result_of(settle(self.course, self._estimator.state, self._time, observation.rx_ticks_tag))
-
-    def _packet(self, observation: Observation) -> tuple[Packet, Relays]:
-        self._estimator.know_anchor(observation.anchor, observation.anchor_m)
-        packet, relays = self._estimator.packet_of(
-            observation.anchor,
-            observation.sequence,
-            observation.rx_ticks_tag,
-            observation.tx_ticks_anchor,
-            observation.relays,
-            self._report(observation),
-            observation.rx_variance_factor,
-            observation.phase_cycles,
-            observation.relay_phases,
-        )
-        packet.place.is_open = observation.anchor == self.course.misfit
-        packet.is_stated = observation.tx_ticks_master is not None
-        packet.stated.ticks = observation.tx_ticks_master or 0
-        packet.stated.fraction_ticks = observation.tx_fraction_ticks
-        packet.stated.variance_m2 = observation.tx_variance_m2
-        return packet, relays
-
-    def _report(self, observation: Observation) -> Report:
-        """The anchor's report of its clock against the master's."""
-        if observation.report is None or observation.tx_variance_m2 <= 0.0:
-            return NO_REPORT
-        return Report(*observation.report, observation.tx_variance_m2)
 
 
 REASONS: Final = {

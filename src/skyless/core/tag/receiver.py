@@ -14,13 +14,13 @@ from msgspec import Struct
 from skyless.core.air.almanac import AccuracyPage, GeoreferencePage, NoisePage
 from skyless.core.air.beacon import FAULTS, Beacon, fields_of
 from skyless.core.air.frame import Reception, phase_of, powers_dbm
-from skyless.core.air.site_choice import NO_SITE
+from skyless.core.air.site_choice import NO_SITE, SITE_MASK
 from skyless.core.air.site_pages import LocalAlmanac, encode_page
 from skyless.core.clock_filter import stamp_variance_m2
+from skyless.core.estimator.estimator import NO_REPORT, Report
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.native.library import compiled
 from skyless.core.tag.admission import COUNTER_JUMPED, DROP_COUNTERS, SITE_CHANGED, Admission, Tag
 from skyless.core.tag.following import FIX
@@ -42,19 +42,6 @@ from skyless.core.ticks import FixTime
 
 NOT_DROPS: Final = frozenset({"heard", "fixes", "anchor-restart", "counter-jump", "site-change"})
 """Counters of a receiver that do not count dropped frames."""
-
-
-class MethodOptions(Struct, frozen=True):
-    """Options that the tag's owner sets."""
-
-    method: str
-    """One of ``METHODS``."""
-    qa: float
-    """Spectral density of the tag's acceleration, m²/s³ per axis (filters)."""
-    z_bounds_m: tuple[float, float] | None
-    """Height bounds that choose between mirror solutions."""
-    integrity: IntegrityRequirement
-    """Requirements for the protection levels (``joint``)."""
 
 
 class HeardSite(Struct, frozen=True):
@@ -105,11 +92,10 @@ class TagReceiver(SiteListener, Protocol):
 class BeaconReceiver(ABC):
     """A listening tag that understands one protocol."""
 
-    def __init__(self, options: MethodOptions) -> None:
+    def __init__(self) -> None:
         """Create a tag that has heard nothing."""
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
-        self._options = options
 
     @property
     @abstractmethod
@@ -128,9 +114,9 @@ class BeaconReceiver(ABC):
         """The site in use, once a tag knows all that it needs of it."""
 
     @property
-    @abstractmethod
     def _estimation(self) -> Estimation | None:
-        """The estimator, if the method in use is ``joint``."""
+        """The estimator, if the method is ``joint`` and in use."""
+        return None
 
     @property
     def multipath_m(self) -> tuple[float, float] | None:
@@ -186,20 +172,10 @@ class BeaconReceiver(ABC):
 
 
 def _site_of(site: int) -> int | None:
-    return None if site == NO_SITE else site
+    return None if site == NO_SITE else site & SITE_MASK
 
 
 # Settings of a tag's filter from pages and options
-
-
-def as_required(settings: EstimatorSettings, options: MethodOptions) -> EstimatorSettings:
-    """The settings with the requirements for the protection levels filled in."""
-    return settings.changed(
-        max_acceleration_mps2=options.integrity.max_acceleration_mps2,
-        integrity_risk=options.integrity.risk,
-        alert_limit_m=options.integrity.alert_limit_m,
-        height_std_m=options.integrity.height_std_m,
-    )
 
 
 def stamp_variances(noise: NoisePage) -> tuple[float, float]:
@@ -253,17 +229,12 @@ class Receiver(BeaconReceiver):
         ``z_bounds_m``: height bounds that choose between mirror solutions. ``integrity``: requirements for the
         protection levels.
         """
-        super().__init__(MethodOptions(DEFAULT_METHOD, qa, z_bounds_m, integrity or IntegrityRequirement()))
-        self._begin(NO_SITE if site is None else site)
-
-    def _begin(self, site: int) -> None:
-        """Reset to a tag with these options that has heard nothing."""
-        options, required = self._options, self._options.integrity
+        super().__init__()
+        required = integrity or IntegrityRequirement()
         limit_m = nan if required.alert_limit_m is None else required.alert_limit_m
-        bounds_m = options.z_bounds_m or (-inf, inf)
         levels = required.height_std_m, required.max_acceleration_mps2, required.risk, limit_m
         self._tag = Tag()
-        _begin_tag(self._tag, site, options.qa, *bounds_m, *levels)
+        _begin_tag(self._tag, NO_SITE if site is None else site, qa, *(z_bounds_m or (-inf, inf)), *levels)
         self._tag.course.tuning = TUNING
         self._method = Estimation(self._tag.owner, course=self._tag.course)
 
@@ -332,9 +303,13 @@ class Receiver(BeaconReceiver):
             return None
         return self._after(outcome)
 
-    def hear_beacon(self, beacon: Beacon, reception: Reception) -> Fix | None:
-        """Process a decoded beacon as ``hear`` does; ``reception.frame`` may be empty."""
-        page, self._tag.beacon = b"", fields_of(beacon)
+    def hear_beacon(self, beacon: Beacon, reception: Reception, report: Report = NO_REPORT) -> Fix | None:
+        """Process a decoded beacon as ``hear`` does; ``reception.frame`` may be empty.
+
+        ``report``: what an anchor of protocol 1 knows of its clock.
+        """
+        page, packet, self._tag.beacon = b"", self._tag.packet, fields_of(beacon)
+        packet.master, packet.subticks, packet.report_variance_m2 = report.master, report.subticks, report.variance_m2
         if beacon.page is not None:
             page, self._tag.beacon.page_at = b"\0" + encode_page(beacon.page), 1
         host_s = nan if reception.host_s is None else reception.host_s

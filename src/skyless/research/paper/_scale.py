@@ -12,8 +12,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.frame import Reception
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.arrays import Array, Integers
-from skyless.core.protocol1.receiver import Receiver
 from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Section, Verdict, grouped
 from skyless.research.studies.runner import Cell
 from skyless.sim.evaluation.fleet import world_of
@@ -93,7 +93,7 @@ def run_world(tags: int, seed: int) -> FleetResult:
     digest, cpu_s, truth_m = hashlib.sha256(), 0.0, path.position(0.0)
     del world
     for row, own in enumerate(np.array(stamps).T.tolist()):
-        receiver, begun_s = Receiver("joint"), 0.0
+        receiver, begun_s = AnyReceiver(), 0.0
         for (frame, end_s), rx_ticks in zip(received, own, strict=True):
             judged = end_s >= _JUDGED_FROM_S
             begun_s = begun_s or (time.process_time() if judged else 0.0)

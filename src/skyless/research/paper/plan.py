@@ -15,11 +15,11 @@ import numpy as np
 from matplotlib.figure import Figure
 from msgspec import Struct
 
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import schedule_of
-from skyless.core.protocol1.receiver import Receiver
 from skyless.core.protocol1.snapshots import (
     averaged_offset,
     protocol_interval,
@@ -462,7 +462,7 @@ def listen(
     """
     world = world_of(site, [trajectory for trajectory, _ in tags], impairments, seed)
     superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
-    listeners = [[(Receiver(method), _Log(site), most) for method, most in methods.items()] for _, methods in tags]
+    listeners = [[(AnyReceiver(method), _Log(site), most) for method, most in methods.items()] for _, methods in tags]
     most_fixes = max(most for _, methods in tags for most in methods.values())
     end_s = until_s if until_s is not None else _WARMUP_S + 1.02 * most_fixes * superframe_s + 1.0
     now_s = 0.0
@@ -500,7 +500,7 @@ def receptions(
 ) -> list[TimedReception]:
     """All receptions of tags until a true time, and by which methods they gave a fix."""
     world = World(site, lambda anchor: Anchor(site, anchor), tags, lab_impairments(RADIO_PS), seed)
-    receivers = [{method: Receiver(method) for method in methods} for _ in tags]
+    receivers = [{method: AnyReceiver(method) for method in methods} for _ in tags]
     anchors_m = {anchor.id: np.array((anchor.x_m, anchor.y_m, anchor.z_m)) for anchor in site.anchors}
     heard = []
     for broadcast in world.run(until_s):

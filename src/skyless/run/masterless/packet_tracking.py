@@ -14,8 +14,7 @@ import numpy as np
 from skyless.core.air.masterless_packets import Packet, Point, Relay
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
-from skyless.core.observation import Observation
-from skyless.core.tag.joint import Estimation
+from skyless.core.tag.joint import Estimation, Observation
 from skyless.core.ticks import (
     LAST_TICKS,
     SPEED_OF_LIGHT_MPS,
@@ -189,18 +188,12 @@ class PacketTracking:
         observation = Observation(
             packet.anchor,
             anchor.anchor_m,
-            0,
             packet.sequence,
             rx_ticks,
             anchor.tx_ticks,
-            None,
-            None,
-            None,
-            0.0,
-            0.0,
             tuple(relays),
-            phase_cycles=_phase_of(packet),
-            relay_phases=tuple(phases),
+            _phase_of(packet),
+            tuple(phases),
         )
         if self._delays.contradictions_m:
             self._tracking.estimator.withhold_levels()

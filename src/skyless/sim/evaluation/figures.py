@@ -268,8 +268,8 @@ def truth_at(truth: Truth | None, times_s: Vector) -> Matrix:
     places_m = np.column_stack([np.interp(times_s, known_s, axis, np.nan, np.nan) for axis in truth.position_m.T])
     after = np.searchsorted(known_s, times_s).clip(1, max(len(known_s) - 1, 1))
     if len(known_s) > 1:
-        in_gap = (known_s[after] - known_s[after - 1] > MAX_GAP_S) & ~np.isin(times_s, known_s)
-        places_m[in_gap] = np.nan
+        before_s, after_s = known_s[after - 1], known_s[after]
+        places_m[(after_s - before_s > MAX_GAP_S) & (times_s != before_s) & (times_s != after_s)] = np.nan
     return places_m
 
 
