@@ -41,7 +41,7 @@ def test_the_machines_classes_load_no_library_that_is_slow_to_load():
 
 def test_a_value_loads_no_estimator():
     """Value types and the interface of methods do not need what computes them."""
-    modules = "fix, integrity, observation"
+    modules = "fix, integrity"
     script = f"import sys; from skyless import Fix; from skyless.core import {modules}; print(*sys.modules)"
     loaded = subprocess.check_output([sys.executable, "-c", script], text=True).split()
     below = ("skyless.core.estimator", "skyless.core.tag", "skyless.run.masterless")

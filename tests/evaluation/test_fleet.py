@@ -163,7 +163,7 @@ def test_two_frames_per_superframe_give_twice_the_fixes():
         rate = 400 if method == "joint" else 2 / 30e-3
         assert len(errors) == pytest.approx(rate * 1.9, rel=0.05)
         assert max(errors) < 6.0
-        assert fleet.drops == {}
+        assert set(fleet.drops) <= {"no-position"}  # before the almanac is complete
 
 
 @pytest.mark.parametrize("anchors", [LAB.anchors[:1], LAB.anchors[:2]])

@@ -43,13 +43,13 @@ def test_the_clock_goes_on_over_long_sleeps_in_which_nothing_draws_current(folde
     stage.run(0.301)
     for _ in range(20):
         stage.run(2e-3 * milliseconds / 20)
-        if stage.image.is_asleep and milliseconds > 1 and len(stage.lines) < 4:
+        if stage.image.is_asleep and milliseconds > 1 and len(stage.sent) < 16:
             assert not stage.image.drawing
     stage.run(0.1)
     before, after, again, end = words(stage.sent)
     for begin, over in ((before, after), (again, end)):
         assert 0 <= (over - begin - 1000 * milliseconds + 100) % 2**32 <= 100 + 600  # the crystal starts in 360 us
-    (begin_us, _), _, _, (end_us, _) = stage.lines
+    begin_us, end_us = stage.lines[0][0], stage.lines[-1][0]  # a word may come in two parts
     assert (end - before) % 2**32 == pytest.approx((end_us - begin_us) % 2**32, abs=150.0)
     stage.write(b"x")
     stage.run(1e-3)

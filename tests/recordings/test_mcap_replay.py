@@ -148,13 +148,20 @@ def test_judged_against_the_recorded_truth(tmp_path):
         assert report.rate_hz == pytest.approx(400.0, rel=0.05)
 
 
+def damage(report):
+    """What was dropped but for beacons before the almanac is complete, where a recording begins."""
+    beginning = {"no-position", "unconfirmed-anchor"}
+    return {name: count for name, count in report.drops.items() if name not in beginning}
+
+
 def test_messages_that_come_twice_change_nothing(tmp_path):
     path = tmp_path / "twice.mcap"
     record(path, messages(2.0))
     (once,) = replayed(path)
     record(tmp_path / "two.mcap", changed(messages(2.0), lambda _, m: [m, m]))
     (twice,) = replayed(tmp_path / "two.mcap")
-    assert (twice.receptions, twice.fixes, twice.drops) == (once.receptions, once.fixes, {})
+    assert (twice.receptions, twice.fixes, twice.drops) == (once.receptions, once.fixes, once.drops)
+    assert damage(twice) == {}
 
 
 def test_a_lost_message_costs_no_more_than_its_receptions(tmp_path):
@@ -164,7 +171,7 @@ def test_a_lost_message_costs_no_more_than_its_receptions(tmp_path):
     (report,) = replayed(path)
     record(tmp_path / "all.mcap", messages(2.0))
     (whole,) = replayed(tmp_path / "all.mcap")
-    assert report.drops == {"gap-in-receptions": 1}
+    assert damage(report) == {"gap-in-receptions": 1}
     assert report.receptions == whole.receptions - len(lost[0].receptions)
     assert 0 <= whole.fixes - report.fixes <= len(lost[0].receptions) + 10
 
@@ -191,7 +198,7 @@ def test_impossible_receptions_are_counted(tmp_path):
     path = tmp_path / "impossible.mcap"
     record(path, changed(said, change))
     (report,) = replayed(path)
-    assert report.drops == {"impossible-reception": 3}
+    assert damage(report) == {"impossible-reception": 3}
 
 
 def test_another_method(tmp_path):

@@ -4,9 +4,12 @@ from collections import Counter
 from statistics import median
 from typing import Protocol
 
+from msgspec.structs import replace
+
 from skyless.core.air.almanac import suitable_period_s
 from skyless.core.air.beacon import Beacon, decode_cached
 from skyless.core.air.frame import Malformed, Reception, Transmission, has_version
+from skyless.core.air.site_choice import OF_PROTOCOL_1
 from skyless.core.anchor import Anchor, BeaconAuthentication
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.geometry import anchors_in_reach
@@ -171,7 +174,10 @@ class AnyReceiver:
     @property
     def heard_site(self) -> HeardSite | None:
         """Anchors and georeference of the site; None before they are known."""
-        return self._receiver.heard_site
+        found = self._receiver.heard_site
+        if found is None or not self._receiver.admission.choice.site & OF_PROTOCOL_1:
+            return found
+        return replace(found, is_complete=found.georeference is not None)
 
     def hear_height(self, height_m: float, std_m: float) -> bool:
         """Process a reading of the tag's height sensor, as ``Receiver.hear_height`` does."""

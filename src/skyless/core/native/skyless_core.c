@@ -6979,13 +6979,15 @@ INTERNAL int32_t process_rare(Tag *t, State *s, Acquisition *q, uint8_t *frame) 
     if (is_kept_apart(t, n)) {
         return MOVED_ANCHOR;
     }
+    if (!t->has_settings) {
+        if (n->has_place) {  /* other anchors may confirm this one before the pages are complete */
+            take_relays(&t->packet, &t->relays, t->beacon.relays, t->beacon.relay_bytes);
+            gather_packet(q, &t->packet, &t->relays);
+        }
+        return NO_PAGES;
+    }
     if (!n->has_place) {
         return NO_POSITION;
-    }
-    if (!t->has_settings) {  /* other anchors may confirm this one before the pages are complete */
-        take_relays(&t->packet, &t->relays, t->beacon.relays, t->beacon.relay_bytes);
-        gather_packet(q, &t->packet, &t->relays);
-        return NO_PAGES;
     }
     int32_t outcome = join(t, s, n);
     if (outcome != JOINS) {

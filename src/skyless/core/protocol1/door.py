@@ -50,7 +50,7 @@ class Door:
             self._issue,
             self._period_code,
             self._positions.get(beacon.anchor),
-            beacon.heard if beacon.master_heard is None else (beacon.master_heard, *beacon.heard),
+            beacon.relayed,
             0,
             page,
         )

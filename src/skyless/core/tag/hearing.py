@@ -208,12 +208,13 @@ def process_rare(t: Tag, s: State, q: Acquisition, frame: Bytes) -> int:
     _follow_moves(t, q, n)
     if _is_kept_apart(t, n):
         return MOVED_ANCHOR
+    if not t.has_settings:
+        if n.has_place:  # other anchors may confirm this one before the pages are complete
+            take_relays(t.packet, t.relays, t.beacon.relays, t.beacon.relay_bytes)
+            gather_packet(q, t.packet, t.relays)
+        return NO_PAGES
     if not n.has_place:
         return NO_POSITION
-    if not t.has_settings:  # other anchors may confirm this one before the pages are complete
-        take_relays(t.packet, t.relays, t.beacon.relays, t.beacon.relay_bytes)
-        gather_packet(q, t.packet, t.relays)
-        return NO_PAGES
     outcome = _join(t, s, n)
     if outcome != JOINS:
         return outcome
