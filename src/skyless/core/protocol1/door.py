@@ -57,13 +57,13 @@ class Door:
 
     def _read_almanac(self) -> None:
         almanac = self._almanac
+        self._positions, self._pages = {}, ()
+        if not almanac.complete or almanac.schedule is None or almanac.noise is None:
+            return  # a start from all anchors finds the one that contradicts the others
         self._positions = {
             anchor: protocol2.StatedPosition(*point_m, std_m=STATED_BY_PAGE)
             for anchor, point_m in almanac.anchors_m.items()
         }
-        self._pages = ()
-        if almanac.schedule is None or almanac.noise is None:
-            return
         schedule = schedule_from_page(almanac.schedule)
         self._period_code = period_code(1.0 / (schedule.superframe_rate_hz * schedule.frames_per_node))
         others: list[Page] = [almanac.noise, almanac.accuracy]
