@@ -13,8 +13,7 @@ from skyless.core.method_names import FILTERS
 from skyless.core.native.views import view
 from skyless.core.protocol1.anchor import Anchor, Role
 from skyless.core.protocol1.beacon import decode
-from skyless.core.protocol1.clock import SiteTime, is_newer
-from skyless.core.protocol1.receiver import MAX_CHANCE, MasterWatch
+from skyless.core.protocol1.clock import MAX_CHANCE, MasterWatch, SiteTime, is_newer
 from skyless.core.ticks import TICK_S, Unwrapper
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import AnchorOutage, Outage

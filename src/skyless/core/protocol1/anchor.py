@@ -26,8 +26,15 @@ from skyless.core.protocol1.beacon import (
     heard_capacity,
     schedule_of,
 )
-from skyless.core.protocol1.clock import TERMS, Confirmations, MasterTerm, SiteClock, is_newer, master_term_of
-from skyless.core.protocol1.receiver import MasterWatch
+from skyless.core.protocol1.clock import (
+    TERMS,
+    Confirmations,
+    MasterTerm,
+    MasterWatch,
+    SiteClock,
+    is_newer,
+    master_term_of,
+)
 from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import (
     DELAYED_TX_GRANULARITY_TICKS,

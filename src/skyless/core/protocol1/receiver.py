@@ -3,14 +3,12 @@
 It needs only beacons: anchors, schedule and noise figures come from the almanac on the air.
 """
 
-import math
 from math import nan
 from typing import Final
 
 import numpy as np
-from msgspec import Struct
 
-from skyless.core.air.frame import Heard, Malformed, Reception, variance_factor_of
+from skyless.core.air.frame import Heard, Malformed, Reception
 from skyless.core.air.site_choice import NO_SITE, note_fix
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix, NoFixReason
@@ -21,7 +19,7 @@ from skyless.core.protocol1.clock import FollowedMaster
 from skyless.core.protocol1.snapshots import Observation, SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.core.tag.admission import ADMITTED, SITE_CHANGED, Admission, admit_sender, admit_stamp
 from skyless.core.tag.receiver import BeaconReceiver, HeardSite, stamp_variances
-from skyless.core.ticks import FLIGHT_SLACK_TICKS, SUBTICKS, TICK_M, may_elapse, nearest
+from skyless.core.ticks import nearest
 
 
 class Receiver(BeaconReceiver):
@@ -45,8 +43,6 @@ class Receiver(BeaconReceiver):
         self._admission.choice.only_site = NO_SITE if site is None else site
         self.almanac = AlmanacAssembly()
         self._schedule: Schedule | None = None
-        self._scale: tuple[int, int] | None = None
-        """Master time and tag time, both unwrapped, when last compared."""
         self._method: Snapshots | None = None
         self._method_key: object = None
         self._superframe_ticks = 0
@@ -89,7 +85,7 @@ class Receiver(BeaconReceiver):
         if not self._admit(beacon, reception):
             return None
         self.counters["heard"] += 1
-        result = self._process(beacon, reception)
+        result = self._process(beacon)
         if isinstance(result, Fix):
             note_fix(self._admission.choice, self._admission.rx_ticks)
         return self._judge(result)
@@ -121,7 +117,7 @@ class Receiver(BeaconReceiver):
         self.counters["stale-master"] += 1
         return False
 
-    def _process(self, beacon: Beacon, reception: Reception) -> Fix | NoFixReason:
+    def _process(self, beacon: Beacon) -> Fix | NoFixReason:
         """Process an admitted beacon."""
         neighbours, rx_ticks = self._admission.neighbours, self._admission.rx_ticks
         tx_ticks = neighbours.rows[neighbours.row].tx_ticks
@@ -129,7 +125,7 @@ class Receiver(BeaconReceiver):
         method, anchor_m = self._method, self._positions.get(beacon.anchor)
         if method is None or anchor_m is None:
             return NoFixReason.NO_ALMANAC
-        return method.update(self._observation(beacon, reception, anchor_m, rx_ticks, tx_ticks))
+        return method.update(self._observation(beacon, anchor_m, rx_ticks, tx_ticks))
 
     def hear_other(self) -> None:
         """Count a beacon of protocol 2, which has no master."""
@@ -137,16 +133,12 @@ class Receiver(BeaconReceiver):
         if not self.counters["heard"]:
             self.reason = NoFixReason.NO_MASTER
 
-    def _observation(
-        self, beacon: Beacon, reception: Reception, anchor_m: Array, rx_ticks: int, tx_ticks: int
-    ) -> Observation:
+    def _observation(self, beacon: Beacon, anchor_m: Array, rx_ticks: int, tx_ticks: int) -> Observation:
         """The observation of a beacon, with its round and the master's stamp."""
         heard = beacon.master_heard if beacon.master == self._master else None
         master_sequence, master_rx_ticks = _stamp_of(heard, tx_ticks)
-        return Observation(
-            beacon.anchor, anchor_m, self._round(beacon), beacon.sequence, rx_ticks, tx_ticks, master_sequence,
-            master_rx_ticks, *self._master_time(beacon, rx_ticks), variance_factor_of(reception.diagnostics),
-        )  # fmt: skip
+        stamps = rx_ticks, tx_ticks, master_sequence, master_rx_ticks
+        return Observation(beacon.anchor, anchor_m, self._round(beacon), beacon.sequence, *stamps)
 
     def _round(self, beacon: Beacon) -> int:
         """Round of a frame, counted from the master's slot: what follows a frame of the master refers to it."""
@@ -158,26 +150,7 @@ class Receiver(BeaconReceiver):
             superframe += steps
         return superframe if schedule.frames_per_node == 1 else schedule.round_of(superframe, slot)
 
-    def _master_time(self, beacon: Beacon, rx_ticks: int) -> tuple[int | None, float, float]:
-        """TX time on the master's scale: unwrapped whole ticks, fraction, variance in m².
-
-        Only the master, and anchors that agree with previous beacons, advance the scale.
-        """
-        time, scale = beacon.master_time, self._scale
-        if time is None:
-            return None, 0.0, 0.0
-        whole, subticks = divmod(time.tx_subticks_master, SUBTICKS)
-        updates = scale is None or beacon.anchor == self._master
-        if scale is not None:
-            elapsed = rx_ticks - scale[1]
-            whole = nearest(whole, scale[0] + elapsed)
-            updates = updates or may_elapse(whole - scale[0], elapsed, FLIGHT_SLACK_TICKS)
-        if updates:
-            self._scale = (whole, rx_ticks)
-        return whole, subticks / SUBTICKS, (time.std_ticks * TICK_M) ** 2
-
     def _forget_stamps(self) -> None:
-        self._scale = None
         self._followed = FollowedMaster()
         self._method = self._method_key = None
 
@@ -220,74 +193,3 @@ def _stamp_of(heard: Heard | None, tx_ticks: int) -> tuple[int, int] | tuple[Non
 
 _admit_sender: Final = compiled(admit_sender)
 _admit_stamp: Final = compiled(admit_stamp)
-
-
-# Whether the master still lives, from its own beacons and from what others relay of them.
-#
-# Every listener estimates how often each link brings news of the master. A silent master is declared dead once its
-# silence is almost impossible on those links; lost frames alone do not replace a master.
-
-MAX_CHANCE: Final = 1e-10
-"""Chance of a silence, were the master alive, below which it is declared dead."""
-
-MEMORY: Final = 64
-"""Turns of the master over which a link's share is averaged."""
-
-RECENT_TURNS: Final = 8
-"""A link that has brought nothing for this number of turns does not count."""
-
-SEQUENCES: Final = 256
-
-
-class _Link(Struct):
-    """A source of news of the master: itself, or an anchor that receives it."""
-
-    sequence: int
-    """Sequence number of the master's last beacon that it reported."""
-    turns: int = 0
-    share: float = 0.5
-    """Part of the master's turns that it reports before the next one."""
-
-
-class MasterWatch:
-    """Tracks the sequence numbers of one master's beacons; a turn is one beacon that it should send."""
-
-    def __init__(self) -> None:
-        self.news_ticks = 0
-        """Own time of the last news, unwrapped."""
-        self._sequence: int | None = None
-        self._links: dict[int, _Link] = {}
-
-    def begin(self, now_ticks: int) -> None:
-        """Watch another master, which lives at this time."""
-        self.news_ticks, self._sequence = now_ticks, None
-        self._links.clear()
-
-    def update(self, source: int, sequence: int, now_ticks: int) -> None:
-        """Process the sequence number of the master's last beacon, from itself or an anchor that received it."""
-        if self._sequence is None or 0 < (sequence - self._sequence) % SEQUENCES < SEQUENCES // 2:
-            self._sequence, self.news_ticks = sequence, now_ticks
-        link = self._links.get(source)
-        if link is None:
-            self._links[source] = _Link(sequence)
-            return
-        turns = (sequence - link.sequence) % SEQUENCES
-        if not 0 < turns < SEQUENCES // 2:
-            return
-        for turn in range(1, turns + 1):
-            link.turns = min(link.turns + 1, MEMORY)
-            link.share += ((turn == turns) - link.share) / (link.turns + 2)
-        link.sequence = sequence
-
-    def is_dead(self, missed_turns: int) -> bool:
-        """Whether this number of turns without news shows that the master is dead."""
-        return missed_turns * self._surprise() > -math.log(MAX_CHANCE)
-
-    def _surprise(self) -> float:
-        """Negative logarithm of the chance that a turn of a living master brings no news."""
-        least = 1.0 / (MEMORY + 2)
-        return sum(
-            -math.log(max(1.0 - link.share, least))
-            for link in self._links.values()
-            if self._sequence is not None and (self._sequence - link.sequence) % SEQUENCES < RECENT_TURNS
-        )

@@ -32,13 +32,6 @@ class Observation(Struct, frozen=True, gc=False):
     """Sequence number of the last master beacon that the anchor received."""
     master_rx_ticks_anchor: int | None
     """The anchor's RX stamp of that beacon."""
-    tx_ticks_master: int | None
-    """TX time on the master's scale, whole ticks; None while the anchor does not know it."""
-    tx_fraction_ticks: float
-    tx_variance_m2: float
-    """Variance of the TX time on the master's scale, from the anchor's clock filter."""
-    rx_variance_factor: float = 1.0
-    """Factor on the variance of this reception, at least 1, from the radio's diagnostics (``variance_factor``)."""
 
 
 class SnapshotMethod(StrEnum):
