@@ -47,7 +47,6 @@ def problem_of(position_m, first, second, range_m, *, dimensions, delay_std_m, s
         second=np.asarray(second, np.int64),
         range_m=np.asarray(range_m, float),
         variance_m2=np.full(len(range_m), std_m**2),
-        delay_m=np.zeros(n),
         delay_variance_m2=np.full(n, delay_std_m**2),
         coordinate_m=fixed_m,
         coordinate_variance_m2=np.full((n, 3), np.inf),

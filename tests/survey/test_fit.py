@@ -109,7 +109,7 @@ def test_nothing_is_left_out_where_nothing_would_check_the_rest():
     range_m[first + second == 3] += [0.0, -0.11]
     problem = problem_of(position_m, first, second, range_m, dimensions=2, delay_std_m=0.02, std_m=0.03)
     taped = {"tape_first": [0], "tape_second": [3], "tape_m": [math.sqrt(40.5)], "tape_variance_m2": [0.005**2]}
-    problem = replace(problem, **{name: np.array(value) for name, value in taped.items()}, common_delay_m=np.ones(4))
+    problem = replace(problem, **{name: np.array(value) for name, value in taped.items()}, common_delay_m=1.0)
     fit = fit_robustly(problem, start_positions(problem), 0.03)
     assert fit.used.all()
     assert 0.03 <= fit.range_std_m <= 0.06
@@ -121,11 +121,9 @@ def test_nothing_is_left_out_where_nothing_would_check_the_rest():
 
 @pytest.mark.parametrize("common_m", [0.0, 0.1, 1e3])
 def test_weights_of_delays_are_the_root_of_their_information(common_m):
-    problem = draw(LAB, 1, delay_std_m=0.07).problem
-    common = np.array([common_m] * 5 + [0.0])
-    problem = replace(problem, common_delay_m=common)
+    problem = replace(draw(LAB, 1, delay_std_m=0.07).problem, common_delay_m=common_m)
     weights = delay_weights(problem)
-    covariance = np.diag(problem.delay_variance_m2) + np.outer(common, common)
+    covariance = np.diag(problem.delay_variance_m2) + common_m**2
     assert np.allclose(weights.T @ weights @ covariance, np.eye(6), atol=1e-6)
 
 

@@ -41,7 +41,7 @@ def problem_of(rng, positions_m, planar, range_std_m=RANGE_STD_M, delay_std_m=DE
     range_m = distance_m + delay_m[first] + delay_m[second] + rng.normal(0.0, range_std_m, len(first))
     is_free = np.ones((n, 3), dtype=bool)
     is_free[:, 2] = not planar
-    variances = np.full(len(first), range_std_m**2), np.zeros(n), np.full(n, delay_std_m**2)
+    variances = np.full(len(first), range_std_m**2), np.full(n, delay_std_m**2)
     known = np.zeros((n, 3)), np.full((n, 3), np.inf)
     nothing = np.zeros(0)
     return Problem(is_free, first, second, range_m, *variances, *known, NONE, NONE, nothing, nothing), delay_m

@@ -36,7 +36,7 @@ from skyless.site.channel import ChannelModel
 from skyless.site.survey.facts import Facts, PairRanges, Point, Survey, Tape
 from skyless.site.survey.fit import aligned_covariance
 from skyless.site.survey.pair_ranger import PairRanger
-from skyless.site.survey.problem import Problem, jacobian, superimposed
+from skyless.site.survey.problem import Problem, superimposed
 from skyless.site.survey.solve import run_survey
 from skyless.site.survey.surveyed_site import surveyed_site
 
@@ -278,7 +278,6 @@ def survey_bound_m(
         second=second,
         range_m=np.zeros(len(first)),
         variance_m2=np.full(len(first), stamp_m2 / (2.0 * superframes) + facts.pair_std_m**2),
-        delay_m=np.zeros(n),
         delay_variance_m2=np.full(n, facts.delay_std_m**2 + stamp_m2 / (4.0 * superframes)),
         coordinate_m=layout.position_m,
         coordinate_variance_m2=np.full((n, 3), facts.sketch_std_m**2 if facts.sketch_m else np.inf),
@@ -287,9 +286,7 @@ def survey_bound_m(
         tape_m=np.zeros(len(tape_first)),
         tape_variance_m2=np.array([tape.std_m**2 for tape in facts.tapes]),
     )
-    covariance = aligned_covariance(
-        problem, jacobian(problem, layout.position_m), layout.position_m, np.ones(n, dtype=bool)
-    )
+    covariance = aligned_covariance(problem, layout.position_m, np.ones(n, dtype=bool))
     return math.sqrt(float(np.trace(covariance[: 3 * n, : 3 * n])) / n)
 
 

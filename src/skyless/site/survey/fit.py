@@ -274,7 +274,7 @@ def _plain(problem: Problem, start_m: Array) -> Solutions:
 
 
 def _is_large(problem: Problem) -> bool:
-    return int(np.count_nonzero(problem.is_free)) + len(problem.delay_m) > _MANY_UNKNOWNS
+    return int(np.count_nonzero(problem.is_free)) + len(problem.is_free) > _MANY_UNKNOWNS
 
 
 def _huber(problem: Problem, start: Solutions) -> Solutions:
@@ -654,9 +654,8 @@ def aligned_to(problem: Problem, position_m: Array, target_m: Array) -> Array:
 
 def aligned_std_m(fit: RobustFit) -> Array:
     """Standard deviation of each anchor's position error after the best rigid alignment, all axes together, (n,)."""
-    position_m, n = fit.solution.position_m, len(fit.solution.position_m)
-    rows = jacobian(fit.problem, position_m, fit.weight)
-    covariance_m2 = aligned_covariance(fit.problem, rows, position_m, np.ones(n, bool))
+    n = len(fit.solution.position_m)
+    covariance_m2 = aligned_covariance(fit.problem, fit.solution.position_m, np.ones(n, bool), fit.weight)
     variance = np.diag(covariance_m2)[: 3 * n].reshape(n, 3).sum(axis=1)
     return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -771,13 +770,15 @@ def rank(rows: Array) -> int:
     return int(np.count_nonzero(np.linalg.eigvalsh(scaled) > _SAME)) if kept.any() else 0
 
 
-def aligned_covariance(problem: Problem, rows: Array, position_m: Array, core: Mask) -> Array:
+def aligned_covariance(problem: Problem, position_m: Array, core: Mask, weight: Array | None = None) -> Array:
     """Covariance of coordinates and delays after the best rigid alignment over the core, shape (4 n, 4 n).
 
     Rows of coordinates that are not estimated are 0; undetermined unknowns have a standard deviation of some 30 m.
+    ``weight``: see ``jacobian``.
     """
     used = unknown_columns(problem)
-    information = rows[:, used].T @ rows[:, used]
+    rows = jacobian(problem, position_m, weight)[:, used]
+    information = rows.T @ rows
     inside = np.concatenate([np.repeat(core, 3) & problem.is_free.ravel(), np.zeros(len(position_m), bool)])[used]
     motion = _rigid_motions(problem, position_m, inside, used)
     count, size = motion.shape[1], int(inside.sum())
@@ -810,20 +811,20 @@ def position_stds_m(problem: Problem, covariance_m2: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(variance.sum(axis=1), 0.0) / np.maximum(free, 1)))
 
 
-def determined_core(problem: Problem, rows: Array, position_m: Array, least: int) -> Mask:
+def determined_core(problem: Problem, position_m: Array, least: int, weight: Array) -> Mask:
     """Mask of the anchors whose standard deviation is at most ``max_std_m`` when aligned over themselves, shape (n,).
 
     All False if fewer than ``least`` remain.
     """
     core, most_m = np.ones(len(position_m), bool), max_std_m(problem)
     while core.sum() >= least:
-        std = position_stds_m(problem, aligned_covariance(problem, rows, position_m, core))
+        std = position_stds_m(problem, aligned_covariance(problem, position_m, core, weight))
         worst = float(std[core].max())
         if worst <= most_m:
             joins = ~core & (std <= most_m)
             if joins.any():
                 core = core | joins
-                std = position_stds_m(problem, aligned_covariance(problem, rows, position_m, core))
+                std = position_stds_m(problem, aligned_covariance(problem, position_m, core, weight))
                 core = core & (std <= most_m)
             return core
         # Equally uncertain anchors leave together, so that their order does not matter.

@@ -42,9 +42,8 @@ class Problem(Struct, frozen=True, eq=False):
     """Shape (m,)."""
     variance_m2: Array
     """Shape (m,): noise and constant error of each pair together."""
-    delay_m: Array
     delay_variance_m2: Array
-    """Shape (n,): expected delays h, and variance of each anchor's own part."""
+    """Shape (n,): variance of each anchor's own part of the delay h."""
     coordinate_m: Array
     coordinate_variance_m2: Array
     """Shape (n, 3): known coordinates; infinite variance where unknown."""
@@ -53,9 +52,8 @@ class Problem(Struct, frozen=True, eq=False):
     tape_m: Array
     tape_variance_m2: Array
     """Shape (t,)."""
-    common_delay_m: Array | None = None
-    """Shape (n,): standard deviation of the part of the delay that all anchors share, 0 for an anchor without it; None
-    if there is no shared part."""
+    common_delay_m: float = 0.0
+    """Standard deviation of the part of the delay that all anchors share."""
     more: tuple[MoreRows, ...] = ()
     """Costly: for a final fit, not for searches."""
 
@@ -89,7 +87,7 @@ class Solutions(Struct, frozen=True, eq=False):
 
 
 def solve_least_squares(problem: Problem, position_m: Array, weight: Array | None = None) -> Solution:
-    """Levenberg–Marquardt from one start, shape (n, 3); delays start at their expected values.
+    """Levenberg–Marquardt from one start, shape (n, 3); delays start at 0.
 
     ``weight``: factor on 1/variance of each range, shape (m,), by default 1.
     """
@@ -105,11 +103,11 @@ def solve_many(
 ) -> Solutions:
     """Levenberg–Marquardt from ``b`` starts, shape (b, n, 3), with weights of shape (b, m), all at once.
 
-    ``delay_m``: starts of the delays, shape (b, n); by default their expected values.
+    ``delay_m``: starts of the delays, shape (b, n); by default 0.
     """
     equations = _Equations(problem)
     position_m = position_m.astype(np.float64).copy()
-    delay_m = np.tile(problem.delay_m, (len(position_m), 1)) if delay_m is None else delay_m.astype(np.float64).copy()
+    delay_m = np.zeros(position_m.shape[:2]) if delay_m is None else delay_m.astype(np.float64).copy()
     damping = np.full(len(position_m), 1e-3)
     cost = equations.cost(position_m, delay_m, weight)
     busy = np.arange(len(position_m))
@@ -142,10 +140,8 @@ def solve_many(
 
 
 def delay_weights(problem: Problem) -> Array:
-    """Square root of the delays' prior information, shape (n, n): weights of deviations from expected delays."""
+    """Square root of the delays' prior information, shape (n, n): weights of the delays."""
     own = 1.0 / np.sqrt(np.maximum(problem.delay_variance_m2, _MIN_STD_M**2))
-    if problem.common_delay_m is None:
-        return np.diag(own)
     # The covariance is own² + common·commonᵀ; the root of its inverse has a closed form.
     common = own * problem.common_delay_m
     square = float(common @ common)
@@ -190,14 +186,14 @@ def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -
     rows[number[:m], 3 * n + problem.second] = of_range
     rows[m + t : m + t + n, 3 * n :] = delay_weights(problem)
     rows[m + t + n + np.arange(len(known)), known] = of_coordinate[known]
-    rows = np.vstack([rows, *(more.rows(position_m, problem.delay_m)[0] for more in problem.more)])
+    rows = np.vstack([rows, *(more.rows(position_m, np.zeros(n))[0] for more in problem.more)])
     rows[:, : 3 * n] *= problem.is_free.ravel()
     return rows
 
 
 def unknown_columns(problem: Problem) -> Integers:
     """Columns of a ``jacobian`` that are estimated: free coordinates, then delays."""
-    n = len(problem.delay_m)
+    n = len(problem.is_free)
     return np.concatenate([np.flatnonzero(problem.is_free.ravel()), 3 * n + np.arange(n)])
 
 
@@ -239,7 +235,7 @@ class _Equations:
 
     def __init__(self, problem: Problem) -> None:
         self._problem = problem
-        n, m, t = len(problem.delay_m), len(problem.range_m), len(problem.tape_m)
+        n, m, t = len(problem.is_free), len(problem.range_m), len(problem.tape_m)
         self._free = np.flatnonzero(problem.is_free.ravel())
         self._unknowns = len(self._free) + n
         self._more_columns = unknown_columns(problem)
@@ -286,7 +282,7 @@ class _Equations:
         coordinates = len(self._free)
         np.einsum("bii->bi", information)[:, :coordinates] += self._of_coordinate.ravel()[self._free]
         information[:, coordinates:, coordinates:] += of_delay
-        from_delays = (self._problem.delay_m - delay_m) @ of_delay
+        from_delays = -delay_m @ of_delay
         from_coordinates = from_coordinates.reshape(b, self._problem.is_free.size)[:, self._free]
         gradient = gradient + np.concatenate([from_coordinates, from_delays], axis=1)
         for one, more in product(range(b), self._problem.more):
@@ -300,7 +296,7 @@ class _Equations:
         """Sum of all weighted squares, shape (b,)."""
         _, _, residual = self._rows(position_m, delay_m)
         squares = np.sum(self._weights(weight) * residual**2, axis=1)
-        of_delays = np.sum(((self._problem.delay_m - delay_m) @ self._of_delay.T) ** 2, axis=1)
+        of_delays = np.sum((delay_m @ self._of_delay.T) ** 2, axis=1)
         of_coordinates = np.sum(self._of_coordinate * (self._coordinate_m - position_m) ** 2, axis=(1, 2))
         whole = np.asarray(squares + of_delays + of_coordinates)
         for one, more in product(range(len(whole)), self._problem.more):

@@ -201,18 +201,15 @@ def build_problem(
     if facts.dimensions == 2:
         is_free[:, 2] = False
         coordinate[:, 2], variance[:, 2] = fixed_heights_m(measured)[kept], np.inf
-    delay_variance = np.full(n, facts.delay_std_m**2, np.float64)
-    common = np.full(n, facts.common_delay_std_m if facts.delay_std_m > 0.0 else 0.0, np.float64)
-    delay_variance += np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in index]).reshape(n)
+    stamp_variance = np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in index]).reshape(n)
     problem = Problem(
         is_free=is_free,
         first=np.array([index[pair.a] for pair in pairs], np.int64),
         second=np.array([index[pair.b] for pair in pairs], np.int64),
         range_m=np.array([pair.range_m for pair in pairs], np.float64),
         variance_m2=np.array([own_variance_m2(pair) + pair_std_m**2 for pair in pairs], np.float64),
-        delay_m=np.zeros(n),
-        delay_variance_m2=delay_variance,
-        common_delay_m=common if common.any() else None,
+        delay_variance_m2=facts.delay_std_m**2 + stamp_variance,
+        common_delay_m=facts.common_delay_std_m if facts.delay_std_m > 0.0 else 0.0,
         coordinate_m=coordinate,
         coordinate_variance_m2=variance,
         tape_first=np.array([index[tape.a] for tape in tapes], np.int64),
@@ -234,13 +231,14 @@ def with_free_delays(problem: Problem) -> tuple[Problem, Mask]:
     Also returns which delays have no prior then, shape (n,).
     """
     typical = float(np.median(problem.variance_m2)) if len(problem.variance_m2) else 0.0
-    own, common = problem.delay_variance_m2, problem.common_delay_m
-    free = structs.replace(problem, delay_variance_m2=np.where(own > typical, np.inf, own))
-    if common is None:
-        return free, np.asarray(own > typical)
-    shared = common**2 > typical
-    free = structs.replace(free, common_delay_m=np.where(shared, _UNKNOWN_DELAY_STD_M, common))
-    return free, np.asarray((own > typical) | shared)
+    is_open = problem.delay_variance_m2 > typical
+    is_common_open = problem.common_delay_m**2 > typical
+    free = structs.replace(
+        problem,
+        delay_variance_m2=np.where(is_open, np.inf, problem.delay_variance_m2),
+        common_delay_m=_UNKNOWN_DELAY_STD_M if is_common_open else problem.common_delay_m,
+    )
+    return free, np.asarray(is_open | is_common_open)
 
 
 def own_delays(
@@ -251,13 +249,12 @@ def own_delays(
     ``delay_m``, ``covariance_m2``: delay and stamp error together, as fitted; the priors tell how to divide them.
     """
     shared = np.array([measured.tx_std_m.get(anchor, 0.0) ** 2 for anchor in anchors])
-    common = np.zeros(len(anchors)) if problem.common_delay_m is None else problem.common_delay_m
-    own = np.diag(np.maximum(problem.delay_variance_m2 - shared, 0.0)) + np.outer(common, common)
-    whole = np.diag(np.maximum(problem.delay_variance_m2, 1e-10)) + np.outer(common, common)
+    common_m2 = problem.common_delay_m**2
+    own = np.diag(np.maximum(problem.delay_variance_m2 - shared, 0.0)) + common_m2
+    whole = np.diag(np.maximum(problem.delay_variance_m2, 1e-10)) + common_m2
     part = own @ np.linalg.inv(whole)
-    own_m = problem.delay_m + part @ (delay_m - problem.delay_m)
     variance = np.diag(part @ covariance_m2 @ part.T + own - part @ own)
-    return np.asarray(own_m), np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+    return np.asarray(part @ delay_m), np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
 
 # Alignments, and frames through anchors
@@ -589,11 +586,10 @@ def start_positions(problem: Problem, sketch_m: Array | None = None) -> list[Arr
 
 def _known_distances(problem: Problem, axes: Integers) -> Array:
     """Distances along the estimated axes, shape (n, n); infinite where there is no range."""
-    n = len(problem.delay_m)
+    n = len(problem.is_free)
     first = np.concatenate([problem.first, problem.tape_first])
     second = np.concatenate([problem.second, problem.tape_second])
-    delays = problem.delay_m[problem.first] + problem.delay_m[problem.second]
-    length_m = np.maximum(np.concatenate([problem.range_m - delays, problem.tape_m]), 0.0)
+    length_m = np.maximum(np.concatenate([problem.range_m, problem.tape_m]), 0.0)
     others = np.setdiff1d(np.arange(3), axes)
     apart = np.nan_to_num(problem.coordinate_m[:, others])
     across = np.sum((apart[first] - apart[second]) ** 2, axis=1)
@@ -751,11 +747,10 @@ def _determined(
     """Mask of the determined anchors, and the covariance aligned over them."""
     weight = used.astype(np.float64)
     surveyed = structs.replace(problem, coordinate_variance_m2=_without_sketch(measured, kept, point))
-    rows = jacobian(surveyed, solution.position_m, weight)
     least = 1 if point is not None else 3 if levels(measured) else 4
-    core = determined_core(surveyed, rows, solution.position_m, least)
+    core = determined_core(surveyed, solution.position_m, least, weight)
     aligned_over = core if core.any() else np.ones(len(kept), bool)
-    covariance = aligned_covariance(surveyed, rows, solution.position_m, aligned_over)
+    covariance = aligned_covariance(surveyed, solution.position_m, aligned_over, weight)
     for direction in weak_directions(surveyed, covariance, core, 0.02, 4):
         if folds(surveyed, solution.position_m, solution.delay_m, weight, direction):
             core = core & ~direction.anchors
@@ -772,16 +767,10 @@ def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Ma
 
     Errors bend a shape that is held only by expected delays, and a bent shape seems to be held by its ranges.
     """
-
-    def covariance_at(at_m: Array) -> Array:
-        rows = jacobian(problem, at_m, weight)
-        return aligned_covariance(problem, rows, at_m, core)
-
-    covariance = covariance_at(position_m)
-    found = [covariance]
-    for direction in weak_directions(problem, covariance, core, _BENDS_M, 1):
+    found = [aligned_covariance(problem, position_m, core, weight)]
+    for direction in weak_directions(problem, found[0], core, _BENDS_M, 1):
         steps = (sigma * direction.std_m * direction.shift_m for sigma in _BENT_SIGMAS)
-        found += [covariance_at(position_m + step) for step in steps]
+        found += [aligned_covariance(problem, position_m + step, core, weight) for step in steps]
     return max(found, key=lambda one: float(np.trace(one[: 3 * len(core), : 3 * len(core)])))
 
 
@@ -859,10 +848,9 @@ def _moved_sketch(sketch: Array | None, motion: Motion) -> Array | None:
 def _shown_std_m(fitted: Fitted) -> float:
     """Constant error of a pair from the residuals, if they contradict the assumed one; otherwise 0."""
     problem, used = fitted.problem, fitted.used
-    full = jacobian(problem, fitted.solution.position_m, used.astype(np.float64))
-    everyone = np.ones(len(fitted.kept), bool)
-    covariance = aligned_covariance(problem, full, fitted.solution.position_m, everyone)
-    rows = full[: len(used)]
+    position_m, weight = fitted.solution.position_m, used.astype(np.float64)
+    covariance = aligned_covariance(problem, position_m, np.ones(len(position_m), bool), weight)
+    rows = jacobian(problem, position_m, weight)[: len(used)]
     freedom = float(used.sum()) - float(np.einsum("ij,jk,ik->", rows, covariance, rows, optimize=True))
     squares = fitted.solution.residual_m[used] ** 2
     noise = np.array([own_variance_m2(pair) for pair in fitted.pairs])[used]

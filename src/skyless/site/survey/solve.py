@@ -47,7 +47,7 @@ from skyless.site.survey.fit import (
     position_stds_m,
     weak_directions,
 )
-from skyless.site.survey.problem import Problem, adjacency, delay_weights, jacobian, unit_vectors
+from skyless.site.survey.problem import Problem, adjacency, delay_weights, unit_vectors
 from skyless.site.survey.shape import (
     Fitted,
     Framed,
@@ -375,7 +375,7 @@ def _delay_covariance(
 
 def _incidence(problem: Problem) -> Array:
     """Incidence matrix of ranges and anchors, shape (m, k): 1 where a range contains an anchor's delay."""
-    rows = np.zeros((len(problem.first), len(problem.delay_m)))
+    rows = np.zeros((len(problem.first), len(problem.is_free)))
     number = np.arange(len(rows))
     rows[number, problem.first] = 1.0
     rows[number, problem.second] = 1.0
@@ -564,8 +564,7 @@ def _held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
 def _expected_m(problem: Problem, delay_m: Array) -> float:
     """Expected error of one delay in a joint change of delays."""
     along = float(np.sum((delay_weights(problem) @ delay_m) ** 2))
-    common = 0.0 if problem.common_delay_m is None else float(np.median(problem.common_delay_m))
-    one = math.sqrt(float(np.median(problem.delay_variance_m2)) + common**2)
+    one = math.sqrt(float(np.median(problem.delay_variance_m2)) + problem.common_delay_m**2)
     return min(one, math.sqrt(float(np.sum(delay_m**2)) / max(along, 1e-12)))
 
 
@@ -579,8 +578,7 @@ def _least_held(fitted: Fitted, surveyed: Problem) -> tuple[Array, Array]:
     start = fitted.solution.position_m
 
     def covariance_at(position_m: Array) -> tuple[float, Array]:
-        rows = jacobian(surveyed, position_m, weight)
-        covariance = aligned_covariance(surveyed, rows, position_m, fitted.core)
+        covariance = aligned_covariance(surveyed, position_m, fitted.core, weight)
         return float(position_stds_m(surveyed, covariance)[fitted.core].max()), covariance
 
     worst, covariance = covariance_at(start)
