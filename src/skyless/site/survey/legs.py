@@ -151,6 +151,8 @@ class AnchorLeg(Struct, frozen=True, gc=False):
     """When the listener received the same broadcast, on its own clock."""
     carrier_phase_cycles: float | None = None
     """Carrier phase at the receiver, if it was measured and relayed."""
+    age_ticks: int = 0
+    """Time from ``t_s`` until the listener received the relay, on its counter."""
 
 
 class _Received(Struct, frozen=True, gc=False):
@@ -211,7 +213,7 @@ class RelayMatcher:
         self._last[pair] = relay.rx_ticks
         self.counters["legs"] += 1
         phase_cycles = relay.phase_cycles if isinstance(relay, Heard) else relay.carrier_phase_cycles
-        return AnchorLeg(relay.anchor, anchor, frame.tx_ticks, rx_ticks, frame.t_s, phase_cycles)
+        return AnchorLeg(relay.anchor, anchor, frame.tx_ticks, rx_ticks, frame.t_s, phase_cycles, age_ticks)
 
     def _prune(self, now_ticks: int) -> None:
         """Remove frames that are too old to be relayed."""
@@ -370,7 +372,6 @@ _LONGEST_TICKS: Final = round(0.3 * TICK_RATE_HZ)
 _RATE_TICKS: Final = round(0.1 * TICK_RATE_HZ)
 """Least time over which a rate is measured, with the noise of two stamps."""
 
-_MAX_RELAYED_FRAMES: Final = 4096
 _MAX_BEFORE: Final = 256
 
 
@@ -389,13 +390,9 @@ class RelayedDifferences:
 
     def __init__(self, site_id: int) -> None:
         self._site_id = site_id
-        self._ticks = Unwrapper()
-        self._frames: dict[tuple[int, int], int] = {}
-        """The tag's stamps, unwrapped, by anchor and sequence number, in the order of reception."""
+        self._ticks, self._matcher = Unwrapper(), RelayMatcher()
         self._before: dict[int, deque[tuple[int, int]]] = {}
         """TX stamps and the tag's stamps of each anchor's last beacons."""
-        self._last: dict[tuple[int, int], int] = {}
-        """RX stamp of each directed pair's last relay, as a stamp is relayed until there is a newer one."""
 
     def add(self, reception: Reception) -> list[RelayedDifference]:
         """Add a reception and return the differences that it completes; none unless it is a beacon of the site."""
@@ -404,24 +401,13 @@ class RelayedDifferences:
             return []
         now_ticks = self._ticks.unwrap(reception.rx_ticks, reception.host_s)
         relative_rate = self._relative_rate(beacon, now_ticks)
+        relays = () if relative_rate is None else beacon.relayed
         found: list[RelayedDifference] = []
-        for heard in beacon.relayed:
-            pair = (heard.anchor, beacon.anchor)
-            frame_ticks = self._frames.get((heard.anchor, heard.sequence))
-            if frame_ticks is None or relative_rate is None or self._last.get(pair) == heard.rx_ticks:
-                continue
-            self._last[pair] = heard.rx_ticks
-            age_ticks = now_ticks - frame_ticks
-            held_ticks = difference(beacon.tx_ticks, heard.rx_ticks_near(beacon.tx_ticks - age_ticks))
-            apart_ticks = age_ticks - held_ticks
-            if not 0 < held_ticks <= _LONGEST_TICKS or abs(apart_ticks) > _most_apart(held_ticks):
-                continue
-            difference_m = (apart_ticks - relative_rate * held_ticks) * TICK_M
-            found.append(RelayedDifference(*pair, difference_m, age_ticks / TICK_RATE_HZ))
-        self._frames.pop((beacon.anchor, beacon.sequence), None)
-        self._frames[beacon.anchor, beacon.sequence] = now_ticks
-        if len(self._frames) > _MAX_RELAYED_FRAMES:
-            del self._frames[next(iter(self._frames))]
+        for leg in self._matcher.add(beacon.anchor, beacon.sequence, beacon.tx_ticks, relays, now_ticks, 0.0):
+            held_ticks = difference(beacon.tx_ticks, leg.rx_ticks)
+            if relative_rate is not None and 0 < held_ticks <= _LONGEST_TICKS:
+                difference_m = (leg.age_ticks - held_ticks - relative_rate * held_ticks) * TICK_M
+                found.append(RelayedDifference(leg.sender, leg.receiver, difference_m, leg.age_ticks / TICK_RATE_HZ))
         return found
 
     def _relative_rate(self, beacon: SiteBeacon, now_ticks: int) -> float | None:
@@ -435,14 +421,10 @@ class RelayedDifferences:
         rate = None
         if before and now_ticks - before[0][1] >= _RATE_TICKS:
             sent_ticks = difference(beacon.tx_ticks, before[0][0])
-            if abs(now_ticks - before[0][1] - sent_ticks) > _most_apart(sent_ticks):
+            # Paths differ by up to 3 km.
+            if abs(now_ticks - before[0][1] - sent_ticks) > 2.0 * MAX_DRIFT * abs(sent_ticks) + 3000.0 / TICK_M:
                 before.clear()
             else:
                 rate = (now_ticks - before[0][1] - sent_ticks) / sent_ticks
         before.append((beacon.tx_ticks, now_ticks))
         return rate
-
-
-def _most_apart(ticks: int) -> float:
-    """Largest possible difference of two counters' advances, with paths that differ by up to 3 km."""
-    return 2.0 * MAX_DRIFT * abs(ticks) + 3000.0 / TICK_M
