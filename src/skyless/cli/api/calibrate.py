@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import msgspec
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -19,6 +20,7 @@ from skyless.research.replays.site import recorded_site
 from skyless.run.recordings.recording import McapRecording, is_mcap
 from skyless.site.report import BLUE, panel, report_style
 from skyless.site.survey.facts import Count
+from skyless.site.tables import calibrated_table, new_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -51,11 +53,14 @@ class BiasResult(Result, frozen=True, eq=False):
     @property
     def summary(self) -> dict[str, Any]:
         """The object that ``skyless calibrate --json`` writes, in SI units, without version and written file."""
-        return self.found.report()
+        found = self.found
+        estimated = msgspec.to_builtins(found.estimate)
+        return {"format": found.format, **estimated, "drops": found.drops, "notes": found.notes}
 
     def corrected_file(self) -> str:
         """The table of anchors with the biases in it, as ``skyless calibrate --out`` writes it. Raises SkylessError."""
-        return self.found.table(self.table)
+        known = self.found.estimate.calibration()
+        return new_table(self.found.anchors_m, known) if self.table is None else calibrated_table(self.table, known)
 
     def to_dataframe(self) -> "DataFrame":
         """One row per anchor: ``anchor``, ``bias_m``, ``std_m``, ``noise_m``, ``count``.
@@ -97,7 +102,7 @@ class BiasResult(Result, frozen=True, eq=False):
             yield "range bias (received power)", slope
         for note in self.found.notes:
             yield "note", note
-        for reason, number in self.found.samples.drops.items():
+        for reason, number in self.found.drops.items():
             yield f"left out: {reason}", str(number)
 
 

@@ -4,12 +4,12 @@ import math
 import os
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from math import dist, inf, log
 from os import PathLike
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Final, cast
 
-import msgspec
 import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
@@ -34,7 +34,7 @@ from skyless.site.survey.facts import PairBlock, PairRanges
 from skyless.site.survey.legs import AnchorLeg, LegCollector, RelayedDifferences, RelayMatcher
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.walk import EPOCH_S, EpochCollector, TagEpochs
-from skyless.site.tables import Truth, calibrated_table, new_table
+from skyless.site.tables import Truth
 
 # Tags of a recording of ``skyless record`` that were carried around, or stood at known positions.
 
@@ -52,32 +52,28 @@ PositionAt = Callable[[float], Point | None]
 """Position of the tag's antenna at a time of the recording; None if unknown."""
 
 
-def position_of_truth(truth: TruthTrack, above_m: float | None) -> PositionAt:
-    """Position by time from truth that is high enough."""
-
-    def position_at(time_s: float) -> Point | None:
-        at_m = truth.at(time_s)
-        return None if at_m is None or (above_m is not None and at_m[2] <= above_m) else at_m
-
-    return position_at
-
-
-def position_of_stays(stays: Sequence[Stay], height_m: float | None, begin_s: float) -> PositionAt:
-    """Position by time from stays; the first of overlapping ones counts.
+def positions_of(
+    asked: CalibrateOptions, truth: Truth | None, above_m: float | None, height_m: float | None, begin_s: float
+) -> PositionAt:
+    """Position by time: from stays, of which the first of overlapping ones counts, else from truth that is high enough.
 
     Raises:
         SkylessError: a stay has no height, and the site does not state it either.
     """
     stays_m: list[tuple[Stay, Point]] = []
-    for stay in stays:
+    for stay in cast("Sequence[Stay]", asked.stays):
         z_m = height_m if stay.z_m is None else stay.z_m
         if z_m is None:
             raise SkylessError(f"--at {stay.x_m:g},{stay.y_m:g} lacks its height: it should be x,y,z")
         stays_m.append((stay, (stay.x_m, stay.y_m, z_m)))
+    track = TruthTrack(truth)
 
     def position_at(time_s: float) -> Point | None:
-        since_s = time_s - begin_s
-        return next((position_m for stay, position_m in stays_m if stay.from_s <= since_s <= stay.to_s), None)
+        if stays_m:
+            since_s = time_s - begin_s
+            return next((position_m for stay, position_m in stays_m if stay.from_s <= since_s <= stay.to_s), None)
+        at_m = track.at(time_s)
+        return None if at_m is None or (above_m is not None and at_m[2] <= above_m) else at_m
 
     return position_at
 
@@ -99,12 +95,7 @@ def known_tags(
     for tag in raw if asked.tag is None else (asked.tag,):
         epochs = walk_of(recording, site.id, tag)
         begin_s = float(epochs.t_s[0]) - EPOCH_S / 2.0
-        if asked.stays:
-            known = position_of_stays(
-                [one for one in asked.stays if isinstance(one, Stay)], site.tags.height_m, begin_s
-            )
-        else:
-            known = position_of_truth(TruthTrack(truth or recorded.get(tag)), asked.above_m)
+        known = positions_of(asked, truth or recorded.get(tag), asked.above_m, site.tags.height_m, begin_s)
         end_s = _end_s(epochs, begin_s, asked.first)
         found.append(at_positions(epochs, tag, lambda t_s: known(t_s) if t_s <= end_s else None))  # noqa: B023 - at once
     if not any(len(epochs.t_s) for epochs in found):
@@ -171,15 +162,12 @@ def at_positions(epochs: TagEpochs, tag: str, position_at: PositionAt) -> TagEpo
     is_known = np.array([one is not None for one in known], dtype=bool)
     rows = is_known[epochs.epoch]
     number = np.cumsum(is_known) - 1
+    of_rows = ("first", "second", "difference_m", "since_s", "count")
     return replace(
         epochs,
+        **{name: getattr(epochs, name)[rows] for name in of_rows},
         t_s=epochs.t_s[is_known],
         epoch=number[epochs.epoch[rows]],
-        first=epochs.first[rows],
-        second=epochs.second[rows],
-        difference_m=epochs.difference_m[rows],
-        since_s=epochs.since_s[rows],
-        count=epochs.count[rows],
         known_m=np.array([one for one in known if one is not None]).reshape(-1, 3),
         known_std_m=(_TAG_STD_M, _TAG_STD_M, _TAG_STD_M),
         offset_std_m=_OFFSET_STD_M,
@@ -221,23 +209,15 @@ _MAX_ROWS: Final = 300_000
 _NEAREST_M: Final = 0.01
 
 
-class Samples(Struct, frozen=True):
-    """Time differences at known positions, from a recording."""
-
-    differences: Differences
-    anchors_m: dict[int, Point]
-    """Latest positions of the anchors."""
-    seen: int
-    drops: dict[str, int]
-    """Unusable differences, by reason."""
-
-
 class Biases(Struct, frozen=True):
     """Biases of another system's anchors, estimated from a tag at known positions."""
 
     format: str
     estimate: CalibrationEstimate
-    samples: Samples
+    anchors_m: dict[int, Point]
+    """Latest positions of the anchors."""
+    drops: dict[str, int]
+    """Unusable differences, by reason."""
 
     @property
     def notes(self) -> list[str]:
@@ -254,16 +234,6 @@ class Biases(Struct, frozen=True):
             )
         return notes
 
-    def report(self) -> dict[str, Any]:
-        """The whole report, SI units."""
-        estimated = msgspec.to_builtins(self.estimate)
-        return {"format": self.format, **estimated, "drops": self.samples.drops, "notes": self.notes}
-
-    def table(self, anchors: str | Path | None) -> str:
-        """The table of anchors with the biases added; a new one if none is given. Raises SkylessError."""
-        known = self.estimate.calibration()
-        return new_table(self.samples.anchors_m, known) if anchors is None else calibrated_table(anchors, known)
-
 
 def biases_of(asked: CalibrateOptions) -> Biases:
     """Estimate constants of another system's anchors, relative to their mean.
@@ -272,25 +242,20 @@ def biases_of(asked: CalibrateOptions) -> Biases:
         SkylessError: the recording cannot be used, or has no differences at a known position.
     """
     asked.leave_out("tag", "recorded_truth", why="it is for recordings of skyless record")
-    path, first = Path(asked.file), asked.first if isinstance(asked.first, First) else First()
+    path = Path(asked.file)
     truth = None if asked.stays else known_truth(path, asked)
     above_m, (anchors_m, height_m) = flight_height(asked.above_m, truth), known_anchors(asked.anchors, asked.site)
-
-    def position_from(begin_s: float) -> PositionAt:
-        if asked.stays:
-            return position_of_stays([one for one in asked.stays if isinstance(one, Stay)], height_m, begin_s)
-        return position_of_truth(TruthTrack(truth), above_m)
-
     with open_recording(path, asked.format, asked.listener) as recording:
-        samples = gather(tdoas_of(recording, anchors_m), anchors_m, position_from, first)
+        position_from = partial(positions_of, asked, truth, above_m, height_m)
+        differences, drops = gather(tdoas_of(recording, anchors_m), anchors_m, position_from, asked.first)
         name = recording.format.name
-    if not len(samples.differences.t_s):
-        reasons = ", ".join(f"{count} × {reason}" for reason, count in samples.drops.items())
+    if not len(differences.t_s):
+        reasons = ", ".join(f"{count} × {reason}" for reason, count in drops.items())
         raise SkylessError(
             f"no time difference could be used ({reasons or 'the recording gives none'}); --truth or --at should say "
             "where the tag was, and --anchors or --site where the anchors are"
         )
-    return Biases(name, estimate(samples.differences), samples)
+    return Biases(name, estimate(differences), anchors_m, drops)
 
 
 def tdoas_of(recording: Recording, anchors_m: Mapping[int, Point]) -> Iterator[PairTdoa]:
@@ -307,13 +272,16 @@ def tdoas_of(recording: Recording, anchors_m: Mapping[int, Point]) -> Iterator[P
 
 def gather(
     pairs: Iterable[PairTdoa],
-    anchors_m: Mapping[int, Point],
+    anchors_m: dict[int, Point],
     position_from: Callable[[float], PositionAt],
-    first: First,
-) -> Samples:
-    """Gather the differences at known positions; ``position_from`` is called with the time of the first difference."""
+    asked_first: object,
+) -> tuple[Differences, dict[str, int]]:
+    """Gather the differences at known positions, and count those that cannot be used by reason.
+
+    ``anchors_m`` is brought up to date. ``position_from`` is called with the time of the first difference.
+    """
     drops: Drops = Counter()
-    anchor_positions_m = dict(anchors_m)
+    first = asked_first if isinstance(asked_first, First) else First()
     sample = EvenSample(5, _MAX_ROWS)
     position_at: PositionAt | None = None
     begin_s = last_s = 0.0
@@ -323,7 +291,7 @@ def gather(
         if first.seconds is not None and pair.time_s - begin_s > first.seconds:
             break
         last_s = max(last_s, pair.time_s)
-        row = _row(pair, anchor_positions_m, position_at)
+        row = _row(pair, anchors_m, position_at)
         if isinstance(row, str):
             drops[row] += 1
             continue
@@ -335,17 +303,16 @@ def gather(
         rows = rows[rows[:, 0] <= begin_s + first.part * (last_s - begin_s)]
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     ids = rows[:, 1:3].astype(np.int64)
-    differences = Differences(rows[:, 0], ids[:, 0], ids[:, 1], rows[:, 3], rows[:, 4])
-    return Samples(differences, anchor_positions_m, sample.seen, dict(sorted(drops.items())))
+    return Differences(rows[:, 0], ids[:, 0], ids[:, 1], rows[:, 3], rows[:, 4]), dict(sorted(drops.items()))
 
 
-def _row(pair: PairTdoa, anchor_positions_m: dict[int, Point], position_at: PositionAt) -> tuple[float, ...] | str:
+def _row(pair: PairTdoa, anchors_m: dict[int, Point], position_at: PositionAt) -> tuple[float, ...] | str:
     """Time, anchors, excess over the geometry, and log of the ranges' ratio; or the reason for a drop."""
     if pair.a_m is not None:
-        anchor_positions_m[pair.anchor_a] = pair.a_m
+        anchors_m[pair.anchor_a] = pair.a_m
     if pair.b_m is not None:
-        anchor_positions_m[pair.anchor_b] = pair.b_m
-    a_m, b_m = anchor_positions_m.get(pair.anchor_a), anchor_positions_m.get(pair.anchor_b)
+        anchors_m[pair.anchor_b] = pair.b_m
+    a_m, b_m = anchors_m.get(pair.anchor_a), anchors_m.get(pair.anchor_b)
     if a_m is None or b_m is None:
         return "unknown-anchor"
     at_m = position_at(pair.time_s)
