@@ -7,7 +7,7 @@ from skyless.research.studies import survey as study
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import Plan
 from skyless.research.studies.survey import GROUPS, Group, Variant, limits_of
-from skyless.research.studies.surveyed_rooms import AirErrors, aligned, drawn_errors, survey_layouts, tag_error_m
+from skyless.research.studies.surveyed_rooms import RoomErrors, aligned, drawn_errors, survey_layouts, tag_error_m
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.site
 SMALL = {
     "lab": (
         Group("exact", (Variant("delays known", 0.0), Variant("positions kept", 0.15, keeps=True)), seconds=1.0),
-        Group("late", (Variant("late", 0.0),), AirErrors(pair_std_m=0.02, late_share=0.2, missing_share=0.1), 1.0),
+        Group("late", (Variant("late", 0.0),), RoomErrors(pair_std_m=0.02, late_share=0.2, missing_share=0.1), 1.0),
     )
 }
 
@@ -68,9 +68,8 @@ def test_what_all_anchors_share_does_not_move_a_tag():
 
 
 def test_shares_of_late_and_missing_pairs():
-    layout, draw = survey_layouts()["hall"], np.random.default_rng(2)
-    group = AirErrors(late_share=0.3, missing_share=0.25)
-    drawn = [drawn_errors(group, layout, draw) for _ in range(100)]
+    layout, errors = survey_layouts()["hall"], RoomErrors(late_share=0.3, missing_share=0.25)
+    drawn = [drawn_errors(layout, errors, 100.0, seed) for seed in range(100)]
     missing, late = (sum(len(getattr(one, name)) for one in drawn) for name in ("missing", "late"))
     pairs = 6600
     assert missing / pairs == pytest.approx(0.25, abs=4 * np.sqrt(0.25 * 0.75 / pairs))

@@ -12,25 +12,24 @@ from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct
+from msgspec.structs import replace
 
-from skyless.core.arrays import Array
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.studies.surveyed_rooms import (
     HAND_STD_M,
-    SKETCH_STD_M,
-    TAPE_STD_M,
-    AirErrors,
+    DrawnRoom,
     Outcome,
-    SurveyLayout,
+    RoomErrors,
     drawn_errors,
-    free_axes,
+    facts_of,
     judged,
     ranges_in_air,
     survey_bound_m,
     survey_layouts,
     tag_error_m,
+    taped,
 )
-from skyless.site.survey.facts import Facts, Point, Tape
+from skyless.site.survey.facts import Facts, TapeAdvice
 from skyless.site.survey.solve import run_survey
 
 NEAR_M: Final = 0.1
@@ -61,7 +60,7 @@ class Group(Struct, frozen=True):
 
     name: str
     variants: tuple[Variant, ...]
-    errors: AirErrors = AirErrors()
+    errors: RoomErrors = RoomErrors()
     seconds: float | None = None
 
 
@@ -78,26 +77,26 @@ _DELAYS: Final = Group(
         Variant("delays 15 cm, 3 tapes", 0.15, tapes=3),
         Variant("delays 15 cm, positions kept", 0.15, keeps=True),
     ),
-    errors=AirErrors(delay_std_m=0.15),
+    errors=RoomErrors(delay_std_m=0.15),
 )
 _PAIRS: Final = Group(
-    "pairs", (Variant("pairs 2 cm, delays 7 cm", 0.07),), AirErrors(delay_std_m=0.07, pair_std_m=0.02)
+    "pairs", (Variant("pairs 2 cm, delays 7 cm", 0.07),), RoomErrors(delay_std_m=0.07, pair_std_m=0.02)
 )
-_CLEAN: Final = Group("clean", (Variant("pairs 3 cm", 0.0),), AirErrors(pair_std_m=0.03), _LATE_S)
-_LATE: Final = Group("late", (Variant("10 % late", 0.0),), AirErrors(pair_std_m=0.03, late_share=0.1), _LATE_S)
+_CLEAN: Final = Group("clean", (Variant("pairs 3 cm", 0.0),), RoomErrors(pair_std_m=0.03), _LATE_S)
+_LATE: Final = Group("late", (Variant("10 % late", 0.0),), RoomErrors(pair_std_m=0.03, late_share=0.1), _LATE_S)
 _LATE_HALL: Final = Group(
     "late",
     (Variant("10 % late, 25 % missing, delays 7 cm", 0.07),),
-    AirErrors(delay_std_m=0.07, pair_std_m=0.03, late_share=0.1, missing_share=0.25),
+    RoomErrors(delay_std_m=0.07, pair_std_m=0.03, late_share=0.1, missing_share=0.25),
     _LATE_S,
 )
 _VERY_LATE: Final = Group(
-    "very late", (Variant("30 % late", 0.0),), AirErrors(pair_std_m=0.03, late_share=0.3), _LATE_S
+    "very late", (Variant("30 % late", 0.0),), RoomErrors(pair_std_m=0.03, late_share=0.3), _LATE_S
 )
 _VERY_LATE_HALL: Final = Group(
     "very late",
     (Variant("30 % late, 25 % missing", 0.0), Variant("30 % late, 25 % missing, sketch", 0.0, sketched=True)),
-    AirErrors(pair_std_m=0.03, late_share=0.3, missing_share=0.25),
+    RoomErrors(pair_std_m=0.03, late_share=0.3, missing_share=0.25),
     _LATE_S,
 )
 GROUPS: Final = {
@@ -203,51 +202,34 @@ def _weight_s(runs: SurveyRuns) -> float:
 
 def survey_runs(runs: SurveyRuns) -> tuple[tuple[Outcome, ...], ...]:
     """Outcomes of each run, one for each variant."""
-    return tuple(_run(runs, survey_layouts()[runs.layout], seed) for seed in runs.seeds)
+    return tuple(
+        _run(runs, drawn_errors(survey_layouts()[runs.layout], runs.group.errors, runs.noise_ps, seed))
+        for seed in runs.seeds
+    )
 
 
-def _run(runs: SurveyRuns, layout: SurveyLayout, seed: int) -> tuple[Outcome, ...]:
-    draw = np.random.default_rng(seed)
-    drawn = drawn_errors(runs.group.errors, layout, draw)
-    ranges = ranges_in_air(layout, drawn, runs.seconds, runs.noise_ps, int(draw.integers(1 << 60)))
-    hand_m = draw.normal(0.0, HAND_STD_M, layout.position_m.shape) * free_axes(layout)
-    sketch_m = draw.normal(0.0, SKETCH_STD_M, layout.position_m.shape) * free_axes(layout)
-    tape_m = draw.normal(0.0, TAPE_STD_M, 3)
-    hand_tag_m = tag_error_m(layout, layout.position_m + hand_m, np.zeros(len(hand_m)), drawn.delay_m)
-    outcomes, asked_for = [], tuple[tuple[int, int], ...]()
+def _run(runs: SurveyRuns, room: DrawnRoom) -> tuple[Outcome, ...]:
+    layout, ranges = room.layout, ranges_in_air(room, runs.seconds)
+    no_delay_m = np.zeros(len(layout.anchors))
+    hand_tag_m = tag_error_m(layout, layout.position_m + room.hand_m, no_delay_m, room.tx_delay_m)
+    outcomes, asked_for = [], tuple[TapeAdvice, ...]()
     for variant in runs.group.variants:
-        facts = _facts(layout, runs.group, variant, asked_for[: variant.tapes], tape_m, (hand_m, sketch_m))
+        facts = _facts(room, runs.group, variant, asked_for[: variant.tapes])
         survey = run_survey(ranges, facts)
         if not variant.tapes and not variant.keeps:
-            asked_for = tuple((tape.a, tape.b) for tape in survey.tapes)
-        bound_m = survey_bound_m(layout, ranges, facts, drawn, runs.seconds, runs.noise_ps)
-        outcomes.append(judged(layout, survey, drawn, Outcome(variant.name, bound_m, False, False, False, hand_tag_m)))
+            asked_for = survey.tapes
+        bound_m = survey_bound_m(room, ranges, facts, runs.seconds)
+        outcomes.append(judged(room, survey, Outcome(variant.name, bound_m, False, False, False, hand_tag_m)))
     return tuple(outcomes)
 
 
-def _facts(
-    layout: SurveyLayout,
-    group: Group,
-    variant: Variant,
-    tapes: Sequence[tuple[int, int]],
-    tape_m: Array,
-    off_m: tuple[Array, Array],
-) -> Facts:
-    """Facts for a survey; ``off_m``: errors of positions by hand and of a sketch."""
-    at_m = dict(zip(layout.anchors, layout.position_m, strict=True))
-    sketch: dict[int, Point] = {}
-    if variant.keeps or variant.sketched:
-        rough_m = layout.position_m + (off_m[0] if variant.keeps else off_m[1])
-        sketch = {anchor: (x, y, z) for anchor, (x, y, z) in zip(layout.anchors, rough_m.tolist(), strict=True)}
-    return Facts(
-        dimensions=layout.dimensions,
-        heights_m=layout.heights_m,
-        tapes=tuple(
-            Tape(a, b, float(np.linalg.norm(at_m[a] - at_m[b])) + float(error_m), TAPE_STD_M)
-            for (a, b), error_m in zip(tapes, tape_m, strict=False)
-        ),
-        sketch_m=sketch,
-        sketch_std_m=HAND_STD_M if variant.keeps else SKETCH_STD_M,
+def _facts(room: DrawnRoom, group: Group, variant: Variant, tapes: Sequence[TapeAdvice]) -> Facts:
+    off_m = room.hand_m if variant.keeps else room.sketch_m if variant.sketched else None
+    facts = facts_of(room, None if off_m is None else room.layout.position_m + off_m)
+    return replace(
+        facts,
+        tapes=taped(room, tapes),
+        sketch_std_m=HAND_STD_M if variant.keeps else facts.sketch_std_m,
         keep_positions=variant.keeps,
         delay_std_m=variant.delay_std_m,
         pair_std_m=group.errors.pair_std_m,

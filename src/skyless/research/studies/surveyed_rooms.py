@@ -8,7 +8,7 @@ no error of the site's shape, and tags then walk the same paths for every file.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, Literal
 
 import numpy as np
@@ -33,7 +33,7 @@ from skyless.sim.impairments import (
 from skyless.sim.lab import lab_site
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
-from skyless.site.survey.facts import Facts, PairRanges, Point, Survey, Tape
+from skyless.site.survey.facts import Facts, PairRanges, Point, Survey, Tape, TapeAdvice
 from skyless.site.survey.fit import aligned_covariance
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.problem import Problem, superimposed
@@ -145,8 +145,14 @@ class RecordedAnchor:
         return self._machine.transmission(tx_ticks)
 
 
-# The air of one run: sites with random errors, and their anchors' ranges.
+# Rooms with random errors.
 
+HAND_STD_M: Final = 0.02
+"""Error of positions measured by hand, per axis."""
+SKETCH_STD_M: Final = 0.3
+ROOM_RANGES: Final = Room().ranges
+"""Errors of ranges at tags in the scenario ``room``."""
+TAPE_STD_M: Final = 0.005
 LATE_M: Final = (0.2, 1.0)
 """Least and greatest lateness of late pairs."""
 _SENSITIVITY_DBM: Final = -105.0
@@ -155,25 +161,41 @@ _SETTLE_S: Final = 1.0
 """Time until anchors of protocol 2 send regularly."""
 
 
-class AirErrors(Struct, frozen=True):
-    """Distribution of the errors in the air."""
+class RoomErrors(Struct, frozen=True):
+    """Distribution of the errors of a room."""
 
     delay_std_m: float = 0.0
+    """Standard deviation of h, half of the sum of an anchor's TX and RX delay errors, and of half their difference."""
     pair_std_m: float = 0.0
-    """Standard deviation of each pair's constant error."""
+    """Standard deviation of the constant error of each pair of anchors."""
+    ranges: RangeErrorModel = RangeErrorModel()
+    """Range errors at tags."""
     late_share: float = 0.0
     missing_share: float = 0.0
     """Shares of all pairs that are late, and that have no ranges."""
 
 
-class DrawnErrors(Struct, frozen=True, eq=False):
-    """Errors in the air of one run."""
+class DrawnRoom(Struct, frozen=True, eq=False):
+    """A room with its errors. Arrays are in the order of the layout's anchors."""
 
-    delay_m: Array
-    """Shape (n,)."""
-    late: frozenset[tuple[int, int]]
-    missing: frozenset[tuple[int, int]]
-    errors: tuple[PairError, ...]
+    layout: SurveyLayout
+    tx_delay_m: Array
+    """True delay less the usual one, shape (n,)."""
+    rx_delay_m: Array
+    pairs: tuple[PairError, ...]
+    ranges: RangeErrorModel
+    hand_m: Array
+    """Errors of positions measured by hand, shape (n, 3)."""
+    sketch_m: Array
+    """Errors of a sketch, shape (n, 3)."""
+    tape_m: Array
+    """Errors of taped distances."""
+    noise_ps: float
+    seed: int
+    """Seed of the air."""
+    late: frozenset[tuple[int, int]] = frozenset()
+    missing: frozenset[tuple[int, int]] = frozenset()
+    """Pairs that are late, and that have no ranges."""
 
 
 def free_axes(layout: SurveyLayout) -> Array:
@@ -181,48 +203,59 @@ def free_axes(layout: SurveyLayout) -> Array:
     return np.array([1.0, 1.0, 1.0 if layout.dimensions == 3 else 0.0])
 
 
-def drawn_errors(errors_of: AirErrors, layout: SurveyLayout, draw: np.random.Generator) -> DrawnErrors:
-    """Draw delays, and errors of pairs, which are late or missing independently."""
-    anchors = layout.anchors
-    delay_m = draw.normal(0.0, errors_of.delay_std_m, len(anchors)) if errors_of.delay_std_m else np.zeros(len(anchors))
-    late, missing, errors = [], [], []
+def drawn_errors(layout: SurveyLayout, errors: RoomErrors, noise_ps: float, seed: int) -> DrawnRoom:
+    """Draw the errors of a room whose TX and RX delays are alike and whose pairs may be late or missing."""
+    draw, anchors = np.random.default_rng(seed), layout.anchors
+    delay_m = draw.normal(0.0, errors.delay_std_m, len(anchors)) if errors.delay_std_m else np.zeros(len(anchors))
+    late, missing, pairs = [], [], []
     for index, a in enumerate(anchors):
         for b in anchors[index + 1 :]:
-            error_m = draw.normal(0.0, errors_of.pair_std_m) if errors_of.pair_std_m else 0.0
-            is_late, is_missing, late_m = draw.random() < errors_of.late_share, draw.random(), draw.uniform(*LATE_M)
-            if is_missing < errors_of.missing_share:
+            error_m = draw.normal(0.0, errors.pair_std_m) if errors.pair_std_m else 0.0
+            is_late, is_missing, late_m = draw.random() < errors.late_share, draw.random(), draw.uniform(*LATE_M)
+            if is_missing < errors.missing_share:
                 missing.append((a, b))
-                errors.append(PairError(a, b, blocked=True))
+                pairs.append(PairError(a, b, blocked=True))
                 continue
             if is_late:
                 late.append((a, b))
             if is_late or error_m:
-                errors.append(PairError(a, b, late_m=error_m + (late_m if is_late else 0.0)))
-    return DrawnErrors(delay_m, frozenset(late), frozenset(missing), tuple(errors))
+                pairs.append(PairError(a, b, late_m=error_m + (late_m if is_late else 0.0)))
+    return DrawnRoom(
+        layout=layout,
+        tx_delay_m=delay_m,
+        rx_delay_m=delay_m,
+        pairs=tuple(pairs),
+        ranges=errors.ranges,
+        seed=int(draw.integers(1 << 60)),
+        hand_m=draw.normal(0.0, HAND_STD_M, layout.position_m.shape) * free_axes(layout),
+        sketch_m=draw.normal(0.0, SKETCH_STD_M, layout.position_m.shape) * free_axes(layout),
+        tape_m=draw.normal(0.0, TAPE_STD_M, 3),
+        noise_ps=noise_ps,
+        late=frozenset(late),
+        missing=frozenset(missing),
+    )
 
 
-def ranges_in_air(layout: SurveyLayout, drawn: DrawnErrors, seconds: float, noise_ps: float, seed: int) -> PairRanges:
-    """Ranges between the anchors of a site in this air."""
-    anchors = tuple(
-        AnchorSite(anchor, x_m, y_m, z_m)
-        for anchor, (x_m, y_m, z_m) in zip(layout.anchors, layout.position_m.tolist(), strict=True)
+def drawn_room(layout: SurveyLayout, errors: RoomErrors, noise_ps: float, seed: int) -> DrawnRoom:
+    """Draw the errors of a room without late pairs, whose TX and RX delays differ."""
+    draw = np.random.default_rng(seed)
+    n, anchors = len(layout.anchors), layout.anchors
+    common_m, half_m = errors.delay_std_m * draw.standard_normal((2, n))
+    late_m = errors.pair_std_m * draw.standard_normal((n, n))
+    return DrawnRoom(
+        layout=layout,
+        tx_delay_m=common_m + half_m,
+        rx_delay_m=common_m - half_m,
+        pairs=tuple(
+            PairError(anchors[a], anchors[b], late_m=float(late_m[a, b])) for a in range(n) for b in range(a + 1, n)
+        ),
+        ranges=errors.ranges,
+        hand_m=HAND_STD_M * draw.standard_normal((n, 3)) * free_axes(layout),
+        sketch_m=SKETCH_STD_M * draw.standard_normal((n, 3)) * free_axes(layout),
+        tape_m=TAPE_STD_M * draw.standard_normal(1),
+        noise_ps=noise_ps,
+        seed=int(draw.integers(1 << 60)),
     )
-    schedule = ScheduleSite(slot_s=SLOT_S)
-    if drawn.missing:  # a master would have to reach all
-        schedule = ScheduleSite(mode="free")
-    site = Site(layout.name, 1, 1, anchors, schedule, accuracy=EXACT)
-    delays = tuple(
-        DelayError(anchor, float(delay_m / TICK_M), float(delay_m / TICK_M))
-        for anchor, delay_m in zip(layout.anchors, drawn.delay_m, strict=True)
-    )
-    air = replace(
-        lab_impairments(noise_ps),
-        delay_errors=delays,
-        anchor_pair_errors=drawn.errors,
-        channel=ChannelModel(sensitivity_dbm=_SENSITIVITY_DBM),
-    )
-    settle_s = _SETTLE_S if drawn.missing else 0.0
-    return stamps_of(site, air, seconds, seed, settle_s=settle_s).ranges()
 
 
 # A survey compared with the truth: errors after the best rigid alignment, their bound, and errors of a tag.
@@ -259,17 +292,15 @@ class Outcome(Struct, frozen=True):
     excluded_wrongly: int = 0
 
 
-def survey_bound_m(
-    layout: SurveyLayout, ranges: PairRanges, facts: Facts, drawn: DrawnErrors, seconds: float, noise_ps: float
-) -> float:
+def survey_bound_m(room: DrawnRoom, ranges: PairRanges, facts: Facts, seconds: float) -> float:
     """Bound of the anchors' RMS distance error for the pairs in the air, if it were known which are late."""
-    n = len(layout.position_m)
+    layout, n = room.layout, len(room.layout.position_m)
     if facts.keep_positions:
         return facts.sketch_std_m * math.sqrt(layout.dimensions)
     superframes = seconds / (n * SLOT_S)
-    stamp_m2 = (noise_ps * 1e-12 * SPEED_OF_LIGHT_MPS) ** 2 + TICK_M**2 / 12.0
+    stamp_m2 = (room.noise_ps * 1e-12 * SPEED_OF_LIGHT_MPS) ** 2 + TICK_M**2 / 12.0
     index = {anchor: number for number, anchor in enumerate(layout.anchors)}
-    direct = [pair for pair in ranges.pairs if (pair.a, pair.b) not in drawn.late]
+    direct = [pair for pair in ranges.pairs if (pair.a, pair.b) not in room.late]
     first, second = (np.array([index[getattr(pair, end)] for pair in direct]) for end in "ab")
     tape_first, tape_second = (np.array([index[getattr(tape, end)] for tape in facts.tapes], int) for end in "ab")
     problem = Problem(
@@ -290,8 +321,9 @@ def survey_bound_m(
     return math.sqrt(float(np.trace(covariance[: 3 * n, : 3 * n])) / n)
 
 
-def judged(layout: SurveyLayout, survey: Survey, drawn: DrawnErrors, outcome: Outcome) -> Outcome:
+def judged(room: DrawnRoom, survey: Survey, outcome: Outcome) -> Outcome:
     """The outcome with the survey's figures added."""
+    layout = room.layout
     is_determined = all(one.determined for one in survey.anchors) and len(survey.anchors) == len(layout.anchors)
     flagged = bool(survey.ambiguities) or survey.unchecked is not None or not is_determined
     excluded = {(pair.a, pair.b) for pair in survey.pairs if pair.excluded}
@@ -301,10 +333,10 @@ def judged(layout: SurveyLayout, survey: Survey, drawn: DrawnErrors, outcome: Ou
         is_determined=is_determined,
         is_open=bool(survey.not_determined),
         is_flagged=flagged,
-        late=len(drawn.late),
-        found=len(drawn.late & excluded),
-        direct=len(used - drawn.late),
-        excluded_wrongly=len(excluded - drawn.late),
+        late=len(room.late),
+        found=len(room.late & excluded),
+        direct=len(used - room.late),
+        excluded_wrongly=len(excluded - room.late),
     )
     if not is_determined:
         return outcome
@@ -318,7 +350,7 @@ def judged(layout: SurveyLayout, survey: Survey, drawn: DrawnErrors, outcome: Ou
         for one, error in zip(survey.anchors, error_m[:, :k], strict=True)
         if one.covariance_m2 is not None
     ]
-    off_m = delay_m - drawn.delay_m
+    off_m = delay_m - room.tx_delay_m
     said_m2 = [k * (one.std_m or 0.0) ** 2 for one in survey.anchors]
     return replace(
         outcome,
@@ -326,7 +358,7 @@ def judged(layout: SurveyLayout, survey: Survey, drawn: DrawnErrors, outcome: Ou
         said_m=math.sqrt(float(np.mean(said_m2))),
         nees=float(np.mean(squares)) / k if squares else None,
         delay_m=float(np.std(off_m)),
-        tag_m=tag_error_m(layout, aligned(found_m, layout.position_m, k), delay_m, drawn.delay_m),
+        tag_m=tag_error_m(layout, aligned(found_m, layout.position_m, k), delay_m, room.tx_delay_m),
     )
 
 
@@ -356,65 +388,7 @@ def tag_error_m(layout: SurveyLayout, found_m: Array, delay_m: Array, true_delay
     return math.sqrt(float(np.mean(squares)))
 
 
-HAND_STD_M: Final = 0.02
-"""Error of positions measured by hand, per axis."""
-SKETCH_STD_M: Final = 0.3
-ROOM_RANGES: Final = Room().ranges
-"""Errors of ranges at tags in the scenario ``room``."""
-TAPE_STD_M: Final = 0.005
-
-
-class RoomErrors(Struct, frozen=True):
-    """Distribution of the errors of a room."""
-
-    delay_std_m: float = 0.0
-    """Standard deviation of h, half of the sum of an anchor's TX and RX delay errors, and of half their difference."""
-    pair_std_m: float = 0.0
-    """Standard deviation of the constant error of each pair of anchors."""
-    ranges: RangeErrorModel = RangeErrorModel()
-    """Range errors at tags."""
-
-
-class DrawnRoom(Struct, frozen=True, eq=False):
-    """A room with its errors. Arrays are in the order of the layout's anchors."""
-
-    layout: SurveyLayout
-    tx_delay_m: Array
-    """True delay less the usual one, shape (n,)."""
-    rx_delay_m: Array
-    pairs: tuple[PairError, ...]
-    ranges: RangeErrorModel
-    hand_m: Array
-    """Errors of positions measured by hand, shape (n, 3)."""
-    sketch_m: Array
-    """Errors of a sketch, shape (n, 3)."""
-    tape_m: float
-    """Error of a taped distance."""
-    noise_ps: float
-    seed: int
-    """Seed of the air."""
-
-
-def drawn_room(layout: SurveyLayout, errors: RoomErrors, noise_ps: float, seed: int) -> DrawnRoom:
-    """Draw the errors of a room."""
-    draw = np.random.default_rng(seed)
-    n, anchors = len(layout.anchors), layout.anchors
-    common_m, half_m = errors.delay_std_m * draw.standard_normal((2, n))
-    late_m = errors.pair_std_m * draw.standard_normal((n, n))
-    return DrawnRoom(
-        layout=layout,
-        tx_delay_m=common_m + half_m,
-        rx_delay_m=common_m - half_m,
-        pairs=tuple(
-            PairError(anchors[a], anchors[b], late_m=float(late_m[a, b])) for a in range(n) for b in range(a + 1, n)
-        ),
-        ranges=errors.ranges,
-        hand_m=HAND_STD_M * draw.standard_normal((n, 3)) * free_axes(layout),
-        sketch_m=SKETCH_STD_M * draw.standard_normal((n, 3)) * free_axes(layout),
-        tape_m=float(TAPE_STD_M * draw.standard_normal()),
-        noise_ps=noise_ps,
-        seed=int(draw.integers(1 << 60)),
-    )
+# Site files of a room.
 
 
 def site_at(layout: SurveyLayout, position_m: Array, noise_ps: float) -> Site:
@@ -471,6 +445,15 @@ def hand_site(room: DrawnRoom) -> Site:
     return _aligned(room, site_at(room.layout, room.layout.position_m + room.hand_m, room.noise_ps))
 
 
+def ranges_in_air(room: DrawnRoom, seconds: float) -> PairRanges:
+    """Ranges between the anchors, with a site file that has the true positions, where the radio reaches all pairs."""
+    # Without a master if pairs are missing: it would have to reach all.
+    schedule = ScheduleSite(mode="free") if room.missing else ScheduleSite(slot_s=SLOT_S)
+    site = replace(site_at(room.layout, room.layout.position_m, room.noise_ps), schedule=schedule)
+    air = replace(air_of(room, site), channel=ChannelModel(sensitivity_dbm=_SENSITIVITY_DBM))
+    return stamps_of(site, air, seconds, room.seed, settle_s=_SETTLE_S if room.missing else 0.0).ranges()
+
+
 def ranges_of(room: DrawnRoom, seconds: float) -> PairRanges:
     """Ranges between the anchors, with a site file from a sketch."""
     site = site_at(room.layout, room.layout.position_m + room.sketch_m, room.noise_ps)
@@ -480,7 +463,7 @@ def ranges_of(room: DrawnRoom, seconds: float) -> PairRanges:
 def kept_site(room: DrawnRoom, ranges: PairRanges) -> Site:
     """A site file with positions measured by hand, and delays from ``--keep-positions``."""
     rough_m = room.layout.position_m + room.hand_m
-    facts = replace(_facts(room, rough_m), sketch_std_m=HAND_STD_M, keep_positions=True)
+    facts = replace(facts_of(room, rough_m), sketch_std_m=HAND_STD_M, keep_positions=True)
     return _aligned(room, _written(room, rough_m, run_survey(ranges, facts), AccuracySite()))
 
 
@@ -491,23 +474,29 @@ def surveyed_room(room: DrawnRoom, ranges: PairRanges, *, with_tape: bool = Fals
     pairs have no errors, and the file states exact ranges.
     """
     rough_m = room.layout.position_m + room.sketch_m
-    facts = _facts(room, rough_m)
+    facts = facts_of(room, rough_m)
     if is_exact:
         facts = replace(facts, delay_std_m=0.0, pair_std_m=0.0)
     survey = run_survey(ranges, facts)
     if with_tape and survey.tapes:
-        a, b = survey.tapes[0].a, survey.tapes[0].b
-        at_m = dict(zip(room.layout.anchors, room.layout.position_m, strict=True))
-        measured_m = float(np.linalg.norm(at_m[a] - at_m[b])) + room.tape_m
-        survey = run_survey(ranges, replace(facts, tapes=(Tape(a, b, measured_m, TAPE_STD_M),)))
+        survey = run_survey(ranges, replace(facts, tapes=taped(room, survey.tapes[:1])))
     return _aligned(room, _written(room, rough_m, survey, EXACT if is_exact else AccuracySite()))
 
 
-def _facts(room: DrawnRoom, rough_m: Array) -> Facts:
-    layout = room.layout
-    sketch: dict[int, Point] = {
-        anchor: (x, y, z) for anchor, (x, y, z) in zip(layout.anchors, rough_m.tolist(), strict=True)
-    }
+def taped(room: DrawnRoom, advised: Sequence[TapeAdvice]) -> tuple[Tape, ...]:
+    """The advised distances as they are measured."""
+    at_m = dict(zip(room.layout.anchors, room.layout.position_m, strict=True))
+    return tuple(
+        Tape(one.a, one.b, float(np.linalg.norm(at_m[one.a] - at_m[one.b])) + float(error_m), TAPE_STD_M)
+        for one, error_m in zip(advised, room.tape_m, strict=False)
+    )
+
+
+def facts_of(room: DrawnRoom, rough_m: Array | None) -> Facts:
+    """What a survey is told: heights in two dimensions, and a sketch with these positions, shape (n, 3), if any."""
+    layout, sketch = room.layout, dict[int, Point]()
+    if rough_m is not None:
+        sketch = {anchor: (x, y, z) for anchor, (x, y, z) in zip(layout.anchors, rough_m.tolist(), strict=True)}
     return Facts(dimensions=layout.dimensions, heights_m=layout.heights_m, sketch_m=sketch, sketch_std_m=SKETCH_STD_M)
 
 

@@ -777,8 +777,8 @@ def aligned_covariance(problem: Problem, position_m: Array, core: Mask, weight: 
     ``weight``: see ``jacobian``.
     """
     used = unknown_columns(problem)
-    rows = jacobian(problem, position_m, weight)[:, used]
-    information = rows.T @ rows
+    rows = jacobian(problem, position_m, weight)
+    information = rows[:, used].T @ rows[:, used]
     inside = np.concatenate([np.repeat(core, 3) & problem.is_free.ravel(), np.zeros(len(position_m), bool)])[used]
     motion = _rigid_motions(problem, position_m, inside, used)
     count, size = motion.shape[1], int(inside.sum())
