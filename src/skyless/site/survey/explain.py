@@ -21,6 +21,7 @@ from scipy.special import chdtri
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.ticks import CARRIER_CYCLES, TICK_M, TICK_RATE_HZ, difference
 from skyless.site.survey.legs import MAX_BRACKET_RATE, STD_OVER_MAD, AnchorLeg
+from skyless.site.survey.problem import incidence, unit_vectors
 
 # Findings
 
@@ -125,14 +126,13 @@ class Fit(Struct, frozen=True, eq=False):
 
 def weight_of(first: Integers, second: Integers, anchors: int, white_m: Array, drift_m: Array) -> Array:
     """Inverse covariance, shape (m, m), of changes with white noise of stamps and drift, each shape (m,)."""
-    rows = np.arange(len(first))
-    shared = np.zeros((len(first), anchors))  # effect of each anchor's TX noise on its pairs
-    shared[rows, first] = shared[rows, second] = math.sqrt(_SHARED) * white_m
+    # Effect of each anchor's TX noise on its pairs.
+    shared = math.sqrt(_SHARED) * white_m[:, None] * incidence(anchors, first, second)
     own = 1.0 / ((1.0 - 2.0 * _SHARED) * white_m**2 + drift_m**2)
     weighted = own[:, None] * shared
     inner = np.linalg.inv(np.eye(anchors) + shared.T @ weighted)  # matrix inversion lemma: n × n, not m × m
     weight: Array = -(weighted @ inner) @ weighted.T
-    weight[rows, rows] += own
+    weight[np.diag_indices_from(weight)] += own
     return weight
 
 
@@ -144,7 +144,7 @@ def evidence(pairs: Pairs, weight: Array, weighted_m: Array) -> tuple[Array, Int
     """
     n, dim, m = pairs.anchors, pairs.dimensions, len(pairs.first)
     moved = _moved_columns(pairs, pairs.position_m).reshape(m, n * dim)
-    delayed = _delay_columns(pairs)
+    delayed = incidence(n, pairs.first, pairs.second)
     products = (weight @ moved).reshape(m, n, dim)
     information, directions = np.linalg.eigh(np.einsum("pid,pie->ide", moved.reshape(m, n, dim), products))
     is_seen = information > _MIN_INFORMATION_PER_M2
@@ -220,21 +220,11 @@ def _inverse(information: Array) -> Array:
 
 def _moved_columns(pairs: Pairs, position_m: Array) -> Array:
     """Derivatives of each pair's distance with respect to the anchors' positions, shape (m, n, dim)."""
-    apart = (position_m[pairs.first] - position_m[pairs.second])[:, : pairs.dimensions]
-    distance = np.linalg.norm(position_m[pairs.first] - position_m[pairs.second], axis=1)
-    unit = apart / np.maximum(distance, 1e-6)[:, None]
+    unit = unit_vectors(position_m, pairs.first, pairs.second)[:, : pairs.dimensions]
     columns = np.zeros((len(pairs.first), pairs.anchors, pairs.dimensions))
     rows = np.arange(len(pairs.first))
     columns[rows, pairs.first] = unit
     columns[rows, pairs.second] = -unit
-    return columns
-
-
-def _delay_columns(pairs: Pairs) -> Array:
-    """Derivatives of each pair's range with respect to the anchors' delays, shape (m, n)."""
-    columns = np.zeros((len(pairs.first), pairs.anchors))
-    rows = np.arange(len(pairs.first))
-    columns[rows, pairs.first] = columns[rows, pairs.second] = 1.0
     return columns
 
 
@@ -249,7 +239,7 @@ def _model(pairs: Pairs, causes: Sequence[int], ends: Integers, parameter: Array
     before_m = np.linalg.norm(pairs.position_m[pairs.first] - pairs.position_m[pairs.second], axis=1)
     predicted = apart_m - before_m
     columns = np.zeros((m, len(parameter)))
-    moved, delayed = _moved_columns(pairs, position_m), _delay_columns(pairs)
+    moved, delayed = _moved_columns(pairs, position_m), incidence(n, pairs.first, pairs.second)
     for cause, end in zip(causes, ends.tolist(), strict=True):
         if cause < n:
             columns[:, end - dim : end] = moved[:, cause]

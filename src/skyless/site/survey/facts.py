@@ -227,19 +227,19 @@ class Survey(Struct, frozen=True):
     pairs: tuple[SurveyedPair, ...]
     range_std_m: float
     """Constant error of a pair that the result assumes: as given, or as the residuals show if that is more."""
-    redundancy: int
+    redundancy: int = 0
     """Ranges in use less unknowns: the number of ranges that check the result."""
-    unchecked: str | None
+    unchecked: str | None = None
     """A sentence if too few ranges check the result; otherwise None."""
-    not_determined: tuple[str, ...]
+    not_determined: tuple[str, ...] = ()
     """Sentences on what is not determined, and why."""
-    ambiguities: tuple[Ambiguity, ...]
-    tapes: tuple[TapeAdvice, ...]
+    ambiguities: tuple[Ambiguity, ...] = ()
+    tapes: tuple[TapeAdvice, ...] = ()
     """The best first; each assumes that those before it have been measured."""
-    frame: str
+    frame: str = ""
     """A sentence on what defines origin and axes."""
-    gauge: Gauge | None
-    notes: tuple[str, ...]
+    gauge: Gauge | None = None
+    notes: tuple[str, ...] = ()
     """Sentences, for instance on facts that do not fit."""
     assumed_heights: str | None = None
     """A sentence if heights are assumed, being neither given nor estimated; otherwise None."""

@@ -162,6 +162,14 @@ def unit_vectors(position_m: Array, first: Integers, second: Integers) -> Array:
     return np.asarray(apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None])
 
 
+def incidence(n: int, first: Integers, second: Integers) -> Array:
+    """Incidence matrix of pairs and n anchors, shape (pairs, n): 1 where a pair contains an anchor."""
+    rows = np.zeros((len(first), n))
+    number = np.arange(len(rows))
+    rows[number, first] = rows[number, second] = 1.0
+    return rows
+
+
 def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -> Array:
     """Weighted derivatives of ranges, tapes, delay priors and coordinate priors, shape (rows, 4 n).
 
@@ -182,8 +190,7 @@ def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -
     for axis in range(3):
         rows[number, 3 * first + axis] = factor * unit[:, axis]
         rows[number, 3 * second + axis] = -factor * unit[:, axis]
-    rows[number[:m], 3 * n + problem.first] = of_range
-    rows[number[:m], 3 * n + problem.second] = of_range
+    rows[:m, 3 * n :] = of_range[:, None] * incidence(n, problem.first, problem.second)
     rows[m + t : m + t + n, 3 * n :] = delay_weights(problem)
     rows[m + t + n + np.arange(len(known)), known] = of_coordinate[known]
     rows = np.vstack([rows, *(more.rows(position_m, np.zeros(n))[0] for more in problem.more)])

@@ -32,10 +32,13 @@ from skyless.site.survey.problem import (
     MoreRows,
     Problem,
     Solution,
+    delay_weights,
     distances_m,
+    incidence,
     jacobian,
     solve_least_squares,
     superimposed,
+    unit_vectors,
 )
 from skyless.site.survey.walk import TagEpochs, fit_with_tag
 
@@ -680,14 +683,13 @@ class Fitted(Struct, frozen=True, eq=False):
     solution: Solution
     used: Mask
     """Shape (m,): ranges in use."""
-    range_std_m: float
     core: Mask
     """Shape (k,): determined anchors."""
     covariance_m2: Array
     """Shape (4 k, 4 k), coordinates and delays, aligned over the core, or over all if no anchor is determined."""
-    points_used: tuple[int, ...]
+    points_used: tuple[int, ...] = ()
     """Identifiers of the known points that hold the shape."""
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def anchors(self) -> tuple[int, ...]:
@@ -713,7 +715,7 @@ def fit_shape(measured: Measured, kept: Integers) -> Fitted:
     for _ in range(_MAX_ROUNDS):
         fitted = _round(measured, kept, range_std_m, held if is_held.any() else None, sketch, extra)
         shown = _shown_std_m(fitted)
-        if shown <= fitted.range_std_m:
+        if shown <= fitted.robust.range_std_m:
             break
         range_std_m = shown
     used = tuple(anchor for anchor, chosen in zip(anchors, is_held, strict=True) if chosen)
@@ -736,9 +738,7 @@ def _round(
         solution = _in_sketch_frame(problem, solution, robust.weight, sketch)
         robust = structs.replace(robust, solution=solution)
     core, covariance = _determined(measured, kept, problem, solution, used, point)
-    return Fitted(
-        measured, kept, robust, problem, tuple(pairs), solution, used, robust.range_std_m, core, covariance, (), ()
-    )
+    return Fitted(measured, kept, robust, problem, tuple(pairs), solution, used, core, covariance)
 
 
 def _determined(
@@ -777,8 +777,11 @@ def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Ma
 def with_tag(fitted: Fitted, rows: MoreRows, solution: Solution, used: Mask) -> Fitted:
     """The shape with a tag's rows, for a solution that includes them."""
     problem = structs.replace(fitted.problem, more=(*fitted.problem.more, rows))
+    fitted = structs.replace(fitted, problem=problem, solution=solution, used=used)
+    if fitted.measured.facts.keep_positions:
+        return fitted
     core, covariance = _determined(fitted.measured, fitted.kept, problem, solution, used, _points(fitted))
-    return structs.replace(fitted, problem=problem, solution=solution, used=used, core=core, covariance_m2=covariance)
+    return structs.replace(fitted, core=core, covariance_m2=covariance)
 
 
 def _in_sketch_frame(problem: Problem, solution: Solution, weight: Array, sketch: Array) -> Solution:
@@ -903,3 +906,46 @@ def with_tags(fitted: Fitted, others: tuple[OtherFit, ...]) -> tuple[Fitted, tup
             others = tuple(others[number - 1] for number in joint.possible if number and number != joint.chosen)
         fitted = structs.replace(fitted, notes=notes)
     return fitted, others
+
+
+# Only delays, of anchors whose positions are kept
+
+
+def fit_delays(measured: Measured, kept: Integers, position_m: Array) -> Fitted:
+    """Fit the delays of anchors whose positions, shape (k, 3), stay; their errors count as errors of the ranges."""
+    facts = measured.facts
+    problem, pairs = build_problem(measured, kept, facts.pair_std_m, None, None)
+    problem = structs.replace(
+        problem,
+        is_free=np.zeros((len(kept), 3), bool),
+        coordinate_m=position_m,
+        variance_m2=problem.variance_m2 + 2.0 * facts.sketch_std_m**2,
+    )
+    fit = fit_robustly(problem, [position_m], math.hypot(facts.pair_std_m, math.sqrt(2.0) * facts.sketch_std_m))
+    core, covariance = np.ones(len(kept), bool), np.zeros((4 * len(kept), 4 * len(kept)))
+    return Fitted(measured, kept, fit, fit.problem, tuple(pairs), fit.solution, fit.used, core, covariance)
+
+
+def delay_covariance(fitted: Fitted) -> Array:
+    """Covariance of the delays, shape (k, k), with errors of kept positions, which all ranges of an anchor share."""
+    problem, solution, facts = fitted.problem, fitted.solution, fitted.measured.facts
+    k, m, dimensions = len(fitted.kept), len(problem.first), facts.dimensions
+    of_tags = np.zeros((4 * k, 4 * k))
+    for more in problem.more:
+        rows, _ = more.rows(solution.position_m, solution.delay_m)
+        of_tags += rows.T @ rows
+    by_tags = of_tags[3 * k :, : 3 * k].reshape(k, k, 3)[:, :, :dimensions]
+    of_tags = of_tags[3 * k :, 3 * k :]
+    weight = fitted.used / problem.variance_m2
+    delays = incidence(k, problem.first, problem.second)
+    prior = delay_weights(problem).T @ delay_weights(problem)
+    inverse = np.linalg.inv(delays.T @ (weight[:, None] * delays) + prior + of_tags)
+    gain = inverse @ (delays.T * weight)
+    unit = unit_vectors(solution.position_m, problem.first, problem.second)[:, :dimensions]
+    shift, number = np.zeros((m, k, dimensions)), np.arange(m)
+    shift[number, problem.first], shift[number, problem.second] = unit, -unit
+    moved = gain @ shift.reshape(m, -1) + inverse @ by_tags.reshape(k, -1)
+    noise = np.maximum(problem.variance_m2 - 2.0 * facts.sketch_std_m**2, 0.0)
+    return np.asarray(
+        (gain * noise) @ gain.T + facts.sketch_std_m**2 * moved @ moved.T + inverse @ (prior + of_tags) @ inverse
+    )

@@ -36,25 +36,24 @@ from skyless.site.survey.fit import (
     Direction,
     Links,
     OtherFit,
-    RobustFit,
     aligned_covariance,
     best_tapes,
     count_links,
     find_ambiguities,
-    fit_robustly,
     max_std_m,
     mending_tapes,
     position_stds_m,
     weak_directions,
 )
-from skyless.site.survey.problem import Problem, adjacency, delay_weights, unit_vectors
+from skyless.site.survey.problem import Problem, adjacency, delay_weights, incidence
 from skyless.site.survey.shape import (
     Fitted,
     Framed,
     Measured,
     as_array,
     assumed_heights,
-    build_problem,
+    delay_covariance,
+    fit_delays,
     fit_shape,
     fixed_heights_m,
     in_frame,
@@ -66,7 +65,6 @@ from skyless.site.survey.shape import (
     with_free_delays,
     with_tags,
 )
-from skyless.site.survey.walk import TagEpochs, fit_with_tag
 
 _MOVED_M: Final = 0.1  # an anchor that differs less between two results is at the same position
 _ELSEWHERE: Final = 0.3
@@ -110,7 +108,7 @@ def _survey(measured: Measured) -> Survey:
     return Survey(
         anchors=_anchors(measured, links, fitted, framed),
         pairs=_pairs(measured, fitted),
-        range_std_m=fitted.range_std_m,
+        range_std_m=fitted.robust.range_std_m,
         redundancy=redundancy(fitted),
         unchecked=_unchecked(fitted),
         not_determined=(*_missing_sentences(measured, links, fitted), *_held_by_expected_delays(fitted, framed)),
@@ -154,7 +152,6 @@ def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -
             found.append(SurveyedAnchor(anchor, determined=False, reason=reasons[anchor]))
             continue
         x, y, z = framed.position_m[k].tolist()
-        covariance = tuple(tuple(row) for row in framed.covariance_m2[k].tolist())
         found.append(
             SurveyedAnchor(
                 anchor,
@@ -163,7 +160,7 @@ def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -
                 y_m=y,
                 z_m=z,
                 std_m=float(stds[k]),
-                covariance_m2=covariance,
+                covariance_m2=tuple(tuple(row) for row in framed.covariance_m2[k].tolist()),
                 delay_m=float(delays[k]),
                 delay_std_m=float(delay_stds[k]),
             )
@@ -256,14 +253,10 @@ def _nothing(measured: Measured, links: Links, fitted: Fitted | None) -> Survey:
             SurveyedAnchor(anchor, determined=False, reason=reasons.get(anchor)) for anchor in measured.anchors
         ),
         pairs=_pairs(measured, fitted),
-        range_std_m=measured.facts.pair_std_m if fitted is None else fitted.range_std_m,
-        redundancy=0,
+        range_std_m=measured.facts.pair_std_m if fitted is None else fitted.robust.range_std_m,
         unchecked="nothing checks this survey: no anchor is determined",
         not_determined=_missing_sentences(measured, links, fitted),
-        ambiguities=(),
-        tapes=(),
         frame="no anchor is determined, so there is no frame",
-        gauge=None,
         notes=measured.notes if fitted is None else (*measured.notes, *fitted.notes),
     )
 
@@ -280,31 +273,23 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
     sketch = as_array(facts.sketch_m, measured.anchors)
     sketch[:, 2] = np.where(np.isnan(sketch[:, 2]), fixed_heights_m(measured), sketch[:, 2])
     kept = np.flatnonzero(np.isfinite(sketch[:, :2]).all(axis=1))
-    position = sketch[kept]
-    problem, pairs = build_problem(measured, kept, facts.pair_std_m, None, None)
-    problem = structs.replace(
-        problem,
-        is_free=np.zeros((len(kept), 3), bool),
-        coordinate_m=position,
-        variance_m2=problem.variance_m2 + 2.0 * facts.sketch_std_m**2,
-    )
     ids = tuple(measured.anchors[index] for index in kept)
+    pairs = [pair for pair in measured.pairs if {pair.a, pair.b} <= set(ids)]
     linked = {anchor for pair in pairs for anchor in (pair.a, pair.b)}
     delays: dict[int, tuple[float, float]] = {}
     residuals: dict[tuple[int, int], tuple[float | None, bool]] = {}
     redundancy, range_std_m = 0, facts.pair_std_m
     notes: tuple[str, ...] = ()
     if pairs:
-        fit = fit_robustly(problem, [position], math.hypot(facts.pair_std_m, math.sqrt(2.0) * facts.sketch_std_m))
-        fit, tag_information, notes = _kept_with_tags(fit, measured, ids, position)
-        covariance = _delay_covariance(fit, position, facts.sketch_std_m, facts.dimensions, tag_information)
-        own, std = own_delays(measured, ids, fit.problem, fit.solution.delay_m, covariance)
+        fit, _ = with_tags(fit_delays(measured, kept, sketch[kept]), ())
+        notes = fit.notes
+        own, std = own_delays(measured, ids, fit.problem, fit.solution.delay_m, delay_covariance(fit))
         delays = {anchor: (float(own[k]), float(std[k])) for k, anchor in enumerate(ids) if anchor in linked}
         for index, pair in enumerate(pairs):
             residuals[pair.a, pair.b] = float(fit.solution.residual_m[index]), not fit.used[index]
-        incidence = _incidence(fit.problem)[fit.used]
-        redundancy = int(fit.used.sum()) - int(np.linalg.matrix_rank(incidence))
-        range_std_m = math.sqrt(max(fit.range_std_m**2 - 2.0 * facts.sketch_std_m**2, facts.pair_std_m**2))
+        delays_in_use = incidence(len(ids), fit.problem.first, fit.problem.second)[fit.used]
+        redundancy = int(fit.used.sum()) - int(np.linalg.matrix_rank(delays_in_use))
+        range_std_m = math.sqrt(max(fit.robust.range_std_m**2 - 2.0 * facts.sketch_std_m**2, facts.pair_std_m**2))
     kept_pairs = []
     for pair in measured.pairs:
         residual_m, excluded = residuals.get((pair.a, pair.b), (None, False))
@@ -322,64 +307,9 @@ def survey_of_kept_positions(measured: Measured) -> Survey:
         redundancy=redundancy,
         unchecked=None if redundancy >= MIN_CHECKS else "too few ranges check these delays",
         not_determined=tuple(sentences),
-        ambiguities=(),
-        tapes=(),
         frame="positions are the given ones, which stay",
-        gauge=None,
         notes=(*measured.notes, *notes),
     )
-
-
-def _kept_with_tags(
-    fit: RobustFit, measured: Measured, ids: tuple[int, ...], position_m: Array
-) -> tuple[RobustFit, Array, tuple[str, ...]]:
-    """The fit with the tags' receptions, their information on coordinates and delays, (4 k, 4 k), and sentences."""
-    ranges_m = {(pair.a, pair.b): pair.range_m for pair in measured.pairs}
-    information = np.zeros((4 * len(ids), 4 * len(ids)))
-    sentences: list[str] = []
-    for epochs in measured.facts.tags:
-        assert isinstance(epochs, TagEpochs)
-        joint = fit_with_tag(fit.problem, ids, [fit.solution], epochs, ranges_m, [fit.used])
-        sentences.append(joint.sentence)
-        if joint.solution is not None and joint.rows is not None:
-            problem = structs.replace(fit.problem, more=(*fit.problem.more, joint.rows))
-            fit = structs.replace(fit, problem=problem, solution=joint.solution)
-            jacobian, _ = joint.rows.rows(position_m, joint.solution.delay_m)
-            information += jacobian.T @ jacobian
-    return fit, information, tuple(sentences)
-
-
-def _delay_covariance(
-    fit: RobustFit, position_m: Array, position_std_m: float, dimensions: int, tag_information: Array
-) -> Array:
-    """Covariance of the delays, shape (k, k), with position errors, which all ranges of an anchor share."""
-    problem, k = fit.problem, len(position_m)
-    weight = fit.used / problem.variance_m2
-    incidence = _incidence(problem)
-    prior = delay_weights(problem).T @ delay_weights(problem)
-    of_tags = tag_information[3 * k :, 3 * k :]
-    inverse = np.linalg.inv(incidence.T @ (weight[:, None] * incidence) + prior + of_tags)
-    gain = inverse @ (incidence.T * weight)
-    unit = unit_vectors(position_m, problem.first, problem.second)
-    shift = np.zeros((len(problem.first), k, dimensions))
-    number = np.arange(len(problem.first))
-    shift[number, problem.first] = unit[:, :dimensions]
-    shift[number, problem.second] = -unit[:, :dimensions]
-    by_tags = tag_information[3 * k :, : 3 * k].reshape(k, k, 3)[:, :, :dimensions]
-    moved = gain @ shift.reshape(len(number), -1) + inverse @ by_tags.reshape(k, -1)
-    noise = np.maximum(problem.variance_m2 - 2.0 * position_std_m**2, 0.0)
-    return np.asarray(
-        (gain * noise) @ gain.T + position_std_m**2 * moved @ moved.T + inverse @ (prior + of_tags) @ inverse
-    )
-
-
-def _incidence(problem: Problem) -> Array:
-    """Incidence matrix of ranges and anchors, shape (m, k): 1 where a range contains an anchor's delay."""
-    rows = np.zeros((len(problem.first), len(problem.is_free)))
-    number = np.arange(len(rows))
-    rows[number, problem.first] = 1.0
-    rows[number, problem.second] = 1.0
-    return rows
 
 
 def _kept_anchor(
@@ -390,8 +320,7 @@ def _kept_anchor(
     facts = measured.facts
     x, y, z = position_m.tolist()
     delay, std = delays.get(anchor, (None, None))
-    variance = [facts.sketch_std_m**2 if axis < facts.dimensions else 0.0 for axis in range(3)]
-    a, b, c = np.diag(variance).tolist()
+    variances = np.where(np.arange(3) < facts.dimensions, facts.sketch_std_m**2, 0.0)
     return SurveyedAnchor(
         anchor,
         determined=True,
@@ -399,7 +328,7 @@ def _kept_anchor(
         y_m=y,
         z_m=z,
         std_m=facts.sketch_std_m,
-        covariance_m2=(tuple(a), tuple(b), tuple(c)),
+        covariance_m2=tuple(tuple(row) for row in np.diag(variances).tolist()),
         delay_m=delay,
         delay_std_m=std,
     )
