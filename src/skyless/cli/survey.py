@@ -171,8 +171,8 @@ def _written(found: "SurveyResult", out: Path) -> tuple[tuple[str, ...], tuple[s
     assert found.file is not None
     saved = save_survey(found.file, found.survey, found.ranges, time.time(), out=out)
     known = {anchor.id for anchor in found.site.all_anchors}
-    strangers = [one.id for one in found.survey.anchors if one.determined and one.id not in known]
-    more = tuple(f"anchor {one} is not in {found.file} and was not written" for one in strangers)
+    strangers = found.survey.determined.keys() - known
+    more = tuple(f"anchor {one} is not in {found.file} and was not written" for one in sorted(strangers))
     return tuple(map(str, saved.written)), more
 
 
@@ -181,7 +181,7 @@ def _table(result: "Survey") -> str:
     from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
     from skyless.site.tables import new_table
 
-    found = [one for one in result.anchors if one.determined]
+    found = result.determined.values()
     positions_m = {
         one.id: (round(one.x_m or 0.0, 4), round(one.y_m or 0.0, 4), round(one.z_m or 0.0, 4)) for one in found
     }

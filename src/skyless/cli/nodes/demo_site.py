@@ -256,7 +256,7 @@ def survey_record(site: Site) -> SurveyRecord:
     )
     anchors = tuple(SurveyedAnchor(one.id, True, one.x_m, one.y_m, one.z_m) for one in site.anchors)
     ranges = PairRanges(pairs, tuple(one.id for one in site.anchors))
-    survey = Survey(anchors, (), 0.01, len(pairs) - 2 * len(anchors) + 3, None, (), (), (), "", None, ())
+    survey = Survey(anchors, (), 0.01, len(pairs) - 2 * len(anchors) + 3)
     return SurveyRecord(site.name, site.id, 0.0, ranges, survey, {})
 
 

@@ -17,7 +17,7 @@ from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, missed_limits, seed_of
 from skyless.research.studies.surveyed_rooms import SurveyLayout, survey_layouts
-from skyless.site.survey.explain import Finding, Kind, Pairs, is_significant, weight_of
+from skyless.site.survey.explain import Finding, Kind, is_significant, pairs_of
 from skyless.site.survey.facts import PairBlock
 from skyless.site.survey.watch import GRACE_S, AnchorWatch
 
@@ -396,8 +396,7 @@ def striking_windows(layout: SurveyLayout, window_s: float, alarm: float, window
     first, second = np.triu_indices(n, 1)
     m = len(first)
     std_m = _STAMP_S * SPEED_OF_LIGHT_MPS / math.sqrt(window_s / (n * _SLOT_S))
-    weight = weight_of(first, second, n, np.full(m, std_m), np.zeros(m))
-    pairs = Pairs(position_m, first, second, layout.dimensions, weight)
+    pairs = pairs_of(position_m, first, second, layout.dimensions, np.full(m, std_m), np.zeros(m))
     found = 0
     for start in range(0, windows, _CHUNK):
         count = min(_CHUNK, windows - start)

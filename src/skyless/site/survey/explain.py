@@ -16,6 +16,7 @@ from typing import Final, Literal
 
 import numpy as np
 from msgspec import Struct, field
+from msgspec.structs import replace
 from scipy.special import chdtri
 
 from skyless.core.arrays import Array, Integers, Mask
@@ -124,8 +125,11 @@ class Fit(Struct, frozen=True, eq=False):
     """Shape (m, k): derivatives of the changes with respect to all parameters, at the solution."""
 
 
-def weight_of(first: Integers, second: Integers, anchors: int, white_m: Array, drift_m: Array) -> Array:
-    """Inverse covariance, shape (m, m), of changes with white noise of stamps and drift, each shape (m,)."""
+def pairs_of(
+    position_m: Array, first: Integers, second: Integers, dimensions: int, white_m: Array, drift_m: Array
+) -> Pairs:
+    """Pairs whose changes have white noise of stamps and drift, each shape (m,)."""
+    anchors = len(position_m)
     # Effect of each anchor's TX noise on its pairs.
     shared = math.sqrt(_SHARED) * white_m[:, None] * incidence(anchors, first, second)
     own = 1.0 / ((1.0 - 2.0 * _SHARED) * white_m**2 + drift_m**2)
@@ -133,7 +137,7 @@ def weight_of(first: Integers, second: Integers, anchors: int, white_m: Array, d
     inner = np.linalg.inv(np.eye(anchors) + shared.T @ weighted)  # matrix inversion lemma: n × n, not m × m
     weight: Array = -(weighted @ inner) @ weighted.T
     weight[np.diag_indices_from(weight)] += own
-    return weight
+    return Pairs(position_m, first, second, dimensions, weight)
 
 
 def evidence(pairs: Pairs, weight: Array, weighted_m: Array) -> tuple[Array, Integers]:
@@ -406,7 +410,7 @@ def _displaced(pairs: Pairs, one: _Set) -> Pairs:
     position_m = pairs.position_m.copy()
     for cause, parameter in moved:
         position_m[cause, : pairs.dimensions] += parameter
-    return Pairs(position_m, pairs.first, pairs.second, pairs.dimensions, pairs.weight)
+    return replace(pairs, position_m=position_m)
 
 
 def _parts(pairs: Pairs, best: _Set, rivals: list[_Set]) -> list[Part]:

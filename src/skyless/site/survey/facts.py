@@ -244,6 +244,11 @@ class Survey(Struct, frozen=True):
     assumed_heights: str | None = None
     """A sentence if heights are assumed, being neither given nor estimated; otherwise None."""
 
+    @property
+    def determined(self) -> dict[int, SurveyedAnchor]:
+        """The determined anchors by identifier."""
+        return {anchor.id: anchor for anchor in self.anchors if anchor.determined}
+
 
 # Lists of anchors in sentences
 

@@ -645,9 +645,9 @@ def aligned_to(problem: Problem, position_m: Array, target_m: Array) -> Array:
     """
     axes = np.flatnonzero(problem.is_free.any(axis=0))
     weight = np.ones(len(position_m))
-    moved_m = position_m.copy()
+    moved_m = position_m
     for _ in range(5):
-        moved_m[:, axes] = superimposed(position_m[:, axes], target_m[:, axes], weight)
+        moved_m = superimposed(position_m, target_m, weight, axes)
         weight = 1.0 / np.maximum(np.linalg.norm(moved_m - target_m, axis=1), 0.01)
     return moved_m
 

@@ -226,15 +226,17 @@ def distances_m(position_m: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("ijk,ijk->ij", apart, apart)))
 
 
-def superimposed(position_m: Array, target_m: Array, weight: Array) -> Array:
-    """Positions rotated, shifted and possibly reflected to best fit a target (weighted Procrustes problem).
+def superimposed(position_m: Array, target_m: Array, weight: Array, axes: Integers) -> Array:
+    """Positions rotated, shifted and possibly reflected in some axes to best fit a target (weighted Procrustes).
 
-    ``position_m``, ``target_m``: shape (n, d). ``weight``: of each anchor's squared distance, shape (n,), not all 0.
+    ``position_m``, ``target_m``: shape (n, 3). ``weight``: of each anchor's squared distance, shape (n,), not all 0.
     """
-    centre = np.average(position_m, axis=0, weights=weight)
-    goal = np.average(target_m, axis=0, weights=weight)
-    left, _, right = np.linalg.svd((weight[:, None] * (position_m - centre)).T @ (target_m - goal))
-    return np.asarray((position_m - centre) @ (left @ right) + goal)
+    own, other = position_m[:, axes], target_m[:, axes]
+    centre, goal = np.average(own, axis=0, weights=weight), np.average(other, axis=0, weights=weight)
+    left, _, right = np.linalg.svd((weight[:, None] * (own - centre)).T @ (other - goal))
+    moved_m = position_m.copy()
+    moved_m[:, axes] = (own - centre) @ (left @ right) + goal
+    return moved_m
 
 
 class _Equations:

@@ -343,8 +343,7 @@ class Axes(Struct, frozen=True, eq=False):
     origin: int
     x_axis: int
     left: int | None
-    side_decided: bool
-    """Whether an anchor is clearly on the left."""
+    """None if no anchor is clearly on the left."""
 
 
 def axes_through(
@@ -378,7 +377,7 @@ def axes_through(
     shift = -rotation @ position_m[origin]
     if axes == 2:
         shift[2] = 0.0
-    return Axes(Motion(rotation, shift), origin, x_axis, chosen if decided else None, decided)
+    return Axes(Motion(rotation, shift), origin, x_axis, chosen if decided else None)
 
 
 def _first(chosen: Mask) -> int | None:
@@ -494,14 +493,14 @@ def _by_gauge(
         )
     found = axes_through(position_m, core, axes, origin, x_axis, chosen[2] if len(chosen) > 2 else None)
     mirror = ""
-    if len(chosen) > 2 and not found.side_decided:
+    if len(chosen) > 2 and found.left is None:
         notes.append(f"anchor {anchors[chosen[2]]} stands on the x axis, so it cannot show which side is left")
     if len(chosen) < 3 and known is not None and decided and axes == 2:
         motion = found.motion
         if np.linalg.det(motion.rotation) < 0.0:
             motion = Motion(motion.rotation * [[1.0], [-1.0], [1.0]], motion.shift_m * [1.0, -1.0, 1.0])
-        found = Axes(motion, found.origin, found.x_axis, None, True)
-    elif len(chosen) < 3 or not found.side_decided:
+        found = structs.replace(found, motion=motion, left=None)
+    elif len(chosen) < 3 or found.left is None:
         mirror = "; no anchor on the left is named, so the result may be a mirror image"
     sentence = _sentence(anchors, found, axes) + mirror
     if known is not None:
@@ -632,7 +631,10 @@ def _moved_to(layout_m: Array, known_m: Array, axes: Integers) -> Array:
         position_m = _levelled(position_m, known_m[:, 2])
     whole = np.isfinite(known_m[:, axes]).all(axis=1)
     flat = axes if np.count_nonzero(whole) > len(axes) else axes[axes < 2]
-    return _aligned(position_m, known_m, flat) if flat.size else position_m
+    known: Mask = np.asarray(np.isfinite(known_m[:, flat]).all(axis=1))
+    if not flat.size or not known.any():
+        return position_m
+    return superimposed(position_m, np.nan_to_num(known_m), known.astype(np.float64), flat)
 
 
 def _levelled(position_m: Array, height_m: Array) -> Array:
@@ -645,16 +647,6 @@ def _levelled(position_m: Array, height_m: Array) -> Array:
     axes = np.linalg.qr(np.column_stack([upwards, np.eye(3)]))[0]
     axes = axes * np.sign(axes[:, 0] @ upwards)
     return np.asarray((position_m - centre) @ axes[:, [1, 2, 0]] + [0.0, 0.0, height_m[known].mean()])
-
-
-def _aligned(position_m: Array, known_m: Array, axes: Integers) -> Array:
-    """Positions moved rigidly, or reflected, in these axes to fit the anchors whose coordinates are known in all."""
-    known: Mask = np.asarray(np.isfinite(known_m[:, axes]).all(axis=1))
-    if not known.any():
-        return position_m
-    moved_m = position_m.copy()
-    moved_m[:, axes] = superimposed(position_m[:, axes], np.nan_to_num(known_m[:, axes]), known.astype(np.float64))
-    return moved_m
 
 
 # The shape: a fit of all anchors with enough ranges

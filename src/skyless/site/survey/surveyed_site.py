@@ -48,7 +48,7 @@ def surveyed_site(site: Site, survey: Survey) -> Site:
     Raises:
         SkylessError: an anchor would need an antenna delay that no radio has.
     """
-    found = {anchor.id: anchor for anchor in survey.anchors if anchor.determined}
+    found = survey.determined
     known = [_placed(anchor, found.get(anchor.id), site) for anchor in site.all_anchors]
     accuracy = _accuracy(site, found, survey.range_std_m)
     delays = {anchor.id: anchor.tx_antenna_delay_ticks for anchor in site.all_anchors}
@@ -84,8 +84,7 @@ def surveyed_text(text: str, survey: Survey, site: Site, path: str | PathLike[st
 
 def unchanged_anchors(site: Site, survey: Survey) -> tuple[int, ...]:
     """Anchors of the site that the survey has not determined."""
-    found = {anchor.id for anchor in survey.anchors if anchor.determined}
-    return tuple(anchor.id for anchor in site.all_anchors if anchor.id not in found)
+    return tuple(anchor.id for anchor in site.all_anchors if anchor.id not in survey.determined)
 
 
 def delay_changes_ticks(site: Site, survey: Survey) -> dict[int, int]:
@@ -94,7 +93,7 @@ def delay_changes_ticks(site: Site, survey: Survey) -> dict[int, int]:
     Raises:
         SkylessError: an anchor would need an antenna delay that no radio has.
     """
-    found = {anchor.id: anchor for anchor in survey.anchors if anchor.determined}
+    found = survey.determined
     return {
         anchor.id: _delay_ticks(anchor, found[anchor.id]) - anchor.tx_antenna_delay_ticks
         for anchor in site.all_anchors

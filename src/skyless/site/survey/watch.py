@@ -21,9 +21,9 @@ from skyless.site.survey.explain import (
     explain,
     is_significant,
     nothing,
+    pairs_of,
     sentence_of,
     silent_link,
-    weight_of,
 )
 from skyless.site.survey.facts import Facts, PairBlock, PairRange, PairRanges, Survey
 from skyless.site.survey.legs import MEDIAN_VARIANCE, STD_OVER_MAD
@@ -360,8 +360,7 @@ class AnchorWatch:
 
     def _pairs(self, rows: Integers, white_m: Array, drift_m: Array) -> Pairs:
         first, second = np.array(self._first)[rows], np.array(self._second)[rows]
-        weight = weight_of(first, second, len(self._ids), white_m, drift_m)
-        return Pairs(self._position_m, first, second, self._dimensions, weight)
+        return pairs_of(self._position_m, first, second, self._dimensions, white_m, drift_m)
 
     def _named(self, part: Part) -> Part:
         return replace(part, anchors=tuple(self._ids[number] for number in part.anchors))
@@ -582,13 +581,10 @@ def _explained(
     if len(ids) < 3 or not len(rows):
         return None
     first, second = (np.array([ids.index(table.pairs[row][end]) for row in rows]) for end in (0, 1))
-    both_sides = np.sqrt(2.0)
-    weight = weight_of(
-        first, second, len(ids), both_sides * np.sqrt(white_m2[rows]), both_sides * np.sqrt(drift_m2[rows])
-    )
+    white_m, drift_m = (np.sqrt(2.0) * np.sqrt(one[rows]) for one in (white_m2, drift_m2))
     position_m = np.array([placed[anchor] for anchor in ids], np.float64)
-    parts = explain(Pairs(position_m, first, second, facts.dimensions, weight), (after_m - before_m)[rows]).parts
-    causes = [part for part in parts if part.kind != "link"]
+    compared = pairs_of(position_m, first, second, facts.dimensions, white_m, drift_m)
+    causes = [part for part in explain(compared, (after_m - before_m)[rows]).parts if part.kind != "link"]
     if not causes:
         return None
     largest = max(causes, key=lambda part: abs(part.size_m))
