@@ -133,19 +133,15 @@ def walk_of(
         wanted = f"one of {', '.join(names)}" if names else "of a tag whose receptions were recorded"
         raise ConfigurationError(recording.summary().path, "tag", tag, wanted)
     collector = EpochCollector()
-    receptions, differences = NewReceptions(), RelayedDifferences(site)
+    differences, counted = RelayedDifferences(site), ""
     begin_s: float | None = None
-    for found in recording.messages({"receptions"}):
-        if found.channel.name != tag:
-            continue
-        message = cast("ReceptionsMessage", found.message)
-        if receptions.begins(message):
-            differences = RelayedDifferences(site)
-        for reception, unix_s in receptions.read(message):
-            begin_s = unix_s if begin_s is None else begin_s
-            if span[0] <= unix_s - begin_s <= span[1]:
-                for one in differences.add(reception):
-                    collector.add(unix_s - one.age_s, one.first, one.second, one.difference_m)
+    for segment, reception, unix_s in timed_receptions(recording, tag):
+        if segment != counted:
+            differences, counted = RelayedDifferences(site), segment
+        begin_s = unix_s if begin_s is None else begin_s
+        if span[0] <= unix_s - begin_s <= span[1]:
+            for one in differences.add(reception):
+                collector.add(unix_s - one.age_s, one.first, one.second, one.difference_m)
     epochs = replace(collector.epochs(), name=f"the walk of {tag}")
     if not len(epochs.t_s):
         raise SkylessError(f"the receptions of {tag} give no differences between anchors in {span[0]:g}:{span[1]:g} s")
@@ -175,29 +171,22 @@ def at_positions(epochs: TagEpochs, tag: str, position_at: PositionAt) -> TagEpo
     )
 
 
-class NewReceptions:
-    """Reads one tag's receptions from messages, each once."""
-
-    def __init__(self) -> None:
-        self._clock: HostClock[Reception] = HostClock()
-        self._segment = ""
-        self._next = 0
-
-    def begins(self, message: ReceptionsMessage) -> bool:
-        """Whether the tag has restarted, so that earlier receptions have another counter."""
-        if message.segment == self._segment:
-            return False
-        self._segment, self._next, self._clock = message.segment, message.first, HostClock()
-        return True
-
-    def read(self, message: ReceptionsMessage) -> Iterator[tuple[Reception, float]]:
-        """New receptions with their Unix times, as these become known, also of earlier messages."""
-        new = message.receptions[max(self._next - message.first, 0) :]
-        self._next = max(self._next, message.first + len(message.receptions))
-        for raw in new:
-            reception = reception_of(raw)
+def timed_receptions(recording: McapRecording, tag: str) -> Iterator[tuple[str, Reception, float]]:
+    """Receptions of one tag, each once, with the segment of the recording whose counter they have, and Unix time."""
+    clock: HostClock[Reception] = HostClock()
+    segment, following = "", 0
+    for found in recording.messages({"receptions"}):
+        if found.channel.name != tag:
+            continue
+        message = cast("ReceptionsMessage", found.message)
+        if message.segment != segment:
+            segment, following, clock = message.segment, message.first, HostClock()
+        new = message.receptions[max(following - message.first, 0) :]
+        following = max(following, message.first + len(message.receptions))
+        for reception in map(reception_of, new):
             if reception is not None:
-                yield from self._clock.add(reception, message.unix_less_host_s, reception)
+                for timed in clock.add(reception, message.unix_less_host_s, reception):
+                    yield segment, *timed
 
 
 _MANY_OUTLIERS: Final = 0.05
