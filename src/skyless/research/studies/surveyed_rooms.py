@@ -364,7 +364,7 @@ def judged(room: DrawnRoom, survey: Survey, outcome: Outcome) -> Outcome:
 
 def aligned(true_m: Array, found_m: Array, axes: int) -> Array:
     """True positions, shape (n, 3), rotated, reflected and shifted to best fit the found ones; in 2-D on the floor."""
-    return superimposed(true_m, found_m, np.ones(len(true_m)), np.arange(axes))
+    return superimposed(true_m, found_m, np.ones(len(true_m)), slice(axes))
 
 
 def tag_error_m(layout: SurveyLayout, found_m: Array, delay_m: Array, true_delay_m: Array) -> float:

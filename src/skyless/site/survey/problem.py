@@ -226,7 +226,7 @@ def distances_m(position_m: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("ijk,ijk->ij", apart, apart)))
 
 
-def superimposed(position_m: Array, target_m: Array, weight: Array, axes: Integers) -> Array:
+def superimposed(position_m: Array, target_m: Array, weight: Array, axes: Integers | slice) -> Array:
     """Positions rotated, shifted and possibly reflected in some axes to best fit a target (weighted Procrustes).
 
     ``position_m``, ``target_m``: shape (n, 3). ``weight``: of each anchor's squared distance, shape (n,), not all 0.
