@@ -767,7 +767,7 @@ def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Ma
 
 
 def with_tag(fitted: Fitted, rows: MoreRows, solution: Solution, used: Mask) -> Fitted:
-    """The shape with a tag's rows, for a solution that includes them."""
+    """The shape with a tag's rows, for a solution that includes them; kept positions stay determined."""
     problem = structs.replace(fitted.problem, more=(*fitted.problem.more, rows))
     fitted = structs.replace(fitted, problem=problem, solution=solution, used=used)
     if fitted.measured.facts.keep_positions:
