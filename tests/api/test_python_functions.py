@@ -61,7 +61,7 @@ def results(folder):
         simulate=skyless.simulate(tags=2, duration_s=3.0, method="weighted", seed=7),
         replay=skyless.replay(folder / "tdoa-table", anchors=anchors, truth=truth, settle_s=0.5),
         recorded=skyless.replay(folder / "stay.mcap"),
-        plan=skyless.plan(folder / "lab.toml", method="weighted", step_m=1.0, target_m=0.1),
+        plan=skyless.plan(folder / "lab.toml", step_m=1.0, target_m=0.1),
         biases=skyless.calibrate(folder / "tdoa-table", anchors=anchors, truth=truth),
         delays=skyless.calibrate(folder / "stay.mcap", site=folder / "lab.toml", stays=((3.0, 4.0),)),
         study=skyless.study(
@@ -74,7 +74,7 @@ COMMANDS = {
     "simulate": "simulate --tags 2 --duration 3 --method weighted --seed 7",
     "replay": "replay tdoa-table --anchors anchors.csv --truth truth.csv --settle 0.5",
     "recorded": "replay stay.mcap",
-    "plan": "plan lab.toml --method weighted --step 1 --target 10",
+    "plan": "plan lab.toml --step 1 --target 10",
     "biases": "calibrate tdoa-table --anchors anchors.csv --truth truth.csv",
     "delays": "calibrate stay.mcap --site lab.toml --at 3,4",
     "study": "study room --conditions motion --quick --method weighted --worlds 2 --seconds 1 --processes 1",
@@ -105,7 +105,7 @@ def test_functions_print_nothing_and_report_progress(folder, capsys):
     shares = {"simulate": [], "replay": [], "plan": []}
     skyless.simulate(duration_s=2.5, method="weighted", progress=shares["simulate"].append)
     skyless.replay(folder / "tdoa-table", anchors=folder / "anchors.csv", progress=shares["replay"].append)
-    skyless.plan(paper_lab_site(accuracy=AccuracySite()), method="weighted", step_m=1.0, progress=shares["plan"].append)
+    skyless.plan(paper_lab_site(accuracy=AccuracySite()), step_m=1.0, progress=shares["plan"].append)
     assert capsys.readouterr() == ("", "")
     for name, reached in shares.items():
         assert reached == sorted(reached), name
@@ -195,7 +195,7 @@ def test_values_serve_as_well_as_files(results, folder):
     truth = np.loadtxt(folder / "truth.csv", delimiter=",", skiprows=1)
     again = skyless.replay(folder / "tdoa-table", anchors=synthetic.ANCHORS_M, truth=truth, settle_s=0.5)
     assert repeatable(again.summary) == repeatable(results.replay.summary)
-    planned = skyless.plan(load_site(folder / "lab.toml"), method="weighted", step_m=1.0)
+    planned = skyless.plan(load_site(folder / "lab.toml"), step_m=1.0)
     np.testing.assert_array_equal(planned.sigma_m, results.plan.sigma_m)
 
 
@@ -211,7 +211,6 @@ def test_arrays_of_a_plan(results):
 def test_an_optimised_plan_has_other_anchors():
     plan = skyless.plan(
         paper_lab_site(accuracy=AccuracySite()),
-        method="weighted",
         step_m=2.0,
         optimise=4,
         search_s=0.5,
@@ -462,7 +461,6 @@ PLAN = [
         {"search_s": 3.0},
         {"verify_rounds": 200},
         {"seed": 2},
-        {"method": "weighted"},
         {"optimise": 4},
     ],
     ids=str,
@@ -474,7 +472,7 @@ def test_what_has_no_effect_on_a_plan_of_beacons_is_refused(arguments):
 
 @pytest.mark.parametrize(("arguments", "right"), PLAN, ids=[str(sorted(given)) for given, _ in PLAN])
 def test_mistakes_of_a_plan_are_named(arguments, right):
-    refused(right, skyless.plan, {"site": paper_lab_site(accuracy=AccuracySite()), "method": "weighted"} | arguments)
+    refused(right, skyless.plan, {"site": paper_lab_site(accuracy=AccuracySite())} | arguments)
 
 
 CALIBRATE = [

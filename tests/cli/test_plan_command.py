@@ -56,7 +56,7 @@ def refused(capsys, *arguments):
 def test_all_files_at_once(lab, tmp_path, capsys):
     png, page, table = tmp_path / "map.png", tmp_path / "plan.html", tmp_path / "grid.geojson"
     files = ["--plot", png, "--html", page, "--grid", table]
-    result = planned(capsys, lab, "--method", "joint", "--step", "0.5", "--target", "4.5", *files)
+    result = planned(capsys, lab, "--step", "0.5", "--target", "4.5", *files)
     assert result["points"] == 192
     assert 0.035 < result["mean_sigma_m"] < result["worst_sigma_m"] < 0.06
     assert 0.0 < result["target_share"] < 1.0
@@ -70,7 +70,7 @@ def test_all_files_at_once(lab, tmp_path, capsys):
 
 
 def test_people_get_a_table(lab, capsys):
-    assert main(["plan", str(lab), "--step", "1", "--method", "bracketed"]) == 0
+    assert main(["plan", str(lab), "--step", "1"]) == 0
     out = capsys.readouterr().out
     assert "standard deviation" in out
     assert "one more anchor" in out
@@ -80,7 +80,7 @@ def test_people_get_a_table(lab, capsys):
 def test_an_optimised_site_is_a_site(lab, tmp_path, capsys):
     out = tmp_path / "better" / "site.toml"
     out.parent.mkdir()
-    options = ["--optimise", "4", "--out", out, "--heights", "0,1", "--method", "bracketed", "--step", "1"]
+    options = ["--optimise", "4", "--out", out, "--heights", "0,1", "--step", "1", "--search-seconds", "10"]
     result = planned(capsys, lab, *options)
     site = load_site(out)
     assert len(site.anchors) == 4
@@ -93,7 +93,7 @@ def test_an_optimised_site_is_a_site(lab, tmp_path, capsys):
 
 
 def test_verification_tells_its_points(lab, capsys):
-    result = planned(capsys, lab, "--method", "bracketed", "--verify", "2", "--rounds", "300", "--step", "1")
+    result = planned(capsys, lab, "--verify", "2", "--rounds", "300", "--step", "1")
     points = result["verification"]["points"]
     assert len(points) == 2
     for point in points:
@@ -134,7 +134,6 @@ def test_an_image_that_cannot_be_read(lab, tmp_path, capsys, keep):
 @pytest.mark.parametrize(
     ("options", "told"),
     [
-        (["--method", "best"], "--method is 'best'; it should be one of literal"),
         (["--region", "1,2,3"], "--region is '1,2,3'"),
         (["--region", "3,3,1,1"], "x1 < x2"),
         (["--region", "50,50,60,60"], "inside the outline"),

@@ -104,7 +104,6 @@ def test_a_plan_shows_and_draws_what_reaches_tags(hall, tmp_path, capsys):
     ("options", "said"),
     [
         (["--optimise", "5"], "--optimise is"),
-        (["--method", "weighted"], "--method is"),
         (["--verify", "5"], "--verify is"),
         (["--html", "x.html"], "--html is"),
         (["--rounds", "200"], "--rounds is"),

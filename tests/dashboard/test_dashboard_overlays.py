@@ -8,8 +8,8 @@ import pytest
 from msgspec.structs import replace
 from starlette.exceptions import HTTPException
 
-from skyless.core.errors import ConfigurationError, SkylessError
-from skyless.core.method_names import DEFAULT_METHOD, METHODS
+from skyless.core.errors import ConfigurationError
+from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import AccuracySite, AnchorSite, FloorPlanSite, TagsSite
 from skyless.page.overlay_process import MAX_CELLS, grid_of, overlay
 from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, TaskProcess
@@ -23,8 +23,8 @@ pytestmark = pytest.mark.site
 LAB = paper_lab_site(accuracy=AccuracySite())
 
 
-def task(site=LAB, kind="sigma", method="weighted", step_m=1.0):
-    return OverlayTask(site, kind, method, step_m, None)
+def task(site=LAB, kind="sigma", step_m=1.0):
+    return OverlayTask(site, kind, step_m, None)
 
 
 def values(*args, **kwargs):
@@ -58,7 +58,7 @@ def test_a_large_hall_gets_a_coarser_grid_and_every_grid_is_bounded():
 
 
 def test_values_are_the_planners_row_by_row_from_the_lowest_y():
-    predictor = Predictor(LAB, PlanSettings("weighted"))
+    predictor = Predictor(LAB, PlanSettings())
     for kind, which, error in (("pdop", PDOP, 1e-3), ("hdop", HDOP, 1e-3), ("sigma", SIGMA, 1e-5)):
         found = overlay(task(kind=kind))
         for column, row in ((0, 0), (5, 0), (2, 7), (3, 3)):
@@ -76,22 +76,12 @@ def test_where_there_is_no_fix_there_is_no_value():
     assert values(site, "pdop", step_m=10.0)[sigma["columns"] - 1] is None
 
 
-def test_a_method_that_does_not_exist_is_taken_for_the_default():
-    assert values(method="magic", step_m=2.0) == values(method=DEFAULT_METHOD, step_m=2.0)
-
-
-def test_the_methods_of_tags_are_predicted_each_as_itself():
-    sigmas = [values(method=method, step_m=2.0) for method in METHODS]
-    assert all(None not in sigma for sigma in sigmas)
-    assert len({sigma[5] for sigma in sigmas}) == len(METHODS)
-
-
 def test_each_kind_has_its_unit_and_scale():
     pdop, hdop, sigma = (overlay(task(kind=kind)) for kind in KINDS)
     assert (pdop["unit"], hdop["unit"], sigma["unit"]) == ("1", "1", "m")
     assert (sigma["x_m"], sigma["y_m"], sigma["columns"], sigma["rows"]) == ([0.5, 5.5], [0.5, 7.5], 6, 8)
     assert len(sigma["values"]) == 48
-    assert sigma["method"] == "weighted"
+    assert sigma["method"] == DEFAULT_METHOD
     assert sigma["least"] <= sigma["scale"]["low"] < sigma["scale"]["high"]
     assert sigma["scale"]["stops"] == COLOUR_STOPS
     assert sigma["height_m"] == LAB.tags.height_m
@@ -134,6 +124,4 @@ def test_nothing_is_computed_after_the_end():
 
 
 def test_errors_are_predicted_without_a_master_too():
-    assert None not in values(lab_site(), method="joint")
-    with pytest.raises(SkylessError, match="needs a master"):
-        values(lab_site())
+    assert None not in values(lab_site())

@@ -222,4 +222,4 @@ def test_a_site_without_positions_has_no_overlay_yet(live, wire):
     wire.deliver(topics.site_topic(SITE_ID), replace(SITE, site=site))
     assert live.dropped == {}
     with pytest.raises(SkylessError, match="no anchor of this site has a position yet"):
-        overlay(OverlayTask(site, "pdop", "joint", 0.25, None))
+        overlay(OverlayTask(site, "pdop", 0.25, None))

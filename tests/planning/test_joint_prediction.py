@@ -11,8 +11,7 @@ from skyless.core.site import EXACT, AccuracySite, AnchorSite, Site, TagsSite, W
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_S
 from skyless.research.uncertainty import BoundSettings, tracking_bound
 from skyless.sim.lab import lab_site, paper_lab_site
-from skyless.site.channel import ChannelModel, barriers_of
-from skyless.site.planning.anchor_clocks import anchor_clocks, relays_of, stamp_variances
+from skyless.site.channel import ChannelModel
 from skyless.site.planning.links import (
     BIAS,
     CLAIMED,
@@ -21,10 +20,10 @@ from skyless.site.planning.links import (
     SIGMA,
     SIGMA_X,
     SIGMA_Z,
-    anchor_links,
-    link_budget,
+    with_range,
 )
 from skyless.site.planning.predict import PlanSettings, Predictor
+from skyless.site.planning.superframe import stamp_variances
 
 pytestmark = pytest.mark.statistical
 
@@ -34,12 +33,9 @@ ROOM = Site("room", 2, 1, tuple(AnchorSite(k + 1, *place) for k, place in enumer
 QA = 0.3
 
 
-def relays_and_clocks(site, channel=None):
-    channel = channel or ChannelModel()
-    anchors, budget, walls = anchor_positions(site), link_budget(channel), barriers_of(site.walls)
-    master = [anchor.id for anchor in site.anchors].index(site.master)
-    clocks = anchor_clocks(site, anchor_links(anchors, master, budget, walls).share)
-    return clocks, relays_of(anchors, master, clocks, budget, walls)
+def superframe_and_relays(site, channel=None):
+    predictor = Predictor(site, PlanSettings(channel=channel or ChannelModel()))
+    return predictor.superframe, predictor.relays
 
 
 @pytest.mark.parametrize(("site", "point"), [(LAB, (3.0, 4.0, 0.0)), (LAB, (1.2, 1.6, 0.0)), (ROOM, (3.0, 6.0, 1.3))])
@@ -69,7 +65,7 @@ def test_the_filter_claims_the_bound_of_what_has_come_in(site, point):
     for first in range(len(anchors)):
         order = np.roll(anchors, -first, axis=0)
         turns.append(np.trace(tracking_bound(order, path, settings)[-1]))
-    row = Predictor(site, PlanSettings("joint", qa=QA)).at(np.array([point]))[0]
+    row = Predictor(site, PlanSettings(qa=QA)).at(np.array([point]))[0]
     assert row[CLAIMED] == pytest.approx(np.sqrt(np.mean(turns)), rel=0.006)
 
 
@@ -81,7 +77,7 @@ def dense(site, point, superframes, shift_m=0.0):
     """
     anchors, accuracy = anchor_positions(site), site.accuracy
     n, dim = len(anchors), 2 if site.tags.height_m is not None else 3
-    clocks, relays = relays_and_clocks(site)
+    superframe, relays = superframe_and_relays(site)
     tx_var, rx_var = stamp_variances(site)
     white, walk = (SPEED_OF_LIGHT_MPS * site.noise.white_fm) ** 2, (SPEED_OF_LIGHT_MPS * site.noise.random_walk_fm) ** 2
     half = dim + n
@@ -92,10 +88,10 @@ def dense(site, point, superframes, shift_m=0.0):
     P = np.diag(np.r_[[1.0] * dim, [100.0] * n, [1.0] * dim, [100.0] * n, [tx_var] * n, np.square(stds)])
     S, mean = P.copy(), np.zeros(len(P))
     said = true = shifts = 0.0
-    kept = np.exp(-clocks.gap_s.sum() / accuracy.place_time_s)
-    for superframe in range(superframes):
-        for k, i in enumerate(clocks.sender):
-            dt, F, Q = clocks.gap_s[k], np.eye(len(P)), np.zeros((len(P), len(P)))
+    kept = np.exp(-superframe.gap_s.sum() / accuracy.place_time_s)
+    for number in range(superframes):
+        for k, i in enumerate(superframe.sender):
+            dt, F, Q = superframe.gap_s[k], np.eye(len(P)), np.zeros((len(P), len(P)))
             F[range(half), range(half, 2 * half)] = dt
             F[2 * half + i, 2 * half + i] = 0.0
             F[change + i, change + i] = kept
@@ -127,10 +123,10 @@ def dense(site, point, superframes, shift_m=0.0):
                 A = np.eye(len(P)) - np.outer(gain, h)
                 P, S = (A @ X @ A.T + variance * np.outer(gain, gain) for X in (P, S))
                 mean = mean + gain * (late - h @ mean)
-            if superframe == superframes - 1:
-                said += np.trace(P[:dim, :dim]) / len(clocks.sender)
-                true += np.trace(S[:dim, :dim]) / len(clocks.sender)
-                shifts += mean[:dim] @ mean[:dim] / len(clocks.sender)
+            if number == superframes - 1:
+                said += np.trace(P[:dim, :dim]) / len(superframe.sender)
+                true += np.trace(S[:dim, :dim]) / len(superframe.sender)
+                shifts += mean[:dim] @ mean[:dim] / len(superframe.sender)
     return np.sqrt([said, true, shifts])
 
 
@@ -144,7 +140,7 @@ def dense(site, point, superframes, shift_m=0.0):
     ids=("lab", "3-D", "range errors"),
 )
 def test_the_true_error_is_that_of_a_dense_recursion(site, point, motion):
-    row = Predictor(site, PlanSettings("joint", qa=QA)).at(np.array([point]))[0]
+    row = Predictor(site, PlanSettings(qa=QA)).at(np.array([point]))[0]
     said, true, _ = dense(site, np.array(point), 100)
     assert row[CLAIMED] == pytest.approx(said, rel=4e-3)
     assert row[SIGMA] == pytest.approx(true, rel=4e-3)
@@ -160,7 +156,7 @@ def test_range_errors_add_to_the_noise():
     )
     point = np.array([[1.2, 1.6, 0.0]])
     exact, one, two = (
-        Predictor(lab_site(accuracy=accuracy), PlanSettings("joint")).at(point)[0, SIGMA] ** 2
+        Predictor(lab_site(accuracy=accuracy), PlanSettings()).at(point)[0, SIGMA] ** 2
         for accuracy in (EXACT, base, twice)
     )
     assert (two - exact) / (one - exact) == pytest.approx(4.0, rel=0.1)
@@ -171,17 +167,17 @@ def test_a_late_anchor_shifts_positions_as_in_a_dense_recursion():
     point = (2.0, 5.5, 0.0)
     wall = WallSite(4.5, 4.4, 4.5, 4.7, loss_db=0.0, delay_m=0.05)
     site = replace(LAB, walls=(wall,))
-    _, relays = relays_and_clocks(site)
+    _, relays = superframe_and_relays(site)
     assert (relays.delay_m == 0.0).all()
-    row = Predictor(site, PlanSettings("joint", qa=QA)).at(np.array([point]))[0]
+    row = Predictor(site, PlanSettings(qa=QA)).at(np.array([point]))[0]
     expected = dense(LAB, np.array(point), 150, 0.05)[2]
     assert row[BIAS] == pytest.approx(expected, rel=0.01)
     assert row[RMSE] ** 2 == pytest.approx(row[SIGMA] ** 2 + row[BIAS] ** 2)
 
 
 def test_small_sites_relay_everything_once():
-    clocks, relays = relays_and_clocks(LAB)
-    assert clocks.sender.tolist() == [0, 1, 2, 3, 4, 5]
+    superframe, relays = superframe_and_relays(LAB)
+    assert superframe.sender.tolist() == [0, 1, 2, 3, 4, 5]
     assert relays.ends.tolist() == [5, 10, 15, 20, 25, 30]
     slot_s = schedule_of(LAB).slot_ticks * TICK_S
     assert relays.sender[5:10].tolist() == [0, 5, 4, 3, 2]
@@ -193,11 +189,11 @@ def test_large_sites_relay_the_master_and_the_last_receptions_that_fit():
     """Six beside the master's; with every other frame lost, those that came after fill the room by chance."""
     anchors = tuple(AnchorSite(k + 1, float(k % 5), float(k // 5)) for k in range(20))
     site = Site("many", 1, 1, anchors, tags=TagsSite(0.0))
-    _, relays = relays_and_clocks(site)
+    _, relays = superframe_and_relays(site)
     last = slice(relays.ends[18], relays.ends[19])
     assert relays.sender[last].tolist() == [18, 17, 16, 15, 14, 13, 0]
     assert relays.sender[: relays.ends[0]].tolist() == [19, 18, 17, 16, 15, 14, 13]  # the master has none to tell first
-    _, relays = relays_and_clocks(site, ChannelModel(loss_probability=0.5))
+    _, relays = superframe_and_relays(site, ChannelModel(loss_probability=0.5))
     heard, share = relays.sender[relays.ends[18] :], relays.share[relays.ends[18] :]
     expected = 0.5 * binom.cdf(5, np.arange(18), 0.5)
     expected = expected[expected >= 0.01]
@@ -209,8 +205,8 @@ def test_silent_anchors_relay_nothing_and_are_not_relayed():
     site = replace(
         LAB, walls=(WallSite(5.0, 7.0, 7.0, 7.0, loss_db=300.0), WallSite(5.0, 9.0, 5.0, 7.0, loss_db=300.0))
     )
-    clocks, relays = relays_and_clocks(site)
-    assert clocks.sends.tolist() == [True, True, True, False, True, True]
+    superframe, relays = superframe_and_relays(site)
+    assert superframe.sent.tolist() == [1.0, 1.0, 1.0, 0.0, 1.0, 1.0]
     assert 3 not in relays.sender
     assert len(relays.ends) == 5
 
@@ -218,10 +214,22 @@ def test_silent_anchors_relay_nothing_and_are_not_relayed():
 def test_lost_packets_cost_and_fixes_come_with_those_that_arrive():
     point = np.array([[3.0, 4.0, 0.0]])
     rows = [
-        Predictor(LAB, PlanSettings("joint", channel=ChannelModel(loss_probability=lost))).at(point)[0]
+        Predictor(LAB, PlanSettings(channel=ChannelModel(loss_probability=lost))).at(point)[0]
         for lost in (0.0, 0.2, 0.5)
     ]
     assert [row[FIX_SHARE] for row in rows] == pytest.approx([1.0, 0.8, 0.5], abs=1e-5)
     assert rows[0][SIGMA] < rows[1][SIGMA] < rows[2][SIGMA]
     # anchors lose half as well here: more than the 1.39 of tags alone (docs/maths.md section 7)
     assert 1.39 < rows[2][CLAIMED] / rows[0][CLAIMED] < 1.6
+
+
+def test_fixes_count_among_the_messages_of_the_anchors_in_use():
+    """Of a corridor's twelve anchors the tag uses eight; of the last two of these half of the messages arrive."""
+    anchors = tuple(AnchorSite(k + 1, 6.0 * (k // 2), 3.0 * (k % 2)) for k in range(12))
+    site = Site("corridor", 1, 5, anchors, tags=TagsSite(0.0))
+    predictor = Predictor(site, PlanSettings(channel=with_range(ChannelModel(), 17.0)))
+    point = np.array([[1.0, 1.5, 0.0]])
+    (share,), _ = predictor.scene.heard_at(point)
+    assert predictor.messages_at(point).tolist() == [8]
+    assert 0.4 < share[7] < 0.6
+    assert predictor.at(point)[0, FIX_SHARE] == pytest.approx(share[:8].mean())

@@ -36,9 +36,9 @@ L_SHAPE = np.array([(0, 0), (12, 0), (12, 4), (5, 4), (5, 9), (0, 9)], dtype=flo
 LAB = paper_lab_site()
 
 
-def lab_map(step=0.5, method="bracketed", site=LAB):
+def lab_map(step=0.5, site=LAB):
     floor = floor_of(site, Path("lab.toml"), None, None)
-    return plan_map(Predictor(site, PlanSettings(method)), grid_of(floor, (0.0,), step))
+    return plan_map(Predictor(site, PlanSettings()), grid_of(floor, (0.0,), step))
 
 
 @given(x=st.floats(-2, 14), y=st.floats(-2, 11))
@@ -95,9 +95,9 @@ def test_a_summary_is_that_of_the_table():
 def test_interpolation_of_the_filter_is_close_and_keeps_walls_sharp(monkeypatch):
     """A wall that hides two anchors altogether: what was computed in full every 0.2 m against every 0.8 m."""
     site = replace(LAB, walls=(WallSite(2.0, 3.0, 4.0, 3.0, loss_db=60.0, delay_m=0.0),))
-    full = lab_map(0.2, "joint", site)
+    full = lab_map(0.2, site)
     monkeypatch.setattr(maps, "_JOINT_BUDGET", 1.4e4)
-    rough = lab_map(0.2, "joint", site)
+    rough = lab_map(0.2, site)
     assert full.computed_every_m == 0.2
     assert rough.computed_every_m == pytest.approx(0.8)
     assert (rough.column(ANCHORS_IN_VIEW) == full.column(ANCHORS_IN_VIEW)).all()

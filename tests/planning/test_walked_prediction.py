@@ -71,4 +71,3 @@ def test_a_plan_says_what_phases_give_only_where_the_site_has_them():
     assert after.median_sigma_m < 0.85 * after.stamps_median_sigma_m
     assert after.worst_sigma_m < 0.85 * after.stamps_worst_sigma_m
     assert f"median {100 * after.median_sigma_m:.2f} cm" in dict(found.facts())["after 1 m of walking"]
-    assert skyless.plan(site, step_m=1.0, method="bracketed").summary["after_metre"] is None

@@ -23,9 +23,9 @@ from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
 from skyless.sim.impairments import RangeErrorModel
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.site.planning.anchor_clocks import AnchorClocks, Relays, relays_of
 from skyless.site.planning.links import PLAN_COLUMNS, RMSE
 from skyless.site.planning.predict import PlanSettings, Predictor, fill_joint_sigma
+from skyless.site.planning.superframe import Relays, Superframe
 
 POINTS_M = np.array([(2.0, 3.0), (1.0, 1.0), (4.5, 6.0), (3.0, 4.0), (5.0, 2.0), (0.7, 7.0)])
 PLACES_M = np.column_stack([POINTS_M, np.zeros(len(POINTS_M))])
@@ -59,22 +59,21 @@ def planned_m(site):
 def round_planned_m(site, settings):
     """The same where tags receive a round's messages only, which relay the poll, or the responses in the final one."""
     planner = Predictor(site, PlanSettings(qa=QA))
-    clocks, master = planner.clocks, planner.master
-    relays = relays_of(planner.anchors_m, master, clocks, planner.budget, planner.barriers)
+    superframe, relays, master = planner.superframe, planner.relays, planner.master
     messages = len(site.anchors) + site.schedule.frames_per_node - 1
     begins, ends, kept = [0, *relays.ends[:-1].tolist()], [], []
     for k in range(messages):
-        is_final = k > 0 and clocks.sender[k] == master
+        is_final = k > 0 and superframe.sender[k] == master
         rows = range(begins[k], relays.ends[k]) if k > 0 else ()
         kept += [row for row in rows if is_final or relays.sender[row] == master]
         ends.append(len(kept))
-    gaps_s = clocks.gap_s[:messages].copy()
-    gaps_s[0] += clocks.gap_s[messages:].sum()
-    clocks = AnchorClocks(clocks.sends, clocks.sender[:messages], gaps_s, clocks.kept)
+    gaps_s = superframe.gap_s[:messages].copy()
+    gaps_s[0] += superframe.gap_s[messages:].sum()
+    superframe = Superframe(superframe.sent, superframe.sender[:messages], gaps_s)
     rest = (column[kept].copy() for column in relays[1:])
     table = np.zeros((len(PLACES_M), len(PLAN_COLUMNS)))
     relays = Relays(np.array(ends, np.int64), *rest)
-    fill_joint_sigma(PLACES_M, settings, planner.scene, clocks, relays, planner.farthest_m, None, table)
+    fill_joint_sigma(PLACES_M, settings, planner.scene, superframe, relays, planner.farthest_m, table)
     return math.sqrt(float(np.mean(table[:, RMSE] ** 2)))
 
 

@@ -28,17 +28,16 @@ if TYPE_CHECKING:
     from skyless.core.site import Site
     from skyless.site.planning.picture import Background
 
-app = App(name="plan", help_epilogue="Example: skyless plan hall.toml --method joint --plot hall.png --target 5")
+app = App(name="plan", help_epilogue="Example: skyless plan hall.toml --plot hall.png --target 5")
 
 _NOTES: Final = (
-    "Tags are at rest. A moving tag's filter (joint) is more accurate where survey and ranges have errors, which it "
-    "tells from the position while it moves, else less; motion hardly affects the paper's methods up to 1 m/s.",
+    "Tags are at rest and compute with joint. A moving tag's filter is more accurate where survey and ranges have "
+    "errors, which it tells from the position while it moves, else less.",
     "Stamps' noise and crystals are those of the site file, and the filters know them.",
     "Links are free space on channel 5 with the walls' losses of the site file; people, furniture, reflections and "
     "antennas' patterns are not known to the plan.",
     "Walls delay what crosses them as the site file states; nothing else is delayed.",
-    "joint's figures hold the errors of survey and ranges that the site file states (accuracy); for the other methods "
-    "positions of the anchors, antenna delays and ranges are assumed to be right.",
+    "The figures hold the errors of survey and ranges that the site file states (accuracy).",
 )
 
 

@@ -129,7 +129,7 @@ def _new_site(asked: NewOptions) -> Site:
         raise SkylessError("a room needs both --width and --depth; without them the lab is written")
     if asked.paper:
         from skyless.site.channel import ChannelModel
-        from skyless.site.planning.anchor_clocks import with_best_master
+        from skyless.site.planning.superframe import with_best_master
 
         site = with_best_master(replace(site, schedule=ScheduleSite(slot_s=_PAPER_SLOT_S)), ChannelModel())
     return site
@@ -211,7 +211,7 @@ def _report(site: Site) -> dict[str, Any]:
     """The report on a valid site, SI units."""
     from skyless.site.channel import ChannelModel
     from skyless.site.file.advice import warnings_of
-    from skyless.site.planning.anchor_clocks import master_warnings, reception_of
+    from skyless.site.planning.superframe import master_warnings, reception_of
 
     period_s, frame_s = beacon_period_s(site), air_time_s(MAX_FRAME_BYTES)
     anchors: list[dict[str, Any]] = [

@@ -70,9 +70,9 @@ class ClockNoise(Struct, frozen=True, gc=False):
     """Random walk of the rate, m²/s³."""
 
 
-def clock_noise(white_fm: float, random_walk_fm: float, clocks: int = 2) -> ClockNoise:
+def clock_noise(white_fm: float, random_walk_fm: float) -> ClockNoise:
     """Process noise from oscillator figures: Allan deviation at 1 s, and 1/√s; summed over both clocks."""
-    scale = clocks * SPEED_OF_LIGHT_MPS**2
+    scale = 2.0 * SPEED_OF_LIGHT_MPS**2
     return ClockNoise(scale * white_fm**2, scale * random_walk_fm**2)
 
 

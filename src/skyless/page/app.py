@@ -8,7 +8,6 @@ import mimetypes
 import signal
 import socket
 import time
-from collections import Counter
 from collections.abc import Callable, Coroutine, Iterator
 from functools import partial
 from pathlib import Path
@@ -29,7 +28,6 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from skyless.core.errors import ConfigurationError, SkylessError
-from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import Site
 from skyless.page._alarms import NoAlarmError
 from skyless.page.api import questions
@@ -197,10 +195,9 @@ async def _overlay(request: Request) -> Response:
         raise HTTPException(400, f"kind is {kind!r}; it should be one of {', '.join(KINDS)}")
     step_m = _number(request, "step_m", 0.25, 0.01, 100.0)
     site = await _planned(request, live)
-    method = next((method for method, _ in Counter(live.state.methods()).most_common(1)), DEFAULT_METHOD)
     plan = live.plans.get(None)
     plan_px = None if plan is None else image_size(plan)
-    answer = await _services(request).overlays.run(OverlayTask(site, kind, method, step_m, plan_px))
+    answer = await _services(request).overlays.run(OverlayTask(site, kind, step_m, plan_px))
     return Response(answer, media_type="application/json")
 
 

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
-from skyless.core.method_names import DEFAULT_METHOD, METHODS
+from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import Site
 from skyless.page.tasks import OverlayTask, serve_tasks
 from skyless.site.planning.colours import COLOUR_STOPS, scale_of
@@ -42,7 +42,7 @@ def overlay(task: OverlayTask) -> dict[str, Any]:
         "columns": len(grid.x_m),
         "rows": len(grid.y_m),
         "values": values,
-        "method": task.method,
+        "method": DEFAULT_METHOD,
         "height_m": float(grid.heights_m[0]),
         "least": known[0],
         "most": known[-1],
@@ -62,11 +62,7 @@ def _grids(task: bytes) -> tuple[Grid, dict[str, list[float | None]]]:
     if count < needed:
         raise SkylessError(f"a position needs {needed} anchors or more; this site has {count}")
     grid = grid_of(asked.site, asked.plan_px, asked.step_m)
-    settings = PlanSettings(asked.method if asked.method in METHODS else DEFAULT_METHOD)
-    try:
-        table = plan_map(Predictor(asked.site, settings), grid).table[0]
-    except ValueError as error:
-        raise SkylessError(str(error)) from None
+    table = plan_map(Predictor(asked.site, PlanSettings()), grid).table[0]
     covered = table[..., FIX_SHARE] >= _MIN_FIX_SHARE
     return grid, {
         "pdop": _values(table[..., PDOP], 3),

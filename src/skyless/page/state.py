@@ -182,10 +182,6 @@ class SiteState:
         """Names of the tags with a kept fix."""
         return self._tags.keys()
 
-    def methods(self) -> list[str]:
-        """The positioning method of each tag whose health is known."""
-        return [known.health.method for known in self._healths["tags"].values() if isinstance(known.health, TagHealth)]
-
     # Fixes
 
     def state_since(self, serial: int) -> bytes:

@@ -27,7 +27,6 @@ class OverlayTask(Struct, frozen=True):
 
     site: Site
     kind: Kind
-    method: str
     step_m: float
     """Least side of the cells."""
     plan_px: tuple[int, int] | None

@@ -1,7 +1,7 @@
 """Predictions against the simulated world: tags at rest at given points, each one's errors next to its prediction.
 
-Where the method is ``joint`` and the site's survey and ranges have errors, there are many worlds, each with its own
-errors, and what is compared is the RMSE over all of them.
+Where the site's survey and ranges have errors, there are many worlds, each with its own errors, and what is compared is
+the RMSE over all of them.
 """
 
 from collections.abc import Callable
@@ -12,8 +12,7 @@ from msgspec.structs import replace
 
 from skyless.core.any_receiver import superframe_s as period_s
 from skyless.core.arrays import Matrix
-from skyless.core.method_names import FILTERS
-from skyless.core.native.records import MAX_ANCHORS_IN_USE
+from skyless.core.method_names import DEFAULT_METHOD
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of, stated_room
 from skyless.sim.trajectory import Static
@@ -81,7 +80,7 @@ def verify(
     """Let a tag rest at each point, shape (m, 3), for ``rounds`` superframes, and compare."""
     site, settings = predictor.site, predictor.settings
     superframe_s = period_s(site)
-    worlds = 1 if settings.method != "joint" or site.accuracy.is_exact else _WORLDS
+    worlds = 1 if site.accuracy.is_exact else _WORLDS
     rounds = max(rounds // worlds, 1)
     still = [Static(*point) for point in points_m.tolist()]
     warm_up_s = max(_WARM_UP_S, 60.0 * superframe_s)
@@ -92,7 +91,7 @@ def verify(
         room = None if worlds == 1 else stated_room(site, slope_m=slope_m, at_rest=True)
         request = Request(site=site, seed=seed + world, room=room)
         impairments = replace(impairments_of(request, site), channel=settings.channel)
-        fleet = Fleet(site, still, impairments, request.seed, FleetSettings(settings.method, settings.qa, warm_up_s))
+        fleet = Fleet(site, still, impairments, request.seed, FleetSettings(DEFAULT_METHOD, settings.qa, warm_up_s))
         now_s = 0.0
         while now_s < end_s:
             now_s = min(now_s + 0.25, end_s)
@@ -102,16 +101,12 @@ def verify(
                     batches[judged.tag].add(batch, judged.error_m)
             if progress is not None:
                 progress((world + now_s / end_s) / worlds)
-    # filters give a fix for every message, snapshots one for each frame of a node
-    per_round = len(predictor.clocks.sender) if settings.method in FILTERS else site.schedule.frames_per_node
-    if predictor.master is None:
-        per_round = min(per_round, MAX_ANCHORS_IN_USE)
-    possible, rows = worlds * rounds * per_round, predictor.at(points_m)
+    possible = (worlds * rounds * predictor.messages_at(points_m)).tolist()
     checks = [
-        _check(point, row, batch, possible, has_range_errors=worlds > 1)
-        for point, row, batch in zip(points_m, rows, batches, strict=True)
+        _check(point, row, batch, most, has_range_errors=worlds > 1)
+        for point, row, batch, most in zip(points_m, predictor.at(points_m), batches, possible, strict=True)
     ]
-    return _summary(settings.method, seed, worlds * end_s, checks)
+    return _summary(seed, worlds * end_s, checks)
 
 
 def _check(point: Matrix, row: Matrix, batch: _Batches, possible: int, *, has_range_errors: bool) -> PointCheck:
@@ -133,16 +128,15 @@ def _check(point: Matrix, row: Matrix, batch: _Batches, possible: int, *, has_ra
         simulated_rmse_m=rmse_m,
         predicted_claim_m=float(row[CLAIMED]) if predicted else None,
         predicted_fix_share=float(row[FIX_SHARE]),
-        simulated_fix_share=batch.fixes / possible,
+        simulated_fix_share=batch.fixes / max(possible, 1),
         fixes=batch.fixes,
     )
 
 
-def _summary(method: str, seed: int, simulated_s: float, checks: list[PointCheck]) -> Verification:
+def _summary(seed: int, simulated_s: float, checks: list[PointCheck]) -> Verification:
     ratios = [check.ratio for check in checks if check.ratio is not None]
     errors = [check.ratio_error for check in checks if check.ratio_error is not None]
     return Verification(
-        method=method,
         seed=seed,
         simulated_s=simulated_s,
         points=tuple(checks),

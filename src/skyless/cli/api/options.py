@@ -128,8 +128,6 @@ class _Planned(ComputedOptions, frozen=True):
 class PlanOptions(_Planned, frozen=True, kw_only=True):
     """Options of ``skyless plan``."""
 
-    method: Method = DEFAULT_METHOD
-    """How positions are computed: literal, literal-delayed, weighted, bracketed or joint."""
     noise_ps: Picoseconds | None = None
     """Noise of every TX and RX stamp in picoseconds; by default the site's own figures."""
     qa: Positive | None = None

@@ -7,14 +7,13 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 
-from skyless.arguments import check_choice, check_whole, process_noise, python_function, wrong
+from skyless.arguments import check_choice, check_whole, process_noise, python_function
 from skyless.cli.api.fixes import Result, data_frame
 from skyless.cli.api.options import PlanOptions
 from skyless.cli.common import cm
 from skyless.core.arrays import Array, Vector
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import Box
-from skyless.core.method_names import DEFAULT_METHOD, FILTERS
 from skyless.core.site import Site
 from skyless.research.verify import random_points, verify
 from skyless.site.channel import ChannelModel
@@ -216,7 +215,7 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
             f"mean {cm(found['mean_sigma_m'])}, median {cm(found['median_sigma_m'])}, "
             f"95 % {cm(found['p95_sigma_m'])}, worst {cm(found['worst_sigma_m'])}{where}",
         )
-        if found["method"] in FILTERS and not self.site.accuracy.is_exact:
+        if not self.site.accuracy.is_exact:
             yield "tags that walk", _WALKING
         if found["walls_bias"]:
             rmse = f"RMSE mean {cm(found['mean_rmse_m'])}, worst {cm(found['worst_rmse_m'])}"
@@ -290,7 +289,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
     site, file = site_of(asked.site)
     if not site.schedule.needs_master and len(site.anchors) > MAX_PREDICTED:
         asked.leave_out(
-            *("method", "noise_ps", "qa", "dynamics", "target_m", "optimise", "anchor_heights_m", "mounts_m"),
+            *("noise_ps", "qa", "dynamics", "target_m", "optimise", "anchor_heights_m", "mounts_m"),
             *("search_s", "verify_points", "verify_rounds", "seed"),
             why=f"errors are predicted for sites of at most {MAX_PREDICTED} anchors; this one has {len(site.anchors)}",
         )
@@ -300,10 +299,8 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
         asked.progress(1.0)
         return rates
     asked.leave_out("exponent", why=f"it is for sites of more than {MAX_PREDICTED} anchors")
-    if not site.schedule.needs_master and asked.method not in FILTERS:
-        raise wrong("method", asked.method, f"{DEFAULT_METHOD}: this site has no master")
     channel = ChannelModel() if asked.range_m is None else with_range(ChannelModel(), asked.range_m)
-    settings = PlanSettings(asked.method, asked.noise_ps, process_noise(asked.qa, asked.dynamics) or 0.3, channel)
+    settings = PlanSettings(asked.noise_ps, process_noise(asked.qa, asked.dynamics) or 0.3, channel)
     if asked.optimise is None:
         check_anchor_count(site, file)
     else:

@@ -43,7 +43,7 @@ PLAN_COLUMNS: Final = (
     "sigma_z_m",
     "bias_m",  # length of the mean error due to walls
     "rmse_m",  # standard deviation and bias together
-    "fix_share",  # of the rounds that give a fix
+    "fix_share",  # of the messages of the anchors that a tag uses, those that give a fix
     "claimed_m",  # standard deviation that the fixes themselves will report
 )
 """Columns of a prediction, metres; infinite where there is no fix."""
@@ -52,22 +52,6 @@ ANCHORS_IN_VIEW, GDOP, PDOP, HDOP, VDOP, TDOP, SIGMA, SIGMA_X, SIGMA_Y, SIGMA_Z,
     14
 )
 
-
-def fill_errors(
-    table: Matrix,
-    rows: Integers,
-    variance_m2: Matrix,
-    square_bias_m2: Vector,
-    claimed_m2: Vector,
-) -> None:
-    """Fill the error columns in these rows of a table. ``variance_m2``: of three axes, shape (k, 3); others (k,)."""
-    table[rows, SIGMA_X : SIGMA_Z + 1] = np.sqrt(variance_m2)
-    table[rows, SIGMA] = np.sqrt(variance_m2.sum(axis=1))
-    table[rows, BIAS] = np.sqrt(square_bias_m2)
-    table[rows, RMSE] = np.hypot(table[rows, SIGMA], table[rows, BIAS])
-    table[rows, CLAIMED] = np.sqrt(claimed_m2)
-
-
 IN_VIEW: Final = 0.5
 """An anchor is in view where at least this share of its frames arrives."""
 
@@ -75,15 +59,6 @@ _NEGLIGIBLE_SHARE: Final = 1e-4  # a smaller share of received frames, in free s
 _NEGLIGIBLE_LOSS: Final = 1e-7  # a smaller share of lost frames, in free space, counts as none
 MIN_SYNC: Final = 0.01
 """An anchor that receives less than this share of the master's frames is assumed to stay silent."""
-
-
-class AnchorLinks(Struct, frozen=True):
-    """Links from the master to the anchors of a site, in the order of its file; shape (anchors,) each."""
-
-    share: Vector
-    """Share of the master's frames that arrives; 1 for the master itself."""
-    delay_m: Vector
-    """Delay by walls."""
 
 
 def range_of(channel: ChannelModel, exponent: float = 2.0) -> float:
@@ -162,11 +137,11 @@ def links(senders_m: Matrix, listeners_m: Matrix, budget: Vector, barriers: Barr
     return share, delay_m
 
 
-def anchor_links(anchors_m: Matrix, master: int, budget: Vector, barriers: Barriers) -> AnchorLinks:
-    """Links from the anchor in row ``master`` to anchors at positions of shape (anchors, 3)."""
-    share, delay_m = links(anchors_m[master : master + 1], anchors_m, budget, barriers)
+def master_links(anchors_m: Matrix, master: int, budget: Vector, barriers: Barriers) -> Vector:
+    """Share of the frames of the anchor in row ``master`` that reaches each of the anchors; 1 for itself."""
+    share, _ = links(anchors_m[master : master + 1], anchors_m, budget, barriers)
     share[master] = 1.0
-    return AnchorLinks(share[:, 0], delay_m[:, 0])
+    return share[:, 0]
 
 
 def masters_by_links(anchors_m: Matrix, budget: Vector, barriers: Barriers) -> Integers:

@@ -1,8 +1,8 @@
 """Maps: predictions over a grid of the floor, one slice per height, and their export as tables.
 
-The filter's predictions are slow. On large grids they are computed on a coarser grid (on the largest grids those of the
-other methods, too), and their ratio to the PDOP weighted by shares of frames, which is smooth, is interpolated; that
-PDOP is computed at every point, so that edges behind walls stay sharp.
+The filter's predictions are slow. On large grids they are computed on a coarser grid, and their ratio to the PDOP
+weighted by shares of frames, which is smooth, is interpolated; that PDOP is computed at every point, so that edges
+behind walls stay sharp.
 """
 
 import math
@@ -41,8 +41,6 @@ _JOINT_BUDGET: Final = 2.5e5
 """Points of the joint filter times the cost of one: the square of the anchors in view plus a constant."""
 
 _SAMPLE_POINTS: Final = 500  # points to estimate the mean number of anchors in view
-_SNAPSHOT_BUDGET: Final = 20_000_000
-"""Points of a snapshot method times the cost of one: anchors plus a constant. Only the largest grids exceed this."""
 
 _TABLE_ROWS: Final = 20_000  # rows of a table that are written at once
 
@@ -88,7 +86,7 @@ class MapSummary(Struct, frozen=True):
 
     points: int
     covered_share: float
-    """Share of the points with a fix in at least half of the rounds or messages."""
+    """Share of the points with a fix in at least half of the messages."""
     mean_sigma_m: float | None
     """Over the covered points."""
     median_sigma_m: float | None
@@ -193,11 +191,8 @@ def points_of(grid: Grid, height_m: float) -> Array:
 
 def _stride(predictor: Predictor, grid: Grid, points: Matrix) -> int:
     """Stride of the rows and columns to compute in full; ``points``: a slice's points inside the outline, (n, 3)."""
-    if predictor.settings.method == "joint":
-        some = points[:: math.ceil(len(points) / _SAMPLE_POINTS)]
-        most = _JOINT_BUDGET / float(((predictor.geometry_at(some)[:, ANCHORS_IN_VIEW] + 8.0) ** 2).mean())
-    else:
-        most = _SNAPSHOT_BUDGET / (len(predictor.anchors_m) + 14.0)
+    some = points[:: math.ceil(len(points) / _SAMPLE_POINTS)]
+    most = _JOINT_BUDGET / float(((predictor.geometry_at(some)[:, ANCHORS_IN_VIEW] + 8.0) ** 2).mean())
     return max(1, math.ceil(math.sqrt(grid.points / most)))
 
 
@@ -214,7 +209,7 @@ def _interpolate(
     within: Mask,
     fine: Matrix,
 ) -> None:
-    """Fill the method's columns of ``fine`` from a coarse table of these rows and columns of the grid.
+    """Fill the filter's columns of ``fine`` from a coarse table of these rows and columns of the grid.
 
     ``carrier``: weighted PDOP at the coarse points; at the fine points it is in the column ``sigma_m``.
     """

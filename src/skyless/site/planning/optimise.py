@@ -1,9 +1,9 @@
-"""Optimise anchor positions: the best of several starts, first on a lattice, then by the method's own prediction.
+"""Optimise anchor positions: the best of several starts, first on a lattice, then by the filter's prediction.
 
 A quick search exchanges anchors on a lattice of mounts. Its error measure is (HᵀWH)⁻¹ with each anchor weighted by the
-share of its frames that arrives, independent of the method. The results are then improved and judged by the method's
-own prediction. The evenly spaced layout is one of the starts, so the result is never worse. Mean and worst error over
-the region count equally, relative to those of that layout. The same seed gives the same result, unless time runs out.
+share of its frames that arrives. The results are then improved and judged by the filter's prediction. The evenly spaced
+layout is one of the starts, so the result is never worse. Mean and worst error over the region count equally, relative
+to those of that layout. The same seed gives the same result, unless time runs out.
 """
 
 import time
@@ -21,7 +21,6 @@ from skyless.core.native.library import KERNELS, compiled
 from skyless.core.native.records import Array, Reals, Record, Ticks, record
 from skyless.core.site import AnchorSite, Site
 from skyless.site.channel import Barriers, barriers_of
-from skyless.site.planning.anchor_clocks import stamp_variances
 from skyless.site.planning.links import (
     FIX_SHARE,
     SIGMA,
@@ -33,12 +32,13 @@ from skyless.site.planning.links import (
     sample_points,
 )
 from skyless.site.planning.predict import PlanSettings, Predictor, with_noise
+from skyless.site.planning.superframe import stamp_variances
 
 _SEARCH_POINTS: Final = 140
 _JUDGE_POINTS: Final = 1500
 _MAX_CANDIDATES: Final = 220
 _STARTS: Final = 16
-_REFINED: Final = 4  # starts improved further by the method's own prediction, including the even layout
+_REFINED: Final = 4  # starts improved further by the filter's prediction, including the even layout
 _FINEST_M: Final = 0.05
 
 _MAX_PASSES: Final = 12  # of an exchange on the lattice
@@ -230,7 +230,7 @@ def exchange(
     return score
 
 
-# The search by the method's own prediction
+# The search by the filter's prediction
 
 
 class Scored(Struct, frozen=True):
@@ -352,7 +352,7 @@ class Search:
         found.sort(key=lambda pair: pair[0])
         return [layout for _, layout in found]
 
-    # By the method's own prediction
+    # By the filter's prediction
 
     def _site_of(self, layout: Layout, rank: int = 0) -> Site:
         anchors_m = self._mounts.at(layout.along_m, layout.levels)
@@ -440,7 +440,7 @@ def one_more(
 ) -> OneMore | None:
     """Try one more anchor at a hundred positions; None if none is free.
 
-    The quick search on the lattice gives the position, the method's own prediction its benefit.
+    The quick search on the lattice gives the position, the filter's prediction its benefit.
     """
     before = Predictor(site, settings)
     points, weights = sample_points(floor, heights_m, _SEARCH_POINTS)

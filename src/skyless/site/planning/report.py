@@ -9,16 +9,16 @@ from msgspec import Struct
 from skyless.core.any_receiver import superframe_s
 from skyless.core.arrays import Array, Mask
 from skyless.core.fix import NoFixReason
-from skyless.core.method_names import FILTERS
+from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.native.records import MAX_ANCHORS
 from skyless.core.protocol1.snapshots import literal_covariance
 from skyless.core.tag.position import NoSolution, locate
 from skyless.site.file.advice import warnings_of
-from skyless.site.planning.anchor_clocks import master_warnings, stamp_variances
 from skyless.site.planning.links import BIAS, FIX_SHARE, IN_VIEW, SIGMA, Floor, Mounts, range_of, sample_points
 from skyless.site.planning.maps import MapSummary, PlanMap
 from skyless.site.planning.optimise import Optimised, Scored, one_more
-from skyless.site.planning.predict import Predictor, delays
+from skyless.site.planning.predict import Predictor
+from skyless.site.planning.superframe import master_warnings, stamp_variances
 
 
 class PointCheck(Struct, frozen=True):
@@ -36,14 +36,13 @@ class PointCheck(Struct, frozen=True):
     predicted_claim_m: float | None
     predicted_fix_share: float
     simulated_fix_share: float
-    """Share of the rounds (snapshots) or messages (filters) after the warm-up."""
+    """Share of the messages after the warm-up of the anchors that a tag there uses."""
     fixes: int
 
 
 class Verification(Struct, frozen=True):
     """All checked points, and statistics of the ratios."""
 
-    method: str
     seed: int
     simulated_s: float
     points: tuple[PointCheck, ...]
@@ -79,7 +78,7 @@ def plan_report(
     more = one_more(site, settings, floor, mounts, heights) if len(site.anchors) < 200 else None
     return {
         "site": site.name,
-        "method": settings.method,
+        "method": DEFAULT_METHOD,
         "tx_stamp_ps": site.noise.tx_stamp_ps,
         "rx_stamp_ps": site.noise.rx_stamp_ps,
         "qa": settings.qa,
@@ -100,8 +99,8 @@ def plan_report(
                 "x_m": anchor.x_m,
                 "y_m": anchor.y_m,
                 "z_m": anchor.z_m,
-                "hears_master": None if predictor.master is None else float(predictor.links.share[row]),
-                "sends": bool(predictor.clocks.sends[row]),
+                "hears_master": None if predictor.master is None else float(predictor.hears_master[row]),
+                "sends": bool(predictor.superframe.sent[row]),
             }
             for row, anchor in enumerate(site.anchors)
         ],
@@ -117,8 +116,8 @@ _WALKED_PLACES: Final = 6
 
 
 def _after_metre(predictor: Predictor, floor: Floor, heights_m: tuple[float, ...]) -> AfterMetre | None:
-    """Benefit of carrier phases to walking tags; None if the site has none or the method does not use them."""
-    if predictor.site.schedule.carrier_phase is not True or predictor.settings.method not in FILTERS:
+    """Benefit of carrier phases to walking tags; None if the site has none."""
+    if predictor.site.schedule.carrier_phase is not True:
         return None
     points, _ = sample_points(floor, heights_m, _WALKED_PLACES)
     with_phases, stamps = (predictor.walked_sigma(points, has_phases=has_phases) for has_phases in (True, False))
@@ -152,12 +151,11 @@ def _scored(scored: Scored) -> dict[str, Any]:
 
 
 def described(result: dict[str, Any]) -> str:
-    """Method, noise and schedule in one line."""
+    """Assumptions of a plan in one line."""
     tx_ps, rx_ps = result["tx_stamp_ps"], result["rx_stamp_ps"]
     noise = f"{tx_ps:g} ps" if tx_ps == rx_ps else f"{tx_ps:g} ps (TX) and {rx_ps:g} ps (RX)"
-    process_noise = f" with qa {result['qa']:g} m²/s³" if result["method"] == "joint" else ""
     return (
-        f"predicted for {result['method']}{process_noise}, stamps of {noise}, "
+        f"predicted for {result['method']} with qa {result['qa']:g} m²/s³, stamps of {noise}, "
         f"{'periods' if result['master'] is None else 'superframes'} of {1e3 * result['superframe_s']:.1f} ms, "
         "tags at rest"
     )
@@ -172,23 +170,11 @@ def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str
     return [
         *warnings_of(predictor.site),
         *master_warnings(predictor.site, predictor.settings.channel),
-        *_order(predictor),
         *_mirrors(predictor, floor, plan),
         *_holes(plan),
         *_weak(plan),
-        *_walls(predictor, plan),
+        *_walls(plan),
     ]
-
-
-def _order(predictor: Predictor) -> list[str]:
-    if predictor.settings.method in FILTERS:
-        return []
-    kappa, _ = delays(predictor.site)
-    early = [anchor.id for anchor, delay in zip(predictor.site.anchors, kappa, strict=True) if delay < 0.0]
-    if not early:
-        return []
-    numbers = ", ".join(map(str, early))
-    return [f"anchor {numbers}: sends before the master in a round, and {predictor.settings.method} cannot use it"]
 
 
 def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
@@ -248,7 +234,7 @@ def _weak(plan: PlanMap) -> list[str]:
     ]
 
 
-def _walls(predictor: Predictor, plan: PlanMap) -> list[str]:
+def _walls(plan: PlanMap) -> list[str]:
     bias, sigma = plan.column(BIAS), plan.column(SIGMA)
     known = np.isfinite(bias) & np.isfinite(sigma)
     worse = known & (bias > sigma)
@@ -256,10 +242,10 @@ def _walls(predictor: Predictor, plan: PlanMap) -> list[str]:
         return []
     largest = float(bias[known].max())
     # The prediction does not include joint's fault monitors (docs/planning.md).
-    monitors = "; joint may take delays for faults of anchors there, and err more than predicted"
     return [
         f"walls' delays shift positions by more than their standard deviation in {worse.sum() / known.sum():.0%} of "
-        f"the region, by {100 * largest:.0f} cm at most{monitors if predictor.settings.method == 'joint' else ''}"
+        f"the region, by {100 * largest:.0f} cm at most; joint may take delays for faults of anchors there, and err "
+        "more than predicted"
     ]
 
 

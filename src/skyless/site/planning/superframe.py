@@ -1,4 +1,4 @@
-"""A site's anchors in planning: their reception of the master, their clocks, the schedule of messages, and relays."""
+"""A site's anchors in planning: the messages of a superframe, their relays, and the reception of the master."""
 
 import math
 from collections.abc import Iterator
@@ -13,7 +13,15 @@ from skyless.core.air import beacon
 from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
 from skyless.core.any_receiver import beacon_period_s
 from skyless.core.arrays import Integers, Mask, Matrix, Vector
-from skyless.core.clock_filter import clock_noise, predict, stamp_variance_m2, update
+from skyless.core.clock_filter import (
+    ClockNoise,
+    TwoState,
+    clock_noise,
+    predict,
+    predicted_value_variance,
+    stamp_variance_m2,
+    update,
+)
 from skyless.core.geometry import anchor_positions, anchors_in_reach
 from skyless.core.protocol1 import beacon as protocol1_codec
 from skyless.core.protocol1.anchor import MAX_OFFSET_STD_M
@@ -21,30 +29,28 @@ from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_S
 from skyless.site.channel import Barriers, ChannelModel, barriers_of
-from skyless.site.planning.links import MIN_SYNC, anchor_links, link_budget, links, masters_by_links
-
-_STEADY_CHANGE: Final = 1e-7
-_MAX_SUPERFRAMES: Final = 20_000  # superframes after which a filter counts as steady in any case
-
+from skyless.site.planning.links import MIN_SYNC, link_budget, links, master_links, masters_by_links
 
 MIN_SHARE: Final = 0.01
 """Receptions that are relayed more rarely are ignored."""
 
+_START_RATE_VARIANCE: Final = 144.0  # m²/s²; the steady state does not depend on it
+_STEADY_CHANGE: Final = 1e-7
+_MAX_TURNS: Final = 20_000  # frames of the master after which a clock filter counts as steady in any case
 
-class AnchorClocks(NamedTuple):
+
+class Superframe(NamedTuple):
     """The messages of one superframe: senders and times."""
 
-    sends: Mask
-    """Anchors whose clock is known well enough to send; shape (anchors,)."""
+    sent: Vector
+    """Share of each anchor's messages that is sent and not lost to collisions; shape (anchors,)."""
     sender: Integers
     """Row of the sending anchor; shape (messages,)."""
     gap_s: Vector
     """Time since the previous message."""
-    kept: float
-    """Share of the messages that are not lost to collisions."""
 
 
-def anchor_clocks(site: Site, share: Vector) -> AnchorClocks:
+def superframe_of(site: Site, share: Vector) -> Superframe:
     """Superframe of anchors, in the order of the file, that receive these shares of the master's messages.
 
     Anchors without a master are assumed to send one after the other, the average of random instants; a message arrives
@@ -54,35 +60,20 @@ def anchor_clocks(site: Site, share: Vector) -> AnchorClocks:
         count, period_s = len(site.anchors), beacon_period_s(site)
         rivals = median(anchors_in_reach(site).tolist()) - 1.0
         kept = math.exp(-2.0 * air_time_s(MAX_FRAME_BYTES) * rivals / period_s)
-        return AnchorClocks(np.ones(count, np.bool_), np.arange(count), np.full(count, period_s / count), kept)
-    sender, time_s, superframe_s = _messages(site)
-    variances = offset_variances(site, share)
-    sends = share >= MIN_SYNC
-    sends[sender[variances > MAX_OFFSET_STD_M**2]] = False
-    sent = sends[sender]
-    sender, time_s = sender[sent], time_s[sent]
-    gap_s = np.diff(time_s, prepend=time_s[-1] - superframe_s) if len(time_s) else time_s
-    return AnchorClocks(sends, sender, gap_s, 1.0)
+        return Superframe(np.full(count, kept), np.arange(count), np.full(count, period_s / count))
+    schedule, first = schedule_of(site), first_slots(site)
+    sends = _send(site, share)
+    order = sorted(
+        (slot, row) for row, one in enumerate(site.anchors) if sends[row] for slot in schedule.slots_of(first[one.id])
+    )
+    slots, sender = np.array(order, np.int64).T
+    gap_slots = np.diff(slots, prepend=slots[-1] - schedule.slots)
+    return Superframe(sends.astype(np.float64), sender, gap_slots * schedule.slot_ticks * TICK_S)
 
 
 def row_of_master(site: Site) -> int:
     """Index of the master among the anchors."""
     return [anchor.id for anchor in site.anchors].index(site.master)
-
-
-def offset_variances(site: Site, share: Vector) -> Vector:
-    """Variance of the sender's clock offset that each message states in the steady state, m²; 0 for the master."""
-    noise = clock_noise(site.noise.white_fm, site.noise.random_walk_fm)
-    master = row_of_master(site)
-    sender, time_s, superframe_s = _messages(site)
-    variance, reported = sum(stamp_variances(site)), {}
-    for part in set(share[share >= MIN_SYNC].tolist()):
-        reported[part] = np.zeros(len(sender))
-        _run_filter(sender, time_s, superframe_s, master, part, variance, noise.white, noise.walk, reported[part])
-    own = [
-        0.0 if row == master or share[row] not in reported else reported[share[row]][k] for k, row in enumerate(sender)
-    ]
-    return np.array(own)
 
 
 def stamp_variances(site: Site) -> tuple[float, float]:
@@ -92,45 +83,37 @@ def stamp_variances(site: Site) -> tuple[float, float]:
     return tx_var, stamp_variance_m2(noise.rx_stamp_ps * 1e-12, rounded=True)
 
 
-def _messages(site: Site) -> tuple[Integers, Vector, float]:
-    """Rows of the sending anchors and times of the messages in a superframe, in order, and its length in seconds."""
+def _send(site: Site, share: Vector) -> Mask:
+    """Whether each anchor knows its clock well enough to send, from the steady state of its clock filter."""
     schedule, first = schedule_of(site), first_slots(site)
-    slot_s = schedule.slot_ticks * TICK_S
-    order = sorted((slot, row) for row, a in enumerate(site.anchors) for slot in schedule.slots_of(first[a.id]))
-    senders = np.array([row for _, row in order], dtype=np.int64)
-    return senders, np.array([slot * slot_s for slot, _ in order]), schedule.superframe_ticks * TICK_S
+    turn = schedule.slots // schedule.frames_per_node
+    slot_s, master = schedule.slot_ticks * TICK_S, first[site.master]
+    variance, noise = sum(stamp_variances(site)), clock_noise(site.noise.white_fm, site.noise.random_walk_fm)
+    sends = share >= MIN_SYNC
+    clocks = {part: steady_clock(part, turn * slot_s, variance, noise) for part in set(share[sends].tolist())}
+    for row in np.flatnonzero(sends).tolist():
+        anchor = site.anchors[row].id
+        after_s = (first[anchor] - master) % turn * slot_s
+        stated_m2 = predicted_value_variance(clocks[share[row]], after_s, noise.white, noise.walk)
+        sends[row] = anchor == site.master or stated_m2 <= MAX_OFFSET_STD_M**2
+    return sends
 
 
-def _run_filter(
-    sender: Integers,
-    time_s: Vector,
-    superframe_s: float,
-    master: int,
-    share: float,
-    variance: float,
-    white: float,
-    walk: float,
-    reported: Vector,
-) -> None:
-    """Run one anchor's clock filter to its steady state, and store its offset's variance at every message."""
-    covariance = (variance, 0.0, 144.0)
-    last_s = 0.0
-    for _ in range(_MAX_SUPERFRAMES):
-        before = covariance[0]
-        for k in range(len(sender)):
-            dt = time_s[k] - last_s if time_s[k] >= last_s else time_s[k] - last_s + superframe_s
-            last_s = time_s[k]
-            covariance = predict(covariance, dt, white, walk)
-            reported[k] = covariance[0]
-            if sender[k] == master:
-                _, _, updated = update(covariance, variance)
-                covariance = (
-                    covariance[0] + share * (updated[0] - covariance[0]),
-                    covariance[1] + share * (updated[1] - covariance[1]),
-                    covariance[2] + share * (updated[2] - covariance[2]),
-                )
-        if abs(covariance[0] - before) <= _STEADY_CHANGE * share * covariance[0]:
+def steady_clock(share: float, turn_s: float, variance: float, noise: ClockNoise) -> TwoState:
+    """Covariance of an anchor's clock filter after the master's frame, of which it receives this share."""
+    P = variance, 0.0, _START_RATE_VARIANCE
+    for _ in range(_MAX_TURNS):
+        before = predict(P, turn_s, noise.white, noise.walk)
+        _, _, after = update(before, variance)
+        last = P[0]
+        P = (
+            before[0] + share * (after[0] - before[0]),
+            before[1] + share * (after[1] - before[1]),
+            before[2] + share * (after[2] - before[2]),
+        )
+        if abs(P[0] - last) <= _STEADY_CHANGE * share * P[0]:
             break
+    return P
 
 
 class Relays(NamedTuple):
@@ -149,23 +132,21 @@ class Relays(NamedTuple):
 
 
 def relays_of(
-    anchors_m: Matrix, master: int | None, clocks: AnchorClocks, budget: Vector, barriers: Barriers
+    anchors_m: Matrix, master: int | None, superframe: Superframe, budget: Vector, barriers: Barriers
 ) -> Relays:
     """The relays of a site's superframe; each frame carries as many of the latest receptions as fit.
 
     ``anchors_m``: shape (anchors, 3); ``master``: row of the master, whose packets have a separate field.
     """
     share, delay_m = links(anchors_m, anchors_m, budget, barriers)
-    share *= clocks.kept * (clocks.sends & clocks.sends[:, None])
-    if master is None:
-        capacity = master_capacity = beacon.heard_capacity(position=True)
-    else:
-        capacity = protocol1_codec.heard_capacity(master_heard=True, master_time=True, page=True)
-        master_capacity = protocol1_codec.heard_capacity(master_heard=False, master_time=True, page=True)
+    share *= superframe.sent
     ends, rows = [], []
-    for k, listener in enumerate(clocks.sender.tolist()):
-        fits = master_capacity if listener == master else capacity
-        for sender, age_s, part in _relayed(clocks, k, share[listener], master, fits):
+    for k, listener in enumerate(superframe.sender.tolist()):
+        if master is None:
+            fits = beacon.heard_capacity(position=True)
+        else:
+            fits = protocol1_codec.heard_capacity(master_heard=listener != master, master_time=True, page=True)
+        for sender, age_s, part in _relayed(superframe, k, share[listener], master, fits):
             rows.append((sender, age_s, part, delay_m[listener, sender]))
         ends.append(len(rows))
     columns = np.array(rows).reshape(-1, 4).T
@@ -173,7 +154,7 @@ def relays_of(
 
 
 def _relayed(
-    clocks: AnchorClocks, k: int, share: Vector, master: int | None, capacity: int
+    superframe: Superframe, k: int, share: Vector, master: int | None, capacity: int
 ) -> Iterator[tuple[int, float, float]]:
     """Relays in message k: sender, time since it sent, and share of the messages that relay it.
 
@@ -182,11 +163,11 @@ def _relayed(
     """
     fewer = np.zeros(capacity + 1)  # element i: probability that i − 1 later packets were received
     fewer[1] = 1.0
-    seen, age_s = {int(clocks.sender[k])}, 0.0
-    for back in range(1, len(clocks.sender)):
-        age_s += float(clocks.gap_s[k - back + 1])
-        sender = int(clocks.sender[k - back])
-        if sender == clocks.sender[k]:
+    seen, age_s = {int(superframe.sender[k])}, 0.0
+    for back in range(1, len(superframe.sender)):
+        age_s += float(superframe.gap_s[k - back + 1])
+        sender = int(superframe.sender[k - back])
+        if sender == superframe.sender[k]:
             break
         if sender in seen or share[sender] == 0.0:
             continue
@@ -222,10 +203,9 @@ class MasterReception(Struct, frozen=True):
 def reception_of(site: Site, channel: ChannelModel) -> MasterReception:
     """Predict the anchors' reception of their master, with the losses of the site's walls."""
     anchors_m, master = anchor_positions(site), row_of_master(site)
-    share = anchor_links(anchors_m, master, link_budget(channel), barriers_of(site.walls, site.storeys)).share
-    return MasterReception(
-        np.linalg.norm(anchors_m - anchors_m[master], axis=1), share, anchor_clocks(site, share).sends
-    )
+    share = master_links(anchors_m, master, link_budget(channel), barriers_of(site.walls, site.storeys))
+    sent = superframe_of(site, share).sent
+    return MasterReception(np.linalg.norm(anchors_m - anchors_m[master], axis=1), share, sent > 0.0)
 
 
 def with_best_master(site: Site, channel: ChannelModel) -> Site:
