@@ -686,12 +686,12 @@ SKYLESS_EXPORT void skyless_fill_links(real *senders_m, int32_t senders, real *l
     }
 }
 
-/* Optimise anchor positions: the best of several starts, first on a lattice, then by the method's own prediction.
+/* Optimise anchor positions: the best of several starts, first on a lattice, then by the filter's prediction.
  *
  * A quick search exchanges anchors on a lattice of mounts. Its error measure is (HᵀWH)⁻¹ with each anchor weighted by the
- * share of its frames that arrives, independent of the method. The results are then improved and judged by the method's
- * own prediction. The evenly spaced layout is one of the starts, so the result is never worse. Mean and worst error over
- * the region count equally, relative to those of that layout. The same seed gives the same result, unless time runs out. */
+ * share of its frames that arrives. The results are then improved and judged by the filter's prediction. The evenly spaced
+ * layout is one of the starts, so the result is never worse. Mean and worst error over the region count equally, relative
+ * to those of that layout. The same seed gives the same result, unless time runs out. */
 
 /* The quick search on a lattice */
 
