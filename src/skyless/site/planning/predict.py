@@ -102,34 +102,6 @@ def anchors_in_use(scene: Scene, point: Vector, share: Vector) -> Integers:
     return scene.strongest(point, np.flatnonzero(share >= _RARELY), MAX_ANCHORS_IN_USE)
 
 
-def walked_sigma(
-    point: Vector,
-    velocity_mps: Vector,
-    settings: EstimatorSettings,
-    scene: Scene,
-    superframe: Superframe,
-    relays: Relays,
-    has_phases: bool,
-) -> float:
-    """Standard deviation, metres, that the filter claims for a tag that rested at a point and then walked for a second.
-
-    With ``has_phases`` the tag measures carrier phases, with the noise and wander that the filter starts with.
-    Infinite if there is no fix.
-    """
-    (share,), (delay_m,) = scene.heard_at(point[None])
-    rows = anchors_in_use(scene, point, share)
-    if len(rows) <= settings.dim:
-        return math.inf
-    s = _state_at(settings, scene.anchors, rows, point, has_phases)
-    s.tuning.slow_forgetting = 0.0  # nothing is learnt from innovations of zero
-    columns, found = _planned(superframe, relays, share, delay_m, rows), SteadyState()
-    superframe_s = superframe.gap_s.sum()
-    walked = max(1, round(1.0 / superframe_s))
-    velocity = np.ascontiguousarray(velocity_mps / (walked * superframe_s))
-    _find_walked(s, *columns, len(superframe.sender), math.ceil(_RESTED_S / superframe_s), velocity, walked, found)
-    return math.sqrt(sum(found.variance_m2) / found.fixes)
-
-
 def _state_at(
     settings: EstimatorSettings, anchors_m: Matrix, rows: Integers, point: Vector, has_phases: bool = False
 ) -> State:
@@ -219,12 +191,27 @@ class Predictor:
     def walked_sigma(self, points_m: Matrix, *, has_phases: bool) -> Vector:
         """Standard deviations that ``joint`` claims after walks of 1 m from points, along x and along y, shape (2·m,).
 
-        Walks go towards the middle of the points, shape (m, 3), at 1 m/s. Infinite where there is no fix.
+        Walks go towards the middle of the points, shape (m, 3), at 1 m/s. With ``has_phases`` the tag measures carrier
+        phases, with the noise and wander that the filter starts with. Infinite where there is no fix.
         """
         sides = np.where(points_m > points_m.mean(axis=0), -1.0, 1.0)
         walks = ((point, side * axis) for point, side in zip(points_m, sides, strict=True) for axis in np.eye(3)[:2])
-        joint = self._estimator, self.scene, self.superframe, self.relays
-        return np.array([walked_sigma(point, way, *joint, has_phases) for point, way in walks])
+        return np.array([self._walked_sigma(point, way, has_phases) for point, way in walks])
+
+    def _walked_sigma(self, point: Vector, velocity_mps: Vector, has_phases: bool) -> float:
+        """Standard deviation after a rest at a point and a walk of a second."""
+        (share,), (delay_m,) = self.scene.heard_at(point[None])
+        rows = anchors_in_use(self.scene, point, share)
+        if len(rows) <= self.dim:
+            return math.inf
+        s = _state_at(self._estimator, self.anchors_m, rows, point, has_phases)
+        s.tuning.slow_forgetting = 0.0  # nothing is learnt from innovations of zero
+        columns, found = _planned(self.superframe, self.relays, share, delay_m, rows), SteadyState()
+        length_s = self.superframe.gap_s.sum()
+        walked, at_rest = max(1, round(1.0 / length_s)), math.ceil(_RESTED_S / length_s)
+        velocity = np.ascontiguousarray(velocity_mps / (walked * length_s))
+        _find_walked(s, *columns, len(self.superframe.sender), at_rest, velocity, walked, found)
+        return math.sqrt(sum(found.variance_m2) / found.fixes)
 
     def messages_at(self, points_m: Matrix) -> Integers:
         """Messages in a superframe of the anchors that a tag uses at points, shape (m, 3); shape (m,)."""
