@@ -3,7 +3,7 @@ import struct
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
+from msgspec.structs import asdict, replace
 
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SitePage
 from skyless.core.air.beacon import Beacon, StatedPosition, fields_of
@@ -19,12 +19,12 @@ from skyless.core.air.site_pages import (
     site_issue,
 )
 from skyless.core.anchor import site_page_for, site_pages_of
+from skyless.core.clock_filter import clock_noise, stamp_variances_m2
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.native.records import MAX_NEIGHBOURS, MAX_PAGES
 from skyless.core.site import GeoreferenceSite
 from skyless.core.tag.hearing import keep_place
-from skyless.core.tag.joint import DROP_S, fill_ages, read_accuracy
-from skyless.core.tag.receiver import estimator_settings
+from skyless.core.tag.joint import read_accuracy
 from skyless.core.ticks import from_seconds
 from skyless.sim.lab import lab_site
 
@@ -191,7 +191,11 @@ def test_strangers_do_not_displace_anchors_that_others_have_received():
 )
 def test_settings_from_the_bytes_of_pages_are_those_from_their_figures(figures, steps):
     pages = encode_page(NoisePage(*figures)), struct.pack("<B6H4x", 5, *steps)
-    found, expected = EstimatorSettings(), estimator_settings(0.5, None, *map(decode_page, pages), 0.0)
+    noise, accuracy = map(decode_page, pages)
+    expected = EstimatorSettings(**asdict(accuracy))
+    expected.tx_variance_m2, expected.rx_variance_m2 = stamp_variances_m2(noise.tx_stamp_s, noise.rx_stamp_s)
+    oscillator = clock_noise(noise.white_fm, noise.random_walk_fm)
+    expected.white, expected.walk = oscillator.white / 2.0, oscillator.walk / 2.0  # of one clock
+    found = EstimatorSettings()
     read_accuracy(found, *pages)
-    fill_ages(found, 0.0, DROP_S)
     assert bytes(found) == bytes(expected)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dense_covariance import position_covariance
-from skyless.core.clock_filter import stamp_variance_m2
+from skyless.core.clock_filter import stamp_variances_m2
 from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covariance, literal_delayed_covariance
 from skyless.core.tag.position import Solution, locate
 
@@ -67,7 +67,7 @@ def test_it_is_the_scatter_of_the_solvers_estimates(anchors, height, weighted):
 )
 def test_it_predicts_the_simulated_lab(covariance, weighted, at_p1_cm, at_p2_cm):
     """The column "predicted σ" of docs/maths.md section 5: 100 ps, one fix per superframe."""
-    tx, rx = (stamp_variance_m2(100e-12, rounded=rounded) for rounded in (False, True))
+    tx, rx = stamp_variances_m2(100e-12, 100e-12)
     predicted = position_covariance(LAB, [P1, P2], covariance(KAPPA, tx, rx), height_known=True, weighted=weighted)
     sigma_cm = 100.0 * np.sqrt(np.trace(predicted, axis1=1, axis2=2))
     np.testing.assert_allclose(sigma_cm, [at_p1_cm, at_p2_cm], atol=0.008)

@@ -76,10 +76,10 @@ def clock_noise(white_fm: float, random_walk_fm: float) -> ClockNoise:
     return ClockNoise(scale * white_fm**2, scale * random_walk_fm**2)
 
 
-def stamp_variance_m2(stamp_s: float, *, rounded: bool) -> float:
-    """Variance of a stamp in m²; rounding to whole ticks adds a twelfth of a tick squared."""
-    rounding = TICK_S**2 / 12.0 if rounded else 0.0
-    return SPEED_OF_LIGHT_MPS**2 * (stamp_s**2 + rounding)
+def stamp_variances_m2(tx_stamp_s: float, rx_stamp_s: float) -> tuple[float, float]:
+    """Variances of a TX stamp and of an RX stamp, to which rounding to whole ticks adds a twelfth of a tick squared."""
+    light_2 = SPEED_OF_LIGHT_MPS**2
+    return light_2 * tx_stamp_s**2, light_2 * (rx_stamp_s**2 + TICK_S**2 / 12.0)
 
 
 class ClockFilter:

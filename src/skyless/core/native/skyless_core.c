@@ -406,7 +406,7 @@ INTERNAL real power_dbm(Neighbour *n, State *s, int32_t *origin_mm);
 INTERNAL real place_m(Neighbour *n, int32_t *origin_mm, int32_t axis);
 INTERNAL void read_accuracy(EstimatorSettings *e, uint8_t *noise, uint8_t *accuracy);
 INTERNAL void fill_noise(EstimatorSettings *e, real tx_stamp_s, real rx_stamp_s, real white_fm, real random_walk_fm);
-INTERNAL void fill_ages(EstimatorSettings *e, real superframe_s, real drop_s);
+INTERNAL void fill_ages(EstimatorSettings *e, real superframe_s);
 INTERNAL real float_at(uint8_t *data, int32_t at);
 INTERNAL void handle_events(Tag *t, Acquisition *q);
 INTERNAL void forget_stamps(Tag *t, Acquisition *q);
@@ -6749,9 +6749,9 @@ INTERNAL void fill_noise(EstimatorSettings *e, real tx_stamp_s, real rx_stamp_s,
     e->walk = new_2;
 }
 
-/* Fill in the ages beyond which packets and anchors are dropped; anchors not before ``drop_s``. */
-INTERNAL void fill_ages(EstimatorSettings *e, real superframe_s, real drop_s) {
-    e->drop_s = max_real(drop_s, REAL(4.0) * superframe_s);
+/* Fill in the ages beyond which packets and anchors are dropped. */
+INTERNAL void fill_ages(EstimatorSettings *e, real superframe_s) {
+    e->drop_s = max_real(DROP_S, REAL(4.0) * superframe_s);
     e->relay_age_s = max_real(RELAY_AGE_S, RELAY_SUPERFRAMES * superframe_s);
 }
 
@@ -6912,7 +6912,7 @@ INTERNAL void read_pages(Tag *t) {
     c->settings = t->owner;
     read_accuracy(&c->settings, t->pages.used[NOISE_KIND].contents, t->pages.used[ACCURACY_KIND].contents);
     c->superframe_s = (real)t->period_ticks * TICK_S;
-    fill_ages(&c->settings, c->superframe_s, CELL_DROP_S);
+    fill_ages(&c->settings, c->superframe_s);
     c->dim = AXES;
     if ((site[HEIGHT_FLAG_AT] & HEIGHT_GIVEN) != 0) {
         c->settings.height_m = (real)signed_(site, HEIGHT_FLAG_AT + 1) / (real)MM_PER_M;

@@ -75,8 +75,6 @@ typedef double real;
 #define BLOCKED_DB REAL(11.0)
 #define BOUND_SIGMAS REAL(3.0)
 #define BROADCAST 65535
-/* An anchor leaves the estimator after at least this silence at sites where tags move from cell to cell. */
-#define CELL_DROP_S REAL(1.0)
 /* Length of a certificate (``skyless.core.keys.chain``). */
 #define CERTIFICATE_BYTES 94
 #define CHANGED 2
@@ -111,6 +109,8 @@ typedef double real;
 #define DEPENDENT REAL(1e-06)
 #define DISTINCT_MINIMA_CHI2 REAL(9.0)
 #define DIVERGED 2
+/* An anchor leaves the estimator after this silence, or after four superframes if that is longer. */
+#define DROP_S REAL(1.0)
 #define DUPLICATE 1
 #define EARTH_KIND 1
 #define EXHAUSTED 3

@@ -14,7 +14,7 @@ from msgspec import Struct
 from skyless.core.air.almanac import Page
 from skyless.core.air.frame import Heard, Malformed, Reception, Transmission
 from skyless.core.anchor import MAX_RELAY_AGE_TICKS, delay_change_ticks, on_radio_grid
-from skyless.core.clock_filter import ClockFilter, clock_noise, stamp_variance_m2
+from skyless.core.clock_filter import ClockFilter, clock_noise, stamp_variances_m2
 from skyless.core.protocol1.almanac import almanac_issue, page_for, pages_of
 from skyless.core.protocol1.beacon import (
     Beacon,
@@ -441,8 +441,7 @@ class Anchor:
 
 def _filter_of(site: Site) -> ClockFilter:
     noise = site.noise
-    variance = stamp_variance_m2(noise.tx_stamp_ps * 1e-12, rounded=False)
-    variance += stamp_variance_m2(noise.rx_stamp_ps * 1e-12, rounded=True)
+    variance = sum(stamp_variances_m2(noise.tx_stamp_ps * 1e-12, noise.rx_stamp_ps * 1e-12))
     return ClockFilter(clock_noise(noise.white_fm, noise.random_walk_fm), variance)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from skyless.core.air.frame import Heard, Malformed, Reception
 from skyless.core.air.site_choice import NO_SITE, note_fix
 from skyless.core.arrays import Array
+from skyless.core.clock_filter import stamp_variances_m2
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.native.library import compiled
 from skyless.core.protocol1.almanac import AlmanacAssembly
@@ -18,7 +19,7 @@ from skyless.core.protocol1.beacon import Beacon, Schedule, decode_cached, sched
 from skyless.core.protocol1.clock import FollowedMaster
 from skyless.core.protocol1.snapshots import Observation, SnapshotMethod, Snapshots, SnapshotSettings
 from skyless.core.tag.admission import ADMITTED, SITE_CHANGED, Admission, admit_sender, admit_stamp
-from skyless.core.tag.receiver import BeaconReceiver, HeardSite, stamp_variances
+from skyless.core.tag.receiver import BeaconReceiver, HeardSite
 from skyless.core.ticks import nearest
 
 
@@ -182,7 +183,8 @@ class Receiver(BeaconReceiver):
             self._schedule = schedule_from_page(schedule)
             self._superframe_ticks = self._schedule.superframe_ticks
             heights = schedule.tag_height_m, self._z_bounds_m
-            settings = SnapshotSettings(master, schedule.anchors, *stamp_variances(noise), *heights)
+            variances_m2 = stamp_variances_m2(noise.tx_stamp_s, noise.rx_stamp_s)
+            settings = SnapshotSettings(master, schedule.anchors, *variances_m2, *heights)
             self._method = Snapshots(self._method_name, settings, self._admission.time)
 
 

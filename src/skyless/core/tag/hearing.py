@@ -55,9 +55,6 @@ from skyless.core.ticks import NEVER, TICK_RATE_HZ, TICK_S, from_seconds
 
 # What changes rarely for a tag: its site, the site's pages, its counter, anchors that move or join.
 
-CELL_DROP_S: Final = 1.0
-"""An anchor leaves the estimator after at least this silence at sites where tags move from cell to cell."""
-
 MOVED_HOLD_TICKS: Final = from_seconds(0.3)
 MOVE_TICKS: Final = from_seconds(10.0)
 """A survey moves all anchors of a site, some of them seconds after the others, and positions from before and after it
@@ -153,7 +150,7 @@ def _read_pages(t: Tag) -> None:
     c.settings = t.owner
     read_accuracy(c.settings, t.pages.used[NOISE_KIND].contents, t.pages.used[ACCURACY_KIND].contents)
     c.superframe_s = t.period_ticks * TICK_S
-    fill_ages(c.settings, c.superframe_s, CELL_DROP_S)
+    fill_ages(c.settings, c.superframe_s)
     c.dim = AXES
     if site[HEIGHT_FLAG_AT] & HEIGHT_GIVEN != 0:
         c.settings.height_m, c.dim = signed(site, HEIGHT_FLAG_AT + 1) / MM_PER_M, AXES - 1

@@ -183,7 +183,7 @@ _follow: Final = compiled(follow)
 
 # What the estimator assumes at a site, from its pages of noise and accuracy
 
-DROP_S: Final = 2.0
+DROP_S: Final = 1.0
 """An anchor leaves the estimator after this silence, or after four superframes if that is longer."""
 
 # Relays of older packets are not used; the longer of the two counts.
@@ -215,9 +215,9 @@ def fill_noise(
     e.white, e.walk = _LIGHT_2 * square(white_fm), _LIGHT_2 * square(random_walk_fm)
 
 
-def fill_ages(e: EstimatorSettings, superframe_s: float, drop_s: float) -> None:
-    """Fill in the ages beyond which packets and anchors are dropped; anchors not before ``drop_s``."""
-    e.drop_s = max(drop_s, 4.0 * superframe_s)
+def fill_ages(e: EstimatorSettings, superframe_s: float) -> None:
+    """Fill in the ages beyond which packets and anchors are dropped."""
+    e.drop_s = max(DROP_S, 4.0 * superframe_s)
     e.relay_age_s = max(RELAY_AGE_S, RELAY_SUPERFRAMES * superframe_s)
 
 

@@ -11,14 +11,13 @@ from typing import Final, Protocol
 
 from msgspec import Struct
 
-from skyless.core.air.almanac import AccuracyPage, GeoreferencePage, NoisePage
+from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.beacon import FAULTS, Beacon, fields_of
 from skyless.core.air.frame import Reception, phase_of, powers_dbm
 from skyless.core.air.site_choice import NO_SITE, SITE_MASK
 from skyless.core.air.site_pages import LocalAlmanac, encode_page
-from skyless.core.clock_filter import stamp_variance_m2
 from skyless.core.estimator.estimator import NO_REPORT, Report
-from skyless.core.estimator.settings import TUNING, EstimatorSettings
+from skyless.core.estimator.settings import TUNING
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.native.library import compiled
@@ -35,7 +34,7 @@ from skyless.core.tag.hearing import (
     hear_fields,
     hear_frame,
 )
-from skyless.core.tag.joint import DROP_S, Estimation, fill_ages, fill_noise
+from skyless.core.tag.joint import Estimation
 from skyless.core.ticks import FixTime
 
 # Common to the receivers of both protocols
@@ -173,33 +172,6 @@ class BeaconReceiver(ABC):
 
 def _site_of(site: int) -> int | None:
     return None if site == NO_SITE else site & SITE_MASK
-
-
-# Settings of a tag's filter from pages and options
-
-
-def stamp_variances(noise: NoisePage) -> tuple[float, float]:
-    """Variances of a TX and of an RX timestamp, m²."""
-    return stamp_variance_m2(noise.tx_stamp_s, rounded=False), stamp_variance_m2(noise.rx_stamp_s, rounded=True)
-
-
-def estimator_settings(
-    qa: float, height_m: float | None, noise: NoisePage, accuracy: AccuracyPage, superframe_s: float
-) -> EstimatorSettings:
-    """The estimator's settings at a site with this noise and accuracy."""
-    settings = EstimatorSettings(
-        qa=qa,
-        height_m=height_m,
-        survey_std_m=accuracy.survey_std_m,
-        range_std_m=accuracy.range_std_m,
-        slope_std_m=accuracy.slope_std_m,
-        place_std_m=accuracy.place_std_m,
-        place_distance_m=accuracy.place_distance_m,
-        place_time_s=accuracy.place_time_s,
-    )
-    fill_noise(settings, noise.tx_stamp_s, noise.rx_stamp_s, noise.white_fm, noise.random_walk_fm)
-    fill_ages(settings, superframe_s, DROP_S)
-    return settings
 
 
 _UNUSED: Final = {

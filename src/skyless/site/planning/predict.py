@@ -12,6 +12,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from skyless.core.air.site_pages import encode_page
 from skyless.core.anchor import filter_pages_of
 from skyless.core.any_receiver import superframe_s
 from skyless.core.arrays import Integers, Matrix, Vector
@@ -25,7 +26,7 @@ from skyless.core.native.library import compiled
 from skyless.core.native.records import MAX_ANCHORS_IN_USE
 from skyless.core.native.views import records, view
 from skyless.core.site import Site
-from skyless.core.tag.receiver import estimator_settings
+from skyless.core.tag.joint import fill_ages, read_accuracy
 from skyless.core.ticks import TICK_S
 from skyless.site.channel import ChannelModel, barriers_of
 from skyless.site.planning.links import (
@@ -184,9 +185,9 @@ class Predictor:
         self.relays = relays_of(self.anchors_m, self.master, self.superframe, self.budget, self.barriers)
         self.scene = Scene(self.anchors_m, self.superframe.sent, self.budget, self.barriers)
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
-        self._estimator = estimator_settings(
-            settings.qa, site.tags.height_m, *filter_pages_of(self.site), superframe_s(site)
-        )
+        self._estimator = EstimatorSettings(qa=settings.qa, height_m=site.tags.height_m)
+        read_accuracy(self._estimator, *map(encode_page, filter_pages_of(self.site)))
+        fill_ages(self._estimator, superframe_s(site))
 
     def walked_sigma(self, points_m: Matrix, *, has_phases: bool) -> Vector:
         """Standard deviations that ``joint`` claims after walks of 1 m from points, along x and along y, shape (2·m,).

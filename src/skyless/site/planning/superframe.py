@@ -19,7 +19,7 @@ from skyless.core.clock_filter import (
     clock_noise,
     predict,
     predicted_value_variance,
-    stamp_variance_m2,
+    stamp_variances_m2,
     update,
 )
 from skyless.core.geometry import anchor_positions, anchors_in_reach
@@ -78,9 +78,7 @@ def row_of_master(site: Site) -> int:
 
 def stamp_variances(site: Site) -> tuple[float, float]:
     """Variances, m², of a TX stamp and of an RX stamp with its rounding."""
-    noise = site.noise
-    tx_var = stamp_variance_m2(noise.tx_stamp_ps * 1e-12, rounded=False)
-    return tx_var, stamp_variance_m2(noise.rx_stamp_ps * 1e-12, rounded=True)
+    return stamp_variances_m2(site.noise.tx_stamp_ps * 1e-12, site.noise.rx_stamp_ps * 1e-12)
 
 
 def _send(site: Site, share: Vector) -> Mask:
