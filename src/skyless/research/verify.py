@@ -12,7 +12,6 @@ from msgspec.structs import replace
 
 from skyless.core.any_receiver import superframe_s as period_s
 from skyless.core.arrays import Matrix
-from skyless.core.method_names import DEFAULT_METHOD
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of, stated_room
 from skyless.sim.trajectory import Static
@@ -91,7 +90,7 @@ def verify(
         room = None if worlds == 1 else stated_room(site, slope_m=slope_m, at_rest=True)
         request = Request(site=site, seed=seed + world, room=room)
         impairments = replace(impairments_of(request, site), channel=settings.channel)
-        fleet = Fleet(site, still, impairments, request.seed, FleetSettings(DEFAULT_METHOD, settings.qa, warm_up_s))
+        fleet = Fleet(site, still, impairments, request.seed, FleetSettings(qa=settings.qa, warmup_s=warm_up_s))
         now_s = 0.0
         while now_s < end_s:
             now_s = min(now_s + 0.25, end_s)
