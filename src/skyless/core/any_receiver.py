@@ -21,8 +21,8 @@ from skyless.core.protocol1 import beacon as protocol1_codec
 from skyless.core.protocol1 import receiver as protocol1
 from skyless.core.protocol1.beacon import Beacon as Protocol1Beacon
 from skyless.core.protocol1.beacon import schedule_of
-from skyless.core.protocol1.door import Door
 from skyless.core.protocol1.snapshots import Snapshots
+from skyless.core.protocol1.translator import Translator
 from skyless.core.site import Site
 from skyless.core.tag.joint import Estimation
 from skyless.core.tag.receiver import HeardSite, Receiver
@@ -133,7 +133,7 @@ class AnyReceiver:
             self._receiver: Receiver | protocol1.Receiver = joint
         else:
             self._receiver = protocol1.Receiver(method, site=site, z_bounds_m=z_bounds_m)
-        self._doors: dict[int, Door] = {}
+        self._translators: dict[int, Translator] = {}
         """Of the sites of protocol 1 that ``joint`` hears, the one in use and those received last."""
 
     @property
@@ -207,13 +207,13 @@ class AnyReceiver:
             return None
         if not isinstance(receiver, Receiver):
             return receiver.hear_beacon(beacon, reception)
-        door = self._door_of(beacon.site)
-        report = door.report(beacon, reception.rx_ticks)
-        return receiver.hear_beacon(door.translated(beacon), reception, report)
+        translator = self._translator_of(beacon.site)
+        report = translator.report(beacon, reception.rx_ticks)
+        return receiver.hear_beacon(translator.translated(beacon), reception, report)
 
-    def _door_of(self, site: int) -> Door:
-        door = self._doors.pop(site, None) or Door()
-        self._doors[site] = door
-        if len(self._doors) > MAX_SITES:
-            del self._doors[next(other for other in self._doors if other != self.site)]
-        return door
+    def _translator_of(self, site: int) -> Translator:
+        translator = self._translators.pop(site, None) or Translator()
+        self._translators[site] = translator
+        if len(self._translators) > MAX_SITES:
+            del self._translators[next(other for other in self._translators if other != self.site)]
+        return translator

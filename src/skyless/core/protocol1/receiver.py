@@ -24,7 +24,7 @@ from skyless.core.ticks import nearest
 
 
 class Receiver(BeaconReceiver):
-    """One listening tag of protocol 1 with one of the paper's methods; ``joint`` hears it through ``Door``."""
+    """One listening tag of protocol 1 with one of the paper's methods; ``joint`` hears it through ``Translator``."""
 
     def __init__(
         self,

@@ -11,7 +11,7 @@ from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.estimator.estimator import NO_REPORT
 from skyless.core.protocol1.beacon import encode
-from skyless.core.protocol1.door import Door
+from skyless.core.protocol1.translator import Translator
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.lab import paper_lab_site
 
@@ -35,5 +35,5 @@ def test_the_anchors_own_estimates_help_where_most_frames_are_lost(monkeypatch):
         return np.sqrt(np.mean(squares))
 
     with_reports_m = rmse_m()
-    monkeypatch.setattr(Door, "report", lambda *_: NO_REPORT)
+    monkeypatch.setattr(Translator, "report", lambda *_: NO_REPORT)
     assert with_reports_m < 0.9 * rmse_m()

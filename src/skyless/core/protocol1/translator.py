@@ -1,9 +1,9 @@
 """How ``joint`` hears a site of protocol 1: its beacons as those of protocol 2.
 
 An anchor of protocol 1 states its own TX stamp and relays its receptions, the master's among them, as one of protocol 2
-does. Its position and the site's pages come from the almanac that the beacons carry. What protocol 2 has not is the
-anchor's own estimate of its clock against the master's: where most frames are lost, relays alone are a third less
-accurate (``docs/protocol.md``).
+does. Its position and the site's pages come from the almanac that the beacons carry. What protocol 2 lacks
+is the anchor's own estimate of its clock against the master's: where most frames are lost, positions from relays alone
+are a third less accurate (``docs/protocol.md``).
 """
 
 from typing import Final
@@ -22,8 +22,8 @@ STATED_BY_PAGE: Final = -1.0
 """Standard deviation of a position where that of the accuracy page counts."""
 
 
-class Door:
-    """Translates the beacons that a tag receives of one site."""
+class Translator:
+    """Translates the beacons that a tag receives from one site."""
 
     def __init__(self) -> None:
         self._almanac = AlmanacAssembly()
@@ -49,13 +49,14 @@ class Door:
             beacon.tx_ticks,
             self._issue,
             self._period_code,
-            self._positions.get(beacon.anchor),
-            beacon.relayed,
-            0,
-            page,
+            position=self._positions.get(beacon.anchor),
+            heard=beacon.relayed,
+            weak=0,
+            page=page,
         )
 
     def _read_almanac(self) -> None:
+        """Derive positions and pages from the almanac; none before it is complete."""
         almanac = self._almanac
         self._positions, self._pages = {}, ()
         if not almanac.complete or almanac.schedule is None or almanac.noise is None:
