@@ -248,7 +248,6 @@ TUNING: Final = Tuning()
 """The constants in use. Each state holds a copy."""
 
 
-MAX_CLOCK_RATE: Final = 50e-6  # two crystals of ±20 ppm, and margin
 # Standard deviation of the constant error of the range between two anchors, without that of their survey.
 PAIR_STD_M: Final = 0.02
 

@@ -24,9 +24,6 @@ from skyless.research.studies.runner import (
 OF_EPISODES: Final = ("efficiency", "integrity")
 """Studies of episodes, which have no worlds."""
 
-WITHOUT_POSITIONS: Final = ("watch",)
-"""Studies without positions of tags."""
-
 
 class Parts(Struct, frozen=True):
     """How many cells of a study were computed, and how many resumed."""
