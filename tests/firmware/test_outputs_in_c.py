@@ -20,8 +20,7 @@ from skyless.bridges.target import is_usable
 from skyless.core.earth import geodetic
 from skyless.core.fix import NoFixReason
 from skyless.core.site import GeoreferenceSite
-from skyless.radio.tag_reports import AnchorPlace, board_fix
-from skyless.run.board import BoardReceiver
+from skyless.radio.tag_reports import AnchorPlace, BoardReceiver, board_fix
 from skyless.run.mqtt.messages import FixMessage, fix_message
 from support.board_tag import ANCHORS, FixInC, OriginInC, fix_in_c
 

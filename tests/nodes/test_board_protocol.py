@@ -22,7 +22,8 @@ from skyless.radio.interface import Late, Restarted, Sent
 from skyless.radio.serial import link
 from skyless.radio.serial.link import BoardSettings, Done, Hello, NotDone, Status, TagConfig, TooLate, decode
 from skyless.radio.serial.link import Heard as HeardFrame
-from skyless.run.board import BoardReceiver, LinkProtocol, SnifferProtocol
+from skyless.radio.tag_reports import BoardReceiver
+from skyless.run.board import LinkProtocol, SnifferProtocol
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.listening import TagSpec

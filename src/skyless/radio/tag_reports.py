@@ -4,18 +4,20 @@ The bytes are those of structs in ``firmware/source/fix.h``; records contain the
 """
 
 import struct
+from collections import Counter
 from collections.abc import Sequence
 from math import inf, isfinite, nan
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import astuple
+from msgspec.structs import astuple, replace
 
 from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import UNAVAILABLE, IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.tag.receiver import HeardSite
 from skyless.core.ticks import TICK_RATE_HZ
 
 BODY_AT: Final = 2
@@ -159,3 +161,45 @@ def georeference_body(earth: GeoreferencePage) -> bytes:
     """The body of GEOREFERENCE."""
     latitude, longitude, height_m, heading = astuple(earth)
     return _EARTH.pack(round(1e7 * latitude), round(1e7 * longitude), round(1000 * height_m), round(1e7 * heading))
+
+
+class BoardReceiver:
+    """Stands in for the receiver of a tag whose board computes (``skyless.core.tag.receiver.SiteListener``)."""
+
+    def __init__(self) -> None:
+        self.counters: Counter[str] = Counter()
+        self.reason = NoFixReason.NO_BEACONS
+        self.site: int | None = None
+        self.multipath_m: tuple[float, float] | None = None
+        self.phase_anchors: tuple[int, ...] = ()
+        self._anchors_m: dict[int, tuple[float, float, float]] = {}
+        self._georeference: GeoreferencePage | None = None
+
+    @property
+    def heard_site(self) -> HeardSite | None:
+        """The anchors that the board has used, and the georeference; None before any."""
+        earth = self._georeference
+        return HeardSite(self._anchors_m, earth, is_complete=earth is not None) if self._anchors_m else None
+
+    def take(self, report: TagReport) -> Fix | None:
+        """Process a report of the board; return the fix if it is one."""
+        if isinstance(report, BoardFix):
+            self._enter(report.site)
+            known = all(anchor in self._anchors_m for anchor in report.fix.anchors)
+            places = [self._anchors_m[anchor] for anchor in report.fix.anchors] if known else []
+            return replace(report.fix, anchors_m=np.array(places).reshape(-1, 3))
+        if isinstance(report, BoardStatus):
+            self._enter(report.site)
+            self.reason = report.reason or self.reason
+            self.counters = Counter(report.counters)
+        elif isinstance(report, AnchorPlace):
+            self._anchors_m = self._anchors_m | {report.anchor: report.position_m}
+        else:
+            self._georeference = report
+        return None
+
+    def _enter(self, site: int | None) -> None:
+        """Switch to another site, which has other anchors."""
+        if self.site is not None and site not in (None, self.site):
+            self._anchors_m, self._georeference = {}, None
+        self.site = self.site if site is None else site

@@ -9,17 +9,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Literal, Protocol
 
-import numpy as np
 from msgspec.structs import replace
 
-from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.frame import Diagnostics, Malformed, Reception, Transmission, is_intact
 from skyless.core.any_receiver import SiteBeacon, decode_any
-from skyless.core.fix import Fix, NoFixReason
+from skyless.core.fix import Fix
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.protocol1.almanac import AlmanacAssembly
 from skyless.core.protocol1.beacon import Beacon
-from skyless.core.tag.receiver import NOT_DROPS, HeardSite, Receiver
+from skyless.core.tag.receiver import NOT_DROPS, Receiver
 from skyless.core.ticks import TICK_M, difference, wrap
 from skyless.radio.foreign.bitcraze import TDOA3
 from skyless.radio.foreign.uci import (
@@ -38,10 +36,6 @@ from skyless.radio.serial.link import ANY_SITE, MODES, OUTPUTS, BoardSettings, p
 from skyless.radio.serial.serial_port import Pty
 from skyless.radio.tag_reports import (
     BODY_AT,
-    AnchorPlace,
-    BoardFix,
-    BoardStatus,
-    TagReport,
     fix_body,
     georeference_body,
     place_body,
@@ -537,45 +531,3 @@ class Board:
         elif isinstance(event, Hint):
             self._log(f"board {self.radio.name}: {event.text}")
         self.protocol.on_radio_event(event)
-
-
-class BoardReceiver:
-    """Stands in for the receiver of a tag whose board computes (``skyless.core.tag.receiver.SiteListener``)."""
-
-    def __init__(self) -> None:
-        self.counters: Counter[str] = Counter()
-        self.reason = NoFixReason.NO_BEACONS
-        self.site: int | None = None
-        self.multipath_m: tuple[float, float] | None = None
-        self.phase_anchors: tuple[int, ...] = ()
-        self._anchors_m: dict[int, tuple[float, float, float]] = {}
-        self._georeference: GeoreferencePage | None = None
-
-    @property
-    def heard_site(self) -> HeardSite | None:
-        """The anchors that the board has used, and the georeference; None before any."""
-        earth = self._georeference
-        return HeardSite(self._anchors_m, earth, is_complete=earth is not None) if self._anchors_m else None
-
-    def take(self, report: TagReport) -> Fix | None:
-        """Process a report of the board; return the fix if it is one."""
-        if isinstance(report, BoardFix):
-            self._enter(report.site)
-            known = all(anchor in self._anchors_m for anchor in report.fix.anchors)
-            places = [self._anchors_m[anchor] for anchor in report.fix.anchors] if known else []
-            return replace(report.fix, anchors_m=np.array(places).reshape(-1, 3))
-        if isinstance(report, BoardStatus):
-            self._enter(report.site)
-            self.reason = report.reason or self.reason
-            self.counters = Counter(report.counters)
-        elif isinstance(report, AnchorPlace):
-            self._anchors_m = self._anchors_m | {report.anchor: report.position_m}
-        else:
-            self._georeference = report
-        return None
-
-    def _enter(self, site: int | None) -> None:
-        """Switch to another site, which has other anchors."""
-        if self.site is not None and site not in (None, self.site):
-            self._anchors_m, self._georeference = {}, None
-        self.site = self.site if site is None else site

@@ -3,21 +3,21 @@
 import os
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final, Literal
+from typing import TYPE_CHECKING, Final, Literal
 
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import Point
 from skyless.core.errors import SkylessError
-from skyless.radio.dw1000.radio import Dw1000Radio
-from skyless.radio.dw1000.spi import DEFAULT_CHIP, DEFAULT_FAST_HZ, MAX_FAST_HZ, START_HZ, SpiBus, SpiPort, check_spi
 from skyless.radio.emulated import DEFAULT_PORT, EtherConnection, Join
-from skyless.radio.foreign.fira import AnchorFrame
-from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferRadio, UciRadio
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Radio, Restarted
-from skyless.radio.serial.serial_port import check_path
-from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, SerialRadio
 from skyless.run.process import Log
+
+if TYPE_CHECKING:
+    from skyless.radio.dw1000.spi import SpiPort
+    from skyless.radio.foreign.foreign_radios import SnifferRadio, UciRadio
+
+# ruff: noqa: PLC0415 - a tag loads its own kind of radio only
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
 _SERIAL_BAUD: Final = 1_000_000
@@ -79,7 +79,8 @@ def open_radios(
     settings = delays or [AntennaDelays()] * len(names)
     phases = kind == "tag" if phases is None else phases
     if driver == "model":
-        from skyless.run.dw1000_model import ModelPort  # noqa: PLC0415 - a robot does not load a simulation
+        from skyless.radio.dw1000.radio import Dw1000Radio
+        from skyless.run.dw1000_model import ModelPort
 
         host, port = host_and_port(spec, where, DEFAULT_PORT)
         nodes = EtherConnection(host, port, join).radios
@@ -88,10 +89,14 @@ def open_radios(
             for node, own in zip(nodes, settings, strict=True)
         )
     if driver == "spi":
+        from skyless.radio.dw1000.radio import Dw1000Radio
+
         if len(names) != 1:
             raise SkylessError(f"--radio is {spec!r}; a chip on SPI carries one node, not {len(names)}")
         return (Dw1000Radio(spi_port(spec, where), names[0], settings[0], phases=phases),)
     if driver == "serial":
+        from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, SerialRadio
+
         ports, transmits = _ports(spec, where, _SERIAL_BAUD, names), kind == "anchor"
         computing = UNTIL_NEXT_START if computes else None
         return tuple(
@@ -101,6 +106,8 @@ def open_radios(
     if driver in ("listener", "sniffer", "uci") and kind == "anchor":
         raise SkylessError(f"--radio is {spec!r}; it should be one that can transmit: a {driver} only listens")
     if driver == "listener":
+        from skyless.radio.foreign.foreign_radios import ListenerRadio
+
         ports = _ports(spec, where, _FOREIGN_BAUD, names)
         return tuple(ListenerRadio(*port, name) for port, name in zip(ports, names, strict=True))
     raise SkylessError(f"--radio is {spec!r}; it should be {_EXPECTED}")
@@ -108,11 +115,14 @@ def open_radios(
 
 def open_sniffers(
     spec: str, names: tuple[str, ...], anchors_m: Mapping[int, Point] | None = None
-) -> tuple[SnifferRadio | UciRadio, ...]:
+) -> "tuple[SnifferRadio | UciRadio, ...]":
     """Create sniffers or FiRa boards for the tags of one process, in the order of their names.
 
     ``anchors_m``: known positions of the system's anchors. Raises SkylessError.
     """
+    from skyless.radio.foreign.fira import AnchorFrame
+    from skyless.radio.foreign.foreign_radios import SnifferRadio, UciRadio
+
     driver, _, where = spec.partition(":")
     ports = zip(_ports(spec, where, _FOREIGN_BAUD, names), names, strict=True)
     if driver == "sniffer":
@@ -123,6 +133,8 @@ def open_sniffers(
 
 def _ports(spec: str, where: str, usual_baud: int, names: tuple[str, ...]) -> list[tuple[str, int]]:
     """Parse path and baud rate of each node's port, from PATH[@BAUD],PATH[@BAUD] and so on. Raises SkylessError."""
+    from skyless.radio.serial.serial_port import check_path
+
     parts = where.split(",")
     if len(parts) != len(names) or not all(parts):
         wanted = "one port" if len(names) == 1 else f"{len(names)} ports, one for each node, with commas"
@@ -135,8 +147,18 @@ def _ports(spec: str, where: str, usual_baud: int, names: tuple[str, ...]) -> li
     return ports
 
 
-def spi_port(spec: str, where: str) -> SpiPort:
+def spi_port(spec: str, where: str) -> "SpiPort":
     """Parse BUS.DEVICE[,irq=PIN][,reset=PIN][,hz=RATE][,chip=PATH], and check the device. Raises SkylessError."""
+    from skyless.radio.dw1000.spi import (
+        DEFAULT_CHIP,
+        DEFAULT_FAST_HZ,
+        MAX_FAST_HZ,
+        START_HZ,
+        SpiBus,
+        SpiPort,
+        check_spi,
+    )
+
     wires, _, rest = where.partition(",")
     bus, dot, device = wires.partition(".")
     options = [part.partition("=")[::2] for part in rest.split(",") if part]

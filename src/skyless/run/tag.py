@@ -17,8 +17,7 @@ from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.tag.receiver import NOT_DROPS, Receiver, SiteListener, TagReceiver
 from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted
-from skyless.radio.tag_reports import BoardFix, Reported
-from skyless.run.board import BoardReceiver
+from skyless.radio.tag_reports import BoardFix, BoardReceiver, Reported
 from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog, PhaseLog
 from skyless.run.keys import Remembered, TagMemory, TagReport, trust_reason
 from skyless.run.mqtt.address import MqttAddress
