@@ -13,7 +13,6 @@ from skyless.core.air.almanac import (
     period_code,
     period_ticks,
     suitable_period_s,
-    ticks_ahead,
 )
 from skyless.core.ticks import DELAYED_TX_GRANULARITY_TICKS, WRAP_TICKS, from_seconds, to_seconds
 
@@ -34,12 +33,6 @@ def test_gaps_are_steps_of_the_radio_around_their_period(anchor_id, sequence, co
     assert gap % DELAYED_TX_GRANULARITY_TICKS == 0
     assert period // 2 <= gap < period + period // 2 < WRAP_TICKS // 2
     assert gap >= from_seconds(1.3e-3), "the driver's lead time, and a frame after its RMARKER"
-
-
-@given(ANCHORS, SEQUENCES, CODES, st.integers(0, 300))
-def test_what_lies_ahead_is_the_sum_of_gaps(anchor_id, sequence, code, beacons):
-    gaps = [gap_ticks(anchor_id, (sequence + number) % 256, code) for number in range(beacons)]
-    assert ticks_ahead(anchor_id, sequence, code, beacons) == sum(gaps)
 
 
 @given(st.floats(4e-3, 3.9))

@@ -7,7 +7,7 @@ import pytest
 from bench import LAB, Stage
 from msgspec.structs import replace
 
-from skyless.core.air.almanac import OFFERED_HZ, gap_ticks, period_code, period_ticks, suitable_period_s, ticks_ahead
+from skyless.core.air.almanac import OFFERED_HZ, gap_ticks, period_code, period_ticks, suitable_period_s
 from skyless.core.air.beacon import Beacon, decode, encode
 from skyless.core.air.frame import BLOCKED_DB, CLEAR_DB, Diagnostics, Reception
 from skyless.core.anchor import Anchor
@@ -57,6 +57,11 @@ def test_anchors_send_at_the_rate_of_the_site_file_at_instants_that_anybody_can_
     assert min(len(beacon.heard) for time_s, beacon in sent if time_s > 0.5) == 5
 
 
+def ticks_ahead(beacon, beacons):
+    """From this beacon of an anchor to the one that is ``beacons`` later."""
+    return sum(gap_ticks(beacon.anchor, beacon.sequence + number, beacon.period_code) for number in range(beacons))
+
+
 def test_a_tag_knows_when_an_anchor_sends_next_whatever_it_has_lost():
     """Predicted within the error of two clocks from a single beacon, also after losses and after a late host."""
     stage = Stage(site_of(3, 2, 6.0), tags=[(3.0, 4.0, 0.0)], make=new_anchor)
@@ -71,7 +76,7 @@ def test_a_tag_knows_when_an_anchor_sends_next_whatever_it_has_lost():
             if known is not None:
                 before, before_ticks = known
                 lost = (beacon.sequence - before.sequence) % 256
-                expected = before_ticks + ticks_ahead(beacon.anchor, before.sequence, before.period_code, lost)
+                expected = before_ticks + ticks_ahead(before, lost)
                 assert abs(rx_ticks - expected) < 45e-6 * (expected - before_ticks) + from_seconds(20e-9)
                 predicted += 1
             if known is None or random.random() < 0.05:  # it sleeps through the others
@@ -86,7 +91,7 @@ def test_a_beacon_that_is_not_sent_has_a_sequence_number_all_the_same():
     later = decode(machine.transmission(machine.next_transmission_ticks(late_ticks)).frame)
     passed = (later.sequence - first.sequence) % 256
     assert passed > 20
-    assert later.tx_ticks == first.tx_ticks + ticks_ahead(1, first.sequence, first.period_code, passed)
+    assert later.tx_ticks == first.tx_ticks + ticks_ahead(first, passed)
     assert later.tx_ticks > late_ticks
 
 

@@ -3,12 +3,13 @@
 import numpy as np
 import pytest
 from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, settings_of, tracked
+from pseudoranges import located
 
 from skyless.core.estimator.levels import is_side_open
 from skyless.core.fix import NoFixReason
 from skyless.core.integrity import SOUND, UNAVAILABLE
 from skyless.core.native.views import view
-from skyless.core.tag.position import NoSolution, locate_pseudoranges
+from skyless.core.tag.position import NoSolution
 
 ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03}
 
@@ -88,7 +89,7 @@ def test_no_start_takes_the_wrong_side_of_a_row_of_anchors(seed):
     reasons = set()
     for _ in range(40):
         heard_m = ranges_m + late_m + draw.normal(0.0, 0.045, 6)
-        found = locate_pseudoranges(anchors_m, heard_m, np.full(6, 0.045**2 + 0.03**2 + 0.02**2), height_m=1.0)
+        found = located(anchors_m, heard_m, np.full(6, 0.045**2 + 0.03**2 + 0.02**2), height_m=1.0)
         if isinstance(found, NoSolution):
             reasons.add(found.reason)
         else:

@@ -8,7 +8,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from skyless.core.fix import NoFixReason
-from skyless.core.tag.position import NoSolution, Solution, locate, locate_pseudoranges
+from skyless.core.tag.position import NoSolution, Solution, locate
 
 pytestmark = pytest.mark.site
 
@@ -105,22 +105,6 @@ def test_weights_pay():
     plain = locate(LAB, tdoas(LAB, P2), covariance, height_m=0, weighted=False)
     difference = plain.covariance_m2[:2, :2] - best.covariance_m2[:2, :2]
     assert np.linalg.eigvalsh(difference).min() > 0
-
-
-@pytest.mark.parametrize("height", [0.0, None])
-@pytest.mark.statistical
-def test_the_joint_covariance_is_that_of_position_and_bias(height):
-    count, variances = 4000, np.array([4, 1, 2, 1, 3, 1]) * 0.01**2
-    anchors, p = (LAB, P2) if height is not None else (LAB_3D, np.array([2.0, 3.0, 1.2]))
-    dims = 2 if height is not None else 3
-    noise = np.random.default_rng(3).normal(size=(count, 6)) * np.sqrt(variances)
-    pseudoranges = np.linalg.norm(anchors - p, axis=1) + 40.0
-    solutions = [locate_pseudoranges(anchors, pseudoranges + e, variances, height_m=height) for e in noise]
-    errors = np.array([np.append(s.position_m[:dims] - p[:dims], s.bias_m - 40.0) for s in solutions])
-    joint = locate_pseudoranges(anchors, pseudoranges, variances, height_m=height).covariance_joint_m2
-    whitened = errors @ np.linalg.inv(np.linalg.cholesky(joint)).T
-    scatter = whitened.T @ whitened / count
-    np.testing.assert_allclose(scatter, np.eye(dims + 1), atol=5 * math.sqrt(2 / count))
 
 
 @pytest.mark.parametrize("std", [0.1, 0.5])

@@ -145,11 +145,3 @@ def gap_ticks(anchor_id: int, sequence: int, code: int) -> int:
     drawn = mixed(mixed(anchor_id) ^ (sequence & 0xFF))
     steps = ((_STEPS + (code & 15)) << (code >> 4)) * _UNIT_STEPS
     return (steps // 2 + (steps * drawn >> 32)) * DELAYED_TX_GRANULARITY_TICKS
-
-
-def ticks_ahead(anchor_id: int, sequence: int, code: int, beacons: int) -> int:
-    """Return the ticks from the beacon with this sequence number to the one that is ``beacons`` later."""
-    ahead = 0
-    for number in range(beacons):
-        ahead += gap_ticks(anchor_id, sequence + number, code)
-    return ahead

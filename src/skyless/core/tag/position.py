@@ -242,14 +242,6 @@ class Solution(Struct, frozen=True, gc=False):
     iterations: int
 
 
-class PseudorangeSolution(Solution, frozen=True, gc=False):
-    """A position together with the common bias of the pseudoranges, such as a receiver's clock offset."""
-
-    bias_m: float
-    covariance_joint_m2: Array
-    """Covariance of (x, y, z, bias), shape (4, 4); with a given height of (x, y, bias), shape (3, 3)."""
-
-
 class NoSolution(Struct, frozen=True, gc=False):
     """Why there is no position."""
 
@@ -331,60 +323,3 @@ def _solution(found: Found, count: int) -> Solution:
         mirror_m=view(found.mirror_m).copy() if found.has_mirror else None,
         iterations=found.iterations,
     )
-
-
-def locate_pseudoranges(
-    anchors_m: ArrayLike,
-    pseudoranges_m: ArrayLike,
-    variances_m2: ArrayLike,
-    *,
-    height_m: float | None = None,
-    z_bounds_m: tuple[float, float] | None = None,
-    residual_tail: float = RESIDUAL_TAIL,
-) -> PseudorangeSolution | NoSolution:
-    """Locate a tag by pseudoranges |p − anchors_m[i]| + bias with independent errors.
-
-    ``anchors_m``: shape (n, 3); ``pseudoranges_m`` and ``variances_m2``: shape (n,). The other arguments are those of
-    ``locate``, which gets the differences to the first pseudorange with its variance in common; this loses nothing.
-    """
-    anchors = np.array(anchors_m, np.float64, ndmin=2)
-    pseudoranges, variances = np.array(pseudoranges_m, np.float64), np.array(variances_m2, np.float64)
-    if not (anchors.shape == (len(pseudoranges), 3) and variances.shape == pseudoranges.shape):
-        raise ValueError(
-            f"anchors {anchors.shape}, pseudoranges {pseudoranges.shape}, variances {variances.shape}: "
-            "expected (n, 3), (n,), (n,)"
-        )
-    if not (np.isfinite(pseudoranges).all() and np.isfinite(variances).all() and (variances > 0.0).all()):
-        return NoSolution(NoFixReason.BAD_GEOMETRY, "a pseudorange is not finite or its variance not positive")
-    solution = locate(
-        anchors,
-        pseudoranges[1:] - pseudoranges[:1],
-        np.diag(variances[1:]) + variances[:1],
-        height_m=height_m,
-        z_bounds_m=z_bounds_m,
-        residual_tail=residual_tail,
-    )
-    if isinstance(solution, NoSolution):
-        return solution
-    return _with_bias(solution, anchors, pseudoranges, 1.0 / variances, 2 if height_m is not None else 3)
-
-
-def _with_bias(
-    solution: Solution, anchors: Array, pseudoranges: Array, weights: Array, dims: int
-) -> PseudorangeSolution:
-    """Add the bias: the weighted mean of the ranges' residuals.
-
-    That mean's own error is uncorrelated with all differences of pseudoranges, hence with the position p; so
-    bias = mean − hᵀp with h the mean direction, and its covariances follow from p's.
-    """
-    away = solution.position_m - anchors
-    ranges = np.sqrt((away * away).sum(axis=1))
-    mean = weights / weights.sum()
-    direction = (mean / np.maximum(ranges, 1e-9)) @ away[:, :dims]
-    position = solution.covariance_m2[:dims, :dims]
-    joint = np.empty((dims + 1, dims + 1))
-    joint[:dims, :dims] = position
-    joint[dims, :dims] = joint[:dims, dims] = -(position @ direction)
-    joint[dims, dims] = 1.0 / weights.sum() + direction @ position @ direction
-    fields = {name: getattr(solution, name) for name in Solution.__struct_fields__}
-    return PseudorangeSolution(**fields, bias_m=float(mean @ (pseudoranges - ranges)), covariance_joint_m2=joint)
