@@ -97,7 +97,6 @@ def test_an_installed_wheel_runs_the_demo_a_modelled_radio_and_the_examples(chec
     run(shell, uv, "pip", "install", "--quiet", "--python", python, f"{wheel}[page,history,research]")
 
     assert json.loads(run(shell, skyless, "demo", "--duration", "3", "--json", cwd=tmp_path))["fixes"] > 0
-    assert list(environment.glob("lib/*/site-packages/skyless/radio/dw1000/__pycache__/*.pyc"))
 
     air, broker = f"127.0.0.1:{free_port()}", ("--mqtt", "none")
     numbers = [str(number) for number in range(1, 7)]
@@ -116,6 +115,7 @@ def test_an_installed_wheel_runs_the_demo_a_modelled_radio_and_the_examples(chec
             process.send_signal(signal.SIGINT)
         for process in processes:
             process.communicate(timeout=WAIT_S)
+    assert list(environment.glob("lib/*/site-packages/skyless/radio/dw1000/__pycache__/*.pyc"))
     for example in sorted((ROOT / "examples").glob("*.py")):
         shutil.copy(example, tmp_path)
         assert run(shell, python, example.name, cwd=tmp_path).strip(), example.name
