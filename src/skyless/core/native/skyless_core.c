@@ -5691,9 +5691,9 @@ INTERNAL void fill_residuals(LocateProblem *p, Found *found, Minimum *minimum) {
  *
  * When anchor i relays its reception of a packet of anchor j that the tag received too, the offset between the two
  * anchors' clocks at that moment is known up to noise. Along such links all TX times are converted to the clock of one
- * anchor. The tag's clock is up to 20 ppm off, so pseudoranges
- * drift by tens of metres within one superframe. Two packets of the same anchor measure that drift; the newest
- * pseudoranges of all anchors are then propagated to a common time and solved in closed form. */
+ * anchor. The tag's clock is up to 20 ppm off, so pseudoranges drift by tens of metres within one superframe. Two packets
+ * of the same anchor measure that drift; the newest pseudoranges of all anchors are then propagated to a common time and
+ * solved in closed form. */
 
 /* Forget all packets. */
 INTERNAL void forget_all(Acquisition *q) {

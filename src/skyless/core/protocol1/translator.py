@@ -1,9 +1,9 @@
 """How ``joint`` hears a site of protocol 1: its beacons as those of protocol 2.
 
 An anchor of protocol 1 states its own TX stamp and relays its receptions, the master's among them, as one of protocol 2
-does. Its position and the site's pages come from the almanac that the beacons carry. What protocol 2 lacks
-is the anchor's own estimate of its clock against the master's: where most frames are lost, positions from relays alone
-are a third less accurate (``docs/protocol.md``).
+does. Its position and the site's pages come from the almanac that the beacons carry. What protocol 2 lacks is the
+anchor's own estimate of its clock against the master's: where most frames are lost, positions from relays alone are a
+third less accurate (``docs/protocol.md``).
 """
 
 from typing import Final

@@ -491,7 +491,7 @@ def taped(room: DrawnRoom, advised: Sequence[TapeAdvice]) -> tuple[Tape, ...]:
 
 
 def facts_of(room: DrawnRoom, rough_m: Array | None) -> Facts:
-    """What a survey is told: heights in two dimensions, and a sketch with these positions, shape (n, 3), if any."""
+    """Input of a survey: heights in two dimensions, and a sketch with these positions, shape (n, 3), if any."""
     layout, sketch = room.layout, dict[int, Point]()
     if rough_m is not None:
         sketch = {anchor: (x, y, z) for anchor, (x, y, z) in zip(layout.anchors, rough_m.tolist(), strict=True)}
