@@ -22,6 +22,7 @@ sys.path.extend(str(Path(__file__).parents[1] / "tests" / folder) for folder in 
 
 import numpy as np
 from estimator_builders import Case, begun, episode_of, one_by_one, settings_of
+from pseudoranges import located
 from scipy.optimize import least_squares
 from textbook_filter import TextbookFilter
 
@@ -31,7 +32,6 @@ from skyless.core.estimator.estimator import Packets
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.method_names import SNAPSHOTS
 from skyless.core.protocol1.beacon import decode, decode_cached, encode
-from skyless.core.tag.position import locate_pseudoranges
 from skyless.core.tag.receiver import Receiver
 from skyless.machine import cores
 from skyless.research.paper.plan import draw_moments
@@ -131,7 +131,7 @@ def snapshots(quick):
     def residuals(unknown, row):
         return np.hypot(*(ANCHORS_M[:, :2] - unknown[:2]).T) + unknown[2] - row
 
-    own = partial(map, lambda row: locate_pseudoranges(ANCHORS_M, row, variances, height_m=0.0), rows)
+    own = partial(map, lambda row: located(ANCHORS_M, row, variances, height_m=0.0), rows)
     scipys = partial(map, lambda row: least_squares(residuals, middle, method="lm", args=(row,)), rows)
     ours, other = (len(rows) / seconds(lambda each=each: lambda: list(each()), 3) for each in (own, scipys))
     return {"fixes_per_s": ours, "scipy_fixes_per_s": other, "ratio": ours / other}

@@ -169,15 +169,35 @@ def until(found, wait_s=60.0):
     return result
 
 
-def test_an_interrupt_during_an_import_that_drops_it_is_not_lost(tmp_path):
-    """As NumPy's modules drop it, and callbacks of Python's import system."""
-    (tmp_path / "dropping.py").write_text(
-        "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGINT)\n    list(range(9))\n"
-        "except KeyboardInterrupt:\n    pass\n"
-    )
+DROPPED_BY_AN_IMPORT = """
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    list(range(9))
+except KeyboardInterrupt:
+    pass
+"""
+DROPPED_BY_CTYPES = """
+class Number:
+    @classmethod
+    def from_param(cls, number):
+        os.kill(os.getpid(), signal.SIGINT)
+        list(range(9))
+        return number
+
+import ctypes
+function = ctypes.CDLL(None).abs
+function.argtypes = [Number]
+sys.modules["__main__"].function = function
+"""
+
+
+@pytest.mark.parametrize("dropping", [DROPPED_BY_AN_IMPORT, DROPPED_BY_CTYPES])
+def test_an_interrupt_that_would_be_dropped_is_not_lost(dropping, tmp_path):
+    """As NumPy's modules drop it, callbacks of Python's import system, and arguments of ctypes."""
+    (tmp_path / "dropping.py").write_text("import os, signal, sys\n" + dropping)
     code = (
-        "import sys, time\nfrom skyless.cli import main\n"
-        "def command(_):\n    import dropping\n    print('imported', flush=True)\n    time.sleep(60)\n"
+        "import sys, time\nfrom skyless.cli import main\nfunction = abs\n"
+        "def command(_):\n    import dropping\n    function(1)\n    print('done', flush=True)\n    time.sleep(60)\n"
         "main.program = lambda: command\nsys.exit(main.main())"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join((str(tmp_path), *sys.path))}

@@ -80,6 +80,7 @@ _BROKEN_PIPE = 1
 _CANNOT_WRITE = (ENOSPC, EDQUOT, EFBIG, EIO)
 _USER_ERROR = 2
 _IMPORT_SYSTEM: Final = "<frozen importlib._bootstrap>"
+_CONVERSION: Final = "from_param"  # the method by which ctypes converts an argument
 _TRY_AGAIN_S: Final = 0.02
 
 
@@ -133,7 +134,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _write_any_character()
     interrupted = [_INTERRUPTED]
     try:
-        with _interrupts_between_imports(), _ended_by_sigterm(lambda: interrupted.append(_TERMINATED)):
+        with _interrupts_where_they_are_kept(), _ended_by_sigterm(lambda: interrupted.append(_TERMINATED)):
             result = program()(arguments)
         if sys.stdout is not None:
             sys.stdout.flush()
@@ -172,15 +173,19 @@ def _meant(error: CycloptsError) -> str:
 
 
 @contextmanager
-def _interrupts_between_imports() -> Iterator[None]:
-    """Delay Ctrl-C until the end of an import, as Python itself and NumPy's modules can drop it there."""
+def _interrupts_where_they_are_kept() -> Iterator[None]:
+    """Delay Ctrl-C where it would be lost.
+
+    That is during an import, where Python itself and NumPy's modules can drop it, and while ctypes converts an
+    argument, where it becomes an ArgumentError.
+    """
     if threading.current_thread() is not threading.main_thread() or not callable(signal.getsignal(signal.SIGINT)):
         yield
         return
 
     def interrupt(_: int, frame: FrameType | None) -> None:
         caller = frame
-        while caller is not None and caller.f_code.co_filename != _IMPORT_SYSTEM:
+        while caller and not (caller.f_code.co_filename == _IMPORT_SYSTEM or caller.f_code.co_name == _CONVERSION):
             caller = caller.f_back
         if caller is None:
             signal.default_int_handler(signal.SIGINT, frame)
