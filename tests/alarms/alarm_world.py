@@ -13,6 +13,7 @@ from itertools import pairwise
 from skyless.core.site import AlarmRule
 from skyless.run.alarms import AlarmEngine, is_over
 from skyless.run.mqtt.messages import FixMessage, Zone
+from skyless.run.site_table import SiteTable
 from skyless.run.zones import ZoneMonitor
 
 UNIX_S = 1_795_000_000.0
@@ -134,7 +135,8 @@ class Server:
 
     def __init__(self, kept: dict, at_s: float) -> None:
         self.monitor = ZoneMonitor()
-        self.engine = AlarmEngine(self.monitor)
+        self.table = SiteTable(at_s)
+        self.engine = AlarmEngine(self.monitor, self.table)
         unix_s = UNIX_S + at_s
         self.engine.on_zone_events(self.monitor.set_zones(ZONES, unix_s), at_s)
         self.engine.set_zones(ZONES, at_s)
@@ -143,13 +145,15 @@ class Server:
         self._expired_s = at_s
 
     def on_fix(self, fix: FixMessage, at_s: float) -> None:
-        self.engine.on_fix(fix, at_s)
-        self.engine.on_zone_events(self.monitor.update(fix, at_s), at_s)
+        self.table.add_fix(fix, at_s)
+        self.engine.on_fix(fix.tag)
+        self.engine.on_zone_events(self.monitor.update(fix), at_s)
 
     def tick(self, at_s: float) -> list:
         if at_s - self._expired_s >= 1.0:
             self._expired_s = at_s
-            self.engine.on_zone_events(self.monitor.expire_tags(at_s, UNIX_S + at_s), at_s)
+            for tag in self.table.tick(at_s):
+                self.engine.on_zone_events(self.monitor.remove_tag(tag, UNIX_S + at_s), at_s)
         return self.engine.tick(at_s, UNIX_S + at_s)
 
 

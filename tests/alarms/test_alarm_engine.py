@@ -12,8 +12,18 @@ from hypothesis import strategies as st
 from skyless.core.alert import Alert
 from skyless.core.site import AlarmRule
 from skyless.run import alarms as engine_module
-from skyless.run.alarms import CONFIRM_S, EVALUATION_S, STOREY_M, AlarmEngine, Concerned, is_over, near_tags
-from skyless.run.mqtt.messages import Asset, Counters, FixMessage, TagHealth, WatchFinding, WatchMessage, Zone
+from skyless.run.alarms import EVALUATION_S, STOREY_M, AlarmEngine, Concerned, is_over, near_tags
+from skyless.run.mqtt.messages import (
+    Asset,
+    Counters,
+    FixMessage,
+    StatusMessage,
+    TagHealth,
+    WatchFinding,
+    WatchMessage,
+    Zone,
+)
+from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.zones import ZoneMonitor
 
 HALL = Zone("hall", "Hall", ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0)))
@@ -40,7 +50,8 @@ class Site:
         self.more = {}
         self.blind = False
         self.monitor = ZoneMonitor()
-        self.engine = AlarmEngine(self.monitor, lambda unix_s: time.gmtime(unix_s + self.hour_shift_s))
+        self.table = SiteTable(0.0)
+        self.engine = AlarmEngine(self.monitor, self.table, lambda unix_s: time.gmtime(unix_s + self.hour_shift_s))
         self.happened = []
         if assets:
             self.engine.set_assets({asset.tag: asset for asset in assets})
@@ -65,16 +76,21 @@ class Site:
                 message = fix(
                     tag, self.now_s, place[:2], z=place[2] if len(place) > 2 else 1.0, **self.more.get(tag, {})
                 )
-                self.engine.on_fix(message, self.now_s)
-                self.engine.on_zone_events(self.monitor.update(message, self.now_s), self.now_s)
-            events = self.monitor.expire_tags(self.now_s, self.unix_s)
-            self.engine.on_zone_events(events, self.now_s)
+                self.table.add_fix(message, self.now_s)
+                self.engine.on_fix(tag)
+                self.engine.on_zone_events(self.monitor.update(message), self.now_s)
+            for tag in self.table.tick(self.now_s):
+                self.engine.on_zone_events(self.monitor.remove_tag(tag, self.unix_s), self.now_s)
             self.happened += self.engine.tick(self.now_s, self.unix_s, blind=self.blind)
         return [(what, one.rule, one.subject) for what, one in self.happened[begin:] if what != "updated"]
 
+    def hear_health(self, health):
+        self.table.add_health("tag", health.tag, health, self.now_s)
+        self.engine.on_health(health)
+
     def gone(self, tag):
         del self.places[tag]
-        self.engine.on_tag_gone(tag)
+        self.table.add_status(StatusMessage(online=False, kind="tag", name=tag), self.now_s)
         self.engine.on_zone_events(self.monitor.remove_tag(tag, self.unix_s), self.now_s)
 
     @property
@@ -200,7 +216,7 @@ def test_crowded():
         AlarmRule("r", "crowded", zone="hall", limit=2.0, hysteresis=1.0, clear_after_s=0.0, tags=("a", "b", "c"))
     )
     site.places = {"a": IN, "b": IN, "d": IN}
-    assert site.run(CONFIRM_S) == []
+    assert site.run(THRESHOLDS.grace_s) == []
     site.places["c"] = IN
     assert site.run(1.0) == [("raised", "r", "zone-hall")]
     assert site.last.sentence == "3 tags are in Hall; at most 2 are allowed"
@@ -242,7 +258,7 @@ def test_battery():
         (0.25, []),
         (0.4, [("ended", "r", "t")]),
     ):
-        site.engine.on_health(health("t", share), site.now_s)
+        site.hear_health(health("t", share))
         assert site.run(2.0) == expected
     assert site.happened[0][1].sentence == "the battery of t is at 8%; 20% is the least"
 
@@ -259,7 +275,7 @@ def worst_of_levels(values):
 def worst_of_batteries(values):
     site = Site(AlarmRule("r", "battery", limit=0.9))
     for share in values:
-        site.engine.on_health(health("t", share), site.now_s)
+        site.hear_health(health("t", share))
         site.run(0.5)
     return site
 
@@ -407,7 +423,7 @@ RULES = (
 def test_another_engine_goes_on_from_what_is_kept():
     site = Site(*RULES)
     site.places = {"a": IN, "b": (5.5, 5.0), "c": OUT, "d": OUT}
-    site.engine.on_health(health("a", 0.1), site.now_s)
+    site.hear_health(health("a", 0.1))
     site.run(2.0)
     del site.places["d"]
     site.run(5.0)
@@ -418,7 +434,10 @@ def test_another_engine_goes_on_from_what_is_kept():
     assert again.run(30.0) == []
     assert [one.id for one in again.engine.messages.values()] == [one.id for one in kept.values()]
     cold = Site(*RULES, kept=kept.values())
-    assert {what for what, *_ in cold.run(2 * CONFIRM_S + 5)} == {"ended"}
+    cold.table.longest_s = 20.0  # for as long a tag may sleep
+    assert ("ended", "in", "a") not in cold.run(20.0)
+    cold.run(15.0)
+    assert {what for what, _ in cold.happened} == {"ended", "updated"}
     ended = {one.rule for what, one in cold.happened if what == "ended"}
     assert ended == {"in", "near", "many"}  # the others hold until there is a sign against them
     gone = Site(*RULES[1:], kept=kept.values())

@@ -14,7 +14,6 @@ from msgspec.structs import replace
 from skyless.bridges.home_assistant import (
     MAX_ANNOUNCED,
     SETTLE_S,
-    STALE_S,
     Announcer,
     document,
     make_target,
@@ -26,6 +25,7 @@ from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import TagPosition, TagZones, Zone
+from skyless.run.site_table import THRESHOLDS
 
 WEST = Zone("z1", "West", ((0.0, 0.0), (3.0, 0.0), (3.0, 8.0), (0.0, 8.0)))
 EAST = Zone("z2", "East", ((3.0, 0.0), (6.0, 0.0), (6.0, 8.0), (3.0, 8.0)))
@@ -163,7 +163,7 @@ def test_without_a_fix_a_tag_is_unavailable_until_the_next(broker):
     announcer = announcer_of(broker)
     announcer.on_fix(at(1.0))
     for second in range(3):
-        announcer.on_no_fix("tag1", 101.0 + second)
+        announcer.on_gone("tag1", 101.0 + second)
         announcer.on_second(101.0 + second)
     assert broker.value(ZONE, TagZones) == TagZones("tag1", 101.0, usable=False, by="pi-tag1")
     assert (broker.sent.count(ZONE), broker.sent.count(POSITION)) == (2, 1)
@@ -249,7 +249,7 @@ def test_what_was_so_before_a_restart_does_not_stay_where_the_tag_has_gone(broke
     later = announcer_of(broker)
     broker.deliver(ZONE, broker.kept[ZONE])
     broker.deliver("skyless/v1/7/tag/tag9/zone", msgspec.json.encode(TagZones("tag9", 1.0, usable=True, by="another")))
-    for second in range(STALE_S + 1):
+    for second in range(round(THRESHOLDS.longest_s) + 1):
         assert broker.value(ZONE, TagZones).usable
         later.on_second(200.0 + second)
     assert not broker.value(ZONE, TagZones).usable

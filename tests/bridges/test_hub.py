@@ -31,7 +31,7 @@ class Recorded(Target):
     def __init__(self, text="test:", *, one_tag=False, needs_earth=False):
         super().__init__(text)
         self.one_tag, self.needs_earth = one_tag, needs_earth
-        self.fixes, self.none, self.states, self.seconds = [], [], [], 0
+        self.fixes, self.none, self.gone, self.states, self.seconds = [], [], [], [], 0
 
     def on_site(self, site):
         if self.needs_earth:
@@ -42,6 +42,9 @@ class Recorded(Target):
 
     def on_no_fix(self, tag, unix_s, reason):
         self.none.append((tag, unix_s, reason))
+
+    def on_gone(self, tag, unix_s):
+        self.gone.append((tag, unix_s))
 
     def on_second(self, unix_s):
         self.seconds += 1
@@ -96,12 +99,12 @@ def test_unusable_fixes_count_as_none_and_are_never_given(changes):
     target = Recorded()
     hub = hub_of(target)
     hub.on_fix(a_fix(), 10.0)
-    for step in range(1, 30):
+    for step in range(1, 50):
         hub.on_fix(a_fix(serial=step + 1, **changes), 10.0 + 0.1 * step)
         if step % 10 == 0:
             hub.on_tick(10.0 + 0.1 * step, 500.0 + 0.1 * step)
     assert len(target.fixes) == 1
-    assert [when_s for _, when_s, _ in target.none] == [501.0, 502.0]
+    assert [when_s for _, when_s, _ in target.none] == [503.0, 504.0]
     assert {reason for _, _, reason in target.none} == {changes.get("alert") or "position is not finite"}
 
 
@@ -114,42 +117,35 @@ def test_a_tag_without_a_fix_is_reported_each_second_until_it_has_one_or_is_forg
     target = Recorded()
     hub = hub_of(target)
     hub.on_fix(a_fix(), 0.0)
-    hub.on_tick(0.9, 100.9)
+    hub.on_tick(2.4, 102.4)
     assert target.none == []
-    for second in (2, 3):
+    for second in (3, 4):
         hub.on_tick(float(second), 100.0 + second)
-    assert target.none == [("tag1", 102.0, "no fix"), ("tag1", 103.0, "no fix")]
-    hub.on_fix(a_fix(serial=2), 3.5)
-    hub.on_tick(4.0, 104.0)
+    assert target.none == [("tag1", 103.0, "no fix"), ("tag1", 104.0, "no fix")]
+    hub.on_fix(a_fix(serial=2), 4.5)
+    hub.on_tick(5.0, 105.0)
     assert len(target.none) == 2
-    hub.on_tick(5000.0, 5100.0)
-    hub.on_tick(5001.0, 5101.0)
-    assert len(target.none) == 2, "a tag that left an hour ago is not spoken of"
+    hub.on_tick(2000.0, 2100.0)
+    assert target.gone == [("tag1", 2100.0)]
+    hub.on_tick(100_000.0, 100_100.0)
+    hub.on_tick(100_001.0, 100_101.0)
+    assert len(target.none) == 3, "a tag that left a day ago is not spoken of"
 
 
 def test_a_tag_whose_fixes_are_rare_has_none_only_when_some_are_missing():
     target = Recorded()
     hub = hub_of(target)
-    for step in range(4):  # a fix every two seconds
-        hub.on_fix(a_fix(serial=step + 1), 2.0 * step)
-        for quarter in range(8):
-            hub.on_tick(2.0 * step + 0.25 * quarter, 100.0 + 2.0 * step + 0.25 * quarter)
-    assert (len(target.fixes), target.seconds) == (4, 8)
-    assert [when_s for _, when_s, _ in target.none] == [101.0, 103.0], "its interval was not known then"
+    for step in range(4):  # a fix every four seconds
+        hub.on_fix(a_fix(serial=step + 1), 4.0 * step)
+        for quarter in range(16):
+            hub.on_tick(4.0 * step + 0.25 * quarter, 100.0 + 4.0 * step + 0.25 * quarter)
+    assert (len(target.fixes), target.seconds) == (4, 16)
+    assert [when_s for _, when_s, _ in target.none] == [102.5, 103.5], "its interval was not known then"
     target.none.clear()
-    for quarter in range(1, 33):
-        hub.on_tick(8.0 + 0.25 * quarter, 108.0 + 0.25 * quarter)
-    assert [when_s for _, when_s, _ in target.none] == [111.0 + second for second in range(6)]
-
-
-def test_a_single_fix_after_an_outage_does_not_make_a_tag_slow():
-    target = Recorded()
-    hub = hub_of(target)
-    for step in range(50):
-        hub.on_fix(a_fix(serial=step), 0.02 * step)
-    hub.on_fix(a_fix(serial=50), 30.0)
-    hub.on_tick(31.25, 131.25)
-    assert [when_s for _, when_s, _ in target.none] == [131.25]
+    for quarter in range(1, 68):
+        hub.on_tick(12.0 + 0.25 * quarter, 112.0 + 0.25 * quarter)
+    assert [when_s for _, when_s, _ in target.none] == [122.0 + second for second in range(7)]
+    assert target.gone == [("tag1", 128.0)]
 
 
 def test_no_fix_of_a_tag_at_the_targets_own_rate_is_missed_because_it_came_early():
@@ -177,10 +173,10 @@ def test_a_tag_that_has_never_had_a_fix_does_not_hold_a_target_for_one_tag():
     target = Recorded(one_tag=True)
     hub = hub_of(target)
     hub.on_health(tag_health("tag1"), 0.0)
-    hub.on_tick(2.0, 102.0)
+    hub.on_tick(3.0, 103.0)
     assert [tag for tag, _, _ in target.none] == ["tag1"]
-    hub.on_fix(a_fix(tag="tag2"), 2.1)
-    hub.on_tick(2.9, 102.9)
+    hub.on_fix(a_fix(tag="tag2"), 3.1)
+    hub.on_tick(3.9, 103.9)
     assert [fix.tag for fix in target.fixes] == ["tag2"]
     assert len(target.none) == 1, "it is another tag's now"
 
@@ -190,8 +186,8 @@ def test_a_target_that_is_for_one_tag_by_the_users_choice_gets_no_other_tags_sta
     hub = Hub([Route(target, "tag1", 50.0), Route(all_tags, None, 50.0)], print)
     for tag in ("tag1", "tag2"):
         hub.on_health(tag_health(tag), 0.0)
-        hub.on_status(StatusMessage(True, "tag", tag))
-    hub.on_status(StatusMessage(True, "anchor", "2"))
+        hub.on_status(StatusMessage(True, "tag", tag), 0.0, 0.0)
+    hub.on_status(StatusMessage(True, "anchor", "2"), 0.0, 0.0)
     assert target.states == ["tag1", "tag1", "2"]
     assert all_tags.states == ["tag1", "tag1", "tag2", "tag2", "2"]
 
@@ -228,7 +224,7 @@ def test_a_site_without_georeference_is_refused_with_the_keys_to_add():
     hub = Hub([Route(earthly, None, 10.0), Route(other, None, 10.0)], said.append)
     hub.on_site(BARE_SITE)
     hub.on_fix(a_fix(), 1.0)
-    hub.on_tick(3.0, 3.0)
+    hub.on_tick(4.0, 4.0)
     assert (len(earthly.fixes), len(other.fixes), len(earthly.none), len(other.none)) == (0, 1, 0, 1)
     assert len(said) == 1
     assert "earthly:" in said[0]

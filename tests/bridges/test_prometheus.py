@@ -18,7 +18,6 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from skyless.bridges import prometheus as prometheus_target
 from skyless.bridges.prometheus import (
-    GAUGE_AGE_S,
     LATENCY_BOUNDS_S,
     Rising,
     SiteMetrics,
@@ -27,6 +26,7 @@ from skyless.bridges.prometheus import (
 from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.messages import AnchorHealth, Counters, StatusMessage, TagHealth
+from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.web import BridgeLimits
 
 pytestmark = pytest.mark.site
@@ -85,17 +85,37 @@ def of_tag(name, tag="tag1", **labels):
     return (f"skyless_{name}", *sorted({"tag": tag, **labels}.items()))
 
 
+class Metrics(SiteMetrics):
+    """Metrics with a table, which gets the same messages."""
+
+    def __init__(self, **more):
+        super().__init__(SiteTable(0.0), **more)
+
+    def take_fix(self, fix, now_s):
+        if self.table.add_fix(fix, now_s) is not None:
+            self.on_fix(fix)
+
+    def take_health(self, health, now_s):
+        kind, name = ("tag", health.tag) if isinstance(health, TagHealth) else ("anchor", str(health.anchor))
+        self.table.add_health(kind, name, health, now_s)
+        self.on_health(health)
+
+    def take_status(self, status):
+        self.table.add_status(status, 100.0)
+        self.on_status(status)
+
+
 @pytest.fixture
 def metrics():
-    metrics = SiteMetrics(positions=True)
+    metrics = Metrics(positions=True)
     metrics.site = SITE
-    metrics.on_fix(a_fix(serial=200, latency_s=0.004, hpl_m=0.3, verified_until_s=11.7, unverified=0.25), 100.0)
+    metrics.take_fix(a_fix(serial=200, latency_s=0.004, hpl_m=0.3, verified_until_s=11.7, unverified=0.25), 100.0)
     trust = {"trust": "open", "is_verified": True, "clock_error_s": -0.5, "faults": {"2": "bad-code", "3": "bad-code"}}
-    metrics.on_health(tag_health(fixes=190, counters={"foreign": 2}, mqtt=Counters(50, 4, 1), **trust), 100.0)
-    metrics.on_health(anchor_health(chain=2, chain_ends_unix_s=1.9e9, faults={"5": "late-frame"}), 100.0)
-    metrics.on_status(StatusMessage(online=True, kind="tag", name="tag1"))
-    metrics.on_status(StatusMessage(online=False, kind="anchor", name="2"))
-    metrics.on_status(StatusMessage(online=True, kind="dashboard", name="pi"))
+    metrics.take_health(tag_health(fixes=190, counters={"foreign": 2}, mqtt=Counters(50, 4, 1), **trust), 100.0)
+    metrics.take_health(anchor_health(chain=2, chain_ends_unix_s=1.9e9, faults={"5": "late-frame"}), 100.0)
+    metrics.take_status(StatusMessage(online=True, kind="tag", name="tag1"))
+    metrics.take_status(StatusMessage(online=False, kind="anchor", name="2"))
+    metrics.take_status(StatusMessage(online=True, kind="dashboard", name="pi"))
     return metrics
 
 
@@ -137,43 +157,43 @@ KEY_METRICS = ("verified", "clock_error", "not_accepted", "codes", "chain_end")
 
 
 def test_nothing_is_said_of_keys_where_there_are_none_and_nothing_old():
-    metrics = SiteMetrics()
-    metrics.on_fix(a_fix(), 100.0)
-    metrics.on_health(tag_health(), 100.0)
-    metrics.on_health(anchor_health(), 100.0)
+    metrics = Metrics()
+    metrics.take_fix(a_fix(), 100.0)
+    metrics.take_health(tag_health(), 100.0)
+    metrics.take_health(anchor_health(), 100.0)
     assert not any(name in metrics.text(100.0) for name in KEY_METRICS)
-    metrics.on_health(tag_health(trust="open"), 100.0)
-    metrics.on_health(anchor_health(chain_ends_unix_s=1.0, code_fault="no-chain"), 100.0)
+    metrics.take_health(tag_health(trust="open"), 100.0)
+    metrics.take_health(anchor_health(chain_ends_unix_s=1.0, code_fault="no-chain"), 100.0)
     samples = read(metrics)
     assert (samples[of_tag("tag_verified")], samples[of_tag("tag_verified_ratio")]) == (0.0, 0.0)
     assert samples["skyless_anchor_codes", ("anchor", "2")] == 0.0
-    assert not any(name in metrics.text(100.0 + 2 * GAUGE_AGE_S) for name in KEY_METRICS)
+    assert not any(name in metrics.text(100.0 + 2 * THRESHOLDS.report_s) for name in KEY_METRICS)
 
 
 def test_positions_are_given_on_request_only():
-    metrics = SiteMetrics()
-    metrics.on_fix(a_fix(), 100.0)
+    metrics = Metrics()
+    metrics.take_fix(a_fix(), 100.0)
     assert of_tag("tag_position_metres", axis="x") not in read(metrics)
 
 
 def test_the_age_of_a_killed_tag_grows_from_scrape_to_scrape_and_its_gauges_end(metrics):
     ages = [read(metrics, 100.0 + later_s)[of_tag("tag_fix_age_seconds")] for later_s in (0.0, 1.5, 3600.0)]
     assert ages == pytest.approx([0.004, 1.504, 3600.004])
-    fresh, old = read(metrics, 100.0 + GAUGE_AGE_S - 0.1), read(metrics, 100.1 + GAUGE_AGE_S)
+    fresh, old = read(metrics, 99.9 + THRESHOLDS.fresh_s), read(metrics, 100.1 + THRESHOLDS.report_s)
     gone = {key[0] for key in fresh.keys() - old.keys()}
     assert of_tag("tag_error_std_metres")[0] in gone
     assert not any(name.endswith(("_total", "_count", "_online", "age_seconds")) for name in gone)
 
 
 def test_a_restarted_tag_lets_no_counter_fall(metrics):
-    metrics.on_fix(a_fix(serial=3), 110.0)  # it has been started again; its health has not said so yet
+    metrics.take_fix(a_fix(serial=3), 110.0)  # it has been started again; its health has not said so yet
     assert read(metrics)[of_tag("tag_fixes_total")] == 200
-    metrics.on_health(tag_health(uptime_s=1.0, fixes=30, counters={"foreign": 1}, mqtt=Counters(5, 0, 0)), 111.0)
+    metrics.take_health(tag_health(uptime_s=1.0, fixes=30, counters={"foreign": 1}, mqtt=Counters(5, 0, 0)), 111.0)
     samples = read(metrics)
     assert samples[of_tag("tag_fixes_total")] == 230
     assert samples[of_tag("tag_dropped_frames_total", reason="foreign")] == 3
     assert samples[("skyless_mqtt_dropped_total", ("kind", "tag"), ("name", "tag1"))] == 4
-    metrics.on_fix(a_fix(serial=31), 111.1)
+    metrics.take_fix(a_fix(serial=31), 111.1)
     assert read(metrics)[of_tag("tag_fixes_total")] == 231
 
 
@@ -187,13 +207,13 @@ def test_a_counter_only_rises_whatever_comes(steps):
 
 
 def test_nobody_can_fill_the_memory_with_names():
-    metrics = SiteMetrics()
+    metrics = Metrics()
     for k in range(3000):
-        metrics.on_fix(a_fix(tag=f"t{k}"), 0.0)
-    metrics.on_health(tag_health("t1", counters={f"reason{k}": 1 for k in range(200)}), 0.0)
+        metrics.take_fix(a_fix(tag=f"t{k}"), 0.0)
+    metrics.take_health(tag_health("t1", counters={f"reason{k}": 1 for k in range(200)}), 0.0)
     for name in ("x" * 100_000, "a/b", ""):
-        metrics.on_fix(a_fix(tag=name), 0.0)
-        metrics.on_status(StatusMessage(online=True, kind="anchor", name=name))
+        metrics.take_fix(a_fix(tag=name), 0.0)
+        metrics.take_status(StatusMessage(online=True, kind="anchor", name=name))
     assert metrics.dropped == {"too-many-names": 1000, "name": 6}
     text = metrics.text(0.0)
     assert len(text) < 2_000_000
@@ -202,17 +222,17 @@ def test_nobody_can_fill_the_memory_with_names():
 
 
 def test_a_fix_from_the_future_is_not_younger_than_new_and_lets_no_sum_fall():
-    metrics = SiteMetrics()
-    metrics.on_fix(a_fix(latency_s=-100.0), 0.0)
+    metrics = Metrics()
+    metrics.take_fix(a_fix(latency_s=-100.0), 0.0)
     assert read(metrics, 10.0)[of_tag("tag_fix_age_seconds")] == 10.0
     assert read(metrics)[of_tag("tag_latency_seconds_sum")] == 0.0
 
 
 @given(st.lists(st.floats(0.0, 1.0), max_size=30))
 def test_a_histogram_counts_as_prometheus_does(values):
-    metrics = SiteMetrics()
+    metrics = Metrics()
     for value in values:
-        metrics.on_fix(a_fix(latency_s=value), 1.0)
+        metrics.take_fix(a_fix(latency_s=value), 1.0)
     samples = read(metrics)
     for bound in LATENCY_BOUNDS_S if values else ():
         assert samples[of_tag("tag_latency_seconds_bucket", le=str(bound))] == sum(v <= bound for v in values)

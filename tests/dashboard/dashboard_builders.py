@@ -1,5 +1,7 @@
 """Messages of a small site, an MQTT that only remembers, and a client of the server."""
 
+from itertools import count
+
 import msgspec
 from paho.mqtt.client import topic_matches_sub
 from starlette.testclient import TestClient
@@ -15,16 +17,18 @@ from skyless.sim.lab import lab_site
 
 SITE = SiteMessage(lab_site(100.0), simulated=True, unix_s=1000.0)
 SITE_ID = SITE.site.id
+_SERIALS = count(1)
 SQUARE = Zone("desk", "Desk", ((1.0, 1.0), (3.0, 1.0), (3.0, 3.0), (1.0, 3.0)), "#ff8800")
 
 
 def fix(
-    tag="t1", unix_s=1000.0, position_m=(2.0, 2.0, 1.0), std_m=0.01, velocity_mps=(0.1, 0.0, 0.0), serial=1, **more
+    tag="t1", unix_s=1000.0, position_m=(2.0, 2.0, 1.0), std_m=0.01, velocity_mps=(0.1, 0.0, 0.0), serial=None, **more
 ):
+    """A fix; without a number, it has a larger one than those before."""
     variance = std_m**2 / 2
     given = {
         "tag": tag,
-        "serial": serial,
+        "serial": next(_SERIALS) if serial is None else serial,
         "unix_s": unix_s,
         "time_s": unix_s,
         "position_m": position_m,

@@ -13,6 +13,7 @@ import threading
 import time
 from pathlib import Path
 
+import msgspec
 import page_fake_history
 import page_fake_site as made_up
 import uvicorn
@@ -23,7 +24,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocketDisconnect
 
 import skyless
-from skyless.page.state import SILENT_S
+from skyless.run.site_table import THRESHOLDS
 from support.processes import free_port
 
 PAGE = Path(skyless.__file__).parent / "page" / "browser"
@@ -331,6 +332,7 @@ class FakeServer:
         if site:
             site["site"]["name"] = self.site_name
         more = {
+            "thresholds": msgspec.to_builtins(THRESHOLDS),
             "zones": self.zones,
             "events": self.zone_events,
             "mqtt": True,
@@ -393,7 +395,7 @@ class FakeServer:
         for health in anchors:
             name = str(health["anchor"])
             here = health["synchronised"] or health["role"] == "master"
-            conditions[name] = "bad" if ages["anchors"][name] > SILENT_S else "good" if here else "warn"
+            conditions[name] = "bad" if ages["anchors"][name] > THRESHOLDS.report_s else "good" if here else "warn"
         known = {"anchors": anchors, "tags": tags, "ether": ether, "nodes": nodes, "ages": ages}
         return {"type": "health", "whole": True, "conditions": conditions, "waiting": [], **known}
 

@@ -2,6 +2,7 @@
 
 import math
 
+from skyless.run.site_table import THRESHOLDS
 from skyless.site.planning.colours import COLOUR_STOPS, scale_of
 
 WIDTH_M, DEPTH_M = 24.0, 14.0
@@ -71,6 +72,7 @@ def state_row(name, number, time_s, unix_s, verified=(None, None)):
         int(not estimated),
         0.08 if estimated else None,
         *verified,
+        *(THRESHOLDS.fresh_s, 0.0, THRESHOLDS.gone_s),
     ]
     return [name, *(round(value, 5) for value in numbers), *rest]
 

@@ -7,9 +7,10 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.keys.fault import Fault
-from skyless.page.condition._reasons import authentication_reasons
-from skyless.page.condition.evidence import Evidence
+from skyless.run.condition._reasons import authentication_reasons
+from skyless.run.condition.evidence import Evidence
 from skyless.run.mqtt.messages import AnchorHealth, Counters, TagHealth
+from skyless.run.site_table import SiteTable
 
 DAY_S = 86400.0
 UNIX_S = 1e9
@@ -27,7 +28,7 @@ class Site:
 
     def __init__(self, anchors=KEYED, tags=TRUSTING):
         self.now_s = 100.0
-        self.evidence = Evidence("here", 0.0)
+        self.evidence = Evidence(SiteTable(0.0, "here"))
         self.anchors = {str(n): replace(anchors, anchor=n) for n in range(1, 7)}
         self.tags = {name: replace(tags, tag=name) for name in ("t1", "t2")}
         for kind, names in (("anchor", self.anchors), ("tag", self.tags)):
@@ -49,7 +50,7 @@ class Site:
             for name, health in self.tags.items():
                 self.tags[name] = replace(health, receptions=health.receptions + 400)
                 self.evidence.add_health("tag", name, self.tags[name], self.now_s, UNIX_S)
-                self.evidence.add_fix(fix(name, UNIX_S), self.now_s)
+                self.evidence.add_fix(fix(name, UNIX_S + self.now_s), self.now_s, UNIX_S)
         return {reason.kind: reason for reason in authentication_reasons(self.evidence, self.now_s)}
 
 
@@ -172,7 +173,7 @@ def test_a_tag_that_starts_or_receives_nothing_is_not_one_without_verified_beaco
     site = Site().change("t1", is_verified=False)
     assert site.run(4) == {}
     assert site.run(4).keys() == {"not-verified"}
-    silent = site.evidence.nodes["tag", "t1"]
+    silent = site.evidence.table.known("tag", "t1")
     silent.previous = silent.health
     assert [*authentication_reasons(site.evidence, site.now_s)] == []
 

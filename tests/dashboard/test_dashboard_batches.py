@@ -7,12 +7,12 @@ from msgspec.structs import replace
 
 from skyless.core.site import AlarmRule
 from skyless.page._alarms import KEPT_WAIT_S
-from skyless.page.condition.evidence import EXPECTED_S, FRESH_S, GRACE_S
 from skyless.page.live import LiveSite
 from skyless.page.state import Sent
 from skyless.run.fix_batch import FIELDS, fix_of, records_of
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import AlarmMessage, AlarmRulesMessage, ZoneEvent, ZonesMessage
+from skyless.run.site_table import THRESHOLDS
 
 RULES = (AlarmRule("in", "inside", zone=SQUARE.id), AlarmRule("quiet", "silent", after_s=4.0))
 IN_M, OUT_M = (sum(x for x, _ in SQUARE.polygon_m) / 4, 2.5, 1.0), (9.0, 9.0, 1.0)
@@ -22,27 +22,29 @@ class Dashboard:
     """One that leads at a site with a zone and rules, and is given fixes in one of both ways."""
 
     def __init__(self, *, batched):
-        self.times, self.wire, self.batched = Times(), Wire(), batched
+        self.times, self.wire, self.batched, self.number = Times(), Wire(), batched, 0
         self.live = LiveSite("here", "mqtt://b:1", SITE, lambda: self.times.now_s, lambda: self.times.unix_s)
         self.live.attach(self.wire, SITE_ID)
         self.live.on_connection(connected=True)
         self.wire.deliver(topics.zones_topic(SITE_ID), ZonesMessage((SQUARE,), SITE.site.name))
         self.wire.deliver(topics.alarm_rules_topic(SITE_ID), AlarmRulesMessage(RULES, SITE.site.name))
         self.wire.deliver(topics.status_topic(SITE_ID, "dashboard", "here"), status("dashboard", "here"))
-        self.run(KEPT_WAIT_S + GRACE_S)
+        self.run(KEPT_WAIT_S + THRESHOLDS.grace_s)
 
     def run(self, seconds, **places):
         """Pass time, with a fix of each tag that has a place ten times a second."""
         for _ in range(round(10 * seconds)):
             self.times.move(0.1)
-            fixes = [fix(name, self.times.unix_s - 0.05, place) for name, place in places.items()]
+            self.number += 1
+            at_s = self.times.unix_s - 0.05
+            fixes = [fix(name, at_s, place, serial=self.number) for name, place in places.items()]
             for number, one in enumerate(fixes if self.batched else ()):
                 (record,) = FIELDS.iter_unpack(records_of([(number, one)], simulated=False).tobytes())
                 self.live.on_batched_fix(fix_of(one.tag, record), self.times.now_s)
             for one in () if self.batched else fixes:
                 self.wire.deliver(topics.fix_topic(SITE_ID, one.tag), one)
             if self.batched:
-                self.live.on_batches(places, self.times.now_s)
+                self.live.table.hear(places, self.times.now_s)
             self.live.tick()
 
     def said(self):
@@ -63,10 +65,10 @@ def test_zones_alarms_and_lists_are_those_of_messages():
     said = []
     for batched in (False, True):
         dashboard = Dashboard(batched=batched)
-        dashboard.run(2.0, t1=OUT_M, t2=OUT_M)
+        dashboard.run(12.0, t1=OUT_M, t2=OUT_M)
         dashboard.run(2.0, t1=IN_M, t2=OUT_M)
         assert dashboard.live.condition.tags_with_fix == 2
-        dashboard.run(6.0, t2=OUT_M)
+        dashboard.run(THRESHOLDS.gone_s + 3.0, t2=OUT_M)
         assert (dashboard.live.condition.tags, dashboard.live.condition.tags_with_fix) == (2, 1)
         said.append(dashboard.said())
     events, alarms, rows = said[0]
@@ -81,21 +83,22 @@ def test_zones_alarms_and_lists_are_those_of_messages():
 
 def test_the_condition_names_tags_that_batches_have_no_longer_and_forgets_them():
     dashboard = Dashboard(batched=True)
-    dashboard.run(2.0, t1=OUT_M, t2=OUT_M)
-    dashboard.run(FRESH_S + 1.0, t1=OUT_M)
+    dashboard.run(12.0, t1=OUT_M, t2=OUT_M)
+    dashboard.run(THRESHOLDS.gone_s + 1.0, t1=OUT_M)
     condition = dashboard.live.condition
     found = {reason.kind: reason for reason in condition.reasons}
     assert "t2" in found["silent"].text
     assert found["silent"].names == ("tag/t2",)
-    dashboard.live.evidence.batches_connected = False  # silence means nothing
+    table, times = dashboard.live.table, dashboard.times
+    table.set_connected(connected=False, now_s=times.now_s, batches=True)  # silence means nothing
     dashboard.run(10.0)
     assert "silent" not in {reason.kind for reason in dashboard.live.condition.reasons}
-    dashboard.live.evidence.batches_connected = True
-    dashboard.run(FRESH_S + 1.0)
+    table.set_connected(connected=True, now_s=times.now_s, batches=True)
+    dashboard.run(THRESHOLDS.gone_s + 1.0)
     assert "no-fixes" in {reason.kind for reason in dashboard.live.condition.reasons}
-    dashboard.times.move(EXPECTED_S)
+    times.move(THRESHOLDS.longest_s)
     dashboard.run(4.0)
-    assert dashboard.live.condition.tags == 0
+    assert dashboard.live.condition.reasons == ()
 
 
 def test_alerts_of_batches_are_reasons():
@@ -108,12 +111,13 @@ def test_alerts_of_batches_are_reasons():
 def test_the_same_fix_in_a_message_and_a_batch_counts_once():
     dashboard = Dashboard(batched=False)
     dashboard.run(1.0, t1=OUT_M)
-    serial = dashboard.live.state.serial
-    dashboard.live.on_batched_fix(fix("t1"), dashboard.times.now_s + 0.1)
-    dashboard.live.on_batches(["t1"], dashboard.times.now_s + 0.1)
+    serial = dashboard.live.table.fixes_serial
+    newest = dashboard.live.table.tag("t1").fix
+    dashboard.live.on_batched_fix(replace(newest, serial=0), dashboard.times.now_s + 0.1)
+    dashboard.live.table.hear(["t1"], dashboard.times.now_s + 0.1)
     dashboard.run(0.5)
-    assert dashboard.live.state.serial == serial
+    assert dashboard.live.table.fixes_serial == serial
     assert dashboard.live.condition.tags == 1
-    dashboard.run(4.0)
-    dashboard.live.on_batched_fix(fix("t1"), dashboard.times.now_s)  # its messages have ended
-    assert dashboard.live.state.serial == serial + 1
+    later = replace(newest, serial=0, unix_s=newest.unix_s + 4.0)
+    dashboard.live.on_batched_fix(later, dashboard.times.now_s)  # its messages have ended
+    assert dashboard.live.table.fixes_serial == serial + 1

@@ -6,10 +6,11 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health, tag_health
 
-from skyless.page.condition._reasons import Reason
-from skyless.page.condition.monitor import Condition
-from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, SILENT_S, EventLog
+from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, EventLog
+from skyless.run.condition._reasons import Reason
+from skyless.run.condition.monitor import Condition
 from skyless.run.mqtt.messages import SurveyMessage, WatchFinding, WatchMessage
+from skyless.run.site_table import THRESHOLDS
 from skyless.site.survey.facts import Facts
 
 NOW = 1000.0
@@ -41,9 +42,9 @@ def test_a_node_that_reports_no_more_is_offline_once_and_comes_back():
     log = EventLog()
     log.on_status(status("anchor", "3", unix_s=1.0), NOW)
     log.on_health("anchor", "3", anchor_health(3, NOW), NOW)
-    log.tick(NOW + SILENT_S)
+    log.tick(NOW + THRESHOLDS.report_s)
     assert not log.events
-    log.tick(NOW + SILENT_S + 0.1)
+    log.tick(NOW + THRESHOLDS.report_s + 0.1)
     log.on_status(status("anchor", "3", online=False), NOW + 15)  # the broker's last will, for the same reason
     log.tick(NOW + 20)
     assert texts(log) == ["anchor 3 does not report any more"]

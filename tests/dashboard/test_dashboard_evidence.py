@@ -2,7 +2,7 @@
 
 import pytest
 
-from skyless.page.condition.evidence import USE_WINDOW_S, FixAges, ProcessorUse
+from skyless.run.condition.evidence import USE_WINDOW_S, FixAges, ProcessorUse
 
 UNIX_S = 1e9
 

@@ -9,8 +9,8 @@ from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 from test_dashboard_live import drained, of
 
-from skyless.page.condition import evidence
 from skyless.page.state import MAX_ROWS, PageRequest, read_request
+from skyless.run import site_table
 from skyless.run.mqtt import topics
 
 SPACING_M = 4.0
@@ -31,12 +31,12 @@ def large(live, wire, times, tags, anchors):
     for second in range(7):
         for n in range(1, anchors + 1):
             if not second:
-                live._on_status(topics.status_topic(SITE_ID, "anchor", str(n)), encoded(status("anchor", str(n))))
-            live._on_health(topics.health_topic(SITE_ID, "anchor", str(n)), encoded(anchor_health(n, times.unix_s)))
+                live.feed.receive(topics.status_topic(SITE_ID, "anchor", str(n)), encoded(status("anchor", str(n))))
+            live.feed.receive(topics.health_topic(SITE_ID, "anchor", str(n)), encoded(anchor_health(n, times.unix_s)))
         for n, name in enumerate(names):
             if second in {5, 6}:
                 made = fix(name, times.unix_s, (n % 400, n // 400, 1.0), latency_s=0.0)
-                live._on_fix(topics.fix_topic(SITE_ID, name), encoded(made))
+                live.feed.receive(topics.fix_topic(SITE_ID, name), encoded(made))
         times.move(1.0)
         live.tick()
     return live.condition
@@ -59,7 +59,7 @@ def test_a_healthy_large_site_is_good_and_says_how_many_are_shown(live, wire, ti
 
 
 def test_what_is_not_taken_in_is_counted_and_not_judged(live, wire, times, monkeypatch):
-    monkeypatch.setattr(evidence, "MAX_NAMES", {"tag": 5, "anchor": 6})
+    monkeypatch.setattr(site_table, "MAX_NAMES", {"tag": 5, "anchor": 6})
     condition = large(live, wire, times, 8, 9)
     assert condition.level == "warning"
     assert [(reason.kind, reason.text) for reason in condition.reasons] == [
@@ -73,11 +73,11 @@ def test_what_is_not_taken_in_is_counted_and_not_judged(live, wire, times, monke
 
 
 def test_invented_kinds_and_names_do_not_fill_the_memory(live, wire, monkeypatch):
-    monkeypatch.setattr(evidence, "MAX_OTHERS", 3)
+    monkeypatch.setattr(site_table, "MAX_OTHERS", 3)
     for n in range(9):
         wire.deliver(topics.status_topic(SITE_ID, f"kind{n}", "a"), status(f"kind{n}", "a"))
         wire.deliver(topics.health_topic(SITE_ID, "ether", f"air{n}"), b'{"unix_s":1,"simulated_s":1,"transmissions":1,"late":0,"at_anchors":{},"at_tags":{},"stalls":0,"overruns":0}')  # fmt: skip  # noqa: E501
-    assert len(live.state.statuses) + len(live.evidence.nodes) <= 6
+    assert sum(len(live.table.all(kind)) for kind in live.table.kinds) <= 6
 
 
 def test_a_server_that_does_not_keep_up_says_so_and_calls_no_anchor_offline(live, wire, times):

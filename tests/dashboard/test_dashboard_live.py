@@ -9,11 +9,11 @@ from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status, truth
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 
-from skyless.page.events import MAX_KEPT, SILENT_S
+from skyless.page.events import MAX_KEPT
 from skyless.page.live import LiveSite
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import SiteZones, WrongMessageError, ZoneEvent, ZonesMessage
-from skyless.run.zones import TAG_TIMEOUT_S
+from skyless.run.site_table import THRESHOLDS
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)
@@ -89,7 +89,7 @@ def test_a_row_has_the_time_of_its_fix_by_the_servers_clock_however_late_it_come
     def time_of_fix(late_s=0.0, error_s=clock_error_s):
         times.move(0.1 + late_s)  # a late fix does not overtake the one before it
         wire.deliver(FIX, fix(unix_s=times.unix_s - late_s + error_s, latency_s=0.0))
-        return json.loads(live.state.state_since(live.state.serial - 1))["tags"][0][15] - times.unix_s
+        return json.loads(live.state.state_since(live.table.fixes_serial - 1))["tags"][0][15] - times.unix_s
 
     assert time_of_fix() == pytest.approx(0.0, abs=1e-3)
     assert time_of_fix(late_s=2.0) == pytest.approx(-2.0, abs=1e-3)
@@ -131,7 +131,7 @@ def test_the_condition_has_the_servers_time(live, times):
 def test_wrong_messages_are_counted_and_change_nothing(live, wire, topic, payload):
     wire.deliver(topic, payload)
     assert live.dropped.total() == 1
-    assert live.state.serial == 0
+    assert live.table.fixes_serial == 0
     assert live.site is None
     assert live.monitor.zones == ()
     counted = of("health", drained(live, live.open_page()))[0]["dropped"]
@@ -139,7 +139,7 @@ def test_wrong_messages_are_counted_and_change_nothing(live, wire, topic, payloa
 
 
 def test_health_of_unknown_kinds_and_cleared_statuses_are_no_fault(live, wire):
-    wire.deliver(topics.health_topic(SITE_ID, "toaster", "1"), b"{}")
+    live.feed.receive(topics.health_topic(SITE_ID, "toaster", "1"), b"{}")
     wire.deliver(topics.status_topic(SITE_ID, "tag", "t1"), b"")
     assert not live.dropped
 
@@ -186,7 +186,7 @@ def test_a_second_dashboard_leaves_publishing_to_the_first(live, wire, times):
 
 def test_a_tag_without_fixes_or_offline_leaves(live, wire, times):
     enter_the_desk(live, wire)
-    times.move(TAG_TIMEOUT_S)
+    times.move(THRESHOLDS.longest_s)
     live.tick()
     assert json.loads(wire.published[-1][1])["kind"] == "leave"
     wire.deliver(FIX, fix(unix_s=times.unix_s))
@@ -326,6 +326,6 @@ def test_neither_a_clock_that_is_set_nor_an_absent_broker_nor_a_stall_makes_anch
     pass_time(0.5)
     pass_time(0.5)
     assert [event for event in live.log.events if event.kind == "anchor"] == []
-    pass_time(SILENT_S)
+    pass_time(THRESHOLDS.report_s)
     (event,) = [event for event in live.log.events if event.kind == "anchor"]
     assert (event.text, event.unix_s) == ("anchor 1 does not report any more", times.unix_s)

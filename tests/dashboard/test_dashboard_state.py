@@ -8,13 +8,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.page.state import EXPIRY_S, MAX_HEALTHS, UNHEARD_S, PageRequest, Sent, SiteState
+from skyless.page.state import MAX_HEALTHS, PageRequest, Sent, SiteState
 from skyless.run.mqtt.messages import AnchorHealth, Counters, EtherHealth
+from skyless.run.site_table import SiteTable
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
 ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y", "anchors_used", "chi2", "fix_unix_s")
 LEVELS = ("hpl_m", "alert", "height_given", "std_z_m", "verified_age_s", "unverified")
-FIELDS = POSITION + ERRORS + LEVELS
+FIELDS = POSITION + ERRORS + LEVELS + ("fresh_s", "sleep_s", "gone_s")
+
+
+class State(SiteState):
+    """A state whose table gets a fix of a tag at any time."""
+
+    def __init__(self):
+        super().__init__(SiteTable(0.0))
+        self.given = 0
+
+    def add_fix(self, fix, now_s, unix_s):
+        self.given += 1
+        self.table.add_fix(replace(fix, unix_s=fix.unix_s + 1e-6 * self.given), now_s).ended_unix_s = unix_s
+
+    def add_health(self, name, health, now_s):
+        self.table.add_health("anchor" if isinstance(health, AnchorHealth) else "ether", name, health, now_s)
 
 
 def rows(state, since=0):
@@ -22,7 +38,7 @@ def rows(state, since=0):
 
 
 def test_a_row_has_the_fields_in_order():
-    state = SiteState()
+    state = State()
     state.unix_s = 1000.0625
     covariance = (4e-4, 1e-4, 9.0, 1e-4, 2e-4, 9.0, 9.0, 9.0, 9.0)
     state.add_fix(
@@ -32,7 +48,7 @@ def test_a_row_has_the_fields_in_order():
     assert message["type"] == "state"
     assert message["unix_s"] == pytest.approx(1000.0625, abs=1e-3)
     position, errors = ("t1", 1.25, 2.5, 0.75, 0.5, -0.25), (4e-4, 1e-4, 2e-4, 0.01, None, None, None)
-    assert message["tags"] == [[*position, *errors, 4, 2.5, 1000.0, None, None, 1, None, None, None]]
+    assert message["tags"] == [[*position, *errors, 4, 2.5, 1000.0, None, None, 1, None, None, None, 2.5, 0.0, 900.0]]
     state.add_fix(fix(velocity_mps=None), 0.0, 1000.0)
     assert rows(state)[0]["vx"] is None
 
@@ -56,39 +72,39 @@ VERIFIED = {"time_s": 1000.0, "unverified": 0.1789}
     ],
 )
 def test_rows_hold_levels_alerts_heights_and_how_far_a_fix_is_verified(given_fields, shown):
-    state = SiteState()
+    state = State()
     state.add_fix(fix(**given_fields), 0.0, 1000.0)
     assert {name: rows(state)[0][name] for name in shown} == shown
 
 
 @pytest.mark.parametrize(("unix_s", "shown_unix_s"), [(1000.4, 1000.4), (1000.6, 1000.0), (4600.0, 1000.0)])
 def test_the_time_of_a_fix_whose_tag_has_a_wrong_clock_is_the_servers(unix_s, shown_unix_s):
-    state = SiteState()
+    state = State()
     state.add_fix(fix(unix_s=unix_s), 0.0, 1000.0)
     state.unix_s = 1200.0  # a page that is opened much later gets the same time
     assert rows(state)[0]["fix_unix_s"] == shown_unix_s
 
 
 def test_only_tags_with_a_newer_fix_are_sent_and_only_their_last():
-    state = SiteState()
+    state = State()
     state.add_fix(fix("a"), 0.0, 1000.0)
     state.add_fix(fix("b"), 0.0, 1000.0)
-    seen = state.serial
+    seen = state.table.fixes_serial
     state.add_fix(fix("b", position_m=(5.0, 5.0, 1.0)), 0.1, 1000.0)
     state.add_fix(fix("b", position_m=(6.0, 5.0, 1.0)), 0.2, 1000.0)
     assert [(row["name"], row["x_m"]) for row in rows(state, seen)] == [("b", 6.0)]
     assert {row["name"] for row in rows(state)} == {"a", "b"}
-    assert rows(state, state.serial) == []
+    assert rows(state, state.table.fixes_serial) == []
 
 
 def test_readers_at_the_same_serial_share_the_bytes():
-    state = SiteState()
+    state = State()
     state.add_fix(fix(), 0.0, 1000.0)
     assert state.state_since(0) is state.state_since(0)
 
 
 def test_the_error_is_against_the_truth_moved_to_the_moment_of_the_fix():
-    state = SiteState()
+    state = State()
     state.add_truth(truth(unix_s=999.9, position_m=(0.0, 0.0, 1.0), velocity_mps=(2.0, 1.0, 0.0)))
     state.add_truth(truth(unix_s=1000.05, position_m=(9.0, 9.0, 1.0), velocity_mps=(1.0, 0.0, 0.0)))
     state.add_truth(truth(unix_s=1000.2, position_m=(50.0, 50.0, 1.0)))
@@ -102,7 +118,7 @@ def test_the_error_is_against_the_truth_moved_to_the_moment_of_the_fix():
 
 @pytest.mark.parametrize("late_s", [0.3, -0.3, 100.0])
 def test_a_truth_of_another_time_gives_no_error(late_s):
-    state = SiteState()
+    state = State()
     state.add_truth(truth(unix_s=1000.0 + late_s))
     state.add_fix(fix(unix_s=1000.0), 0.0, 1000.0)
     assert rows(state)[0]["error_m"] is None
@@ -110,7 +126,7 @@ def test_a_truth_of_another_time_gives_no_error(late_s):
 
 
 def test_a_restarted_ether_is_accepted():
-    state = SiteState()
+    state = State()
     state.add_truth(truth(unix_s=5000.0))
     state.add_truth(truth(unix_s=1000.0, position_m=(2.0, 2.0, 1.0)))
     state.add_fix(fix(unix_s=1000.0), 0.0, 1000.0)
@@ -128,7 +144,7 @@ def health(state, sent=None):
 
 
 def test_health_holds_the_newest_of_every_node():
-    state = SiteState()
+    state = State()
     assert health(state) == {
         "type": "health",
         "whole": True,
@@ -144,10 +160,10 @@ def test_health_holds_the_newest_of_every_node():
     state.add_health("2", anchor_health(1), 0.0)
     state.add_health("2", anchor_health(2), 1.0)
     state.add_health("air", EtherHealth(0.0, 1.0, 5, 0, {}, {}, 0, 0), 1.0)
-    state.add_status(status())
-    state.add_status(status(online=False))
-    state.dropped["fix"] = 3
+    state.table.add_status(status(), 1.0)
+    state.table.add_status(status(online=False), 1.0)
     state.now_s = 3.5
+    state.dropped["fix"] = 3
     message = health(state)
     assert [anchor["anchor"] for anchor in message["anchors"]] == [2]
     assert message["ether"]["transmissions"] == 5
@@ -156,27 +172,17 @@ def test_health_holds_the_newest_of_every_node():
     assert message["ages"] == {"anchors": {"2": 2.5}, "tags": {}, "ether": {"air": 2.5}}
 
 
-def test_old_messages_expire():
-    state = SiteState()
-    state.add_fix(fix("old"), 0.0, 1000.0)
-    state.add_health("1", anchor_health(1), 0.0)
-    state.add_fix(fix("new"), 1.0, 1000.0)
-    state.expire(EXPIRY_S + 0.5)
-    assert {row["name"] for row in rows(state)} == {"new"}
-    assert health(state)["anchors"] == []
-
-
 def test_a_page_gets_the_health_that_is_new_to_it():
-    state, sent = SiteState(), Sent()
+    state, sent = State(), Sent()
     for name in ("1", "2"):
         state.add_health(name, anchor_health(int(name)), 1.0)
-        state.add_status(status("anchor", name))
+        state.table.add_status(status("anchor", name), 1.0)
     state.judge(1.0, blind=False)
     first = health(state, sent)
     assert (first["whole"], len(first["anchors"]), len(first["nodes"])) == (True, 2, 2)
     assert first["conditions"] == {"1": "good", "2": "good"}
     state.add_health("2", anchor_health(2), 4.0)
-    state.add_status(status("anchor", "1", online=False))
+    state.table.add_status(status("anchor", "1", online=False), 1.0)
     state.judge(4.0, blind=False)
     then = health(state, sent)
     assert (then["whole"], [one["anchor"] for one in then["anchors"]]) == (False, [2])
@@ -187,7 +193,7 @@ def test_a_page_gets_the_health_that_is_new_to_it():
 
 
 def test_silence_makes_an_anchor_offline_only_while_the_server_can_hear():
-    state = SiteState()
+    state = State()
     state.add_health("1", anchor_health(1), 0.0)
     for now_s, blind, kind in ((3.0, False, "good"), (9.0, True, "good"), (9.5, False, "bad"), (10.0, True, "bad")):
         state.judge(now_s, blind=blind)
@@ -195,7 +201,7 @@ def test_silence_makes_an_anchor_offline_only_while_the_server_can_hear():
 
 
 def test_of_many_anchors_a_page_gets_all_conditions_and_the_healths_that_it_names():
-    state, sent = SiteState(), Sent()
+    state, sent = State(), Sent()
     for n in range(MAX_HEALTHS + 1):
         state.add_health(str(n), replace(anchor_health(n), role="master" if n == 7 else "anchor"), 0.0)
     state.judge(0.0, blind=False)
@@ -224,7 +230,7 @@ def test_of_many_anchors_a_page_gets_all_conditions_and_the_healths_that_it_name
 )
 def test_a_page_always_has_the_newest_fix_of_just_the_tags_that_it_was_given(steps):
     """Whatever moves, and whatever it asks for; those that it names come first, and others only from its view."""
-    state, sent = SiteState(), Sent()
+    state, sent = State(), Sent()
     newest, shown = {}, {}
     for serial, (moves, view, named, text, rows_wanted) in enumerate(steps):
         state.now_s = float(serial)
@@ -253,5 +259,5 @@ def test_a_page_always_has_the_newest_fix_of_just_the_tags_that_it_was_given(ste
         for name in shown.keys() - wished:
             assert low <= newest[name][0] <= high or (text and text in name)
         if message["tags"]:
-            inside = [x for x, now_s in newest.values() if low <= x <= high and state.now_s - now_s < UNHEARD_S]
+            inside = [x for x, _ in newest.values() if low <= x <= high]
             assert (message["of"], message["inside"]) == (len(newest), len(inside))

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from skyless.page.events import TAKEOVER_S, EventQueue, publisher_rank
 from skyless.run.mqtt.messages import WrongMessageError, Zone, ZoneEvent, ZonesMessage
-from skyless.run.zones import CROSSING_S, MIN_MARGIN_M, TAG_TIMEOUT_S, ZoneMonitor, read_zones, zones_of
+from skyless.run.zones import CROSSING_S, MIN_MARGIN_M, ZoneMonitor, read_zones, zones_of
 
 INSIDE, OUTSIDE = (2.0, 2.0, 1.0), (8.0, 2.0, 1.0)
 
@@ -28,7 +28,7 @@ def walk(monitor, xs, begin_s=0.0, step_s=0.1, std_m=0.01):
     events = []
     for k, x in enumerate(xs):
         at_s = begin_s + k * step_s
-        events += monitor.update(fix(unix_s=at_s, position_m=(float(x), 2.0, 1.0), std_m=std_m), at_s)
+        events += monitor.update(fix(unix_s=at_s, position_m=(float(x), 2.0, 1.0), std_m=std_m))
     return events
 
 
@@ -50,7 +50,7 @@ def test_events_alternate_and_agree_with_where_the_tag_was(places, std_m):
     square = Path([*SQUARE.polygon_m, SQUARE.polygon_m[0]], closed=True)
     last = "leave"
     for k, (x, y) in enumerate(places):
-        for event in monitor.update(fix(unix_s=k * 0.1, position_m=(x, y, 1.0), std_m=std_m), k * 0.1):
+        for event in monitor.update(fix(unix_s=k * 0.1, position_m=(x, y, 1.0), std_m=std_m)):
             assert event.kind != last
             assert square.contains_point((x, y)) == (event.kind == "enter")
             last = event.kind
@@ -98,17 +98,8 @@ def test_the_margin_is_of_the_worst_direction():
     monitor = monitor_of()
     turned = (0.01, 0.0099, 0.0, 0.0099, 0.01, 0.0, 0.0, 0.0, 0.0)  # sigma of 0.14 m along the diagonal
     at = fix(position_m=(1.2, 2.0, 1.0), covariance_m2=turned)
-    assert monitor.update(at, 0.0) == []
-    assert len(monitor.update(replace(at, position_m=(1.5, 2.0, 1.0)), 0.1)) == 1
-
-
-def test_a_tag_without_fixes_leaves():
-    monitor = monitor_of()
-    walk(monitor, [2.0])
-    assert monitor.expire_tags(TAG_TIMEOUT_S - 0.01, 50.0) == []
-    (event,) = monitor.expire_tags(TAG_TIMEOUT_S, 50.0)
-    assert (event.kind, event.unix_s, event.position_m) == ("leave", 50.0, INSIDE)
-    assert monitor.expire_tags(TAG_TIMEOUT_S + 1.0, 51.0) == []
+    assert monitor.update(at) == []
+    assert len(monitor.update(replace(at, position_m=(1.5, 2.0, 1.0)))) == 1
 
 
 def test_a_tag_that_goes_offline_leaves_at_once():
@@ -141,8 +132,8 @@ def test_tags_in_a_deleted_zone_leave_it():
 def test_a_host_that_sets_its_clock_back_does_not_hold_a_tag_out():
     monitor = monitor_of()
     at = fix(position_m=(1.03, 2.0, 1.0), unix_s=1000.0)
-    monitor.update(at, 0.0)
-    events = [event for k in range(5) for event in monitor.update(replace(at, unix_s=10.0 + k * 0.1), k * 0.1)]
+    monitor.update(at)
+    events = [event for k in range(5) for event in monitor.update(replace(at, unix_s=10.0 + k * 0.1))]
     assert [event.kind for event in events] == ["enter"]
 
 

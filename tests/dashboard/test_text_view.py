@@ -10,8 +10,8 @@ from rich.console import Console
 
 from skyless.cli.common import plain
 from skyless.cli.nodes.site_view import AnchorRow, Picture, SiteView, TagRow, drawn
-from skyless.page.condition._reasons import Reason
-from skyless.page.condition.monitor import Condition
+from skyless.run.condition._reasons import Reason
+from skyless.run.condition.monitor import Condition
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import (
     AlarmMessage,

@@ -99,8 +99,9 @@ class FakeLink:
     def receive(self, topic, message):
         """A message comes, of a topic or of the end of one that is subscribed to."""
         payload = message if isinstance(message, bytes) else msgspec.json.encode(message)
-        (handler,) = [handler for name, handler in self.handlers.items() if name.endswith(topic)]
-        handler(topic, payload)
+        ((name, handler),) = [one for one in self.handlers.items() if one[0].endswith(topic)]
+        own_name = getattr(message, "tag", None) or str(getattr(message, "anchor", 1))
+        handler(name.replace("+", own_name), payload)
 
     def newest(self, kind):
         return next((message for _, message, _ in reversed(self.published) if isinstance(message, kind)), None)

@@ -71,10 +71,10 @@ def test_a_zone_on_a_floor_holds_its_tags_only():
     monitor = ZoneMonitor()
     monitor.floors = FLOORS
     monitor.set_zones((Zone("up", "Up", square, floor=2), Zone("all", "All", square)), 0.0)
-    assert {(e.zone, e.kind) for e in monitor.update(fix(1.0), 0.0)} == {("all", "enter")}
-    assert [(e.zone, e.kind) for e in monitor.update(fix(8.0), 0.1)] == [("up", "enter")]
-    assert [(e.zone, e.kind) for e in monitor.update(fix(1.0), 0.2)] == [("up", "leave")]
-    assert {e.zone for e in monitor.update(fix(1.0, height_known=True), 0.3)} == {"up"}
+    assert {(e.zone, e.kind) for e in monitor.update(fix(1.0))} == {("all", "enter")}
+    assert [(e.zone, e.kind) for e in monitor.update(fix(8.0))] == [("up", "enter")]
+    assert [(e.zone, e.kind) for e in monitor.update(fix(1.0))] == [("up", "leave")]
+    assert {e.zone for e in monitor.update(fix(1.0, height_known=True))} == {"up"}
 
 
 def test_the_file_s_floors_travel_beside_the_site(tmp_path):

@@ -24,8 +24,9 @@ from skyless.core.version import installed_version
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import Limits
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import Asset, FixMessage, StatusMessage, TagPosition, TagZones, Vector, Zone
+from skyless.run.mqtt.messages import Asset, FixMessage, TagPosition, TagZones, Vector, Zone
 from skyless.run.mqtt.topics import status_topic, tag_position_topic, tag_zones_topic
+from skyless.run.site_table import THRESHOLDS
 from skyless.run.zones import ZoneMonitor
 
 OUTSIDE: Final = "outside"
@@ -164,9 +165,6 @@ class _Document(msgspec.Struct, frozen=True):
 NODE_KIND: Final = "homeassistant"
 """Kind of the status on MQTT."""
 
-STALE_S: Final = 5
-"""A tag known from before a restart of the bridge must have a fix within this time."""
-
 MAX_ANNOUNCED: Final = 500
 """Further tags are not announced."""
 
@@ -221,14 +219,14 @@ class Announcer:
         tag = self._tags.get(fix.tag) or self._add(fix.tag)
         if tag is None:
             return
-        self._monitor.update(fix, fix.unix_s)
+        self._monitor.update(fix)
         tag.fix = fix
         self._send_zones(tag, fix.unix_s)
         if tag.position is None:
             self._send_position(tag, fix)
 
-    def on_no_fix(self, name: str, unix_s: float) -> None:
-        """The tag no longer has a usable fix."""
+    def on_gone(self, name: str, unix_s: float) -> None:
+        """The tag has gone, or is of another site."""
         self._monitor.remove_tag(name, unix_s)
         tag = self._tags.get(name)
         if tag is not None:
@@ -238,7 +236,7 @@ class Announcer:
     def on_site_left(self, unix_s: float) -> None:
         """No tag has a fix of this site any more."""
         for name in self._tags:
-            self.on_no_fix(name, unix_s)
+            self.on_gone(name, unix_s)
 
     def on_second(self, unix_s: float) -> None:
         """Send considerable changes; once a second."""
@@ -362,7 +360,7 @@ class Announcer:
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
             return
         if kept.usable and kept.by == self._name and TAG_NAME.fullmatch(kept.tag) and len(self._kept) < MAX_ANNOUNCED:
-            self._kept[kept.tag] = STALE_S
+            self._kept[kept.tag] = round(THRESHOLDS.longest_s)
 
 
 def _are_alike(a: float, b: float) -> bool:
@@ -430,21 +428,16 @@ class HomeAssistant(Target):
         if self._announcer is not None:
             self._announcer.on_fix(fix)
 
-    def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:  # noqa: ARG002 - Home Assistant has no field for it
+    def on_gone(self, tag: str, unix_s: float) -> None:
         """Make the tag unavailable."""
         if self._announcer is not None:
-            self._announcer.on_no_fix(tag, unix_s)
+            self._announcer.on_gone(tag, unix_s)
 
     def on_second(self, unix_s: float) -> None:
         """Send changed positions."""
         self._known_s += self._site is not None
         if self._announcer is not None:
             self._announcer.on_second(unix_s)
-
-    def on_status(self, status: StatusMessage) -> None:
-        """Make a tag that has left unavailable at once."""
-        if self._announcer is not None and status.kind == "tag" and not status.online:
-            self._announcer.on_no_fix(status.name, time.time())  # a last will has no time
 
     async def run(self) -> None:
         """Keep the link from the first fix until cancelled."""

@@ -18,7 +18,7 @@ from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.masterless_packets import Point
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
-from skyless.run.assets import assets_at, read_assets
+from skyless.run.assets import assets_at
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -31,18 +31,9 @@ from skyless.run.mqtt.messages import (
     TagHealth,
     ZonesMessage,
 )
-from skyless.run.mqtt.topics import (
-    EVERY_NODE,
-    alarm_topic,
-    assets_topic,
-    fix_topic,
-    health_topic,
-    site_topic,
-    status_topic,
-    zones_topic,
-)
-from skyless.run.process import HEALTH_S, Log, every, keep, reader, together
-from skyless.run.zones import read_zones, zones_of
+from skyless.run.process import HEALTH_S, Log, every, keep, together
+from skyless.run.site_feed import SiteFeed
+from skyless.run.zones import zones_of
 
 if TYPE_CHECKING:  # it compiles kernels, which a bridge of a broker does not need
     from skyless.core.tag.receiver import SiteListener
@@ -78,22 +69,18 @@ class BridgeNode:
         self._site: SiteMessage | None = None
         self._zones = ZonesMessage(())
         self._assets = AssetsMessage(())
-        self._malformed = 0
         self._refused: asyncio.Future[None] | None = None
-        assets = reader(read_assets, self._on_assets, self._on_malformed, AssetsMessage(()))
-        self.link.subscribe(assets_topic(site), assets)
-        for topic, kind, act in (
-            (site_topic(site), SiteMessage, self._on_site),
-            (zones_topic(site), read_zones, self._on_zones),
-            (fix_topic(site, EVERY_NODE), FixMessage, self._on_fix),
-            (health_topic(site, "tag", EVERY_NODE), TagHealth, self._on_health),
-            (health_topic(site, "anchor", EVERY_NODE), AnchorHealth, self._on_health),
-            (status_topic(site, "tag", EVERY_NODE), StatusMessage, self.hub.on_status),
-            (status_topic(site, "anchor", EVERY_NODE), StatusMessage, self.hub.on_status),
-        ):
-            self.link.subscribe(topic, reader(kind, act, self._on_malformed))
-        alarms = reader(AlarmMessage, self.hub.on_alarm, self._on_malformed)
-        self.link.subscribe(alarm_topic(site, "+", "+"), alarms, qos=1)
+        self.feed = feed = SiteFeed()
+        feed.on(SiteMessage, lambda message, _: self._on_site(message))
+        feed.on(ZonesMessage, lambda message, _: self._on_zones(message or ZonesMessage(())))
+        feed.on(AssetsMessage, lambda message, _: self._on_assets(message or AssetsMessage(())))
+        feed.on(FixMessage, lambda fix, _: self._on_fix(fix))
+        for kind in (TagHealth, AnchorHealth):
+            feed.on(kind, lambda health, _: self.hub.on_health(health, time.monotonic()))
+        feed.on(StatusMessage, lambda status, _: self._on_status(status))
+        feed.on(AlarmMessage, lambda alarm, _: self._on_alarm(alarm))
+        feed.attach(self.link, site)
+        self.link.on_state.append(self._on_state)
 
     async def run(self) -> None:
         """Serve until cancelled. Raises SkylessError: a target cannot begin, or the site lacks what they need."""
@@ -107,15 +94,24 @@ class BridgeNode:
             seconds=time.monotonic() - self._started_s,
             fixes=self.hub.fixes,
             dropped={route.target.text: dict(route.target.dropped) for route in self.hub.routes},
-            malformed=self._malformed,
+            malformed=self.feed.drops.total(),
         )
 
-    def _on_malformed(self) -> None:
-        self._malformed += 1
+    def _on_state(self, connected: bool) -> None:
+        self.hub.table.set_connected(connected=connected, now_s=time.monotonic())
 
-    def _on_site(self, message: SiteMessage) -> None:
-        self._site = message
-        self._update_site()
+    def _on_status(self, status: StatusMessage | None) -> None:
+        if status is not None and status.kind in ("tag", "anchor"):
+            self.hub.on_status(status, time.monotonic(), time.time())
+
+    def _on_alarm(self, alarm: AlarmMessage | None) -> None:
+        if alarm is not None:
+            self.hub.on_alarm(alarm)
+
+    def _on_site(self, message: SiteMessage | None) -> None:
+        if message is not None:
+            self._site = message
+            self._update_site()
 
     def _on_zones(self, message: ZonesMessage) -> None:
         self._zones = message
@@ -140,9 +136,6 @@ class BridgeNode:
     def _on_fix(self, fix: FixMessage) -> None:
         self._last_fix_s, self._is_silent = time.monotonic(), False
         self.hub.on_fix(fix, self._last_fix_s)
-
-    def _on_health(self, health: TagHealth | AnchorHealth) -> None:
-        self.hub.on_health(health, time.monotonic())
 
     def _on_tick(self) -> None:
         now_s = time.monotonic()

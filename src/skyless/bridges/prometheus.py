@@ -19,6 +19,7 @@ from skyless.bridges.target import TAG_NAME, BridgeContext, BridgedSite, Target,
 from skyless.core.version import installed_version
 from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
+from skyless.run.site_table import Node, SiteTable
 from skyless.run.web import BRIDGES as LIMITS
 from skyless.run.web import is_own_host, own_names
 
@@ -27,9 +28,6 @@ _T = TypeVar("_T")
 Labels = Mapping[str, str]
 Samples = Iterable[tuple[Labels, float | None]]
 """Labels by name, and the value; None is omitted."""
-
-GAUGE_AGE_S: Final = 5.0
-"""Gauges of older fixes or health messages are omitted."""
 
 LATENCY_BOUNDS_S: Final = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1)
 
@@ -113,25 +111,18 @@ class Rising:
 
 
 class _Node:
-    """State of a tag or an anchor."""
+    """A tag or an anchor, and its counters, which only rise."""
 
-    def __init__(self) -> None:
-        self.online: bool | None = None
-        """None while unknown."""
-        self.health: TagHealth | AnchorHealth | None = None
-        self.health_s = 0.0
-        """Arrival of its last health message."""
+    def __init__(self, node: Node) -> None:
+        self.node = node
         self.counters: dict[str, Rising] = {}
         """By name of the metric."""
         self.dropped: dict[str, Rising] = {}
-        self.fix: FixMessage | None = None
-        self.fix_s = 0.0
-        """End of its last fix, on the clock of arrivals."""
 
-    def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
-        """Process the counters of its health message."""
-        restarted = self.health is not None and health.uptime_s < self.health.uptime_s
-        self.health, self.health_s = health, now_s
+    def on_health(self, health: TagHealth | AnchorHealth) -> None:
+        """Process the counters of its newest health message."""
+        before = self.node.previous
+        restarted = isinstance(before, TagHealth | AnchorHealth) and health.uptime_s < before.uptime_s
         counters = _TAG_COUNTERS if isinstance(health, TagHealth) else _ANCHOR_COUNTERS
         values = {name: getattr(health, field) for name, field, _ in counters}
         values |= {name: getattr(health.mqtt, field) for name, field, _ in _LINK_COUNTERS}
@@ -148,8 +139,9 @@ _Nodes = Sequence[tuple[Labels, _Node]]
 class SiteMetrics:
     """Collects the figures of one site. No I/O; the time is passed in."""
 
-    def __init__(self, *, positions: bool = False) -> None:
+    def __init__(self, table: SiteTable, *, positions: bool = False) -> None:
         """``positions``: whether to expose the tags' positions."""
+        self.table = table
         self.dropped: Counter[str] = Counter()
         """Messages of uncounted nodes, by reason."""
         self.site: BridgedSite | None = None
@@ -161,40 +153,36 @@ class SiteMetrics:
         self._tags: dict[str, _Node] = {}
         self._anchors: dict[str, _Node] = {}
 
-    def on_fix(self, fix: FixMessage, now_s: float) -> None:
-        """Process a usable fix that arrives at ``now_s``, on the clock of ``text``."""
-        tag = self._known(self._tags, fix.tag)
-        if tag is None:
-            return
-        latency_s = max(fix.latency_s, 0.0)
-        tag.fix, tag.fix_s = fix, now_s - latency_s
-        tag.counters.setdefault(_FIXES, Rising()).update(fix.serial)
-        self._latencies.labels(fix.tag).observe(latency_s)
+    def on_fix(self, fix: FixMessage) -> None:
+        """Count a usable fix, which the table has."""
+        tag = self._known("tag", fix.tag)
+        if tag is not None:
+            tag.counters.setdefault(_FIXES, Rising()).update(fix.serial)
+            self._latencies.labels(fix.tag).observe(max(fix.latency_s, 0.0))
 
-    def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
-        """State of a tag or an anchor."""
+    def on_health(self, health: TagHealth | AnchorHealth) -> None:
+        """Count what a tag or an anchor states, which the table has."""
         is_tag = isinstance(health, TagHealth)
-        name = health.tag if isinstance(health, TagHealth) else str(health.anchor)
-        node = self._known(self._tags if is_tag else self._anchors, name)
+        node = self._known("tag", health.tag) if isinstance(health, TagHealth) else None
+        node = node if is_tag else self._known("anchor", str(getattr(health, "anchor", "")))
         if node is not None:
-            node.on_health(health, now_s)
+            node.on_health(health)
 
     def on_status(self, status: StatusMessage) -> None:
-        """A tag or an anchor has come or gone."""
-        nodes = {"tag": self._tags, "anchor": self._anchors}.get(status.kind)
-        node = None if nodes is None else self._known(nodes, status.name)
-        if node is not None:
-            node.online = status.online
+        """Show a tag or an anchor that has come or gone."""
+        if status.kind in ("tag", "anchor"):
+            self._known(status.kind, status.name)
 
-    def _known(self, nodes: dict[str, _Node], name: str) -> _Node | None:
+    def _known(self, kind: str, name: str) -> _Node | None:
         """The node of this name, created if needed; None for an invalid name, or if there are too many."""
+        nodes = self._tags if kind == "tag" else self._anchors
         if name not in nodes:
             if not TAG_NAME.fullmatch(name):
                 self.dropped["name"] += 1
             elif len(nodes) >= _MAX_NAMES:
                 self.dropped["too-many-names"] += 1
             else:
-                nodes[name] = _Node()
+                nodes[name] = _Node(self.table.known(kind, name))
         return nodes.get(name)
 
     def text(self, now_s: float) -> str:
@@ -219,14 +207,17 @@ class SiteMetrics:
         yield from _totals(_LINK_COUNTERS, links)
 
     def _tag_families(self, tags: _Nodes, now_s: float) -> Iterator[Metric]:
-        fixed = [(labels, fix, now_s - tag.fix_s) for labels, tag in tags if (fix := tag.fix) is not None]
-        fresh = [(labels, fix) for labels, fix, age_s in fixed if age_s <= GAUGE_AGE_S]
+        table = self.table
+        fixed = [(labels, fix, one.node) for labels, one in tags if (fix := one.node.fix) is not None]
+        fresh = [(labels, fix) for labels, fix, tag in fixed if table.presence(tag, now_s) == "fresh"]
         for latencies in self._latencies.collect():
             latencies.samples = [one for one in latencies.samples if not one.name.endswith("_created")]
             if latencies.samples:
                 yield latencies
-        ages = [(labels, max(age_s, 0.0)) for labels, _, age_s in fixed]
+        ages = [(labels, max(now_s - tag.fix_s + max(fix.latency_s, 0.0), 0.0)) for labels, fix, tag in fixed]
         yield from _gauge("skyless_tag_fix_age_seconds", "Time since the tag's last usable fix.", ages)
+        there = [(labels, table.is_there(tag, now_s)) for labels, _, tag in fixed]
+        yield from _gauge("skyless_tag_present", "Whether the tag is there: it has not been silent for long.", there)
         yield from _gauges(_FIX_GAUGES, fresh)
         used = [(labels, len(fix.anchors)) for labels, fix in fresh]
         yield from _gauge("skyless_tag_anchors", "Anchors that the tag's last fix used.", used)
@@ -251,7 +242,7 @@ class SiteMetrics:
 
 def _anchor_families(anchors: _Nodes, now_s: float) -> Iterator[Metric]:
     fresh = [(labels, health) for labels, health in _fresh(anchors, now_s) if isinstance(health, AnchorHealth)]
-    ages = [(labels, max(now_s - one.health_s, 0.0)) for labels, one in anchors if one.health is not None]
+    ages = [(labels, max(now_s - one.node.health_s, 0.0)) for labels, one in anchors if one.node.health is not None]
     yield from _gauge("skyless_anchor_health_age_seconds", "Time since the anchor's last health message.", ages)
     yield from _gauges(_ANCHOR_GAUGES, fresh)
     text = "Rate of the anchor's clock against the site's time, as a share."
@@ -266,7 +257,7 @@ def _anchor_families(anchors: _Nodes, now_s: float) -> Iterator[Metric]:
 
 def _node_families(kind: str, counters: _Plain, nodes: _Nodes) -> Iterator[Metric]:
     """What tags and anchors have in common."""
-    online = [(labels, node.online) for labels, node in nodes]
+    online = [(labels, one.node.online) for labels, one in nodes]
     yield from _gauge(f"skyless_{kind}_online", f"Whether the {kind}'s program is connected.", online)
     yield from _totals(counters, nodes)
     text = f"Frames that the {kind} has dropped, by reason."
@@ -275,7 +266,8 @@ def _node_families(kind: str, counters: _Plain, nodes: _Nodes) -> Iterator[Metri
 
 
 def _fresh(nodes: _Nodes, now_s: float) -> list[tuple[Labels, TagHealth | AnchorHealth]]:
-    return [(labels, one.health) for labels, one in nodes if one.health and now_s - one.health_s <= GAUGE_AGE_S]
+    found = [(labels, one.node.health) for labels, one in nodes if one.node.reports(now_s)]
+    return [(labels, health) for labels, health in found if isinstance(health, TagHealth | AnchorHealth)]
 
 
 def _faults(health: TagHealth | AnchorHealth) -> dict[str, int]:
@@ -341,7 +333,7 @@ class Prometheus(Target):
         """``names``: further host names by which it is reached, besides the computer's own and its addresses."""
         super().__init__(text)
         self._names = {*own_names(host), *names}
-        self.metrics = SiteMetrics(positions=positions)
+        self.metrics = SiteMetrics(SiteTable(0.0), positions=positions)
         self.dropped = self.metrics.dropped
         self.port = port
         """The port in use; with 0 configured, known once the server runs."""
@@ -349,17 +341,21 @@ class Prometheus(Target):
         self._open: dict[asyncio.StreamWriter, None] = {}
         """Oldest first."""
 
+    def use(self, table: SiteTable) -> None:
+        """Show what the hub's table has."""
+        self.metrics.table = table
+
     def on_site(self, site: BridgedSite) -> None:
         """The site is known, or has changed."""
         self.metrics.site = site
 
     def on_fix(self, fix: FixMessage) -> None:
         """Count it."""
-        self.metrics.on_fix(fix, time.monotonic())
+        self.metrics.on_fix(fix)
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
-        """Keep its figures."""
-        self.metrics.on_health(health, time.monotonic())
+        """Count what it states."""
+        self.metrics.on_health(health)
 
     def on_status(self, status: StatusMessage) -> None:
         """A tag or an anchor has come or gone."""

@@ -30,6 +30,7 @@ from skyless.run.mqtt.messages import (
     Zone,
 )
 from skyless.run.process import RateLimit
+from skyless.run.site_table import THRESHOLDS, SiteTable
 
 MIN_STD_M: Final = 0.01
 """Smallest standard deviation per axis in outputs: the gates of other programs reject fixes with honest millimetres."""
@@ -116,6 +117,9 @@ class Target:
         self.dropped: Counter[str] = Counter()
         """What readers missed, by reason."""
 
+    def use(self, table: SiteTable) -> None:
+        """The hub's table, which has usable fixes only; given before anything else."""
+
     def on_site(self, site: BridgedSite) -> None:
         """The site is known or has changed. Raises SkylessError if it lacks what this target needs."""
 
@@ -123,7 +127,10 @@ class Target:
         """Process a usable fix; called at most at the target's ``hz``, and not before the site is known."""
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
-        """A known tag has had no usable fix for a second; called again each second."""
+        """A known tag has no fresh usable fix; called again each second."""
+
+    def on_gone(self, tag: str, unix_s: float) -> None:
+        """A tag has gone: it has been silent for long, or its program has ended."""
 
     def on_second(self, unix_s: float) -> None:
         """Another second has passed."""
@@ -310,23 +317,11 @@ class TargetUrl:
 #
 # No I/O, and the time is passed in.
 
-NO_FIX_S: Final = 1.0
-"""A tag has no fix once its last usable one is older than this, ..."""
-
-_MISSED: Final = 2.5
-"""... or, if its fixes are rarer, older than this number of their intervals, ..."""
-
-_LONGEST_S: Final = 10.0
-"""... but at most this."""
-
 SILENCE_CHECK_S: Final = 0.25
 """Interval at which to call ``on_tick``."""
 
 _SECOND_S: Final = 1.0 - 0.1 * SILENCE_CHECK_S
 """Threshold for another second, as ticks are sometimes late."""
-
-_FORGET_S: Final = 3600.0
-"""A tag without a fix for this time is forgotten."""
 
 
 class Route(Struct):
@@ -348,28 +343,22 @@ class Route(Struct):
     """Number of failures."""
 
 
-class _Tag(Struct):
-    """State of one tag."""
-
-    usable_s: float
-    """Arrival of its last usable fix, or of the first message about it."""
-    reason: str
-    """Why there is none."""
-    intervals_s: tuple[float, float] = (0.0, 0.0)
-    """Between its last three usable fixes: a single long one is an outage, two are its rate."""
-    reported_s: float = -inf
-    """When targets were last notified that it has no fix."""
-
-
 class Hub:
     """Distributes one site's messages to its targets."""
 
-    def __init__(self, routes: Sequence[Route], log: Callable[[str], None]) -> None:
+    def __init__(self, routes: Sequence[Route], log: Callable[[str], None], table: SiteTable | None = None) -> None:
+        """``table``: a new one by default, in which messages can arrive."""
         self.routes = tuple(routes)
+        self.table = SiteTable(-inf) if table is None else table
+        for route in self.routes:
+            route.target.use(self.table)
         self.site: BridgedSite | None = None
         self.fixes = 0
         self._log = log
-        self._tags: dict[str, _Tag] = {}
+        self._reasons: dict[str, str] = {}
+        """Why tags have no usable fix."""
+        self._due_s: dict[str, float] = {}
+        """When targets are next notified that a tag has no fix."""
         self._second_s = -inf
         """Beginning of the current second."""
 
@@ -394,12 +383,13 @@ class Hub:
 
     def on_fix(self, fix: FixMessage, now_s: float) -> None:
         """Distribute a tag's fix; ``now_s``: the host's monotonic clock. Fixes before the site is known are ignored."""
-        tag = self._tags.setdefault(fix.tag, _Tag(now_s, "no fix yet"))
         if not is_usable(fix):
-            tag.reason = fix.alert or "position is not finite"
+            self._expect(fix.tag, now_s, fix.alert or "position is not finite")
             return
-        tag.intervals_s = (tag.intervals_s[1], now_s - tag.usable_s)
-        tag.usable_s, tag.reason = now_s, "no fix"
+        if self.table.add_fix(fix, now_s) is None:
+            return
+        self._reasons[fix.tag] = "no fix"
+        self._due_s[fix.tag] = now_s
         if self.site is None:
             return
         self.fixes += 1
@@ -410,15 +400,29 @@ class Hub:
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
         """Distribute the state of a tag or an anchor."""
         if isinstance(health, TagHealth):
-            tag = self._tags.setdefault(health.tag, _Tag(now_s, "no fix yet"))
-            if health.reason is not None:
-                tag.reason = health.reason
+            self._expect(health.tag, now_s, health.reason)
+            self.table.add_health("tag", health.tag, health, now_s)
+        else:
+            self.table.add_health("anchor", str(health.anchor), health, now_s)
         for route in self.routes:
             if not isinstance(health, TagHealth) or route.tag in (None, health.tag):
                 self._guard(route, lambda target: target.on_health(health))
 
-    def on_status(self, status: StatusMessage) -> None:
+    def _expect(self, tag: str, now_s: float, reason: str | None) -> None:
+        """Note that a tag should have fixes, and why it has none."""
+        node = self.table.expect("tag", tag)
+        if node is None:
+            return  # too many
+        node.begin(now_s)
+        if tag not in self._reasons:
+            self._reasons[tag], self._due_s[tag] = "no fix yet", now_s + THRESHOLDS.fresh_s
+        if reason is not None:
+            self._reasons[tag] = reason
+
+    def on_status(self, status: StatusMessage, now_s: float, unix_s: float) -> None:
         """A program of the site has connected or left."""
+        if self.table.add_status(status, now_s) and status.kind == "tag":
+            self._give_gone(status.name, unix_s)
         for route in self.routes:
             if status.kind != "tag" or route.tag in (None, status.name):
                 self._guard(route, lambda target: target.on_status(status))
@@ -431,20 +435,29 @@ class Hub:
 
     def on_tick(self, now_s: float, unix_s: float) -> None:
         """Report silent tags and seconds; call every ``SILENCE_CHECK_S``."""
-        for name, tag in tuple(self._tags.items()):
-            age_s = now_s - tag.usable_s
-            if age_s > _FORGET_S:
+        for name in self.table.tick(now_s):
+            self._give_gone(name, unix_s)
+        for name, reason in tuple(self._reasons.items()):
+            tag = self.table.tag(name)
+            if tag is None:
                 self._forget(name)
-            elif age_s >= _silence_s(tag.intervals_s) and now_s - tag.reported_s >= _SECOND_S and self.site is not None:
-                tag.reported_s = now_s
-                self._give_no_fix(name, unix_s, tag.reason)
+            elif self.table.presence(tag, now_s) in ("fresh", "asleep"):
+                continue
+            elif now_s >= self._due_s[name] and self.site is not None:
+                self._due_s[name] = now_s + _SECOND_S
+                self._give_no_fix(name, unix_s, reason)
         if now_s - self._second_s >= _SECOND_S:
             self._second_s = now_s
             for route in self.routes:
                 self._guard(route, lambda target: target.on_second(unix_s))
 
+    def _give_gone(self, tag: str, unix_s: float) -> None:
+        for route in self.routes:
+            if route.tag in (None, tag):
+                self._guard(route, lambda target: target.on_gone(tag, unix_s))
+
     def _forget(self, tag: str) -> None:
-        del self._tags[tag]
+        del self._reasons[tag], self._due_s[tag]
         for route in self.routes:
             route.rates.pop(tag, None)
 
@@ -498,8 +511,3 @@ def _refusal(target: Target, site: BridgedSite) -> str:
     except SkylessError as error:
         return str(error)
     return ""
-
-
-def _silence_s(intervals_s: tuple[float, float]) -> float:
-    """How long a tag with these intervals between fixes must be silent to have no fix."""
-    return min(max(NO_FIX_S, _MISSED * min(intervals_s)), _LONGEST_S)

@@ -84,9 +84,9 @@ def dashboard(
 
     from skyless.page.api.questions import Past
     from skyless.page.app import Services, bind, serve
-    from skyless.page.condition.evidence import ProcessorUse
     from skyless.page.live import LiveSite
     from skyless.page.playback import Playback
+    from skyless.run.condition.evidence import ProcessorUse
 
     if recordings is not None and not recordings.is_dir():
         raise SkylessError(f"--recordings is {str(recordings)!r}; it should be a folder")

@@ -22,7 +22,9 @@ from skyless.run.mqtt.messages import (
     WrongMessageError,
     read_message,
 )
-from skyless.run.mqtt.topics import acknowledge_topic, alarm_rules_topic, alarm_topic
+from skyless.run.mqtt.topics import alarm_rules_topic, alarm_topic
+from skyless.run.site_feed import Channel, SiteFeed
+from skyless.run.site_table import SiteTable
 from skyless.run.zones import ZoneMonitor
 from skyless.site.alarm_rules import check_rules
 
@@ -33,8 +35,6 @@ KEPT_WAIT_S: Final = 2.0
 """Time after connecting by which the broker's retained messages have arrived."""
 
 _BROADCAST_S: Final = 0.25
-
-Handler = Callable[[str, bytes], None]
 
 
 class NoAlarmError(Exception):
@@ -48,11 +48,12 @@ class SiteAlarms:
         self,
         name: str,
         monitor: ZoneMonitor,
+        table: SiteTable,
         broadcast: Callable[[str, bytes], None],
         log: Callable[[str, AlarmMessage, float], None],
     ) -> None:
         """``name``: of the dashboard on MQTT; ``log`` is called with changes of alarms."""
-        self.engine = AlarmEngine(monitor)
+        self.engine = AlarmEngine(monitor, table)
         self.rules: tuple[AlarmRule, ...] = ()
         """Rules made on the page."""
         self.file_rules: tuple[AlarmRule, ...] = ()
@@ -86,15 +87,13 @@ class SiteAlarms:
 
     # MQTT
 
-    def attach(self, link: SiteLink, site_id: int) -> dict[str, Handler]:
-        """Use a site's connection. Returns the topics to subscribe to, with their handlers."""
+    def follow(self, feed: SiteFeed, link: SiteLink, site_id: int) -> None:
+        """Get the rules and alarms of a feed, and use its connection."""
         self._link, self._site_id = link, site_id
         self._kept_rules.attach(link, alarm_rules_topic(site_id))
-        return {
-            alarm_rules_topic(site_id): self._on_rules,
-            alarm_topic(site_id, "+", "+"): self._on_alarm,
-            acknowledge_topic(site_id, "+", "+"): self._on_acknowledge,
-        }
+        feed.on_bytes("alarm_rules", lambda payload, _: self._on_rules(payload))
+        feed.on(AlarmMessage, self._on_alarm)
+        feed.on(AcknowledgeMessage, self._on_acknowledge)
 
     def on_connection(self, connected: bool, now_s: float) -> None:
         """The broker has been connected or disconnected."""
@@ -108,16 +107,13 @@ class SiteAlarms:
         self._site, self.file_rules = site.site.name, site.alarms
         self._apply_rules()
 
-    def _on_rules(self, _topic: str, payload: bytes) -> None:
+    def _on_rules(self, payload: bytes) -> None:
         if self._kept_rules.receive(payload):
             self._apply_rules()
 
-    def _on_alarm(self, topic: str, payload: bytes) -> None:
-        rule, subject = topic.split("/")[-3:-1]
-        key, kept = (rule, subject), self.engine.messages
-        message = read_message(payload, AlarmMessage) if payload else None
-        if message is not None and (message.rule, message.subject) != key:
-            raise WrongMessageError(f"it is of {message.rule[:40]!r} and {message.subject[:40]!r}")
+    def _on_alarm(self, message: AlarmMessage | None, channel: Channel) -> None:
+        rule, _, subject = channel.name.partition("/")
+        key, kept, was_cleared = (rule, subject), self.engine.messages, message is None
         if message is not None and is_over(message):
             message = None
         if message is None:
@@ -127,8 +123,8 @@ class SiteAlarms:
         else:
             self._received[key] = message
         if self.engine.leading:
-            if not payload and key not in kept and self._link is not None:
-                self._link.forget(topic)  # the broker has cleared it
+            if was_cleared and key not in kept and self._link is not None:
+                self._link.forget(alarm_topic(self._site_id, rule, subject))  # the broker has cleared it
             return
         self._changed = True
         if message is None:
@@ -136,10 +132,9 @@ class SiteAlarms:
         else:
             kept[key] = _joined(kept.get(key), message)
 
-    def _on_acknowledge(self, topic: str, payload: bytes) -> None:
+    def _on_acknowledge(self, message: AcknowledgeMessage, channel: Channel) -> None:
         """Acknowledge an alarm, even while following: the leader may end before it publishes the acknowledged alarm."""
-        rule, subject = topic.split("/")[-3:-1]
-        message = read_message(payload, AcknowledgeMessage)
+        rule, _, subject = channel.name.partition("/")
         self._changed |= self.engine.acknowledge(rule, subject, message.id, message.by[:100], message.unix_s)
 
     # Actions of users

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Final, Generic, Literal, TypeAlias, TypeVar
 from msgspec import Struct
 from msgspec.structs import asdict
 
-from skyless.page.condition.evidence import ALERT_WORDS, ALERTS, Health, LeaderTracker
-from skyless.page.condition.monitor import Condition
-from skyless.page.state import SILENT_S, encode
+from skyless.page.state import encode
+from skyless.run.condition.evidence import ALERT_WORDS, ALERTS, LeaderTracker
+from skyless.run.condition.monitor import Condition
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
     AlarmMessage,
@@ -26,6 +26,7 @@ from skyless.run.mqtt.messages import (
     WrongMessageError,
     ZoneEvent,
 )
+from skyless.run.site_table import THRESHOLDS, Health
 
 if TYPE_CHECKING:
     from skyless.run.hub import HubLink
@@ -149,7 +150,7 @@ class EventLog:
     def tick(self, now_s: float) -> None:
         """Find alerts that have ended and nodes that fell silent. To be called once or twice a second."""
         for key, reported_s in list(self._reported.items()):
-            if now_s - reported_s > SILENT_S:
+            if now_s - reported_s > THRESHOLDS.report_s:
                 del self._reported[key]
                 self._silent.add(key)
                 self._add_presence(key, False, now_s, "does not report any more")

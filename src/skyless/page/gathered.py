@@ -64,7 +64,9 @@ class Gathered:
                     for live in served.keys() - set(shown):
                         served.pop(live).cancel()
                     for live in shown:
-                        live.evidence.batches_connected = client.is_connected
+                        if live.table.batches_connected != client.is_connected:
+                            now_s = time.monotonic()
+                            live.table.set_connected(connected=client.is_connected, now_s=now_s, batches=True)
                         if live.number is not None and live not in served:
                             served[live] = tasks.create_task(self._read(client, live.number, live))
                     await asyncio.sleep(PERIOD_S)
@@ -91,7 +93,8 @@ class Gathered:
             now_s = time.monotonic()
             if now_s - heard_s >= _HEARD_S:
                 heard, heard_s = columns.heard_since(heard_s), now_s
-                live.on_batches([name for number in heard if (name := names.get(number))], now_s)
+                rare = live.table.hear([name for number in heard if (name := names.get(number))], now_s)
+                columns.set_gone_after({numbers[name]: gone_s for name, gone_s in rare.items() if name in numbers})
             named = {name for page in live.pages for name in page.named}
             records, arrived_s = columns.pop_due(now_s, [numbers[name] for name in named if name in numbers])
             unknown = (number for number in records["tag"].tolist() if number not in names)

@@ -5,26 +5,24 @@ Everything here belongs to one event loop. From the same messages ``condition`` 
 """
 
 import asyncio
-import logging
 import platform
 import time
 import zlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
 import msgspec
-from msgspec import UNSET, Struct
+from msgspec import UNSET
 from starlette.exceptions import HTTPException
 
-from skyless.core.errors import ConfigurationError
 from skyless.core.version import installed_version
 from skyless.page._alarms import SiteAlarms
-from skyless.page.condition.evidence import Evidence
-from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor, offline_anchors
 from skyless.page.events import EventList, EventLog, EventQueue, Kept, SiteLink, publisher_rank
 from skyless.page.site_assets import AssetsFile, SiteAssets
 from skyless.page.state import PageRequest, Sent, SiteState, SiteSurvey, encode
+from skyless.run.condition.evidence import Evidence
+from skyless.run.condition.monitor import EVALUATION_S, Condition, ConditionMonitor, offline_anchors
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import Role
 from skyless.run.mqtt.messages import (
@@ -42,22 +40,17 @@ from skyless.run.mqtt.messages import (
     Zone,
     ZoneEvent,
     ZonesMessage,
-    read_message,
 )
+from skyless.run.site_feed import Channel, SiteFeed
+from skyless.run.site_table import THRESHOLDS, Health, Presence, SiteTable
 from skyless.run.web import PAGE as LIMITS
 from skyless.run.zones import ZoneMonitor, check_zones, read_zones, zones_of
 from skyless.site.file.check import check_site
 
 _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0
-_WATCH_FRESH_S: Final = 30.0  # the watch reports at least every 10 s
 _EVALUATION_SHARE: Final = 5.0  # evaluations take at most a sixth of the time
 
-_HEALTHS: Final[dict[str, type[Struct]]] = {"tag": TagHealth, "anchor": AnchorHealth, "ether": EtherHealth}
-_log = logging.getLogger("skyless.page")
-
-OLDEST_S: Final = 5.0
-"""Fixes older than this are not given to programs."""
 
 IDLE_S: Final = 12.0
 """A page that has sent nothing for this long may be closed for another one. A visible page sends a ping every 2 s."""
@@ -154,7 +147,9 @@ class LiveSite:
         self.plans: dict[int | None, bytes] = {}
         """Images of the floors by number; None for the image of the whole site."""
         self.connected = False
-        self.state = SiteState()
+        self.table = SiteTable(clock(), platform.node(), connected=False)
+        self.feed = SiteFeed(clock)
+        self.state = SiteState(self.table, self.feed.drops)
         self.monitor = ZoneMonitor()
         self.events = EventQueue()
         self.pages: set[PageQueue] = set()
@@ -164,19 +159,18 @@ class LiveSite:
         self.assets = SiteAssets(self._broadcast, assets_file)
         self.event_list = EventList()
         self.has_history, self._at_hub = has_history, at_hub
-        self.dropped = self.state.dropped
+        self.dropped = self.feed.drops
         self._clock, self.wall_clock = clock, wall_clock
         self._link: SiteLink | None = None
         self._site_id: int | None = None
         self._zones = Kept(ZonesMessage(()), self._read_zones)
         """Zones, including those of other sites with the same number."""
-        self._dashboards: dict[str, StatusMessage] = {}
         self._sent_serials = 0, 0  # of the newest fix and event sent to pages
         self._health_due_s = self._condition_due_s = 0.0
-        self.evidence = Evidence(platform.node(), clock())
+        self.evidence = Evidence(self.table)
         self.evidence.hub_trouble = "" if at_hub else None
         self.log = EventLog(wall_clock() - clock(), self.event_list.add_logged)
-        self.alarms = SiteAlarms(name, self.monitor, self._broadcast, self.log.on_alarm)
+        self.alarms = SiteAlarms(name, self.monitor, self.table, self._broadcast, self.log.on_alarm)
         if site is not None:
             self._use_site(site)
         self._condition_monitor = ConditionMonitor(self.evidence)
@@ -196,22 +190,20 @@ class LiveSite:
     def attach(self, link: SiteLink, site_id: int) -> None:
         """Subscribe to a site's topics."""
         self._link, self._site_id = link, site_id
-        handlers: dict[str, Callable[[str, bytes], None]] = {
-            topics.site_topic(site_id): self._on_site,
-            topics.floor_plan_topic(site_id): self._on_floor_plan,
-            topics.plan_of_floor_topic(site_id, "+"): self._on_floor_plan,
-            topics.fix_topic(site_id, "+"): self._on_fix,
-            topics.status_topic(site_id, "+", "+"): self._on_status,
-            topics.health_topic(site_id, "+", "+"): self._on_health,
-            topics.truth_topic(site_id): lambda _, payload: self.state.add_truth(read_message(payload, TruthMessage)),
-            topics.zones_topic(site_id): self._on_zones,
-            topics.zone_event_topic(site_id, "+"): self._on_zone_event,
-            topics.assets_topic(site_id): lambda _topic, payload: self.assets.on_message(payload),
-            **self.survey.handlers(site_id),
-            **self.alarms.attach(link, site_id),
-        }
-        for topic, handler in handlers.items():
-            link.subscribe(topic, self._counting(topic.rsplit("/", 1)[-1], handler), _qos(topic))
+        feed = self.feed
+        feed.on(SiteMessage, self._on_site)
+        feed.on_bytes("floor_plan", self._on_floor_plan)
+        feed.on(FixMessage, lambda fix, _: self._on_fix(fix))
+        feed.on(StatusMessage, lambda status, _: self._on_status(status))
+        for kind in (TagHealth, AnchorHealth, EtherHealth):
+            feed.on(kind, self._on_health)
+        feed.on(TruthMessage, lambda truth, _: self.state.add_truth(truth))
+        feed.on_bytes("zones", lambda payload, _: self._on_zones(payload))
+        feed.on(ZoneEvent, lambda event, _: self._on_zone_event(event))
+        feed.on_bytes("assets", lambda payload, _: self.assets.on_message(payload))
+        self.survey.follow(feed)
+        self.alarms.follow(feed, link, site_id)
+        feed.attach(link, site_id)
         self._zones.attach(link, topics.zones_topic(site_id))
         self.assets.kept.attach(link, topics.assets_topic(site_id))
 
@@ -224,7 +216,7 @@ class LiveSite:
         """Update whether the broker is connected."""
         if connected != self.connected:
             self.connected = connected
-            self.evidence.set_connected(connected=connected, now_s=self._clock())
+            self.table.set_connected(connected=connected, now_s=self._clock())
             self._evaluate(self._clock())
             self.survey.expect_kept()
             if not self._at_hub:  # a hub keeps alarms, which are complete after every cut
@@ -239,19 +231,9 @@ class LiveSite:
             self._sites = message
             self._broadcast("sites", message)
 
-    def _counting(self, kind: str, handler: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
-        def handle(topic: str, payload: bytes) -> None:
-            try:
-                handler(topic, payload)
-            except (WrongMessageError, ConfigurationError) as error:
-                self.dropped[kind] += 1
-                if self.dropped[kind] == 1:
-                    _log.warning("dropped a wrong message of %s: %s; there may be more", topic, error)
-
-        return handle
-
-    def _on_site(self, _topic: str, payload: bytes) -> None:
-        message = read_message(payload, SiteMessage)
+    def _on_site(self, message: SiteMessage | None, _channel: Channel) -> None:
+        if message is None:
+            return
         check_site(message.whole_site, Path("the site on MQTT"))
         if message.site.id != self._site_id:
             raise WrongMessageError(f"it is of site {message.site.id}")
@@ -262,15 +244,17 @@ class LiveSite:
     def _use_site(self, message: SiteMessage) -> None:
         self.site = message
         self.monitor.floors = () if message.floors is UNSET else message.floors
-        self.evidence.set_site(message.site, self._clock())
+        self.table.set_site(message.site, self._clock())
         self.alarms.on_site(message)
         self.assets.on_site(message.site.name)
 
-    def _on_floor_plan(self, topic: str, payload: bytes) -> None:
-        image, floor = payload or None, _floor_of(topic)
+    def _on_floor_plan(self, payload: bytes, channel: Channel) -> None:
+        if channel.name and not channel.name.removeprefix("-").isdecimal():
+            raise WrongMessageError(f"it is of the floor {channel.name[:20]!r}")
+        image, floor = payload or None, int(channel.name) if channel.name else None
         if image != self.plans.get(floor):
-            if self._link is not None:
-                self._link.forget(topic)  # an image stored here must not be repeated after a reconnect
+            if self._link is not None and floor is None:  # an image stored here must not be repeated after a reconnect
+                self._link.forget(topics.floor_plan_topic(channel.site))
             self._show_floor_plan(floor, image)
 
     def _show_floor_plan(self, floor: int | None, image: bytes | None) -> None:
@@ -284,57 +268,43 @@ class LiveSite:
         digests = {floor: f"{zlib.crc32(image):08x}" for floor, image in self.plans.items()}
         return encode("floor_plan", {"digest": digests.pop(None, None), "floors": digests})
 
-    def _on_fix(self, topic: str, payload: bytes) -> None:
-        fix = read_message(payload, FixMessage)
-        _check_name(fix.tag, topic)
-        now_s = self._clock()
-        if self.evidence.roster.admits("tag", fix.tag):
-            self._take_fix(fix, now_s, self.evidence.add_fix(fix, now_s))
+    def _on_fix(self, fix: FixMessage) -> None:
+        self._add_fix(fix, self._clock())
 
     def on_batched_fix(self, fix: FixMessage, now_s: float) -> None:
-        """Process a fix that arrived in a batch at this time; ignored if the tag's messages also arrive."""
-        if not self.evidence.sends_messages(fix.tag, now_s):
-            self._take_fix(fix, now_s, self.evidence.add_batched(fix, now_s))
+        """Process a fix that arrived in a batch at this time."""
+        self._add_fix(fix, now_s, batched=True)
 
-    def on_batches(self, tags: Iterable[str], now_s: float) -> None:
-        """Note that batches have fixes of these tags, passed on or not, so that they are not silent."""
-        for name in tags:
-            self.evidence.hear(name, now_s)
-            self.alarms.engine.hear(name, now_s)
-            self.monitor.hear(name, now_s)
+    def _add_fix(self, fix: FixMessage, now_s: float, *, batched: bool = False) -> None:
+        unix_s = self.wall_clock() - self._clock() + now_s
+        if self.evidence.add_fix(fix, now_s, unix_s, batched=batched) is not None:
+            self.log.on_fix(fix, now_s)
+            self.alarms.engine.on_fix(fix.tag)
+            self._schedule(self.monitor.update(fix))
 
-    def _take_fix(self, fix: FixMessage, now_s: float, age_s: float) -> None:
-        self.state.add_fix(fix, now_s, self.wall_clock() - self._clock() + now_s - age_s)
-        self.log.on_fix(fix, now_s)
-        self.alarms.engine.on_fix(fix, now_s)
-        self._schedule(self.monitor.update(fix, now_s))
-
-    def _on_status(self, topic: str, payload: bytes) -> None:
-        if not payload:
+    def _on_status(self, status: StatusMessage | None) -> None:
+        if status is None:
             return  # a retained status was cleared
-        status = read_message(payload, StatusMessage)
-        _check_name(status.name, topic)
-        if not self.evidence.roster.admits(status.kind, status.name):
-            return
-        self.state.add_status(status)
-        if status.kind == "dashboard":
-            self._dashboards[status.name] = status
-        self.evidence.add_status(status, self._clock())
+        has_gone = self.evidence.add_status(status, self._clock())
+        if self.table.get(status.kind, status.name) is None:
+            return  # there are too many
         self.log.on_status(status, self._clock())
-        if status.kind == "tag" and not status.online:
-            self.alarms.engine.on_tag_gone(status.name)
+        if has_gone and status.kind == "tag":
             self._schedule(self.monitor.remove_tag(status.name, self.wall_clock()))
 
-    def _on_health(self, topic: str, payload: bytes) -> None:
-        _, kind, name, _ = topic.rsplit("/", 3)
-        if kind in _HEALTHS and self.evidence.roster.admits(kind, name):
-            health: TagHealth | AnchorHealth | EtherHealth = read_message(payload, _HEALTHS[kind])  # type: ignore[assignment]
-            now_s, unix_s = self._clock(), self.wall_clock()
-            self.state.add_health(name, health, now_s)
-            self.evidence.add_health(kind, name, health, now_s, unix_s)
-            self.log.on_health(kind, name, health, now_s)
-            if isinstance(health, TagHealth):
-                self.alarms.engine.on_health(health, now_s)
+    def _on_health(self, health: Health, channel: Channel) -> None:
+        now_s, kind, name = self._clock(), channel.who, channel.name
+        self.evidence.add_health(kind, name, health, now_s, self.wall_clock())
+        if self.table.get(kind, name) is None:
+            return  # there are too many
+        self.log.on_health(kind, name, health, now_s)
+        if isinstance(health, TagHealth):
+            self.alarms.engine.on_health(health)
+
+    @property
+    def _dashboards(self) -> list[StatusMessage]:
+        """Statuses of the site's dashboards."""
+        return [node.status for node in self.table.all("dashboard").values() if node.status is not None]
 
     def _read_zones(self, payload: bytes) -> ZonesMessage:
         message = read_zones(payload)
@@ -342,7 +312,7 @@ class LiveSite:
             message = msgspec.structs.replace(message, others=self._zones.message.others)
         return message
 
-    def _on_zones(self, _topic: str, payload: bytes) -> None:
+    def _on_zones(self, payload: bytes) -> None:
         fault = self._zones.fault
         try:
             if self._zones.receive(payload):
@@ -351,9 +321,7 @@ class LiveSite:
             if self._zones.fault != fault:
                 self._broadcast("zones", encode("zones", self._zone_fields()))
 
-    def _on_zone_event(self, topic: str, payload: bytes) -> None:
-        event = read_message(payload, ZoneEvent)
-        _check_name(event.zone, topic)
+    def _on_zone_event(self, event: ZoneEvent) -> None:
         if self.events.add_published(event):
             self.event_list.add_zone_event(event)
 
@@ -391,7 +359,7 @@ class LiveSite:
     def _schedule(self, events: list[ZoneEvent]) -> None:
         if events and not self._at_hub:
             self.alarms.engine.on_zone_events(events, self._clock())
-            self.events.schedule(events, publisher_rank(self.name, list(self._dashboards.values())), self._clock())
+            self.events.schedule(events, publisher_rank(self.name, self._dashboards), self._clock())
 
     def _publish_events(self, now_s: float) -> None:
         for event in self.events.pop_due(now_s):
@@ -433,8 +401,12 @@ class LiveSite:
         return self._link, self._site_id
 
     def recent_fixes(self, after: int = 0) -> list[tuple[FixMessage, float]]:
-        """The newest fix of each tag within ``OLDEST_S`` and after a serial, with the end time of its last frame."""
-        return self.state.fixes_since(self._clock(), OLDEST_S, after)
+        """The newest fix of each tag that is fresh and after a serial, with the end time of its last frame."""
+        return self.state.fixes_since(self._clock(), after)
+
+    def presence(self, tag: str) -> Presence:
+        """Whether a known tag is there, in a word."""
+        return self.table.presence(self.table.known("tag", tag), self._clock())
 
     # Pages
 
@@ -444,6 +416,7 @@ class LiveSite:
         hello = {
             "version": installed_version(),
             "site": self.site,
+            "thresholds": THRESHOLDS,
             **self._zone_fields(),
             "events": list(self.events.recent),
             "mqtt": self.connected,
@@ -497,18 +470,19 @@ class LiveSite:
         self.log.unix_offset_s = unix_s - now_s
         if now_s >= self._health_due_s:
             self._health_due_s = now_s + _HEALTH_PERIOD_S
-            self._schedule(self.monitor.expire_tags(now_s, unix_s))
-            self.state.expire(now_s)
+            self.state.forget_encoded()
+            for name in self.table.tick(now_s):
+                self._schedule(self.monitor.remove_tag(name, unix_s))
             for page in self.pages:
                 page.request_state(health=True)
             for page in [page for page in self.pages if now_s - page.active_s > GONE_S]:
                 self._close_idle(page)
         self._publish_events(now_s)
-        self.alarms.tick(now_s, unix_s, self._dashboards.values(), blind=self._condition_monitor.is_blind(now_s))
+        self.alarms.tick(now_s, unix_s, self._dashboards, blind=self._condition_monitor.is_blind(now_s))
         self.assets.tick(now_s)
         if now_s >= self._condition_due_s:
             self._evaluate(now_s)
-        serials = self.state.serial, self.event_list.last
+        serials = self.table.fixes_serial, self.event_list.last
         if serials != self._sent_serials:
             self._sent_serials = serials
             for page in self.pages:
@@ -527,7 +501,7 @@ class LiveSite:
         blind = self._condition_monitor.is_blind(now_s)
         self.state.judge(now_s, blind=blind)
         offline = None if blind else offline_anchors(self.evidence, now_s)
-        fresh = watch if age_s is not None and age_s < _WATCH_FRESH_S else None
+        fresh = watch if age_s is not None and age_s < THRESHOLDS.watch_s else None
         self.alarms.engine.on_anchors(offline, fresh)
         self.alarms.engine.set_assets(self.assets.by_tag)
         self.log.on_watch(watch, now_s)
@@ -556,25 +530,3 @@ class LiveSite:
     def _broadcast(self, kind: str, message: bytes) -> None:
         for page in self.pages:
             page.replace(kind, message)
-
-
-def _floor_of(topic: str) -> int | None:
-    """Number of the floor whose plan a topic carries; None for the whole site. Raises WrongMessageError."""
-    name = topic.rsplit("/", 1)[-1]
-    if name == "floor_plan":
-        return None
-    try:
-        return int(name)
-    except ValueError:
-        raise WrongMessageError(f"it is of the floor {name[:20]!r}") from None
-
-
-def _qos(topic: str) -> int:
-    """Quality of service of a subscription: 1 for messages that are sent only once."""
-    return 1 if any(part in topic for part in ("/zone", "/survey/", "/alarm", "/assets")) else 0
-
-
-def _check_name(name: str, topic: str) -> None:
-    """Raise WrongMessageError unless a message names the same node or zone as its topic."""
-    if name != topic.rsplit("/", 2)[-2]:
-        raise WrongMessageError(f"it is of {name[:40]!r}")

@@ -2,7 +2,7 @@
 
 import math
 import struct
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, Final
 
 import msgspec
@@ -11,8 +11,8 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 
 from skyless.core.site import AnchorSite
-from skyless.page.state import UNHEARD_S
 from skyless.run.fix_batch import ALERT_BITS, RECORD, Records
+from skyless.run.site_table import THRESHOLDS
 
 # The newest fix of every tag of a large site in NumPy arrays, by tag number. No I/O.
 
@@ -39,7 +39,7 @@ class Columns:
         """Names by tag number, as far as requested; empty for tags without a name."""
         self._used = 0
         self._newest = np.zeros(MAX_NUMBER + 1, RECORD)  # the system allocates only pages that are written
-        self._arrived_s, self._popped_s = np.zeros((2, MAX_NUMBER + 1))
+        self._arrived_s, self._popped_s, self._gone_after_s = np.zeros((3, MAX_NUMBER + 1))
 
     def update(self, records: Records, now_s: float) -> None:
         """Add the records of a batch."""
@@ -58,12 +58,13 @@ class Columns:
     def visible(self, view: tuple[float, float, float, float], now_s: float) -> tuple[Records, Array]:
         """Records of the tags within a view (least x, y and largest x, y in m), and their ages since arrival.
 
-        Tags without a fix for ``UNHEARD_S`` are left out.
+        Tags that have gone are left out.
         """
         low_x, low_y, high_x, high_y = (1000.0 * edge for edge in view)
         x_mm, y_mm, _ = self._newest["position_mm"][: self._used].T
         inside = (x_mm >= low_x) & (x_mm <= high_x) & (y_mm >= low_y) & (y_mm <= high_y)
-        inside &= self._arrived_s[: self._used] > max(0.0, now_s - UNHEARD_S)
+        gone_after_s = np.maximum(self._gone_after_s[: self._used], THRESHOLDS.gone_s)
+        inside &= self._arrived_s[: self._used] > np.maximum(0.0, now_s - gone_after_s)
         tags = np.flatnonzero(inside)
         return self._newest.take(tags), now_s - self._arrived_s.take(tags)
 
@@ -81,6 +82,11 @@ class Columns:
         tags = np.union1d(tags, [tag for tag in first if is_new[tag]]).astype(np.int64)
         self._popped_s[tags] = now_s
         return self._newest.take(tags), arrived_s.take(tags)
+
+    def set_gone_after(self, gone_after_s: Mapping[int, float]) -> None:
+        """Set for how long tags that send rarely must be silent to be gone, by number; others have the shortest."""
+        for number, seconds in gone_after_s.items():
+            self._gone_after_s[number] = seconds
 
     def heard_since(self, time_s: float) -> list[int]:
         """Numbers of the tags with a fix that arrived after a time."""
@@ -139,7 +145,7 @@ def tags_message(columns: Columns, view: View, now_s: float, unix_us: int) -> by
     points["tag"], points["alert"] = records["tag"], records["flags"] & ALERT_BITS
     points["x"], points["y"] = np.rint(_MAX_U16 * x_share), np.rint(_MAX_U16 * y_share)
     points["sigma_mm"] = np.minimum(np.nan_to_num(sigma_mm, nan=_MAX_U16), _MAX_U16)
-    points["freshness"] = np.clip(10.0 * ages_s, 0.0, 10.0 * UNHEARD_S)
+    points["freshness"] = np.clip(10.0 * ages_s, 0.0, 10.0 * THRESHOLDS.gone_s)
     return _HEAD.pack(ord("P"), 0, len(points), unix_us) + points.tobytes()
 
 

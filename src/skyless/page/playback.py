@@ -5,7 +5,7 @@ import math
 import os
 import threading
 from collections import OrderedDict
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -18,7 +18,6 @@ from skyless.core.errors import SkylessError
 from skyless.page.events import Event, EventLog
 from skyless.page.state import SiteState
 from skyless.run.mqtt.messages import (
-    REACH_S,
     AnchorHealth,
     EtherHealth,
     FixMessage,
@@ -30,6 +29,8 @@ from skyless.run.mqtt.messages import (
     Zone,
 )
 from skyless.run.recordings.recording import McapRecording, Recorded
+from skyless.run.site_feed import SiteFeed
+from skyless.run.site_table import SiteTable
 from skyless.run.zones import zones_of
 
 _SUFFIX: Final = ".mcap"
@@ -38,6 +39,7 @@ _GAP_S: Final = 2.5  # shorter gaps without fixes are not shown, as the recorder
 
 MAX_RECORDED_EVENTS: Final = 2000
 _TICK_S: Final = 0.5
+_LEAD_S: Final = 12.0  # how much earlier than its first state a recording is read
 _PIECE_BYTES: Final = 1 << 18
 _Version = tuple[int, int, int]  # a file's inode, size and time of change
 
@@ -221,32 +223,30 @@ def _events(path: Path, _of: _Version, stopped: threading.Event) -> RecordedEven
     """Events of a recording from the live page's log, by the recording's times."""
     events: list[Event] = []
     log = EventLog(add=events.append)
-    due_s, last_s = 0.0, float("-inf")
-    with McapRecording(path) as recording:
-        for found in recording.messages({"status", "health", "fix", "watch"}):
+    feed = SiteFeed()
+    feed.on(FixMessage, lambda fix, _: log.on_fix(fix, feed.now_s))
+    feed.on(StatusMessage, lambda status, _: log.on_status(status, feed.now_s))
+    feed.on(WatchMessage, lambda watch, _: log.on_watch(watch, feed.now_s))
+    for kind in (TagHealth, AnchorHealth, EtherHealth):
+        feed.on(kind, lambda health, channel: log.on_health(channel.who, channel.name, health, feed.now_s))
+
+    def watched(recorded: Iterable[Recorded]) -> Iterator[Recorded]:
+        """The messages, with the log's own work between them."""
+        due_s, last_s = 0.0, float("-inf")
+        for found in recorded:
             if stopped.is_set() or len(events) >= MAX_RECORDED_EVENTS:
-                break
+                return
             if found.time_s - last_s > _GAP_S:
                 log.pause(found.time_s)  # the recorder was cut off
             elif found.time_s >= due_s:
                 log.tick(found.time_s)
                 due_s = found.time_s + _TICK_S
             last_s = found.time_s
-            _log_message(log, found)
+            yield found
+
+    with McapRecording(path) as recording:
+        feed.play(watched(recording.messages({"status", "health", "fix", "watch"})))
     return RecordedEvents(tuple(events[:MAX_RECORDED_EVENTS]), len(events) < MAX_RECORDED_EVENTS)
-
-
-def _log_message(log: EventLog, found: Recorded) -> None:
-    message = found.message
-    if isinstance(message, FixMessage):
-        log.on_fix(message, found.time_s)
-    elif isinstance(message, StatusMessage):
-        log.on_status(message, found.time_s)
-    elif isinstance(message, WatchMessage):
-        log.on_watch(message, found.time_s)
-    elif isinstance(message, TagHealth | AnchorHealth | EtherHealth):
-        kind = {TagHealth: "tag", AnchorHealth: "anchor", EtherHealth: "ether"}[type(message)]
-        log.on_health(kind, found.channel.name, message, found.time_s)
 
 
 def _zones(recording: McapRecording) -> tuple[Zone, ...]:
@@ -268,27 +268,46 @@ def _fix_spans(recording: McapRecording) -> tuple[tuple[float, float], ...]:
 def _states(
     recording: McapRecording, begin_s: float, end_s: float, step_s: float, stopped: threading.Event
 ) -> list[bytes]:
-    """A ``state`` message every ``step_s``, if there is anything new. Unix times."""
-    site = SiteState()
+    """A ``state`` message every ``step_s``, if there is anything new. Unix times.
+
+    Reading begins some time before, as the tags' intervals must be learnt.
+    """
+    table = SiteTable(begin_s)
+    site = SiteState(table)
     states: list[bytes] = []
-    sent, due_s = 0, begin_s + step_s
-    for found in recording.messages({"fix", "truth"}, begin_s - REACH_S, end_s):
-        if stopped.is_set():
-            break
-        if found.time_s >= due_s:
-            sent = _append_state(site, sent, due_s, states)
-            due_s += step_s * (1 + math.floor((found.time_s - due_s) / step_s))
-        if isinstance(found.message, TruthMessage):
-            site.add_truth(found.message)
-        elif isinstance(found.message, FixMessage) and found.time_s >= begin_s:
-            site.add_fix(found.message, found.time_s, found.time_s)
+    sent, due_s, feed = 0, begin_s + step_s, SiteFeed()
+
+    def take_fix(fix: FixMessage) -> None:
+        node = table.add_fix(fix, feed.now_s)
+        if node is not None:
+            node.ended_unix_s = feed.now_s
+
+    feed.on(FixMessage, lambda fix, _: take_fix(fix))
+    feed.on(TruthMessage, lambda truth, _: site.add_truth(truth))
+    feed.on(TagHealth, lambda health, channel: table.add_health("tag", channel.name, health, feed.now_s))
+
+    def sampled(recorded: Iterable[Recorded]) -> Iterator[Recorded]:
+        """The messages, with the states between them."""
+        nonlocal sent, due_s
+        for found in recorded:
+            if stopped.is_set():
+                return
+            if found.time_s >= due_s:
+                sent = _append_state(site, sent, due_s, states)
+                due_s += step_s * (1 + math.floor((found.time_s - due_s) / step_s))
+            yield found
+
+    kinds = {"fix", "truth", "health"}
+    feed.play(recording.messages(kinds, begin_s - _LEAD_S, begin_s))
+    sent = table.fixes_serial
+    feed.play(sampled(recording.messages(kinds, begin_s, end_s)))
     _append_state(site, sent, min(due_s, end_s), states)
     return states
 
 
 def _append_state(site: SiteState, sent: int, unix_s: float, states: list[bytes]) -> int:
     """Append a state if there is anything new. Returns the state's serial."""
-    if site.serial > sent:
+    if site.table.fixes_serial > sent:
         site.unix_s = unix_s
         states.append(site.state_since(sent))
-    return site.serial
+    return site.table.fixes_serial

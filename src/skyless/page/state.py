@@ -1,11 +1,9 @@
 """The state of the site for pages, gathered from messages, and the parts that are new to each page. No I/O."""
 
 import math
-from collections import Counter
-from collections.abc import Callable, Collection, Iterable
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping
 from itertools import islice
-from typing import Annotated, Any, Final, Generic, NamedTuple, TypeVar
+from typing import Annotated, Any, Final, Generic, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -14,13 +12,11 @@ from starlette.exceptions import HTTPException
 
 from skyless.run.mqtt.messages import (
     AnchorHealth,
-    EtherHealth,
     FixMessage,
     StatusMessage,
     SurveyFactsMessage,
     SurveyMessage,
     SurveySaveMessage,
-    TagHealth,
     TruthBuffer,
     TruthMessage,
     Vector,
@@ -28,11 +24,9 @@ from skyless.run.mqtt.messages import (
     WrongMessageError,
     read_message,
 )
-from skyless.run.mqtt.topics import survey_topic, watch_topic
+from skyless.run.site_feed import SiteFeed
+from skyless.run.site_table import THRESHOLDS, Node, SiteTable
 from skyless.run.survey.checked_facts import BadFactsError, check_facts
-
-EXPIRY_S: Final = 600.0
-"""Fixes and health messages older than this are dropped."""
 
 MAX_CLOCK_ERROR_S: Final = 0.5
 """The time of a fix by its tag's clock is replaced if it is wrong by more than this."""
@@ -47,16 +41,11 @@ _MAX_NAMED: Final = 200
 
 _MAX_ENCODED: Final = 16
 _Request = TypeVar("_Request", bound=Struct)
-_KINDS: Final[dict[type, str]] = {AnchorHealth: "anchors", TagHealth: "tags", EtherHealth: "ether"}
+_GROUPS: Final = {"anchors": "anchor", "tags": "tag", "ether": "ether"}
+"""Kinds of nodes by their name in messages to pages."""
 
 CHOICE_S: Final = 0.5
 """Interval at which the tags for a page are chosen again."""
-
-UNHEARD_S: Final = 10.0
-"""A tag without a fix for this long is no longer on the map, as in ``page/clock.js``."""
-
-SILENT_S: Final = 3.5
-"""A node that reports once a second and has been silent for this long is offline, even if its status says online."""
 
 
 class PageRequest(Struct, frozen=True):
@@ -97,96 +86,38 @@ class Sent:
         self.conditions: dict[str, str] = {}  # of anchors
 
 
-class _Tag:
-    """The last fix of a tag, and its row once requested."""
-
-    __slots__ = ("ended_unix_s", "fix", "received_s", "row", "serial")
-
-    def __init__(self, fix: FixMessage, serial: int, received_s: float, ended_unix_s: float) -> None:
-        self.fix, self.serial, self.received_s, self.ended_unix_s = fix, serial, received_s, ended_unix_s
-        self.row: list[Any] | None = None
-
-
-class _Health(NamedTuple):
-    """The last health of a node."""
-
-    serial: int
-    received_s: float
-    health: TagHealth | AnchorHealth | EtherHealth
-
-
 class SiteState:
-    """The newest fix, health and status by name."""
+    """What pages get of a site's table: rows of tags, healths and statuses."""
 
-    def __init__(self) -> None:
-        self.serial = 0  # counts fixes; a reader with the state at one serial requests those since
-        self.statuses: dict[tuple[str, str], StatusMessage] = {}  # by kind and name
+    def __init__(self, table: SiteTable, dropped: Mapping[str, int] | None = None) -> None:
+        """``dropped``: messages that could not be read, by kind, as counted by a feed."""
+        self.table, self.dropped = table, {} if dropped is None else dropped
         self.now_s = self.unix_s = 0.0
-        """Times of the next messages, by the clock of ``expire`` and by Unix time; set by the owner."""
-        self.dropped: Counter[str] = Counter()  # wrong messages by kind
-        self._tags: dict[str, _Tag] = {}
+        """Times of the next messages, by the table's clock and by Unix time; set by the owner."""
         self._truths = TruthBuffer()
-        self._healths: dict[str, dict[str, _Health]] = {kind: {} for kind in _KINDS.values()}  # by kind and name
-        self._health_serial = 0
-        self._status_serial = 0
-        self._status_serials: dict[tuple[str, str], int] = {}
         self._leaders: set[str] = set()  # anchors that lead the site's time
         self._conditions: dict[str, str] = {}  # of anchors
         self._waiting: list[str] = []  # tags that report and have no position yet
         self._encoded: dict[tuple[int, int], bytes] = {}
 
-    def add_fix(self, fix: FixMessage, now_s: float, unix_s: float) -> None:
-        """Add a fix. ``now_s``: time of arrival, by the clock of ``expire``.
-
-        ``unix_s``: end of the fix's last frame, by the owner's wall clock.
-        """
-        self.serial += 1
-        self._tags[fix.tag] = _Tag(fix, self.serial, now_s, unix_s)
-
     def add_truth(self, truth: TruthMessage) -> None:
         """Add true positions of simulated tags."""
         self._truths.add(truth)
 
-    def add_status(self, status: StatusMessage) -> None:
-        """Update whether a node is online."""
-        key = status.kind, status.name
-        self._status_serial += 1
-        self.statuses[key], self._status_serials[key] = status, self._status_serial
-
-    def add_health(self, name: str, health: TagHealth | AnchorHealth | EtherHealth, now_s: float) -> None:
-        """Update a node's health."""
-        self._health_serial += 1
-        self._healths[_KINDS[type(health)]][name] = _Health(self._health_serial, now_s, health)
-        if isinstance(health, AnchorHealth):
-            (self._leaders.add if health.role == "master" else self._leaders.discard)(name)
-
-    def expire(self, now_s: float) -> None:
-        """Drop fixes and health messages older than ``EXPIRY_S``."""
+    def forget_encoded(self) -> None:
+        """Encode rows again, as truth or time may have changed them."""
         self._encoded.clear()
-        for name in [name for name, tag in self._tags.items() if now_s - tag.received_s > EXPIRY_S]:
-            del self._tags[name]
-        for healths in self._healths.values():
-            for name in [name for name, known in healths.items() if now_s - known.received_s > EXPIRY_S]:
-                del healths[name]
 
-    def fixes_since(self, now_s: float, longest_s: float, serial: int = 0) -> list[tuple[FixMessage, float]]:
-        """The newest fix of each tag after a serial and within the last ``longest_s``.
-
-        Each comes with the end time of its last frame, as ``unix_s``.
-        """
-        newer = [tag for tag in self._tags.values() if tag.serial > serial and now_s - tag.received_s <= longest_s]
-        return [(tag.fix, tag.ended_unix_s) for tag in newer]
-
-    @property
-    def tags(self) -> Collection[str]:
-        """Names of the tags with a kept fix."""
-        return self._tags.keys()
+    def fixes_since(self, now_s: float, serial: int = 0) -> list[tuple[FixMessage, float]]:
+        """The newest fix of each tag that is fresh and after a serial, with the end of its last frame as Unix time."""
+        newer = [tag for tag in self.table.fixed.values() if tag.serial > serial and self.table.is_fresh(tag, now_s)]
+        return [(tag.fix, tag.ended_unix_s) for tag in newer if tag.fix is not None]
 
     # Fixes
 
     def state_since(self, serial: int) -> bytes:
         """The ``state`` message with all tags that have a newer fix. Readers at the same serial share its bytes."""
-        key = serial, self.serial
+        key = serial, self.table.fixes_serial
         if key not in self._encoded:
             if len(self._encoded) >= _MAX_ENCODED:
                 self._encoded.clear()
@@ -195,11 +126,15 @@ class SiteState:
 
     def rows_since(self, serial: int) -> list[list[Any]]:
         """Rows of the ``state`` message, with fields in the order of ``page/tracks.js``."""
-        return [self._row(tag) for tag in self._tags.values() if tag.serial > serial]
+        return [self._row(tag) for tag in self.table.fixed.values() if tag.serial > serial]
 
-    def _row(self, tag: _Tag) -> list[Any]:
+    def _row(self, tag: Node) -> list[Any]:
+        fix, table = tag.fix, self.table
+        assert fix is not None
         if tag.row is None:
-            tag.row = _row(tag.fix, self._truths.at(tag.fix.tag, tag.fix.unix_s), tag.ended_unix_s)
+            slept_s = max(0.0, tag.asleep_until_s - tag.fix_s)
+            presence = table.fresh_for_s(tag), slept_s, slept_s + table.gone_after_s(tag)
+            tag.row = [*_row(fix, self._truths.at(fix.tag, fix.unix_s), tag.ended_unix_s), *map(_tenths, presence)]
         return tag.row
 
     def new_state(self, sent: Sent) -> bytes | None:
@@ -208,37 +143,40 @@ class SiteState:
         At a large site the page gets a part of the tags; ``left`` are those that no longer belong to that part, ``of``
         is the number of all tags, and ``inside`` the number in the page's view.
         """
-        if len(self._tags) <= sent.wanted.rows:
-            if sent.fixes == self.serial and sent.tags is None:
+        if len(self.table.fixed) <= sent.wanted.rows:
+            serial = self.table.fixes_serial
+            if sent.fixes == serial and sent.tags is None:
                 return None
-            since, sent.fixes = 0 if sent.tags is not None else sent.fixes, self.serial
+            since, sent.fixes = 0 if sent.tags is not None else sent.fixes, serial
             sent.tags = None
             return self.state_since(since)
-        before = sent.tags if sent.tags is not None else dict.fromkeys(self._tags if sent.fixes else ())
+        tags = self.table.fixed
+        before = sent.tags if sent.tags is not None else dict.fromkeys(tags if sent.fixes else ())
         if sent.tags is None or self.now_s - sent.chosen_s >= CHOICE_S:
             sent.chosen_s = self.now_s
             sent.tags = self._choose(sent, before)
-        chosen = {name: self._tags[name] for name in sent.tags if name in self._tags}
+        chosen = {name: tags[name] for name in sent.tags if name in tags}
         rows = [self._row(tag) for name, tag in chosen.items() if tag.serial > sent.fixes or name not in before]
         left = [name for name in before if name not in sent.tags] if before is not sent.tags else []
-        sent.fixes = self.serial
+        sent.fixes = self.table.fixes_serial
         if not rows and not left:
             return None
-        fields = {"tags": rows, "left": left, "of": len(self._tags), "inside": sent.inside}
+        fields = {"tags": rows, "left": left, "of": len(tags), "inside": sent.inside}
         return encode("state", {"unix_s": round(self.unix_s, 3), **fields})
 
     def _choose(self, sent: Sent, before: dict[str, None]) -> dict[str, None]:
         """Choose tags for a page: those that it names, searches, and has in view, first the already sent ones."""
         wanted, text = sent.wanted, sent.wanted.find.lower()
         x1, y1, x2, y2 = wanted.view or (-math.inf, -math.inf, math.inf, math.inf)
-        inside = []
-        for name, tag in self._tags.items():
+        inside, tags = [], self.table.fixed
+        for name, tag in tags.items():
+            assert tag.fix is not None
             x, y, _ = tag.fix.position_m
-            if x1 <= x <= x2 and y1 <= y <= y2 and self.now_s - tag.received_s < UNHEARD_S:
+            if x1 <= x <= x2 and y1 <= y <= y2 and not tag.is_gone:
                 inside.append(name)
         sent.inside = len(inside)
-        named = [name for name in wanted.tags if name in self._tags]
-        found = [name for name in self._tags if text in name.lower()] if text else []
+        named = [name for name in wanted.tags if name in tags]
+        found = [name for name in tags if text in name.lower()] if text else []
         names = dict.fromkeys([*named, *found, *(name for name in inside if name in before), *inside])
         return dict.fromkeys(list(names)[: wanted.rows])
 
@@ -254,16 +192,20 @@ class SiteState:
 
         While ``blind``, when messages may be missing, silence does not make an anchor ``bad``.
         """
-        self._waiting = list(islice((name for name in self._healths["tags"] if name not in self._tags), MAX_HEALTHS))
-        found = {}
-        for name, known in self._healths["anchors"].items():
-            if isinstance(known.health, AnchorHealth):
-                health = known.health
+        table = self.table
+        waiting = (name for name, tag in table.of("tag") if tag.health is not None and tag.fix is None)
+        self._waiting = list(islice(waiting, MAX_HEALTHS))
+        found, self._leaders = {}, set()
+        for name, anchor in table.all("anchor").items():
+            health = anchor.health
+            if isinstance(health, AnchorHealth):
+                if health.role == "master":
+                    self._leaders.add(name)
                 found[name] = "good" if health.synchronised or health.role == "master" else "warn"
-                if now_s - known.received_s > SILENT_S and not (blind and self._conditions.get(name) != "bad"):
+                is_silent = now_s - anchor.health_s > THRESHOLDS.report_s
+                if is_silent and not (blind and self._conditions.get(name) != "bad"):
                     found[name] = "bad"
-        for (kind, name), status in self.statuses.items():
-            if kind == "anchor" and not status.online:
+            if anchor.online is False:
                 found[name] = "bad"
         self._conditions = found
 
@@ -273,26 +215,30 @@ class SiteState:
         With many tags or anchors it contains only the health of those that the page names, and of leading anchors.
         ``ages``: since each arrived; ``waiting``: tags that report but have no position yet.
         """
-        whole, since = sent.healths is None, sent.healths or 0
+        table, whole, since = self.table, sent.healths is None, sent.healths or 0
         named = {"tags": {*sent.wanted.tags}, "anchors": {*sent.wanted.anchors, *self._leaders}}
         new: dict[str, list[Any]] = {}
         ages: dict[str, dict[str, float]] = {}
-        for kind, healths in self._healths.items():
+        for group, kind in _GROUPS.items():
+            healths = {name: node for name, node in table.of(kind) if node.health is not None}
             names: Iterable[str] = healths
             if len(healths) > MAX_HEALTHS:
-                names = [name for name in named[kind] if name in healths]
-            fresh = [n for n in names if healths[n].serial > since or n in named.get(kind, set()) - sent.named[kind]]
-            new[kind] = [healths[name].health for name in fresh]
-            ages[kind] = {name: round(self.now_s - healths[name].received_s, 2) for name in fresh}
-        nodes = []
-        if sent.statuses < self._status_serial:
-            nodes = [self.statuses[key] for key, serial in self._status_serials.items() if serial > sent.statuses]
-        if len(self.statuses) > MAX_HEALTHS:  # if there are many, pages list only the other programs
-            nodes = [node for node in nodes if node.kind not in {"tag", "anchor"}]
+                names = [name for name in named[group] if name in healths]
+            more = named.get(group, set()) - sent.named[group]
+            fresh = [name for name in names if healths[name].health_serial > since or name in more]
+            new[group] = [healths[name].health for name in fresh]
+            ages[group] = {name: round(self.now_s - healths[name].health_s, 2) for name in fresh}
+        nodes: list[StatusMessage] = []
+        if sent.statuses < table.statuses_serial:
+            there = {kind: [node.status for _, node in table.of(kind) if node.status] for kind in table.kinds}
+            newer = [node for kind in table.kinds for _, node in table.of(kind) if node.status_serial > sent.statuses]
+            nodes = [node.status for node in sorted(newer, key=lambda node: node.status_serial) if node.status]
+            if sum(map(len, there.values())) > MAX_HEALTHS:  # then pages list only the other programs
+                nodes = [status for status in nodes if status.kind not in {"tag", "anchor"}]
         changed = {name: kind for name, kind in self._conditions.items() if sent.conditions.get(name) != kind}
         changed |= dict.fromkeys(sent.conditions.keys() - self._conditions.keys(), "unknown")
-        sent.healths, sent.named = self._health_serial, named | {"ether": set()}
-        sent.statuses, sent.conditions = self._status_serial, self._conditions
+        sent.healths, sent.named = table.healths_serial, named | {"ether": set()}
+        sent.statuses, sent.conditions = table.statuses_serial, self._conditions
         return encode(
             "health",
             {
@@ -307,6 +253,10 @@ class SiteState:
                 "ages": ages,
             },
         )
+
+
+def _tenths(seconds: float) -> float:
+    return round(seconds, 1)
 
 
 def encode(kind: str, fields: dict[str, Any]) -> bytes:
@@ -357,7 +307,6 @@ def _row(fix: FixMessage, true_m: Vector | None, ended_unix_s: float) -> list[An
 #
 # The survey program computes; its messages are forwarded here, and pages' requests are checked and published.
 
-Handler = Callable[[str, bytes], None]
 _M = TypeVar("_M", SurveyMessage, WatchMessage)
 
 
@@ -368,10 +317,9 @@ class Newest(Generic[_M]):
     whatever their sender's clock.
     """
 
-    def __init__(self, name: str, kind: type[_M], clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
+    def __init__(self, name: str, clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
         self.name = name
         self.message: _M | None = None
-        self._kind: type[_M] = kind
         self._clock, self._wall_clock = clock, wall_clock
         self._first = True
         self._made_s = 0.0
@@ -380,9 +328,9 @@ class Newest(Generic[_M]):
         """Expect that the next message may be a retained one."""
         self._first = True
 
-    def read(self, payload: bytes) -> None:
-        """Replace the message. An empty payload removes it. Raises WrongMessageError."""
-        self.message = read_message(payload, self._kind) if payload else None
+    def replace(self, message: _M | None) -> None:
+        """Replace the message; None removes it."""
+        self.message = message
         self._made_s = self._clock()
         if self.message is not None and self._first:
             self._made_s -= max(0.0, self._wall_clock() - self.message.unix_s)
@@ -409,17 +357,15 @@ class SiteSurvey:
     ) -> None:
         """``name``: of the dashboard on MQTT."""
         self._name, self._broadcast = name, broadcast
-        self.survey = Newest("survey", SurveyMessage, clock, wall_clock)
+        self.survey = Newest[SurveyMessage]("survey", clock, wall_clock)
         """State of the survey program."""
-        self.watch = Newest("watch", WatchMessage, clock, wall_clock)
+        self.watch = Newest[WatchMessage]("watch", clock, wall_clock)
         """Findings of the watch of the anchors."""
 
-    def handlers(self, site_id: int) -> dict[str, Handler]:
-        """Topics to subscribe to, with their handlers."""
-        return {
-            survey_topic(site_id): partial(self._on, self.survey),
-            watch_topic(site_id): partial(self._on, self.watch),
-        }
+    def follow(self, feed: SiteFeed) -> None:
+        """Get the messages of a feed."""
+        feed.on(SurveyMessage, lambda message, _: self._on(self.survey, message))
+        feed.on(WatchMessage, lambda message, _: self._on(self.watch, message))
 
     def messages(self) -> dict[str, bytes]:
         """The messages that a new page needs, by kind."""
@@ -452,8 +398,8 @@ class SiteSurvey:
             raise HTTPException(409, f"there is no result {serial}; the newest is {newest.serial}")
         return SurveySaveMessage(self._name, serial)
 
-    def _on(self, newest: Newest[_M], _topic: str, payload: bytes) -> None:
-        newest.read(payload)
+    def _on(self, newest: Newest[_M], message: _M | None) -> None:
+        newest.replace(message)
         self._broadcast(newest.name, newest.encoded())
 
 

@@ -27,7 +27,8 @@ from msgspec.structs import replace
 from skyless.core.alert import Alert
 from skyless.core.site import AlarmRule, RuleKind
 from skyless.run.mqtt.messages import AlarmMessage, Asset, FixMessage, TagHealth, Vector, WatchMessage, Zone, ZoneEvent
-from skyless.run.zones import TAG_TIMEOUT_S, ZoneMonitor
+from skyless.run.site_table import THRESHOLDS, Node, SiteTable
+from skyless.run.zones import ZoneMonitor
 from skyless.site.alarm_rules import GROUP, read_hours
 
 STOREY_M: Final = 2.5
@@ -68,14 +69,9 @@ def near_tags(
 
 EVALUATION_S: Final = 0.2
 
-CONFIRM_S: Final = 5.0
-"""A tag not heard for this long after a start, or after messages may have been lost, counts as absent."""
-
 SETTLE_S: Final = 0.5
 """A tag counts as outside a zone only after two fixes and this time, because it may be about to be found inside."""
 
-FORGET_S: Final = 86_400.0
-"""A tag that no rule names is forgotten after this long without a fix."""
 _FORGET_PERIOD_S: Final = 60.0
 
 MAX_KEPT: Final = 2_000
@@ -97,32 +93,6 @@ Change = tuple[What, AlarmMessage]
 """A change of an alarm. "updated": the worst value is worse; "dropped": there are too many alarms."""
 Key = tuple[str, str]
 """Rule and subject."""
-
-
-class _Tag(Struct):
-    """State of a tag."""
-
-    first_s: float
-    """Time of the first fix since the last gap."""
-    fixes: int = 0
-    """Number of fixes since ``first_s``."""
-    fix: FixMessage | None = None
-    seen_s: float = -math.inf
-    """Time of the newest fix."""
-    gone: bool = False
-    """Whether the tag's program has ended since the newest fix."""
-    battery: float | None = None
-
-    def is_fresh(self, now_s: float) -> bool:
-        return not self.gone and now_s - self.seen_s < TAG_TIMEOUT_S
-
-    def is_settled(self, now_s: float) -> bool:
-        """Whether it is known which zones the tag is outside."""
-        return self.fixes >= 2 and now_s - self.first_s >= SETTLE_S
-
-
-_UNHEARD: Final = _Tag(math.inf)
-"""State of a tag that has never been heard."""
 
 
 class _Case(Struct):
@@ -180,18 +150,27 @@ class _Rule:
 class AlarmEngine:
     """The alarms of one site. ``tick`` returns the changes since the last call."""
 
-    def __init__(self, monitor: ZoneMonitor, local_time: Callable[[float], time.struct_time] = time.localtime) -> None:
-        """``monitor`` gets the same fixes; its events are passed in. ``local_time`` converts from Unix time."""
+    def __init__(
+        self,
+        monitor: ZoneMonitor,
+        table: SiteTable,
+        local_time: Callable[[float], time.struct_time] = time.localtime,
+    ) -> None:
+        """``monitor`` and ``table`` get the same fixes; the monitor's events are passed in.
+
+        ``local_time`` converts from Unix time.
+        """
         self.messages: dict[Key, AlarmMessage] = {}
         """The alarms kept; another engine's while it leads."""
         self.leading = False
         """Whether this engine raises alarms; true from ``resume`` on."""
-        self._monitor, self._local_time = monitor, local_time
+        self._monitor, self._table, self._local_time = monitor, table, local_time
         self._assets: Mapping[str, Asset] = {}
         self._zones: dict[str, Zone] = {}
         self._members: defaultdict[str, set[str]] = defaultdict(set)
         self._rules: dict[str, _Rule] = {}
-        self._tags: dict[str, _Tag] = {}
+        self._zones_s = -math.inf  # when the zones last changed
+        self._resumed_s: dict[str, float] = {}  # subjects of resumed alarms, and when they were
         self._forget_due_s = 0.0
         self._changed: dict[str, None] = {}  # tags with something new since the last evaluation
         self._anchors: dict[RuleKind, dict[str, str]] = {}
@@ -221,29 +200,18 @@ class AlarmEngine:
     def set_zones(self, zones: Iterable[Zone], now_s: float) -> None:
         """Set the zones that the monitor has now. Pass in the monitor's events of this change first."""
         self._zones = {zone.id: zone for zone in zones}
-        for tag in self._tags.values():
-            tag.first_s, tag.fixes = now_s, 0
+        self._zones_s = now_s
         self._evaluate_all()
 
     def _evaluate_all(self) -> None:
-        self._changed = dict.fromkeys(self._tags)
+        self._changed = dict.fromkeys(self._table.all("tag"))
         self._evaluated_s = -math.inf
 
     # Input
 
-    def on_fix(self, fix: FixMessage, now_s: float) -> None:
-        """Process a fix of a tag. Call this before ``on_zone_events`` with the monitor's events for the same fix."""
-        tag = self._tags.setdefault(fix.tag, _Tag(now_s))
-        if not tag.is_fresh(now_s):
-            tag.first_s, tag.fixes = now_s, 0
-        tag.fix, tag.seen_s, tag.gone = fix, now_s, False
-        tag.fixes += 1
-        self._changed[fix.tag] = None
-
-    def hear(self, name: str, now_s: float) -> None:
-        """Note that a tag has had a fix that is not passed to ``on_fix``."""
-        if name in self._tags:
-            self._tags[name].seen_s = now_s
+    def on_fix(self, name: str) -> None:
+        """Note that the table has a new fix of a tag. Call this before ``on_zone_events`` for the same fix."""
+        self._changed[name] = None
 
     def on_zone_events(self, events: Iterable[ZoneEvent], now_s: float) -> None:
         """Process events of tags entering or leaving zones."""
@@ -254,15 +222,9 @@ class AlarmEngine:
                 if own.rule.zone == event.zone:
                     self._check(own, f"zone-{event.zone}" if own.rule.kind == "crowded" else event.tag, now_s)
 
-    def on_tag_gone(self, name: str) -> None:
-        """Note that a tag's program has ended, so that its position is unknown. Call this before ``on_zone_events``."""
-        if name in self._tags:
-            self._tags[name].gone = True
-
-    def on_health(self, health: TagHealth, now_s: float) -> None:
-        """Process the battery charge in a tag's health message."""
+    def on_health(self, health: TagHealth) -> None:
+        """Note that the table has a tag's health, with the battery's charge."""
         if health.battery_share is not None:
-            self._tags.setdefault(health.tag, _Tag(now_s)).battery = health.battery_share
             self._changed[health.tag] = None
 
     def on_anchors(self, offline: Iterable[str] | None, watch: WatchMessage | None) -> None:
@@ -288,8 +250,8 @@ class AlarmEngine:
             case.begin_s = since_s
             unstated = math.inf if "unknown" in message.sentence else None  # JSON has no infinity
             case.add(message.kind, unstated if message.worst is None else message.worst)
-            if is_new and message.kind == "silent":
-                self._tags.setdefault(message.subject, _Tag(now_s))
+            if is_new:
+                self._resumed_s[message.subject] = now_s
         self._evaluate_all()
 
     @property
@@ -345,8 +307,9 @@ class AlarmEngine:
         match own.rule.kind:
             case "near":
                 reach_m = (own.rule.limit or 0.0) + own.rule.hysteresis
-                fresh_m = {n: tag.fix.position_m for n, tag in self._tags.items() if tag.fix and tag.is_fresh(now_s)}
-                near = near_tags(fresh_m, own.concerned, own.others, reach_m)
+                there = ((n, tag.fix) for n, tag in self._table.fixed.items() if self._table.is_there(tag, now_s))
+                places_m = {name: fix.position_m for name, fix in there if fix is not None}
+                near = near_tags(places_m, own.concerned, own.others, reach_m)
                 own.distances_m = {"~".join(pair): distance_m for pair, distance_m in near.items()}
                 return own.distances_m
             case "crowded":
@@ -354,16 +317,15 @@ class AlarmEngine:
             case "anchor-offline" | "anchor-moved" as kind:
                 return self._anchors.get(kind, ())
             case "silent":
-                heard = ((n, tag) for n, tag in self._tags.items() if tag.fix)
-                heard = ((n, self._tag(n)) for n in own.concerned.named) if own.rule.tags else heard
-                return sorted(name for name, tag in heard if now_s - tag.seen_s >= own.rule.after_s)
+                names: Iterable[str] = own.concerned.named if own.rule.tags else self._table.fixed
+                return sorted(name for name in names if self._silent_s(name, now_s) >= own.rule.after_s)
         return changed
 
     def _holds(  # noqa: PLR0911, PLR0912 - some for each kind
         self, own: _Rule, subject: str, now_s: float, *, held: bool
     ) -> bool | None:
         """Whether the condition holds; None if unknown, so that the case stays unchanged."""
-        rule, tag, inside = own.rule, self._tag(subject), self._members[own.rule.zone or ""]
+        rule, tag, inside = own.rule, self._table.tag(subject), self._members[own.rule.zone or ""]
         limit, hysteresis = rule.limit or 0.0, rule.hysteresis if held else 0.0
         if rule.zone is not None and rule.zone not in self._zones:
             return False
@@ -378,34 +340,53 @@ class AlarmEngine:
                 return subject in self._anchors[kind] if kind in self._anchors else None
         if subject not in own.concerned:
             return False
-        is_fresh, is_settled = tag.is_fresh(now_s), tag.is_settled(now_s)
+        is_there = tag is not None and self._table.is_there(tag, now_s)
+        is_settled = tag is not None and self._is_settled(tag, now_s)
         match rule.kind:
             case "inside":
-                is_unknown = self._is_missed(subject, now_s) or (is_fresh and not is_settled)
+                is_unknown = self._is_missed(subject, now_s) or (is_there and not is_settled)
                 return subject in inside or (None if is_unknown else False)
             case "outside":
-                return False if subject in inside else True if is_fresh and is_settled else None
+                return False if subject in inside else True if is_there and is_settled else None
             case "silent":
-                if now_s - tag.seen_s < rule.after_s:
+                if self._silent_s(subject, now_s) < rule.after_s:
                     return False
                 return None if now_s - self._blind_s < rule.after_s else True
             case "battery":
-                return None if tag.battery is None else tag.battery < limit + hysteresis
+                share = self._battery(tag)
+                return None if share is None else share < limit + hysteresis
             case _:
                 level_m = _level_m(tag)
                 if level_m is None:
                     return None if self._is_missed(subject, now_s) else False
                 return level_m > limit - hysteresis
 
-    def _tag(self, name: str) -> _Tag:
-        return self._tags.get(name, _UNHEARD)
+    def _silent_s(self, name: str, now_s: float) -> float:
+        """For how long a tag has had no fix and has not been asleep; infinite before its first one."""
+        tag = self._table.tag(name)
+        return math.inf if tag is None else now_s - max(tag.fix_s, tag.asleep_until_s)
+
+    def _is_settled(self, tag: Node, now_s: float) -> bool:
+        """Whether it is known which zones a tag is outside."""
+        since_s = max(tag.first_s, self._zones_s)
+        return tag.fixes > 1 and tag.fix_s > since_s and now_s - since_s >= SETTLE_S
+
+    @staticmethod
+    def _battery(tag: Node | None) -> float | None:
+        health = None if tag is None else tag.health
+        return health.battery_share if isinstance(health, TagHealth) else None
 
     def _was_blind(self, now_s: float) -> bool:
-        return now_s - self._blind_s < CONFIRM_S
+        return now_s - self._blind_s < THRESHOLDS.grace_s
 
     def _is_missed(self, name: str, now_s: float) -> bool:
-        """Whether a tag may be present although nothing has been received from it."""
-        return self._was_blind(now_s) and self._tag(name).seen_s <= self._blind_s
+        """Whether a tag may be present although nothing has been received from it since messages were missed."""
+        tag = self._table.tag(name)
+        if tag is None or tag.fix_s == -math.inf:
+            longest_s = self._table.longest_s if name in self._resumed_s else THRESHOLDS.grace_s
+            return now_s - self._blind_s < longest_s
+        is_unheard = tag.fix_s <= self._blind_s and tag.online is not False
+        return is_unheard and now_s - self._blind_s < self._table.gone_after_s(tag)
 
     def _crowd(self, own: _Rule) -> list[str]:
         return [tag for tag in self._members[own.rule.zone or ""] if tag in own.concerned]
@@ -414,11 +395,14 @@ class AlarmEngine:
         if now_s < self._forget_due_s:
             return
         self._forget_due_s = now_s + _FORGET_PERIOD_S
-        for name in [n for n, tag in self._tags.items() if now_s - max(tag.seen_s, tag.first_s) > FORGET_S]:
-            if not any(own.rule.kind == "silent" and name in own.concerned.named for own in self._rules.values()):
-                del self._tags[name]
-                for own in self._rules.values():
-                    own.cases.pop(name, None)
+        last_s = now_s - THRESHOLDS.forgotten_s
+        self._resumed_s = {name: at_s for name, at_s in self._resumed_s.items() if at_s > last_s}
+        for own in self._rules.values():
+            if own.rule.kind not in ("crowded", "anchor-offline", "anchor-moved"):
+                for subject in list(own.cases):
+                    known = (self._table.tag(name) or name in self._resumed_s for name in subject.split("~"))
+                    if not any(known) and subject not in own.concerned.named:
+                        del own.cases[subject]
 
     # From conditions to alarms
 
@@ -434,7 +418,8 @@ class AlarmEngine:
             case.known_s = now_s
             if holds != case.holds:
                 is_silent = holds and rule.kind == "silent"
-                case.holds, case.since_s = holds, max(self._tag(subject).seen_s, self._blind_s) if is_silent else now_s
+                since_s = max(now_s - self._silent_s(subject, now_s), self._blind_s) if is_silent else now_s
+                case.holds, case.since_s = holds, since_s
         message = self.messages.get((rule.id, subject))
         is_active = self.leading and message is not None and message.ended_unix_s is None
         if case.holds and own.is_on is not False:
@@ -462,7 +447,8 @@ class AlarmEngine:
             return
         is_of_tags = rule.kind not in ("crowded", "anchor-offline", "anchor-moved")
         tags = tuple(subject.split("~") if is_of_tags else sorted(self._crowd(own)))
-        fix = self._tag(tags[0]).fix if is_of_tags else None
+        first = self._table.tag(tags[0]) if is_of_tags else None
+        fix = None if first is None else first.fix
         message = AlarmMessage(
             id=f"{rule.id}/{subject}/{round(1000.0 * unix_s)}",
             rule=rule.id,
@@ -496,9 +482,9 @@ class AlarmEngine:
             case "crowded":
                 return float(len(self._crowd(own)))
             case "battery":
-                return self._tag(subject).battery
+                return self._battery(self._table.tag(subject))
             case "protection-level":
-                return _level_m(self._tag(subject))
+                return _level_m(self._table.tag(subject))
             case "anchor-moved":
                 return None
         return max(own.rule.after_s, held_s)
@@ -570,9 +556,9 @@ def is_over(message: AlarmMessage) -> bool:
     return message.ended_unix_s is not None and message.acknowledged_unix_s is not None
 
 
-def _level_m(tag: _Tag) -> float | None:
+def _level_m(tag: Node | None) -> float | None:
     """Horizontal protection level in m; infinite if none can be computed, None if the method has none."""
-    fix = tag.fix
+    fix = None if tag is None else tag.fix
     if fix is None or fix.hpl_m is not None:
         return None if fix is None else fix.hpl_m
     return math.inf if fix.alert in (Alert.UNAVAILABLE, Alert.NOT_EXCLUDED) else None

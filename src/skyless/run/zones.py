@@ -1,7 +1,8 @@
 """Zones: validation of their list, and detection of tags that enter and leave them.
 
-No I/O; the time is passed in. Noise at an edge must not cause a series of events: a tag has crossed the edge when its
-fix is beyond it by the margin, or by half of the margin in every fix for a while. Otherwise it stays on its side.
+No I/O. When a silent tag has gone is decided by the ``SiteTable``. Noise at an edge must not cause a series of events:
+a tag has crossed the edge when its fix is beyond it by the margin, or by half of the margin in every fix for a while.
+Otherwise it stays on its side.
 """
 
 import math
@@ -158,9 +159,6 @@ _MARGIN_SIGMAS: Final = 3.0
 CROSSING_S: Final = 0.3
 """Fixes beyond the edge by half of the margin must last this long."""
 
-TAG_TIMEOUT_S: Final = 3.0
-"""A tag without a fix for this long counts as having left."""
-
 
 class _MonitoredZone:
     """A zone with precomputed values."""
@@ -189,7 +187,6 @@ class _MonitoredZone:
 class _TagState(Struct):
     """The last fix of a tag, and its zones."""
 
-    updated_s: float = 0.0
     position_m: Vector = (0.0, 0.0, 0.0)
     inside: set[str] = set()
     floor: int | None = None
@@ -221,10 +218,10 @@ class ZoneMonitor:
                 events.append(_event(old[zone_id].zone, name, tag, unix_s, entered=False))
         return events
 
-    def update(self, fix: FixMessage, now_s: float) -> list[ZoneEvent]:
-        """Process a fix; ``now_s`` is its time of arrival, on the clock of ``expire_tags``."""
+    def update(self, fix: FixMessage) -> list[ZoneEvent]:
+        """Process a fix."""
         tag = self._tags.get(fix.tag) or self._tags.setdefault(fix.tag, _TagState())
-        tag.updated_s, tag.position_m = now_s, fix.position_m
+        tag.position_m = fix.position_m
         std_z_m = math.sqrt(max(fix.covariance_m2[8], 0.0))
         tag.floor = None if fix.height_known else floor_at(self.floors, fix.position_m[2], std_z_m, tag.floor)
         return [
@@ -233,23 +230,13 @@ class ZoneMonitor:
             if _crossed(tag, zone, fix)
         ]
 
-    def hear(self, name: str, now_s: float) -> None:
-        """Note that a tag has had a fix that is not passed to ``update``."""
-        if name in self._tags:
-            self._tags[name].updated_s = now_s
-
-    def expire_tags(self, now_s: float, unix_s: float) -> list[ZoneEvent]:
-        """Remove tags without a fix for ``TAG_TIMEOUT_S`` from their zones."""
-        expired = [name for name, tag in self._tags.items() if now_s - tag.updated_s >= TAG_TIMEOUT_S]
-        return [event for name in expired for event in self.remove_tag(name, unix_s)]
-
     def zones_with(self, name: str) -> list[Zone]:
         """The zones that a tag is in, smallest first."""
         inside = self._tags[name].inside if name in self._tags else set()
         return sorted((self._monitored[zone].zone for zone in inside), key=lambda zone: area_m2(zone.polygon_m))
 
     def remove_tag(self, name: str, unix_s: float) -> list[ZoneEvent]:
-        """Remove a tag from all zones."""
+        """Remove a tag that has gone from all zones."""
         tag = self._tags.pop(name, None)
         if tag is None:
             return []

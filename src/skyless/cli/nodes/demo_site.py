@@ -29,8 +29,8 @@ from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import AlarmRule, FloorPlanSite, GeoreferenceSite, Site
 from skyless.files import replace_files
 from skyless.machine import extra_module
-from skyless.page.condition.evidence import Health, ProcessorUse
 from skyless.run.broker import Broker, BrokerSettings, start_broker
+from skyless.run.condition.evidence import ProcessorUse
 from skyless.run.fix_log import Latencies
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import Introduction, RefusedError, kept_messages, open_connection, trouble_with
@@ -56,7 +56,6 @@ from skyless.run.mqtt.topics import (
     site_topic,
     status_topic,
     survey_topic,
-    truth_topic,
     watch_topic,
     zones_topic,
 )
@@ -68,11 +67,11 @@ from skyless.run.process import (
     hold_any,
     new_recording,
     outlasting,
-    reader,
     recordings_folder,
     reserve_next,
     together,
 )
+from skyless.run.site_table import Health
 from skyless.sim.evaluation.figures import ErrorStatistics
 from skyless.sim.evaluation.request import ProtectionOptions
 from skyless.sim.lab import lab_site
@@ -128,9 +127,10 @@ class DemoFigures:
 
     def follow(self, view: SiteView) -> None:
         """Collect figures from what this view receives from now on."""
-        view.on_fix.append(self._on_fix)
-        view.on_health.append(self._on_health)
-        view.link.subscribe(truth_topic(view.number), reader(TruthMessage, self._truths.add, lambda: None))
+        view.feed.on(FixMessage, lambda fix, _: self._on_fix(fix))
+        for kind in (TagHealth, AnchorHealth):
+            view.feed.on(kind, lambda health, _: self._on_health(health))
+        view.feed.on(TruthMessage, lambda truth, _: self._truths.add(truth))
 
     def _on_fix(self, fix: FixMessage) -> None:
         self.arrivals.add(time.time() - fix.unix_s)
@@ -425,7 +425,7 @@ class WholeSite:
         link = Link(address, _NAME, site=self.site.id, kind="watch")
         self.view = SiteView(link, self.site.id, used_share=ProcessorUse().share)
         self.figures.follow(self.view)
-        self.view.on_health.append(self._on_health)
+        self.view.feed.on(EtherHealth, lambda health, _: self._on_health(health))
         self.children = [Child(program, self._log) for program in self._programs(address)]
         self.ready.set()
         await outlasting(link.run(), together(*(child.run() for child in self.children)))  # its end is published

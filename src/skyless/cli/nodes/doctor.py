@@ -31,8 +31,8 @@ from skyless.core.errors import SkylessError
 from skyless.core.geometry import RADIO_REACH_M
 from skyless.core.site import NoiseSite, Site, site_digest
 from skyless.core.version import installed_version
-from skyless.page.condition.evidence import ProcessorUse
 from skyless.radio.serial.serial_radio import SerialRadio
+from skyless.run.condition.evidence import ProcessorUse
 from skyless.run.doctor import (
     BoardProbe,
     Check,
@@ -51,7 +51,7 @@ from skyless.run.mqtt.connection import Introduction, Reactions, RefusedError, o
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import FixMessage, RequestMessage, StampsMessage
 from skyless.run.open_radio import open_radios
-from skyless.run.process import every, reader, run, together
+from skyless.run.process import every, run, together
 from skyless.site.file.load import load_site
 
 _FIND_S: Final = 8.0
@@ -213,7 +213,7 @@ class SiteProbe:
         self._pairs = CounterPairs()
         self._stamps: Counter[tuple[int, int]] = Counter()  # by receiver and sender
         self._stamps_s: dict[int, tuple[float, float]] = {}  # by receiver: times of its first and last message
-        view.link.subscribe(topics.stamps_topic(view.number, "+"), reader(StampsMessage, self._on_stamps, lambda: None))
+        view.feed.on(StampsMessage, lambda stamps, _: self._on_stamps(stamps))
 
     def _on_stamps(self, message: StampsMessage) -> None:
         now_s, anchor = self._clock(), message.anchor

@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Coroutine, Mapping, Sequence
 from datetime import datetime
 from functools import partial
-from operator import setitem
 from typing import TYPE_CHECKING, Any, Final, Literal, TypeVar
 
 from cyclopts import App
@@ -23,11 +22,10 @@ from rich.text import Text
 from skyless.cli.common import JsonOptions, command, console, number, plain, print_json, print_table
 from skyless.cli.nodes.options import HubUrl, MqttOptions, SiteOptions, hub_address, log, run_until_stopped
 from skyless.core.errors import SkylessError
-from skyless.page.condition.evidence import ALERTS, FRESH_S, Evidence, Health, Node, ProcessorUse
-from skyless.page.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
-from skyless.run.assets import assets_at, read_assets
+from skyless.run.assets import assets_at
+from skyless.run.condition.evidence import ALERTS, Evidence, ProcessorUse
+from skyless.run.condition.monitor import EVALUATION_S, Condition, ConditionMonitor
 from skyless.run.find_site import SiteOnBroker, find_site, watch_sites
-from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -42,7 +40,9 @@ from skyless.run.mqtt.messages import (
     TagHealth,
     WatchMessage,
 )
-from skyless.run.process import keep, reader, together
+from skyless.run.process import keep, together
+from skyless.run.site_feed import Channel, SiteFeed
+from skyless.run.site_table import THRESHOLDS, Health, Node, SiteTable
 
 if TYPE_CHECKING:
     from skyless.run.hub import HubSite
@@ -54,11 +54,14 @@ LINK_NAME: Final = f"{platform.node()}-{os.getpid()}"
 _WAIT_SHARE: Final = 3.0
 
 
+TagState = Literal["fix", "asleep", "no fix", "offline"]
+
+
 class TagRow(Struct, frozen=True):
     """A tag in the view."""
 
     tag: str
-    state: Literal["fix", "no fix", "offline"]
+    state: TagState
     age_s: float | None = None
     """Time since the last frame of the newest fix; None before the first."""
     fix: FixMessage | None = None
@@ -124,74 +127,53 @@ class SiteView:
         """``used_share``: see the page's ``LiveSite``."""
         self.link, self.number, self._clock, self._wall_clock = link, number, clock, wall_clock
         self._used_share = used_share
-        self.evidence = Evidence(platform.node(), clock())
+        self.table = SiteTable(clock(), platform.node(), connected=False)
+        self.evidence = Evidence(self.table)
         self._monitor = ConditionMonitor(self.evidence)
         self.condition = self._monitor.evaluate(clock())
         self.site: SiteMessage | None = None
-        self._fixes: dict[str, tuple[FixMessage, float]] = {}  # with the end time of the last frame
         self._alarms: dict[str, AlarmMessage] = {}
         self._watch: tuple[WatchMessage, float] | None = None  # with its creation time
-        self._wrong = 0
         self._assets = AssetsMessage(())
-        self.on_fix: list[Callable[[FixMessage], None]] = []
-        """Called with every fix."""
-        self.on_health: list[Callable[[Health], None]] = []
-        """Called with every health message of a tag, an anchor or the air."""
-        for topic, kind, handle in (
-            (topics.site_topic(number), SiteMessage, self._on_site),
-            (topics.fix_topic(number, "+"), FixMessage, self._on_fix),
-            (topics.status_topic(number, "+", "+"), StatusMessage, lambda m: self.evidence.add_status(m, clock())),
-            (topics.health_topic(number, "tag", "+"), TagHealth, lambda m: self._on_health("tag", m.tag, m)),
-            (topics.health_topic(number, "anchor", "+"), AnchorHealth, self._on_anchor),
-            (topics.health_topic(number, "ether", "+"), EtherHealth, lambda m: self._on_health("ether", "air", m)),
-            (topics.watch_topic(number), WatchMessage, self._on_watch),
-        ):  # fmt: skip
-            link.subscribe(topic, reader(kind, handle, self._on_wrong))
-        assets = reader(read_assets, self._on_assets, self._on_wrong, AssetsMessage(()))
-        link.subscribe(topics.assets_topic(number), assets)
-        link.subscribe(topics.alarm_topic(number, "+", "+"), self._on_alarm, qos=1)
+        self.feed = feed = SiteFeed(clock)
+        feed.on(SiteMessage, self._on_site)
+        feed.on(FixMessage, lambda fix, _: self.evidence.add_fix(fix, clock(), wall_clock()))
+        feed.on(StatusMessage, lambda status, _: status and self.evidence.add_status(status, clock()))
+        for kind in (TagHealth, AnchorHealth, EtherHealth):
+            feed.on(kind, self._on_health)
+        feed.on(WatchMessage, lambda watch, _: self._on_watch(watch))
+        feed.on(AssetsMessage, lambda assets, _: self._on_assets(assets))
+        feed.on(AlarmMessage, self._on_alarm)
+        feed.attach(link, number)
         link.on_state.append(self._on_state)
 
     def _on_state(self, connected: bool) -> None:
         self._watch = None
         self._alarms.clear()  # the broker sends retained alarms again
-        self.evidence.set_connected(connected=connected, now_s=self._clock())
+        self.table.set_connected(connected=connected, now_s=self._clock())
 
-    def _on_wrong(self) -> None:
-        self._wrong += 1
+    def _on_site(self, message: SiteMessage | None, _channel: Channel) -> None:
+        if message is not None:
+            self.site = message
+            self.table.set_site(message.site, self._clock())
 
-    def _on_site(self, message: SiteMessage) -> None:
-        self.site = message
-        self.evidence.set_site(message.site, self._clock())
+    def _on_health(self, health: Health, channel: Channel) -> None:
+        self.evidence.add_health(channel.who, channel.name, health, self._clock(), self._wall_clock())
 
-    def _on_fix(self, fix: FixMessage) -> None:
-        now_s = self._clock()
-        if self.evidence.roster.admits("tag", fix.tag):
-            self._fixes[fix.tag] = fix, now_s - self.evidence.add_fix(fix, now_s)
-            for listener in self.on_fix:
-                listener(fix)
-
-    def _on_anchor(self, health: AnchorHealth) -> None:
-        self._on_health("anchor", str(health.anchor), health)
-
-    def _on_health(self, kind: str, name: str, health: Health) -> None:
-        self.evidence.add_health(kind, name, health, self._clock(), self._wall_clock())
-        for listener in self.on_health:
-            listener(health)
-
-    def _on_watch(self, message: WatchMessage) -> None:
+    def _on_watch(self, message: WatchMessage | None) -> None:
         """Keep the message with its creation time: the first one after connecting may be an old, retained one."""
-        kept_s = max(0.0, self._wall_clock() - message.unix_s) if self._watch is None else 0.0
-        self._watch = message, self._clock() - kept_s
+        if message is not None:
+            kept_s = max(0.0, self._wall_clock() - message.unix_s) if self._watch is None else 0.0
+            self._watch = message, self._clock() - kept_s
 
-    def _on_assets(self, message: AssetsMessage) -> None:
-        self._assets = message
+    def _on_assets(self, message: AssetsMessage | None) -> None:
+        self._assets = message or AssetsMessage(())
 
-    def _on_alarm(self, topic: str, payload: bytes) -> None:
-        if payload:
-            reader(AlarmMessage, partial(setitem, self._alarms, topic), self._on_wrong)(topic, payload)
+    def _on_alarm(self, message: AlarmMessage | None, channel: Channel) -> None:
+        if message is None:
+            self._alarms.pop(channel.name, None)
         else:
-            self._alarms.pop(topic, None)
+            self._alarms[channel.name] = message
 
     async def run(self, seconds: float | None, act: Callable[[], None]) -> None:
         """Stay connected for some time, evaluating the condition and then calling ``act`` about twice a second."""
@@ -213,6 +195,7 @@ class SiteView:
     def evaluate(self, lag_s: float = 0.0) -> None:
         """Update the condition as the page does. ``lag_s``: delay of this call."""
         now_s = self._clock()
+        self.table.tick(now_s)
         watch, made_s = self._watch or (None, now_s)
         used, unread_s, refused = self._used_share(now_s), self.link.unread_s, self.link.refused
         self.condition = self._monitor.evaluate(now_s, lag_s, watch, now_s - made_s, used, unread_s, refused)
@@ -220,8 +203,8 @@ class SiteView:
     def picture(self) -> Picture:
         """The site now."""
         now_s, site = self._clock(), self.site
-        tags, anchors = self.evidence.of("tag"), dict.fromkeys(self.evidence.site_anchors(), Node())
-        anchors |= dict(self.evidence.of("anchor"))
+        tags, anchors = self.table.of("tag"), {name: Node(name) for name in self.table.site_anchors()}
+        anchors |= dict(self.table.of("anchor"))
         drops: Counter[str] = Counter()
         for node in (*(node for _, node in tags), *anchors.values()):
             if node.reports(now_s) and isinstance(node.health, TagHealth | AnchorHealth):
@@ -240,21 +223,22 @@ class SiteView:
             ),
             alarms=tuple(sorted(self._alarms.values(), key=_alarm_rank)),
             drops={reason: count for reason, count in drops.most_common() if count and reason not in NOT_DROPS},
-            wrong_messages=self._wrong,
+            wrong_messages=self.feed.drops.total(),
         )
 
     def _tag_rows(self, tags: list[tuple[str, Node]], now_s: float) -> tuple[TagRow, ...]:
         rows = []
         assets = {} if self.site is None else assets_at(self._assets, self.site.site.name)
-        for tag, node in tags:
-            has_fix = self.evidence.connected and node.has_fix(now_s)
-            fix, ended_s = self._fixes.get(tag, (None, now_s))
-            health = node.health if node.reports(now_s) and isinstance(node.health, TagHealth) else None
-            state: Literal["fix", "no fix", "offline"] = "fix" if has_fix else "no fix"
-            state = "offline" if node.online is False else state
-            age_s = None if fix is None else now_s - ended_s
-            name = assets[tag].name if tag in assets else ""
-            rows.append(TagRow(tag, state, age_s, fix, health, name))
+        for name, tag in tags:
+            health = tag.health if tag.reports(now_s) and isinstance(tag.health, TagHealth) else None
+            state: TagState = "no fix"
+            if tag.online is False:
+                state = "offline"
+            elif tag.fix is not None and self.table.connected:
+                found = self.table.presence(tag, now_s)
+                state = "fix" if found == "fresh" else "asleep" if found == "asleep" else "no fix"
+            age_s = None if tag.fix is None else self._wall_clock() - tag.ended_unix_s
+            rows.append(TagRow(name, state, age_s, tag.fix, health, assets[name].name if name in assets else ""))
         return tuple(sorted(rows, key=_tag_rank))
 
 
@@ -263,7 +247,7 @@ def _anchor_row(name: str, node: Node, now_s: float) -> AnchorRow:
     state = "silent"
     if node.online is False:
         state = "offline"
-    elif health is None and now_s - node.used_s < FRESH_S:
+    elif health is None and now_s - node.used_s < THRESHOLDS.fresh_s:
         state = "used"
     elif health is not None and node.reports(now_s):
         state = health.role
@@ -272,7 +256,7 @@ def _anchor_row(name: str, node: Node, now_s: float) -> AnchorRow:
 
 def _tag_rank(row: TagRow) -> int:
     alert = None if row.fix is None else row.fix.alert
-    return {"no fix": 0, "fix": 3 - ALERTS.get(alert, 0), "offline": 4}[row.state]
+    return {"no fix": 0, "fix": 3 - ALERTS.get(alert, 0), "asleep": 4, "offline": 5}[row.state]
 
 
 def _alarm_rank(alarm: AlarmMessage) -> tuple[bool, int, float]:
@@ -389,10 +373,10 @@ def _tag(row: TagRow, errors_m: Mapping[str, float | None] | None) -> list[Text]
 def _anchor(row: AnchorRow) -> list[Text]:
     health, gone = row.health, row.state in GONE
     style = "dim" if gone else ""
-    old = row.age_s is not None and row.age_s > FRESH_S
+    old = row.age_s is not None and row.age_s > THRESHOLDS.fresh_s
     hears, missed = "–", "–"
     if health is not None:
-        hears = str(sum(heard_s < FRESH_S for heard_s in health.heard_age_s.values()))
+        hears = str(sum(heard_s < THRESHOLDS.fresh_s for heard_s in health.heard_age_s.values()))
         missed = f"{health.missed_share:.0%}"
     return [
         _text(row.anchor, style), _text(row.state, "bold red" if gone else ""), _text(hears, style),

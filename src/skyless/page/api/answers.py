@@ -11,10 +11,11 @@ from starlette.exceptions import HTTPException
 
 from skyless.core.site import AlarmRule
 from skyless.core.version import installed_version
-from skyless.page.condition.monitor import Condition
 from skyless.page.connections import JSON
 from skyless.page.events import SiteEvent
+from skyless.run.condition.monitor import Condition
 from skyless.run.mqtt.messages import AlarmRulesMessage, Asset, FixMessage, SiteMessage, Vector, Zone
+from skyless.run.site_table import Presence
 
 if TYPE_CHECKING:
     from skyless.page.api.routes import ApiRoute
@@ -54,10 +55,12 @@ class Tag(Asset, frozen=True, kw_only=True):
 
     online: bool | None
     """None if the tag has not reported."""
+    presence: Presence
+    """``fresh``; ``late``, when its newest fix is older than usual; ``asleep`` by its own statement; or ``gone``."""
     zones: tuple[str, ...]
     """Identifiers of the zones that contain the tag."""
     fix: FixMessage | None
-    """None without a usable fix within five seconds."""
+    """None without a fresh usable fix."""
 
 
 class TagsAnswer(Struct, frozen=True):

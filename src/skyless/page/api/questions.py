@@ -89,8 +89,8 @@ def anchors(live: LiveSite) -> tuple[Anchor, ...]:
 
 
 def _online(live: LiveSite, kind: str, name: str) -> bool | None:
-    status = live.state.statuses.get((kind, name))
-    return None if status is None else status.online
+    node = live.table.get(kind, name)
+    return None if node is None else node.online
 
 
 def tags(
@@ -115,7 +115,7 @@ def tags(
 
 
 def _names(live: LiveSite) -> set[str]:
-    return {name for kind, name in live.state.statuses if kind == "tag"}.union(live.state.tags)
+    return {name for name, tag in live.table.all("tag").items() if tag.status is not None or tag.fix is not None}
 
 
 def tag(live: LiveSite, *, tag: TagName) -> Tag:
@@ -131,6 +131,7 @@ def _tags(live: LiveSite, names: list[str]) -> tuple[Tag, ...]:
         Tag(
             **asdict(live.assets.by_tag.get(name, Asset(name))),
             online=_online(live, "tag", name),
+            presence=live.presence(name),
             zones=_zones(live, name),
             fix=fixes.get(name),
         )
@@ -154,7 +155,7 @@ def usable(given: Iterable[tuple[FixMessage, float]]) -> list[FixMessage]:
 
 def zones(live: LiveSite) -> tuple[ZoneTags, ...]:
     """Zones, and who is in them."""
-    inside = {name: _zones(live, name) for name in sorted(live.state.tags)}
+    inside = {name: _zones(live, name) for name in sorted(live.table.fixed)}
     return tuple(
         ZoneTags(**asdict(zone), tags=tuple(name for name, zones in inside.items() if zone.id in zones))
         for zone in live.monitor.zones

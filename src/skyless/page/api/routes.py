@@ -76,7 +76,7 @@ class SiteStream:
         return not (self._tags and self._tags.isdisjoint(tags))
 
     def _new_fixes(self) -> list[bytes]:
-        serial, self._fixes = self._fixes, self._live.state.serial
+        serial, self._fixes = self._fixes, self._live.table.fixes_serial
         if serial == self._fixes:
             return []
         fixes = usable(given for given in self._live.recent_fixes(after=serial) if self._carries(given[0].tag))

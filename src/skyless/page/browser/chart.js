@@ -1,7 +1,7 @@
 /** Charts over time: uPlot in the page's colours. */
 
 import uPlot from "./vendor/uplot/uPlot.esm.js";
-import { MAX_AGE_S, on } from "./store.js";
+import { on, state } from "./store.js";
 import { h, text } from "./dom.js";
 import { palette } from "./theme.js";
 import { DASH } from "./format.js";
@@ -46,7 +46,7 @@ export class Chart {
   show(data, window_s) {
     this.data = data;
     this.window = [-window_s, 0];
-    const isNow = (value, index) => value !== null && !Number.isNaN(value) && data[0][index] > -MAX_AGE_S;
+    const isNow = (value, index) => value !== null && !Number.isNaN(value) && data[0][index] > -state.thresholds.report_s;
     const last = data.slice(1).map((values) => values.findLast(isNow));
     const parts = last.map((value) => (value === undefined ? DASH : this.write(value)));
     const words =

@@ -1,14 +1,10 @@
 /** Time: the server's clock as estimated here, and the moment that the page shows. */
 
 import { state } from "./store.js";
-import { TIME, Tracks } from "./tracks.js";
+import { FRESH, GONE, SLEEP, TIME, Tracks } from "./tracks.js";
 
 /** Live positions are drawn with this delay, so that there is a state on either side for interpolation. */
 export const DELAY_S = 0.15;
-/** Without a fix for this long a tag is drawn grey. */
-export const GREY_S = 1.0;
-/** Without a fix for this long a tag is not drawn. */
-export const GONE_S = 10.0;
 
 export const live = new Tracks();
 export const replayed = new Tracks();
@@ -45,10 +41,12 @@ export function tracks() {
   return state.mode === "replay" ? replayed : live;
 }
 
-/** State of a tag: "fresh", "stale" (grey), "gone" (only in the list) or "never". */
+/** State of a tag, by the times that the server gives: "fresh", "asleep" or "late" (grey), "gone" (only in the list) or "never". */
 export function freshness(track, now = now_s(), shown = shown_s()) {
   const index = state.mode === "live" ? track.count - 1 : track.find(shown);
   if (index < 0) return "never";
   const age = Math.abs(now - track.value(index, TIME)); // a fix of later than now is of another clock
-  return age < GREY_S ? "fresh" : age < GONE_S ? "stale" : "gone";
+  if (age < track.value(index, FRESH)) return "fresh";
+  if (age < track.value(index, SLEEP)) return "asleep";
+  return age < track.value(index, GONE) ? "late" : "gone";
 }

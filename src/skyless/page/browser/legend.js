@@ -3,7 +3,7 @@
 import { changed, on, saveSetting, savedSetting, select, state } from "./store.js";
 import { byId, h, isPhone, offer, options, text, throttle, toast } from "./dom.js";
 import { allGroups, labelOf } from "./assets/model.js";
-import { DELAY_S, GONE_S, GREY_S, stillMotion, tracks } from "./clock.js";
+import { DELAY_S, stillMotion, tracks } from "./clock.js";
 import { length } from "./format.js";
 import { CONDITIONS, anchorMark, siteMode, wordsOf } from "./map/anchors.js";
 import { savePicture, savePositions } from "./map/export.js";
@@ -191,7 +191,7 @@ function note() {
     (stillMotion.matches
       ? "Positions are the last fixes, not interpolated. "
       : `Live positions are shown ${DELAY_S} s late, interpolated linearly between fixes, never extrapolated. `) +
-    `Without a fix, a tag is hollow and grey after ${GREY_S} s and only in the list after ${GONE_S} s.`;
+    "A tag whose fix is older than usual for it is hollow and grey; one that is silent for longer is only in the list.";
   const box = h("p", { class: "fine" }, words());
   stillMotion.addEventListener("change", () => text(box, words()));
   return box;

@@ -17,8 +17,6 @@ const CHECK_MS = 250;
 /** The connection is lost after this time without a message: while tags move, and otherwise (every ping is answered). */
 const MOVING_TIMEOUT_MS = 3000;
 const IDLE_TIMEOUT_MS = 9000;
-/** The server drops a tag, too, that it has received nothing of for so long. */
-const EXPIRY_S = 600;
 const MAX_EVENTS = 50;
 /** The server accepts no more names of each kind. */
 const MAX_NAMED = 200;
@@ -168,6 +166,7 @@ const handlers = {
     state.events = [...(message.events ?? [])].sort((a, b) => b.unix_s - a.unix_s);
     state.log = [];
     state.condition = null;
+    state.thresholds = message.thresholds;
     state.history = message.history === true;
     state.live2 = message.live2 === true;
     state.hub = message.hub === true;
@@ -224,11 +223,12 @@ const handlers = {
       if (whole) health.heardMs[kind].clear();
       for (const [name, age_s] of Object.entries(ages[kind] ?? {})) health.heardMs[kind].set(name, now - 1e3 * age_s);
     }
-    for (const id of health.anchors.keys()) if (healthAge_s("anchors", id) > EXPIRY_S) health.anchors.delete(id);
-    for (const name of health.tags.keys()) if (healthAge_s("tags", name) > EXPIRY_S) health.tags.delete(name);
+    const { forgotten_s } = state.thresholds;
+    for (const id of health.anchors.keys()) if (healthAge_s("anchors", id) > forgotten_s) health.anchors.delete(id);
+    for (const name of health.tags.keys()) if (healthAge_s("tags", name) > forgotten_s) health.tags.delete(name);
     const named = state.part ? waiting : [...health.tags.keys(), ...waiting];
     live.addNames(named);
-    live.expire(now_s() - EXPIRY_S, new Set(named));
+    live.expire(now_s() - forgotten_s, new Set(named));
     addHealth(anchors, tags, health.anchors, health.tags);
     changed("health");
   },

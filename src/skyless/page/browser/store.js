@@ -22,6 +22,8 @@ export const state = {
   /** @type {any} the site message's `site` */
   site: null,
   simulated: false,
+  /** The server's times from which views decide what is still there, see `run/site_table.py`. */
+  thresholds: { fresh_s: 0, gone_s: 0, report_s: 0, forgotten_s: 0 },
   /** Number of the live site, also while a recording is replayed. @type {number|null} */
   liveId: null,
   /** Whether the page's server is at a hub, which only reads; then this is one of several sites. */
@@ -133,8 +135,10 @@ function flush() {
   }
 }
 
-/** Health older than this is not of now, and whoever sent it is offline; programs report once a second. */
-export const MAX_AGE_S = 3.5;
+/** Whether the server has a recent health of a node. @param {"anchors"|"tags"|"ether"} kind */
+export function reports(kind, name) {
+  return healthAge_s(kind, name) < state.thresholds.report_s;
+}
 
 /**
  * Seconds since the server got the health of a node; Infinity without any.

@@ -1,6 +1,6 @@
 /** The site in a few figures, in the header: what is unknown, or old, is a dash. */
 
-import { MAX_AGE_S, healthAge_s, on, state } from "./store.js";
+import { on, reports, state } from "./store.js";
 import { byId, h, text } from "./dom.js";
 import { freshCondition } from "./condition.js";
 import { freshness, now_s, shown_s, tracks } from "./clock.js";
@@ -72,7 +72,7 @@ export function summaryFacts() {
 }
 
 function liveFacts(lost) {
-  const healths = lost ? [] : [...state.health.tags.values()].filter(({ tag }) => healthAge_s("tags", tag) < MAX_AGE_S);
+  const healths = lost ? [] : [...state.health.tags.values()].filter(({ tag }) => reports("tags", tag));
   const { latency_p50_s, latency_p99_s } = (!lost && freshCondition()) || {};
   const known = latency_p50_s !== null && latency_p50_s !== undefined;
   const anchors = [...(state.site?.anchors ?? []), ...(state.site?.unplaced ?? [])];

@@ -7,11 +7,12 @@ const GAP_S = 1.0;
 /** A state older than the last by more than this comes after the server's clock was set back. */
 const SET_BACK_S = 5;
 
-export const COLUMNS = 21;
+export const COLUMNS = 24;
 /**
  * Columns of a track: the fields of a `state` message's row after the tag's name, in the order of the wire.
  * `HEIGHT_GIVEN` is 1 where z was given and not estimated; `STD_Z` is NaN there. `VERIFIED_AGE` is how long before the
  * fix its last verified beacon was, `UNVERIFIED` the share of others in the last second; NaN where none is verified.
+ * For how many seconds the fix is fresh, the tag sleeps, and until it is gone: `FRESH`, `SLEEP` and `GONE`.
  */
 export const [
   X,
@@ -35,6 +36,9 @@ export const [
   STD_Z,
   VERIFIED_AGE,
   UNVERIFIED,
+  FRESH,
+  SLEEP,
+  GONE,
 ] = Array(COLUMNS).keys();
 
 /** Integrity alerts by their names on the wire; a track holds their index. */

@@ -181,6 +181,10 @@ class TagHealth(Struct, frozen=True):
     """Whether the tag's board computes the fixes, and its program only passes them on."""
     battery_share: float | None = None
     """Remaining charge of the tag's battery, from 0 to 1; None if unknown."""
+    interval_s: float | None = None
+    """Usual time between its fixes, where it knows that it is longer than a second."""
+    sleeps_s: float | None = None
+    """For how long from now it sends no fixes, as it is going to sleep; None while it is awake."""
 
 
 NOT_DROPS: Final = frozenset({"heard", "sent", "takeover"})

@@ -8,7 +8,6 @@ from os import PathLike
 from pathlib import Path
 from typing import IO, Final, cast
 
-import msgspec
 from mcap.writer import CompressionType, Writer
 from msgspec import Struct
 
@@ -17,17 +16,9 @@ from skyless.core.site import GeoreferenceSite
 from skyless.core.version import installed_version
 from skyless.files import Drops
 from skyless.run.foxglove import SCENE_TOPIC, ellipse, foxglove_schema, location_fix, pose_in_frame, scene, schema_of
-from skyless.run.mqtt.messages import FixMessage, SiteMessage
-from skyless.run.recordings.recording import (
-    FLOOR_PLAN,
-    JSON,
-    JSON_SCHEMA,
-    NS,
-    PROFILE,
-    RETAINED_KINDS,
-    channel_of,
-    decoder_of,
-)
+from skyless.run.mqtt.messages import FixMessage, SiteMessage, WrongMessageError
+from skyless.run.recordings.recording import FLOOR_PLAN, JSON, JSON_SCHEMA, NS, PROFILE
+from skyless.run.site_feed import channel_of, decoder_of
 
 # An MCAP file being written, valid after every flush. Chunks are compressed (zstd); a killed program loses what came
 # after the last flush. A full disk ends the recording: the file is cut back to its last complete chunk.
@@ -208,16 +199,18 @@ class McapRecorder:
             self.drops["too-many-topics"] += 1
             return None
         self._topics.add(topic)
-        if channel.kind in RETAINED_KINDS:
+        if channel.of is not None and channel.of.retained:
             self._last[topic] = payload
         log_ns = round(unix_s * NS)
         if channel.payload is None:
             media_type = "image/png" if payload.startswith(b"\x89PNG") else "image/jpeg"
-            self.file.attach(FLOOR_PLAN, media_type, payload, log_ns)
+            self.file.attach(
+                f"{FLOOR_PLAN}/{channel.name}" if channel.name else FLOOR_PLAN, media_type, payload, log_ns
+            )
             return None
         try:
-            message = decoder_of(channel.payload).decode(payload)
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+            message = decoder_of(channel.payload)(payload)
+        except WrongMessageError:
             self.drops["malformed-message"] += 1
             return None
         self.kinds[channel.kind] += 1

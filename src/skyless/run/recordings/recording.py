@@ -8,14 +8,12 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from functools import lru_cache
 from io import BufferedReader
 from os import PathLike
 from pathlib import Path
 from typing import Final, Generic, TypeVar, cast
 
 import lz4.frame
-import msgspec
 import zstandard
 from msgspec import Struct
 
@@ -23,74 +21,22 @@ from skyless.core.air.frame import Reception
 from skyless.core.errors import ConfigurationError
 from skyless.core.ticks import TICK_S, Unwrapper
 from skyless.files import Drops
-from skyless.run.mqtt import messages
-from skyless.run.mqtt.messages import FixMessage, ReceptionsMessage, SiteMessage, TruthMessage, ZonesMessage
-from skyless.run.mqtt.topics import ROOT
+from skyless.run.mqtt.messages import (
+    FixMessage,
+    ReceptionsMessage,
+    SiteMessage,
+    TruthMessage,
+    WrongMessageError,
+    ZonesMessage,
+)
+from skyless.run.site_feed import Channel, channel_of, decoder_of
 
 PROFILE: Final = "skyless"
 JSON: Final = "json"
 JSON_SCHEMA: Final = "jsonschema"
 
-_SITE_WIDE: Final[dict[str, type[Struct]]] = {
-    "site": messages.SiteMessage,
-    "request": messages.RequestMessage,
-    "truth": messages.TruthMessage,
-    "zones": messages.ZonesMessage,
-    "survey/watch": messages.WatchMessage,
-}
-_HEALTH: Final[dict[str, type[Struct]]] = {
-    "tag": messages.TagHealth,
-    "anchor": messages.AnchorHealth,
-    "ether": messages.EtherHealth,
-}
-_OF_A_NODE: Final[dict[str, type[Struct]]] = {
-    "fix": messages.FixMessage,
-    "receptions": messages.ReceptionsMessage,
-    "stamps": messages.StampsMessage,
-    "status": messages.StatusMessage,
-    "event": messages.ZoneEvent,
-}
 FLOOR_PLAN: Final = "floor_plan"
 """An image, which has no schema and is kept as an attachment."""
-
-RETAINED_KINDS: Final = frozenset({"site", "zones", "status", "watch", FLOOR_PLAN})
-"""Kinds of retained messages, of which repetitions are not recorded."""
-
-
-class Channel(Struct, frozen=True):
-    """Meaning of a topic."""
-
-    site: str
-    kind: str
-    """``fix``, ``receptions``, ``stamps``, ``status``, ``health``, ``event``, ``site``, ``zones``, ``watch`` ..."""
-    name: str = ""
-    """Name of the tag, anchor or zone."""
-    payload: type[Struct] | None = None
-
-
-@lru_cache(maxsize=10_000)
-def channel_of(topic: str) -> Channel | None:
-    """Parse a topic; None if it is not one of version 1."""
-    if not topic.startswith(f"{ROOT}/"):
-        return None
-    site, _, rest = topic.removeprefix(f"{ROOT}/").partition("/")
-    if rest in _SITE_WIDE:
-        return Channel(site, rest.rpartition("/")[2], "", _SITE_WIDE[rest])
-    match rest.split("/"):
-        case ["floor_plan"]:
-            return Channel(site, FLOOR_PLAN)
-        case [who, name, "health"] if who in _HEALTH:
-            return Channel(site, "health", name, _HEALTH[who])
-        case [_, name, kind] if kind in _OF_A_NODE:
-            return Channel(site, kind, name, _OF_A_NODE[kind])
-    return None
-
-
-@lru_cache(maxsize=64)
-def decoder_of(payload: type[Struct]) -> msgspec.json.Decoder[Struct]:
-    """JSON decoder of a payload's type."""
-    return msgspec.json.Decoder(payload)
-
 
 # Chunks of an MCAP file (https://mcap.dev/spec), found by walking over its records; neither index nor end is needed.
 # A file that was cut off, or is being written, yields all its complete chunks.
@@ -453,8 +399,8 @@ class McapRecording:
             if channel is None or channel.payload is None or channel.kind not in kinds or not from_s <= time_s < to_s:
                 continue
             try:
-                message = decoder_of(channel.payload).decode(payload)
-            except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+                message = decoder_of(channel.payload)(payload)
+            except WrongMessageError:
                 self.drops["malformed-message"] += 1
                 continue
             yield Recorded(time_s, channel, topic, message)

@@ -56,7 +56,7 @@ function show() {
 function describe() {
   if (followed === null) return;
   const track = tracks().all.get(followed);
-  const gone = !track || !["fresh", "stale"].includes(freshness(track));
+  const gone = !track || !["fresh", "late", "asleep"].includes(freshness(track));
   text(byId("following-words"), gone ? `Following ${shownName(followed)}: no fix` : `Following ${shownName(followed)}`);
 }
 

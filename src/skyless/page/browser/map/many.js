@@ -6,7 +6,7 @@
  */
 
 import { changed, select, state } from "../store.js";
-import { GONE_S, GREY_S, now_s } from "../clock.js";
+import { now_s } from "../clock.js";
 import { palette } from "../theme.js";
 import { colourAt, paintGrid } from "../pictures.js";
 import { drawPicture } from "./floor.js";
@@ -110,14 +110,14 @@ function drawPoints(context, { words, box: [x0, y0, x1, y1] }) {
   const [across, up] = [(ratio * toX(x1, y1) - left) / 65535, (ratio * toY(x1, y1) - low) / 65535];
   const side = Math.max(2, Math.round(SIDE * ratio));
   const [fresh, old, bad] = [palette.accent, palette.muted, palette.bad].map(pixelOf);
-  const [grey, gone] = [10 * GREY_S, 10 * GONE_S];
+  const grey = 10 * state.thresholds.fresh_s;
   for (let at = 0; at < words.length; at += 3) {
     const place = words[at + 1];
     const age = (words[at + 2] >>> 16) & 255;
     const alert = words[at + 2] >>> 24;
     const x = (left + across * (place & 65535) - side / 2) | 0;
     const y = (low + up * (place >>> 16) - side / 2) | 0;
-    if (age >= gone || x < 0 || y < 0 || x + side > width || y + side > height) continue;
+    if (x < 0 || y < 0 || x + side > width || y + side > height) continue;
     const colour = age >= grey ? old : alert === NOT_EXCLUDED || alert === OVER_LIMIT ? bad : fresh;
     for (let row = y * width + x, end = row + side * width; row < end; row += width) {
       for (let column = 0; column < side; column++) pixels[row + column] = colour;

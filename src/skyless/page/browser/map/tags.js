@@ -1,6 +1,6 @@
 /** Tags on the map: ellipses, protection levels, true positions, marks and names. */
 
-import { GONE_S, freshness, now_s, shown_s, stillMotion, tracks } from "../clock.js";
+import { freshness, now_s, shown_s, stillMotion, tracks } from "../clock.js";
 import { faint, palette } from "../theme.js";
 import { state } from "../store.js";
 import { alarmedTags } from "../alarms/model.js";
@@ -48,7 +48,7 @@ export function visibleTags() {
     if (!track.at(shown, row, !stillMotion.matches)) return;
     if (state.mode === "live") {
       moving ||= track.lastTime > shown;
-      ageing ||= now - track.lastTime < GONE_S + 1;
+      ageing = true;
     }
     const [x, y] = [toX(row[X], row[Y]), toY(row[X], row[Y], row[Z])];
     if (!isSeen(x, y, MARGIN) && !selected && track.name !== state.followed) return;

@@ -1,9 +1,9 @@
 /** All tags as a list; the selected one in detail, with its last minute as charts. */
 
-import { MAX_AGE_S, changed, healthAge_s, state } from "../store.js";
+import { changed, reports, state } from "../store.js";
 import { editAssets } from "../assets/editor.js";
 import { allGroups, labelOf, shownName } from "../assets/model.js";
-import { GONE_S, GREY_S, freshness, now_s, shown_s, tracks } from "../clock.js";
+import { freshness, now_s, shown_s, tracks } from "../clock.js";
 import { Chart } from "../chart.js";
 import { h, offer, options, text } from "../dom.js";
 import { DASH, bytes, duration, length, metres, number } from "../format.js";
@@ -40,11 +40,12 @@ export const topics = ["tags", "health", "selection", "mode", "player", "theme",
 export const interval_ms = 300;
 export const changesWithTime = true;
 
-const MARKS = { fresh: "●", stale: "○", gone: "✕", never: "–" };
+const MARKS = { fresh: "●", late: "○", asleep: "☾", gone: "✕", never: "–" };
 const WORDS = {
   fresh: "has a fix",
-  stale: `no fix for ${GREY_S} s`,
-  gone: `no fix for ${GONE_S} s`,
+  late: "its fix is older than usual",
+  asleep: "asleep",
+  gone: "gone",
   never: "no fix yet",
 };
 /** The columns after the name, and what they mean. */
@@ -155,8 +156,7 @@ function stateOf(track) {
 function describe(name, { track, style: look }) {
   const condition = freshness(track);
   stateOf(track);
-  const reports = state.mode === "live" && healthAge_s("tags", name) < MAX_AGE_S;
-  const health = reports ? state.health.tags.get(name) : null;
+  const health = state.mode === "live" && reports("tags", name) ? state.health.tags.get(name) : null;
   const alert = Object.values(ALERTS)[row[ALERT]];
   const unverified = isUnverified(health);
   return {
@@ -256,8 +256,7 @@ function makeDetail() {
   const showDetail = (track) => {
     element.hidden = !track;
     if (!track) return;
-    const reports = state.mode === "live" && healthAge_s("tags", track.name) < MAX_AGE_S;
-    const health = reports ? state.health.tags.get(track.name) : null;
+    const health = state.mode === "live" && reports("tags", track.name) ? state.health.tags.get(track.name) : null;
     text(heading, labelOf(track.name));
     edit.hidden = state.mode !== "live";
     reason.hidden = !health?.reason;

@@ -1,6 +1,6 @@
 /** The superframe, and when each tag processed its messages: the paper's oscilloscope picture, from the tags' health. */
 
-import { MAX_AGE_S, healthAge_s, state } from "../store.js";
+import { healthAge_s, reports, state } from "../store.js";
 import { byId, h, s, text } from "../dom.js";
 import { duration, number, roundStep } from "../format.js";
 import { siteMode } from "../map/anchors.js";
@@ -40,7 +40,7 @@ export function start(panel) {
 
 /** Bring the tab up to date. */
 export function show() {
-  const reporting = [...state.health.tags.values()].filter(({ tag }) => healthAge_s("tags", tag) < MAX_AGE_S);
+  const reporting = [...state.health.tags.values()].filter(({ tag }) => reports("tags", tag));
   const all = state.mode === "live" ? reporting.filter(({ phases }) => phases?.length).map(read) : [];
   all.sort((a, b) => a.tag.localeCompare(b.tag, "en", { numeric: true }));
   const chosen = all.filter((health) => health.tag === state.selection.tag);
@@ -140,7 +140,7 @@ function trace(health, top, at, end_s) {
 
 function showEther() {
   const age = Math.min(...[...state.health.heardMs.ether.keys()].map((name) => healthAge_s("ether", name)));
-  const ether = state.mode === "live" && age < MAX_AGE_S ? state.health.ether : null;
+  const ether = state.mode === "live" && age < state.thresholds.report_s ? state.health.ether : null;
   parts.etherBox.hidden = !ether;
   if (!ether) return;
   parts.ether.show({

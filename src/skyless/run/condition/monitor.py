@@ -11,7 +11,7 @@ from typing import Final, Literal
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.page.condition._reasons import (
+from skyless.run.condition._reasons import (
     LAG_S,
     Reason,
     alert_reasons,
@@ -31,8 +31,9 @@ from skyless.page.condition._reasons import (
     slow_reason,
     watch_reasons,
 )
-from skyless.page.condition.evidence import FRESH_S, Evidence
+from skyless.run.condition.evidence import Evidence
 from skyless.run.mqtt.messages import WatchMessage
+from skyless.run.site_table import THRESHOLDS
 
 __all__ = ["Condition", "ConditionMonitor", "offline_anchors"]
 
@@ -89,9 +90,9 @@ class ConditionMonitor:
         evidence = self.evidence
         ages = evidence.ages.least_ages_s()
         latencies = evidence.ages.percentiles_s(now_s)
-        if not evidence.connected:
+        if not evidence.table.connected:
             self._held.clear()
-            if not evidence.was_connected and now_s - evidence.ready_s < FRESH_S:
+            if not evidence.table.was_connected and now_s - evidence.table.ready_s < THRESHOLDS.fresh_s:
                 awaited = "the broker" if evidence.hub_trouble is None else "the site at its hub"
                 return Condition("waiting", f"waiting for {awaited}", (), None, None)
             reason = broker_reason(evidence.hub_trouble)
@@ -101,7 +102,7 @@ class ConditionMonitor:
             refused_reason(refused),
             behind,
             slow_reason(evidence, now_s, lag_s),
-            busy_reason(evidence, used_share) if evidence.nodes else None,
+            None if evidence.table.is_empty else busy_reason(evidence, used_share),
             late_reason(evidence, ages) if behind is None else None,
             left_out_reason(evidence, now_s),
             master_reason(evidence, now_s),
@@ -112,17 +113,17 @@ class ConditionMonitor:
         ]
         if lag_s > LAG_S or behind is not None:
             self._blind_until_s = now_s + 2 * EVALUATION_S  # until messages that arrived meanwhile have been read
-        if not self.is_blind(now_s) and not evidence.is_bare:
+        if not self.is_blind(now_s) and not evidence.table.is_bare:
             found += [*fix_reasons(evidence, now_s), *anchor_reasons(evidence, now_s)]
         for reason in filter(None, found):
             self._hold(reason, now_s)
         self._held = {kind: held for kind, held in self._held.items() if now_s - held[0] < HOLD_S}
         evidence.alerts.clear()
         reasons = tuple(sorted((reason for _, reason in self._held.values()), key=rank))
-        tags, batched_s = evidence.of("tag"), evidence.batched_s
-        with_fix = sum(tag.has_fix(now_s) for _, tag in tags)
-        with_fix += sum(now_s - fix_s < FRESH_S for fix_s in batched_s.values())
-        figures = *latencies, len(tags) + len(batched_s), with_fix, evidence.roster.size("anchor")
+        tags, batched = evidence.table.of("tag"), evidence.table.batched
+        with_fix = sum(evidence.has_fix(tag, now_s) for _, tag in tags)
+        with_fix += sum(not tag.is_gone for tag in batched.values())
+        figures = *latencies, len(tags) + len(batched), with_fix, evidence.table.roster.size("anchor")
         if reasons:
             return Condition(reasons[0].level, reasons[0].text, reasons, *figures)
         if with_fix:
@@ -131,7 +132,7 @@ class ConditionMonitor:
 
     def is_blind(self, now_s: float) -> bool:
         """Whether messages may be missing: the broker is not connected, or the server itself was delayed."""
-        return not (self.evidence.connected and self.evidence.batches_connected) or now_s < self._blind_until_s
+        return not self.evidence.table.hears or now_s < self._blind_until_s
 
     def _hold(self, reason: Reason, now_s: float) -> None:
         if reason.level == "bad":
@@ -141,10 +142,10 @@ class ConditionMonitor:
         self._held[reason.kind] = now_s, reason
 
     def _awaited(self) -> str:
-        if self.evidence.site is None:
+        if self.evidence.table.site is None:
             return "waiting for the site's anchors"
-        if self.evidence.is_bare:
+        if self.evidence.table.is_bare:
             return "not set up yet: tab Set up"
-        if not self.evidence.batched_s and not any(tag.online for _, tag in self.evidence.of("tag")):
+        if not self.evidence.table.batched and not any(tag.online for _, tag in self.evidence.table.of("tag")):
             return "no tag is online"
         return "waiting for the first position"

@@ -7,8 +7,9 @@ from typing import Final, Literal
 from msgspec import Struct
 
 from skyless.core.keys.fault import Fault
-from skyless.page.condition.evidence import ALERT_WORDS, ALERTS, FRESH_S, GRACE_S, MAX_NAMES, Evidence, Node
+from skyless.run.condition.evidence import ALERT_WORDS, ALERTS, Evidence
 from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, TagHealth, WatchMessage
+from skyless.run.site_table import MAX_NAMES, THRESHOLDS, Node
 
 LATE_S: Final = 0.25
 VERY_LATE_S: Final = 1.0
@@ -44,9 +45,6 @@ START_S: Final = 20.0
 OFTEN: Final = 3
 OFTEN_S: Final = 60.0
 """Changes of the master within this time that are too many."""
-
-WATCH_AGE_S: Final = 60.0
-"""A watch that has not reported for longer is not running."""
 
 UNREAD_S: Final = 0.5
 """The page's server does not keep up if messages have waited unread for this long."""
@@ -145,21 +143,22 @@ def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> 
     worst = max(late, key=lambda name: ages[name][0])
     age_s, made_s = ages[worst]
     whose = "positions" if len(late) == len(ages) else f"positions of {listed('tag', late)}"
-    host = evidence.nodes["tag", worst].host if ("tag", worst) in evidence.nodes else ""
+    tag = evidence.table.tag(worst)
+    host = "" if tag is None else tag.host
     if made_s > 0.5 * age_s:
         why = f"{evidence.computer(host)} does not keep up with the receptions"
         advice = "End other programs there, or move tags to another computer."
     else:
         why = "the broker or the network delivers late"
         advice = "See whether the broker's computer or the network is busy."
-        if host not in {"", evidence.host}:
+        if host not in {"", evidence.table.host}:
             advice += f" Measured against the quickest message from {host} in the last minutes, not by its clock."
     text = f"{whose} are {age_s:.1f} s behind: {why}"
     return _of("tag", "late", "bad" if age_s > VERY_LATE_S else "warning", text, advice, late)
 
 
 def _key_wait_s(evidence: Evidence, tag: str) -> float:
-    node = evidence.nodes.get(("tag", tag))
+    node = evidence.table.get("tag", tag)
     health = None if node is None else node.health
     return KEY_WAIT_S if isinstance(health, TagHealth) and health.trust is not None else 0.0
 
@@ -168,7 +167,7 @@ def slow_reason(evidence: Evidence, now_s: float, lag_s: float) -> Reason | None
     """Computers do not keep up: one reason for all signs. ``lag_s``: delay of the page's server."""
     signs = [*_missed(evidence, now_s), *_dropped(evidence, now_s)]
     if lag_s > LAG_S:
-        signs.insert(0, (evidence.host, 0.0, f"the page's server was delayed by {lag_s:.1f} s"))
+        signs.insert(0, (evidence.table.host, 0.0, f"the page's server was delayed by {lag_s:.1f} s"))
     if not signs:
         return None
     computers: dict[str, list[str]] = {}
@@ -192,7 +191,7 @@ def behind_reason(ages: Mapping[str, tuple[float, float]], unread_s: float) -> R
 
 def left_out_reason(evidence: Evidence, now_s: float) -> Reason | None:
     """Tags or anchors are not shown, as there are too many."""
-    counts = {kind: evidence.roster.left_out(kind, now_s) for kind in MAX_NAMES}
+    counts = {kind: evidence.table.roster.left_out(kind, now_s) for kind in MAX_NAMES}
     words = [f"{count} {kind}{'s' if count > 1 else ''}" for kind, count in counts.items() if count]
     if not words:
         return None
@@ -208,7 +207,8 @@ def busy_reason(evidence: Evidence, used_share: float | None) -> Reason | None:
     """All processors of the page's computer are in use, by any program. An emulated air reports its own misses."""
     if used_share is None or used_share < BUSY_SHARE or _airs(evidence):
         return None
-    text = f"{evidence.computer(evidence.host)} is fully busy: {100.0 * used_share:.0f} % of its processors are in use"
+    computer = evidence.computer(evidence.table.host)
+    text = f"{computer} is fully busy: {100.0 * used_share:.0f} % of its processors are in use"
     return Reason("busy", "warning", text, "End other programs there, or positions may come late or not at all.")
 
 
@@ -217,7 +217,7 @@ _Sign = tuple[str, float, str]  # computer, lost share, and words
 
 def _airs(evidence: Evidence) -> list[Node]:
     """Running emulated airs."""
-    return [air for _, air in evidence.of("ether") if air.online is not False]
+    return [air for _, air in evidence.table.of("ether") if air.online is not False]
 
 
 def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
@@ -229,7 +229,7 @@ def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
             share = air.health.missed_share
             yield air.host, share, f"the emulated air missed {100.0 * share:.0f} % of the transmissions"
     shares: dict[str, dict[str, float]] = {}
-    for name, anchor in evidence.of("anchor"):
+    for name, anchor in evidence.table.of("anchor"):
         share = anchor.health.missed_share if isinstance(anchor.health, AnchorHealth) else 0.0
         if anchor.reports(now_s) and share > most:
             shares.setdefault(anchor.host, {})[name] = share
@@ -241,7 +241,7 @@ def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
 def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
     """Receptions and fixes that tags dropped as too old between their last two health messages."""
     found: dict[str, list[tuple[str, int, float]]] = {}
-    for name, tag in evidence.of("tag"):
+    for name, tag in evidence.table.of("tag"):
         now, before = tag.health, tag.previous
         if not (tag.reports(now_s) and isinstance(now, TagHealth) and isinstance(before, TagHealth)):
             continue
@@ -257,8 +257,10 @@ def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
 
 def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     """Tags are online without a fix, with the cause that they state, or without a report."""
-    online = [(name, tag) for name, tag in evidence.of("tag") if tag.online]
-    without = [(n, tag) for n, tag in online if not tag.has_fix(now_s) and not evidence.in_grace(now_s, tag)]
+    online = [(name, tag) for name, tag in evidence.table.of("tag") if tag.online]
+    without = [
+        (n, tag) for n, tag in online if not evidence.has_fix(tag, now_s) and not evidence.table.in_grace(now_s, tag)
+    ]
     missed = evidence.missed(now_s)
     names = [*(name for name, _ in without), *missed]
     if not names:
@@ -266,7 +268,7 @@ def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     silent = [*(name for name, tag in without if not tag.reports(now_s)), *missed]
     healths = {name: tag.health for name, tag in without if tag.reports(now_s)}
     causes = {name: health.reason or "" for name, health in healths.items() if isinstance(health, TagHealth)}
-    if len(names) == len(online) + len(evidence.batched_s):
+    if len(names) == len(online) + len(evidence.table.batched):
         though = "a tag is online" if len(names) == 1 else f"{len(names)} tags are online"
         why, advice = _causes(causes, len(names))
         if not causes:
@@ -321,9 +323,9 @@ def alert_reasons(evidence: Evidence) -> Iterable[Reason]:
 
 def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     """Anchors of the site are offline, only cut off from the broker, or not synchronised."""
-    if evidence.site is None:
+    if evidence.table.site is None:
         return
-    names = evidence.site_anchors()
+    names = evidence.table.site_anchors()
     offline, cut_off, idle = _anchors(evidence, now_s)
     if offline:
         which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
@@ -344,42 +346,42 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
 
 def offline_anchors(evidence: Evidence, now_s: float) -> list[str] | None:
     """Anchors of the site that are offline; None while it is too early to tell."""
-    return None if evidence.site is None or evidence.in_grace(now_s) else _anchors(evidence, now_s)[0]
+    return None if evidence.table.site is None or evidence.table.in_grace(now_s) else _anchors(evidence, now_s)[0]
 
 
 def _anchors(evidence: Evidence, now_s: float) -> tuple[list[str], list[str], list[str]]:
     """Anchors of the site that are offline, those only cut off from the broker, and those not synchronised."""
-    names = evidence.site_anchors()
+    names = evidence.table.site_anchors()
     offline: list[str] = []
     cut_off: list[str] = []
     idle: list[str] = []
     for name in names:
-        node = evidence.nodes.get(("anchor", name))
+        node = evidence.table.get("anchor", name)
         if node is not None and node.reports(now_s):
             health = node.health
             if isinstance(health, AnchorHealth) and _is_idle(health):
                 idle.append(name)
         elif node is None or node.online is not False:
-            on_air = node is not None and now_s - node.used_s < FRESH_S
-            if not evidence.in_grace(now_s, node):
+            on_air = node is not None and now_s - node.used_s < THRESHOLDS.fresh_s
+            if not evidence.table.in_grace(now_s, node):
                 (cut_off if on_air else offline).append(name)
-        elif node.since_s is not None or not evidence.in_grace(now_s):  # else an old status, kept by the broker
+        elif node.since_s is not None or not evidence.table.in_grace(now_s):  # else an old status, kept by the broker
             offline.append(name)
-    unseen = len(offline) == len(names) and all(node.since_s is None for _, node in evidence.of("anchor"))
-    return [] if unseen and now_s - evidence.ready_s < START_S else offline, cut_off, idle
+    unseen = len(offline) == len(names) and all(node.since_s is None for _, node in evidence.table.of("anchor"))
+    return [] if unseen and now_s - evidence.table.ready_s < START_S else offline, cut_off, idle
 
 
 def _is_idle(health: AnchorHealth) -> bool:
-    return not health.synchronised and health.role not in {"master", "root"} and health.uptime_s > GRACE_S
+    return not health.synchronised and health.role not in {"master", "root"} and health.uptime_s > THRESHOLDS.grace_s
 
 
 def multipath_reason(evidence: Evidence, now_s: float) -> Reason | None:
     """Ranges change more along a tag's path than the site file states."""
-    site = evidence.site
+    site = evidence.table.site
     stated_m = 0.0 if site is None else site.accuracy.place_std_m
     found = {
         name: (tag.health.multipath_std_m, tag.health.multipath_distance_m or 0.0)
-        for name, tag in evidence.of("tag")
+        for name, tag in evidence.table.of("tag")
         if tag.reports(now_s) and isinstance(tag.health, TagHealth) and tag.health.multipath_std_m is not None
     }
     more = [name for name, (std_m, _) in found.items() if std_m > MULTIPATH_RATIO * stated_m]
@@ -409,7 +411,7 @@ def master_reason(evidence: Evidence, now_s: float) -> Reason | None:
 
 def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[Reason]:
     """The watch of the anchors has findings."""
-    ended = (age_s or 0.0) > WATCH_AGE_S
+    ended = (age_s or 0.0) > THRESHOLDS.watch_s
     findings = () if watch is None else watch.findings
     moved = [finding for finding in findings if finding.kind == "moved"]
     other = [finding for finding in findings if finding.kind != "moved"]
@@ -430,12 +432,12 @@ def authentication_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]
     """All reasons about codes and keys."""
     tags = {
         name: node.health
-        for name, node in evidence.of("tag")
+        for name, node in evidence.table.of("tag")
         if node.reports(now_s) and isinstance(node.health, TagHealth) and node.health.trust is not None
     }
     anchors = {
         name: node.health
-        for name, node in evidence.of("anchor")
+        for name, node in evidence.table.of("anchor")
         if node.reports(now_s) and isinstance(node.health, AnchorHealth)
     }
     keyed = {name: health for name, health in anchors.items() if _has_keys(health)}
@@ -477,7 +479,9 @@ def _not_verified(evidence: Evidence, tags: Mapping[str, TagHealth], now_s: floa
     found = {
         name: health
         for name, health in tags.items()
-        if not health.is_verified and health.clock_error_s is None and _receives(evidence.nodes["tag", name], now_s)
+        if not health.is_verified
+        and health.clock_error_s is None
+        and _receives(evidence.table.known("tag", name), now_s)
     }
     if not found:
         return
@@ -496,7 +500,7 @@ def _receives(tag: Node, now_s: float) -> bool:
     now, before = tag.health, tag.previous
     if not isinstance(now, TagHealth) or not isinstance(before, TagHealth) or tag.since_s is None:
         return False
-    return now_s - tag.since_s > GRACE_S and now.receptions > before.receptions
+    return now_s - tag.since_s > THRESHOLDS.grace_s and now.receptions > before.receptions
 
 
 def _chains(keyed: Mapping[str, AnchorHealth]) -> Iterable[Reason]:
@@ -527,7 +531,7 @@ def _codes(evidence: Evidence, keyed: Mapping[str, AnchorHealth], now_s: float) 
         for name, health in keyed.items()
         if health.code_fault is not None
         and _left_s(health) > 0.0
-        and not evidence.in_grace(now_s, evidence.nodes["anchor", name])
+        and not evidence.table.in_grace(now_s, evidence.table.known("anchor", name))
     }
     if not without:
         return
@@ -544,7 +548,9 @@ def _keys(
 ) -> Iterable[Reason]:
     """Anchors have no keys although others have them."""
     without = [
-        name for name in anchors if name not in keyed and not evidence.in_grace(now_s, evidence.nodes["anchor", name])
+        name
+        for name in anchors
+        if name not in keyed and not evidence.table.in_grace(now_s, evidence.table.known("anchor", name))
     ]
     if keyed and without:
         others = f"{len(keyed)} other{verb(keyed, ' has', 's have')}"
@@ -569,8 +575,8 @@ def _forged(
     advice = "Tags that verify beacons do not use these. See that anchor's log and keys, and who else transmits there."
     without_key = [
         name
-        for name, node in evidence.of("tag")
-        if node.has_fix(now_s) and isinstance(node.health, TagHealth) and node.health.trust is None
+        for name, node in evidence.table.of("tag")
+        if evidence.has_fix(node, now_s) and isinstance(node.health, TagHealth) and node.health.trust is None
     ]
     level: _Severity = "warning"
     if without_key and not _FORGED.isdisjoint(faults.values()):
@@ -603,11 +609,11 @@ def _statements(
 
 def _may_be_without_codes(evidence: Evidence, anchor: str, now_s: float) -> bool:
     """Whether an anchor has recently stated that it sends without codes, or has just started."""
-    node = evidence.nodes.get(("anchor", anchor))
+    node = evidence.table.get("anchor", anchor)
     if node is None:
         return False
-    is_recent = now_s - node.health_s < GRACE_S
-    return evidence.in_grace(now_s, node) or (is_recent and node.codes_for_s(now_s) < GRACE_S)
+    is_recent = now_s - node.health_s < THRESHOLDS.grace_s
+    return evidence.table.in_grace(now_s, node) or (is_recent and node.codes_for_s(now_s) < THRESHOLDS.grace_s)
 
 
 def _that_count(statements: _Statements) -> _Statements:

@@ -1,0 +1,227 @@
+"""What a site says, as typed values, whatever brings it: a broker, a hub's streams, or a recording.
+
+A reader names the messages it wants and a function for each. A feed decodes and checks a message once, and counts those
+that are dropped. Connections are restored by what a feed is attached to (``Link``, ``HubLink``); a feed that says
+nothing is silent, and only a ``SiteTable`` can tell what that means.
+"""
+
+import logging
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable
+from functools import lru_cache
+from typing import Any, Final, Protocol
+
+import msgspec
+from msgspec import Struct
+
+from skyless.core.errors import ConfigurationError
+from skyless.run.assets import read_assets
+from skyless.run.mqtt import messages
+from skyless.run.mqtt.link import Handler
+from skyless.run.mqtt.messages import WrongMessageError
+from skyless.run.mqtt.topics import ROOT
+from skyless.run.zones import read_zones
+
+_log = logging.getLogger("skyless.run")
+
+
+class Kind(Struct, frozen=True):
+    """A kind of message of a site."""
+
+    name: str
+    topics: tuple[str, ...]
+    """Topics below the site's, with + for a name."""
+    payload: type[Struct] | None = None
+    """What it is; None for an image."""
+    retained: bool = False
+    """Whether the broker keeps it, so that a reader gets it at once, and perhaps again."""
+    once: bool = False
+    """Whether it is sent only once, so that it is asked for with QoS 1."""
+    own_name: Callable[[Any], str] | None = None
+    """The name that the message itself states, which should be the topic's."""
+
+
+KINDS: Final = (
+    Kind("site", ("site",), messages.SiteMessage, retained=True),
+    Kind("floor_plan", ("floor_plan", "floor_plan/+"), retained=True),
+    Kind("zones", ("zones",), messages.ZonesMessage, retained=True, once=True),
+    Kind("assets", ("assets",), messages.AssetsMessage, retained=True, once=True),
+    Kind("alarm_rules", ("alarm_rules",), messages.AlarmRulesMessage, retained=True, once=True),
+    Kind("survey", ("survey/state",), messages.SurveyMessage, retained=True, once=True),
+    Kind("watch", ("survey/watch",), messages.WatchMessage, retained=True, once=True),
+    Kind("status", ("+/+/status",), messages.StatusMessage, retained=True, own_name=lambda one: str(one.name)),
+    Kind("fix", ("tag/+/fix",), messages.FixMessage, own_name=lambda one: str(one.tag)),
+    Kind("health", ("tag/+/health",), messages.TagHealth, own_name=lambda one: str(one.tag)),
+    Kind("health", ("anchor/+/health",), messages.AnchorHealth, own_name=lambda one: str(one.anchor)),
+    Kind("health", ("ether/+/health",), messages.EtherHealth),
+    Kind("truth", ("truth",), messages.TruthMessage),
+    Kind("request", ("request",), messages.RequestMessage),
+    Kind("receptions", ("tag/+/receptions",), messages.ReceptionsMessage),
+    Kind("stamps", ("anchor/+/stamps",), messages.StampsMessage),
+    Kind("event", ("zone/+/event",), messages.ZoneEvent, once=True, own_name=lambda one: str(one.zone)),
+    Kind(
+        "alarm", ("alarm/+/+/state",), messages.AlarmMessage,
+        retained=True, once=True, own_name=lambda one: f"{one.rule}/{one.subject}",
+    ),
+    Kind("acknowledge", ("alarm/+/+/acknowledge",), messages.AcknowledgeMessage, once=True),
+)  # fmt: skip
+"""All messages that a site's programs send for its readers (``docs/mqtt.md``)."""
+
+_CHECKED: Final[dict[type, Callable[[bytes], Struct]]] = {
+    messages.ZonesMessage: read_zones,
+    messages.AssetsMessage: read_assets,
+}
+"""Messages that people write, which are checked further than their fields' types."""
+
+
+class Channel(Struct, frozen=True):
+    """The meaning of a topic."""
+
+    site: str
+    kind: str
+    """Name of the ``Kind``."""
+    name: str = ""
+    """Name of the tag, anchor, zone or floor; rule and subject of an alarm."""
+    payload: type[Struct] | None = None
+    who: str = ""
+    """Kind of the node whose status or health it is."""
+    of: Kind | None = None
+
+
+@lru_cache(maxsize=10_000)
+def channel_of(topic: str) -> Channel | None:
+    """Parse a topic; None if it is none of a site's messages."""
+    if not topic.startswith(f"{ROOT}/"):
+        return None
+    site, _, rest = topic.removeprefix(f"{ROOT}/").partition("/")
+    levels = rest.split("/")
+    for kind in KINDS:
+        for pattern in kind.topics:
+            wanted = pattern.split("/")
+            if len(wanted) == len(levels) and all(
+                one in ("+", level) for one, level in zip(wanted, levels, strict=True)
+            ):
+                names = [level for one, level in zip(wanted, levels, strict=True) if one == "+"]
+                who, names = (levels[0], names[-1:]) if kind.name in ("status", "health") else ("", names)
+                return Channel(site, kind.name, "/".join(names), kind.payload, who, kind)
+    return None
+
+
+@lru_cache(maxsize=64)
+def decoder_of(payload: type[Struct]) -> Callable[[bytes], Struct]:
+    """The function that decodes a payload of a type, and raises WrongMessageError."""
+    if payload in _CHECKED:
+        return _CHECKED[payload]
+    decode = msgspec.json.Decoder(payload).decode
+
+    def read(data: bytes) -> Struct:
+        try:
+            return decode(data)
+        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
+            raise WrongMessageError(str(error)) from None
+
+    return read
+
+
+class Source(Protocol):
+    """What a feed can be attached to: a ``Link``, or a ``HubLink``."""
+
+    def subscribe(self, topic_filter: str, handler: Handler, qos: int = 0) -> None:
+        """Call ``handler`` with topic and payload of every message that matches a filter."""
+
+
+class Recorded(Protocol):
+    """A message of a recording."""
+
+    @property
+    def time_s(self) -> float:
+        """Unix time of recording."""
+
+    @property
+    def channel(self) -> Channel:
+        """What it is."""
+
+    @property
+    def message(self) -> Struct:
+        """The message."""
+
+
+Act = Callable[[Any, Channel], object]
+"""Gets a message, or None where a retained one was withdrawn, and its channel. It may raise WrongMessageError."""
+
+
+class SiteFeed:
+    """What one site says to one reader."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.drops: Counter[str] = Counter()
+        """Messages that could not be used, by kind."""
+        self._clock = clock
+        self._at_s: float | None = None
+        self._typed: defaultdict[type | None, list[Act]] = defaultdict(list)
+        self._raw: dict[str, Act] = {}
+        self._link: tuple[Source, int] | None = None
+
+    @property
+    def now_s(self) -> float:
+        """The reader's time; while a recording is played, the time of the message."""
+        return self._clock() if self._at_s is None else self._at_s
+
+    def on(self, payload: type[Struct], act: Act) -> None:
+        """Call ``act`` with all messages of a type, after what was set for it before."""
+        self._typed[payload].append(act)
+        self._subscribe(kind for kind in KINDS if kind.payload is payload)
+
+    def on_bytes(self, name: str, act: Act) -> None:
+        """Call ``act`` with the undecoded messages of a kind: images, and lists whose reader keeps what is wrong."""
+        self._raw[name] = act
+        self._subscribe(kind for kind in KINDS if kind.name == name)
+
+    def attach(self, link: Source, site: int) -> None:
+        """Get the messages of a site from a broker or a hub."""
+        self._link = link, site
+        self._subscribe(kind for kind in KINDS if kind.payload in self._typed or kind.name in self._raw)
+
+    def _subscribe(self, kinds: Iterable[Kind]) -> None:
+        if self._link is not None:
+            link, site = self._link
+            for kind in kinds:
+                for topic in kind.topics:
+                    link.subscribe(f"{ROOT}/{site}/{topic}", self.receive, int(kind.once))
+
+    def receive(self, topic: str, payload: bytes) -> None:
+        """Process a message of MQTT."""
+        channel = channel_of(topic)
+        if channel is None or channel.of is None:
+            return
+        try:
+            if (raw := self._raw.get(channel.kind)) is not None:
+                raw(payload, channel)
+            elif channel.payload in self._typed:
+                message = self._decoded(channel, channel.of, payload)
+                for act in self._typed[channel.payload]:
+                    act(message, channel)
+        except (WrongMessageError, ConfigurationError) as error:
+            self.drops[channel.kind] += 1
+            if self.drops[channel.kind] == 1:
+                _log.warning("dropped a wrong message of %s: %s; there may be more", topic, error)
+
+    @staticmethod
+    def _decoded(channel: Channel, kind: Kind, payload: bytes) -> Struct | None:
+        """The message; None if a retained one was withdrawn. Raises WrongMessageError."""
+        assert channel.payload is not None
+        if not payload and kind.retained:
+            return None
+        message = decoder_of(channel.payload)(payload)
+        if kind.own_name is not None and kind.own_name(message) != channel.name:
+            raise WrongMessageError(f"it is of {kind.own_name(message)[:40]!r}")
+        return message
+
+    def play(self, recorded: Iterable[Recorded]) -> None:
+        """Process messages of a recording, in its order and by its times."""
+        for one in recorded:
+            self._at_s = one.time_s
+            for act in self._typed.get(type(one.message), ()):
+                act(one.message, one.channel)
+        self._at_s = None
