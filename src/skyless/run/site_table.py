@@ -428,7 +428,8 @@ class SiteTable:
                 tag.is_gone = True
                 gone.append(name)
             else:
-                heappush(self._due, (max(now_s, tag.asleep_until_s) + max(left_s, _LOOK_S), name))
+                wait_s = min(max(left_s, _LOOK_S), THRESHOLDS.gone_s)  # its interval may become known meanwhile
+                heappush(self._due, (max(now_s, tag.asleep_until_s) + wait_s, name))
         if now_s - self._forget_s >= _FORGET_PERIOD_S:
             self._forget_s = now_s
             self._forget(now_s)
