@@ -64,12 +64,12 @@ def pixels(page, layer):
 
 
 def seek(page, unix_s):
-    page.evaluate("at => import('/page/past.js').then(({ seekPast }) => seekPast(at))", unix_s)
+    page.evaluate("at => import('/page/player.js').then(({ seek }) => seek(at - skyless.state.player.start_unix_s))", unix_s)
     page.evaluate(THREE_FRAMES)
 
 
 def place(page):
-    return page.evaluate("import('/page/past.js').then(({ placeNow }) => placeNow(skyless.state.past)?.place ?? null)")
+    return page.evaluate("import('/page/map/past.js').then(({ placeNow }) => placeNow(skyless.state.past)?.place ?? null)")
 
 
 def test_the_way_of_a_tag_is_shown_and_played(kept):
@@ -86,7 +86,7 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     page.keyboard.press("Enter")
     until(page, "skyless.state.past?.track.tag === 'trolley'")
     asked = len(server.history_asked)
-    page.focus("#past-slider")
+    page.focus("#slider")
     page.evaluate(THREE_FRAMES)
     assert len(server.history_asked) == asked, "a field that loses the focus asks for nothing"
     ask(page, "way", "forklift")
@@ -115,15 +115,15 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     seek(page, pause)
     assert place(page) is None
     assert pixels(page, "moment") == 0
-    assert "no position then" in page.locator("#past-play-time").inner_text()
+    assert page.locator("#player .about").inner_text() == "no position then"
     assert page.evaluate(f"{past}.fixes.length") in {6, 7}
 
     # Played from within a pause, it goes on where there are positions; then the keyboard, to the end.
-    page.select_option("#past-speed", "300")
-    page.click("#past-play")
+    page.select_option("#speed", "300")
+    page.click("#play")
     until(
         page,
-        f"at => {past}.at_s > at + {made_up.PAUSE_S / 2} && !!document.querySelector('#past-play-time')",
+        f"at => {past}.start_unix_s + {past}.at_s > at + {made_up.PAUSE_S / 2} && !!document.querySelector('#play-time')",
         arg=pause,
     )
     page.focus("#canvas")
@@ -132,11 +132,11 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     at = page.evaluate(f"{past}.at_s")
     page.keyboard.press("j")
     assert page.evaluate(f"{past}.at_s") < at
-    page.focus("#past-slider")
+    page.focus("#slider")
     page.keyboard.press("End")
-    until(page, f"{past}.at_s > {past}.start_s + {past}.duration_s - 1.5")
+    until(page, f"{past}.at_s > {past}.duration_s - 1.5")
     page.select_option("#past-colours", "speed")
-    until(page, "document.querySelector('#past .ticks').textContent.endsWith('m/s')")
+    until(page, "document.querySelector('#player .ticks').textContent.endsWith('m/s')")
 
     name, rows = saved(page)
     assert name == "way-forklift.csv"
@@ -146,7 +146,7 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     assert first.astimezone(UTC).timestamp() == pytest.approx(points[0][0], abs=1e-3)
     assert [float(value) for value in rows[1][1:4]] == points[0][1:4]
 
-    page.click("#past-end")
+    page.click("#back")
     page.locator("#past-mark").wait_for(state="hidden")
     assert page.locator("#pill").inner_text() != "Past"
     assert abs(pixels(page, "still") - before) < 100
@@ -162,7 +162,7 @@ def test_heat_map_zones_occupancy_contacts_and_alarms(kept):
     assert pixels(page, "still") > before + 500
     assert "Time in a cell" in page.locator("#past-scale").inner_text()
     units = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0}
-    texts = [text.split() for text in page.locator("#past .ticks span").all_inner_texts()]
+    texts = [text.split() for text in page.locator("#player .ticks span").all_inner_texts()]
     ticks = [sum(float(n) * units[unit] for n, unit in zip(text[::2], text[1::2], strict=True)) for text in texts]
     times = page.evaluate("skyless.state.past.map.seconds.filter((value) => value > 0)")
     assert min(times) / 10 <= ticks[0] < ticks[1] < ticks[2] <= max(times)

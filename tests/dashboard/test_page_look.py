@@ -49,7 +49,7 @@ def test_no_width_scrolls_sideways(server, visit, width):
 
 OVERLAPS = """() => {
   const box = (id) => document.getElementById(id).getBoundingClientRect();
-  const boxes = ["replay-mark", "following", "readout"].map(box);
+  const boxes = ["past-mark", "following", "readout"].map(box);
   const apart = (a, b) => a.right <= b.left || b.right <= a.left || a.bottom <= b.top || b.bottom <= a.top;
   return boxes.some((a, n) => boxes.slice(n + 1).some((b) => !apart(a, b)));
 }"""
@@ -61,7 +61,7 @@ def test_words_on_the_map_of_a_replay_keep_apart(server, visit, size):
     assert page.locator("#summary .latency").is_visible() == (size[0] > 900)
     page.click("#legend summary")
     page.evaluate("import('/page/player.js').then(({ open }) => open('walk.mcap'))")
-    page.wait_for_selector("#replay-mark")
+    page.wait_for_selector("#past-mark")
     page.evaluate("import('/page/map/follow.js').then(({ follow }) => follow('forklift'))")
     page.wait_for_selector("#following-words:has-text('forklift')")
     page.evaluate("document.getElementById('readout').textContent = 'x 12.34 m · y 5.67 m'")

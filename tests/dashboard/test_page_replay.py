@@ -11,14 +11,25 @@ from PIL import Image
 
 pytestmark = pytest.mark.statistical
 
+AT_S = "skyless.state.player.at_s"
+
+
+def begin(page):
+    page.click("#tab-recordings")
+    page.click(".recording")
+    until(page, "skyless.state.mode === 'replay' && !skyless.state.player.waiting")
+
 
 @pytest.fixture
-def replay(serve, visit):
-    shown = visit(serve())
-    shown.page.click("#tab-recordings")
-    shown.page.click(".recording")
-    until(shown.page, "skyless.state.mode === 'replay' && !skyless.state.player.waiting")
-    return shown
+def recorded(serve, visit):
+    server = serve()
+    shown = visit(server)
+    begin(shown.page)
+    return server, shown
+
+
+def paused_at(page, at_s):
+    until(page, f"at => Math.abs({AT_S} - at) < 0.01 && !skyless.state.player.playing", arg=at_s)
 
 
 def place_slider(page, at_s):
@@ -30,86 +41,62 @@ def place_slider(page, at_s):
         }""",
         str(at_s),
     )
-    until(page, "at => !skyless.state.player.waiting && Math.abs(skyless.state.player.at_s - at) < 5", arg=at_s)
+    until(page, f"at => !skyless.state.player.waiting && Math.abs({AT_S} - at) < 5", arg=at_s)
 
 
 def assert_shown(visit):
     until(visit.page, "!skyless.state.player.waiting")
-    at_s = visit.page.evaluate("skyless.state.player.at_s")
     x, y = visit.position("tag-001" if visit.position("tag-001", "replayed") else "forklift", "replayed")
-    true_x, true_y, *_ = made_up.truth(0, at_s)
+    true_x, true_y, *_ = made_up.truth(0, visit.page.evaluate(AT_S))
     assert abs(x - true_x) < 0.15
     assert abs(y - true_y) < 0.15
 
 
-def test_it_plays(replay):
-    page = replay.page
+def test_it_plays_from_the_first_fix_to_the_end_and_anywhere_and_does_not_look_live(recorded):
+    shown = recorded[1]
+    page = shown.page
+    before = page.evaluate(AT_S)
+    assert before >= FIRST_FIX_S
+    assert page.locator("#past-mark").inner_text().startswith("Replay · recorded 2026-05-28")
     assert page.locator("#pill").inner_text() == "Replay"
-    before = page.evaluate("skyless.state.player.at_s")
-    until(page, "before => skyless.state.player.at_s > before + 0.5", arg=before)
+    assert page.locator("#banner").is_hidden()
+    until(page, f"before => {AT_S} > before + 0.5", arg=before)
     page.click("#play")
-    assert_shown(replay)
-    still = page.evaluate("skyless.state.player.at_s")
-    page.wait_for_timeout(300)
-    assert page.evaluate("skyless.state.player.at_s") == still
-
-
-def test_the_slider_leads_anywhere(replay):
-    page = replay.page
-    page.click("#play")
+    assert_shown(shown)
+    still = page.evaluate(AT_S)
     for at_s in (70.0, 12.5, 13.0, 89.0, 2.5):
         place_slider(page, at_s)
-        assert page.evaluate("skyless.state.player.at_s") == at_s
-        assert_shown(replay)
-
-
-def test_it_goes_on_beyond_what_was_fetched_first_and_stops_at_the_end(replay):
-    page = replay.page
-    page.select_option("#speed", "8")
-    place_slider(page, 60.0)
-    until(page, "!skyless.state.player.playing", timeout_s=15.0)
-    assert page.evaluate("skyless.state.player.at_s") == 90.0
-    assert_shown(replay)
-
-
-def paused_at(page, at_s):
-    until(page, "at => Math.abs(skyless.state.player.at_s - at) < 0.01 && !skyless.state.player.playing", arg=at_s)
-
-
-def test_it_begins_at_the_first_fix_and_shows_where_there_are_fixes(serve, visit):
-    shown = visit(serve())
-    page = shown.page
-    page.click("#tab-recordings")
-    page.click(".recording")
-    until(page, "skyless.state.player")
-    assert page.evaluate("skyless.state.player.at_s") >= FIRST_FIX_S
-    until(page, "!skyless.state.player.waiting")
-    until(page, "skyless.replayed.all.get('forklift').count > 0")
-    assert shown.position("forklift", "replayed") is not None
+        assert page.evaluate(AT_S) == at_s != still, "it pauses"
+        assert_shown(shown)
     spans = page.evaluate("""() => {
       const box = document.querySelector(".spans").getBoundingClientRect();
-      const at = (x) => (90 * (x - box.left - 8)) / (box.width - 16);
+      const at = (x) => (90 * (x - box.left)) / box.width;
       const spans = [...document.querySelectorAll(".spans i")].map((span) => span.getBoundingClientRect());
       return spans.map((span) => [at(span.left), at(span.right)]);
     }""")
     assert [round(at_s) for span in spans for at_s in span] == [2, 55, 60, 90]
 
+    page.select_option("#speed", "8")  # beyond what was fetched first, to the end, and again from the first fix
+    place_slider(page, 60.0)
+    page.click("#play")
+    until(page, "!skyless.state.player.playing", timeout_s=15.0)
+    assert page.evaluate(AT_S) == 90.0
+    assert_shown(shown)
+    page.click("#play")
+    until(page, f"{AT_S} < 60")
+    assert page.evaluate(AT_S) >= FIRST_FIX_S
 
-def test_a_replay_does_not_look_live(replay):
-    page = replay.page
-    mark = page.locator("#replay-mark")
-    assert mark.inner_text().startswith("Replay · recorded 2026-05-28")
-    assert page.locator("#pill").inner_text() == "Replay"
-    assert page.locator("#banner").is_hidden()
     page.click("#tab-anchors")
     assert page.locator("#panel-anchors tr.good").count() == 0, "no anchor is shown as if its health were known"
     page.click("#back")
-    mark.wait_for(state="hidden")
+    page.locator("#past-mark").wait_for(state="hidden")
+    assert page.evaluate("skyless.state.mode") == "live"
+    until(page, "document.getElementById('pill').textContent === 'Live'")
 
 
-def test_events_have_marks_with_words_that_lead_to_them(replay):
+def test_events_have_marks_with_words_that_lead_to_them(recorded):
     """Events that are close share a mark; news of programs, and that an anchor is back, have none."""
-    page = replay.page
+    page = recorded[1].page
     until(page, "document.querySelectorAll('.event-mark').length === 3")
     page.keyboard.press("k")
     names = page.evaluate("[...document.querySelectorAll('.event-mark')].map((mark) => mark.ariaLabel)")
@@ -136,79 +123,26 @@ def test_events_have_marks_with_words_that_lead_to_them(replay):
     paused_at(page, 49.0)
 
 
-def test_a_recording_is_downloaded_under_its_name(replay):
-    for link in ("#download", "#panel-recordings a"):
-        with replay.page.expect_download() as found:
-            replay.page.click(link)
-        assert found.value.suggested_filename == "walk.mcap"
-        assert Path(found.value.path()).read_bytes() == b"recorded"
-
-
-def test_keys_step_and_change_the_speed(replay):
-    page = replay.page
+def test_keys_and_downloads(recorded):
+    page = recorded[1].page
     place_slider(page, 30.0)
-    page.keyboard.press(",")
-    until(page, "!skyless.state.player.playing")
-    at_s = page.evaluate("skyless.state.player.at_s")
-    for key in ("5", ".", ".", ","):
+    for key, at_s in ((",", None), ("5", 45.0), (".", 45.1), (".", 45.2), ("l", 50.2), ("j", 45.2)):
         page.keyboard.press(key)
-    paused_at(page, 45.1)
-    assert at_s < 45.0
-    page.keyboard.press(">")
-    until(page, "document.getElementById('speed').value === '2'")
-    page.keyboard.press("<")
-    page.keyboard.press("<")
-    until(page, "document.getElementById('speed').value === '0.5'")
-
-
-def test_keys_move_the_slider(replay):
-    page = replay.page
-    page.keyboard.press("k")
-    until(page, "!skyless.state.player.playing")
-    place_slider(page, 30.0)
-    page.keyboard.press("l")
-    until(page, "skyless.state.player.at_s === 35 && document.getElementById('slider').value === '35'")
+        until(page, "!skyless.state.player.playing")
+        assert at_s is None or page.evaluate(AT_S) == pytest.approx(at_s)
     page.focus("#slider")
     page.keyboard.press("ArrowLeft")
-    until(page, "Math.abs(skyless.state.player.at_s - 34.9) < 1e-6")
-
-
-def test_live_comes_back(replay):
-    page = replay.page
-    page.click("#back")
-    assert page.evaluate("skyless.state.mode") == "live"
-    until(page, "document.getElementById('pill').textContent === 'Live'")
-    assert page.locator("table.tags tbody tr").count() == 0 or replay.position("robot")
-
-
-PICTURE = """async () => {
-  const { floor } = await import("/page/map/floor.js");
-  return floor?.image.naturalWidth ?? null;
-}"""
-FLASHES = """async () => {
-  const { drawZones } = await import("/page/map/zones.js");
-  return drawZones(document.createElement("canvas").getContext("2d"));
-}"""
-
-
-def picture(width):
-    file = io.BytesIO()
-    Image.new("RGB", (width, 30)).save(file, "PNG")
-    return file.getvalue()
-
-
-def begin(page):
-    page.click(".recording")
-    until(page, "skyless.state.mode === 'replay' && !skyless.state.player.waiting")
-
-
-@pytest.fixture
-def recorded(serve, visit):
-    server = serve()
-    shown = visit(server)
-    shown.page.click("#tab-recordings")
-    begin(shown.page)
-    return server, shown
+    paused_at(page, 45.1)
+    for key, speed in ((">", "2"), ("<", "1"), ("<", "0.5")):
+        page.keyboard.press(key)
+        until(page, "speed => document.getElementById('speed').value === speed", arg=speed)
+    page.keyboard.press("k")
+    until(page, f"{AT_S} > 45.2")
+    for link in ("#download", "#panel-recordings a"):
+        with page.expect_download() as found:
+            page.click(link)
+        assert found.value.suggested_filename == "walk.mcap"
+        assert Path(found.value.path()).read_bytes() == b"recorded"
 
 
 def test_a_recording_opens_again_and_one_that_cannot_be_opened_leaves_it_playing(recorded):
@@ -218,16 +152,13 @@ def test_a_recording_opens_again_and_one_that_cannot_be_opened_leaves_it_playing
     begin(page)
     until(page, "skyless.replayed.all.get('forklift').count > 0")
     server.recorded_waits = True
-    page.evaluate("""async () => {
-      const player = await import("/page/player.js");
-      player.setSpeed(8);
-      player.seek(20);
-    }""")
-    until(page, "skyless.state.player.at_s > 21")  # the states after 22 s are awaited
+    page.select_option("#speed", "8")
+    place_slider(page, 20)
+    until(page, f"{AT_S} > 21")  # the states after 22 s are awaited
     failure = "import('/page/player.js').then(({ open }) => open('broken.mcap')).catch((error) => error.message)"
     assert page.evaluate(failure) == "there is no such recording"
     server.recorded_waits = False
-    until(page, "skyless.state.player.at_s > 25")
+    until(page, f"{AT_S} > 25")
     assert page.evaluate("[skyless.state.player.name, skyless.state.player.playing]") == ["walk.mcap", True]
     assert [text for text in shown.problems if "404" not in text] == []
     shown.problems.clear()
@@ -264,6 +195,22 @@ def test_states_of_another_moment_that_come_late_do_not_undo_a_seek(recorded):
     assert moments[2] is False
 
 
+PICTURE = """async () => {
+  const { floor } = await import("/page/map/floor.js");
+  return floor?.image.naturalWidth ?? null;
+}"""
+FLASHES = """async () => {
+  const { drawZones } = await import("/page/map/zones.js");
+  return drawZones(document.createElement("canvas").getContext("2d"));
+}"""
+
+
+def picture(width):
+    file = io.BytesIO()
+    Image.new("RGB", (width, 30)).save(file, "PNG")
+    return file.getvalue()
+
+
 def test_all_that_is_shown_is_of_the_recording(serve, visit):
     """Its events and its floor plan; nothing of the live site."""
     server = serve(floor_plan=picture(40))
@@ -272,7 +219,6 @@ def test_all_that_is_shown_is_of_the_recording(serve, visit):
     shown = visit(server)
     page = shown.page
     until(page, f"({PICTURE})().then((width) => width === 40)")
-    page.click("#tab-recordings")
     begin(page)
     until(page, f"({PICTURE})().then((width) => width === 50)")
     page.click("#tab-events")
@@ -300,7 +246,6 @@ def test_a_recording_without_a_site_or_events_so_far(serve, visit):
     server = serve()
     server.recorded_site = False
     page = visit(server).page
-    page.click("#tab-recordings")
     begin(page)
     page.evaluate(THREE_FRAMES)
     assert page.locator("#waiting").is_hidden()

@@ -23,7 +23,7 @@ let list = null;
 
 /** Fill the header and the banner, and keep them up to date. */
 export function start() {
-  on(["connection", "mode", "player", "condition", "site", "alarms", "past"], show);
+  on(["connection", "mode", "player", "condition", "site", "alarms"], show);
   setInterval(() => {
     show();
     if (state.connection.phase !== "lost") text(byId("time"), timeOfDay(now_s()));

@@ -1,4 +1,4 @@
-/** Plays a recording: fetches its states ahead of time, and moves the shown moment. */
+/** The player of the past: a recording, whose states are fetched ahead, a tag's way, or a heat map, which has no moment. */
 
 import { changed, on, select, siteOf, state } from "./store.js";
 import { recordedEvents, recordedStates, recording } from "./api.js";
@@ -10,53 +10,88 @@ const BEFORE_S = 25;
 const AFTER_S = 20;
 /** Time that is kept: a track's ring buffer holds 2048 states. */
 const KEPT_S = 90;
-export const SPEEDS = [0.25, 0.5, 1, 2, 4, 8];
-
-/** Count what makes an answer that is awaited useless: another recording is to be opened; another moment is shown. */
-let openings = 0;
-let generation = 0;
-let fetching = false;
-let loaded = { from: 0, to: 0 };
-let lastFrame = 0;
-let seekTimer = 0;
-
 /** Events nearer than this to the present moment are passed when the next or the last one is looked for. */
 const AT_EVENT_S = 0.3;
 /** An event is shown from a little before it on. */
 const LEAD_S = 1.0;
-/** A step by the keyboard. */
-export const STEP_S = 0.1;
 /** Levels of events that have a mark on the bar. */
 const MARKED = new Set(["warning", "bad"]);
+/** Points of a way are joined up to this time, as in the server's answers, or a multiple of their usual step: they are thinned. */
+const MIN_GAP_S = 15;
+const GAP_STEPS = 3;
+/** Multiples of real time. */
+export const SPEEDS = { recording: [0.25, 0.5, 1, 2, 4, 8], way: [1, 4, 16, 60, 300, 1000], heat: [] };
+
+/** What is chosen in the bar holds for the next one of the same kind, too. */
+const chosen = { recording: { speed: 1 }, way: { speed: 16, colours: "time" } };
+/** Increases where an answer that is awaited is useless, as another recording is to be opened. */
+let openings = 0;
+/** Stands for the states that are awaited; null where none are. */
+let loading = null;
+let seekTimer = 0;
+let lastFrame = 0;
 
 /** Open a recording and play it from its first fix; where it cannot be opened, what is shown stays. */
 export async function open(name) {
   const mine = ++openings;
-  const found = await recording(name);
+  const { start_unix_s, end_unix_s, fix_spans_unix_s = [], site, tags = [], zones = [] } = await recording(name);
   if (mine !== openings) return;
-  abandon();
-  loaded = { from: 0, to: 0 };
-  const duration_s = Math.max(0, found.end_unix_s - found.start_unix_s);
-  const fixes = (found.fix_spans_unix_s ?? []).map((span) => span.map((at) => at - found.start_unix_s));
-  const player = { name, start_unix_s: found.start_unix_s, duration_s, fixes, at_s: 0, playing: true, speed: 1 };
-  state.player = { ...player, waiting: true, error: fixes.length ? "" : "There are no fixes in it.", events: null };
   state.mode = "replay";
-  state.site = siteOf(found.site);
-  state.simulated = found.site?.simulated ?? false;
-  state.zones = found.zones ?? [];
+  state.site = siteOf(site);
+  state.simulated = site?.simulated ?? false;
+  state.zones = zones;
   replayed.clear();
-  replayed.addNames(found.tags ?? []);
+  replayed.addNames(tags);
   select(null);
-  changed("mode", "site", "zones", "player", "tags", "selection");
+  const fixes = fix_spans_unix_s.map((span) => span.map((at) => at - start_unix_s));
+  const error = fixes.length ? "" : "There are no fixes in it.";
+  const unknown = { loaded: { from: 0, to: 0 }, events: null, waiting: true };
+  play({ kind: "recording", name, start_unix_s, duration_s: Math.max(0, end_unix_s - start_unix_s), fixes, error, ...unknown, playing: true });
+  changed("site", "zones", "tags");
   loadEvents(state.player);
-  await seek(firstFix_s(state.player));
+  seek(firstFix_s(state.player));
+}
+
+/** Show a tag's way, a `Track` with at least one point; `title` says whose. */
+export function showWay(track, title) {
+  const start_unix_s = track.points[0][0];
+  const times = track.points.map(([unix_s]) => unix_s - start_unix_s);
+  const steps = Float64Array.from(times.slice(1), (at, index) => at - times[index]).sort();
+  const gap_s = Math.max(MIN_GAP_S, GAP_STEPS * (steps[steps.length >> 1] ?? 0));
+  const fixes = [];
+  times.forEach((at, index) => {
+    if (index && at - times[index - 1] <= gap_s) fixes.at(-1)[1] = at;
+    else fixes.push([at, at]);
+  });
+  play({ kind: "way", title, track, times, gap_s, start_unix_s, duration_s: times.at(-1), fixes });
+}
+
+/** Show a heat map, a `Heatmap` of a time. */
+export function showHeat(map, title, { from_unix_s, to_unix_s }) {
+  play({ kind: "heat", title, map, start_unix_s: from_unix_s, duration_s: to_unix_s - from_unix_s });
+}
+
+/** Show the past; `fixes` are when there are some, `loaded` is what can be played at once, in s since the start. */
+function play(source) {
+  abandon();
+  const whole = { fixes: [], loaded: { from: 0, to: Infinity }, events: [], marked: [], error: "", waiting: false };
+  state.player = { at_s: 0, playing: false, ...whole, ...chosen[source.kind], ...source };
+  changed("mode", "player");
 }
 
 /** Wait for no states any more. */
 function abandon() {
   clearTimeout(seekTimer);
-  generation++;
-  fetching = false;
+  loading = null;
+}
+
+/** Show the present again. */
+export function close() {
+  openings++;
+  abandon();
+  state.player = null;
+  if (state.mode === "replay") backToLive();
+  changed("mode", "player");
 }
 
 /** The first moment that shows a tag. */
@@ -67,103 +102,90 @@ function firstFix_s(player) {
 /** Fetch the events while the recording is played already. */
 async function loadEvents(player) {
   try {
-    const found = await recordedEvents(player.name);
-    player.events = found.events.map((event) => ({ ...event, at_s: event.unix_s - player.start_unix_s }));
-    player.eventsNote = found.complete ? "" : "The recording has more events than are listed.";
+    const { events, complete } = await recordedEvents(player.name);
+    player.events = events.map((event) => ({ ...event, at_s: event.unix_s - player.start_unix_s }));
+    player.marked = player.events.filter(({ level, kind }) => MARKED.has(level) && kind !== "program");
+    player.eventsNote = complete ? "" : "The recording has more events than are listed.";
   } catch (error) {
     player.events = [];
     player.eventsNote = `The events cannot be read: ${error.message}`;
   }
-  if (player === state.player) changed("player", "events");
-}
-
-/** The events that have a mark on the bar. */
-export function markedEvents(player) {
-  return (player.events ?? []).filter((event) => MARKED.has(event.level) && event.kind !== "program");
+  if (player === state.player) changed("mode", "player");
 }
 
 /** Show the moment of an event. */
 export function seekEvent(event) {
-  return seek(event.at_s - LEAD_S);
+  seek(event.at_s - LEAD_S);
 }
 
 /** Seek to the next event with a mark (1) or the one before (-1). */
 export function stepEvent(direction) {
-  const player = state.player;
-  if (!player) return;
-  const now = player.at_s + LEAD_S;
-  const marked = markedEvents(player);
-  const found =
-    direction > 0
-      ? marked.find((event) => event.at_s > now + AT_EVENT_S)
-      : marked.findLast((event) => event.at_s < now - AT_EVENT_S);
+  const { marked, at_s } = state.player;
+  const apart_s = (event) => direction * (event.at_s - at_s - LEAD_S);
+  const found = (direction > 0 ? marked : marked.toReversed()).find((event) => apart_s(event) > AT_EVENT_S);
   if (found) seekEvent(found);
 }
 
 /** Pause, and seek by a time in s. */
 export function step(by_s) {
-  if (!state.player) return;
   state.player.playing = false;
   seek(state.player.at_s + by_s);
 }
 
 /** The next higher (1) or lower (-1) speed. */
 export function stepSpeed(direction) {
-  const at = SPEEDS.indexOf(state.player?.speed) + direction;
-  if (SPEEDS[at]) setSpeed(SPEEDS[at]);
+  const speeds = SPEEDS[state.player.kind];
+  const speed = speeds[speeds.indexOf(state.player.speed) + direction];
+  if (speed) choose({ speed });
 }
 
-/** Leave the replay. */
-export function close() {
-  openings++;
-  abandon();
-  state.player = null;
-  backToLive();
-  changed("player");
+/** Set the speed, or what the colours of a way mean ("time" or "speed"). */
+export function choose(values) {
+  Object.assign(chosen[state.player.kind], values);
+  Object.assign(state.player, values);
+  changed("mode", "player");
 }
 
-/** Seek to a time in s since the start. */
-export async function seek(at_s) {
-  const player = state.player;
+/** Show a moment, in s since the start. */
+export function seek(at_s) {
+  const { player } = state;
   if (!player) return;
   player.at_s = Math.min(Math.max(at_s, 0), player.duration_s);
   changed("player", "tags");
-  const there = player.at_s >= loaded.from && player.at_s < loaded.to;
+  const there = player.at_s >= player.loaded.from && player.at_s < player.loaded.to;
   if (there && !player.waiting) return;
   abandon(); // states of another moment
   player.waiting = !there;
-  if (!there) seekTimer = setTimeout(() => load(true), 60);
+  if (!there) seekTimer = setTimeout(load, 60, true);
 }
 
+/** Fetch the states around the moment, or those after what is loaded. */
 async function load(restart) {
-  const player = state.player;
-  const mine = restart ? ++generation : generation;
+  const { player } = state;
+  const mine = (loading = {});
   const ahead_s = Math.min(AFTER_S * Math.max(1, player.speed / 2), 60 - BEFORE_S);
-  const from = restart ? Math.max(0, player.at_s - BEFORE_S) : loaded.to;
-  const to = Math.min((restart ? player.at_s : loaded.to) + ahead_s, player.duration_s + 0.001);
-  fetching = true;
+  const from = restart ? Math.max(0, player.at_s - BEFORE_S) : player.loaded.to;
+  const to = Math.min((restart ? player.at_s : from) + ahead_s, player.duration_s + 0.001);
   try {
     const states = await recordedStates(player.name, from, to, player.speed > 2 ? 10 : 20);
-    if (mine !== generation || player !== state.player) return;
+    if (mine !== loading) return;
     if (restart) replayed.clearStates();
     for (const one of states) replayed.add(one.tags);
-    loaded = { from: restart ? from : Math.max(loaded.from, to - KEPT_S), to };
+    player.loaded = { from: restart ? from : Math.max(player.loaded.from, to - KEPT_S), to };
     player.waiting = false;
     if (player.fixes.length) player.error = "";
   } catch (error) {
-    if (mine !== generation || player !== state.player) return;
+    if (mine !== loading) return;
     player.error = error.message;
     player.playing = false;
-  } finally {
-    if (mine === generation) fetching = false;
   }
+  loading = null;
   changed("player", "tags");
 }
 
 /** Play or pause; at the end, from the first fix. */
 export function toggle() {
-  const player = state.player;
-  if (!player) return;
+  const { player } = state;
   player.playing = !player.playing;
   if (player.playing && player.at_s >= player.duration_s) seek(firstFix_s(player));
   if (player.playing && player.error) load(true);
@@ -171,28 +193,20 @@ export function toggle() {
   changed("player");
 }
 
-/** Set the speed, a multiple of real time. */
-export function setSpeed(speed) {
-  if (!state.player) return;
-  state.player.speed = speed;
-  changed("player");
-}
-
 on(["player"], () => {
-  const player = state.player;
+  const { player } = state;
   const now = performance.now();
   const step_s = Math.min((now - (lastFrame || now)) / 1e3, 0.25);
   lastFrame = player?.playing ? now : 0;
   if (!player?.playing) return;
-  if (!player.waiting) advance(player, step_s);
+  if (!player.waiting) advance(player, step_s * player.speed);
   changed("player", "tags");
 });
 
 function advance(player, step_s) {
-  const end_s = Math.min(player.duration_s, loaded.to);
-  player.at_s = Math.min(player.at_s + step_s * player.speed, end_s);
-  if (player.at_s >= player.duration_s) player.playing = false;
-  else if (loaded.to - player.at_s < 6 * Math.max(1, player.speed) && loaded.to < player.duration_s && !fetching) {
-    load(false);
-  }
+  const { loaded, duration_s, speed } = player;
+  player.at_s = Math.min(player.at_s + step_s, duration_s, loaded.to);
+  if (player.kind === "way") player.at_s = Math.max(player.at_s, player.fixes.find(([, to]) => player.at_s <= to)[0]); // gaps are skipped
+  if (player.at_s >= duration_s) player.playing = false;
+  else if (loaded.to - player.at_s < 6 * Math.max(1, speed) && loaded.to < duration_s && !loading) load(false);
 }

@@ -2,7 +2,7 @@
  * The one state of the page. Modules change it and notify the topics; callbacks run at most once a frame.
  *
  * Topics: connection, site, zones, events, health, tags, mode, player, recordings, selection, options, overlay, editor,
- * theme, survey, watch, setup, picking, plan, placing, condition, log, read, sites, assets, alarms, rules, past, moment.
+ * theme, survey, watch, setup, picking, plan, placing, condition, log, read, sites, assets, alarms, rules.
  */
 
 /** @type {Map<string, Set<() => void>>} */
@@ -89,16 +89,18 @@ export const state = {
   floorDigests: {},
   /** @type {any[]|null} */
   recordings: null,
-  /** @type {any} the recording that `player.js` plays */
+  /** @type {any} what `player.js` shows of the past, in `mode` "replay" a recording */
   player: null,
+  /** The way or the heat map that the map shows instead of the present. @returns {any} */
+  get past() {
+    return this.mode === "live" ? this.player : null;
+  },
   /** Whether the server keeps a history; null until it has said so. @type {boolean|null} */
   history: null,
   /** Whether the server streams all tags of a large site in binary, and the newest message with its view, see `map/many.js`. */
   live2: false,
   /** @type {any} */
   many: null,
-  /** @type {any} the way or the heat map that the map shows instead of the present, see `past.js` */
-  past: null,
   selection: { tag: null, anchor: null, zone: null },
   options: { names: true, trails: 15, ellipses: true, levels: true, truth: true, overlay: "none", floor: null },
   /** @type {{data: any, picture: HTMLCanvasElement|null, error: string, pendingSince: number|null}} pending: computing */

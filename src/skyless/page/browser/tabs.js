@@ -53,7 +53,7 @@ export function start() {
   byId("legend").addEventListener("toggle", () => byId("legend").open && isPhone() && sheet("low"));
   on(["picking"], () => picking && isPhone() && sheet("half"));
   setInterval(() => TABS[current].changesWithTime && show(), 1000);
-  on(["mode", "past", "placing"], showMap);
+  on(["mode", "placing"], showMap);
   on(["selection"], () => {
     const { tag, anchor, zone } = state.selection;
     if (tag !== null && current !== "timing") open("tags");

@@ -98,7 +98,7 @@ export function mapPicture() {
 
 /** Of what the picture is, and of when; without a connection it shows the state at the loss. */
 function pictured() {
-  if (state.past) return { kind: `the past: ${state.past.title}`, unix_s: state.past.at_s ?? state.past.span.from_unix_s };
+  if (state.past) return { kind: `the past: ${state.past.title}`, unix_s: state.past.start_unix_s + state.past.at_s };
   if (state.mode === "replay") return { kind: `recording ${state.player?.name ?? ""}`, unix_s: shown_s() };
   const { phase, since } = state.connection;
   if (phase !== "lost") return { kind: "live", unix_s: shown_s() };

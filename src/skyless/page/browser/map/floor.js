@@ -23,7 +23,7 @@ const OVER_PLAN = 0.75;
  * loaded.
  */
 export function loadFloor(done) {
-  const chosen = state.player ? undefined : chosenFloor();
+  const chosen = state.mode === "replay" ? undefined : chosenFloor();
   const own = chosen?.image ? chosen : null;
   const stated = own ?? state.site?.floor_plan ?? null;
   const digest = own ? state.floorDigests[own.number] : state.floorDigest;

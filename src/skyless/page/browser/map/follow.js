@@ -64,7 +64,7 @@ function describe() {
 export function start() {
   byId("follow").addEventListener("click", toggleFollow);
   byId("following-end").addEventListener("click", endFollow);
-  on(["past"], () => state.past && endFollow());
+  on(["mode"], () => state.past && endFollow());
   on(["mode"], () => followed !== null && !tracks().all.has(followed) && endFollow());
   setInterval(describe, 1000);
 }

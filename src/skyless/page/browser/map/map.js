@@ -144,7 +144,7 @@ export function start() {
     if (overlay !== state.options.overlay && !view.touched) fitAll();
     overlay = state.options.overlay;
   });
-  on(["past"], () => !view.touched && fitAll());
+  on(["mode"], () => !view.touched && fitAll());
   let surveyed = "";
   on(["survey", "setup"], () => {
     if (view.spatial && surveyShown()) showSpatial(false);
@@ -159,6 +159,6 @@ export function start() {
     flashedMs = performance.now();
   });
   const still = ["site", "zones", "events", "health", "overlay", "theme", "options", "selection", "mode", "connection"];
-  on([...still, "survey", "watch", "setup", "plan", "placing", "alarms", "past"], () => redraw(true));
-  on(["tags", "editor", "player", "moment"], () => redraw(false));
+  on([...still, "survey", "watch", "setup", "plan", "placing", "alarms"], () => redraw(true));
+  on(["tags", "editor", "player"], () => redraw(false));
 }

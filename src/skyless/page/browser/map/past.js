@@ -2,7 +2,6 @@
 
 import { state } from "../store.js";
 import { duration } from "../format.js";
-import { placeNow } from "../past.js";
 import { colourAt, paintGrid } from "../pictures.js";
 import { faint, isDark, palette } from "../theme.js";
 import { DIMMED } from "./anchors.js";
@@ -89,7 +88,7 @@ export function drawWay(context) {
   const other = otherFloor();
   const pieces = speeds(past).flatMap((speed, n) => {
     if (Number.isNaN(speed)) return [];
-    const share = past.colours === "speed" ? speed / top : (points[n][0] - past.start_s) / (past.duration_s || 1);
+    const share = past.colours === "speed" ? speed / top : past.times[n] / (past.duration_s || 1);
     const path = new Path2D();
     path.moveTo(...pixel(points[n]));
     path.lineTo(...pixel(points[n + 1]));
@@ -114,6 +113,16 @@ export function drawWay(context) {
 
 function pixel([, x_m, y_m, z_m]) {
   return [toX(x_m, y_m), toY(x_m, y_m, z_m)];
+}
+
+/** Where a way's tag was at the shown moment, interpolated: x, y, z in m, and the alert of the point before; null in a gap. */
+export function placeNow({ track: { points }, times, gap_s, at_s }) {
+  const index = times.findLastIndex((time) => time <= at_s);
+  const [point, next = point] = points.slice(index, index + 2);
+  const [after_s, step_s] = [at_s - times[index], next[0] - point[0]];
+  if (after_s && step_s > gap_s) return null;
+  const share = after_s && after_s / step_s;
+  return { place: [1, 2, 3].map((axis) => point[axis] + share * (next[axis] - point[axis])), alert: point[6] };
 }
 
 /** Draw the tag where it was at the shown moment; nothing in a gap. */

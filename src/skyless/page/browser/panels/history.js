@@ -5,7 +5,6 @@ import { history } from "../api.js";
 import { shownName } from "../assets/model.js";
 import { now_s } from "../clock.js";
 import { button, h, offer, options, text } from "../dom.js";
-import { endPast } from "../past.js";
 import { close } from "../player.js";
 import { KINDS } from "./history_kinds.js";
 
@@ -67,6 +66,7 @@ export function start(panel) {
   parts = { tag, names, range, from, to, kinds, zone, zones, form, nothing, back, progress, fault, result };
   panel.append(nothing, back, form, progress, fault, result);
   on(["connection", "site"], forgetOtherSite);
+  on(["mode"], () => state.mode === "replay" && abandon());
 }
 
 /** Bring the tab up to date: whether there is a history, and the tags and zones to choose from. */
@@ -140,7 +140,7 @@ function chosenSpan() {
 /** End the question that is under way, and show no answer. */
 function abandon() {
   asking.abort();
-  endPast();
+  if (state.past) close();
   parts.progress.replaceChildren();
   text(parts.fault, "");
   parts.result.replaceChildren();

@@ -9,7 +9,7 @@ import { shownName } from "../assets/model.js";
 import { button, h } from "../dom.js";
 import { saveCsv, utc } from "../files.js";
 import { dateTime, duration, length, number, sentence } from "../format.js";
-import { seekPast, showHeat, showWay } from "../past.js";
+import { seek, showHeat, showWay } from "../player.js";
 import { facts } from "./parts.js";
 
 /** Of more rows only the first ones are shown; the file has all. */
@@ -184,7 +184,7 @@ function placeButton(unix_s, tag, context) {
     target.disabled = true;
     try {
       if (state.past?.track?.tag !== tag) await askWay({ ...context, tag, title: shownName(tag) });
-      if (!context.signal.aborted) seekPast(unix_s);
+      if (!context.signal.aborted) seek(unix_s - state.past?.start_unix_s);
     } catch (error) {
       if (!context.signal.aborted) target.after(h("span", { role: "alert" }, ` ${error.message}`));
     }

@@ -5,7 +5,7 @@ import { fileOf, recordings } from "../api.js";
 import { Rows, h, text, toast } from "../dom.js";
 import { bytes, dateTime, duration } from "../format.js";
 import { open as play, close } from "../player.js";
-import { KEYS } from "../replay_bar.js";
+import { KEYS } from "../player_bar.js";
 
 export const title = "Replay";
 export const topics = ["recordings", "player", "mode"];
@@ -43,7 +43,7 @@ export function show() {
 
 function keys() {
   const rows = KEYS.map(([key, words]) => h("div", {}, h("dt", {}, key), h("dd", {}, words)));
-  return h("section", {}, h("h2", {}, "Keys while a recording is replayed"), h("dl", { class: "facts keys" }, ...rows));
+  return h("section", {}, h("h2", {}, "Keys while a recording or a way is played"), h("dl", { class: "facts keys" }, ...rows));
 }
 
 async function load() {
