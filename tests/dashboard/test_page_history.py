@@ -63,42 +63,30 @@ def pixels(page, layer):
     )
 
 
-def seek(page, unix_s):
-    page.evaluate("at => import('/page/player.js').then(({ seek }) => seek(at - skyless.state.player.start_unix_s))", unix_s)
+def place(page, unix_s):
+    """Where the marker is at a moment."""
+    page.evaluate(
+        "at => import('/page/player.js').then(({ seek }) => seek(at - skyless.state.past.start_unix_s))", unix_s
+    )
     page.evaluate(THREE_FRAMES)
-
-
-def place(page):
-    return page.evaluate("import('/page/map/past.js').then(({ placeNow }) => placeNow(skyless.state.past)?.place ?? null)")
+    return page.evaluate("import('/page/map/past.js').then(({ placeNow }) => placeNow(skyless.state.past)?.place)")
 
 
 def test_the_way_of_a_tag_is_shown_and_played(kept):
     server, shown = kept
     page = shown.page
     before = pixels(page, "still")
-    page.click("#history-alarms")
-    page.wait_for_selector("#history-result table")
+    ask(page, "way", "trolley")
     page.fill("#history-tag", "forklift")
-    page.keyboard.press("Enter")  # asks for the alarms again
-    page.click("#history-way")
-    page.wait_for_selector("#history-result dl")
-    page.fill("#history-tag", "trolley")
     page.keyboard.press("Enter")
-    until(page, "skyless.state.past?.track.tag === 'trolley'")
-    asked = len(server.history_asked)
-    page.focus("#slider")
-    page.evaluate(THREE_FRAMES)
-    assert len(server.history_asked) == asked, "a field that loses the focus asks for nothing"
-    ask(page, "way", "forklift")
-    until(page, "skyless.state.past?.track.tag === 'forklift'")
     past = "skyless.state.past"
-    assert page.evaluate(f"{past}.track.tag") == "forklift"
-    assert pixels(page, "still") > before + 500
+    until(page, f"{past}?.track.tag === 'forklift'")
     query = server.history_asked[-1][1]
     assert float(query["to"]) - float(query["from"]) == pytest.approx(3600, abs=60)
     assert query["site"] == "7"
 
     # Nothing looks like the present.
+    assert pixels(page, "still") > before + 500
     assert page.locator("#past-mark").inner_text().startswith("Past · forklift · 20")
     assert page.locator("#pill").inner_text() != "Live"  # but Past, or a warning that the browser is busy
     assert page.evaluate("getComputedStyle(document.getElementById('moving')).opacity") == "0.2"
@@ -108,33 +96,28 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     points = page.evaluate(f"{past}.track.points")
     index = next(n for n in range(20, len(points)) if points[n + 1][0] - points[n][0] < 5)
     (begin, *one), (end, *two) = points[index][:4], points[index + 1][:4]
-    seek(page, (begin + end) / 2)
-    assert place(page) == pytest.approx([(a + b) / 2 for a, b in zip(one, two, strict=True)], abs=1e-6)
+    middle = [(a + b) / 2 for a, b in zip(one, two, strict=True)]
+    assert place(page, (begin + end) / 2) == pytest.approx(middle, abs=1e-6)
     assert pixels(page, "moment") > 50
     pause = begin - begin % made_up.PERIOD_S + made_up.PERIOD_S + made_up.PAUSE_S / 2
-    seek(page, pause)
-    assert place(page) is None
+    assert place(page, pause) is None
     assert pixels(page, "moment") == 0
     assert page.locator("#player .about").inner_text() == "no position then"
     assert page.evaluate(f"{past}.fixes.length") in {6, 7}
 
-    # Played from within a pause, it goes on where there are positions; then the keyboard, to the end.
-    page.select_option("#speed", "300")
-    page.click("#play")
-    until(
-        page,
-        f"at => {past}.start_unix_s + {past}.at_s > at + {made_up.PAUSE_S / 2} && !!document.querySelector('#play-time')",
-        arg=pause,
-    )
-    page.focus("#canvas")
-    page.keyboard.press("k")
-    until(page, f"!{past}.playing")
-    at = page.evaluate(f"{past}.at_s")
-    page.keyboard.press("j")
-    assert page.evaluate(f"{past}.at_s") < at
+    # Played from within a pause, it goes on where there are positions; the keys are those of recordings.
+    page.select_option("#speed", "60")
     page.focus("#slider")
+    page.keyboard.press(">")
+    page.keyboard.press("k")
+    until(page, f"at => {past}.start_unix_s + {past}.at_s > at + {made_up.PAUSE_S / 2}", arg=pause)
+    assert page.evaluate(f"{past}.speed") == 300
+    page.keyboard.press("k")
+    page.keyboard.press("5")
+    page.keyboard.press("j")
+    assert page.evaluate(f"{past}.at_s / {past}.duration_s") == pytest.approx(0.49)
     page.keyboard.press("End")
-    until(page, f"{past}.at_s > {past}.duration_s - 1.5")
+    until(page, f"{past}.at_s > {past}.duration_s - 1.5 && !{past}.playing")
     page.select_option("#past-colours", "speed")
     until(page, "document.querySelector('#player .ticks').textContent.endsWith('m/s')")
 

@@ -3,7 +3,7 @@
 import { on, state } from "./store.js";
 import { button, byId, h, offer, options, s, text } from "./dom.js";
 import { fileOf } from "./api.js";
-import { clock, dateTime, metres } from "./format.js";
+import { clock, dateTime, metres, timeOfDay } from "./format.js";
 import { heatScale, heatTicks, placeNow, ramp, topSpeed } from "./map/past.js";
 import { paintScale } from "./pictures.js";
 import { SPEEDS, choose, close, seek, seekEvent, step, stepEvent, stepSpeed, toggle } from "./player.js";
@@ -134,7 +134,7 @@ function showMoment() {
   parts.play.ariaLabel = `${player.playing ? "Pause" : "Play"} (K)`;
   parts.icon.setAttribute("d", player.playing ? ICONS.pause : ICONS.play);
   parts.slider.value = String(player.at_s);
-  parts.slider.ariaValueText = words.time;
+  parts.slider.ariaValueText = player.kind === "way" ? dateTime(player.start_unix_s + player.at_s) : words.time;
   for (const [part, value] of Object.entries(words)) text(parts[part], value);
   text(parts.problem, player.error);
 }
@@ -151,7 +151,7 @@ function wordsOf(player) {
   const found = placeNow(player);
   const alert = ALERTS[found?.alert]?.grade ? ` · ${ALERTS[found.alert].words}` : "";
   const about = found ? `x ${metres(found.place[0])} m · y ${metres(found.place[1])} m${alert}` : "no position then";
-  return { time: day, about, mark: `Past · ${title} · ${day}` };
+  return { time: timeOfDay(player.start_unix_s + at_s), about, mark: `Past · ${title} · ${day}` };
 }
 
 /** A button for every event that deserves attention; those that are close share one. */

@@ -27,8 +27,8 @@ export function start() {
   on(["picking", "plan"], showPicking);
   on(["site", "options"], showFloors);
   on(["mode"], () => {
-    byId("draw").disabled = view.spatial || document.body.classList.contains("replaying");
-    if (editor.drawing) cancel();
+    byId("draw").disabled = view.spatial || state.mode === "replay";
+    if (editor.drawing && state.mode === "replay") cancel();
   });
 }
 
