@@ -4,9 +4,12 @@ import json
 import time
 from pathlib import Path
 
+import numpy as np
+import page_fake_site as made_up
 import pytest
 from page_browser import THREE_FRAMES, until
 from page_fake_server import DOCK
+from scipy.spatial import ConvexHull
 
 pytestmark = pytest.mark.statistical
 
@@ -198,3 +201,68 @@ def test_zones_are_exported_and_imported(hall, tmp_path):
     page.set_input_files("#panel-zones input[type=file]", file)
     page.wait_for_selector("text=zones.json holds no zones.")
     assert len(server.stored) == 1
+
+
+def row(number, x, y, std_m=0.1, alert=None):
+    """A state of a tag that is carried around."""
+    _, _, _, *fields = made_up.state_row("walker", 0, 0.0, time.time() - 1.0 + 0.001 * number)
+    fields[6], fields[14] = std_m, alert
+    return ["walker", x, y, *fields]
+
+
+def walk(corners, count):
+    """Positions at equal distances along a closed line."""
+    ends = np.array([*corners, corners[0]], float)
+    at = np.linspace(0, len(corners), count)
+    return np.column_stack([np.interp(at, range(len(ends)), ends[:, axis]) for axis in (0, 1)])
+
+
+def test_a_zone_is_walked(hall):
+    """Its edges are outside of the walk; positions that may be wrong count for nothing."""
+    server, visit = hall
+    page = visit.page
+    server.send({"type": "state", "unix_s": time.time(), "tags": [row(0, 0, 0)]})
+    until(page, "skyless.live.all.has('walker')")
+    page.click("#tab-zones")
+    page.select_option("#outline-tag", "walker")
+    page.click("#outline")
+    walked = walk([(3, 3), (7, 3), (7, 6), (3, 6)], 61)
+    wrong = [row(70, 20, 12, alert="detected-not-excluded"), row(71, 20, 12, std_m=1.2)]
+    rows = [row(n + 1, *map(float, position)) for n, position in enumerate(walked)]
+    server.send({"type": "state", "unix_s": time.time(), "tags": [*rows, *wrong]})
+    page.wait_for_selector("text=61 good positions so far.")
+    page.fill("#outline-margin", "9")
+    page.click("#outline:text-is('Stop')")
+    page.wait_for_selector("text=The margin is 9; it should be 0 to 5 m")
+    page.fill("#outline-margin", "0.5")
+    page.click("#outline")
+    zone = wait_for_put(server)[1]
+    octagon = [
+        (x, y) for x in (2.5, 2.8, 7.2, 7.5) for y in (2.5, 2.8, 6.2, 6.5) if (x in {2.5, 7.5}) != (y in {2.5, 6.5})
+    ]
+    near(sorted(zone["polygon_m"]), sorted(octagon))
+    until(page, "id => skyless.state.selection.zone === id", arg=zone["id"])
+    page.click("#outline:text-is('Record outline')")
+    page.click("#outline")
+    page.wait_for_selector("text=No zone: The tag had 0 good positions; an outline needs 10.")
+
+
+def test_the_outline_of_a_noisy_walk_holds_it_and_has_few_corners(hall):
+    rng = np.random.default_rng(5)
+    angles = np.linspace(0, 2 * np.pi, 3000)
+    for radius_m, most in ((4.0, 40), (400.0, 100)):
+        walked = radius_m * np.column_stack([np.cos(angles), np.sin(angles)]) + 0.1 * rng.standard_normal((3000, 2))
+        outline = (
+            "([points, margin]) => import('/page/map/outline.js').then(({ outlineOf }) => outlineOf(points, margin))"
+        )
+        corners = np.array(hall[1].page.evaluate(outline, [walked.tolist(), 0.3]))
+        assert len(corners) <= most
+        edges = np.roll(corners, -1, axis=0) - corners
+        apart = walked[:, None] - corners
+        left_m = (edges[:, 0] * apart[..., 1] - edges[:, 1] * apart[..., 0]) / np.hypot(*edges.T)
+        assert left_m.min() > 0.2
+        hull = ConvexHull(walked)
+        grown_m2 = hull.volume + 0.3 * hull.area + np.pi * 0.3**2  # of a convex shape, by Steiner's formula
+        assert ConvexHull(corners).volume == pytest.approx(grown_m2, rel=0.01)
+    fault = hall[1].page.evaluate(f"({outline})([Array(20).fill([1, 2]), 0.3]).catch(({{ message }}) => message)")
+    assert fault == "The walk spans 0.00 m²; an outline needs 0.25 m²: walk around the place."

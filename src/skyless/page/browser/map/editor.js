@@ -54,14 +54,20 @@ export function setCursor(at) {
 /** Close the polygon and store it. */
 export async function finish() {
   if (editor.points.length < 3) return toast("A zone needs at least three corners.");
+  const corners = editor.points;
+  cancel();
+  await addZone(corners);
+}
+
+/** Store a new zone, and select it. */
+export async function addZone(polygon_m) {
   const zone = {
     id: freshId(),
     name: freshName(),
-    polygon_m: editor.points,
+    polygon_m,
     floor: chosenFloor()?.number ?? null,
     colour: COLOURS.find((colour) => !state.zones.some((one) => one.colour === colour)) ?? COLOURS[0],
   };
-  cancel();
   if (await store([...state.zones, zone], `${zone.name} stored.`)) select("zone", zone.id);
 }
 

@@ -9,9 +9,10 @@ import { floors } from "../map/floors.js";
 import { startDrawing } from "../map/tools.js";
 import { zoneColour } from "../map/zones.js";
 import { hexOf } from "../theme.js";
+import { outlineFields } from "./outline.js";
 
 export const title = "Zones";
-export const topics = ["zones", "events", "selection", "mode", "editor", "site", "theme"];
+export const topics = ["zones", "events", "selection", "mode", "editor", "site", "theme", "health"];
 export const interval_ms = 60;
 
 let parts = null;
@@ -28,9 +29,10 @@ export function start(panel) {
   const others = h("ul", { class: "given" });
   const kept = h("section", { hidden: true }, h("h2", {}, "Kept, not shown"), others);
   const file = fileButtons();
-  parts = { add, none, silent, fault, kept, file, others: new Rows(others, makeOther) };
+  const outline = outlineFields();
+  parts = { add, none, silent, fault, kept, file, outline, others: new Rows(others, makeOther) };
   Object.assign(parts, { zones: new Rows(zones, makeZone), events: new Rows(events, makeEvent) });
-  panel.append(h("div", { class: "above" }, h("p", { class: "count" }), add), fault, none, zones, file.element, kept);
+  panel.append(h("div", { class: "above" }, h("p", { class: "count" }), add), fault, none, zones, file.element, outline.element, kept);
   panel.append(h("section", {}, h("h2", {}, "Events"), silent, events));
 }
 
@@ -43,6 +45,7 @@ export function show() {
   parts.add.disabled = !live || editor.drawing || Boolean(fault);
   parts.none.hidden = state.zones.length > 0 || Boolean(fault);
   parts.file.show(live && !fault);
+  parts.outline.show();
   parts.kept.hidden = !live || !state.otherZones.length;
   parts.others.show(state.otherZones.map((other) => [JSON.stringify(other), other]));
   parts.zones.show(state.zones.map((zone) => [zone.id, zone]));
