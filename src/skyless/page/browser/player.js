@@ -26,9 +26,6 @@ export const SPEEDS = { recording: [0.25, 0.5, 1, 2, 4, 8], way: [1, 4, 16, 60, 
 const chosen = { recording: { speed: 1 }, way: { speed: 16, colours: "time" } };
 /** Increases where an answer that is awaited is useless, as another recording is to be opened. */
 let openings = 0;
-/** Stands for the states that are awaited; null where none are. */
-let loading = null;
-let seekTimer = 0;
 let lastFrame = 0;
 
 /** Open a recording and play it from its first fix; where it cannot be opened, what is shown stays. */
@@ -44,9 +41,8 @@ export async function open(name) {
   replayed.addNames(tags);
   select(null);
   const fixes = fix_spans_unix_s.map((span) => span.map((at) => at - start_unix_s));
-  const error = fixes.length ? "" : "There are no fixes in it.";
-  const unknown = { loaded: { from: 0, to: 0 }, events: null, waiting: true };
-  play({ kind: "recording", name, start_unix_s, duration_s: Math.max(0, end_unix_s - start_unix_s), fixes, error, ...unknown, playing: true });
+  const duration_s = Math.max(0, end_unix_s - start_unix_s);
+  play({ kind: "recording", name, start_unix_s, duration_s, fixes, loaded: { from: 0, to: 0 }, events: null, playing: true });
   changed("site", "zones", "tags");
   loadEvents(state.player);
   seek(firstFix_s(state.player));
@@ -73,22 +69,14 @@ export function showHeat(map, title, { from_unix_s, to_unix_s }) {
 
 /** Show the past; `fixes` are when there are some, `loaded` is what can be played at once, in s since the start. */
 function play(source) {
-  abandon();
-  const whole = { fixes: [], loaded: { from: 0, to: Infinity }, events: [], marked: [], error: "", waiting: false };
-  state.player = { at_s: 0, playing: false, ...whole, ...chosen[source.kind], ...source };
+  const whole = { fixes: [], loaded: { from: 0, to: Infinity }, events: [], marked: [] };
+  state.player = { at_s: 0, playing: false, waiting: false, error: "", ...whole, ...chosen[source.kind], ...source };
   changed("mode", "player");
-}
-
-/** Wait for no states any more. */
-function abandon() {
-  clearTimeout(seekTimer);
-  loading = null;
 }
 
 /** Show the present again. */
 export function close() {
   openings++;
-  abandon();
   state.player = null;
   if (state.mode === "replay") backToLive();
   changed("mode", "player");
@@ -151,35 +139,33 @@ export function seek(at_s) {
   const { player } = state;
   if (!player) return;
   player.at_s = Math.min(Math.max(at_s, 0), player.duration_s);
+  player.waiting = isMissing(player);
+  player.error = "";
   changed("player", "tags");
-  const there = player.at_s >= player.loaded.from && player.at_s < player.loaded.to;
-  if (there && !player.waiting) return;
-  abandon(); // states of another moment
-  player.waiting = !there;
-  if (!there) seekTimer = setTimeout(load, 60, true);
 }
 
-/** Fetch the states around the moment, or those after what is loaded. */
-async function load(restart) {
-  const { player } = state;
-  const mine = (loading = {});
+/** Whether the states of the moment have to be fetched first. */
+function isMissing({ at_s, loaded }) {
+  return at_s < loaded.from || at_s >= loaded.to;
+}
+
+/** Fetch the states around the moment, or with `more` those after what is loaded. */
+async function load(player, more) {
+  player.loading = true;
   const ahead_s = Math.min(AFTER_S * Math.max(1, player.speed / 2), 60 - BEFORE_S);
-  const from = restart ? Math.max(0, player.at_s - BEFORE_S) : player.loaded.to;
-  const to = Math.min((restart ? player.at_s : from) + ahead_s, player.duration_s + 0.001);
+  const from = more ? player.loaded.to : Math.max(0, player.at_s - BEFORE_S);
+  const to = Math.min((more ? from : player.at_s) + ahead_s, player.duration_s + 0.001);
   try {
     const states = await recordedStates(player.name, from, to, player.speed > 2 ? 10 : 20);
-    if (mine !== loading) return;
-    if (restart) replayed.clearStates();
+    if (player !== state.player) return;
+    if (!more) replayed.clearStates();
     for (const one of states) replayed.add(one.tags);
-    player.loaded = { from: restart ? from : Math.max(player.loaded.from, to - KEPT_S), to };
-    player.waiting = false;
-    if (player.fixes.length) player.error = "";
+    player.loaded = { from: more ? Math.max(player.loaded.from, to - KEPT_S) : from, to };
+    player.waiting = isMissing(player); // where another moment has been chosen meanwhile
   } catch (error) {
-    if (mine !== loading) return;
-    player.error = error.message;
-    player.playing = false;
+    Object.assign(player, { error: error.message, playing: false });
   }
-  loading = null;
+  player.loading = false;
   changed("player", "tags");
 }
 
@@ -187,8 +173,7 @@ async function load(restart) {
 export function toggle() {
   const { player } = state;
   player.playing = !player.playing;
-  if (player.playing && player.at_s >= player.duration_s) seek(firstFix_s(player));
-  if (player.playing && player.error) load(true);
+  if (player.playing) seek(player.at_s < player.duration_s ? player.at_s : firstFix_s(player));
   lastFrame = 0;
   changed("player");
 }
@@ -198,15 +183,16 @@ on(["player"], () => {
   const now = performance.now();
   const step_s = Math.min((now - (lastFrame || now)) / 1e3, 0.25);
   lastFrame = player?.playing ? now : 0;
-  if (!player?.playing) return;
-  if (!player.waiting) advance(player, step_s * player.speed);
-  changed("player", "tags");
+  if (!player) return;
+  if (player.playing && !player.waiting) advance(player, step_s * player.speed);
+  const { loaded, duration_s, at_s } = player;
+  const ends = player.playing && loaded.to < duration_s && loaded.to - at_s < 6 * Math.max(1, player.speed);
+  if ((player.waiting || ends) && !player.loading && !player.error) load(player, !player.waiting);
+  if (player.playing) changed("player", "tags");
 });
 
 function advance(player, step_s) {
-  const { loaded, duration_s, speed } = player;
-  player.at_s = Math.min(player.at_s + step_s, duration_s, loaded.to);
+  player.at_s = Math.min(player.at_s + step_s, player.duration_s, player.loaded.to);
   if (player.kind === "way") player.at_s = Math.max(player.at_s, player.fixes.find(([, to]) => player.at_s <= to)[0]); // gaps are skipped
-  if (player.at_s >= duration_s) player.playing = false;
-  else if (loaded.to - player.at_s < 6 * Math.max(1, speed) && loaded.to < duration_s && !loading) load(false);
+  if (player.at_s >= player.duration_s) player.playing = false;
 }

@@ -136,7 +136,7 @@ function showMoment() {
   parts.slider.value = String(player.at_s);
   parts.slider.ariaValueText = player.kind === "way" ? dateTime(player.start_unix_s + player.at_s) : words.time;
   for (const [part, value] of Object.entries(words)) text(parts[part], value);
-  text(parts.problem, player.error);
+  text(parts.problem, player.error || (player.fixes.length ? "" : "There are no fixes in it."));
 }
 
 /** What is written of the moment: its time, what there is then, and the mark on the map. */
