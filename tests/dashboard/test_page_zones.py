@@ -188,7 +188,7 @@ def test_zones_are_exported_and_imported(hall, tmp_path):
     page.click("#tab-zones")
     with page.expect_download() as found:
         page.click("text=Export")
-    assert found.value.suggested_filename == "zones Hall 7.json"
+    assert found.value.suggested_filename == "zones-Hall-7.json"
     file = tmp_path / "zones.json"
     file.write_bytes(Path(found.value.path()).read_bytes())
     assert json.loads(file.read_bytes()) == {"zones": [DOCK], "site": "Hall 7"}

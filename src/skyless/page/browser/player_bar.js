@@ -130,23 +130,23 @@ function range({ start_unix_s, duration_s }) {
 function showMoment() {
   const { player } = state;
   if (!player) return;
-  const words = wordsOf(player);
+  const words = { about: "", problem: "", time: "", ...wordsOf(player) };
   parts.play.ariaLabel = `${player.playing ? "Pause" : "Play"} (K)`;
   parts.icon.setAttribute("d", player.playing ? ICONS.pause : ICONS.play);
   parts.slider.value = String(player.at_s);
   parts.slider.ariaValueText = player.kind === "way" ? dateTime(player.start_unix_s + player.at_s) : words.time;
   for (const [part, value] of Object.entries(words)) text(parts[part], value);
-  text(parts.problem, player.error || (player.fixes.length ? "" : "There are no fixes in it."));
 }
 
 /** What is written of the moment: its time, what there is then, and the mark on the map. */
 function wordsOf(player) {
   const { kind, title, name, at_s, duration_s } = player;
   const day = dateTime(player.start_unix_s + at_s);
-  if (kind === "heat") return { time: "", about: "", mark: `Past · ${title} · ${range(player).join(" to ")}` };
+  if (kind === "heat") return { mark: `Past · ${title} · ${range(player).join(" to ")}` };
   if (kind === "recording") {
     const loading = player.waiting ? " · loading" : player.events === null ? " · reading events" : "";
-    return { time: `${clock(at_s)} of ${clock(duration_s)}`, about: `${name} · ${day}${loading}`, mark: `Replay · recorded ${day}` };
+    const problem = player.error || (player.fixes.length ? "" : "There are no fixes in it.");
+    return { time: `${clock(at_s)} of ${clock(duration_s)}`, about: `${name} · ${day}${loading}`, problem, mark: `Replay · recorded ${day}` };
   }
   const found = placeNow(player);
   const alert = ALERTS[found?.alert]?.grade ? ` · ${ALERTS[found.alert].words}` : "";

@@ -64,7 +64,6 @@ function describe() {
 export function start() {
   byId("follow").addEventListener("click", toggleFollow);
   byId("following-end").addEventListener("click", endFollow);
-  on(["mode"], () => state.past && endFollow());
-  on(["mode"], () => followed !== null && !tracks().all.has(followed) && endFollow());
+  on(["mode"], () => (state.past || !tracks().all.has(followed)) && endFollow());
   setInterval(describe, 1000);
 }

@@ -1,7 +1,7 @@
 /** What has happened, at the live site or in a recording, the newest first; with filters, and a count of the unread. */
 
 import { changed, savedSetting, saveSetting, select, state } from "../store.js";
-import { Rows, h, text } from "../dom.js";
+import { Rows, h, options, text } from "../dom.js";
 import { dateTime, sentence, timeOfDay } from "../format.js";
 
 export const title = "Events";
@@ -29,13 +29,9 @@ let readUnix_s = Number(savedSetting(READ)) || 0;
 
 /** Build the tab. */
 export function start(panel) {
-  const filter = h(
-    "select",
-    { "aria-label": "Which events", id: "event-filter" },
-    ...Object.entries(GROUPS).map(([value, { words }]) => h("option", { value }, words)),
-  );
-  filter.addEventListener("change", () => {
-    group = filter.value;
+  const groups = Object.entries(GROUPS).map(([value, { words }]) => [value, words]);
+  const filter = options({ "aria-label": "Which events", id: "event-filter" }, groups, (value) => {
+    group = value;
     show();
   });
   const count = h("p", { class: "count" });

@@ -13,33 +13,32 @@ import { ALERT, ALERTS, STD, TIME, X, Y } from "../tracks.js";
 const MAX_STD_M = 1;
 const GRADES = Object.values(ALERTS).map(({ grade }) => grade);
 
-/** @type {{tag: string, site: number|null, last_s: number, positions: number[][]}|null} */
-let recorded = null;
-
 /** The fields and the button: an element, and `show`, which brings them up to date. */
 export function outlineFields() {
+  /** @type {{name: string, site: number|null, last_s: number, positions: number[][]}|null} */
+  let walk = null;
   const tag = h("select", { id: "outline-tag" });
   const margin = h("input", { type: "number", id: "outline-margin", min: "0", max: "5", step: "0.05", value: "0.3" });
-  const go = button("", () => (recorded ? stop() : record()), { id: "outline" });
+  const go = button("", () => (walk ? stop() : record(tag.value)), { id: "outline" });
   const note = h("p", { class: "fine", role: "status" });
   const labels = Object.entries({ Tag: tag, "Margin, m": margin }).map(([words, field]) => h("label", { class: "field" }, words, field));
   const element = h("section", { class: "changes" }, h("h2", {}, "A zone by walking around it"), h("div", { class: "fields" }, ...labels, go), note);
   const show = () => {
-    offer(tag, live.sorted.map(({ name }) => [name, labelOf(name)]), recorded?.tag ?? tag.value);
-    tag.disabled = recorded !== null;
+    offer(tag, live.sorted.map(({ name }) => [name, labelOf(name)]), walk?.name ?? tag.value);
+    tag.disabled = walk !== null;
     go.disabled = !isChangeable() || !tag.value;
-    text(go, recorded ? "Stop" : "Record outline");
+    text(go, walk ? "Stop" : "Record outline");
   };
-  const record = () => {
-    recorded = { tag: tag.value, site: state.liveId, last_s: live.all.get(tag.value).lastTime, positions: [] };
-    if (state.part) follow(tag.value); // of a large site the server sends what is in view, and the followed tag
+  const record = (name) => {
+    walk = { name, site: state.liveId, last_s: live.all.get(name)?.lastTime ?? -Infinity, positions: [] };
+    if (state.part) follow(name); // of a large site the server sends what is in view, and the followed tag
     text(note, "Walk around the place with the tag.");
     show();
   };
   const stop = async () => {
     if (!margin.value || !margin.validity.valid) return text(note, `The margin is ${margin.value || "no number"}; it should be 0 to 5 m, in steps of 5 cm.`);
-    const { positions } = recorded;
-    recorded = null;
+    const { positions } = walk;
+    walk = null;
     show();
     try {
       await addZone(outlineOf(positions, margin.valueAsNumber));
@@ -49,20 +48,15 @@ export function outlineFields() {
     }
   };
   on(["tags"], () => {
-    if (recorded && recorded.site !== state.liveId) recorded = null;
-    if (recorded && collect(recorded)) text(note, `${recorded.positions.length} good positions so far.`);
+    if (walk?.site !== state.liveId) walk = null;
+    const track = live.all.get(walk?.name);
+    if (!track) return;
+    for (let index = track.find(walk.last_s) + 1; index < track.count; index++) {
+      const [at_s, x_m, y_m, std_m, alert] = [TIME, X, Y, STD, ALERT].map((column) => track.value(index, column));
+      walk.last_s = at_s;
+      if (GRADES[alert] !== "bad" && !(std_m > MAX_STD_M)) walk.positions.push([x_m, y_m]);
+    }
+    if (walk.positions.length) text(note, `${walk.positions.length} good positions so far.`);
   });
   return { element, show };
-}
-
-/** Add the positions that have come; returns whether there are some. */
-function collect(record) {
-  const track = live.all.get(record.tag);
-  const before = record.positions.length;
-  for (let index = track ? track.find(record.last_s) + 1 : 0; index < (track?.count ?? 0); index++) {
-    record.last_s = track.value(index, TIME);
-    if (GRADES[track.value(index, ALERT)] === "bad" || track.value(index, STD) > MAX_STD_M) continue;
-    record.positions.push([track.value(index, X), track.value(index, Y)]);
-  }
-  return record.positions.length > before;
 }

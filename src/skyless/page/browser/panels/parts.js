@@ -28,10 +28,6 @@ export function selectionTable(kind, heads, describe) {
     let shown = "";
     const update = ({ item, index }) => {
       const chosen = state.selection[kind] === id;
-      if (row.classList.contains("selected") !== chosen) {
-        row.classList.toggle("selected", chosen);
-        button.setAttribute("aria-pressed", String(chosen));
-      }
       if (index !== null) row.setAttribute("aria-rowindex", String(index + 2));
       const { condition, words, key, mark, name, figures } = describe(id, item);
       if (shown !== key) cells[0].replaceChildren(mark(), h("span", { class: "unseen" }, words));

@@ -2,7 +2,8 @@
 
 import { isChangeable, select, state, toggleSelection } from "../store.js";
 import { shownName } from "../assets/model.js";
-import { Rows, h, offer, options, text, toast } from "../dom.js";
+import { Rows, button, h, offer, options, text, toast } from "../dom.js";
+import { saveFile } from "../files.js";
 import { sentence, timeOfDay } from "../format.js";
 import { add as addZones, change, editor, remove } from "../map/editor.js";
 import { floors } from "../map/floors.js";
@@ -59,8 +60,8 @@ export function show() {
 function makeOther(_key, { site, zones }) {
   const count = `${zones.length} ${zones.length === 1 ? "zone" : "zones"}`;
   const copy = () => addZones(zones, `${count} of ${site} copied.`);
-  const button = h("button", { type: "button", class: "changes", onclick: copy, "aria-label": `Copy the zones of ${site} here` }, "Copy here");
-  return { element: h("li", {}, h("span", {}, `Site ${site}: ${count}`), button) };
+  const here = button("Copy here", copy, { class: "changes", "aria-label": `Copy the zones of ${site} here` });
+  return { element: h("li", {}, h("span", {}, `Site ${site}: ${count}`), here) };
 }
 
 /** Zones to a file and from one, in the form of `skyless/v1/<site>/zones`. */
@@ -82,10 +83,8 @@ function fileButtons() {
 
 function exportZones() {
   const name = state.site?.name ?? "";
-  const file = new Blob([JSON.stringify({ zones: state.zones, site: name }, null, 1)], { type: "application/json" });
-  const link = h("a", { href: URL.createObjectURL(file), download: `zones ${name}.json` });
-  link.click();
-  setTimeout(() => URL.revokeObjectURL(link.href), 10_000);
+  const words = JSON.stringify({ zones: state.zones, site: name }, null, 1);
+  saveFile(new Blob([words], { type: "application/json" }), `zones ${name}.json`);
 }
 
 /** Add the zones of a file; the server checks them. @param {File} file */
@@ -106,12 +105,8 @@ function makeZone(id, zone) {
   const name = h("input", { type: "text", maxLength: 60, "aria-label": "Name of the zone" });
   name.addEventListener("change", () => name.value.trim() && change(id, { name: name.value.trim() }));
   name.addEventListener("keydown", (event) => event.key === "Enter" && name.blur());
-  const corners = h(
-    "button",
-    { type: "button", class: "quiet", onclick: () => toggleSelection("zone", id) },
-    "Corners",
-  );
-  const del = h("button", { type: "button", class: "quiet changes", onclick: () => remove(id) }, "Delete");
+  const corners = button("Corners", () => toggleSelection("zone", id), { class: "quiet" });
+  const del = button("Delete", () => remove(id), { class: "quiet changes" });
   const table = h("div", { class: "corners", hidden: true });
   const floor = options({ "aria-label": `Floor of ${zone.name}` }, [], (value) => change(id, { floor: value === "" ? null : Number(value) }));
   const element = h("li", {}, h("div", { class: "zone" }, swatch, name, floor, corners, del), table);
