@@ -102,7 +102,7 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     pause = begin - begin % made_up.PERIOD_S + made_up.PERIOD_S + made_up.PAUSE_S / 2
     assert place(page, pause) is None
     assert pixels(page, "moment") == 0
-    assert page.locator("#player .about").inner_text() == "no position then"
+    assert page.locator("#play-about").inner_text() == "no position then"
     assert page.evaluate(f"{past}.fixes.length") in {6, 7}
 
     # Played from within a pause, it goes on where there are positions; the keys are those of recordings.

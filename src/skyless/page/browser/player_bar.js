@@ -1,21 +1,17 @@
 /** The bar below the map while it shows the past: controls, keys and events of what is played, and the scale of its colours. */
 
 import { on, state } from "./store.js";
-import { button, byId, h, offer, options, s, text } from "./dom.js";
+import { button, byId, h, offer, text } from "./dom.js";
 import { fileOf } from "./api.js";
 import { clock, dateTime, metres, timeOfDay } from "./format.js";
 import { heatScale, heatTicks, placeNow, ramp, topSpeed } from "./map/past.js";
 import { paintScale } from "./pictures.js";
 import { SPEEDS, choose, close, seek, seekEvent, step, stepEvent, stepSpeed, toggle } from "./player.js";
 import { ALERTS } from "./tracks.js";
-import { whatIfButton } from "./what_if.js";
+import { openWhatIf } from "./what_if.js";
 
-const ICONS = {
-  play: "M7 4.5v15l12-7.5z",
-  pause: "M7 5h3.5v14H7zM13.5 5H17v14h-3.5z",
-  back: "M18 5v14L9 12zM6 5h2.5v14H6z",
-  next: "M6 5v14l9-7zM15.5 5H18v14h-2.5z",
-};
+const PLAY = "M7 4.5v15l12-7.5z";
+const PAUSE = "M7 5h3.5v14H7zM13.5 5H17v14h-3.5z";
 /** The keys, for the list in the tab Replay. */
 export const KEYS = [
   ["K or space", "play, pause"],
@@ -32,53 +28,22 @@ const MARK_PX = 26;
 /** How many of the events that share a mark are named. */
 const NAMED = 3;
 
-let parts = null;
-
 /** Build the bar. */
 export function start() {
-  const bar = byId("player");
-  const icon = s("path", {});
-  const play = iconButton("play", icon, toggle);
-  const jumps = Object.entries({ back: "The event before ([)", next: "The next event (])" }).map(([name, words]) => {
-    const jump = iconButton(`event-${name}`, s("path", { d: ICONS[name] }), () => stepEvent(name === "next" ? 1 : -1));
-    jump.title = jump.ariaLabel = words;
-    return jump;
-  });
-  const marks = h("div", { class: "event-marks", role: "group", "aria-label": "Events", onkeydown: moveAlong });
-  const slider = h("input", { type: "range", id: "slider", min: "0", "aria-label": "Time since the start", oninput: () => seek(Number(slider.value)) });
-  const spans = h("div", { class: "spans", "aria-hidden": "true" });
-  const time = h("output", { id: "play-time" });
-  const about = h("span", { class: "about" });
-  const problem = h("span", { class: "problem", role: "alert" });
-  const speeds = options({ id: "speed", "aria-label": "Speed" }, [], (value) => choose({ speed: Number(value) }));
-  const scale = { words: h("span", { id: "past-scale" }), canvas: h("canvas", { "aria-hidden": "true" }), ticks: h("div", { class: "ticks" }) };
-  const pairs = Object.entries({ time: "Colour: time", speed: "Colour: speed" });
-  const colours = options({ id: "past-colours", "aria-label": "Colours of the way" }, pairs, (value) => choose({ colours: value }));
-  const download = h("a", { id: "download", class: "button" }, "Download");
-  bar.append(
-    play,
-    ...jumps,
-    h("div", { class: "along" }, h("div", { class: "timeline" }, marks, slider, spans), h("div", { class: "under" }, time, about, problem)),
-    speeds,
-    h("div", { class: "past-ramp" }, ...Object.values(scale)),
-    colours,
-    whatIfButton(),
-    download,
-    button("Back to live", close, { id: "back" }),
-  );
-  const mark = h("p", { id: "past-mark", hidden: true });
-  byId("map").append(mark);
-  parts = { bar, play, icon, jumps, marks, slider, spans, time, about, problem, speeds, scale, colours, download, mark };
+  const listen = (id, event, call) => byId(id).addEventListener(event, call);
+  listen("play", "click", toggle);
+  listen("event-back", "click", () => stepEvent(-1));
+  listen("event-next", "click", () => stepEvent(1));
+  listen("event-marks", "keydown", moveAlong);
+  listen("slider", "input", ({ target }) => seek(Number(target.value)));
+  listen("speed", "change", ({ target }) => choose({ speed: Number(target.value) }));
+  listen("past-colours", "change", ({ target }) => choose({ colours: target.value }));
+  listen("what-if", "click", openWhatIf);
+  listen("back", "click", close);
   addEventListener("keydown", pressKey);
-  new ResizeObserver(showMarks).observe(marks);
+  new ResizeObserver(showMarks).observe(byId("event-marks"));
   on(["mode", "theme"], show);
   on(["player"], showMoment);
-}
-
-/** A button with a picture. */
-function iconButton(id, path, onclick) {
-  const picture = s("svg", { viewBox: "0 0 24 24", class: "solid", "aria-hidden": "true" }, path);
-  return button(picture, onclick, { id, class: "icon" });
 }
 
 /** A moment as a place along the bar. */
@@ -89,23 +54,23 @@ function along({ duration_s }, at_s) {
 /** Show what does not depend on the moment. */
 function show() {
   const { player } = state;
-  parts.bar.hidden = parts.mark.hidden = !player;
+  byId("player").hidden = byId("past-mark").hidden = !player;
   document.body.classList.toggle("replaying", player?.kind === "recording");
   document.body.classList.toggle("past", state.past !== null);
   if (!player) return;
   text(byId("announcement"), "The map shows the past.");
-  parts.bar.dataset.kind = player.kind;
-  Object.assign(parts.slider, { max: player.duration_s, step: step_s(player) });
-  offer(parts.speeds, SPEEDS[player.kind].map((speed) => [speed, `${speed} ×`]), player.speed);
-  parts.colours.value = player.colours;
+  byId("player").dataset.kind = player.kind;
+  Object.assign(byId("slider"), { max: player.duration_s, step: step_s(player) });
+  offer(byId("speed"), SPEEDS[player.kind].map((speed) => [speed, `${speed} ×`]), player.speed);
+  byId("past-colours").value = player.colours;
   const spans = player.fixes.map(([from, to]) => {
     const span = h("i", {});
     Object.assign(span.style, { left: along(player, from), right: `calc(100% - ${along(player, to)})` });
     return span;
   });
-  parts.spans.replaceChildren(...spans);
-  for (const jump of parts.jumps) jump.disabled = !player.marked.length;
-  Object.assign(parts.download, { href: fileOf(player.name), download: player.name, ariaLabel: `Download ${player.name}` });
+  byId("spans").replaceChildren(...spans);
+  byId("event-back").disabled = byId("event-next").disabled = !player.marked.length;
+  Object.assign(byId("download"), { href: fileOf(player.name), download: player.name, ariaLabel: `Download ${player.name}` });
   showMarks();
   showScale(player);
   showMoment();
@@ -117,8 +82,9 @@ function showScale(player) {
   const isHeat = player.kind === "heat";
   const ends = player.colours === "speed" ? ["0", `${topSpeed(player).toFixed(1)} m/s`] : range(player);
   const ticks = isHeat ? heatTicks(heatScale(player.map)) : ends.map((words, at) => [at, words]);
-  text(parts.scale.words, isHeat ? `Time in a cell of ${player.map.cell_m} m × ${player.map.cell_m} m, logarithmic` : "");
-  paintScale(parts.scale.canvas, ramp(), parts.scale.ticks, ticks);
+  text(byId("past-scale"), isHeat ? `Time in a cell of ${player.map.cell_m} m × ${player.map.cell_m} m, logarithmic` : "");
+  const [, canvas, marks] = byId("past-ramp").children;
+  paintScale(canvas, ramp(), marks, ticks);
 }
 
 /** Begin and end in a few characters: within a day without the second date. */
@@ -130,12 +96,15 @@ function range({ start_unix_s, duration_s }) {
 function showMoment() {
   const { player } = state;
   if (!player) return;
-  const words = { about: "", problem: "", time: "", ...wordsOf(player) };
-  parts.play.ariaLabel = `${player.playing ? "Pause" : "Play"} (K)`;
-  parts.icon.setAttribute("d", player.playing ? ICONS.pause : ICONS.play);
-  parts.slider.value = String(player.at_s);
-  parts.slider.ariaValueText = player.kind === "way" ? dateTime(player.start_unix_s + player.at_s) : words.time;
-  for (const [part, value] of Object.entries(words)) text(parts[part], value);
+  const { mark, time = "", about = "", problem = "" } = wordsOf(player);
+  byId("play").ariaLabel = `${player.playing ? "Pause" : "Play"} (K)`;
+  byId("play").querySelector("path").setAttribute("d", player.playing ? PAUSE : PLAY);
+  byId("slider").value = String(player.at_s);
+  byId("slider").ariaValueText = player.kind === "way" ? dateTime(player.start_unix_s + player.at_s) : time;
+  text(byId("past-mark"), mark);
+  text(byId("play-time"), time);
+  text(byId("play-about"), about);
+  text(byId("play-problem"), problem);
 }
 
 /** What is written of the moment: its time, what there is then, and the mark on the map. */
@@ -157,7 +126,7 @@ function wordsOf(player) {
 /** A button for every event that deserves attention; those that are close share one. */
 function showMarks() {
   const { player } = state;
-  const box = parts.marks;
+  const box = byId("event-marks");
   const groups = [];
   for (const event of player?.marked ?? []) {
     const x = (event.at_s / (player.duration_s || 1)) * box.clientWidth;
@@ -186,7 +155,7 @@ function markOf(player, events, index) {
 
 /** One mark is in the order of the tab key; arrows lead to the others. */
 function moveAlong(event) {
-  const marks = [...parts.marks.children];
+  const marks = [...byId("event-marks").children];
   const at = marks.indexOf(event.target);
   const to = marks[{ ArrowRight: at + 1, ArrowLeft: at - 1, Home: 0, End: marks.length - 1 }[event.key]];
   if (!to) return;

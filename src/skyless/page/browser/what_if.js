@@ -10,9 +10,9 @@ const SECONDS = 30;
 const LEAST_ANCHORS = 3;
 const MARGIN_M = 0.5;
 
-/** The button that opens the dialog, for the bar of the replay. */
-export function whatIfButton() {
-  return h("button", { type: "button", id: "what-if", onclick: () => openDialog().catch(showFailure) }, "What if…");
+/** Open the dialog for the moment that is shown of a recording. */
+export function openWhatIf() {
+  openDialog().catch(showFailure);
 }
 
 const failure = h("p", { class: "problem", role: "alert" });
