@@ -45,7 +45,6 @@ export async function open(name) {
   play({ kind: "recording", name, start_unix_s, duration_s, fixes, loaded: { from: 0, to: 0 }, events: null, playing: true });
   changed("site", "zones", "tags");
   loadEvents(state.player);
-  seek(firstFix_s(state.player));
 }
 
 /** Show a tag's way, a `Track` with at least one point; `title` says whose. */
@@ -70,8 +69,9 @@ export function showHeat(map, title, { from_unix_s, to_unix_s }) {
 /** Show the past; `fixes` are when there are some, `loaded` is what can be played at once, in s since the start. */
 function play(source) {
   const whole = { fixes: [], loaded: { from: 0, to: Infinity }, events: [], marked: [] };
-  state.player = { at_s: 0, playing: false, waiting: false, error: "", ...whole, ...chosen[source.kind], ...source };
-  changed("mode", "player");
+  state.player = { playing: false, ...whole, ...chosen[source.kind], ...source };
+  seek(firstFix_s(state.player));
+  changed("mode");
 }
 
 /** Show the present again. */
