@@ -5,7 +5,6 @@ import threading
 import time
 from itertools import pairwise
 
-import msgspec
 import numpy as np
 import pytest
 from dashboard_builders import HERE, SITE_ID, browser_of
@@ -134,7 +133,7 @@ def test_pages_have_each_tag_once(client, limit):
 
 
 def test_tags_by_group_zone_and_name(client, site, wire):
-    show(site, wire, "t2", x=8.0, serial=2)
+    show(site, wire, "t2", x=8.0)
     names = lambda **query: [tag["tag"] for tag in client.get("tags", params=query).json()["tags"]]  # noqa: E731
     assert names(group="forklifts") == ["t1"]
     assert names(zone="desk") == [name for name in NAMES if name != "t2"]
@@ -150,8 +149,8 @@ def test_tags_by_group_zone_and_name(client, site, wire):
 
 def test_old_and_forbidden_fixes_are_none(client, site, wire, times):
     times.move(4.0)
-    show(site, wire, "t1", serial=2, alert="alert-limit-exceeded")
-    show(site, wire, "t2", serial=2)
+    show(site, wire, "t1", alert="alert-limit-exceeded")
+    show(site, wire, "t2")
     times.move(2.0)
     assert [fix["tag"] for fix in client.get("fixes").json()["fixes"]] == ["t2"]
     assert client.get("fixes").json()["fixes"][0]["unix_s"] == pytest.approx(site.wall_clock() - 2.0, abs=0.01)
@@ -177,7 +176,7 @@ def test_geojson_has_the_assets_and_true_places(client, site):
 
 
 def test_without_a_georeference_there_is_no_geojson(client, site, wire):
-    site._on_site("", msgspec.json.encode(replace(site.site, site=replace(site.site.site, georeference=None))))
+    wire.deliver(topics.site_topic(SITE_ID), replace(site.site, site=replace(site.site.site, georeference=None)))
     for path in ("fixes", "anchors", "zones"):
         answer = client.get(path, params={"format": "geojson"})
         assert answer.status_code == 409

@@ -55,12 +55,12 @@ def test_hello_comes_first_and_then_all_that_is_there(site):
 
 
 async def _show_later(live):
-    show(live, live._link, "t5", serial=2)
+    show(live, live._link, "t5")
 
 
 def test_the_first_fixes_are_not_old(site, wire, times):
     times.move(4.0)
-    show(site, wire, "t2", serial=2)
+    show(site, wire, "t2")
     times.move(2.0)
     assert fixed(SiteStream(site, frozenset())) == ["t2"]
 
@@ -69,8 +69,8 @@ def test_only_what_is_new(site, wire):
     reader = SiteStream(site, frozenset())
     assert fixed(reader) == NAMES
     assert messages(reader) == []
-    show(site, wire, "t2", x=1.0, serial=2)
-    show(site, wire, "t2", x=1.5, serial=3)
+    show(site, wire, "t2", x=1.0)
+    show(site, wire, "t2", x=1.5)
     (message,) = messages(reader)
     assert [(fix["tag"], fix["position_m"][0]) for fix in message["fixes"]] == [("t2", 1.5)]
 
