@@ -289,7 +289,7 @@ def test_wrong_messages_are_counted(live, wire):
     for payload in (b"\xff", b"{}", msgspec.json.encode(message)):
         wire.deliver(topics.alarm_topic(SITE_ID, "r", "t2"), payload)
     wire.deliver(topics.acknowledge_topic(SITE_ID, "r", "t2"), b"[]")
-    assert (live.dropped["state"], live.dropped["acknowledge"]) == (3, 1)
+    assert (live.dropped["alarm"], live.dropped["acknowledge"]) == (3, 1)
     assert live.alarms.messages == ()
 
 

@@ -39,7 +39,7 @@ def test_a_page_first_gets_hello(live, wire):
     wire.deliver(FIX, fix())
     messages = drained(live, live.open_page())
     assert messages[0]["type"] == "hello"
-    assert messages[0].keys() == {*HELLO, "zones", "other_zones", "zones_fault"}
+    assert messages[0].keys() == {*HELLO, "thresholds", "zones", "other_zones", "zones_fault"}
     assert (messages[0]["site"], messages[0]["zones"], messages[0]["mqtt"]) == (None, [], False)
     assert of("mqtt", messages) == [{"type": "mqtt", "connected": False, "broker": "mqtt://broker:1"}]
     assert of("state", messages)[0]["tags"][0][0] == "t1"
@@ -185,6 +185,7 @@ def test_a_second_dashboard_leaves_publishing_to_the_first(live, wire, times):
 
 
 def test_a_tag_without_fixes_or_offline_leaves(live, wire, times):
+    live.on_connection(connected=True)
     enter_the_desk(live, wire)
     times.move(THRESHOLDS.longest_s)
     live.tick()

@@ -218,7 +218,8 @@ def test_no_number_takes_what_is_none(refused, key, number):
     """Every numeric key of the template, given a value that is no finite number."""
     name = key.split(".")[-1]
     own = LAB if f"{name} = " in LAB else PAPER
-    text, count = re.subn(rf"^(# )?({name} = )[^ \n]+", rf"\g<2>{number}", own, count=1, flags=re.MULTILINE)
+    number = f"{{vans = {number}}}" if name == "group_silence_s" else number
+    text, count = re.subn(rf"^(# )?({name} = )(\{{.*?\}}|[^ \n]+)", rf"\g<2>{number}", own, count=1, flags=re.MULTILINE)
     if key in ("anchors.id", "anchors.slot") or count == 0 or "antenna_delay" in key:
         text = LAB.replace("[[anchors]]\nid = 1", f"[[anchors]]\nid = 1\n{name} = {number}").replace("id = 1\nid", "id")
     error = refused(text)

@@ -127,6 +127,8 @@ class BridgeNode:
         site = self._site.whole_site
         zones = zones_of(self._zones, site.name).zones
         assets = assets_at(self._assets, site.name)
+        self.hub.table.set_site(site, time.monotonic())
+        self.hub.table.set_assets(assets)
         try:
             self.hub.on_site(bridged_site(site, zones, simulated=self._site.simulated, assets=assets))
         except SkylessError as error:

@@ -156,6 +156,11 @@ class TagsSite(Struct, frozen=True, forbid_unknown_fields=True):
 
     height_m: float | None = None
     """All tags move at this height (2-D positioning); leave out to estimate the height."""
+    longest_silence_s: float | UnsetType = UNSET
+    """A tag that has been silent for longer has gone, however rarely it sends; 900 s by default.
+    Omitted if unset, as earlier versions refuse it."""
+    group_silence_s: dict[str, float] | UnsetType = UNSET
+    """The same for groups of assets, by name. Omitted if unset too."""
 
 
 class FloorPlanSite(Struct, frozen=True, forbid_unknown_fields=True):

@@ -504,6 +504,7 @@ class LiveSite:
         fresh = watch if age_s is not None and age_s < THRESHOLDS.watch_s else None
         self.alarms.engine.on_anchors(offline, fresh)
         self.alarms.engine.set_assets(self.assets.by_tag)
+        self.table.set_assets(self.assets.by_tag)
         self.log.on_watch(watch, now_s)
         self.log.on_survey(self.survey.survey.message, now_s)
         self.log.on_condition(self.condition, now_s)

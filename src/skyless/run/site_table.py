@@ -14,11 +14,11 @@ from collections.abc import Iterable, Mapping
 from heapq import heappop, heappush
 from typing import Final, Literal
 
-from msgspec import Struct
+from msgspec import UNSET, Struct
 from msgspec.structs import replace
 
 from skyless.core.site import Site
-from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, StatusMessage, TagHealth
+from skyless.run.mqtt.messages import AnchorHealth, Asset, EtherHealth, FixMessage, StatusMessage, TagHealth
 
 Health = TagHealth | AnchorHealth | EtherHealth
 Presence = Literal["fresh", "late", "asleep", "gone"]
@@ -218,6 +218,13 @@ class SiteTable:
             self.ready_s = now_s
         self.site = site
         self.site_anchors()
+        tags = site.tags
+        self.longest_s = THRESHOLDS.longest_s if tags.longest_silence_s is UNSET else tags.longest_silence_s
+        self.longest_of_groups_s = {} if tags.group_silence_s is UNSET else tags.group_silence_s
+
+    def set_assets(self, assets: Mapping[str, Asset]) -> None:
+        """Update the groups of tags."""
+        self.group_of = {tag: asset.group for tag, asset in assets.items()} if self.longest_of_groups_s else {}
 
     @property
     def is_bare(self) -> bool:

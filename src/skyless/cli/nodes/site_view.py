@@ -32,6 +32,7 @@ from skyless.run.mqtt.messages import (
     NOT_DROPS,
     AlarmMessage,
     AnchorHealth,
+    Asset,
     AssetsMessage,
     EtherHealth,
     FixMessage,
@@ -156,6 +157,7 @@ class SiteView:
         if message is not None:
             self.site = message
             self.table.set_site(message.site, self._clock())
+            self.table.set_assets(self._named())
 
     def _on_health(self, health: Health, channel: Channel) -> None:
         self.evidence.add_health(channel.who, channel.name, health, self._clock(), self._wall_clock())
@@ -168,6 +170,11 @@ class SiteView:
 
     def _on_assets(self, message: AssetsMessage | None) -> None:
         self._assets = message or AssetsMessage(())
+        self.table.set_assets(self._named())
+
+    def _named(self) -> dict[str, Asset]:
+        """The assets of the site shown, by tag."""
+        return {} if self.site is None else assets_at(self._assets, self.site.site.name)
 
     def _on_alarm(self, message: AlarmMessage | None, channel: Channel) -> None:
         if message is None:
@@ -228,7 +235,7 @@ class SiteView:
 
     def _tag_rows(self, tags: list[tuple[str, Node]], now_s: float) -> tuple[TagRow, ...]:
         rows = []
-        assets = {} if self.site is None else assets_at(self._assets, self.site.site.name)
+        assets = self._named()
         for name, tag in tags:
             health = tag.health if tag.reports(now_s) and isinstance(tag.health, TagHealth) else None
             state: TagState = "no fix"

@@ -58,6 +58,9 @@ _SLOT = Limits(0, 254, whole=True)
 _MAX_BY_PAIRS: Final = 255  # anchors up to which all pairs are compared one by one
 _DELAY = Limits(0, 65_535, "ticks (15.65 ps)", whole=True)
 
+_SILENCE = Limits(1, 86400, "seconds")
+_GROUP_SILENCE = Limits(1, 86400, "seconds for each group, as {vehicles = 60},")
+
 SITE_LIMITS: Final = {
     "id": _ADDRESS,
     "master": _ADDRESS,
@@ -87,6 +90,8 @@ SITE_LIMITS: Final = {
     "accuracy.place_distance_m": Limits(0, 650, "metres", above=True),
     "accuracy.place_time_s": Limits(0, 6000, "seconds", above=True),
     "tags.height_m": _COORDINATE,
+    "tags.longest_silence_s": _SILENCE,
+    "tags.group_silence_s": _GROUP_SILENCE,
     "walls.x1_m": _COORDINATE,
     "walls.y1_m": _COORDINATE,
     "walls.x2_m": _COORDINATE,
@@ -252,13 +257,16 @@ def _with_anchor(path: str, site: Site) -> str:
 
 
 def _numbers(value: object, path: str = "", row: int | None = None) -> Iterator[tuple[str, int | None, float]]:
-    """Every number in a tree of structs: its key without indices, its row if in a list, and its value."""
+    """Every number in a tree of structs: its key without indices and names, its row if in a list, and its value."""
     if isinstance(value, Struct):
         for field in value.__struct_fields__:
             yield from _numbers(getattr(value, field), f"{path}.{field}" if path else field, row)
     elif isinstance(value, tuple):
         for index, entry in enumerate(value):
             yield from _numbers(entry, path, index)
+    elif isinstance(value, dict):
+        for entry in value.values():
+            yield from _numbers(entry, path, row)
     elif isinstance(value, int | float) and not isinstance(value, bool):
         yield path, row, value
 

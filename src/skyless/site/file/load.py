@@ -193,7 +193,7 @@ def _refuse_unknown(path: Path, document: dict[str, Any], prefix: str, table: ob
 def _wrong_type(path: Path, document: dict[str, Any], message: str) -> ConfigurationError:
     """Translate msgspec's message: which key of the file, its value, and what would be right."""
     match = _FINDING.fullmatch(message)
-    key_path = match["path"] or "" if match else ""
+    key_path = (match["path"] or "" if match else "").removesuffix("[...]")  # so it names any key of a table
     missing = _MISSING.match(message)
     if missing:
         key_path = f"{key_path}.{missing['name']}".lstrip(".")

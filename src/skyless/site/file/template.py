@@ -207,6 +207,7 @@ def site_template(site: Site) -> str:
     )
     height = site.tags.height_m
     tags = _ESTIMATED_HEIGHT if height is None else _KNOWN_HEIGHT.format(height=height)
+    tags += _silences(site.tags)
     anchors = _ANCHORS.format(more=_MASTER_ANCHORS if schedule.needs_master else _FREE_ANCHORS)
     return head + tags + anchors + "".join(map(_anchor, site.all_anchors)) + _tail(site)
 
@@ -279,6 +280,17 @@ def _rule(rule: AlarmRule, off: str = "") -> str:
 def rectangle(width_m: float, depth_m: float) -> Outline:
     """Outline of a rectangular room with a corner at (0, 0)."""
     return (0.0, 0.0), (width_m, 0.0), (width_m, depth_m), (0.0, depth_m)
+
+
+def _silences(tags: TagsSite) -> str:
+    """After which silence tags have gone, where the site says so."""
+    longest_s, groups = tags.longest_silence_s, tags.group_silence_s or {}
+    named = ", ".join(f"{json.dumps(name, ensure_ascii=False)} = {seconds}" for name, seconds in groups.items())
+    return (
+        f"{_off(longest_s is not UNSET)}longest_silence_s = {900.0 if longest_s is UNSET else longest_s}"
+        "       # a tag that is silent for longer has gone, however rarely it sends\n"
+        f"{_off(bool(named))}group_silence_s = {{{named or 'vehicles = 60.0'}}}   # the same for groups of assets\n"
+    )
 
 
 def rectangular_site(width_m: float, depth_m: float, anchors: int, height_m: float, tag_height_m: float | None) -> Site:
