@@ -1,17 +1,12 @@
-"""Fixes whose serial number can be found in a history, and what a folder holds."""
+"""Fixes whose serial number can be found in a history."""
 
-import shutil
-import sqlite3
-import tempfile
-from contextlib import closing
 from itertools import chain
-from pathlib import Path
 
 import numpy as np
 from pyarrow import parquet
 
 from skyless.run.fix_batch import RECORD
-from skyless.run.history.layout import current_files, rows_of, site_folder
+from skyless.run.history.layout import current_files
 from skyless.run.mqtt.messages import FixMessage
 
 DAY_S = 86_400.0
@@ -55,25 +50,3 @@ def in_files(folder, site=1):
     """The serials in the current files, in the order of their numbers where each file is sorted by them."""
     tables = (parquet.read_table(file, partitioning=None) for file in current_files(folder, site))
     return list(chain.from_iterable(table["x_mm"].to_pylist() for table in tables))
-
-
-def on_disk(folder, site=1):
-    """The serials in files and, after those, in the journal, read as a stranger would."""
-    last = max((rows_of(file)[1] for file in current_files(folder, site)), default=0)
-    found = in_files(folder, site)
-    for first, data in batches_in(site_folder(folder, site)):
-        rows = np.frombuffer(data, RECORD)["position_mm"][:, 0].tolist()
-        found += rows[max(0, last + 1 - first) :]
-    return found
-
-
-def batches_in(site):
-    """First numbers and bytes of a journal's fixes, from a copy: its program may be running."""
-    with tempfile.TemporaryDirectory() as scratch:
-        for name in ("journal.sqlite", "journal.sqlite-wal"):
-            if (site / name).exists():
-                shutil.copy(site / name, scratch)
-        with closing(sqlite3.connect(Path(scratch) / "journal.sqlite")) as sql:
-            if not sql.execute("SELECT name FROM sqlite_master WHERE name = 'fixes'").fetchall():
-                return []
-            return sql.execute("SELECT first, data FROM fixes ORDER BY first").fetchall()

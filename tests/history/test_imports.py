@@ -77,8 +77,6 @@ def test_a_longer_recording_and_one_beside_the_running_history_add_what_is_new(t
         message = fix("bob", serial, NOON_S + 0.1 * serial, (serial / 1000.0, 0.0, 0.0))
         number = writer.number(message, NOON_S)
         writer.fixes.add(records_of([(number, message)], simulated=True), NOON_S + 0.1 * serial + 3.0)
-    writer.store()
-    writer.write()
     writer.close()
     found = imported(capsys, recording(tmp_path / "a.mcap", range(50)), folder)
     assert (found["fixes"], found["known_fixes"], found["events"]) == (80, 20, 5)

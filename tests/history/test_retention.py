@@ -11,7 +11,7 @@ from pyarrow import parquet
 from test_writer import dying
 
 from skyless.run.fix_batch import records_of
-from skyless.run.history.layout import current_events, current_files, file_name, rows_of, site_folder
+from skyless.run.history.layout import Place, current_events, current_files, file_name, rows_of, site_folder
 from skyless.run.history.tables import Event, fix_table
 from skyless.run.history.writer import Keep, Writer, thinned, tidy
 
@@ -30,7 +30,6 @@ def filled(folder, days, files=3):
             writer.fixes.add(batch, unix_s)
             event = Event(datetime.fromtimestamp(unix_s + 1e-3 * serial, UTC), "enter", "tag1", "z1")
             writer.events.add((event,), unix_s)
-            writer.store()
             writer.write()
             serial += 2
     writer.close()
@@ -147,3 +146,18 @@ def test_a_day_is_thinned_once_and_keeps_its_numbers(tmp_path):
     assert [rows_of(file) for file in files] == [(1, 6), (7, 12)]
     tidy(tmp_path, 1, KEEP, NOON_S)
     assert {file: file.stat().st_mtime_ns for file in current_files(tmp_path, 1)} == before
+
+
+def test_the_place_in_the_stream_outlasts_joining_thinning_and_the_last_row(tmp_path):
+    writer = Writer(tmp_path, 1)
+    for number in (1, 2, 3):
+        writer.fixes.place = writer.events.place = Place("site 2026", number)
+        writer.fixes.add(records([number], writer.number(fix(), NOON_S)), NOON_S)
+        writer.write()
+    writer.close()
+    for days, files, rows in ((1, 1, [1, 2, 3]), (8, 1, [1]), (31, 1, []), (40, 1, [])):
+        tidy(tmp_path, 1, KEEP, NOON_S + DAY_S * days)
+        assert (len(current_files(tmp_path, 1)), in_files(tmp_path)) == (files, rows)
+        writer = Writer(tmp_path, 1)
+        assert (writer.fixes.place, writer.fixes.last) == (Place("site 2026", 3), 3)
+        writer.close()

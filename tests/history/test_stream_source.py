@@ -64,7 +64,7 @@ def test_each_batch_is_taken_once_and_gaps_are_counted(writer):
     again = message(3, 5, 2, 1)
     take(writer, names, message(1, 5, 1, 1), message(2, 5, 2, 1), again, message(4, 5, 6, 1), message(9, 6, 3, 1))
     assert writer.fixes.taken == 4
-    assert writer.fixes.position == 9
+    assert writer.fixes.place.number == 9
     assert writer.drops["lost-batches"] == 3  # of run 5; where run 6 began is not known
     take(writer, names, message(9, 6, 3, 1), message(10, 6, 4, 1))  # another start goes on after its place
     assert writer.fixes.taken == 5

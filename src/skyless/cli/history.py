@@ -330,15 +330,16 @@ def run(
 ) -> int:
     """Keep the fixes and events of a running site, or of a hub's, until Ctrl-C, in Parquet files for any tool.
 
-    What was received 0.1 s before a kill -9 is kept. Give the same folder at every start. The exit code is 1 where the
-    disk did not take everything.
+    A kill -9 loses nothing that has reached the site's stream. Give the same folder at every start. The exit code is 1
+    where the disk did not take everything; the next start goes on there.
 
     Parameters
     ----------
     to
         Where fixes are kept: a folder, which several sites may share.
     nats
-        NATS server of a site with a gather, nats://[USER@]HOST[:PORT] or tls://...: its stream then gives the fixes.
+        NATS server of the site, nats://[USER@]HOST[:PORT] or tls://...; by default that of a broker with a gather on
+        this machine, or else one of its own.
     from_
         Servers of a hub, nats://[USER@]HOST[:PORT],HOST... or tls://...: all its sites are kept, or that of --site-id.
     site_id
@@ -355,10 +356,10 @@ def run(
     from skyless.run.gather.subjects import nats_address
     from skyless.run.history.writer import Keep
 
+    extra_module("nats", "skyless history run")
     keep = Keep(keep_days, full_days, event_days)
     found: list[_History] = []
     if from_ is not None:
-        extra_module("nats", "--from")
         if broker.mqtt is not None or nats is not None:
             raise SkylessError(f"--from is {from_!r}; give it without --mqtt and --nats, which are of a single site")
         hub = nats_address(from_, "--from", broker.mqtt_ca)
@@ -378,18 +379,21 @@ def run(
         print(f"{to}: nothing was kept, as no program of a site was online")
     else:
         print(f"{to}: {_counts(state)} in {state.seconds:.0f} s{_losses(state)}")
-    return 1 if state is not None and (state.disk or state.lost) else 0
+    return 1 if state is not None and state.disk else 0
 
 
 async def _of_broker(
     folder: Path, address: "MqttAddress", site_id: int | None, keep: "Keep", nats: "NatsAddress | None"
 ) -> "_History":
+    from skyless.run.broker import nats_of
     from skyless.run.find_site import find_site
     from skyless.run.history.program import HistoryNode
-    from skyless.run.history.writer import Writer
+    from skyless.run.mqtt.address import Role
 
+    if nats is None and address.user not in {*Role} - {Role.OPERATOR}:  # the other roles may not read streams
+        nats = nats_of(address)
     site = await find_site(address) if site_id is None else site_id
-    return HistoryNode(Writer(folder, site), address, keep, log, nats)
+    return HistoryNode(folder, site, address, keep, log, nats)
 
 
 async def _of_hub(folder: Path, hub: "NatsAddress", site_id: int | None, keep: "Keep") -> "_History":
@@ -417,9 +421,7 @@ async def _status(node: "_History") -> None:
         await asyncio.sleep(_STATUS_S)
         now = node.state()
         trouble = now.disk or (f"no broker, {now.trouble}" if now.trouble else "Ctrl-C ends")
-        line = (
-            f"history, {now.seconds:.0f} s: {_counts(now)}, {now.waiting} rows in the journal{_losses(now)}; {trouble}"
-        )
+        line = f"history, {now.seconds:.0f} s: {_counts(now)}, {now.waiting} in no file yet{_losses(now)}; {trouble}"
         print(f"\r\x1b[2K{line}", end="", file=sys.stderr, flush=True)
 
 
@@ -429,7 +431,6 @@ def _counts(state: "HistoryState") -> str:
 
 def _losses(state: "HistoryState") -> str:
     lost = [f"{count} {reason}" for reason, count in sorted(state.drops.items())]
-    lost += [f"{state.lost} that the disk did not take"] if state.lost else []
     return f"; not kept: {', '.join(lost)}" if lost else ""
 
 

@@ -36,6 +36,8 @@ from skyless.run.mqtt.connection import check_broker
 from skyless.run.process import data_folder, end, end_with_parent, is_free, locked, reserve, reserve_next
 
 FIRST_PORT: Final = 1883
+_PRIVATE: Final = 10_000
+"""How much higher the ports of a private broker are."""
 _PORTS_TO_TRY: Final = 100
 
 _TEMPORARY: Final = "skyless-broker-"  # prefix of temporary folders' names
@@ -92,6 +94,8 @@ class BrokerSettings(Struct, frozen=True):
     """Disk limit of a gather's streams; None without a gather, for which the NATS port is unused."""
     hub: Leaf | None = None
     """The site's connection to a hub."""
+    is_private: bool = False
+    """Whether it is for the program that starts it alone: its address is not stated, and its ports are unusual ones."""
 
     def check(self) -> None:
         """Check the options for access control.
@@ -153,6 +157,8 @@ def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAd
         "logfile_max_num": 2,
         "mqtt": mqtt,
     }
+    if settings.is_private:
+        whole["jetstream"]["sync_interval"] = "1s"  # what a power cut may cost; 2 minutes by default
     if settings.hub is not None:
         site = at(DOMAIN, settings.hub.site)
         # The hub keeps only the newer of two servers with one name, so duplicate sites could not be detected.
@@ -262,12 +268,15 @@ class Broker:
         lock: IO[str],
         reservation: socket.socket,
         nats: NatsAddress | None,
+        settings: BrokerSettings,
     ) -> None:
         self.address = address  # for clients on this machine, with credentials
         self.nats = nats  # for the broker's gather; None without one
         self.data = data
         self._process, self._lock, self._reservation = process, lock, reservation
-        self._stated = None if address.tls else StatedAddress(address, nats)  # its certificate is for other names
+        self._settings = settings
+        is_stated = not (settings.is_private or address.tls)  # a certificate is for other names
+        self._stated = StatedAddress(address, nats) if is_stated else None
 
     @property
     def pid(self) -> int:
@@ -277,6 +286,17 @@ class Broker:
     async def wait(self) -> int:
         """Wait until nats-server ends, and return its exit code."""
         return await self._process.wait()
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether nats-server has ended."""
+        return self._process.returncode is not None
+
+    async def restart(self) -> None:
+        """End nats-server, and start it again at the same ports. Raises SkylessError if it does not start."""
+        await end(self._process)
+        port = self.address.port
+        self._process = await _spawn(_program(), self._settings, port, self.data, self._lock, self.nats)
 
     async def stop(self, *, to_restart: bool = False) -> None:
         """Stop the broker. Temporary data are deleted unless another broker continues with them (``to_restart``)."""
@@ -307,16 +327,17 @@ async def start_broker(settings: BrokerSettings | None = None) -> Broker:
     settings.check()
     program = _program()
     data, lock = _locked_folder(settings)
-    last = FIRST_PORT + _PORTS_TO_TRY - 1
+    first = FIRST_PORT + (_PRIVATE if settings.is_private else 0)
+    last = first + _PORTS_TO_TRY - 1
     try:
-        for port in range(FIRST_PORT, last + 1) if settings.port is None else (settings.port,):
+        for port in range(first, last + 1) if settings.port is None else (settings.port,):
             with contextlib.suppress(_PortTakenError):
                 return await _start(program, settings, port, data, lock)
         if settings.port is not None:
             raise SkylessError(
                 f"--port is {settings.port}, where another program listens; without --port a free one is taken"
             )
-        raise SkylessError(f"ports {FIRST_PORT} to {last} of {settings.listen} are all taken; --port names one")
+        raise SkylessError(f"ports {first} to {last} of {settings.listen} are all taken; --port names one")
     except BaseException:
         _release(data, lock)
         raise
@@ -330,14 +351,15 @@ async def _start(program: Path, settings: BrokerSettings, port: int, data: Path,
         with contextlib.ExitStack() as until_it_listens:
             nats: NatsAddress | None = None
             if settings.gathered_bytes is not None:
-                nats_port, held = reserve_next(_NATS_HOST, FIRST_NATS_PORT)
+                first = FIRST_NATS_PORT + (_PRIVATE if settings.is_private else 0)
+                nats_port, held = reserve_next(_NATS_HOST, first)
                 until_it_listens.enter_context(held)
                 nats = NatsAddress(f"nats://{_NATS_HOST}:{nats_port}", *settings.operator)
             process = await _spawn(program, settings, port, data, lock, nats)
     except BaseException:
         reservation.close()
         raise
-    return Broker(settings.address(port), data, process, lock, reservation, nats)
+    return Broker(settings.address(port), data, process, lock, reservation, nats, settings)
 
 
 async def _spawn(

@@ -118,8 +118,8 @@ class HistoryLimits(Struct, frozen=True):
     """Cells of a heat map."""
     exported_rows: int = 100_000_000
     """Rows of an exported file."""
-    waiting_rows: int = 500_000
-    """Fixes, and as many events, that wait in memory while the disk does not take them."""
+    waiting_rows: int = 1_000_000
+    """Fixes, and as many events, that wait in memory for the next file; further ones are left in the stream."""
     tags: int = 200_000
     """Tags of a site."""
     first_unix_s: float = 1e9

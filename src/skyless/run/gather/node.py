@@ -242,6 +242,15 @@ class Gather:
             cuts=0 if self._client is None else self._client.stats["reconnects"],
         )
 
+    @property
+    def drops(self) -> dict[str, int]:
+        """Messages and fixes that were dropped since the start, by reason."""
+        return dict(self._packer.drops)
+
+    def add_fix(self, name: str, payload: bytes) -> None:
+        """Take a tag's fix in JSON that has come in another way than from the server."""
+        self._packer.add(name, payload)
+
     async def run(self) -> None:
         """Gather until cancelled, then send what is waiting."""
         client = self._client = await connect(self._address, "skyless gather", self._say, self._packer.drops)
@@ -271,7 +280,7 @@ class Gather:
     # Messages
 
     async def _on_fix(self, message: Msg) -> None:
-        self._packer.add(subjects.tag_in(message.subject), message.data)
+        self.add_fix(subjects.tag_in(message.subject), message.data)
 
     async def _on_batch(self, message: Msg) -> None:
         with contextlib.suppress(BadBatchError):

@@ -5,7 +5,7 @@
     FOLDER/site=<n>/names.parquet                                     the tags' numbers and names
     FOLDER/site=<n>/assets.parquet                                    the tags' names and their assets' names
     FOLDER/site=<n>/zones.parquet                                     the zones' identifiers, names and corners
-    FOLDER/site=<n>/journal.sqlite                                    rows not in Parquet yet
+    FOLDER/site=<n>/stream                                            a broker without streams: rows not in Parquet yet
 
 The day is that of arrival, in UTC. Any engine that reads Parquet can read and join them. A file whose numbers lie
 within those of another has been joined into it and will be removed.
@@ -13,6 +13,8 @@ within those of another has been joined into it and will be removed.
 
 from pathlib import Path
 from typing import Final, Literal
+
+from msgspec import Struct
 
 FIX_COLUMNS: Final = {
     "tag": "uint32",
@@ -51,6 +53,18 @@ ZONE_COLUMNS: Final = {"zone": "string", "name": "string", "corners_m": "string"
 
 THINNED: Final = b"skyless_thinned"
 """Metadata key of files with thinned fixes: one every ten seconds or every minute."""
+PLACE: Final = b"skyless_place"
+"""Metadata key of the place in the site's stream (``Place``, JSON) up to which this file and those before are complete.
+"""
+
+
+class Place(Struct, frozen=True):
+    """A place in a stream."""
+
+    stream: str = ""
+    """Source of the stream and when it was made; empty before anything was taken from a stream."""
+    number: int = 0
+    """Number of the last message."""
 
 
 def site_folder(folder: Path, site: int) -> Path:

@@ -1,11 +1,13 @@
-"""``skyless history run``: write a site's messages, a large site's batches, or recordings to a history."""
+"""``skyless history run``: write what is in a site's streams, or in recordings, to a history."""
 
 import asyncio
+import contextlib
 import platform
 import re
+import secrets
 import time
 import zlib
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Coroutine
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -21,27 +23,28 @@ from nats.errors import Error
 from numpy.typing import NDArray
 
 from skyless.core.errors import SkylessError
-from skyless.run.fix_batch import MAX_RECORDS, BadBatchError, Batch, Records, decode_batch, records_of
+from skyless.run.broker import Broker, BrokerSettings, start_broker
+from skyless.run.fix_batch import BadBatchError, Batch, Records, decode_batch, records_of
 from skyless.run.gather import subjects
-from skyless.run.gather.streams import Names, follow
+from skyless.run.gather.node import Gather
+from skyless.run.gather.streams import Names, follow, make_streams
 from skyless.run.gather.subjects import NatsAddress, connect, rarely
-from skyless.run.history.layout import FIX_COLUMNS, current_events, current_files, day_of
+from skyless.run.history.layout import FIX_COLUMNS, Place, current_events, current_files, day_of
 from skyless.run.history.tables import REMEMBERED_KINDS, Event, EventLog, read_events, read_table, unix_ms
 from skyless.run.history.writer import FILE_ROWS, Intake, Keep, Writer, tidy
 from skyless.run.hub import LIST_S, sites_at
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.link import Handler, Link, Subscriptions
+from skyless.run.mqtt.link import Link, Subscriptions
 from skyless.run.mqtt.messages import (
     AlarmMessage,
     AssetsMessage,
     FixMessage,
-    SiteMessage,
     StatusMessage,
     ZoneEvent,
     ZonesMessage,
 )
-from skyless.run.process import Log, every, keep, reader, together
+from skyless.run.process import Log, keep, reader, together
 from skyless.run.recordings.recording import McapRecording
 from skyless.run.web import HISTORY as LIMITS
 from skyless.run.zones import read_zones
@@ -53,15 +56,19 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
 
-# Fixes of a large site, from the stream that a gather fills instead of from MQTT.
+# The history of a site, from its streams.
 
 _PERIOD_S: Final = 0.2
 _STREAM_RETRY_S: Final = 2.0
-_MAX_WAITING: Final = 100_000
-"""While more rows than this wait for the disk, further ones are left in the stream."""
 _NAMES_S: Final = 60.0
 """How much later than a batch its tags' names may come: a hub's streams catch up one after the other."""
 _MAX_SENDERS: Final = 1000
+
+
+async def _until_room(intake: Intake) -> None:
+    """Wait until few enough rows wait for the disk; further ones are left in the stream."""
+    while intake.waiting > LIMITS.waiting_rows:
+        await asyncio.sleep(_PERIOD_S)
 
 
 class BatchTaker:
@@ -79,11 +86,10 @@ class BatchTaker:
 
         Waits for the disk, and for the names of its tags.
         """
-        while self._writer.fixes.waiting > _MAX_WAITING:
-            await asyncio.sleep(_PERIOD_S)
-        place = message.metadata.sequence.stream
-        if place <= self._writer.fixes.position:
+        fixes, number = self._writer.fixes, message.metadata.sequence.stream
+        if number <= fixes.place.number:
             return
+        await _until_room(fixes)
         try:
             batch = decode_batch(message.data)
         except BadBatchError:
@@ -93,7 +99,8 @@ class BatchTaker:
             return
         await self._read_names(batch.names_issue)
         now_s = time.time()
-        self._writer.fixes.add(self._renumbered(batch.records, now_s), now_s, place)
+        fixes.place = replace(fixes.place, number=number)
+        fixes.add(self._renumbered(batch.records, now_s), now_s)
 
     def _is_next(self, batch: Batch) -> bool:
         """Whether a batch is new. Batches missing since the sender's last one are counted as lost."""
@@ -134,50 +141,13 @@ class BatchTaker:
         return kept
 
 
-async def first_place(stream: "JetStreamContext", name: str, intake: Intake, say: Log) -> int:
-    """Return the place in a stream up to which an intake is complete. Waits for the stream."""
-    while True:
-        try:
-            last = (await stream.stream_info(name)).state.last_seq
-            break
-        except Error as error:
-            say(f"waits for the stream {name}, which a gather or skyless hub apply makes: {error or 'no answer'}")
-            await asyncio.sleep(_STREAM_RETRY_S)
-    if intake.position > last:
-        say(f"the stream {name} was deleted and made again; it is taken from its beginning")
-        intake.position = 0
-    return intake.position
-
-
-async def take_batches(stream: "JetStreamContext", writer: Writer, say: Log) -> None:
-    """Pass the batches of a site's stream to a history until cancelled, from where it last stopped.
-
-    The place in the stream is stored together with the rows, so that each batch is taken once.
-    """
-    name, own = subjects.at(subjects.FIX_STREAM, writer.site), subjects.at(subjects.FIXES, writer.site)
-    taker = BatchTaker(Names(stream, writer.site), writer, say)
-    async for message in follow(stream, name, own, say, await first_place(stream, name, writer.fixes, say)):
-        await taker.take(message)
-
-
-async def take_stream(address: NatsAddress, writer: Writer, log: Log) -> None:
-    """Run ``take_batches`` over a connection of its own."""
-    say = rarely(log)
-    client = await connect(address, "skyless history", say, writer.drops)
-    try:
-        await take_batches(client.jetstream(), writer, say)
-    finally:
-        await client.close()
-
-
-_STORE_S: Final = 0.1
-_SYNC_S: Final = 1.0
+_CHECK_S: Final = 2.0
 _FIRST_FILE_S: Final = 30.0
 FILE_S: Final = 600.0
 """Longest interval between files. The first files come early, so that a new history can be queried; the interval then
 doubles up to this.
 """
-_RETRY_S: Final = 10.0  # after a file could not be written
+_RETRY_S: Final = 5.0  # after a file could not be written
 
 
 class HistoryState(Struct, frozen=True):
@@ -188,9 +158,7 @@ class HistoryState(Struct, frozen=True):
     events: int
     tags: int
     waiting: int
-    """Rows not in a Parquet file yet."""
-    lost: int
-    """Rows dropped because the disk was too slow."""
+    """Rows not in a Parquet file yet, which the stream has, too."""
     drops: dict[str, int]
     """Messages that were not kept, by reason."""
     trouble: str | None
@@ -200,106 +168,141 @@ class HistoryState(Struct, frozen=True):
 
 
 class SiteHistory:
-    """Keeps the history of one site, whatever the source of its messages."""
+    """Keeps the history of one site from its streams at a server.
+
+    The place in a stream is stored together with the rows, so that each message is taken once. Messages in the streams
+    under another site's subjects are ignored.
+    """
 
     def __init__(self, writer: Writer, keep: Keep, log: Log) -> None:
         """Raises SkylessError if the past events cannot be read."""
-        self.event_place = 0
-        """Place in the source of the next event, if the source has places."""
-        self._writer, self._keep, self._log = writer, keep, log
+        self._writer, self._keep, self._log, self._say = writer, keep, log, rarely(log)
         self._trouble: dict[str, str] = {}
-        self._try("files", writer.write)  # so that all past events are in files
         remembered = pc.field("kind").isin(REMEMBERED_KINDS)
         self._events = EventLog(read_events(current_events(writer.root, writer.site), remembered))
-        self._fixes: list[tuple[int, FixMessage]] = []
-        self._simulated = False
         self._started_s = time.monotonic()
-
-    def attach(self, subscribe: Callable[[str, Handler, int], None], *, fixes: bool) -> None:
-        """Call ``subscribe`` with the MQTT topic filters of the messages to keep. ``fixes`` includes single fixes."""
-        site = self._writer.site
+        self._subscriptions = Subscriptions()
+        site = writer.site
 
         def on_wrong() -> None:
-            self._writer.drops["wrong-message"] += 1
+            writer.drops["wrong-message"] += 1
 
-        def take(topic: str, kind: type[Struct], act: Callable[[Any], None], qos: int = 1) -> None:
-            subscribe(topic, reader(kind, act, on_wrong), qos)
+        def take(topic: str, kind: type[Struct], act: Callable[[Any], None]) -> None:
+            self._subscriptions.add(topic, reader(kind, act, on_wrong), 1)
 
-        take(topics.site_topic(site), SiteMessage, self._on_site)
-        if fixes:
-            take(topics.fix_topic(site, "+"), FixMessage, self._on_fix, 0)
         take(topics.zone_event_topic(site, "+"), ZoneEvent, self._on_event)
         take(topics.alarm_topic(site, "+", "+"), AlarmMessage, self._on_event)
         for kind in ("tag", "anchor"):
             take(topics.status_topic(site, kind, "+"), StatusMessage, self._on_event)
-        take(topics.assets_topic(site), AssetsMessage, lambda message: self._writer.set_assets(message.assets))
-        zones = reader(read_zones, lambda message: self._writer.set_zones(message.zones), on_wrong, ZonesMessage(()))
-        subscribe(topics.zones_topic(site), zones, 1)
+        take(topics.assets_topic(site), AssetsMessage, lambda message: writer.set_assets(message.assets))
+        zones = reader(read_zones, lambda message: writer.set_zones(message.zones), on_wrong, ZonesMessage(()))
+        self._subscriptions.add(topics.zones_topic(site), zones, 1)
 
-    async def run(self, *sources: Coroutine[Any, Any, None]) -> None:
-        """Keep what the sources deliver.
-
-        At the end write files; what cannot be written waits in the journal for the next start.
-        """
+    async def run(self, stream: "JetStreamContext") -> None:
+        """Keep the history until cancelled, then write what waits; what cannot be written is still in the streams."""
+        self._stream = stream
         try:
-            await together(*sources, every(_STORE_S, self._store), self._work())
+            await together(self._take_fixes(), self._take_events(), self._take_state(), self._work())
         finally:
-            self._store()
             self._try("files", self._writer.close)
 
     def state(self) -> HistoryState:
         """Return the progress so far."""
-        intakes = (self._writer.fixes, self._writer.events)
+        writer = self._writer
         return HistoryState(
             seconds=time.monotonic() - self._started_s,
-            fixes=self._writer.fixes.taken,
-            events=self._writer.events.taken,
-            tags=len(self._writer.names.rows),
-            waiting=self._writer.unwritten + sum(intake.waiting for intake in intakes),
-            lost=sum(intake.lost for intake in intakes),
-            drops=dict(self._writer.drops),
+            fixes=writer.fixes.taken,
+            events=writer.events.taken,
+            tags=len(writer.names.rows),
+            waiting=writer.waiting,
+            drops=dict(+writer.drops),
             trouble=None,
             disk=next(iter(self._trouble.values()), None),
         )
 
-    def _on_site(self, message: SiteMessage) -> None:
-        self._simulated = message.simulated
+    # Streams
 
-    def _on_fix(self, fix: FixMessage) -> None:
-        number = self._writer.number(fix, time.time())
-        if number is not None:
-            self._fixes.append((number, fix))
-        if len(self._fixes) >= MAX_RECORDS:
-            self._add_fixes()
+    async def _take_fixes(self) -> None:
+        taker = BatchTaker(Names(self._stream, self._writer.site), self._writer, self._say)
+        own = subjects.at(subjects.FIXES, self._writer.site)
+        async for message in self._follow(subjects.FIX_STREAM, self._writer.fixes, own):
+            await taker.take(message)
 
-    def _add_fixes(self) -> None:
-        if self._fixes:
-            self._writer.fixes.add(records_of(self._fixes, simulated=self._simulated), time.time())
-            self._fixes.clear()
+    async def _take_events(self) -> None:
+        events = self._writer.events
+        async for message in self._follow(subjects.EVENT_STREAM, events):
+            await _until_room(events)
+            events.place = replace(events.place, number=message.metadata.sequence.stream)
+            self._receive(message)
+
+    async def _take_state(self) -> None:
+        async for message in self._follow(subjects.STATE_STREAM):
+            await _until_room(self._writer.events)
+            self._receive(message)
+
+    async def _follow(
+        self, pattern: str, intake: Intake | None = None, subject: str | None = None
+    ) -> "AsyncGenerator[Msg, None]":
+        """Yield the messages of a stream: those after the place of an intake, or else the newest of each subject."""
+        site, say = self._writer.site, self._say
+        name, own = subjects.at(pattern, site), subject or f"skyless.v1.{site}.>"
+        after = 0 if intake is None else await self._place(name, intake)
+        async for message in follow(self._stream, name, own, say, after, newest_of_each=intake is None):
+            yield message
+
+    async def _place(self, name: str, intake: Intake) -> int:
+        """Return the number of the last message of a stream that an intake has. Waits for the stream."""
+        while True:
+            try:
+                found = await self._stream.stream_info(name)
+                break
+            except Error as error:
+                why = error or "no answer"
+                self._say(f"waits for the stream {name}, which a gather or skyless hub apply makes: {why}")
+                await asyncio.sleep(_STREAM_RETRY_S)
+        made = f"{self._writer.source} {found.created}"
+        if intake.place.stream not in {"", made}:
+            self._say(f"the stream {name} was deleted and made again; it is taken from its beginning")
+        if intake.place.stream != made:
+            intake.place = Place(made)
+        elif found.state.last_seq < intake.place.number:
+            self._say(f"the stream {name} has lost its last messages, which the history has; a power cut may do so")
+            intake.place = Place(made, found.state.last_seq)
+        lost = found.state.first_seq - 1 - intake.place.number
+        if intake.place.number and lost > 0:
+            self._writer.drops["lost-batches" if intake is self._writer.fixes else "lost-events"] += lost
+            self._say(f"the stream {name} has dropped {lost} messages before they could be read")
+        return intake.place.number
+
+    def _receive(self, message: "Msg") -> None:
+        self._subscriptions.receive(subjects.topic_of(message.subject), message.data)
 
     def _on_event(self, message: ZoneEvent | AlarmMessage | StatusMessage) -> None:
         now_s = time.time()
-        self._writer.events.add(self._events.of(message, now_s), now_s, self.event_place)
+        self._writer.events.add(self._events.of(message, now_s), now_s)
 
-    def _store(self) -> None:
-        self._add_fixes()
-        self._try("journal", self._writer.store)
+    # Files
 
     async def _work(self) -> None:
-        """Sync the journal, write files and tidy up; runs in another thread."""
+        """Write files and tidy up; runs in another thread."""
         due_s, file_s, tidied = time.monotonic() + _FIRST_FILE_S, _FIRST_FILE_S, None
         while True:
-            await asyncio.sleep(_SYNC_S)
-            await asyncio.to_thread(self._try, "journal", self._writer.journal.sync)
-            if time.monotonic() >= due_s or (self._writer.unwritten >= FILE_ROWS and "files" not in self._trouble):
-                await asyncio.to_thread(self._try, "files", self._writer.write)
+            await asyncio.sleep(_CHECK_S)
+            if self._writer.waiting >= FILE_ROWS or time.monotonic() >= due_s or "files" in self._trouble:
+                await asyncio.to_thread(self._try, "files", self._save)
                 file_s = min(2.0 * file_s, FILE_S)
-                due_s = time.monotonic() + (_RETRY_S if "files" in self._trouble else file_s)
+                due_s = time.monotonic() + file_s
+            else:
+                await asyncio.to_thread(self._try, "files", self._writer.check)
             today = datetime.fromtimestamp(time.time() - 2.0 * FILE_S, UTC).date()  # the day before is complete
             if today != tidied:
                 tidied = today
                 work = partial(tidy, self._writer.root, self._writer.site, self._keep, time.time())
                 await asyncio.to_thread(self._try, "daily work", work)
+
+    def _save(self) -> None:
+        self._writer.check()
+        self._writer.write()
 
     def _try(self, what: str, act: Callable[[], None]) -> None:
         """Run a disk operation, and log when errors begin and end."""
@@ -312,72 +315,156 @@ class SiteHistory:
             self._trouble[what] = text
         else:
             if self._trouble.pop(what, None) is not None:
-                self._log(f"the history's {what} can be written again; {self.state().lost} rows were lost so far")
+                self._log(f"the history's {what} can be written again")
+
+
+# The history of one site on a broker.
+
+_HEARD_S: Final = 3.0
+"""A gather says every second that it is there."""
+_START_S: Final = 5.0
+"""How long the nats-server of a history that was killed may take to end."""
+_KEEP_BYTES: Final = 1_000_000_000
+"""Limit of the fixes in a stream that is made here, which are mostly those that are in no file yet."""
+_MAX_PASSING: Final = 10_000
+_PASSED_ON: Final = (*(one for one in subjects.STATE if "floor_plan" not in one), *subjects.EVENTS)
+_NO_SUBJECT: Final = re.compile(r"[\s*>]|\.\.|\.$")
 
 
 class HistoryNode:
-    """Keeps the history of one site on a broker until cancelled."""
+    """Keeps the history of one site on a broker until cancelled.
+
+    Its rows come from the streams that a gather fills. Where no gather is heard, one runs here; for a broker without
+    NATS, beside a nats-server of its own, to whose streams this passes on what the site publishes.
+    """
 
     def __init__(
-        self, writer: Writer, address: MqttAddress, keep: Keep, log: Log, nats: NatsAddress | None = None
+        self, folder: Path, site: int, address: MqttAddress, keep: Keep, log: Log, nats: NatsAddress | None = None
     ) -> None:
-        """``nats`` is the server of a site with a gather; the fixes then come from its stream.
-
-        Raises SkylessError if the past events cannot be read.
-        """
+        """``nats`` is the broker's NATS address. Raises SkylessError if the history cannot be written or read."""
         host = re.sub(r"[^A-Za-z0-9_.-]", "-", platform.node())
-        name = f"{host}-{zlib.crc32(str(writer.folder.resolve()).encode()):08x}"
-        self.link = Link(address, name, site=writer.site, kind="history")
-        self._writer, self._nats, self._log = writer, nats, log
-        self._history = SiteHistory(writer, keep, log)
-        self._history.attach(self.link.subscribe, fixes=nats is None)
-
-    async def run(self) -> None:
-        """Keep the history until cancelled."""
-        sources = [keep(self.link, self._log)]
-        if self._nats is not None:
-            sources.append(take_stream(self._nats, self._writer, self._log))
-        await self._history.run(*sources)
+        self.link = Link(address, f"{host}-{zlib.crc32(str(folder.resolve()).encode()):08x}", site=site, kind="history")
+        self._writer = Writer(folder, site)
+        self._history = SiteHistory(self._writer, keep, log)
+        self._address, self._nats, self._log, self._say = address, nats, log, rarely(log)
+        self._gather: Gather | None = None
+        self._passing: deque[tuple[str, bytes]] = deque()
 
     def state(self) -> HistoryState:
         """Return the progress so far."""
-        return replace(self._history.state(), trouble=self.link.trouble)
-
-
-# The histories of a hub's sites, from the hub's streams.
-
-
-class _Site:
-    """Keeps the history of one site of a hub. Messages in its streams under another site's subjects are ignored."""
-
-    def __init__(self, stream: "JetStreamContext", writer: Writer, keep: Keep, log: Log) -> None:
-        self.writer, self.history = writer, SiteHistory(writer, keep, log)
-        self._stream, self._say = stream, rarely(log)
-        self._subscriptions = Subscriptions()
-        self.history.attach(self._subscriptions.add, fixes=False)
+        state = self._history.state()
+        dropped = Counter(state.drops) + Counter({} if self._gather is None else self._gather.drops)
+        return replace(state, drops=dict(dropped), trouble=self.link.trouble)
 
     async def run(self) -> None:
-        """Keep the site's history until cancelled."""
-        fixes = take_batches(self._stream, self.writer, self._say)
-        await self.history.run(self._take_state(), self._take_events(), fixes)
+        """Keep the history until cancelled. Raises SkylessError if a nats-server of its own does not start."""
+        site, work = self._writer.site, list[Coroutine[Any, Any, None]]()
+        async with contextlib.AsyncExitStack() as until_end:
+            nats = self._nats
+            if nats is None:
+                server = await until_end.enter_async_context(await _own_server(self._writer.folder / "stream"))
+                nats = cast("NatsAddress", server.nats)
+                work.append(self._restart(server))
+            client = await connect(nats, "skyless history", self._say, self._writer.drops)
+            until_end.push_async_callback(client.close)
+            stream = client.jetstream()
+            if self._nats is None or not await _is_gathered(client, site):
+                broker = None if self._nats is None else self._address
+                keep_bytes = await _bytes_of(stream, site)
+                with contextlib.suppress(Error):  # the gather tries again
+                    await make_streams(stream, site, keep_bytes)
+                gather = self._gather = Gather(nats, site, keep_bytes, self._log, broker)
+                work.append(gather.run())
+            if self._nats is None:
+                self._take_messages(gather)
+                work.append(self._pass_on(stream))
+            await together(*work, keep(self.link, self._log), self._history.run(stream))
 
-    async def _take_state(self) -> None:
-        async for message in self._follow(subjects.STATE_STREAM, is_state=True):
-            self._receive(message)
+    async def _restart(self, server: Broker) -> None:
+        """Start a server again that has ended, or whose disk was full, as it would take nothing more."""
+        was_full = False
+        while True:
+            await asyncio.sleep(_CHECK_S)
+            is_full = self._history.state().disk is not None
+            if server.has_ended or (was_full and not is_full):
+                self._say("the history's own nats-server is started again")
+                try:
+                    await server.restart()
+                except SkylessError as error:
+                    self._say(str(error))
+                    continue
+            was_full = is_full
 
-    async def _take_events(self) -> None:
-        name, intake = subjects.at(subjects.EVENT_STREAM, self.writer.site), self.writer.events
-        after = await first_place(self._stream, name, intake, self._say)
-        async for message in self._follow(subjects.EVENT_STREAM, after):
-            self.history.event_place = message.metadata.sequence.stream
-            self._receive(message)
+    def _take_messages(self, gather: Gather) -> None:
+        """Subscribe to what ends in the streams."""
 
-    def _follow(self, pattern: str, after: int = 0, *, is_state: bool = False) -> "AsyncGenerator[Msg, None]":
-        name, own = subjects.at(pattern, self.writer.site), f"skyless.v1.{self.writer.site}.>"
-        return follow(self._stream, name, own, self._say, after, newest_of_each=is_state)
+        def on_fix(topic: str, payload: bytes) -> None:
+            gather.add_fix(topic.split("/")[4], payload)
 
-    def _receive(self, message: "Msg") -> None:
-        self._subscriptions.receive(subjects.topic_of(message.subject), message.data)
+        def on_other(topic: str, payload: bytes) -> None:
+            subject = subjects.subject_of(topic)
+            if _NO_SUBJECT.search(subject):
+                self._writer.drops["wrong-topic"] += 1
+            elif len(self._passing) >= _MAX_PASSING:
+                self._writer.drops["late"] += 1
+            else:
+                self._passing.append((subject, payload))
+
+        def topic_filter(pattern: str) -> str:
+            return subjects.topic_of(subjects.at(pattern, self._writer.site)).replace("*", "+")
+
+        self.link.subscribe(topic_filter(subjects.JSON_FIXES), on_fix)
+        for pattern in _PASSED_ON:
+            self.link.subscribe(topic_filter(pattern), on_other, qos=1)
+
+    async def _pass_on(self, stream: "JetStreamContext") -> None:
+        """Publish messages to the streams, each until a stream has acknowledged it."""
+        while True:
+            while self._passing:
+                try:
+                    await stream.publish(*self._passing[0])
+                except Error as error:
+                    self._say(f"the messages of site {self._writer.site} wait: {error or type(error).__name__}")
+                    break
+                self._passing.popleft()
+            await asyncio.sleep(_PERIOD_S)
+
+
+async def _own_server(folder: Path) -> Broker:
+    """Start a nats-server for this process alone. Raises SkylessError."""
+    password, deadline_s = secrets.token_urlsafe(24), time.monotonic() + _START_S
+    settings = BrokerSettings(
+        data=folder, user="history", password=password, gathered_bytes=_KEEP_BYTES, is_private=True
+    )
+    while True:
+        try:
+            return await start_broker(settings)
+        except SkylessError:
+            if time.monotonic() > deadline_s:
+                raise
+        await asyncio.sleep(_PERIOD_S)
+
+
+async def _is_gathered(client: "Client", site: int) -> bool:
+    heard = await client.subscribe(subjects.at(subjects.SUMMARY, site))
+    try:
+        await heard.next_msg(_HEARD_S)
+    except TimeoutError:
+        return False
+    finally:
+        await heard.unsubscribe()
+    return True
+
+
+async def _bytes_of(stream: "JetStreamContext", site: int) -> int:
+    """Return the limit of a site's stream of fixes, which is not to change if the stream is there."""
+    try:
+        return (await stream.stream_info(subjects.at(subjects.FIX_STREAM, site))).config.max_bytes or _KEEP_BYTES
+    except Error:
+        return _KEEP_BYTES
+
+
+# The histories of a hub's sites.
 
 
 class HubHistory:
@@ -387,16 +474,15 @@ class HubHistory:
         self._folder, self._address, self._keep, self._log = folder, address, keep, log
         self._only = site
         self._say = rarely(log)
-        self._sites: dict[int, _Site] = {}
+        self._sites: dict[int, SiteHistory] = {}
         self._drops: Counter[str] = Counter()
         self._begin_s = time.monotonic()
         self._client: Client | None = None
-        self._stream: JetStreamContext
         self._tasks: asyncio.TaskGroup
 
     def state(self) -> HistoryState:
         """Return the progress of all sites so far."""
-        states = [site.history.state() for site in self._sites.values()]
+        states = [site.state() for site in self._sites.values()]
         client = self._client
         is_connected = client is not None and (client.is_connected or client.is_closed)  # it is closed at the end
         return HistoryState(
@@ -405,7 +491,6 @@ class HubHistory:
             events=sum(state.events for state in states),
             tags=sum(state.tags for state in states),
             waiting=sum(state.waiting for state in states),
-            lost=sum(state.lost for state in states),
             drops=dict(sum((Counter(state.drops) for state in states), self._drops)),
             trouble=None if is_connected else f"the hub {self._address} cannot be reached",
             disk=next((state.disk for state in states if state.disk), None),
@@ -414,30 +499,28 @@ class HubHistory:
     async def run(self) -> None:
         """Keep the histories. Raises SkylessError if a site's folder cannot be written."""
         client = self._client = await connect(self._address, "skyless history", self._say, self._drops)
-        self._stream = client.jetstream()
         try:
             async with asyncio.TaskGroup() as self._tasks:
                 for folder in self._folder.glob("site=*"):
                     if (number := folder.name.removeprefix("site=")).isdecimal():
-                        self._keep_site(int(number))
+                        self._keep_site(int(number), client)
                 self._tasks.create_task(self._find_sites(client))
         except* SkylessError as errors:
             raise errors.exceptions[0] from None
         finally:
             await client.close()
 
-    def _keep_site(self, number: int) -> None:
+    def _keep_site(self, number: int, client: "Client") -> None:
         if number not in self._sites and self._only in {None, number}:
-            writer = Writer(self._folder, number, "hub ")
-            site = self._sites[number] = _Site(self._stream, writer, self._keep, self._log)
-            self._tasks.create_task(site.run())
+            site = self._sites[number] = SiteHistory(Writer(self._folder, number, "hub"), self._keep, self._log)
+            self._tasks.create_task(site.run(client.jetstream()))
 
     async def _find_sites(self, client: "Client") -> None:
         """Follow the hub's list of sites, and keep each of them."""
         while True:
             try:
                 for number in sorted(await sites_at(client)):
-                    self._keep_site(number)
+                    self._keep_site(number, client)
             except Error as error:
                 self._say(f"the sites at the hub cannot be listed: {error or type(error).__name__}")
             await asyncio.sleep(LIST_S)
@@ -469,7 +552,6 @@ def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[
         SkylessError: the history cannot be read.
         OSError: the disk fails; what was written stays, and importing again adds the rest.
     """
-    writer.write()  # rows that an earlier import or run has left in the journal
     writer.set_zones(() if recording.zones is None else recording.zones.zones)
     simulated = recording.site is not None and recording.site.simulated
     known, known_events = _known(recording, writer)
@@ -483,8 +565,7 @@ def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[
         keys, rows = np.unique(_keys(records["tag"], unix_ms(records)), return_index=True)
         new = records[rows[~np.isin(keys, known)]]
         writer.fixes.add(new, arrived_s)
-        writer.store()
-        if writer.unwritten >= FILE_ROWS:
+        if writer.waiting >= FILE_ROWS:
             writer.write()
         counts["fixes"] += len(new)
         counts["known_fixes"] += len(chunk) - len(new)

@@ -17,7 +17,7 @@ from pyarrow import parquet
 
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import NONE_U16, Records
-from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, EventKind
+from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, PLACE, EventKind, Place
 from skyless.run.mqtt.messages import AlarmMessage, StatusMessage, ZoneEvent
 from skyless.run.web import HISTORY as LIMITS
 
@@ -81,6 +81,22 @@ def read_table(file: Path, columns: dict[str, str], wanted: pc.Expression | None
         should = f"it should be a Parquet file with {', '.join(columns)}"
         raise SkylessError(f"{file} cannot be read; {should}: {error}") from None
     return table if wanted is None else table.filter(wanted)
+
+
+def metadata_of(file: Path) -> dict[bytes, bytes]:
+    """Return the metadata of a file. Raises SkylessError if it cannot be read."""
+    try:
+        return dict(parquet.read_schema(file).metadata or {})
+    except (OSError, ValueError, pa.ArrowException) as error:
+        raise SkylessError(f"{file} cannot be read; it should be a Parquet file: {error}") from None
+
+
+def place_in(file: Path) -> Place:
+    """Return the place in the stream up to which a history is complete with this file. Raises SkylessError."""
+    try:
+        return msgspec.json.decode(metadata_of(file).get(PLACE, b"{}"), type=Place)
+    except msgspec.MsgspecError as error:
+        raise SkylessError(f"{file} has wrong metadata {PLACE.decode()}: {error}") from None
 
 
 def read_events(files: Iterable[Path], wanted: pc.Expression) -> Iterator[Event]:

@@ -1,20 +1,21 @@
-"""Write one site's history: rows wait in memory, then in a journal (SQLite), and end in Parquet.
+"""Write one site's history: rows wait in memory until they are a Parquet file, with their place in the site's stream.
 
-Rows are numbered. A row whose number is within a file's name is in Parquet, whatever the journal says, so no row is
-lost or written twice if a program is killed. Only one process at a time writes a site.
+The stream still has what is in no file, so no row is lost or written twice if a program is killed: a file appears
+whole, and its metadata say where the next start goes on. Rows are numbered. Only one process at a time writes a site.
 """
 
 import contextlib
 import errno
 import math
-import sqlite3
+import os
+import shutil
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import UTC, date, datetime
 from itertools import chain, groupby
 from pathlib import Path
 from threading import Lock
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import msgspec
 import numpy as np
@@ -24,155 +25,97 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from skyless.core.errors import SkylessError
-from skyless.run.fix_batch import RECORD, Records
+from skyless.run.fix_batch import Records
 from skyless.run.history.layout import (
     ASSET_COLUMNS,
     EVENT_COLUMNS,
     FIX_COLUMNS,
     NAME_COLUMNS,
+    PLACE,
     THINNED,
     ZONE_COLUMNS,
+    Place,
     day_of,
     file_name,
     largest_files,
     rows_of,
     site_folder,
 )
-from skyless.run.history.tables import Event, event_table, fix_table, read_table, schema_of, write_table
+from skyless.run.history.tables import (
+    Event,
+    event_table,
+    fix_table,
+    metadata_of,
+    place_in,
+    read_table,
+    schema_of,
+    write_table,
+)
 from skyless.run.mqtt.messages import Asset, FixMessage, Zone
 from skyless.run.process import locked
 from skyless.run.web import HISTORY as LIMITS
 
-FILE_ROWS: Final = 1_000_000
+FILE_ROWS: Final = 500_000
 """Approximate number of rows in a file, which ends before the batch that would exceed it."""
+_ROW_BYTES: Final = 32
+"""More than a row takes in a file."""
+_ROOM_BYTES: Final = 1_000_000
+"""What the disk should have free besides the rows that wait."""
 
 
 class Intake:
-    """Rows of one kind. ``write`` may be called from another thread than the other methods."""
+    """Rows of one kind, waiting for a file. ``write`` may be called from another thread than ``add``."""
 
-    def __init__(
-        self,
-        journal: "Journal",
-        kind: str,
-        folder: Path,
-        encode: Callable[[Any], bytes],
-        table: Callable[[Sequence[bytes]], pa.Table],
-        source: str,
-    ) -> None:
-        self.lost = 0
-        """Rows dropped because the disk was too slow."""
+    def __init__(self, folder: Path, table: Callable[[Sequence[Any]], pa.Table]) -> None:
+        """``table`` makes a table of batches of rows. Raises SkylessError if the newest file cannot be read."""
         self.taken = 0
         """Rows taken since the start."""
-        self._journal, self._kind, self._folder, self._place = journal, kind, folder, source + kind
-        self._encode, self._table = encode, table
-        self._batches: list[tuple[Records | Sequence[Event], float]] = []
-        self.position = 0
-        """Place of the newest rows in the source, if it has places."""
-        files = [rows for file in largest_files(folder) if (rows := rows_of(file))]
-        self.last = max((last for _, last in files), default=0)
+        self._folder, self._table = folder, table
+        self._batches: list[tuple[Records | Sequence[Event], float, Place]] = []
+        files = largest_files(folder)
+        first = self.last = (rows_of(files[-1]) or (0, 0))[1] if files else 0
         """Number of the last row in a file."""
-        with journal.transaction() as sql:
-            sql.execute(f"CREATE TABLE IF NOT EXISTS {kind} (first INTEGER PRIMARY KEY, rows, unix_s, data)")
-            (end,) = sql.execute(f"SELECT max(first + rows) FROM {kind}").fetchone()
-            sql.execute("CREATE TABLE IF NOT EXISTS positions (kind PRIMARY KEY, position)")
-            for (position,) in sql.execute("SELECT position FROM positions WHERE kind = ?", (self._place,)):
-                self.position = position
-        self.next = max(self.last + 1, end or 1)
-        """Number of the next row to enter the journal."""
+        self.place = place_in(files[-1]) if files else Place()
+        """Place in the stream up to which everything was taken. It is set before the rows of a message are added."""
+        self._first = first
 
-    def add(self, rows: Records | Sequence[Event], arrived_unix_s: float, position: int = 0) -> None:
-        """Take rows. ``store`` moves them to the journal, together with their place in the source."""
+    def add(self, rows: Records | Sequence[Event], arrived_unix_s: float) -> None:
+        """Take the rows of the message at ``place``."""
         if len(rows):
-            self._batches.append((rows, arrived_unix_s))
-        self.taken += len(rows)
-        self.position = position
+            self.taken += len(rows)
+            self._batches.append((rows, arrived_unix_s, self.place))
 
     @property
     def waiting(self) -> int:
-        """Rows not in the journal yet."""
-        return sum(len(rows) for rows, _ in self._batches)
+        """Rows not in a file yet."""
+        return self._first + self.taken - self.last
 
-    def store(self) -> None:
-        """Move all waiting rows to the journal.
+    @property
+    def batches(self) -> int:
+        """Number of batches that wait."""
+        return len(self._batches)
 
-        Raises OSError: none is stored, and the oldest beyond the limit are dropped.
-        """
-        number, values = self.next, []
-        for rows, unix_s in self._batches:
-            values.append((number, len(rows), unix_s, self._encode(rows)))
-            number += len(rows)
-        if not values:
-            return
-        try:
-            with self._journal.transaction() as sql:
-                sql.executemany(f"INSERT INTO {self._kind} VALUES (?, ?, ?, ?)", values)
-                sql.execute("INSERT OR REPLACE INTO positions VALUES (?, ?)", (self._place, self.position))
-        except OSError:
-            while self.waiting > LIMITS.waiting_rows:
-                self.lost += len(self._batches.pop(0)[0])
-            raise
-        self._batches.clear()
-        self.next = number
-
-    def write(self) -> None:
-        """Move the rows now in the journal to files. Raises OSError: the rest stays."""
-        end = self.next
-        while self.last + 1 < end:
-            day, last, batches = self._next_file(end)
-            if batches:
-                write_table(self._table(batches), self._folder / f"day={day}" / file_name(self.last + 1, last))
+    def write(self, batches: int) -> None:
+        """Write so many of the waiting batches to files. Raises OSError: the rest waits."""
+        while batches > 0:
+            day, rows, place = self._next_file(batches)
+            last = self.last + sum(map(len, rows))
+            table = self._table(rows).replace_schema_metadata({PLACE: msgspec.json.encode(place)})
+            write_table(table, self._folder / f"day={day}" / file_name(self.last + 1, last))
             self.last = last
-            with self._journal.transaction() as sql:
-                sql.execute(f"DELETE FROM {self._kind} WHERE first <= ?", (last,))
+            del self._batches[: len(rows)]
+            batches -= len(rows)
 
-    def _next_file(self, end: int) -> tuple[str, int, list[bytes]]:
-        """Return day, last row and rows of the next file; its rows arrived on one day."""
-        day, last, batches = "", self.last, list[bytes]()
-        query = f"SELECT first, rows, unix_s, data FROM {self._kind} WHERE first > ? AND first < ? ORDER BY first"
-        with self._journal.transaction() as sql:
-            for first, rows, unix_s, data in sql.execute(query, (self.last, end)):
-                of_day = datetime.fromtimestamp(unix_s, UTC).date().isoformat()
-                if batches and (of_day != day or first + rows - self.last - 1 > FILE_ROWS):
-                    break
-                day, last = of_day, first + rows - 1
-                batches.append(data)
-        return day, last if batches else end - 1, batches
-
-
-class Journal:
-    """An SQLite file. Committed data survive the program, and after ``sync`` a power cut."""
-
-    def __init__(self, file: Path) -> None:
-        """Raises OSError."""
-        self._file, self._lock = file, Lock()
-        with self._errors():
-            self._sql = sqlite3.connect(file, check_same_thread=False)
-            self._sql.execute("PRAGMA locking_mode = EXCLUSIVE")  # no shared memory, which network disks lack
-            self._sql.execute("PRAGMA journal_mode = WAL")
-            self._sql.execute("PRAGMA synchronous = NORMAL")
-
-    @contextlib.contextmanager
-    def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Commit a block, or roll it back if it fails. Raises OSError."""
-        with self._lock, self._errors(), self._sql:
-            yield self._sql
-
-    def sync(self) -> None:
-        """Wait until all committed data are on the disk. Raises OSError."""
-        with self._lock, self._errors():
-            self._sql.execute("PRAGMA wal_checkpoint").fetchall()
-
-    def close(self) -> None:
-        """Close the file, so that other programs can open it."""
-        with self._lock:
-            self._sql.close()
-
-    @contextlib.contextmanager
-    def _errors(self) -> Iterator[None]:
-        try:
-            yield
-        except sqlite3.Error as error:
-            raise OSError(errno.EIO, str(error), str(self._file)) from None
+    def _next_file(self, most: int) -> tuple[str, list[Records | Sequence[Event]], Place]:
+        """Return day, batches and place of the next file, of at most so many batches; its rows arrived on one day."""
+        day, found, count, place = "", list[Records | Sequence[Event]](), 0, Place()
+        for rows, unix_s, at in self._batches[:most]:
+            of_day = datetime.fromtimestamp(unix_s, UTC).date().isoformat()
+            if found and (of_day != day or count + len(rows) > FILE_ROWS):
+                break
+            day, place, count = of_day, at, count + len(rows)
+            found.append(rows)
+        return day, found, place
 
 
 class Table:
@@ -189,59 +132,69 @@ class Table:
     def set(self, *values: object) -> None:
         """Add or replace a row; the values are in the order of the columns."""
         row: dict[str, Any] = dict(zip(self._columns, values, strict=True))
-        self._is_saved = self._is_saved and self.rows.get(row[self._key]) == row
+        is_known = self.rows.get(row[self._key]) == row
         self.rows[row[self._key]] = row
+        self._is_saved = self._is_saved and is_known
 
     def save(self) -> None:
-        """Write the table if it has changed. Raises OSError."""
+        """Write the table if it has changed, perhaps in another thread than that of ``set``. Raises OSError."""
         if not self._is_saved:
-            write_table(pa.Table.from_pylist([*self.rows.values()], schema_of(self._columns)), self._file)
-            self._is_saved = True
+            self._is_saved = True  # before the rows are read: one that is set meanwhile is written the next time
+            try:
+                write_table(pa.Table.from_pylist([*self.rows.values()], schema_of(self._columns)), self._file)
+            except BaseException:
+                self._is_saved = False
+                raise
 
 
 class Writer:
     """Writes the history of one site."""
 
-    def __init__(self, folder: Path, site: int, source: str = "") -> None:
-        """``source`` names streams whose places are stored; a history of another source is refused.
+    def __init__(self, folder: Path, site: int, source: Literal["site", "hub"] = "site") -> None:
+        """``source`` says at whose server the streams are; a history from the other's is refused.
 
         Raises SkylessError: the history cannot be written, is being written by another program, is damaged, or has rows
         from elsewhere.
         """
-        self.root, self.site, self.folder = folder, site, site_folder(folder, site)
+        self.root, self.site, self.folder, self.source = folder, site, site_folder(folder, site), source
         self.drops: Counter[str] = Counter()
         """Messages that were not kept, by reason."""
         self._writing = Lock()  # a thread may still be at work when the program ends
-        names = self.folder / "names.parquet"
+        names, journal = self.folder / "names.parquet", self.folder / "journal.sqlite"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._lock = locked(self.folder / "lock")
-            for scratch in self.folder.rglob("*.tmp"):
+            for scratch in chain(self.folder.glob("*.tmp"), self.folder.glob("**/day=*/*.tmp")):
                 scratch.unlink()
             self.names = Table(names, NAME_COLUMNS, "name")
             self.assets = Table(self.folder / "assets.parquet", ASSET_COLUMNS, "tag")
             self.zones = Table(self.folder / "zones.parquet", ZONE_COLUMNS, "zone")
-            self.journal = Journal(self.folder / "journal.sqlite")
-            self.fixes = Intake(self.journal, "fixes", self.folder, np.ndarray.tobytes, _fixes_in, source)
-            events = self.folder / "events"
-            self.events = Intake(self.journal, "events", events, msgspec.json.encode, _events_in, source)
+            self.fixes = Intake(self.folder, lambda batches: fix_table(np.concatenate(batches)))
+            self.events = Intake(self.folder / "events", lambda batches: event_table([*chain.from_iterable(batches)]))
         except BlockingIOError:
             raise SkylessError(f"{self.folder} is written by another program; each needs a folder of its own") from None
         except OSError as error:
             raise SkylessError(f"{error.filename or folder} cannot be written: {error.strerror}") from None
-        fault = ""
-        if not self.names.rows:
+        fault, kept = "", self.fixes.place.stream.partition(" ")[0] or "site"
+        if journal.exists():
+            fault = (
+                f"{journal} may have rows that are in no Parquet file; end skyless history run of the version that "
+                "wrote it (0.1) with Ctrl-C, which writes them, and remove the file"
+            )
+        elif self.fixes.last and not self.names.rows:
             fault = f"{names} is missing; it should be the table that tells whose the fixes are"
-        elif source and not self.fixes.position:
-            fault = f"{self.folder} has fixes that are not from the site's stream at a hub; it should be another folder"
-        if fault and self.fixes.next > 1:
-            self.journal.close()
+        elif self.fixes.last and kept != source:
+            fault = (
+                f"{self.folder} was kept from the streams of a {kept}, not of a {source}; it should be another folder"
+            )
+        if fault:
+            self._lock.close()
             raise SkylessError(fault)
 
     @property
-    def unwritten(self) -> int:
-        """Rows in the journal that are not in a file yet."""
-        return sum(intake.next - 1 - intake.last for intake in (self.fixes, self.events))
+    def waiting(self) -> int:
+        """Rows that are not in a file yet."""
+        return self.fixes.waiting + self.events.waiting
 
     def number(self, fix: FixMessage, unix_s: float) -> int | None:
         """Return the number of a fix's tag; None for a fix not to be kept, which is counted in ``drops``."""
@@ -270,35 +223,29 @@ class Writer:
         for tag, name in (dict.fromkeys(self.assets.rows, "") | {one.tag: one.name for one in assets}).items():
             self.assets.set(tag, name)
 
-    def store(self) -> None:
-        """Move everything added to the journal. Raises OSError: the rest waits."""
-        for table in (self.names, self.assets, self.zones):  # first: the journal refers to the tags' numbers
-            table.save()
-        self.fixes.store()
-        self.events.store()
+    def check(self) -> None:
+        """Try whether the rows that wait could be written now. Raises OSError."""
+        if shutil.disk_usage(self.folder).free < _ROOM_BYTES + _ROW_BYTES * self.waiting:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder))
+        scratch = self.folder / "check.tmp"
+        scratch.write_bytes(b"skyless")
+        scratch.unlink()
 
     def write(self) -> None:
-        """Write all rows of the journal to files. Raises OSError: the rest stays in the journal."""
+        """Write all rows to files. Raises OSError: the rest waits."""
         with self._writing:
-            self.fixes.write()
-            self.events.write()
+            fixes, events = self.fixes.batches, self.events.batches
+            for table in (self.names, self.assets, self.zones):  # first: the fixes refer to the tags' numbers
+                table.save()
+            self.fixes.write(fixes)
+            self.events.write(events)
 
     def close(self) -> None:
         """Write all rows to files, and unlock the history. Raises OSError."""
-        with contextlib.ExitStack() as stack:  # in reverse order, each even if another fails
-            stack.callback(self._lock.close)
-            stack.callback(self.journal.close)
-            stack.callback(self.write)
-            self.store()
-
-
-def _fixes_in(batches: Sequence[bytes]) -> pa.Table:
-    return fix_table(np.frombuffer(b"".join(batches), RECORD))
-
-
-def _events_in(batches: Sequence[bytes]) -> pa.Table:
-    found = (msgspec.json.decode(data, type=list[Event]) for data in batches)
-    return event_table(tuple(chain.from_iterable(found)))
+        try:
+            self.write()
+        finally:
+            self._lock.close()
 
 
 # Daily maintenance: join small files, thin old ones, remove those that are too old. It is safe against kills: a joined
@@ -333,22 +280,26 @@ def _tidy(
     folder: Path, columns: dict[str, str], order: Sequence[str], days: float, full_days: float, unix_s: float
 ) -> None:
     current = largest_files(folder)
+    newest = current[-1] if current else None
     _remove(file for file in folder.glob("day=*/*.parquet") if rows_of(file) and file not in current)
     for day, of_day in groupby(current, day_of):
         age_days = (datetime.fromtimestamp(unix_s, UTC).date() - date.fromisoformat(day)).days
         if age_days > days:
-            _remove(of_day)
+            _remove(file for file in of_day if file != newest)
+            if newest and day == day_of(newest) and parquet.read_metadata(newest).num_rows:  # it has the place
+                empty = schema_of(columns).empty_table().replace_schema_metadata(metadata_of(newest))
+                write_table(empty, newest)
             continue
         for files, first, last in _groups(of_day) if age_days > 0 else ():
-            is_thinned = age_days <= full_days or all(
-                THINNED in (parquet.read_schema(file).metadata or {}) for file in files
-            )
+            is_thinned = age_days <= full_days or all(THINNED in metadata_of(file) for file in files)
             if is_thinned and len(files) == 1:
                 continue
             table = pa.concat_tables([read_table(file, columns) for file in files])
             table = table.sort_by([(name, "ascending") for name in order])
-            joined = files[0].with_name(file_name(first, last))
-            write_table(thinned(table) if age_days > full_days else table, joined)
+            joined, metadata = files[0].with_name(file_name(first, last)), metadata_of(files[-1])
+            if age_days > full_days:
+                table, metadata = thinned(table), metadata | {THINNED: b"yes"}
+            write_table(table.replace_schema_metadata(metadata), joined)
             _remove(file for file in files if file != joined)
 
 
@@ -375,8 +326,7 @@ def thinned(table: pa.Table) -> pa.Table:
     places = [table[name].to_numpy().astype(np.int64) for name in ("x_mm", "y_mm", "z_mm")]
     extents = [np.maximum.reduceat(place, first) - np.minimum.reduceat(place, first) for place in places]
     moves = np.repeat(np.max(extents, axis=0) > _REST_MM, np.diff(np.append(first, len(tag))))
-    kept = table.filter(pa.array(is_minute | (moves & is_step)))
-    return kept.replace_schema_metadata({THINNED: b"yes"})
+    return table.filter(pa.array(is_minute | (moves & is_step)))
 
 
 def _begins(tag: NDArray[Any], part: NDArray[Any]) -> NDArray[np.bool_]:
