@@ -30,6 +30,7 @@ HALL_M = np.array([100.0, 60.0])
 BEGIN = datetime(2026, 11, 2, tzinfo=UTC)
 ZONES = 24
 SHIFT_S = 8 * HOUR_S
+ERROR_OF_TAGS = "SELECT tag, avg(std_m) AS std_m FROM fixes GROUP BY tag"
 
 
 def table_of(columns, data):
@@ -106,8 +107,7 @@ def answer(folder, name, rows):
         "contacts of a tag in a day": lambda: len(history.contacts("tag77", day)),
         "dwell of all, whole range": lambda: len(history.dwell(whole)),
         "dwell of all, a day": lambda: len(history.dwell(day)),
-        "occupancy of all zones, a day": lambda: len(history.occupancy(day)),
-        "alarms, whole range": lambda: len(history.alarms(whole)),
+        "SQL: mean error of each tag, a day": lambda: len(history.sql(ERROR_OF_TAGS, day)),
     }
     if name is None:
         return list(asked)

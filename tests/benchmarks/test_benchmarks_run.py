@@ -25,7 +25,10 @@ RUNS = {
         ["tag", "--only", "awake", "--seconds", "0.2", "--seeds", "1"],
         ("| always on | received a second |", "| 12 anchors"),
     ),
-    "history": (["--rows", "20000", "--json"], ("peak_mb", "way of a tag in a shift", "alarms, whole range")),
+    "history": (
+        ["--rows", "20000", "--json"],
+        ("peak_mb", "way of a tag in a shift", "SQL: mean error of each tag, a day"),
+    ),
     "host_latency": (["--seconds", "5", "--seeds", "1", "--slot-ms", "5"], ("| tag heard |", "| 5 ms | adapts |")),
     "hub": (
         ["gather", "--seconds", "1", "--rate", "10000", "--json-rate", "500"],

@@ -1,7 +1,9 @@
 """``skyless history``: what it answers on the command line, as a table, as JSON and as a picture."""
 
 import json
+import re
 from datetime import UTC, datetime
+from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
@@ -18,13 +20,12 @@ from skyless.run.history.layout import (
     file_name,
     site_folder,
 )
-from skyless.sim.lab import lab_site
-from skyless.site.file.template import site_template
 
 pytestmark = pytest.mark.site
 
 BEGIN = datetime(2026, 11, 20, 8, tzinfo=UTC).timestamp()
 RANGE = ("--from", str(BEGIN), "--to", str(BEGIN + 3600.0))
+DOCUMENT = (Path(__file__).parents[2] / "docs" / "history.md").read_text(encoding="utf-8")
 TYPES = {"timestamp[ms, tz=UTC]": pa.timestamp("ms", tz="UTC")}
 
 
@@ -65,9 +66,7 @@ QUESTIONS = {
     "track": ("[red]ann",),
     "heatmap": ("--cell", "0.5"),
     "dwell": ("--zone", "dock"),
-    "occupancy": ("--every", "60"),
     "contacts": ("forklift 3",),
-    "alarms": (),
 }
 ANSWERS = {
     "track": lambda track: (track["fixes"], len(track["points"])) == (3600, 2000) and 65.0 < track["length_m"] < 80.0,
@@ -75,20 +74,16 @@ ANSWERS = {
     "dwell": lambda dwell: (
         [(one["tag"], one["zone_name"], one["seconds"]) for one in dwell] == [("[red]ann", "Dock", 600.0)]
     ),
-    "occupancy": lambda steps: sum(one["mean"] * 60.0 for one in steps) == pytest.approx(600.0),
     "contacts": lambda found: (
         [(one["tag"], one["tag_name"], one["other"], one["least_m"]) for one in found]
         == [("bob", "Forklift 3", "[red]ann", 1.0)]
     ),
-    "alarms": lambda found: [one["text"] for one in found] == ["ann is late"],
 }
 SHOWN = {
     "track": "length",
     "heatmap": "1 h 59 min",
     "dwell": "10 min 00 s",
-    "occupancy": "1.00",
     "contacts": "Forklift 3",
-    "alarms": "ann is late",
 }
 
 
@@ -103,7 +98,7 @@ def test_answers_as_json_and_as_a_table(folder, question, capsys):
     out = capsys.readouterr().out
     assert SHOWN[question] in out
     assert "seconds" not in out
-    assert "[red]ann" in out or question in {"heatmap", "occupancy"}
+    assert "[red]ann" in out or question == "heatmap"
 
 
 @pytest.mark.parametrize("question", QUESTIONS)
@@ -112,7 +107,7 @@ def test_pictures(folder, question, tmp_path, capsys):
     assert run(folder, question, *QUESTIONS[question], "--plot", str(picture)) == 0
     text = picture.read_text(encoding="utf-8")
     assert text.startswith("<?xml")
-    assert {"contacts": "[red]ann", "alarms": "late, [red]ann"}.get(question, "Dock") in text
+    assert ("[red]ann" if question == "contacts" else "Dock") in text
 
 
 def test_a_picture_names_the_asset(folder, tmp_path, capsys):
@@ -122,15 +117,16 @@ def test_a_picture_names_the_asset(folder, tmp_path, capsys):
     assert "bob" not in capsys.readouterr().out
 
 
-def test_exports(folder, tmp_path, capsys):
-    site = tmp_path / "lab.toml"
-    site.write_text(
-        site_template(lab_site()) + "\n[georeference]\nlatitude_deg = 48.0\nlongitude_deg = 11.0\n", encoding="utf-8"
-    )
-    for name in ("fixes.csv", "fixes.parquet", "fixes.geojsonl"):
-        words = ("export", str(tmp_path / name), "bob", "--site", str(site), "--json")
+def test_sql(folder, tmp_path, capsys):
+    assert run(folder, "sql", "SELECT text, unix_s FROM events WHERE kind = 'alarm-raised'", "--json") == 0
+    assert json.loads(capsys.readouterr().out)["sql"] == [{"text": "ann is late", "unix_s": BEGIN + 90.0}]
+    assert run(folder, "sql", "SELECT tag, max(x_m) AS x_m, max(time_utc) AS last FROM fixes GROUP BY tag") == 0
+    out = capsys.readouterr().out
+    assert all(words in out for words in ("[red]ann", "5.00", "2026-11-20 08:59:59"))
+    for name in ("fixes.csv", "fixes.parquet"):
+        words = ("sql", "FROM fixes WHERE tag = 'bob'", "--write", str(tmp_path / name), "--json")
         assert run(folder, *words) == 0
-        assert json.loads(capsys.readouterr().out)["fixes"] == 3600
+        assert json.loads(capsys.readouterr().out)["rows"] == 3600
         assert run(folder, *words) == 2
         assert "--force overwrites it" in capsys.readouterr().err
         assert run(folder, *words, "--force") == 0
@@ -138,15 +134,23 @@ def test_exports(folder, tmp_path, capsys):
     assert len((tmp_path / "fixes.csv").read_text().splitlines()) == 3601
 
 
+@pytest.mark.parametrize("query", re.findall('skyless history sql "(.*?)"', DOCUMENT, re.DOTALL))
+def test_sql_of_the_document(folder, query, capsys):
+    assert run(folder, "sql", query, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["sql"] or "tag7" in query
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (("track", "nobody"), "has no tag 'nobody'; it has [red]ann, bob"),
         (("dwell", "--zone", "nowhere"), "has no zone 'nowhere'; it has dock"),
-        (("alarms", "--site-id", "6"), "no history of site 6; it holds site 5"),
+        (("heatmap", "--site-id", "6"), "no history of site 6; it holds site 5"),
         (("heatmap", "--plot", "x.gif"), "--plot is 'x.gif'"),
         (("heatmap", "--cell", "-1"), "--cell is -1.0"),
         (("track", "bob", "--points", "1"), "--points is 1"),
+        (("sql", "SELEC 1"), "the SQL cannot be answered: Parser Error: syntax error at or near"),
+        (("sql", "FROM fixes", "--write", "x.txt"), "x.txt ends with '.txt'; it should end with .csv or .parquet"),
     ],
 )
 def test_a_slip_is_one_line(folder, words, said, capsys):
@@ -156,18 +160,18 @@ def test_a_slip_is_one_line(folder, words, said, capsys):
 
 
 def test_where_there_is_no_history_or_no_such_time(tmp_path, folder, capsys):
-    assert main(["history", "alarms"]) == 2
+    assert main(["history", "heatmap"]) == 2
     assert "it should be the folder of a site's history, and it holds none" in capsys.readouterr().err
     (folder / "site=9").mkdir()
-    assert main(["history", "alarms", "--history", str(folder)]) == 2
+    assert main(["history", "heatmap", "--history", str(folder)]) == 2
     assert "the sites 5, 9; --site-id chooses one" in capsys.readouterr().err
     (folder / "site=9").rmdir()
-    assert main(["history", "alarms", "--history", str(folder), "--from", "soonish"]) == 2
+    assert main(["history", "heatmap", "--history", str(folder), "--from", "soonish"]) == 2
     assert "--from is 'soonish'; it should be a time such as" in capsys.readouterr().err
 
 
 def test_a_range_without_fixes_ends_with_1(folder, tmp_path, capsys):
     past = ("--history", str(folder), "--from", "1990-01-01", "--to", "1990-01-02")
     assert main(["history", "heatmap", *past, "--plot", str(tmp_path / "empty.png")]) == 1
-    assert [main(["history", *words, *past]) for words in (("track", "bob"), ("heatmap",), ("alarms",))] == [1, 1, 0]
+    assert [main(["history", *words, *past]) for words in (("track", "bob"), ("heatmap",), ("dwell",))] == [1, 1, 0]
     assert "nothing" in capsys.readouterr().out

@@ -16,7 +16,7 @@ from starlette.exceptions import HTTPException
 from skyless.core.errors import SkylessError
 from skyless.core.site import AlarmRule, GeoreferenceSite
 from skyless.page.api import questions
-from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track, TrackPoint
+from skyless.run.history.answers import Contact, Dwell, Heatmap, Span, Track, TrackPoint
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import AlarmMessage, Asset
 
@@ -76,17 +76,9 @@ class FakeHistory:
         self._note("dwell", span, tags, zone)
         return (Dwell("t1", "desk", "Desk", 1, 5.0, 1.0, 6.0),)
 
-    def occupancy(self, span, zone=None, step_s=300.0):
-        self._note("occupancy", span, zone, step_s)
-        return (Occupancy("desk", "Desk", 1.0, 0.5, 1),)
-
     def contacts(self, tag, span, distance_m=2.0):
         self._note("contacts", tag, span, distance_m)
         return (Contact(tag, "t2", 1.0, 2.0, 0.7),)
-
-    def alarms(self, span):
-        self._note("alarms", span)
-        return (AlarmRow("a", "cold", "t1", "text", 1.0, None, 2.0, "Ada"),)
 
 
 def span_of(from_text, to_text, now_unix_s):

@@ -8,7 +8,6 @@ import page_fake_site as made_up
 PERIOD_S = 600.0
 PAUSE_S = 120.0
 ZONES = (("dock", "Dock", 14.0, 21.0, 2.5, 6.0), ("aisle", "Aisle", 2.0, 11.0, 4.0, 10.0))
-ALARM = "forklift was in Dock for longer than 5 min"
 
 
 def position(tag, unix_s):
@@ -62,18 +61,6 @@ def dwell(tags, from_s, to_s):
     return rows
 
 
-def occupancy(zone_id, from_s, to_s, step_s):
-    zone = next(zone for zone in ZONES if zone[0] == zone_id)
-    rows = []
-    for time in _times(from_s, to_s, (to_s - from_s) / step_s):
-        counts = [
-            sum(_inside(zone, position(tag, time + n * step_s / 10)) for tag in made_up.names(2)) for n in range(10)
-        ]
-        known = {"zone": zone[0], "zone_name": zone[1], "unix_s": time}
-        rows.append({**known, "mean": sum(counts) / 10, "most": max(counts)})
-    return rows
-
-
 def contacts(tag, from_s, to_s, distance_m):
     other = next(name for name in made_up.names(2) if name != tag)
     rows, begun = [], None
@@ -90,18 +77,6 @@ def contacts(tag, from_s, to_s, distance_m):
     return rows
 
 
-def alarms(from_s, to_s):
-    raised = from_s + (to_s - from_s) / 2
-    first = {"id": "stay-1", "rule": "stay", "subject": "forklift", "text": ALARM, "raised_unix_s": raised}
-    second = {"id": "off-1", "rule": "off", "subject": "anchor-8", "text": "anchor 8 was offline"}
-    seen = {"acknowledged_unix_s": raised + 90.0, "acknowledged_by": "Ada"}
-    unseen = {"acknowledged_unix_s": None, "acknowledged_by": ""}
-    return [
-        {**first, "ended_unix_s": raised + 240.0, **seen},
-        {**second, "raised_unix_s": raised - 60.0, "ended_unix_s": None, **unseen},
-    ]
-
-
 def answer(kind, query):
     """What ``/api/v1/history/<kind>`` answers, with a status."""
     if kind == "tags":
@@ -115,8 +90,6 @@ def answer(kind, query):
         "track": lambda: track(tag, from_s, to_s, int(query["points"])),
         "heatmap": lambda: heatmap(tags, from_s, to_s, float(query["cell_m"])),
         "dwell": lambda: {"dwell": dwell(tags, from_s, to_s)},
-        "occupancy": lambda: {"occupancy": occupancy(query["zone"], from_s, to_s, float(query["step_s"]))},
         "contacts": lambda: {"contacts": contacts(tag, from_s, to_s, float(query["distance_m"]))},
-        "alarms": lambda: {"alarms": alarms(from_s, to_s)},
     }
     return found[kind](), 200

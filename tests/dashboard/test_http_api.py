@@ -337,7 +337,7 @@ def test_without_a_history(site):
 def test_a_history_without_this_site(site, tmp_path):
     with browser_of(site, history=tmp_path / "empty") as client:
         assert client.get(f"{API}/history/tags").status_code == 404
-        assert client.get(f"{API}/history/alarms", params={"from": "soon"}).status_code == 404
+        assert client.get(f"{API}/history/dwell", params={"from": "soon"}).status_code == 404
 
 
 # Tokens

@@ -136,7 +136,7 @@ def test_the_way_of_a_tag_is_shown_and_played(kept):
     assert shown.position("forklift") is not None
 
 
-def test_heat_map_zones_occupancy_contacts_and_alarms(kept):
+def test_heat_map_zones_and_contacts(kept):
     server, shown = kept
     page = shown.page
     page.evaluate(axe.AXE_SCRIPT)
@@ -184,12 +184,6 @@ def test_heat_map_zones_occupancy_contacts_and_alarms(kept):
     ask(page, "dwell", "trolley")
     assert set(column(2)) == {"trolley"}
 
-    page.click("#history-occupancy")
-    page.wait_for_selector("#history-result canvas")
-    page.select_option("#history-zone", "aisle")
-    until(page, "document.querySelector('#history-result figcaption')?.textContent.includes('Aisle')")
-    assert server.history_asked[-1][1]["zone"] == "aisle"
-
     ask(page, "contacts", "forklift")
     moment = page.locator("#history-result tbody button >> nth=2")
     begun = moment.inner_text()
@@ -198,11 +192,6 @@ def test_heat_map_zones_occupancy_contacts_and_alarms(kept):
     page.locator(f"#past-mark:has-text('{begun}')").wait_for()
     assert page.locator("#history-result tbody button").count(), "the contacts are still listed"
 
-    ask(page, "alarms")
-    texts = page.locator("#history-result tbody tr").all_inner_texts()
-    assert "Forklift was in Dock for longer than 5 min." in texts[0]
-    assert "Ada" in texts[0]
-    assert "lasts" in texts[1]
     for theme in ("light", "dark"):
         page.emulate_media(color_scheme=theme)
         page.evaluate(THREE_FRAMES)
@@ -261,12 +250,12 @@ def test_answers_that_come_late_and_faults(kept):
     page.wait_for_selector("#history-fault:has-text('The range ends before it begins.')")
     page.evaluate("""() => {
       const ask = window.fetch;
-      window.fetch = (address, options) => String(address).includes("history/alarms")
-        ? Promise.resolve(new Response('{"alarms": []}')) : ask(address, options);
+      window.fetch = (address, options) => String(address).includes("history/dwell")
+        ? Promise.resolve(new Response('{"dwell": []}')) : ask(address, options);
     }""")
     page.select_option("#history-range", "yesterday")
-    page.click("#history-alarms")
-    page.wait_for_selector("#history-result:has-text('There were no alarms of this site')")
+    page.click("#history-dwell")
+    page.wait_for_selector("#history-result:has-text('No zone was entered, or there are no positions, of')")
 
     # A recording, and another site, end the past.
     ask(page, "way", "trolley")

@@ -1,7 +1,6 @@
 """The history's answers equal a plain computation over the same rows, file by file or not."""
 
 import csv
-import json
 import math
 from collections import defaultdict
 from datetime import UTC, datetime
@@ -11,15 +10,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from pyarrow import parquet
 
 from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
-from skyless.core.site import GeoreferenceSite
 from skyless.run.history import queries
-from skyless.run.history.answers import GAP_S, AlarmRow, Contact, Dwell, Span
+from skyless.run.history.answers import GAP_S, Contact, Dwell, Span
 from skyless.run.history.layout import (
     ASSET_COLUMNS,
     EVENT_COLUMNS,
@@ -29,14 +25,13 @@ from skyless.run.history.layout import (
     file_name,
     site_folder,
 )
-from skyless.run.history.queries import History, counts, sites_in
+from skyless.run.history.queries import History, sites_in
 from skyless.run.web import HistoryLimits
 
 SITE, TAGS, FIXES = 7, 20, 5000
 MIDNIGHT = datetime(2026, 11, 20, tzinfo=UTC).timestamp()
 BEGIN = MIDNIGHT - 2000.0
 SPAN = Span(BEGIN + 500.0, BEGIN + 4000.25)
-ORIGIN = GeoreferenceSite(latitude_deg=48.0, longitude_deg=11.0, height_m=500.0)
 EVENTS = [
     (-100.0, "enter", "tag1", "a"),  # before the range, never left
     (-90.0, "enter", "tag2", "a"),
@@ -262,18 +257,6 @@ def test_an_open_visit_ends_where_the_history_does(history, rows):
     assert history.dwell(Span(BEGIN + 50_000.0, BEGIN + 90_000.0)) == ()
 
 
-def test_occupancy_is_the_mean_and_most_in_each_step(history):
-    found = history.occupancy(SPAN, "a", 100.0)
-    assert [one.unix_s - SPAN.from_unix_s for one in found] == [100.0 * k for k in range(36)]
-    assert (found[0].mean, found[0].most) == (2.0, 2)
-    assert (found[1].mean, found[1].most) == (1.0, 1)
-    assert (found[5].mean, found[5].most) == (2.0, 2)
-    assert sum(one.mean for one in found[:35]) * 100.0 == pytest.approx(3500.0 + 400.0)
-    both = history.occupancy(SPAN, None, 1000.0)
-    assert [one.zone for one in both] == ["a"] * 4 + ["b"] * 4 + ["empty"] * 4
-    assert {one.most for one in both[8:]} == {0}
-
-
 @pytest.mark.parametrize("distance_m", [0.5, 2.0])
 def test_contacts_are_pairs_of_the_same_second(history, within, distance_m):
     found = history.contacts("tag1", SPAN, distance_m)
@@ -302,38 +285,6 @@ def test_contacts_are_pairs_of_the_same_second(history, within, distance_m):
     assert [one.least_m for one in found] == pytest.approx([one.least_m for one in expected])
 
 
-def test_alarms_that_overlap_the_range(history):
-    found = history.alarms(SPAN)
-    assert [(one.id, one.rule, one.subject, one.text) for one in found] == [
-        ("r/tag1/2", "r", "tag1", "two at the worst"),
-        ("s/tag1+tag2/3", "s", "tag1+tag2", "three"),
-    ]
-    assert found[0].ended_unix_s == BEGIN + 600.0
-    seen = AlarmRow("s/tag1+tag2/3", "s", "tag1+tag2", "three", BEGIN + 700.0, None, BEGIN + 710.0, "Ada")
-    assert found[1] == seen
-
-
-def test_exports_hold_every_fix_of_the_range(history, within, tmp_path):
-    count = len(within["t"])
-    files = [tmp_path / f"fixes{suffix}" for suffix in (".csv", ".parquet", ".geojsonl")]
-    assert [history.export(file, SPAN) for file in files[:2]] == [count] * 2
-    whole = parquet.read_table(files[1]).to_pylist()
-    assert sorted(one["x_m"] for one in whole) == pytest.approx(sorted((within["x_mm"] / 1000).tolist()))
-    with files[0].open(newline="") as file:
-        text = list(csv.DictReader(file))
-    assert [one["tag"] for one in text] == [one["tag"] for one in whole]
-    assert [float(one["y_m"]) for one in text] == [one["y_m"] for one in whole]
-    assert text[0]["time_utc"][:10] == "2026-11-19"
-    whole = [one for one in whole if one["tag"] == "tag3"]
-    assert history.export(files[2], SPAN, ("tag3",), ORIGIN) == len(whole)
-    features = [json.loads(line) for line in files[2].read_text().splitlines()]
-    assert [one["properties"]["alert"] for one in features] == [one["alert"] for one in whole]
-    assert {one["properties"]["hpl_m"] for one in features} == {None, 1.2}
-    longitude, latitude, height_m = features[0]["geometry"]["coordinates"]
-    assert (longitude, latitude, height_m) == pytest.approx((11.0, 48.0, 501.2), abs=0.01)
-    assert history.export(files[0], SPAN, ("tag3",)) == int((within["tag"] == 3).sum())
-
-
 @pytest.mark.parametrize(
     "spoilt", [lambda data: b"", lambda data: data[:-20], lambda data: data[: len(data) // 2], bytes]
 )
@@ -352,24 +303,20 @@ def test_a_damaged_file_is_named_and_no_traceback(tmp_path, rows, spoilt):
         lambda: history.heatmap(span),
         lambda: history.track("tag1", span),
         lambda: history.contacts("tag1", span),
-        lambda: history.export(tmp_path / "x.csv", span),
+        lambda: history.sql("FROM fixes", span),
     ):
         with pytest.raises(SkylessError, match=f"{file.name}.* cannot be read"):
             ask()
-    assert not (tmp_path / "x.csv").exists()
 
 
-def test_an_empty_range(history, tmp_path):
+def test_an_empty_range(history):
     empty = Span(BEGIN - 9e6, BEGIN - 8e6)
     assert history.track("tag1", empty).points == ()
     assert history.heatmap(empty).seconds == ()
     assert history.contacts("tag1", empty) == ()
     assert history.contacts("tag1", SPAN, 0.01) == ()
-    assert history.dwell(empty) == history.alarms(empty) == ()
-    assert {one.most for one in history.occupancy(Span(0.0, 10.0))} == {0}
-    with pytest.raises(SkylessError, match="no fixes in this range"):
-        history.export(tmp_path / "x.csv", empty)
-    assert not (tmp_path / "x.csv").exists()
+    assert history.dwell(empty) == ()
+    assert history.sql("FROM fixes", empty) == history.sql("FROM events", empty) == []
 
 
 @pytest.mark.parametrize(
@@ -384,10 +331,8 @@ def test_an_empty_range(history, tmp_path):
         (lambda h: h.dwell(SPAN, zone="a' OR 'a'='a"), "has no zone .*; it has a, b, empty"),
         (lambda h: h.heatmap(SPAN, 0.0), "the cells' side is 0.0"),
         (lambda h: h.heatmap(SPAN, 0.01), "too many; choose larger"),
-        (lambda h: h.occupancy(Span(0.0, 1e9), step_s=1.0), "too many; choose longer"),
         (lambda h: h.contacts("tag1", SPAN, 1e6), "the distance is 1000000.0"),
-        (lambda h: h.export(h.folder / "x.xlsx", SPAN), "it should end with .csv or .parquet or .geojsonl"),
-        (lambda h: h.export(h.folder / "x.geojsonl", SPAN), "georeference"),
+        (lambda h: h.write("FROM fixes", SPAN, h.folder / "x.xlsx"), "it should end with .csv or .parquet"),
         (lambda h: History(h.folder, 8), "no history of site 8; it holds site 7"),
         (lambda h: History(h.folder / "none", 8), "skyless history run"),
     ],
@@ -403,14 +348,8 @@ def test_what_cannot_be_answered_is_said(history, ask, error):
         ({"cells": 10}, lambda h: h.heatmap(SPAN), "cells of 0.25 m are too many; choose ones of"),
         ({"contacts": 1}, lambda h: h.contacts("tag1", SPAN), "choose a shorter range or a smaller distance"),
         ({"rows": 3}, lambda h: h.dwell(SPAN), "more than 3 rows; choose a shorter range, a tag or a zone"),
-        ({"rows": 1}, lambda h: h.alarms(SPAN), "more than 1 rows"),
-        (
-            {"steps": 100},
-            lambda h: h.occupancy(SPAN, step_s=99.0),
-            r"99 s for 3 zones .* of 106 s or more, a shorter range or",
-        ),
+        ({"rows": 1}, lambda h: h.sql("FROM zones", SPAN), "more than 1 rows; --write takes all, and LIMIT some"),
         ({"points": 9}, lambda h: h.track("tag1", SPAN, 10), "the number of points is 10"),
-        ({"exported_rows": 9}, lambda h: h.export(h.folder / "x.csv", SPAN), "fixes are more than 9; choose a shorter"),
     ],
 )
 def test_what_is_too_much_is_refused_with_what_would_do(history, monkeypatch, limits, ask, error):
@@ -437,22 +376,6 @@ def test_a_file_that_is_replaced_while_it_is_read(history, monkeypatch):
         history.heatmap(SPAN)
 
 
-VISITS = st.lists(
-    st.tuples(st.integers(-5, 40), st.integers(0, 20)).map(lambda v: (v[0], 60 if v[1] == 20 else v[0] + v[1]))
-)
-
-
-@given(VISITS, st.integers(1, 9), st.integers(1, 30))
-def test_counts_are_those_at_every_instant(visits, step, length):
-    edges = np.append(np.arange(0.0, length, step), float(length))
-    mean, most = counts(*np.array(visits, float).reshape(-1, 2).T, edges)
-    for k, (begin, end) in enumerate(pairwise(edges)):
-        whole = range(int(begin), int(end))  # between whole seconds nothing changes
-        at = [sum(b <= second < e for b, e in visits) for second in whole]
-        assert mean[k] == pytest.approx(sum(at) / len(at))
-        assert most[k] == max(at)
-
-
 def test_days_that_are_thinned(tmp_path):
     """Their fixes, one in ten seconds or in a minute, count longer, and are compared within ten seconds."""
     site, minutes = site_folder(tmp_path, 2), 60
@@ -474,3 +397,93 @@ def test_days_that_are_thinned(tmp_path):
     assert history.contacts("rest", span, 2.0) == (
         Contact("rest", "near", MIDNIGHT + 600.0, MIDNIGHT + 19 * 60.0 + 10.0, 1.5),
     )
+
+
+def test_sql_sees_every_fix_of_the_range(history, within, tmp_path):
+    files = tmp_path / "fixes.csv", tmp_path / "fixes.parquet"
+    query = "SELECT * FROM fixes ORDER BY tag, unix_s -- all of them"
+    assert [history.write(query, SPAN, file) for file in files] == [len(within["t"])] * 2
+    whole = parquet.read_table(files[1]).to_pylist()
+    assert sorted(one["x_m"] for one in whole) == pytest.approx(sorted((within["x_mm"] / 1000).tolist()))
+    assert {one["hpl_m"] for one in whole} == {None, 1.2}
+    assert {one["tag"] for one in whole} == {"renamed", *(f"tag{k}" for k in range(1, TAGS))}
+    with files[0].open(newline="") as file:
+        text = list(csv.DictReader(file))
+    assert [float(one["y_m"]) for one in text] == [one["y_m"] for one in whole]
+    assert text[0]["time_utc"][:10] == "2026-11-19"
+    own = history.sql("SELECT unix_s, alert, simulated FROM fixes WHERE tag = 'tag3';", SPAN)
+    assert sorted(one["unix_s"] for one in own) == (within["t"][within["tag"] == 3] / 1000).tolist()
+
+
+def test_sql_answers_what_the_questions_do_not(history):
+    """Alarms that overlap a range, and how full a zone was."""
+    alarms = f"""
+        SELECT alarm, min(unix_s) FILTER (kind = 'alarm-raised') AS raised,
+            max(unix_s) FILTER (kind = 'alarm-ended') AS ended
+        FROM events WHERE alarm NOT NULL GROUP BY alarm HAVING coalesce(ended, 1e10) > {SPAN.from_unix_s}
+        ORDER BY raised
+    """
+    found = history.sql(alarms, Span(0.0, SPAN.to_unix_s))
+    assert [(one["alarm"], one["ended"]) for one in found] == [
+        ("r/tag1/2", BEGIN + 600.0),
+        ("s/tag1+tag2/3", None),
+    ]
+    inside = """
+        SELECT zone, sum(CASE kind WHEN 'enter' THEN 1 ELSE -1 END) OVER (PARTITION BY zone ORDER BY unix_s) AS tags
+        FROM events JOIN zones USING (zone) WHERE kind IN ('enter', 'leave') AND tag = 'tag4' ORDER BY unix_s
+    """
+    assert [(one["zone"], one["tags"]) for one in history.sql(inside, Span(0.0, 1e10))] == [("b", 1), ("b", 0)]
+    assert {"tag": "tag3", "name": "Forklift"} in history.sql("FROM assets", SPAN)
+
+
+@pytest.mark.parametrize(
+    ("query", "error"),
+    [
+        ("SELEC 1", 'cannot be answered: Parser Error: syntax error at or near "SELEC"'),
+        ("SELECT nothing FROM fixes", "cannot be answered: Binder Error: .*nothing"),
+        ("", "the SQL is ''; it should be one SELECT"),
+        *(
+            (query, "it should be one SELECT")
+            for query in (
+                "SELECT 1; SELECT 2",
+                "COPY fixes TO '$f.csv'",
+                "COPY fixes TO '$history'",
+                "ATTACH '$f.db'",
+                "INSTALL httpfs",
+                "LOAD httpfs",
+                "PRAGMA version",
+                "SET memory_limit = '9GB'",
+                "SET enable_external_access = true",
+                "CALL enable_logging()",
+                "CREATE TABLE t AS SELECT 1",
+                "EXPORT DATABASE '$f'",
+            )
+        ),
+        *(
+            (f"SELECT * FROM {one}", "Permission Error|Parser Error|does not exist|has been locked")
+            for one in (
+                "read_csv('/etc/passwd')",
+                "read_text('/etc/passwd')",
+                "'/etc/passwd.csv'",
+                "glob('/etc/*')",
+                "read_parquet('$other')",
+                "read_parquet('https://example.org/a.parquet')",
+                "query('COPY fixes TO ''$f.csv''')",
+                "enable_logging(storage = 'file', storage_path = '$f')",
+                "history",
+            )
+        ),
+    ],
+)
+def test_sql_reads_the_history_and_nothing_else(history, tmp_path, query, error):
+    other = tmp_path / "other.parquet"
+    parquet.write_table(pa.table({"a": [1]}), other)
+    before = {file: file.stat().st_mtime_ns for file in history.folder.rglob("*")}
+    own = next(iter(history._files(SPAN)))
+    query = query.replace("$f", f"{tmp_path}/f").replace("$other", str(other)).replace("$history", str(own))
+    for ask in (lambda: history.sql(query, SPAN), lambda: history.write(query, SPAN, tmp_path / "out.csv")):
+        with pytest.raises(SkylessError, match=error) as raised:
+            ask()
+        assert "\n" not in str(raised.value)
+    assert {*tmp_path.iterdir()} == {other}
+    assert {file: file.stat().st_mtime_ns for file in history.folder.rglob("*")} == before

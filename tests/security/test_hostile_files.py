@@ -17,9 +17,8 @@ QUESTIONS = {
     "heatmap": lambda history, span: history.heatmap(span),
     "contacts": lambda history, span: history.contacts("a", span),
     "dwell": lambda history, span: history.dwell(span),
-    "occupancy": lambda history, span: history.occupancy(span, step_s=1e6),
-    "alarms": lambda history, span: history.alarms(span),
-    "export": lambda history, span: history.export(history.folder / "all.csv", span),
+    "sql": lambda history, span: history.sql("SELECT count(*) FROM fixes JOIN events USING (tag)", span),
+    "written": lambda history, span: history.write("FROM fixes", span, history.folder / "all.csv"),
     "zones": lambda history, _span: history.zones(),
     "newest": lambda history, _span: history.known_until_unix_s(),
 }

@@ -36,6 +36,7 @@ HOLDS = {
         "test_a_full_disk_is_said_and_forgiven",
     ),
     "history/test_history_questions.py": (
+        "test_sql_reads_the_history_and_nothing_else",
         "test_what_is_too_much_is_refused_with_what_would_do",
         "test_a_damaged_file_is_named_and_no_traceback",
     ),

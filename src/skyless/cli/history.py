@@ -42,15 +42,15 @@ if TYPE_CHECKING:
     _History = HistoryNode | HubHistory
 
 
-# ``skyless history track``, ``heatmap``, ``dwell``, ``occupancy``, ``contacts``, ``alarms`` and ``export``.
+# ``skyless history track``, ``heatmap``, ``dwell``, ``contacts`` and ``sql``.
 
 _LONGEST_TABLE = 40
 """Rows that a table shows; --json gives all."""
 _LONGEST_LIST = 10
 """Cells of a heat map that a table shows."""
 
-_HEADINGS = {"subject_name": "of", "acknowledged_unix_s": "seen", "acknowledged_by": "by", "seconds": "duration"}
-_OF_TAGS = ("tag", "other", "subject")
+_HEADINGS = {"seconds": "duration"}
+_OF_TAGS = ("tag", "other")
 _Row = dict[str, Any]
 
 questions = App(name="history")
@@ -144,7 +144,6 @@ def _heatmap_rows(found: _Row) -> list[_Row]:
 _ROWS: Mapping[str, Callable[[Any], list[_Row]]] = {
     "track": _track_rows,
     "heatmap": _heatmap_rows,
-    "occupancy": lambda found: [row for row in found if row["most"]],
 }
 """Functions that convert an answer to table rows, for commands that do not show the answer itself."""
 
@@ -194,21 +193,6 @@ def dwell(*tags: str, asked: _Drawn, zone: str | None = None) -> int:
     return asked.answer("dwell", lambda history, span: history.dwell(span, tags, zone))
 
 
-@questions.command(help_epilogue="Example: skyless history occupancy --from 6:00 --zone canteen --every 600")
-@command
-def occupancy(*, asked: _Drawn, zone: str | None = None, every: Positive = 300.0) -> int:
-    """How many tags were in zones, over time.
-
-    Parameters
-    ----------
-    zone
-        Identifier of the only zone; by default all.
-    every
-        Seconds of a step of time.
-    """
-    return asked.answer("occupancy", lambda history, span: history.occupancy(span, zone, every))
-
-
 @questions.command(help_epilogue="Example: skyless history contacts tag7 --from yesterday --within 1.5")
 @command
 def contacts(tag: str, /, *, asked: _Drawn, within: Positive = 2.0) -> int:
@@ -224,42 +208,38 @@ def contacts(tag: str, /, *, asked: _Drawn, within: Positive = 2.0) -> int:
     return asked.answer("contacts", lambda history, span: history.contacts(tag, span, within))
 
 
-@questions.command(help_epilogue="Example: skyless history alarms --from yesterday")
+@questions.command(help_epilogue="Example: skyless history sql 'SELECT kind, count(*) FROM events GROUP BY kind'")
 @command
-def alarms(*, asked: _Drawn) -> int:
-    """Alarms of the range, with those that had begun before it and had not ended."""
-    return asked.answer("alarms", lambda history, span: history.alarms(span))
+def sql(query: str, /, *, asked: _Asked, write: Path | None = None, force: bool = False) -> None:
+    """Ask in SQL, of DuckDB's dialect: one SELECT from fixes, events, zones and assets.
 
-
-@questions.command(help_epilogue="Example: skyless history export fixes.csv --from yesterday --to today")
-@command
-def export(file: Path, /, *tags: str, asked: _Asked, site: Path | None = None, force: bool = False) -> None:
-    """Write the fixes of tags, by default all, as a table: CSV, Parquet, or GeoJSON with one feature a line.
+    Fixes and events are those of the range of time. docs/history.md lists their columns.
 
     Parameters
     ----------
-    file
-        The file to write; its ending .csv, .parquet or .geojsonl is its format.
-    tags
-        Names of tags, or of their assets.
-    site
-        Site file with a georeference, which GeoJSON needs.
+    query
+        The SELECT.
+    write
+        File for the answer instead of the table; its ending .csv or .parquet is its format.
     force
         Overwrite what is there, if the file exists.
     """
-    check_folder("FILE", file)
-    check_new(file, force=force)
+    if write is not None:
+        check_folder("--write", write)
+        check_new(write, force=force)
     history, span = asked.opened()
-    origin = None
-    if site is not None:
-        from skyless.site.file.load import load_site
-
-        origin = load_site(site).georeference
-    count = history.export(file, span, tags, origin)
+    if write is not None:
+        count = history.write(query, span, write)
+        if asked.json:
+            _print(history, span, {"file": write, "rows": count})
+        else:
+            console().print(f"{write}: {count} rows, {_range(span)}", markup=False)
+        return
+    rows = history.sql(query, span)
     if asked.json:
-        _print(history, span, {"file": file, "fixes": count})
+        _print(history, span, {"sql": rows})
     else:
-        console().print(f"{file}: {count} fixes, {_range(span)}", markup=False)
+        _table(_range(span), rows)
 
 
 def _print(history: "History", span: "Span", answer: dict[str, Any]) -> None:
@@ -274,7 +254,7 @@ def _table(title: str, rows: Sequence[_Row]) -> None:
 
     more = len(rows) - _LONGEST_TABLE
     table = Table(title=title, caption=f"{more} more rows: --json gives all" if more > 0 else None)
-    names = [name for name in rows[0] if name != "id" and f"{name}_name" not in rows[0]] if rows else []
+    names = [name for name in rows[0] if f"{name}_name" not in rows[0]] if rows else []
     for name in names:
         heading = name.removesuffix("_name").removesuffix("_unix_s")
         heading = f"{heading.removesuffix('_m')} in m" if heading.endswith("_m") else heading.replace("_", " ")

@@ -1,7 +1,5 @@
 """Pictures of the history's answers."""
 
-import time
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from typing import Any, Final
@@ -15,7 +13,6 @@ from skyless.run.history.answers import THINNED_GAP_S
 from skyless.site.report import BLUE, MAP, MUTED, panel, report_style
 
 _BARS: Final = 30
-_LINES: Final = 8
 
 _Zones = Mapping[str, tuple[str, tuple[tuple[float, float], ...]]]
 
@@ -62,38 +59,9 @@ def dwell_figure(dwell: Sequence[_Answer], _zones: _Zones, title: str) -> Figure
         return figure
 
 
-def occupancy_figure(occupancy: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
-    """Draw the mean number of tags over time in the fullest zones."""
-    zones: dict[str, list[_Answer]] = defaultdict(list)
-    for one in occupancy:
-        zones[one["zone"]].append(one)
-    fullest = sorted(zones.values(), key=lambda steps: -sum(step["mean"] for step in steps))[:_LINES]
-    with report_style():
-        figure, axes = panel(title)
-        for steps in fullest:
-            times: list[Any] = [datetime.fromtimestamp(step["unix_s"]) for step in steps]
-            axes.step(times, [step["mean"] for step in steps], where="post", label=steps[0]["zone_name"])
-        axes.set_ylabel("tags, mean of each step")
-        figure.autofmt_xdate()
-        if fullest:
-            axes.legend()
-        return figure
-
-
 def contacts_figure(contacts: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
     """Draw when each other tag was near."""
-    return _times_figure([(one["other_name"], one["begin_unix_s"], one["end_unix_s"]) for one in contacts], title)
-
-
-def alarms_figure(alarms: Sequence[_Answer], _zones: _Zones, title: str) -> Figure:
-    """Draw the duration of each rule's alarms; alarms that have not ended last until now."""
-    times = [(one["raised_unix_s"], one["ended_unix_s"] or time.time()) for one in alarms]
-    names = [f"{one['rule']}, {one['subject_name']}" for one in alarms]
-    return _times_figure([(name, *span) for name, span in zip(names, times, strict=True)], title)
-
-
-def _times_figure(times: Sequence[tuple[str, float, float]], title: str) -> Figure:
-    """Draw a row of bars for each of the first names, between Unix times."""
+    times = [(one["other_name"], one["begin_unix_s"], one["end_unix_s"]) for one in contacts]
     names = list(dict.fromkeys(name for name, _, _ in times))[:_BARS][::-1]
     with report_style():
         figure, axes = panel(title, 1.2 + 0.2 * max(len(names), 3))
@@ -118,8 +86,6 @@ FIGURES: Final[Mapping[str, Callable[[Any, _Zones, str], Figure]]] = {
     "track": track_figure,
     "heatmap": heatmap_figure,
     "dwell": dwell_figure,
-    "occupancy": occupancy_figure,
     "contacts": contacts_figure,
-    "alarms": alarms_figure,
 }
 """Functions that draw the answer to a question, by the question's name."""

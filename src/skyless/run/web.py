@@ -106,18 +106,14 @@ class HistoryLimits(Struct, frozen=True):
     """What DuckDB may use before it writes to temporary files; Python and the libraries take 100 MB besides."""
     points: int = 20_000
     """Points of a way."""
-    steps: int = 20_000
-    """Steps of time of all zones of an occupancy."""
     rows: int = 100_000
-    """Rows of a table of stays or alarms."""
+    """Rows of a table of stays, or of the answer of SQL that is written to no file."""
     contacts: int = 100_000
     """Contacts of a tag."""
     contact_m: float = 50.0
     """Distance within which tags count as in contact."""
     cells: int = 1_000_000
     """Cells of a heat map."""
-    exported_rows: int = 100_000_000
-    """Rows of an exported file."""
     waiting_rows: int = 1_000_000
     """Fixes, and as many events, that wait in memory for the next file; further ones are left in the stream."""
     tags: int = 200_000

@@ -122,7 +122,6 @@ Begin = Annotated[
 End = Annotated[str, Meta(max_length=100, description="The same; by default what follows from the other.")]
 Points = Annotated[int, Meta(ge=2, le=20_000, description="How many points at most.")]
 CellSize = Annotated[float, Meta(ge=0.05, le=50.0, description="Side of a cell in m.")]
-Step = Annotated[float, Meta(ge=1.0, le=86_400.0, description="Length of a step in s.")]
 Distance = Annotated[float, Meta(ge=0.1, le=100.0, description="Tags that are nearer, in m, were in contact.")]
 
 RENAMED: Final = {"begin": "from", "end": "to"}

@@ -35,7 +35,6 @@ from skyless.page.api.answers import (
     Points,
     RuleId,
     SiteAnswer,
-    Step,
     Subject,
     Tag,
     TagName,
@@ -49,7 +48,7 @@ from skyless.page.connections import json_answer
 from skyless.page.live import LiveSite
 from skyless.page.tasks import TaskProcess, serve_tasks
 from skyless.run.assets import read_csv, write_csv
-from skyless.run.history.answers import AlarmRow, Contact, Dwell, Heatmap, Occupancy, Span, Track
+from skyless.run.history.answers import Contact, Dwell, Heatmap, Span, Track
 from skyless.run.history.layout import site_folder
 from skyless.run.mqtt.messages import (
     AlarmMessage,
@@ -294,13 +293,6 @@ def dwell(
     return history.dwell(_span(begin, end), names(tag), zone or None)
 
 
-def occupancy(
-    history: "History", *, begin: Begin, end: End = "", zone: ZoneId = "", step_s: Step = 300.0
-) -> tuple[Occupancy, ...]:
-    """How many tags were in zones."""
-    return history.occupancy(_span(begin, end), zone or None, step_s)
-
-
 def contacts(
     history: "History", *, tag: TagName, begin: Begin, end: End = "", distance_m: Distance = 2.0
 ) -> tuple[Contact, ...]:
@@ -308,16 +300,11 @@ def contacts(
     return history.contacts(tag, _span(begin, end), distance_m)
 
 
-def past_alarms(history: "History", *, begin: Begin, end: End = "") -> tuple[AlarmRow, ...]:
-    """Alarms of the past."""
-    return history.alarms(_span(begin, end))
-
-
 def _answer(question: _Question) -> object:
     """Answer a question in the process; a tuple becomes an object with one key. Raises SkylessError."""
     from skyless.run.history.queries import History  # noqa: PLC0415 - of the extra history
 
-    functions = (past_tags, track, heatmap, dwell, occupancy, contacts, past_alarms)
+    functions = (past_tags, track, heatmap, dwell, contacts)
     function = {one.__name__.removeprefix("past_"): one for one in functions}[question.name]
     found = function(History(Path(question.folder), question.site), **question.given)
     return {question.name: found} if isinstance(found, tuple) else found

@@ -204,9 +204,7 @@ ROUTES: Final = (
     ApiRoute("GET", "/history/track", questions.track),
     ApiRoute("GET", "/history/heatmap", questions.heatmap),
     ApiRoute("GET", "/history/dwell", questions.dwell),
-    ApiRoute("GET", "/history/occupancy", questions.occupancy),
     ApiRoute("GET", "/history/contacts", questions.contacts),
-    ApiRoute("GET", "/history/alarms", questions.past_alarms),
 )
 
 

@@ -12,26 +12,18 @@ on(["theme"], () => charts.forEach((chart) => chart.rebuild()));
 
 const HEIGHT = 96;
 
-/** Time of day, at midnight the day. */
-function dayOrTime(unix_s) {
-  const date = new Date(unix_s * 1e3);
-  const midnight = !date.getHours() && !date.getMinutes();
-  return midnight ? date.toLocaleDateString("en-GB", { day: "numeric", month: "short" }) : date.toLocaleTimeString("en-GB", { timeStyle: "short" });
-}
-
 export class Chart {
   /**
    * @param {string} title the quantity, with its unit
    * @param {Array<{name: string, colour: string, steps?: boolean}>} series colours are names of the palette
    * @param {(value: number) => string} write formats values
    * @param {number} span minimum of y's range
-   * @param {{zero?: boolean, whole?: boolean, past?: boolean}} options whether y starts at zero, whether its marks are
-   *   whole numbers, and whether x is a local time and not seconds before now
+   * @param {{zero?: boolean, whole?: boolean}} options whether y starts at zero, and whether its marks are whole numbers
    */
-  constructor(title, series, write, span, { zero = true, whole = false, past = false } = {}) {
+  constructor(title, series, write, span, { zero = true, whole = false } = {}) {
     this.series = series;
     this.write = write;
-    this.axis = { span, zero, whole, past };
+    this.axis = { span, zero, whole };
     this.plot = null;
     this.data = [[], ...series.map(() => [])];
     this.value = h("output", {});
@@ -53,14 +45,6 @@ export class Chart {
       this.series.length > 1 ? parts.map((part, n) => `${this.series[n].name} ${part}`).join("  ") : parts[0];
     text(this.value, words);
     if (!this.plot && this.box.clientWidth) this.build();
-    this.plot?.setData(data);
-  }
-
-  /** Show values against times, seconds since 1970, with words for a figure. */
-  showPast(data, window, words) {
-    this.data = data;
-    this.window = window;
-    text(this.value, words);
     this.plot?.setData(data);
   }
 
@@ -93,7 +77,7 @@ export class Chart {
       ticks: { show: false },
       font: "10px system-ui, sans-serif",
     };
-    const { span, zero, whole, past } = this.axis;
+    const { span, zero, whole } = this.axis;
     const range = (_plot, low, high) => {
       if (low === null || high === null || low === undefined) return [0, span];
       const bottom = zero ? 0 : low;
@@ -107,13 +91,13 @@ export class Chart {
       legend: { show: false },
       cursor: { show: false },
       padding: [6, 14, 0, 0],
-      scales: { x: { time: past, range: () => this.window }, y: { range } },
+      scales: { x: { time: false, range: () => this.window }, y: { range } },
       axes: [
         {
           ...axis,
           size: 20,
           gap: 6,
-          values: (_plot, marks) => marks.map(past ? dayOrTime : (mark) => `${mark || "now"}`.replace("-", "−")),
+          values: (_plot, marks) => marks.map((mark) => `${mark || "now"}`.replace("-", "−")),
         },
         {
           ...axis,

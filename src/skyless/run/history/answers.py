@@ -72,16 +72,6 @@ class Dwell(Struct, frozen=True):
     last_unix_s: float
 
 
-class Occupancy(Struct, frozen=True):
-    """How many tags were in a zone during one time step."""
-
-    zone: str
-    zone_name: str
-    unix_s: float
-    mean: float
-    most: int
-
-
 class Contact(Struct, frozen=True):
     """A period in which two tags were near each other."""
 
@@ -90,19 +80,6 @@ class Contact(Struct, frozen=True):
     begin_unix_s: float
     end_unix_s: float
     least_m: float
-
-
-class AlarmRow(Struct, frozen=True):
-    """One alarm of the past."""
-
-    id: str
-    rule: str
-    subject: str
-    text: str
-    raised_unix_s: float
-    ended_unix_s: float | None
-    acknowledged_unix_s: float | None
-    acknowledged_by: str
 
 
 _EXAMPLES: Final = "a time such as 14:00, yesterday 8:00, 2 hours ago, 2026-01-31 06:00, or seconds since 1970"

@@ -1,7 +1,7 @@
-"""Queries on the history of a site: tracks, times in cells and zones, contacts, alarms, and export of fixes.
+"""Queries on the history of a site: tracks, times in cells and zones, contacts, and SQL.
 
-DuckDB reads the files, or PyArrow where a query needs all rows. Rows that are only in the journal, from the last ten
-minutes or so, are not included.
+DuckDB reads the files, or PyArrow where a query needs all rows. Rows that are in no file yet, from the last ten minutes
+or so, are not included.
 """
 
 import contextlib
@@ -13,8 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import wraps
-from itertools import chain, groupby, islice
-from operator import itemgetter
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
@@ -26,25 +25,22 @@ from numpy.typing import NDArray
 from pyarrow import parquet
 
 from skyless.arguments import check_number
-from skyless.core.earth import coordinates, feature
 from skyless.core.errors import SkylessError
-from skyless.core.site import GeoreferenceSite
 from skyless.files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
 from skyless.run.history.answers import (
     GAP_S,
     THINNED_GAP_S,
-    AlarmRow,
     Contact,
     Dwell,
     Heatmap,
-    Occupancy,
     Span,
     Track,
     TrackPoint,
 )
 from skyless.run.history.layout import (
     ASSET_COLUMNS,
+    EVENT_COLUMNS,
     FIX_COLUMNS,
     NAME_COLUMNS,
     THINNED,
@@ -201,13 +197,16 @@ def limits(metadata: parquet.FileMetaData, group: int, column: str) -> tuple[int
     return known.min_raw, known.max_raw  # min and max would be dates, and import Pandas
 
 
-EXPORT_SUFFIXES: Final = (".csv", ".parquet", ".geojsonl")
-
 _EARLY: Final = timedelta(hours=1)
 _LATE: Final = timedelta(days=1)
 """How much earlier or later than its own time a fix may arrive: clocks differ, and sites buffer while disconnected."""
 
 _UNREADABLE: Final = (OSError, ValueError, RecursionError, duckdb.Error, pyarrow.ArrowException, msgspec.MsgspecError)
+_OF_SQL: Final = (
+    *(duckdb.ParserException, duckdb.BinderException, duckdb.CatalogException),
+    *(duckdb.PermissionException, duckdb.DataError),
+)
+"""Errors of a query, whatever is in the files."""
 _TRIES: Final = 3
 _MOVE_M: Final = 0.25
 _MOVE_SIGMAS: Final = 3.0
@@ -221,11 +220,15 @@ _PART_S: Final = 28.0 * 86_400.0
 _NAMED: Final = 5
 """How many known names an error lists."""
 
+_FIX_VALUES: Final = f"""
+    x_mm / 1000 AS x_m, y_mm / 1000 AS y_m, z_mm / 1000 AS z_m, std_mm / 1000 AS std_m,
+    CASE WHEN hpl_cm != {NONE_U16} THEN hpl_cm / 100 END AS hpl_m,
+    list_extract({[alert.value for alert in ALERTS]}, flags & {ALERT_BITS}) AS alert,
+    flags & {SIMULATED} != 0 AS simulated
+"""
+
 _FIXES: Final = f"""
-    SELECT tag, epoch_ms(t) AS ms, x_mm / 1000 AS x_m, y_mm / 1000 AS y_m, z_mm / 1000 AS z_m, std_mm / 1000 AS std_m,
-        CASE WHEN hpl_cm != {NONE_U16} THEN hpl_cm / 100 END AS hpl_m,
-        list_extract({[alert.value for alert in ALERTS]}, flags & {ALERT_BITS}) AS alert,
-        flags & {SIMULATED} != 0 AS simulated
+    SELECT tag, epoch_ms(t) AS ms, {_FIX_VALUES}
     FROM read_parquet($files) WHERE t >= to_timestamp($begin) AND t < to_timestamp($end)
         AND x_mm NOT NULL AND y_mm NOT NULL AND z_mm NOT NULL AND std_mm NOT NULL
 """
@@ -254,18 +257,16 @@ _DWELL: Final = f"""
     FROM stays WHERE enters GROUP BY tag, zone ORDER BY tag, zone
 """
 
-_OCCUPANCY: Final = f"{_STAYS} SELECT zone, since, until FROM stays WHERE enters ORDER BY zone"
-
-_ALARMS: Final = """
-    SELECT alarm, split_part(alarm, '/', 1), coalesce(max(subject), ''),
-        coalesce(nullif(max(text) FILTER (kind = 'alarm-ended'), ''), max(text) FILTER (kind = 'alarm-raised'), ''),
-        epoch_ms(min(t) FILTER (kind = 'alarm-raised')) / 1000 AS raised,
-        epoch_ms(max(t) FILTER (kind = 'alarm-ended')) / 1000 AS ended,
-        epoch_ms(min(t) FILTER (kind = 'alarm-acknowledged')) / 1000,
-        coalesce(arg_min(text, t) FILTER (kind = 'alarm-acknowledged'), '')
-    FROM read_parquet($files) WHERE alarm IS NOT NULL GROUP BY alarm
-    HAVING raised < $end AND (ended IS NULL OR ended >= $begin) ORDER BY raised, alarm
+VIEWS: Final = f"""
+    CREATE VIEW fixes AS
+        SELECT coalesce(name, '#' || tag) AS tag, epoch_ms(t) / 1000 AS unix_s, make_timestamp(epoch_us(t)) AS time_utc,
+            {_FIX_VALUES}
+        FROM fix_rows LEFT JOIN names ON number = tag WHERE t >= to_timestamp({{begin}}) AND t < to_timestamp({{end}});
+    CREATE VIEW events AS
+        SELECT epoch_ms(t) / 1000 AS unix_s, make_timestamp(epoch_us(t)) AS time_utc, * EXCLUDE t
+        FROM event_rows WHERE t >= to_timestamp({{begin}}) AND t < to_timestamp({{end}});
 """
+"""What SQL may ask, besides the tables ``zones`` and ``assets``."""
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
@@ -393,29 +394,6 @@ class History:
         )
 
     @_asked
-    def occupancy(self, span: Span, zone: str | None = None, step_s: float = 300.0) -> tuple[Occupancy, ...]:
-        """Return how many tags were in the zones (default: all) in each time step; the last step may be shorter.
-
-        Raises SkylessError.
-        """
-        check_number("the step", step_s, least=1.0)
-        names, length_s = self._zone_names(zone), span.to_unix_s - span.from_unix_s
-        zones = [zone] if zone is not None else sorted(names)
-        if len(zones) * length_s / step_s > LIMITS.steps:
-            many = f"steps of {step_s:g} s for {len(zones)} zones in a range of {length_s:.0f} s are too many"
-            right = math.ceil(len(zones) * length_s / LIMITS.steps)
-            raise SkylessError(f"{many}; choose longer ones, of {right} s or more, a shorter range or one zone")
-        edges, found = np.append(np.arange(0.0, length_s, step_s), length_s), []
-        counted = dict.fromkeys(zones, counts(np.empty(0), np.empty(0), edges))
-        for one, rows in groupby(self._of_stays(_OCCUPANCY, span, (), zone), itemgetter(0)):
-            times = np.fromiter(chain.from_iterable(row[1:] for row in rows), np.float64) - span.from_unix_s
-            counted[one] = counts(times[::2], times[1::2], edges)
-        for one in sorted(counted):
-            for begin, mean, most in zip(edges[:-1].tolist(), *counted[one], strict=True):
-                found.append(Occupancy(one, names.get(one, one), span.from_unix_s + begin, mean, most))
-        return tuple(found)
-
-    @_asked
     def contacts(self, tag: str, span: Span, distance_m: float = 2.0) -> tuple[Contact, ...]:
         """Return when other tags were within a horizontal distance of this tag. Raises SkylessError.
 
@@ -440,45 +418,62 @@ class History:
         return tuple(sorted(contacts, key=lambda one: (one.begin_unix_s, one.other)))
 
     @_asked
-    def alarms(self, span: Span) -> tuple[AlarmRow, ...]:
-        """Return the alarms raised before the range's end that had not ended at its beginning. Raises SkylessError."""
-        return tuple(AlarmRow(*row) for row in _table(_stream(_ALARMS, current_events(self.folder, self.site), span)))
+    def sql(self, query: str, span: Span) -> list[dict[str, Any]]:
+        """Answer an SQL query over ``VIEWS``, of which fixes and events are those of the range. Raises SkylessError."""
+        with self._views(query, span) as (duck, select):
+            found = duck.execute(select)
+            names = [column[0] for column in found.description]
+            rows = found.fetchmany(LIMITS.rows + 1)
+        if len(rows) > LIMITS.rows:
+            raise SkylessError(f"the answer has more than {LIMITS.rows} rows; --write takes all, and LIMIT some")
+        return [dict(zip(names, row, strict=True)) for row in rows]
 
     @_asked
-    def export(self, file: Path, span: Span, tags: Sequence[str] = (), origin: GeoreferenceSite | None = None) -> int:
-        """Write the fixes of the tags (default: all), sorted by name and time; the suffix chooses the format.
+    def write(self, query: str, span: Span, file: Path) -> int:
+        """Write the answer of an SQL query to a .csv or .parquet file. Returns the number of rows.
 
-        Returns their number. GeoJSON, one feature a line, needs the site's georeference. Raises SkylessError, OSError.
+        Raises SkylessError, OSError.
         """
-        if file.suffix not in EXPORT_SUFFIXES:
-            raise SkylessError(f"{file} ends with {file.suffix!r}; it should end with {' or '.join(EXPORT_SUFFIXES)}")
-        if file.suffix == ".geojsonl" and origin is None:
-            raise SkylessError("GeoJSON has degrees: it needs a site with [georeference] (latitude_deg, longitude_deg)")
-        of_tags = f"AND tag IN ({_listed(chain(*self._tags(tags).values()))})" if tags else ""
-        names, files = self._names(), self._files(span)
-        ((count,),) = _stream(f"SELECT count(*) FROM ({_FIXES} {of_tags})", files, span) if files else ((0,),)
-        if not count:
-            raise SkylessError("there are no fixes in this range: nothing is written")
-        if count > LIMITS.exported_rows:
-            raise SkylessError(f"{count} fixes are more than {LIMITS.exported_rows}; choose a shorter range, or tags")
-        parameters = _parameters(files, span) | {"numbers": list(names), "names": list(names.values())}
-        sql = f"""
-            SELECT coalesce(name, '#' || tag) AS tag, make_timestamp(ms * 1000) AS time_utc, x_m, y_m, z_m, std_m,
-                hpl_m, alert, simulated
-            FROM ({_FIXES} {of_tags})
-                LEFT JOIN (SELECT unnest($numbers::BIGINT[]) AS tag, unnest($names::VARCHAR[]) AS name) USING (tag)
-            ORDER BY 1, 2
-        """
-        with _connection() as duck, whole_file(file) as scratch:
-            if origin is not None and file.suffix == ".geojsonl":
-                return _write_features(scratch, duck.execute(sql, parameters), origin)
+        if file.suffix not in {".csv", ".parquet"}:
+            raise SkylessError(f"{file} ends with {file.suffix!r}; it should end with .csv or .parquet")
+        with whole_file(file) as scratch, self._views(query, span, scratch) as (duck, select):
+            copy = f"COPY (\n{select}\n) TO {_quoted(scratch)} (FORMAT {file.suffix[1:]})"
+            return int(duck.execute(copy).fetchall()[0][0])
+
+    @contextlib.contextmanager
+    def _views(self, query: str, span: Span, *written: Path) -> Iterator[tuple[duckdb.DuckDBPyConnection, str]]:
+        """Open DuckDB with the views, and check that a query reads only. It can open no other files than theirs."""
+        events = current_events(self.folder, self.site)
+        tables = {"fix_rows": (FIX_COLUMNS, self._files(span)), "event_rows": (EVENT_COLUMNS, events)}
+        for name, columns in (("zones", ZONE_COLUMNS), ("assets", ASSET_COLUMNS)):
+            file = self._site_folder / f"{name}.parquet"
+            tables[name] = columns, [file] if file.exists() else []
+        readable = [file.resolve() for _, files in tables.values() for file in files]
+        with _connection() as duck:
+            for name, (columns, files) in tables.items():
+                if files:
+                    listed = ", ".join(_quoted(file.resolve()) for file in files)
+                    duck.execute(f"CREATE VIEW {name} AS SELECT {', '.join(columns)} FROM read_parquet([{listed}])")
+                else:
+                    duck.register(name, schema_of(columns).empty_table())
+            names = self._names()
+            duck.execute(
+                "CREATE TABLE names AS SELECT unnest($1::BIGINT[]) AS number, unnest($2::VARCHAR[]) AS name",
+                [list(names), list(names.values())],
+            )
+            duck.execute(VIEWS.format(begin=span.from_unix_s, end=span.to_unix_s))
+            allowed = ", ".join(map(_quoted, (*readable, *written)))
+            duck.execute(f"SET allowed_paths = [{allowed}]; SET enable_external_access = false")
+            duck.execute("SET lock_configuration = true")
             try:
-                copy = f"COPY ({sql}) TO $to (FORMAT {file.suffix[1:]})"
-                return int(duck.execute(copy, parameters | {"to": str(scratch)}).fetchall()[0][0])
-            except duckdb.IOException as error:
-                if scratch.name not in str(error):
+                statements = duck.extract_statements(query)
+                if [one.type for one in statements] != [duckdb.StatementType.SELECT]:
+                    raise SkylessError(f"the SQL is {query[:60]!r}; it should be one SELECT")
+                yield duck, statements[0].query.rstrip().removesuffix(";")
+            except duckdb.Error as error:
+                if isinstance(error, duckdb.IOException) or (not isinstance(error, _OF_SQL) and _damaged(self)):
                     raise
-                raise SkylessError(f"{file} cannot be written: {error}") from None
+                raise SkylessError(f"the SQL cannot be answered: {str(error).partition(chr(10))[0]}") from None
 
     # Helpers
 
@@ -526,26 +521,7 @@ class History:
         return _stream(sql, current_events(self.folder, self.site), known, tags=tags, zone=zone)
 
 
-# Plain computations
-
-
-def counts(begins: _Floats, ends: _Floats, edges: _Floats) -> tuple[list[float], list[int]]:
-    """Mean and largest number of visits present in each interval between edges."""
-    begins, ends = np.sort(begins), np.sort(ends)
-    mean = np.diff(_ramp(begins, edges) - _ramp(ends, edges)) / np.diff(edges)
-    most = np.searchsorted(begins, edges[:-1], "right") - np.searchsorted(ends, edges[:-1], "right")
-    after = np.arange(1, len(begins) + 1) - np.searchsorted(ends, begins, "right")
-    step = np.searchsorted(edges, begins, "right") - 1
-    inside = (step >= 0) & (step < len(most))
-    np.maximum.at(most, step[inside], after[inside])
-    return np.maximum(mean, 0.0).tolist(), most.tolist()
-
-
-def _ramp(times: _Floats, at: _Floats) -> _Floats:
-    """Sum, at each of ``at``, of the time elapsed since each of the earlier ``times``, which are sorted."""
-    passed = np.searchsorted(times, at)
-    ramp: _Floats = passed * at - np.append(0.0, np.cumsum(times))[passed]
-    return ramp
+# The way of a tag
 
 
 class _Way:
@@ -594,7 +570,7 @@ def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
     spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # created only if needed
     options: dict[str, Any] = {"memory_limit": f"{LIMITS.memory_mb}MB", "temp_directory": spill}
     # One thread takes less processor time in total, and leaves the other cores to the site.
-    options |= {"autoinstall_known_extensions": "false", "threads": 1}
+    options |= {"autoinstall_known_extensions": "false", "python_enable_replacements": "false", "threads": 1}
     with duckdb.connect(config=options) as duck:
         yield duck
 
@@ -619,6 +595,11 @@ def _table(found: Iterator[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
 
 def _parameters(files: Iterable[Path], span: Span) -> dict[str, Any]:
     return {"files": list(map(str, files)), "begin": span.from_unix_s, "end": span.to_unix_s}
+
+
+def _quoted(path: Path) -> str:
+    """A path as a text in SQL."""
+    return "'" + str(path).replace("'", "''") + "'"
 
 
 def _day(unix_s: float, later: timedelta) -> str:
@@ -654,16 +635,3 @@ def _some(known: Iterable[str], kind: str) -> str:
     names = sorted(known)
     more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
     return f"it has {', '.join(name[:40] for name in names[:_NAMED])}{more}" if names else f"it has no {kind} yet"
-
-
-def _write_features(file: Path, found: duckdb.DuckDBPyConnection, origin: GeoreferenceSite) -> int:
-    names, count = [column[0] for column in found.description], 0
-    with file.open("wb") as out:
-        while rows := found.fetchmany(_FETCHED):
-            for row in rows:
-                facts = dict(zip(names, row, strict=True))
-                at = coordinates((facts.pop("x_m"), facts.pop("y_m"), facts.pop("z_m")), origin)
-                facts["time_utc"] = f"{facts['time_utc'].isoformat(timespec='milliseconds')}Z"
-                out.write(msgspec.json.encode(feature("Point", at, facts)) + b"\n")
-            count += len(rows)
-    return count

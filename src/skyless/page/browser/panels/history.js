@@ -9,7 +9,7 @@ import { close } from "../player.js";
 import { KINDS } from "./history_kinds.js";
 
 export const title = "History";
-export const topics = ["connection", "site", "zones", "mode", "assets"];
+export const topics = ["connection", "site", "mode", "assets"];
 export const interval_ms = 200;
 
 /** Progress is shown after this time. */
@@ -41,8 +41,6 @@ export function start(panel) {
   const field = (id) => h("input", { type: "datetime-local", id, oninput: () => (range.value = "own") });
   const [from, to] = [field("history-from"), field("history-to")];
   const kinds = Object.entries(KINDS).map(([key, { words }]) => button(words, () => ask(key), { id: `history-${key}`, "aria-pressed": "false" }));
-  const zone = options({ id: "history-zone" }, [], () => ask(kind));
-  const zones = h("label", { class: "field", hidden: true }, "Zone", zone);
   const times = h("p", { class: "fine" }, `Times of ${Intl.DateTimeFormat().resolvedOptions().timeZone}`);
   const form = h(
     "form",
@@ -50,7 +48,6 @@ export function start(panel) {
     ...Object.entries({ Tag: tag, Time: range, From: from, To: to }).map(([words, one]) => h("label", { class: "field" }, words, one)),
     times,
     h("div", { id: "history-kinds", role: "group", "aria-label": "What to show" }, ...kinds),
-    zones,
     names,
   );
   form.addEventListener("keydown", (event) => {
@@ -63,13 +60,13 @@ export function start(panel) {
   const progress = h("p", { id: "history-state", role: "status" });
   const fault = h("p", { id: "history-fault", role: "alert" });
   const result = h("div", { id: "history-result" });
-  parts = { tag, names, range, from, to, kinds, zone, zones, form, nothing, back, progress, fault, result };
+  parts = { tag, names, range, from, to, kinds, form, nothing, back, progress, fault, result };
   panel.append(nothing, back, form, progress, fault, result);
   on(["connection", "site"], forgetOtherSite);
   on(["mode"], () => state.mode === "replay" && abandon());
 }
 
-/** Bring the tab up to date: whether there is a history, and the tags and zones to choose from. */
+/** Bring the tab up to date: whether there is a history, and the tags to choose from. */
 export function show() {
   const isLive = state.mode === "live";
   const none = state.history === null ? "Waiting for the server …" : NONE;
@@ -80,8 +77,6 @@ export function show() {
   for (const part of [parts.form, parts.result]) part.hidden = Boolean(words);
   if (words) return;
   if (!parts.from.value) setRange();
-  const zones = state.zones.map(({ id, name }) => [id, name]);
-  offer(parts.zone, zones.length ? zones : [["", "No zones yet"]], parts.zone.value);
   if (tags === null) loadTags();
   else suggest();
 }
@@ -160,12 +155,11 @@ async function ask(key) {
   asking = new AbortController();
   const { signal } = asking;
   for (const one of parts.kinds) one.setAttribute("aria-pressed", String(one.id === `history-${key}`));
-  parts.zones.hidden = !KINDS[key].zone;
   setRange();
   const waiting = setTimeout(() => parts.progress.append("Reading the history …", button("Cancel", abandon)), PATIENCE_MS);
   signal.addEventListener("abort", () => clearTimeout(waiting));
   try {
-    const asked = { tag: chosenTag(), span: chosenSpan(), zone: parts.zone.value };
+    const asked = { tag: chosenTag(), span: chosenSpan() };
     const { from_unix_s: from, to_unix_s: to } = asked.span;
     const get = (path, query = {}) => history(path, { from, to, ...query }, signal);
     const context = { ...asked, get, signal, title: asked.tag ? shownName(asked.tag) : "all tags", tags };

@@ -4,11 +4,10 @@
  */
 
 import { state } from "../store.js";
-import { Chart } from "../chart.js";
 import { shownName } from "../assets/model.js";
 import { button, h } from "../dom.js";
 import { saveCsv, utc } from "../files.js";
-import { dateTime, duration, length, number, sentence } from "../format.js";
+import { dateTime, duration, length, number } from "../format.js";
 import { seek, showHeat, showWay } from "../player.js";
 import { facts } from "./parts.js";
 
@@ -17,23 +16,14 @@ const MAX_ROWS = 500;
 /** The most cells of a heat map. */
 const MAX_CELLS = 40_000;
 const CELLS_M = [0.25, 0.5, 1, 2, 5, 10];
-/** The most steps of an occupancy. */
-const MAX_STEPS = 300;
-const STEPS_S = [60, 300, 900, 3600, 4 * 3600];
 const NEAR_M = 2;
 
 export const KINDS = {
   way: { words: "Way of a tag", ask: askWay, show: wayFacts },
   heat: { words: "Heat map", ask: askHeat, show: heatFacts },
   dwell: { words: "Time in zones", ask: async ({ get, tag }) => (await get("dwell", tag && { tag })).dwell, show: dwellTable },
-  occupancy: { words: "Occupancy", zone: true, ask: askOccupancy, show: occupancyChart },
   contacts: { words: "Contacts", ask: askContacts, show: contactsTable },
-  alarms: { words: "Past alarms", ask: async ({ get }) => (await get("alarms")).alarms, show: alarmsTable },
 };
-
-const SERIES = [{ name: "most", colour: "muted", steps: true }, { name: "mean", colour: "accent", steps: true }]; // prettier-ignore
-const OCCUPANCY = "Tags in the zone: most (grey) and mean of each step";
-const chart = new Chart(OCCUPANCY, SERIES, (value) => number(value, 1), 1, { whole: true, past: true });
 
 function needsTag(tag, what) {
   if (!tag) throw new Error(`Choose a tag: ${what}.`);
@@ -150,28 +140,7 @@ function dwellTable(rows, context) {
   return sortedTable("time in zones", columns, rows, [3, false], ["Sum", "", number(sum("visits")), duration(sum("seconds"))]);
 }
 
-/* Occupancy of a zone. */
-
-async function askOccupancy({ get, zone, span }) {
-  if (!zone) throw new Error("This site has no zones. The tab Zones makes them.");
-  const wide = span.to_unix_s - span.from_unix_s;
-  const step_s = STEPS_S.find((value) => wide / value <= MAX_STEPS) ?? STEPS_S.at(-1);
-  return (await get("occupancy", { zone, step_s })).occupancy;
-}
-
-function occupancyChart(rows, context) {
-  const name = state.zones.find(({ id }) => id === context.zone)?.name ?? context.zone;
-  const what = { ...context, title: name };
-  if (!rows.length) return nothing(what, "Nothing is known");
-  const sorted = rows.toSorted((a, b) => a.unix_s - b.unix_s);
-  const most = Math.max(...rows.map((row) => row.most));
-  const data = [sorted.map((row) => row.unix_s), sorted.map((row) => row.most), sorted.map((row) => row.mean)];
-  chart.showPast(data, [context.span.from_unix_s, context.span.to_unix_s], `${name}: at most ${most}`);
-  const csv = () => sorted.map((row) => [utc(row.unix_s), row.zone, row.zone_name, row.mean, row.most]);
-  return [chart.element, saveButton(`occupancy ${name}`, ["time", "zone", "zone_name", "mean", "most"], csv)];
-}
-
-/* Contacts and alarms. */
+/* Contacts. */
 
 async function askContacts({ get, tag }) {
   needsTag(tag, "contacts are those of one tag");
@@ -204,23 +173,4 @@ function contactsTable(rows, context) {
   ]; // prettier-ignore
   const words = `Other tags within ${NEAR_M} m of ${context.title}. A click on the time shows the place.`;
   return [h("p", { class: "fine" }, words), ...sortedTable(`contacts ${context.tag}`, columns, rows, [0, true])];
-}
-
-function alarmsTable(rows, context) {
-  if (!rows.length) return nothing({ ...context, title: "this site" }, "There were no alarms");
-  const known = new Set(context.tags);
-  const tagOf = ({ subject }) => subject.split("~").find((name) => known.has(name));
-  const raised = (row) => {
-    const at_s = row.raised_unix_s;
-    return tagOf(row) ? placeButton(at_s, tagOf(row), context) : h("time", {}, dateTime(at_s));
-  };
-  const end = (row) => (row.ended_unix_s === null ? "lasts" : duration(row.ended_unix_s - row.raised_unix_s, 1));
-  const by = (row) => (row.acknowledged_unix_s === null ? "nobody" : row.acknowledged_by || "somebody");
-  const columns = [
-    { head: "Raised", save: "raised", value: (row) => row.raised_unix_s, time: true, show: raised },
-    { head: "Alarm", save: "text", value: (row) => sentence(row.text) },
-    { head: "Lasted", save: "lasted_s", value: (row) => (row.ended_unix_s === null ? null : row.ended_unix_s - row.raised_unix_s), show: end, right: true },
-    { head: "Seen by", save: "acknowledged_by", value: (row) => row.acknowledged_by, show: by },
-  ]; // prettier-ignore
-  return sortedTable("alarms", columns, rows, [0, false]);
 }
