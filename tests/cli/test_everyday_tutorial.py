@@ -82,7 +82,7 @@ def test_every_line_of_the_tutorial_runs(tmp_path):
         body = json.dumps({"id": alarm["id"], "by": "Ada"}).encode()
         urlopen(Request(path, body, {"content-type": "application/json"}, method="POST")).close()
         kept = tmp_path / "history"
-        until(lambda: any(b"Ada" in file.read_bytes() for file in kept.rglob("*.blk")))
+        until(lambda: any(b"Ada" in file.read_bytes() for file in kept.rglob("EVENTS_*/msgs/*.blk")))
     finally:
         running.send_signal(signal.SIGINT)
         said, _ = running.communicate()
