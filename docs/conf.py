@@ -82,6 +82,7 @@ NAVIGATION = {
         "docs/reference/python",
         "docs/sites",
         "docs/page",
+        "docs/live_site",
         "docs/mqtt",
         "docs/batches",
         "docs/hub",

@@ -42,6 +42,7 @@ class FixLog:
         ``clock`` gives the host's monotonic time in s.
         """
         self.tag, self._clock = tag, clock
+        self._interval_s = 1.0 / publish_hz if publish_hz < 1.0 else None
         self.started_s = clock()
         self.unix_less_host_s = 0.0
         self.update_clock_offset()
@@ -118,6 +119,7 @@ class FixLog:
             phases=phases,
             late=self.lateness.dropped + late_fixes,
             lateness_s=self.lateness.drain(),
+            interval_s=self._interval_s,
         )
 
 
