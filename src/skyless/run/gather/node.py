@@ -10,6 +10,7 @@ from itertools import count
 from typing import Final, Literal
 
 import msgspec
+import numpy as np
 from msgspec import Struct
 from nats.aio.client import Client
 from nats.aio.msg import Msg
@@ -25,8 +26,10 @@ from skyless.run.gather.streams import NEVER_WRITTEN, Names, make_streams, messa
 from skyless.run.gather.subjects import NatsAddress, connect, rarely
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import RefusedError, kept_messages, trouble_with
-from skyless.run.mqtt.messages import FixMessage, SiteMessage, StatusMessage, WrongMessageError, read_message
+from skyless.run.mqtt.messages import FixMessage, SiteMessage, StatusMessage
 from skyless.run.process import Log, together
+from skyless.run.site_feed import SiteFeed
+from skyless.run.site_table import THRESHOLDS, SiteTable
 
 MAX_WAITING: Final = 100_000
 """Largest number of fixes waiting for the stream; the oldest are dropped and counted beyond it."""
@@ -84,8 +87,6 @@ class Packer:
 # Condition of a site in one word, with reasons, from the messages that pass a gather. Coarser than the page's, for
 # lists of sites.
 
-HEARD_S: Final = 10.0
-"""A tag without a fix for this long is not heard."""
 _DROPS_S: Final = 60.0
 _MAX_WAITING: Final = 5_000
 _MAX_NAMED: Final = 3
@@ -98,36 +99,39 @@ class SiteCondition:
 
     def __init__(self, now_s: float) -> None:
         self.site: SiteMessage | None = None
-        self._begin_s = now_s
-        self._programs: dict[tuple[str, str], StatusMessage] = {}
-        self._heard_s: dict[int, float] = {}
+        self._table = SiteTable(now_s)
         self._dropped: deque[tuple[float, int]] = deque()
+        self._feed = SiteFeed()
+        self._feed.on(SiteMessage, lambda message, _: self._on_site(message))
+        self._feed.on(StatusMessage, lambda status, _: status and self._table.add_status(status, time.monotonic()))
 
-    def on_message(self, kind: str, name: str, payload: bytes) -> None:
-        """Process a message with the site or a program's status. An unreadable status makes the program unknown."""
-        with contextlib.suppress(WrongMessageError):
-            if kind == "site":
-                self.site = read_message(payload, SiteMessage)
-            else:
-                self._programs.pop((kind, name), None)
-                self._programs[kind, name] = read_message(payload, StatusMessage)
+    def _on_site(self, message: SiteMessage | None) -> None:
+        self.site = message or self.site
+
+    def on_message(self, topic: str, payload: bytes) -> None:
+        """Process a message with the site or a program's status."""
+        self._feed.receive(topic, payload)
 
     def on_batch(self, records: Records, now_s: float) -> None:
         """Process the fixes of a batch of this gather or another program."""
-        self._heard_s.update(dict.fromkeys(records["tag"].tolist(), now_s))
+        self._table.hear(map(str, np.unique(records["tag"]).tolist()), now_s)
+
+    def _online(self) -> list[StatusMessage]:
+        nodes = (node for kind in self._table.kinds for _, node in self._table.of(kind))
+        return [node.status for node in nodes if node.status is not None and node.status.online]
 
     def online(self) -> dict[str, int]:
         """Programs that are online, by kind."""
-        return dict(Counter(kind for (kind, _), status in self._programs.items() if status.online))
+        return dict(Counter(status.kind for status in self._online()))
 
     def versions(self) -> dict[str, int]:
         """Programs that are online, by version."""
-        return dict(Counter(status.version or "unknown" for status in self._programs.values() if status.online))
+        return dict(Counter(status.version or "unknown" for status in self._online()))
 
     def tags_heard(self, now_s: float) -> int:
-        """Tags with a fix in the last ten seconds."""
-        self._heard_s = {tag: heard_s for tag, heard_s in self._heard_s.items() if now_s - heard_s < HEARD_S}
-        return len(self._heard_s)
+        """Tags that are there, by their fixes."""
+        self._table.tick(now_s)
+        return sum(not tag.is_gone for tag in self._table.batched.values())
 
     def reasons(self, drops: Mapping[str, int], waiting: int, now_s: float) -> tuple[ConditionWord, list[str]]:
         """Return the condition, and why it is not good. ``drops`` are the gather's since its start."""
@@ -137,8 +141,8 @@ class SiteCondition:
         bad, degraded = [], []
         if self.site is None:
             bad.append("the site is not published: no anchor or emulated air is running")
-        if not self.tags_heard(now_s) and now_s - self._begin_s > HEARD_S:
-            bad.append(f"no tag has had a fix for {HEARD_S:g} s")
+        if not self.tags_heard(now_s) and now_s - self._table.ready_s > THRESHOLDS.gone_s:
+            bad.append("no tag has a fix")
         if offline := self._offline_anchors():
             named = ", ".join(offline[:_MAX_NAMED]) + (" and others" if len(offline) > _MAX_NAMED else "")
             degraded.append(f"{len(offline)} of the anchors offline: {named}")
@@ -151,8 +155,8 @@ class SiteCondition:
     def _offline_anchors(self) -> list[str]:
         """Anchors of the site that are offline by their own status or the broker's last will."""
         names = [] if self.site is None else [str(anchor.id) for anchor in self.site.site.anchors]
-        found = ((name, self._programs.get(("anchor", name))) for name in names)
-        return [name for name, status in found if status is not None and not status.online]
+        found = ((name, self._table.get("anchor", name)) for name in names)
+        return [name for name, anchor in found if anchor is not None and anchor.online is False]
 
 
 PERIOD_S: Final = 0.1
@@ -178,7 +182,7 @@ class Summary(Struct, frozen=True, kw_only=True):
     reasons: list[str] = []
     """Why the condition is not good."""
     tags_heard: int = 0
-    """Tags with a fix in the last ten seconds, in batches of this gather or of other programs."""
+    """Tags that are there, by their fixes in batches of this gather or of other programs."""
     names: int
     """Tags that have a number."""
     online: dict[str, int]
@@ -287,8 +291,7 @@ class Gather:
             self._condition.on_batch(decode_batch(message.data).records, time.monotonic())
 
     async def _on_message(self, message: Msg) -> None:
-        levels = message.subject.split(".")
-        self._condition.on_message(levels[3], levels[-2], message.data)
+        self._condition.on_message(subjects.topic_of(message.subject), message.data)
         if self._condition.site is not None:
             self._packer.simulated = self._condition.site.simulated
 
