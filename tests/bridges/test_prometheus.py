@@ -8,6 +8,7 @@ import random
 import re
 import shutil
 import subprocess
+import time
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ from skyless.bridges.prometheus import (
     SiteMetrics,
     make_target,
 )
-from skyless.bridges.target import BridgeContext, TargetUrl
+from skyless.bridges.target import BridgeContext, Hub, Route, TargetUrl
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.messages import AnchorHealth, Counters, StatusMessage, TagHealth
 from skyless.run.site_table import THRESHOLDS, SiteTable
@@ -186,14 +187,16 @@ def test_the_age_of_a_killed_tag_grows_from_scrape_to_scrape_and_its_gauges_end(
 
 
 def test_a_restarted_tag_lets_no_counter_fall(metrics):
-    metrics.take_fix(a_fix(serial=3), 110.0)  # it has been started again; its health has not said so yet
+    metrics.take_fix(
+        a_fix(serial=3, unix_s=1_795_000_000.5), 110.0
+    )  # it has been started again; its health has not said so yet
     assert read(metrics)[of_tag("tag_fixes_total")] == 200
     metrics.take_health(tag_health(uptime_s=1.0, fixes=30, counters={"foreign": 1}, mqtt=Counters(5, 0, 0)), 111.0)
     samples = read(metrics)
     assert samples[of_tag("tag_fixes_total")] == 230
     assert samples[of_tag("tag_dropped_frames_total", reason="foreign")] == 3
     assert samples[("skyless_mqtt_dropped_total", ("kind", "tag"), ("name", "tag1"))] == 4
-    metrics.take_fix(a_fix(serial=31), 111.1)
+    metrics.take_fix(a_fix(serial=31, unix_s=1_795_000_001.0), 111.1)
     assert read(metrics)[of_tag("tag_fixes_total")] == 231
 
 
@@ -231,8 +234,8 @@ def test_a_fix_from_the_future_is_not_younger_than_new_and_lets_no_sum_fall():
 @given(st.lists(st.floats(0.0, 1.0), max_size=30))
 def test_a_histogram_counts_as_prometheus_does(values):
     metrics = Metrics()
-    for value in values:
-        metrics.take_fix(a_fix(latency_s=value), 1.0)
+    for serial, value in enumerate(values):
+        metrics.take_fix(a_fix(latency_s=value, serial=serial + 1), 1.0)
     samples = read(metrics)
     for bound in LATENCY_BOUNDS_S if values else ():
         assert samples[of_tag("tag_latency_seconds_bucket", le=str(bound))] == sum(v <= bound for v in values)
@@ -254,8 +257,9 @@ def exchange(*requests):
     async def talk():
         target = make_target(TargetUrl("prometheus://"), CONTEXT)
         target.port = 0
-        target.on_site(SITE)
-        target.on_fix(a_fix())
+        hub = Hub([Route(target, None, 10.0)], print)
+        hub.on_site(SITE)
+        hub.on_fix(a_fix(), time.monotonic())
         serving = asyncio.ensure_future(target.run())
         while not target.port:
             await asyncio.sleep(0.01)

@@ -355,7 +355,7 @@ def test_maps_get_the_tags_as_geojson(browser, live, wire, times):
     assert first["properties"]["age_s"] == pytest.approx(2.0, abs=0.01)
     assert first["properties"]["horizontal_std_m"] == pytest.approx(0.02)
     assert second["properties"]["speed_mps"] is None
-    times.move(4.0)
+    times.move(1.0)
     assert [feature["id"] for feature in browser.get("/fixes.geojson").json()["features"]] == ["t3"]
 
 

@@ -293,9 +293,9 @@ async def test_a_dashboard_reads_batches_and_names_with_the_role_of_a_page(tmp_p
                 await asyncio.sleep(0.05)
             newest, _ = gathered.columns(SITE).visible((0.0, 0.0, 9.0, 9.0), time.monotonic())
             assert newest["position_mm"][:, 0].tolist() == [1500]
-            while not live.state.tags:
+            while not live.table.fixed:
                 await asyncio.sleep(0.02)
-            assert [*live.state.tags] == ["a"]
+            assert [*live.table.fixed] == ["a"]
             assert gathered.columns(SITE).names == {1: "a"}
         async with client_of(page) as reading:
             with pytest.raises(TimeoutError):

@@ -19,7 +19,7 @@ from skyless.bridges.target import TAG_NAME, BridgeContext, BridgedSite, Target,
 from skyless.core.version import installed_version
 from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
-from skyless.run.site_table import Node, SiteTable
+from skyless.run.site_table import THRESHOLDS, Node, SiteTable
 from skyless.run.web import BRIDGES as LIMITS
 from skyless.run.web import is_own_host, own_names
 
@@ -266,8 +266,8 @@ def _node_families(kind: str, counters: _Plain, nodes: _Nodes) -> Iterator[Metri
 
 
 def _fresh(nodes: _Nodes, now_s: float) -> list[tuple[Labels, TagHealth | AnchorHealth]]:
-    found = [(labels, one.node.health) for labels, one in nodes if one.node.reports(now_s)]
-    return [(labels, health) for labels, health in found if isinstance(health, TagHealth | AnchorHealth)]
+    recent = [(labels, one.node) for labels, one in nodes if now_s - one.node.health_s < THRESHOLDS.report_s]
+    return [(labels, one.health) for labels, one in recent if isinstance(one.health, TagHealth | AnchorHealth)]
 
 
 def _faults(health: TagHealth | AnchorHealth) -> dict[str, int]:

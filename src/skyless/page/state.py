@@ -134,6 +134,8 @@ class SiteState:
         if tag.row is None:
             slept_s = max(0.0, tag.asleep_until_s - tag.fix_s)
             presence = table.fresh_for_s(tag), slept_s, slept_s + table.gone_after_s(tag)
+            if tag.is_gone:  # its program has ended
+                presence = 0.0, 0.0, 0.0
             tag.row = [*_row(fix, self._truths.at(fix.tag, fix.unix_s), tag.ended_unix_s), *map(_tenths, presence)]
         return tag.row
 

@@ -60,7 +60,7 @@ _COUNT_S: Final = 10.0
 _SET_BACK_S: Final = 10.0
 """A fix older than the newest by more than this is of a clock that was set back; others that are older are late."""
 
-# A tag's own interval, from its gaps. Only gaps that can change an answer are kept; shorter ones count as this long.
+# A tag's own interval, from its gaps. Only gaps that can change an answer are kept; shorter ones change nothing.
 _SHORT_S: Final = 1.5
 _MAX_GAPS: Final = 8
 _KNOWN_S: Final = 10.0
@@ -271,6 +271,7 @@ class SiteTable:
             return False
         was_there, node.is_gone = not node.is_gone, True
         node.previous, node.codes_s = None, None
+        self._changed(node)
         return was_there
 
     def add_health(self, kind: str, name: str, health: Health, now_s: float) -> None:
@@ -290,9 +291,8 @@ class SiteTable:
         elif isinstance(health, TagHealth):
             node.stated_s = _duration_s(health.interval_s)
             sleep_s = _duration_s(health.sleeps_s)
-            if sleep_s or node.asleep_until_s > now_s:  # readers of the newest fix must know
-                self.fixes_serial += 1
-                node.serial, node.row = self.fixes_serial, None
+            if sleep_s or node.asleep_until_s > now_s:
+                self._changed(node)
             node.asleep_until_s = now_s + sleep_s if sleep_s else float("-inf")
 
     def add_fix(self, fix: FixMessage, now_s: float, *, batched: bool = False) -> Node | None:
@@ -309,9 +309,9 @@ class SiteTable:
             return None
         if not batched or node.is_gone:
             self._note(node, now_s)
-        self.fixes_serial += 1
-        node.fix, node.serial, node.row = fix, self.fixes_serial, None
+        node.fix = fix
         self.fixed[fix.tag] = node
+        self._changed(node)
         for anchor in fix.anchors:
             used = self._sender("anchor", str(anchor))
             if used is not None:
@@ -335,6 +335,11 @@ class SiteTable:
             else:  # the usual case, quickly: there may be 100,000
                 node.fix_s = now_s
         return rare
+
+    def _changed(self, tag: Node) -> None:
+        """Let readers that ask for what is newer get a tag's newest fix, or what has become of it."""
+        self.fixes_serial += 1
+        tag.serial, tag.row = self.fixes_serial, None
 
     def _note(self, node: Node, now_s: float) -> None:
         if node.is_gone:
@@ -407,8 +412,8 @@ class SiteTable:
         return min(max(THRESHOLDS.gone_s, THRESHOLDS.gone_intervals * interval_s), longest_s)
 
     def is_fresh(self, tag: Node, now_s: float) -> bool:
-        """Whether a tag's newest fix is fresh."""
-        return now_s - tag.fix_s < self.fresh_for_s(tag)
+        """Whether a tag's newest fix is fresh, and its program has not ended since."""
+        return not tag.is_gone and now_s - tag.fix_s < self.fresh_for_s(tag)
 
     def is_there(self, tag: Node, now_s: float) -> bool:
         """Whether a tag has had a fix and is not gone."""
@@ -417,7 +422,7 @@ class SiteTable:
     def presence(self, tag: Node, now_s: float) -> Presence:
         """Whether a tag is there, in a word."""
         if self.is_fresh(tag, now_s):
-            return "fresh" if tag.online is not False else "gone"
+            return "fresh"
         if tag.asleep_until_s > now_s:
             return "asleep"
         return "late" if self.is_there(tag, now_s) else "gone"
