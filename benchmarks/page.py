@@ -64,7 +64,7 @@ class Site:
         self.live.attach(Wire(), SITE_ID)
         self.tags, self.anchors, self.wall_clock = tags, anchors, wall_clock
         message, self.side_m = site_of(anchors)
-        self.live._on_site("", encode(message))
+        self.live.feed.receive(topics.site_topic(SITE_ID), encode(message))
         self.live.on_connection(connected=True)
 
     def move(self, first, count, moving=None):
@@ -75,15 +75,15 @@ class Site:
             k = n * max(self.tags // (moving or self.tags), 1) % self.tags
             x, y = self.side_m * (k % columns + unix_s % 1) / columns, self.side_m * (k // columns) / columns
             made = fix(f"t{k}", unix_s, (x, y, 1.0), latency_s=0.0)
-            self.live._on_fix(topics.fix_topic(SITE_ID, f"t{k}"), encode(made))
+            self.live.feed.receive(topics.fix_topic(SITE_ID, f"t{k}"), encode(made))
 
     def report(self, tags, part=0, parts=1):
         """What anchors, or each of ``parts`` in turn, and some tags report of themselves."""
         unix_s = self.wall_clock()
         for n in range(1 + part, self.anchors + 1, parts):
-            self.live._on_health(topics.health_topic(SITE_ID, "anchor", str(n)), encode(anchor_health(n, unix_s)))
+            self.live.feed.receive(topics.health_topic(SITE_ID, "anchor", str(n)), encode(anchor_health(n, unix_s)))
         for k in range(tags):
-            self.live._on_health(topics.health_topic(SITE_ID, "tag", f"t{k}"), encode(tag_health(f"t{k}", unix_s)))
+            self.live.feed.receive(topics.health_topic(SITE_ID, "tag", f"t{k}"), encode(tag_health(f"t{k}", unix_s)))
 
 
 def server_row(tags, anchors):
@@ -125,7 +125,7 @@ def served(tags, anchors):
         for done in itertools.count():
             site.move(done * MOVING // 10, MOVING // 10, MOVING)
             site.report(0 if done % 10 else min(tags, 1_000), done % 10, 10)
-            site.live.evidence.nodes and site.live.tick()
+            site.live.table.is_empty or site.live.tick()
             await asyncio.sleep(0.1)
 
     async def run():
