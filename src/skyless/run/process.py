@@ -127,6 +127,10 @@ def end_with_parent(number: signal.Signals = signal.SIGTERM) -> Callable[[], Non
 # Tasks
 
 
+_CANCEL_AGAIN_S: Final = 10.0
+"""Longer than any part takes to end; a library may have lost the first cancellation."""
+
+
 async def together(*parts: Awaitable[None]) -> None:
     """Run until one part fails or all are cancelled. A failure cancels the others and is raised unwrapped."""
     tasks = [asyncio.ensure_future(part) for part in parts]
@@ -135,8 +139,10 @@ async def together(*parts: Awaitable[None]) -> None:
         for task in done:
             task.result()
     finally:
-        for task in tasks:
-            task.cancel()
+        while left := [task for task in tasks if not task.done()]:
+            for task in left:
+                task.cancel()
+            await asyncio.wait(left, timeout=_CANCEL_AGAIN_S)
         await asyncio.gather(*tasks, return_exceptions=True)
 
 

@@ -22,7 +22,7 @@ from nats.js.errors import APIError
 from skyless.core.version import installed_version
 from skyless.run.fix_batch import MAX_RECORDS, BadBatchError, Batch, Records, decode_batch, encode_batch, records_of
 from skyless.run.gather import subjects
-from skyless.run.gather.streams import NEVER_WRITTEN, Names, make_streams, messages
+from skyless.run.gather.streams import NEVER_WRITTEN, Names, check_cancelled, make_streams, messages
 from skyless.run.gather.subjects import NatsAddress, connect, rarely
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import RefusedError, kept_messages, trouble_with
@@ -311,6 +311,7 @@ class Gather:
                     await self._send_waiting(stream, site, names)
                     await asyncio.sleep(PERIOD_S)
             except Error as error:
+                check_cancelled()
                 self._say(f"the fixes of site {site} wait: {error or type(error).__name__}")
                 await asyncio.sleep(_RETRY_S)
 

@@ -133,8 +133,16 @@ async def follow(
                 with contextlib.suppress(Error):
                     await reading.unsubscribe()
         except Error as error:
+            check_cancelled()
             say(f"the stream {name} cannot be read: {error or type(error).__name__}")
             await asyncio.sleep(_RETRY_S)
+
+
+def check_cancelled() -> None:
+    """Raise CancelledError if this task is cancelled: nats-py may raise an error of its own instead."""
+    task = asyncio.current_task()
+    if task is not None and task.cancelling():
+        raise asyncio.CancelledError
 
 
 async def _next(reading: "JetStreamContext.PushSubscription", place: int) -> "Msg":

@@ -13,7 +13,7 @@ from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import wraps
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import Any, Final, ParamSpec, TypeVar
 
@@ -233,7 +233,7 @@ _FIXES: Final = f"""
         AND x_mm NOT NULL AND y_mm NOT NULL AND z_mm NOT NULL AND std_mm NOT NULL
 """
 
-_STAYS: Final = """
+_DWELL: Final = """
     WITH crossings AS (
         SELECT tag, zone, kind = 'enter' AS enters, epoch_ms(t) / 1000 AS s FROM read_parquet($files)
         WHERE kind IN ('enter', 'leave') AND t >= to_timestamp($begin) AND t < to_timestamp($end) AND tag NOT NULL
@@ -246,15 +246,12 @@ _STAYS: Final = """
         FROM crossings WHERE (len($tags) = 0 OR list_contains($tags, tag)) AND zone = coalesce($zone, zone)
         WINDOW of_tag AS (PARTITION BY hash(tag, zone) ORDER BY s, enters)
     )
-"""
-"""The time from each crossing of a zone's border to the tag's next one. Tags in a zone at the beginning enter it then.
-Of two simultaneous crossings the leaving comes first. Sorting by a 64-bit hash costs two thirds of sorting by two
-texts.
-"""
-
-_DWELL: Final = f"""
-    {_STAYS} SELECT tag, zone, count(*) FILTER (NOT was_inside), sum(until - since), min(since), max(until)
+    SELECT tag, zone, count(*) FILTER (NOT was_inside), sum(until - since), min(since), max(until)
     FROM stays WHERE enters GROUP BY tag, zone ORDER BY tag, zone
+"""
+"""Stays are the time from each crossing of a zone's border to the tag's next one. Tags in a zone at the beginning enter
+it then. Of two simultaneous crossings the leaving comes first. Sorting by a 64-bit hash costs two thirds of sorting by
+two texts.
 """
 
 VIEWS: Final = f"""
@@ -387,10 +384,15 @@ class History:
         A visit across an end of the range counts with its part inside. An unfinished one lasts until the end of the
         range, or of the known data.
         """
-        names = self._zone_names(zone)
+        names, asked, until = self._zone_names(zone), [*self._tags(tags)], self.known_until_unix_s()
+        if until is None or until <= span.from_unix_s:
+            return ()
+        known = Span(span.from_unix_s, min(until, span.to_unix_s))
+        rows = list(_stream(_DWELL, current_events(self.folder, self.site), known, tags=asked, zone=zone))
+        if len(rows) > LIMITS.rows:
+            raise SkylessError(f"the answer has more than {LIMITS.rows} rows; choose a shorter range, a tag or a zone")
         return tuple(
-            Dwell(tag, one, names.get(one, one), visits, *map(float, figures))
-            for tag, one, visits, *figures in _table(self._of_stays(_DWELL, span, tags, zone))
+            Dwell(tag, one, names.get(one, one), visits, *map(float, figures)) for tag, one, visits, *figures in rows
         )
 
     @_asked
@@ -513,13 +515,6 @@ class History:
             raise SkylessError(f"the history of site {self.site} has no zone {zone!r}; {_some(names, 'zones')}")
         return names
 
-    def _of_stays(self, sql: str, span: Span, asked: Sequence[str], zone: str | None) -> Iterator[tuple[Any, ...]]:
-        tags, until = [*self._tags(asked)], self.known_until_unix_s()
-        if until is None or until <= span.from_unix_s:
-            return iter(())
-        known = Span(span.from_unix_s, min(until, span.to_unix_s))
-        return _stream(sql, current_events(self.folder, self.site), known, tags=tags, zone=zone)
-
 
 # The way of a tag
 
@@ -583,14 +578,6 @@ def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iter
             found = duck.execute(sql, parameters)
             while rows := found.fetchmany(_FETCHED):
                 yield from rows
-
-
-def _table(found: Iterator[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-    """Return all rows of a result. Raises SkylessError if there are too many."""
-    rows = list(islice(found, LIMITS.rows + 1))
-    if len(rows) > LIMITS.rows:
-        raise SkylessError(f"the answer has more than {LIMITS.rows} rows; choose a shorter range, a tag or a zone")
-    return rows
 
 
 def _parameters(files: Iterable[Path], span: Span) -> dict[str, Any]:

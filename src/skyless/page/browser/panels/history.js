@@ -162,7 +162,7 @@ async function ask(key) {
     const asked = { tag: chosenTag(), span: chosenSpan() };
     const { from_unix_s: from, to_unix_s: to } = asked.span;
     const get = (path, query = {}) => history(path, { from, to, ...query }, signal);
-    const context = { ...asked, get, signal, title: asked.tag ? shownName(asked.tag) : "all tags", tags };
+    const context = { ...asked, get, signal, title: asked.tag ? shownName(asked.tag) : "all tags" };
     const found = await KINDS[key].ask(context);
     if (!signal.aborted) parts.result.replaceChildren(...KINDS[key].show(found, context));
   } catch (error) {

@@ -107,7 +107,7 @@ function sortedTable(name, columns, rows, sort, foot = null) {
   let [by, up] = sort;
   const fill = () => {
     const { value } = columns[by];
-    const compare = (a, b) => (typeof a === "string" ? a.localeCompare(b, "en", { numeric: true }) : (a ?? Infinity) - (b ?? Infinity));
+    const compare = (a, b) => (typeof a === "string" ? a.localeCompare(b, "en", { numeric: true }) : a - b);
     const sorted = rows.toSorted((a, b) => (up ? 1 : -1) * compare(value(a), value(b)));
     body.replaceChildren(
       ...sorted.slice(0, MAX_ROWS).map((row) => h("tr", {}, ...columns.map((one) => cell(one, (one.show ?? one.value)(row))))),
