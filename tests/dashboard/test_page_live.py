@@ -64,13 +64,13 @@ def test_a_silent_tag_turns_grey_and_then_leaves_the_map(hall):
     page = visit.page
     page.wait_for_selector("table.tags tr.fresh:has-text('robot')")
     server.silent_tags = {"robot"}
-    page.wait_for_selector("table.tags tr.stale:has-text('robot')")
+    page.wait_for_selector("table.tags tr.late:has-text('robot')")
     kinds = page.evaluate("""async () => {
       const { freshness, now_s } = await import("/page/clock.js");
       const track = skyless.live.all.get("robot");
-      return [0.9, 1.1, 9.9, 10.1].map((age) => freshness(track, track.lastTime + age));
+      return [2.4, 2.6, 9.9, 10.1].map((age) => freshness(track, track.lastTime + age));
     }""")
-    assert kinds == ["fresh", "stale", "stale", "gone"]
+    assert kinds == ["fresh", "late", "late", "gone"]
     page.click("table.tags button:has-text('robot')")
     page.wait_for_selector("text=No fix: too few anchors")
 
@@ -245,13 +245,15 @@ def test_tags_of_another_clock_are_not_fresh_and_long_silent_ones_go(serve, visi
     page = visit(server).page
     until(page, "/^[0-9:]+$/.test(document.getElementById('time').textContent)")  # without any tag
     found = page.evaluate("""async () => {
-      const { COLUMNS, TIME, Track, Tracks } = await import("/page/tracks.js");
+      const { COLUMNS, FRESH, GONE, SLEEP, TIME, Track, Tracks } = await import("/page/tracks.js");
       const { freshness } = await import("/page/clock.js");
-      const row = (time, name = "a") => Object.assign(Array(COLUMNS + 1).fill(0), { 0: name, [TIME + 1]: time });
+      const times_s = { [FRESH + 1]: 1, [SLEEP + 1]: 5, [GONE + 1]: 10 };
+      const row = (time, name = "a") =>
+        Object.assign(Array(COLUMNS + 1).fill(0), { 0: name, [TIME + 1]: time, ...times_s });
       const track = new Track("a");
       const kinds = [freshness(track, 1000, 1000)];
       track.push(row(1000));
-      for (const now of [1000.1, 998.5, 985, NaN]) kinds.push(freshness(track, now, now - 0.15));
+      for (const now of [1000.1, 998.5, 994, 985, NaN]) kinds.push(freshness(track, now, now - 0.15));
       const times = [999, 996, 990, 989, 992].map((time) => (track.push(row(time)), track.lastTime));
       const tracks = new Tracks();
       tracks.add([row(100, "old"), row(100, "healthy"), row(800, "new")]);
@@ -260,7 +262,7 @@ def test_tags_of_another_clock_are_not_fresh_and_long_silent_ones_go(serve, visi
       return [kinds, times, track.count, tracks.sorted.map(({ name }) => name)];
     }""")
     assert found == [
-        ["never", "fresh", "stale", "gone", "gone"],
+        ["never", "fresh", "asleep", "late", "gone", "gone"],
         [1000, 1000, 990, 990, 992],
         2,
         ["healthy", "new"],

@@ -179,7 +179,7 @@ class Writer:
         if journal.exists():
             fault = (
                 f"{journal} may have rows that are in no Parquet file; end skyless history run of the version that "
-                "wrote it (0.1) with Ctrl-C, which writes them, and remove the file"
+                "wrote it with Ctrl-C, which writes them, and remove the file"
             )
         elif self.fixes.last and not self.names.rows:
             fault = f"{names} is missing; it should be the table that tells whose the fixes are"
