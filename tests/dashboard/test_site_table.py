@@ -161,6 +161,36 @@ def test_one_outage_of_a_tag_changes_nothing_and_silence_of_the_broker_is_nobody
     assert (table.tick(5009.0), table.tick(5010.5)) == ([], ["t1"])
 
 
+def test_an_absence_is_no_rhythm_however_short_the_time_before_and_two_alike_are_one():
+    table, serial = SiteTable(0.0), 0
+
+    def stay(begin_s, end_s):
+        nonlocal serial
+        for step in range(round(10 * begin_s), round(10 * end_s)):
+            serial += 1
+            table.add_fix(fix(serial=serial, unix_s=0.1 * step), 0.1 * step)
+            table.tick(0.1 * step)
+        return table.gone_after_s(table.tag("t1"))
+
+    assert stay(0.0, 60.0) == THRESHOLDS.gone_s
+    assert table.tick(200.0) == ["t1"]
+    assert stay(360.0, 380.0) == THRESHOLDS.gone_s
+    assert table.tick(391.0) == ["t1"]
+    assert stay(680.0, 700.0) == THRESHOLDS.longest_s
+    assert stay(10_000.0, 10_020.0) == THRESHOLDS.gone_s
+
+
+def test_a_tag_that_comes_and_goes_is_looked_at_once():
+    table = SiteTable(0.0)
+    for n in range(50):
+        table.add_fix(fix(serial=n, unix_s=float(n)), 0.1 * n)
+        table.add_status(status(online=False), 0.1 * n)
+        table.add_status(status(), 0.1 * n)
+    assert len(table._due) == 1
+    assert table.tick(100.0) == []
+    assert table._due == []
+
+
 # Bad input: each has its sentence in docs/live_site.md
 
 

@@ -12,7 +12,7 @@ messages can arrive, and not while a tag is **asleep** by its own statement. Wha
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping
 from heapq import heappop, heappush
-from typing import Final, Literal
+from typing import Final, Literal, NamedTuple
 
 from msgspec import UNSET, Struct
 from msgspec.structs import replace
@@ -75,13 +75,22 @@ _ALIKE: Final = 0.8
 """A gap counts as being as long as another if it has this share of its length."""
 
 
+class _Gap(NamedTuple):
+    """A gap between two fixes of a tag."""
+
+    end_s: float
+    length_s: float
+    was_gone: bool
+    """Whether the tag had gone meanwhile: one such gap is an absence, and only two are its rhythm."""
+
+
 class Node:
     """A tag, an anchor, the emulated air or another program of a site."""
 
     __slots__ = (
         *("asleep_until_s", "codes_s", "ended_unix_s", "first_s", "fix", "fix_s", "fixes", "gaps"),
-        *("health", "health_s", "health_serial", "heard_s", "is_gone", "learnt_s", "name", "previous", "row", "sends"),
-        *("serial", "since_s", "stated_s", "status", "status_serial", "used_s"),
+        *("health", "health_s", "health_serial", "heard_s", "is_due", "is_gone", "learnt_s", "name", "previous"),
+        *("row", "sends", "serial", "since_s", "stated_s", "status", "status_serial", "used_s"),
     )
 
     def __init__(self, name: str) -> None:
@@ -98,8 +107,9 @@ class Node:
         self.first_s = float("-inf")  # arrival of the first fix since it was last gone
         self.fixes = 0  # number of fixes since then
         self.is_gone = True  # as of the last ``tick``, fix or status
+        self.is_due = False  # whether ``tick`` looks at it some time
         self.heard_s: float | None = None  # arrival of the first fix of all
-        self.gaps: list[tuple[float, float]] = []  # the last long gaps between fixes: when each ended, and its length
+        self.gaps: list[_Gap] = []  # the last long gaps between fixes
         self.learnt_s = 0.0  # the interval that the gaps show
         self.stated_s = 0.0  # the interval that the tag states
         self.asleep_until_s = float("-inf")
@@ -138,26 +148,31 @@ class Node:
         is_known = self.gaps or self.stated_s or (self.heard_s is not None and self.fix_s - self.heard_s >= _KNOWN_S)
         return max(self.learnt_s, self.stated_s) if is_known else None
 
-    def note_fix(self, now_s: float, ready_s: float) -> None:
-        """Note the arrival of a fix, and learn from the gap before it, as far as messages could arrive in it."""
+    def note_fix(self, now_s: float, ready_s: float, longest_s: float) -> None:
+        """Note the arrival of a fix, and learn from the gap before it, as far as messages could arrive in it.
+
+        A gap of more than ``longest_s`` is no rhythm: the tag was away.
+        """
         gap_s, self.fix_s = now_s - max(self.fix_s, ready_s, self.asleep_until_s), now_s
+        if self.heard_s is None:
+            self.heard_s = now_s
+        elif _SHORT_S < gap_s <= longest_s:
+            self.gaps = [*self.gaps[1 - _MAX_GAPS :], _Gap(now_s, gap_s, self.is_gone)]
         if self.is_gone:
             self.is_gone, self.first_s, self.fixes = False, now_s, 0
         self.fixes += 1
-        if self.heard_s is None:
-            self.heard_s = now_s
-        elif gap_s > _SHORT_S:
-            self.gaps = [*self.gaps[1 - _MAX_GAPS :], (now_s, gap_s)]
         if self.gaps:
-            self.gaps = [gap for gap in self.gaps if now_s - gap[0] <= _MEMORY * gap[1]]
-            self.learnt_s = max((gap_s for _, gap_s in self.gaps if self._is_rhythm(gap_s, now_s)), default=0.0)
+            self.gaps = [gap for gap in self.gaps if now_s - gap.end_s <= _MEMORY * gap.length_s]
+            rhythms = (gap.length_s for gap in self.gaps if self._is_rhythm(gap.length_s, now_s))
+            self.learnt_s = max(rhythms, default=0.0)
 
     def _is_rhythm(self, gap_s: float, now_s: float) -> bool:
         """Whether gaps about this long fill a share of the time in which they are remembered."""
         assert self.heard_s is not None
         span_s = min(_MEMORY * gap_s, now_s - self.heard_s)
-        filled_s = sum(one_s for end_s, one_s in self.gaps if one_s >= _ALIKE * gap_s and now_s - end_s <= span_s)
-        return filled_s >= _SHARE * span_s
+        alike = [gap for gap in self.gaps if gap.length_s >= _ALIKE * gap_s and now_s - gap.end_s <= span_s]
+        is_absence = len(alike) == 1 and alike[0].was_gone
+        return not is_absence and sum(gap.length_s for gap in alike) >= _SHARE * span_s
 
 
 class SiteTable:
@@ -342,10 +357,11 @@ class SiteTable:
         tag.serial, tag.row = self.fixes_serial, None
 
     def _note(self, node: Node, now_s: float) -> None:
-        if node.is_gone:
+        if not node.is_due:
+            node.is_due = True
             heappush(self._due, (now_s + THRESHOLDS.gone_s, node.name))
         node.begin(now_s)
-        node.note_fix(now_s, self.ready_s)
+        node.note_fix(now_s, self.ready_s, self.longest_silence_s(node))
 
     # What is there
 
@@ -433,11 +449,14 @@ class SiteTable:
         while self._due and self._due[0][0] <= now_s:
             _, name = heappop(self._due)
             tag = self.tag(name)
-            if tag is None or tag.is_gone:
+            if tag is None:
+                continue
+            tag.is_due = not tag.is_gone
+            if tag.is_gone:
                 continue
             left_s = self.gone_after_s(tag) - self.silent_s(tag, now_s)
             if left_s <= 0.0:
-                tag.is_gone = True
+                tag.is_gone, tag.is_due = True, False
                 gone.append(name)
             else:
                 wait_s = min(max(left_s, _LOOK_S), THRESHOLDS.gone_s)  # its interval may become known meanwhile
