@@ -33,9 +33,8 @@ from skyless.run.history.layout import FIX_COLUMNS, Place, current_events, curre
 from skyless.run.history.tables import REMEMBERED_KINDS, Event, EventLog, read_events, read_table, unix_ms
 from skyless.run.history.writer import FILE_ROWS, Intake, Keep, Writer, tidy
 from skyless.run.hub import LIST_S, sites_at
-from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.link import Link, Subscriptions
+from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
     AlarmMessage,
     AssetsMessage,
@@ -44,10 +43,10 @@ from skyless.run.mqtt.messages import (
     ZoneEvent,
     ZonesMessage,
 )
-from skyless.run.process import Log, keep, reader, together
+from skyless.run.process import Log, keep, together
 from skyless.run.recordings.recording import McapRecording
+from skyless.run.site_feed import Channel, SiteFeed
 from skyless.run.web import HISTORY as LIMITS
-from skyless.run.zones import read_zones
 
 if TYPE_CHECKING:
     from collections.abc import AsyncGenerator
@@ -181,22 +180,11 @@ class SiteHistory:
         remembered = pc.field("kind").isin(REMEMBERED_KINDS)
         self._events = EventLog(read_events(current_events(writer.root, writer.site), remembered))
         self._started_s = time.monotonic()
-        self._subscriptions = Subscriptions()
-        site = writer.site
-
-        def on_wrong() -> None:
-            writer.drops["wrong-message"] += 1
-
-        def take(topic: str, kind: type[Struct], act: Callable[[Any], None]) -> None:
-            self._subscriptions.add(topic, reader(kind, act, on_wrong), 1)
-
-        take(topics.zone_event_topic(site, "+"), ZoneEvent, self._on_event)
-        take(topics.alarm_topic(site, "+", "+"), AlarmMessage, self._on_event)
-        for kind in ("tag", "anchor"):
-            take(topics.status_topic(site, kind, "+"), StatusMessage, self._on_event)
-        take(topics.assets_topic(site), AssetsMessage, lambda message: writer.set_assets(message.assets))
-        zones = reader(read_zones, lambda message: writer.set_zones(message.zones), on_wrong, ZonesMessage(()))
-        self._subscriptions.add(topics.zones_topic(site), zones, 1)
+        self._feed = SiteFeed()
+        for kind in (ZoneEvent, AlarmMessage, StatusMessage):
+            self._feed.on(kind, self._on_event)
+        self._feed.on(AssetsMessage, lambda message, _: writer.set_assets(message.assets if message else ()))
+        self._feed.on(ZonesMessage, lambda message, _: writer.set_zones(message.zones if message else ()))
 
     async def run(self, stream: "JetStreamContext") -> None:
         """Keep the history until cancelled, then write what waits; what cannot be written is still in the streams."""
@@ -215,7 +203,7 @@ class SiteHistory:
             events=writer.events.taken,
             tags=len(writer.names.rows),
             waiting=writer.waiting,
-            drops=dict(+writer.drops),
+            drops=dict(+writer.drops + Counter({"wrong-message": self._feed.drops.total()})),
             trouble=None,
             disk=next(iter(self._trouble.values()), None),
         )
@@ -275,9 +263,11 @@ class SiteHistory:
         return intake.place.number
 
     def _receive(self, message: "Msg") -> None:
-        self._subscriptions.receive(subjects.topic_of(message.subject), message.data)
+        self._feed.receive(subjects.topic_of(message.subject), message.data)
 
-    def _on_event(self, message: ZoneEvent | AlarmMessage | StatusMessage) -> None:
+    def _on_event(self, message: ZoneEvent | AlarmMessage | StatusMessage | None, channel: Channel) -> None:
+        if message is None or channel.who not in ("", "tag", "anchor"):
+            return
         now_s = time.time()
         self._writer.events.add(self._events.of(message, now_s), now_s)
 
