@@ -286,7 +286,8 @@ class SiteTable:
             return False
         was_there, node.is_gone = not node.is_gone, True
         node.previous, node.codes_s = None, None
-        self._changed(node)
+        if node.fix is not None:
+            self._changed(node)
         return was_there
 
     def add_health(self, kind: str, name: str, health: Health, now_s: float) -> None:

@@ -96,7 +96,7 @@ class Intake:
         return len(self._batches)
 
     def write(self, batches: int) -> None:
-        """Write so many of the waiting batches to files. Raises OSError: the rest waits."""
+        """Write the first ``batches`` that wait to files. Raises OSError: the rest waits."""
         while batches > 0:
             day, rows, place = self._next_file(batches)
             last = self.last + sum(map(len, rows))
@@ -107,7 +107,7 @@ class Intake:
             batches -= len(rows)
 
     def _next_file(self, most: int) -> tuple[str, list[Records | Sequence[Event]], Place]:
-        """Return day, batches and place of the next file, of at most so many batches; its rows arrived on one day."""
+        """Return day, batches (at most ``most``) and place of the next file; its rows arrived on one day."""
         day, found, count, place = "", list[Records | Sequence[Event]](), 0, Place()
         for rows, unix_s, at in self._batches[:most]:
             of_day = datetime.fromtimestamp(unix_s, UTC).date().isoformat()
