@@ -1,6 +1,7 @@
-"""Long commands cost no more CPU time and memory than their documents state, and the paper's verdicts are those stated.
+"""Long commands take no more memory than their documents state, and the paper's verdicts are those stated.
 
-CPU time is that of all processes. Memory is what they have at a time, each shared page counted once (Linux' PSS).
+Memory is what all processes have at a time, each shared page counted once (Linux' PSS). The CPU time that the documents
+state is that of one machine: it is not judged on another.
 """
 
 import json
@@ -17,7 +18,7 @@ import pytest
 pytestmark = pytest.mark.statistical
 
 DOCS = Path(__file__).parents[2] / "docs"
-STATED = re.compile(r"`skyless ([^`]+)` takes at most (\d+) s of CPU time and (\d+) MB of memory on two cores")
+STATED = re.compile(r"`skyless ([^`]+)` takes \d+ s of CPU time and at most (\d+) MB of memory on two cores")
 
 
 def memory_mb(group):
@@ -33,8 +34,8 @@ def memory_mb(group):
 
 
 def within_what_is_stated(command, page, folder, *more):
-    """What a command writes on standard output and error, which costs no more than a page says."""
-    ((_, most_s, most_mb),) = (
+    """What a command writes on standard output and error, which takes no more memory than a page says."""
+    ((_, most_mb),) = (
         found for found in STATED.findall(" ".join(page.read_text().split())) if found[0] == command
     )
     cores = ",".join(map(str, sorted(os.sched_getaffinity(0))[:2]))
@@ -46,14 +47,12 @@ def within_what_is_stated(command, page, folder, *more):
             while not ended:
                 time.sleep(0.5)
                 peak_mb = max(peak_mb, memory_mb(started.pid))
-                ended, status, used = os.wait4(started.pid, os.WNOHANG)
+                ended, status = os.waitpid(started.pid, os.WNOHANG)
         finally:
             if not ended:
                 os.killpg(started.pid, signal.SIGKILL)
     started.returncode = os.waitstatus_to_exitcode(status)
     assert started.returncode == 0, (folder / "err").read_text()
-    cpu_s = used.ru_utime + used.ru_stime
-    assert cpu_s <= float(most_s)
     assert peak_mb <= float(most_mb)
     return (folder / "out").read_text(), (folder / "err").read_text()
 

@@ -29,6 +29,7 @@ export function outlineFields() {
     go.disabled = !isChangeable() || !tag.value;
     text(go, walk ? "Stop" : "Record outline");
   };
+  const marginFault = () => (margin.value && margin.validity.valid ? "" : `The margin is ${margin.value || "no number"}; it should be 0 to 5 m, in steps of 5 cm.`);
   const record = (name) => {
     walk = { name, site: state.liveId, last_s: live.all.get(name)?.lastTime ?? -Infinity, positions: [] };
     if (state.part) follow(name); // of a large site the server sends what is in view, and the followed tag
@@ -36,7 +37,7 @@ export function outlineFields() {
     show();
   };
   const stop = async () => {
-    if (!margin.value || !margin.validity.valid) return text(note, `The margin is ${margin.value || "no number"}; it should be 0 to 5 m, in steps of 5 cm.`);
+    if (marginFault()) return text(note, marginFault());
     const { positions } = walk;
     walk = null;
     show();
@@ -56,7 +57,7 @@ export function outlineFields() {
       walk.last_s = at_s;
       if (GRADES[alert] !== "bad" && !(std_m > MAX_STD_M)) walk.positions.push([x_m, y_m]);
     }
-    if (walk.positions.length) text(note, `${walk.positions.length} good positions so far.`);
+    if (walk.positions.length) text(note, marginFault() || `${walk.positions.length} good positions so far.`);
   });
   return { element, show };
 }
