@@ -99,7 +99,7 @@ class Views:
         shown = {row[0]: row for row in self.page.state.rows_since(0)}
         found = {}
         for name, answer in answers.items():
-            tag = self.page.table.tag(name)
+            tag = self.page.table.get("tag", name)
             is_there = self.page.table.is_there(tag, self.times.now_s)
             is_fresh = answer.presence == "fresh"
             assert self.both.zones(name) == (is_there, sorted(answer.zones))

@@ -173,7 +173,7 @@ def test_a_tag_that_starts_or_receives_nothing_is_not_one_without_verified_beaco
     site = Site().change("t1", is_verified=False)
     assert site.run(4) == {}
     assert site.run(4).keys() == {"not-verified"}
-    silent = site.evidence.table.known("tag", "t1")
+    silent = site.evidence.table.all("tag")["t1"]
     silent.previous = silent.health
     assert [*authentication_reasons(site.evidence, site.now_s)] == []
 

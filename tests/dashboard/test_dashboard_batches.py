@@ -112,7 +112,7 @@ def test_the_same_fix_in_a_message_and_a_batch_counts_once():
     dashboard = Dashboard(batched=False)
     dashboard.run(1.0, t1=OUT_M)
     serial = dashboard.live.table.fixes_serial
-    newest = dashboard.live.table.tag("t1").fix
+    newest = dashboard.live.table.get("tag", "t1").fix
     dashboard.live.on_batched_fix(replace(newest, serial=0), dashboard.times.now_s + 0.1)
     dashboard.live.table.hear(["t1"], dashboard.times.now_s + 0.1)
     dashboard.run(0.5)

@@ -10,10 +10,25 @@ from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, EventLog
 from skyless.run.condition._reasons import Reason
 from skyless.run.condition.monitor import Condition
 from skyless.run.mqtt.messages import SurveyMessage, WatchFinding, WatchMessage
-from skyless.run.site_table import THRESHOLDS
+from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.site.survey.facts import Facts
 
 NOW = 1000.0
+
+
+class Log(EventLog):
+    """A log with its table, as a page has them."""
+
+    def __init__(self, *given, **more):
+        super().__init__(SiteTable(0.0), *given, **more)
+
+    def on_status(self, status, now_s):
+        super().on_status(status, self._table.add(status.kind, status.name, sends=True).status, now_s)
+        self._table.add_status(status, now_s)
+
+    def on_health(self, kind, name, health, now_s):
+        super().on_health(kind, name, health, now_s)
+        self._table.add_health(kind, name, health, now_s)
 
 
 def texts(log, serial=0):
@@ -21,7 +36,7 @@ def texts(log, serial=0):
 
 
 def test_statuses_that_the_broker_kept_are_no_events_and_changes_are():
-    log = EventLog()
+    log = Log()
     log.on_status(status("anchor", "3", unix_s=NOW - 500), NOW)
     log.on_status(status("anchor", "4", online=False), NOW)
     assert not log.events
@@ -39,7 +54,7 @@ def test_statuses_that_the_broker_kept_are_no_events_and_changes_are():
 
 
 def test_a_node_that_reports_no_more_is_offline_once_and_comes_back():
-    log = EventLog()
+    log = Log()
     log.on_status(status("anchor", "3", unix_s=1.0), NOW)
     log.on_health("anchor", "3", anchor_health(3, NOW), NOW)
     log.tick(NOW + THRESHOLDS.report_s)
@@ -56,14 +71,14 @@ def test_a_node_that_reports_no_more_is_offline_once_and_comes_back():
 
 
 def test_a_status_that_the_broker_repeats_is_no_start():
-    log = EventLog()
+    log = Log()
     log.on_status(status("anchor", "3", unix_s=NOW), NOW)
     log.on_health("anchor", "3", anchor_health(3, NOW), NOW)
     log.tick(NOW + 10)
     log.on_status(status("anchor", "3", unix_s=NOW), NOW + 20)  # after a reconnect
     assert texts(log, 1) == ["anchor 3 does not report any more"]
     log.on_status(status("anchor", "3", unix_s=NOW + 30), NOW + 30)  # it has connected again itself
-    log.tick(NOW + 40)
+    log.tick(NOW + 30 + THRESHOLDS.report_s)
     log.on_health("anchor", "3", anchor_health(3, NOW), NOW + 40)
     log.tick(NOW + 50)
     log.on_status(replace(status("anchor", "3", unix_s=NOW + 51), pid=7), NOW + 60)
@@ -73,7 +88,7 @@ def test_a_status_that_the_broker_repeats_is_no_start():
 
 
 def test_nothing_ends_while_nothing_can_be_received():
-    log = EventLog()
+    log = Log()
     log.on_health("tag", "t1", tag_health("t1", NOW), NOW)
     log.on_fix(fix(alert="alert-limit-exceeded"), NOW)
     log.pause(NOW + 60)
@@ -84,7 +99,7 @@ def test_nothing_ends_while_nothing_can_be_received():
 
 
 def test_times_for_people_follow_their_clock_and_silence_does_not():
-    log = EventLog(1e9)
+    log = Log(1e9)
     log.on_status(status("anchor", "3", unix_s=1e9 + NOW), NOW)
     log.on_health("anchor", "3", anchor_health(3, NOW), NOW)
     log.unix_offset_s = 2e9  # the clock has been set
@@ -96,7 +111,7 @@ def test_times_for_people_follow_their_clock_and_silence_does_not():
 
 
 def test_a_takeover_names_both_masters():
-    log = EventLog()
+    log = Log()
     for k, master in enumerate((1, 1, 2)):
         for anchor in (1, 2, 3):
             log.on_health("anchor", str(anchor), anchor_health(anchor, NOW, master, master), NOW + k)
@@ -104,7 +119,7 @@ def test_a_takeover_names_both_masters():
 
 
 def test_a_computer_that_is_busy_again_and_again_is_one_line():
-    log = EventLog()
+    log = Log()
     busy = Reason("busy", "warning", "this computer is fully busy", "")
     for k in range(20):
         for reasons in ((), (busy,)):
@@ -116,7 +131,7 @@ def test_a_computer_that_is_busy_again_and_again_is_one_line():
 
 def test_changes_of_the_master_in_a_row_are_one_line_with_their_number():
     read = []
-    log = EventLog(add=read.append)
+    log = Log(add=read.append)
     for k in range(400):
         master = 1 + k % 3
         for anchor in (1, 2, 3):
@@ -136,7 +151,7 @@ def test_changes_of_the_master_in_a_row_are_one_line_with_their_number():
 
 
 def test_alerts_begin_and_end_and_are_not_repeated_often():
-    log = EventLog()
+    log = Log()
     for k in range(40):
         log.on_fix(fix(alert="alert-limit-exceeded" if k % 10 < 2 else "none"), NOW + 0.5 * k)
         log.tick(NOW + 0.5 * k)
@@ -149,7 +164,7 @@ def test_alerts_begin_and_end_and_are_not_repeated_often():
 
 
 def test_findings_of_the_watch_begin_and_end():
-    log = EventLog()
+    log = Log()
     moved = WatchFinding("moved", (4,), 0.11, 0.01, 1.0, "anchor 4 has moved by about 11 cm.")
     for k, findings in enumerate(((), (moved,), (replace(moved, size_m=0.12),), ())):
         log.on_watch(WatchMessage(1.0, "watching", findings, 15), NOW + k)
@@ -157,7 +172,7 @@ def test_findings_of_the_watch_begin_and_end():
 
 
 def test_a_saved_survey_is_an_event_once():
-    log = EventLog()
+    log = Log()
     survey = SurveyMessage(1.0, 12, (1,), (), 1.0, (), Facts(), None, by="x")
     for saved in (None, 11, 11, 12):
         log.on_survey(replace(survey, saved_serial=saved, file="hall.toml"), NOW)
@@ -166,7 +181,7 @@ def test_a_saved_survey_is_an_event_once():
 
 
 def test_the_condition_is_an_event_when_its_level_or_first_reason_changes():
-    log = EventLog()
+    log = Log()
     lost = Reason("no-fix", "warning", "tag t1 has no fix", "")
     for condition in (
         Condition("waiting", "no tag is online", (), None, None),
@@ -182,7 +197,7 @@ def test_the_condition_is_an_event_when_its_level_or_first_reason_changes():
 @given(st.lists(st.tuples(st.booleans(), st.sampled_from("abc"), st.floats(0.0, 9.0)), max_size=60))
 def test_readers_get_every_event_once_in_order(steps):
     events = []
-    log, now = EventLog(add=events.append), NOW
+    log, now = Log(add=events.append), NOW
     for online, name, wait_s in steps:
         now += wait_s
         log.on_status(status("tag", name, online, unix_s=now), now)
@@ -194,7 +209,7 @@ def test_readers_get_every_event_once_in_order(steps):
 
 
 def test_the_newest_are_kept():
-    log = EventLog()
+    log = Log()
     for k in range(2 * MAX_LOGGED):
         log.on_status(status("tag", "t1", online=bool(k % 2), unix_s=NOW), NOW)
     assert len(log.events) == MAX_LOGGED

@@ -84,7 +84,7 @@ def test_a_tag_at_rest_stays_in_its_zone_and_leaves_it_once_when_it_has_gone(rat
     assert hall.kinds == [("enter", "a")]
     ((raised_s, _),) = [alarm for alarm in hall.alarms if alarm[1] == "raised"]
     assert 60.0 <= raised_s <= 61.0
-    tag = hall.table.tag("t1")
+    tag = hall.table.get("tag", "t1")
     gone_s = hall.table.gone_after_s(tag)
     interval_s = 30.0 if rate == BURSTS else rate
     assert gone_s == pytest.approx(max(THRESHOLDS.gone_s, THRESHOLDS.gone_intervals * interval_s), rel=0.05)
@@ -123,7 +123,7 @@ def test_a_tag_that_sleeps_by_its_own_statement_is_asleep_and_then_gone():
     for step in range(200):
         table.add_fix(fix(serial=step, unix_s=0.1 * step), 0.1 * step)
     table.add_health("tag", "t1", health(sleeps_s=3600.0), 20.0)
-    tag = table.tag("t1")
+    tag = table.get("tag", "t1")
     assert table.tick(3000.0) == []
     assert table.presence(tag, 3000.0) == "asleep"
     assert (table.tick(3625.0), table.presence(tag, 3625.0)) == ([], "late")
@@ -136,7 +136,7 @@ def test_a_stated_interval_counts_before_one_is_learnt_and_the_site_states_the_l
     table = SiteTable(0.0)
     table.add_health("tag", "t1", health(interval_s=120.0), 0.0)
     table.add_fix(fix(), 0.0)
-    tag = table.tag("t1")
+    tag = table.get("tag", "t1")
     assert (table.fresh_for_s(tag), table.gone_after_s(tag)) == (300.0, 480.0)
     table.longest_s, table.longest_of_groups_s, table.group_of = 200.0, {"vans": 90.0}, {"t1": "vans"}
     assert (table.fresh_for_s(tag), table.gone_after_s(tag)) == (90.0, 90.0)
@@ -154,7 +154,7 @@ def test_one_outage_of_a_tag_changes_nothing_and_silence_of_the_broker_is_nobody
         table.add_fix(fix(serial=serial, unix_s=0.1 * step), 0.1 * step)
     assert table.tick(420.0) == ["t1"]
     table.add_fix(fix(serial=serial + 1, unix_s=430.0), 430.0)
-    assert table.gone_after_s(table.tag("t1")) == THRESHOLDS.gone_s
+    assert table.gone_after_s(table.get("tag", "t1")) == THRESHOLDS.gone_s
     table.set_connected(connected=False, now_s=431.0)
     assert table.tick(5000.0) == []
     table.set_connected(connected=True, now_s=5000.0)
@@ -170,7 +170,7 @@ def test_an_absence_is_no_rhythm_however_short_the_time_before_and_two_alike_are
             serial += 1
             table.add_fix(fix(serial=serial, unix_s=0.1 * step), 0.1 * step)
             table.tick(0.1 * step)
-        return table.gone_after_s(table.tag("t1"))
+        return table.gone_after_s(table.get("tag", "t1"))
 
     assert stay(0.0, 60.0) == THRESHOLDS.gone_s
     assert table.tick(200.0) == ["t1"]
@@ -200,10 +200,10 @@ def test_a_late_or_repeated_fix_is_counted_and_changes_nothing_and_a_clock_set_b
     table.add_fix(first, 0.0)
     for old in (first, replace(first, serial=4, unix_s=999.5)):
         assert table.add_fix(old, 0.5) is None
-    assert (table.drops["late-fix"], table.tag("t1").fix) == (2, first)
+    assert (table.drops["late-fix"], table.get("tag", "t1").fix) == (2, first)
     for serial, unix_s in ((6, 995.0), (7, 1e9), (8, 1000.0), (1, 1.0), (2, 4e12)):  # set back, years ahead, restarted
         assert table.add_fix(fix(serial=serial, unix_s=unix_s), 1.0) is not None
-    assert table.presence(table.tag("t1"), 1.0) == "fresh"
+    assert table.presence(table.get("tag", "t1"), 1.0) == "fresh"
 
 
 def test_two_feeds_of_one_site_give_each_fix_once():
@@ -235,7 +235,7 @@ def test_what_has_gone_is_forgotten_after_a_day_with_room_for_others():
     table.add_fix(fix("t1"), 0.0)
     table.add_status(status("tag", "t2"), 0.0)
     table.tick(THRESHOLDS.forgotten_s + 100.0)
-    assert (table.tag("t1"), table.fixed, table.tag("t2") is not None) == (None, {}, True)
+    assert (table.get("tag", "t1"), table.fixed, table.get("tag", "t2") is not None) == (None, {}, True)
     assert not table.roster.size("tag") > 1
 
 
@@ -260,7 +260,7 @@ def test_a_tag_is_never_gone_and_there_at_once(steps):
         went += table.tick(now_s)
         assert went == [] or there
         there = there and not went
-        tag = table.tag("t1")
+        tag = table.get("tag", "t1")
         if tag is not None and now_s - table.ready_s < THRESHOLDS.forgotten_s:
             assert not (went and table.is_there(tag, now_s))
             assert there or not table.is_there(tag, now_s)

@@ -35,9 +35,7 @@ def memory_mb(group):
 
 def within_what_is_stated(command, page, folder, *more):
     """What a command writes on standard output and error, which takes no more memory than a page says."""
-    ((_, most_mb),) = (
-        found for found in STATED.findall(" ".join(page.read_text().split())) if found[0] == command
-    )
+    ((_, most_mb),) = (found for found in STATED.findall(" ".join(page.read_text().split())) if found[0] == command)
     cores = ",".join(map(str, sorted(os.sched_getaffinity(0))[:2]))
     words = ["taskset", "--cpu-list", cores, sys.executable, "-m", "skyless.cli.main", *command.split(), *more]
     peak_mb, ended = 0.0, 0

@@ -182,7 +182,7 @@ class SiteMetrics:
             elif len(nodes) >= _MAX_NAMES:
                 self.dropped["too-many-names"] += 1
             else:
-                nodes[name] = _Node(self.table.known(kind, name))
+                nodes[name] = _Node(self.table.all(kind)[name])
         return nodes.get(name)
 
     def text(self, now_s: float) -> str:

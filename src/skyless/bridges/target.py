@@ -410,7 +410,7 @@ class Hub:
 
     def _expect(self, tag: str, now_s: float, reason: str | None) -> None:
         """Note that a tag should have fixes, and why it has none."""
-        node = self.table.expect("tag", tag)
+        node = self.table.add("tag", tag)
         if node is None:
             return  # too many
         node.begin(now_s)
@@ -438,7 +438,7 @@ class Hub:
         for name in self.table.tick(now_s):
             self._give_gone(name, unix_s)
         for name, reason in tuple(self._reasons.items()):
-            tag = self.table.tag(name)
+            tag = self.table.get("tag", name)
             if tag is None:
                 self._forget(name)
             elif self.table.presence(tag, now_s) in ("fresh", "asleep"):

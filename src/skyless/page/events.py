@@ -26,7 +26,7 @@ from skyless.run.mqtt.messages import (
     WrongMessageError,
     ZoneEvent,
 )
-from skyless.run.site_table import THRESHOLDS, Health
+from skyless.run.site_table import THRESHOLDS, Health, SiteTable
 
 if TYPE_CHECKING:
     from skyless.run.hub import HubLink
@@ -88,17 +88,18 @@ class _Alert:
 
 
 class EventLog:
-    """Derives events from messages."""
+    """Derives events from messages, and from a site's table, to which its owner adds them."""
 
-    def __init__(self, unix_offset_s: float = 0.0, add: Callable[[Event], None] = lambda _event: None) -> None:
+    def __init__(
+        self, table: SiteTable, unix_offset_s: float = 0.0, add: Callable[[Event], None] = lambda _event: None
+    ) -> None:
         """``add`` is called with each event. ``unix_offset_s``: Unix time less ``now_s``, to be kept up to date."""
-        self.unix_offset_s, self._add_to_list = unix_offset_s, add
+        self.unix_offset_s, self._table, self._add_to_list = unix_offset_s, table, add
         self.serial = 0
         self.events: deque[Event] = deque(maxlen=MAX_LOGGED)
         """Events, the oldest first."""
-        self._statuses: dict[tuple[str, str], StatusMessage] = {}
-        self._reported: dict[tuple[str, str], float] = {}  # reporting nodes, with the time of the last health message
-        self._silent: set[tuple[str, str]] = set()
+        self._silent: set[tuple[str, str]] = set()  # nodes whose silence is in the list
+        self._paused_s = float("-inf")
         self._leader = LeaderTracker()
         self._alerts: dict[str, _Alert] = {}
         self._findings: dict[tuple[str, tuple[int, ...]], str] = {}
@@ -109,20 +110,16 @@ class EventLog:
 
     # Nodes
 
-    def on_status(self, status: StatusMessage, now_s: float) -> None:
-        """Process a status: a node may have come online or gone."""
+    def on_status(self, status: StatusMessage, before: StatusMessage | None, now_s: float) -> None:
+        """Process a status, and the one ``before``: a node may have come online or gone."""
         key = status.kind, status.name
-        before = self._statuses.get(key)
-        self._statuses[key] = status
         kept = now_s + self.unix_offset_s - status.unix_s >= _KEPT_S
         changed = before is not None and (
             before.online != status.online or (status.online and before.pid != status.pid)
         )
         happened = changed or (before is None and status.online and not kept)
-        if not status.online:
-            self._reported.pop(key, None)
-            if status.kind == "tag":
-                self._end_alert(status.name, now_s)
+        if not status.online and status.kind == "tag":
+            self._end_alert(status.name, now_s)
         if key in self._silent:
             if status.online and kept and not changed:
                 return  # repeated by the broker
@@ -139,7 +136,6 @@ class EventLog:
         if key in self._silent:
             self._silent.discard(key)
             self._add_presence(key, True, now_s, "reports again")
-        self._reported[key] = now_s
         if isinstance(health, AnchorHealth):
             before = self._leader.leader
             leader = self._leader.update(health, now_s)
@@ -149,18 +145,21 @@ class EventLog:
 
     def tick(self, now_s: float) -> None:
         """Find alerts that have ended and nodes that fell silent. To be called once or twice a second."""
-        for key, reported_s in list(self._reported.items()):
-            if now_s - reported_s > THRESHOLDS.report_s:
-                del self._reported[key]
-                self._silent.add(key)
-                self._add_presence(key, False, now_s, "does not report any more")
+        for kind in self._table.kinds:
+            for name, node in self._table.senders(kind):
+                if node.health is None or node.online is False or (kind, name) in self._silent:
+                    continue
+                reported_s = max(node.health_s, node.since_s or node.health_s, self._paused_s)
+                if now_s - reported_s > THRESHOLDS.report_s:
+                    self._silent.add((kind, name))
+                    self._add_presence((kind, name), False, now_s, "does not report any more")
         for name, alert in self._alerts.items():
             if alert.alert is not None and now_s - alert.seen_s > ALERT_END_S:
                 self._end_alert(name, now_s)
 
     def pause(self, now_s: float) -> None:
         """Replace ``tick`` while messages cannot arrive, when silence means nothing."""
-        self._reported = dict.fromkeys(self._reported, now_s)
+        self._paused_s = now_s
         for alert in self._alerts.values():
             alert.seen_s = now_s
 

@@ -169,7 +169,7 @@ class LiveSite:
         self._health_due_s = self._condition_due_s = 0.0
         self.evidence = Evidence(self.table)
         self.evidence.hub_trouble = "" if at_hub else None
-        self.log = EventLog(wall_clock() - clock(), self.event_list.add_logged)
+        self.log = EventLog(self.table, wall_clock() - clock(), self.event_list.add_logged)
         self.alarms = SiteAlarms(name, self.monitor, self.table, self._broadcast, self.log.on_alarm)
         if site is not None:
             self._use_site(site)
@@ -285,11 +285,11 @@ class LiveSite:
     def _on_status(self, status: StatusMessage | None) -> None:
         if status is None:
             return  # a retained status was cleared
-        has_gone = self.evidence.add_status(status, self._clock())
-        if self.table.get(status.kind, status.name) is None:
+        node, now_s = self.table.add(status.kind, status.name, sends=True), self._clock()
+        if node is None:
             return  # there are too many
-        self.log.on_status(status, self._clock())
-        if has_gone and status.kind == "tag":
+        self.log.on_status(status, node.status, now_s)
+        if self.evidence.add_status(status, now_s) and status.kind == "tag":
             self._schedule(self.monitor.remove_tag(status.name, self.wall_clock()))
 
     def _on_health(self, health: Health, channel: Channel) -> None:
@@ -406,7 +406,7 @@ class LiveSite:
 
     def presence(self, tag: str) -> Presence:
         """Whether a known tag is there, in a word."""
-        return self.table.presence(self.table.known("tag", tag), self._clock())
+        return self.table.presence(self.table.all("tag")[tag], self._clock())
 
     # Pages
 

@@ -29,8 +29,8 @@ from skyless.run.mqtt.messages import (
     Zone,
 )
 from skyless.run.recordings.recording import McapRecording, Recorded
-from skyless.run.site_feed import SiteFeed
-from skyless.run.site_table import SiteTable
+from skyless.run.site_feed import Channel, SiteFeed
+from skyless.run.site_table import Health, SiteTable
 from skyless.run.zones import zones_of
 
 _SUFFIX: Final = ".mcap"
@@ -222,13 +222,24 @@ def _version(file: Path) -> _Version:
 def _events(path: Path, _of: _Version, stopped: threading.Event) -> RecordedEvents:
     """Events of a recording from the live page's log, by the recording's times."""
     events: list[Event] = []
-    log = EventLog(add=events.append)
-    feed = SiteFeed()
+    table, feed = SiteTable(0.0), SiteFeed()
+    log = EventLog(table, add=events.append)
+
+    def on_status(status: StatusMessage | None) -> None:
+        node = None if status is None else table.add(status.kind, status.name, sends=True)
+        if node is not None and status is not None:
+            log.on_status(status, node.status, feed.now_s)
+            table.add_status(status, feed.now_s)
+
+    def on_health(health: Health, channel: Channel) -> None:
+        log.on_health(channel.who, channel.name, health, feed.now_s)
+        table.add_health(channel.who, channel.name, health, feed.now_s)
+
     feed.on(FixMessage, lambda fix, _: log.on_fix(fix, feed.now_s))
-    feed.on(StatusMessage, lambda status, _: log.on_status(status, feed.now_s))
+    feed.on(StatusMessage, lambda status, _: on_status(status))
     feed.on(WatchMessage, lambda watch, _: log.on_watch(watch, feed.now_s))
     for kind in (TagHealth, AnchorHealth, EtherHealth):
-        feed.on(kind, lambda health, channel: log.on_health(channel.who, channel.name, health, feed.now_s))
+        feed.on(kind, on_health)
 
     def watched(recorded: Iterable[Recorded]) -> Iterator[Recorded]:
         """The messages, with the log's own work between them."""

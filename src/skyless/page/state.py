@@ -195,7 +195,7 @@ class SiteState:
         While ``blind``, when messages may be missing, silence does not make an anchor ``bad``.
         """
         table = self.table
-        waiting = (name for name, tag in table.of("tag") if tag.health is not None and tag.fix is None)
+        waiting = (name for name, tag in table.senders("tag") if tag.health is not None and tag.fix is None)
         self._waiting = list(islice(waiting, MAX_HEALTHS))
         found, self._leaders = {}, set()
         for name, anchor in table.all("anchor").items():
@@ -222,7 +222,7 @@ class SiteState:
         new: dict[str, list[Any]] = {}
         ages: dict[str, dict[str, float]] = {}
         for group, kind in _GROUPS.items():
-            healths = {name: node for name, node in table.of(kind) if node.health is not None}
+            healths = {name: node for name, node in table.senders(kind) if node.health is not None}
             names: Iterable[str] = healths
             if len(healths) > MAX_HEALTHS:
                 names = [name for name in named[group] if name in healths]
@@ -232,8 +232,10 @@ class SiteState:
             ages[group] = {name: round(self.now_s - healths[name].health_s, 2) for name in fresh}
         nodes: list[StatusMessage] = []
         if sent.statuses < table.statuses_serial:
-            there = {kind: [node.status for _, node in table.of(kind) if node.status] for kind in table.kinds}
-            newer = [node for kind in table.kinds for _, node in table.of(kind) if node.status_serial > sent.statuses]
+            there = {kind: [node.status for _, node in table.senders(kind) if node.status] for kind in table.kinds}
+            newer = [
+                node for kind in table.kinds for _, node in table.senders(kind) if node.status_serial > sent.statuses
+            ]
             nodes = [node.status for node in sorted(newer, key=lambda node: node.status_serial) if node.status]
             if sum(map(len, there.values())) > MAX_HEALTHS:  # then pages list only the other programs
                 nodes = [status for status in nodes if status.kind not in {"tag", "anchor"}]

@@ -325,7 +325,7 @@ class AlarmEngine:
         self, own: _Rule, subject: str, now_s: float, *, held: bool
     ) -> bool | None:
         """Whether the condition holds; None if unknown, so that the case stays unchanged."""
-        rule, tag, inside = own.rule, self._table.tag(subject), self._members[own.rule.zone or ""]
+        rule, tag, inside = own.rule, self._table.get("tag", subject), self._members[own.rule.zone or ""]
         limit, hysteresis = rule.limit or 0.0, rule.hysteresis if held else 0.0
         if rule.zone is not None and rule.zone not in self._zones:
             return False
@@ -363,7 +363,7 @@ class AlarmEngine:
 
     def _silent_s(self, name: str, now_s: float) -> float:
         """For how long a tag has had no fix and has not been asleep; infinite before its first one."""
-        tag = self._table.tag(name)
+        tag = self._table.get("tag", name)
         return math.inf if tag is None else now_s - max(tag.fix_s, tag.asleep_until_s)
 
     def _is_settled(self, tag: Node, now_s: float) -> bool:
@@ -381,7 +381,7 @@ class AlarmEngine:
 
     def _is_missed(self, name: str, now_s: float) -> bool:
         """Whether a tag may be present although nothing has been received from it since messages were missed."""
-        tag = self._table.tag(name)
+        tag = self._table.get("tag", name)
         if tag is None or tag.fix_s == -math.inf:
             longest_s = self._table.longest_s if name in self._resumed_s else THRESHOLDS.grace_s
             return now_s - self._blind_s < longest_s
@@ -400,7 +400,7 @@ class AlarmEngine:
         for own in self._rules.values():
             if own.rule.kind not in ("crowded", "anchor-offline", "anchor-moved"):
                 for subject in list(own.cases):
-                    known = (self._table.tag(name) or name in self._resumed_s for name in subject.split("~"))
+                    known = (self._table.get("tag", name) or name in self._resumed_s for name in subject.split("~"))
                     if not any(known) and subject not in own.concerned.named:
                         del own.cases[subject]
 
@@ -447,7 +447,7 @@ class AlarmEngine:
             return
         is_of_tags = rule.kind not in ("crowded", "anchor-offline", "anchor-moved")
         tags = tuple(subject.split("~") if is_of_tags else sorted(self._crowd(own)))
-        first = self._table.tag(tags[0]) if is_of_tags else None
+        first = self._table.get("tag", tags[0]) if is_of_tags else None
         fix = None if first is None else first.fix
         message = AlarmMessage(
             id=f"{rule.id}/{subject}/{round(1000.0 * unix_s)}",
@@ -482,9 +482,9 @@ class AlarmEngine:
             case "crowded":
                 return float(len(self._crowd(own)))
             case "battery":
-                return self._battery(self._table.tag(subject))
+                return self._battery(self._table.get("tag", subject))
             case "protection-level":
-                return _level_m(self._table.tag(subject))
+                return _level_m(self._table.get("tag", subject))
             case "anchor-moved":
                 return None
         return max(own.rule.after_s, held_s)

@@ -252,19 +252,14 @@ class SiteTable:
         ids = [] if site is None else [*(a.id for a in site.anchors), *(a.id for a in site.unplaced)]
         return [name for name in map(str, ids) if self.roster.admits("anchor", name)]
 
-    def expect(self, kind: str, name: str) -> Node | None:
-        """The node of this name, added if need be; None if there are too many."""
+    def add(self, kind: str, name: str, *, sends: bool = False) -> Node | None:
+        """The node of this name, added if need be; None if there are too many. ``sends``: it has sent a message."""
         node = self.get(kind, name)
         if node is None and self.roster.admits(kind, name):
             node = self._nodes[kind][name] = Node(name)
             if kind == "tag":
                 self.batched[name] = node
-        return node
-
-    def _sender(self, kind: str, name: str) -> Node | None:
-        """The same for a node of which a message has arrived."""
-        node = self.expect(kind, name)
-        if node is not None and not node.sends:
+        if node is not None and sends and not node.sends:
             node.sends = True
             self._sorted.pop(kind, None)
             if kind == "tag":
@@ -273,10 +268,11 @@ class SiteTable:
 
     def add_status(self, status: StatusMessage, now_s: float) -> bool:
         """Add a status, which says whether a node is online. Returns whether a tag that was there has gone with it."""
-        node = self._sender(status.kind, status.name)
+        node = self.add(status.kind, status.name, sends=True)
         if node is None:
             return False
-        if status.online and not node.online:
+        before = node.status
+        if status.online and (before is None or not before.online or before.unix_s != status.unix_s):
             node.since_s = now_s
         self.statuses_serial += 1
         if not status.host and node.host:
@@ -292,7 +288,7 @@ class SiteTable:
 
     def add_health(self, kind: str, name: str, health: Health, now_s: float) -> None:
         """Add a node's health."""
-        node = self._sender(kind, name)
+        node = self.add(kind, name, sends=True)
         if node is None:
             return
         node.begin(now_s)
@@ -317,7 +313,7 @@ class SiteTable:
         Two sources may bring the same fix, as messages and batches do: the second one is a repetition. ``batched``: the
         fix is one of those of which ``hear`` was notified.
         """
-        node = self.expect("tag", fix.tag) if batched else self._sender("tag", fix.tag)
+        node = self.add("tag", fix.tag, sends=not batched)
         if node is None:
             return None
         if node.fix is not None and _is_late(fix, node.fix):
@@ -329,7 +325,7 @@ class SiteTable:
         self.fixed[fix.tag] = node
         self._changed(node)
         for anchor in fix.anchors:
-            used = self._sender("anchor", str(anchor))
+            used = self.add("anchor", str(anchor), sends=True)
             if used is not None:
                 used.used_s = now_s
         return node
@@ -343,7 +339,7 @@ class SiteTable:
         for name in tags:
             node = known.get(name)
             if node is None or node.is_gone or node.gaps or now_s - node.fix_s > _SHORT_S:
-                node = self.expect("tag", name)
+                node = self.add("tag", name)
                 if node is not None:
                     self._note(node, now_s)
                     if node.gaps:
@@ -375,14 +371,6 @@ class SiteTable:
         """The node of this kind and name, if known."""
         return self.all(kind).get(name)
 
-    def known(self, kind: str, name: str) -> Node:
-        """The same for one that is known."""
-        return self._nodes[kind][name]
-
-    def tag(self, name: str) -> Node | None:
-        """The tag of this name, if known."""
-        return self._nodes["tag"].get(name)
-
     def all(self, kind: str) -> Mapping[str, Node]:
         """All nodes of a kind, by name."""
         return self._nodes.get(kind, {})
@@ -392,7 +380,7 @@ class SiteTable:
         """The kinds of which nodes are known."""
         return tuple(kind for kind, nodes in self._nodes.items() if nodes)
 
-    def of(self, kind: str) -> list[tuple[str, Node]]:
+    def senders(self, kind: str) -> list[tuple[str, Node]]:
         """Names and nodes of a kind that have sent messages, and anchors in use, in natural order."""
         if kind not in self._sorted:
             found = [(name, node) for name, node in self._nodes[kind].items() if node.sends]
@@ -449,7 +437,7 @@ class SiteTable:
         gone = []
         while self._due and self._due[0][0] <= now_s:
             _, name = heappop(self._due)
-            tag = self.tag(name)
+            tag = self.get("tag", name)
             if tag is None:
                 continue
             tag.is_due = not tag.is_gone

@@ -143,7 +143,7 @@ def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> 
     worst = max(late, key=lambda name: ages[name][0])
     age_s, made_s = ages[worst]
     whose = "positions" if len(late) == len(ages) else f"positions of {listed('tag', late)}"
-    tag = evidence.table.tag(worst)
+    tag = evidence.table.get("tag", worst)
     host = "" if tag is None else tag.host
     if made_s > 0.5 * age_s:
         why = f"{evidence.computer(host)} does not keep up with the receptions"
@@ -217,7 +217,7 @@ _Sign = tuple[str, float, str]  # computer, lost share, and words
 
 def _airs(evidence: Evidence) -> list[Node]:
     """Running emulated airs."""
-    return [air for _, air in evidence.table.of("ether") if air.online is not False]
+    return [air for _, air in evidence.table.senders("ether") if air.online is not False]
 
 
 def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
@@ -229,7 +229,7 @@ def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
             share = air.health.missed_share
             yield air.host, share, f"the emulated air missed {100.0 * share:.0f} % of the transmissions"
     shares: dict[str, dict[str, float]] = {}
-    for name, anchor in evidence.table.of("anchor"):
+    for name, anchor in evidence.table.senders("anchor"):
         share = anchor.health.missed_share if isinstance(anchor.health, AnchorHealth) else 0.0
         if anchor.reports(now_s) and share > most:
             shares.setdefault(anchor.host, {})[name] = share
@@ -241,7 +241,7 @@ def _missed(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
 def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
     """Receptions and fixes that tags dropped as too old between their last two health messages."""
     found: dict[str, list[tuple[str, int, float]]] = {}
-    for name, tag in evidence.table.of("tag"):
+    for name, tag in evidence.table.senders("tag"):
         now, before = tag.health, tag.previous
         if not (tag.reports(now_s) and isinstance(now, TagHealth) and isinstance(before, TagHealth)):
             continue
@@ -257,7 +257,7 @@ def _dropped(evidence: Evidence, now_s: float) -> Iterable[_Sign]:
 
 def fix_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     """Tags are online without a fix, with the cause that they state, or without a report."""
-    online = [(name, tag) for name, tag in evidence.table.of("tag") if tag.online]
+    online = [(name, tag) for name, tag in evidence.table.senders("tag") if tag.online]
     without = [
         (n, tag) for n, tag in online if not evidence.has_fix(tag, now_s) and not evidence.table.in_grace(now_s, tag)
     ]
@@ -367,7 +367,7 @@ def _anchors(evidence: Evidence, now_s: float) -> tuple[list[str], list[str], li
                 (cut_off if on_air else offline).append(name)
         elif node.since_s is not None or not evidence.table.in_grace(now_s):  # else an old status, kept by the broker
             offline.append(name)
-    unseen = len(offline) == len(names) and all(node.since_s is None for _, node in evidence.table.of("anchor"))
+    unseen = len(offline) == len(names) and all(node.since_s is None for _, node in evidence.table.senders("anchor"))
     return [] if unseen and now_s - evidence.table.ready_s < START_S else offline, cut_off, idle
 
 
@@ -381,7 +381,7 @@ def multipath_reason(evidence: Evidence, now_s: float) -> Reason | None:
     stated_m = 0.0 if site is None else site.accuracy.place_std_m
     found = {
         name: (tag.health.multipath_std_m, tag.health.multipath_distance_m or 0.0)
-        for name, tag in evidence.table.of("tag")
+        for name, tag in evidence.table.senders("tag")
         if tag.reports(now_s) and isinstance(tag.health, TagHealth) and tag.health.multipath_std_m is not None
     }
     more = [name for name, (std_m, _) in found.items() if std_m > MULTIPATH_RATIO * stated_m]
@@ -432,12 +432,12 @@ def authentication_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]
     """All reasons about codes and keys."""
     tags = {
         name: node.health
-        for name, node in evidence.table.of("tag")
+        for name, node in evidence.table.senders("tag")
         if node.reports(now_s) and isinstance(node.health, TagHealth) and node.health.trust is not None
     }
     anchors = {
         name: node.health
-        for name, node in evidence.table.of("anchor")
+        for name, node in evidence.table.senders("anchor")
         if node.reports(now_s) and isinstance(node.health, AnchorHealth)
     }
     keyed = {name: health for name, health in anchors.items() if _has_keys(health)}
@@ -479,9 +479,7 @@ def _not_verified(evidence: Evidence, tags: Mapping[str, TagHealth], now_s: floa
     found = {
         name: health
         for name, health in tags.items()
-        if not health.is_verified
-        and health.clock_error_s is None
-        and _receives(evidence.table.known("tag", name), now_s)
+        if not health.is_verified and health.clock_error_s is None and _receives(evidence.table.all("tag")[name], now_s)
     }
     if not found:
         return
@@ -531,7 +529,7 @@ def _codes(evidence: Evidence, keyed: Mapping[str, AnchorHealth], now_s: float) 
         for name, health in keyed.items()
         if health.code_fault is not None
         and _left_s(health) > 0.0
-        and not evidence.table.in_grace(now_s, evidence.table.known("anchor", name))
+        and not evidence.table.in_grace(now_s, evidence.table.all("anchor")[name])
     }
     if not without:
         return
@@ -550,7 +548,7 @@ def _keys(
     without = [
         name
         for name in anchors
-        if name not in keyed and not evidence.table.in_grace(now_s, evidence.table.known("anchor", name))
+        if name not in keyed and not evidence.table.in_grace(now_s, evidence.table.all("anchor")[name])
     ]
     if keyed and without:
         others = f"{len(keyed)} other{verb(keyed, ' has', 's have')}"
@@ -575,7 +573,7 @@ def _forged(
     advice = "Tags that verify beacons do not use these. See that anchor's log and keys, and who else transmits there."
     without_key = [
         name
-        for name, node in evidence.table.of("tag")
+        for name, node in evidence.table.senders("tag")
         if evidence.has_fix(node, now_s) and isinstance(node.health, TagHealth) and node.health.trust is None
     ]
     level: _Severity = "warning"

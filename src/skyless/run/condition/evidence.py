@@ -82,7 +82,7 @@ class Evidence:
         return "this computer" if host in {"", self.table.host} else f"computer {host}"
 
     def _is_here(self, tag: str) -> bool:
-        node = self.table.tag(tag)
+        node = self.table.get("tag", tag)
         return node is not None and node.host == self.table.host
 
 

@@ -120,7 +120,7 @@ class ConditionMonitor:
         self._held = {kind: held for kind, held in self._held.items() if now_s - held[0] < HOLD_S}
         evidence.alerts.clear()
         reasons = tuple(sorted((reason for _, reason in self._held.values()), key=rank))
-        tags, batched = evidence.table.of("tag"), evidence.table.batched
+        tags, batched = evidence.table.senders("tag"), evidence.table.batched
         with_fix = sum(evidence.has_fix(tag, now_s) for _, tag in tags)
         with_fix += sum(not tag.is_gone for tag in batched.values())
         figures = *latencies, len(tags) + len(batched), with_fix, evidence.table.roster.size("anchor")
@@ -146,6 +146,6 @@ class ConditionMonitor:
             return "waiting for the site's anchors"
         if self.evidence.table.is_bare:
             return "not set up yet: tab Set up"
-        if not self.evidence.table.batched and not any(tag.online for _, tag in self.evidence.table.of("tag")):
+        if not self.evidence.table.batched and not any(tag.online for _, tag in self.evidence.table.senders("tag")):
             return "no tag is online"
         return "waiting for the first position"

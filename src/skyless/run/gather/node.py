@@ -117,7 +117,7 @@ class SiteCondition:
         self._table.hear(map(str, np.unique(records["tag"]).tolist()), now_s)
 
     def _online(self) -> list[StatusMessage]:
-        nodes = (node for kind in self._table.kinds for _, node in self._table.of(kind))
+        nodes = (node for kind in self._table.kinds for _, node in self._table.senders(kind))
         return [node.status for node in nodes if node.status is not None and node.status.online]
 
     def online(self) -> dict[str, int]:
