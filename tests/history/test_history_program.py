@@ -23,9 +23,9 @@ from skyless.run.gather.subjects import connect
 from skyless.run.history import program
 from skyless.run.history import writer as writer_module
 from skyless.run.history.layout import current_events, current_files, rows_of, site_folder
-from skyless.run.history.program import HistoryNode
+from skyless.run.history.program import HistoryNode, import_recording
 from skyless.run.history.queries import History
-from skyless.run.history.writer import Keep
+from skyless.run.history.writer import Keep, Writer
 from skyless.run.mqtt.address import MqttAddress, Role, create_access, mqtt_address, read_access
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -47,6 +47,9 @@ from skyless.run.mqtt.topics import (
     zone_event_topic,
     zones_topic,
 )
+from skyless.run.record import RecorderNode
+from skyless.run.recordings.recorder import McapFile
+from skyless.run.recordings.recording import McapRecording
 from skyless.sim.lab import lab_site
 from support.processes import SKYLESS, free_port, running_program
 from support.waiting import until as until_
@@ -282,6 +285,75 @@ def test_what_it_takes_of_a_sites_messages(tmp_path, kind):
     assert fixes.select(["x_mm", "flags"]).to_pylist() == [{"x_mm": 1, "flags": 64}]
     zones = parquet.read_table(site_folder(folder, SITE) / "zones.parquet", partitioning=None)
     assert zones["zone"].to_pylist() == ["z1"]
+
+
+def test_a_recording_gives_the_rows_of_the_running_history(tmp_path):
+    live, played, walk = tmp_path / "live", tmp_path / "played", tmp_path / "walk.mcap"
+    chance, lab = random.Random(7), msgspec.structs.replace(lab_site(), id=SITE)
+
+    def walked(serial):
+        at_m, variances = ([chance.uniform(*limits) for _ in range(3)] for limits in ((-50.0, 50.0), (1e-6, 4.0)))
+        return fix(f"t{serial % 3}", serial, time.time(), tuple(at_m), variances, hpl_m=chance.uniform(0.1, 9.0))
+
+    async def scenario(node):
+        await until(lambda: node.state().events == 1 and recorder.recorder.kinds["status"])
+        publish, now_s = stage.link.publish, time.time()
+        publish(site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
+        publish(zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
+        publish(assets_topic(SITE), AssetsMessage((Asset("t0", "Forklift"),)), qos=1, retain=True)
+        await until(lambda: recorder.recorder.kinds["assets"])
+        for serial in range(1, 301):
+            made = walked(serial)
+            publish(fix_topic(SITE, made.tag), made)
+            if serial % 50 == 0:
+                event = ZoneEvent("z1", "door", made.tag, "enter", made.unix_s, made.position_m)
+                publish(zone_event_topic(SITE, "z1"), event, qos=1)
+                raised = AlarmMessage(
+                    f"cold/{serial}", "cold", "Cold", "inside", "critical", made.tag, now_s, now_s, "in"
+                )
+                publish(alarm_topic(SITE, "cold", made.tag), raised, qos=1, retain=True)
+                publish(
+                    status_topic(SITE, "anchor", 3),
+                    StatusMessage(serial % 100 > 0, "anchor", "3", unix_s=made.unix_s),
+                    qos=1,
+                )
+            await asyncio.sleep(0.002)
+        await until(lambda: (node.state().fixes, node.state().events) == (300, 1 + 6 + 6 + 6))
+        await until(lambda: recorder.recorder.kinds["fix"] == 300 and recorder.recorder.kinds["event"] == 6)
+
+    async def whole():
+        async with stage:
+            recording = asyncio.ensure_future(recorder.run())
+            await keeping(stage, live, print, scenario)
+            await stopped(recording)
+
+    stage = Stage(tmp_path / "broker")
+    recorder = RecorderNode(McapFile(walk), stage.broker.address, SITE, print)
+    asyncio.run(whole())
+    for folder, fixes, events in ((played, 300, 19), (live, 0, 0)):
+        with McapRecording(walk) as recording:
+            writer = Writer(folder, SITE)
+            found = import_recording(recording, writer, print)
+            writer.close()
+        assert (found.fixes, found.events, found.drops) == (fixes, events, {})
+    assert whole_rows(live) == whole_rows(played)
+
+
+def whole_rows(folder):
+    """All rows of a history but for numbers of its own, and the times of arrival that offline programs have."""
+    site = site_folder(folder, SITE)
+    names, zones, assets = (parquet.read_table(site / f"{one}.parquet", partitioning=None) for one in TABLES)
+    of = {row["tag"]: row["name"] for row in names.to_pylist()}
+    rows = [
+        [row for file in files for row in parquet.read_table(file, partitioning=None).to_pylist()]
+        for files in (current_files(folder, SITE), current_events(folder, SITE))
+    ]
+    fixes = sorted((of[row.pop("tag")], *row.values()) for row in rows[0])
+    events = sorted(str(row | ({"t": None} if row["kind"] == "offline" else {})) for row in rows[1])
+    return fixes, events, zones, assets
+
+
+TABLES = "names", "zones", "assets"
 
 
 def test_without_a_gather_one_runs_at_the_brokers_own_streams(tmp_path):

@@ -417,7 +417,7 @@ def _losses(state: "HistoryState") -> str:
 @app.command(name="import", help_epilogue="Example: skyless history import walk.mcap --to history")
 @command
 def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None = None, json: bool = False) -> None:
-    """Add the fixes, zone events and zones of a recording to a history; what that has already is left out.
+    """Add the fixes, events, zones and names of a recording to a history; what that has already is left out.
 
     Parameters
     ----------

@@ -108,8 +108,19 @@ def channel_of(topic: str) -> Channel | None:
     return None
 
 
+def message_of(channel: Channel, payload: bytes) -> Struct | None:
+    """Decode and check a message; None if a retained one was withdrawn. Raises WrongMessageError."""
+    assert channel.payload is not None and channel.of is not None
+    if not payload and channel.of.retained:
+        return None
+    message, own_name = _decoder_of(channel.payload)(payload), channel.of.own_name
+    if own_name is not None and own_name(message) != channel.name:
+        raise WrongMessageError(f"it is of {own_name(message)[:40]!r}")
+    return message
+
+
 @lru_cache(maxsize=64)
-def decoder_of(payload: type[Struct]) -> Callable[[bytes], Struct]:
+def _decoder_of(payload: type[Struct]) -> Callable[[bytes], Struct]:
     """The function that decodes a payload of a type, and raises WrongMessageError."""
     if payload in _CHECKED:
         return _CHECKED[payload]
@@ -199,24 +210,13 @@ class SiteFeed:
             if (raw := self._raw.get(channel.kind)) is not None:
                 raw(payload, channel)
             elif channel.payload in self._typed:
-                message = self._decoded(channel, channel.of, payload)
+                message = message_of(channel, payload)
                 for act in self._typed[channel.payload]:
                     act(message, channel)
         except (WrongMessageError, ConfigurationError) as error:
             self.drops[channel.kind] += 1
             if self.drops[channel.kind] == 1:
                 _log.warning("dropped a wrong message of %s: %s; there may be more", topic, error)
-
-    @staticmethod
-    def _decoded(channel: Channel, kind: Kind, payload: bytes) -> Struct | None:
-        """The message; None if a retained one was withdrawn. Raises WrongMessageError."""
-        assert channel.payload is not None
-        if not payload and kind.retained:
-            return None
-        message = decoder_of(channel.payload)(payload)
-        if kind.own_name is not None and kind.own_name(message) != channel.name:
-            raise WrongMessageError(f"it is of {kind.own_name(message)[:40]!r}")
-        return message
 
     def play(self, recorded: Iterable[Recorded]) -> None:
         """Process messages of a recording, in its order and by its times."""

@@ -255,6 +255,12 @@ class Gather:
         """Take a tag's fix in JSON that has come in another way than from the server."""
         self._packer.add(name, payload)
 
+    def add_message(self, topic: str, payload: bytes) -> None:
+        """Take the site, or a program's status, in the same way."""
+        self._condition.on_message(topic, payload)
+        if self._condition.site is not None:
+            self._packer.simulated = self._condition.site.simulated
+
     async def run(self) -> None:
         """Gather until cancelled, then send what is waiting."""
         client = self._client = await connect(self._address, "skyless gather", self._say, self._packer.drops)
@@ -291,9 +297,7 @@ class Gather:
             self._condition.on_batch(decode_batch(message.data).records, time.monotonic())
 
     async def _on_message(self, message: Msg) -> None:
-        self._condition.on_message(subjects.topic_of(message.subject), message.data)
-        if self._condition.site is not None:
-            self._packer.simulated = self._condition.site.simulated
+        self.add_message(subjects.topic_of(message.subject), message.data)
 
     # Sending
 

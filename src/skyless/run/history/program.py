@@ -7,7 +7,7 @@ import re
 import secrets
 import time
 import zlib
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 from collections.abc import Callable, Coroutine
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -166,6 +166,19 @@ class HistoryState(Struct, frozen=True):
     """Why nothing can be written; None while writing works."""
 
 
+def take_messages(feed: SiteFeed, writer: Writer, log: EventLog, add: Callable[[list[Event], float], None]) -> None:
+    """Keep the zones and names of assets that a feed states, and ``add`` its new events with their time of arrival."""
+
+    def on_event(message: ZoneEvent | AlarmMessage | StatusMessage | None, channel: Channel) -> None:
+        if message is not None and channel.who in ("", "tag", "anchor"):
+            add(log.of(message, feed.now_s), feed.now_s)
+
+    for kind in (ZoneEvent, AlarmMessage, StatusMessage):
+        feed.on(kind, on_event)
+    feed.on(AssetsMessage, lambda message, _: writer.set_assets(message.assets if message else ()))
+    feed.on(ZonesMessage, lambda message, _: writer.set_zones(message.zones if message else ()))
+
+
 class SiteHistory:
     """Keeps the history of one site from its streams at a server.
 
@@ -178,13 +191,10 @@ class SiteHistory:
         self._writer, self._keep, self._log, self._say = writer, keep, log, rarely(log)
         self._trouble: dict[str, str] = {}
         remembered = pc.field("kind").isin(REMEMBERED_KINDS)
-        self._events = EventLog(read_events(current_events(writer.root, writer.site), remembered))
+        log_of_events = EventLog(read_events(current_events(writer.root, writer.site), remembered))
         self._started_s = time.monotonic()
-        self._feed = SiteFeed()
-        for kind in (ZoneEvent, AlarmMessage, StatusMessage):
-            self._feed.on(kind, self._on_event)
-        self._feed.on(AssetsMessage, lambda message, _: writer.set_assets(message.assets if message else ()))
-        self._feed.on(ZonesMessage, lambda message, _: writer.set_zones(message.zones if message else ()))
+        self._feed = SiteFeed(time.time)
+        take_messages(self._feed, writer, log_of_events, writer.events.add)
 
     async def run(self, stream: "JetStreamContext") -> None:
         """Keep the history until cancelled, then write what waits; what cannot be written is still in the streams."""
@@ -264,12 +274,6 @@ class SiteHistory:
 
     def _receive(self, message: "Msg") -> None:
         self._feed.receive(subjects.topic_of(message.subject), message.data)
-
-    def _on_event(self, message: ZoneEvent | AlarmMessage | StatusMessage | None, channel: Channel) -> None:
-        if message is None or channel.who not in ("", "tag", "anchor"):
-            return
-        now_s = time.time()
-        self._writer.events.add(self._events.of(message, now_s), now_s)
 
     # Files
 
@@ -392,6 +396,7 @@ class HistoryNode:
             gather.add_fix(topic.split("/")[4], payload)
 
         def on_other(topic: str, payload: bytes) -> None:
+            gather.add_message(topic, payload)  # at once: fixes behind it are of that site
             subject = subjects.subject_of(topic)
             if _NO_SUBJECT.search(subject):
                 self._writer.drops["wrong-topic"] += 1
@@ -521,6 +526,8 @@ class HubHistory:
 _CHUNK: Final = 100_000
 _MARGIN: Final = timedelta(days=1)
 """How much earlier or later a message may have reached the running history."""
+_SAME: Final = timedelta(seconds=5)
+_NEVER: Final = datetime.min.replace(tzinfo=UTC)
 
 
 class Imported(Struct, frozen=True):
@@ -530,11 +537,12 @@ class Imported(Struct, frozen=True):
     known_fixes: int
     """Fixes that the history already had."""
     events: int
+    """Events that it did not have."""
     drops: dict[str, int]
 
 
 def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[float], None]) -> Imported:
-    """Add a recording's fixes, zone events and zones. ``reach`` is called with the Unix time in s reached so far.
+    """Add a recording's rows, as from the running site. ``reach`` is called with the Unix time in s reached so far.
 
     A tag has at most one fix per millisecond.
 
@@ -542,13 +550,11 @@ def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[
         SkylessError: the history cannot be read.
         OSError: the disk fails; what was written stays, and importing again adds the rest.
     """
-    writer.set_zones(() if recording.zones is None else recording.zones.zones)
     simulated = recording.site is not None and recording.site.simulated
-    known, known_events = _known(recording, writer)
-    log = EventLog()
+    known, is_known = _known(recording, writer)
     chunk: list[tuple[int, FixMessage]] = []
     counts = {"fixes": 0, "known_fixes": 0, "events": 0}
-    day, arrived_s = None, 0.0
+    day, arrived_s, feed = None, 0.0, SiteFeed()
 
     def add() -> None:
         records = records_of(chunk, simulated=simulated)
@@ -561,42 +567,55 @@ def import_recording(recording: McapRecording, writer: Writer, reach: Callable[[
         counts["known_fixes"] += len(chunk) - len(new)
         chunk.clear()
 
-    for found in recording.messages({"fix", "event"}):
-        if isinstance(found.message, ZoneEvent):
-            events = [event for event in log.of(found.message, found.time_s) if event not in known_events]
-            writer.events.add(events, found.time_s)
-            counts["events"] += len(events)
-            continue
-        of_day = datetime.fromtimestamp(found.time_s, UTC).date()
+    def add_events(events: list[Event], now_s: float) -> None:
+        new = [event for event in events if not is_known(event)]
+        writer.events.add(new, now_s)
+        counts["events"] += len(new)
+
+    def on_fix(fix: FixMessage) -> None:
+        nonlocal day, arrived_s
+        of_day = datetime.fromtimestamp(feed.now_s, UTC).date()
         if chunk and (of_day != day or len(chunk) >= _CHUNK):
             add()
-            reach(found.time_s)
-        day, arrived_s = of_day, found.time_s
-        fix = cast("FixMessage", found.message)
-        number = writer.number(fix, found.time_s)
+            reach(feed.now_s)
+        day, arrived_s = of_day, feed.now_s
+        number = writer.number(fix, feed.now_s)
         if number is not None:
             chunk.append((number, fix))
+
+    feed.on(FixMessage, lambda fix, _: on_fix(fix))
+    take_messages(feed, writer, EventLog(), add_events)
+    feed.play(recording.messages({"fix", "event", "alarm", "status", "assets", "zones"}))
     add()
     writer.write()
     return Imported(**counts, drops=dict(writer.drops + recording.drops))
 
 
-def _known(recording: McapRecording, writer: Writer) -> tuple[NDArray[np.int64], set[Event]]:
-    """Return what the history already has for the time of a recording: the keys of fixes, and events."""
+def _known(recording: McapRecording, writer: Writer) -> tuple[NDArray[np.int64], Callable[[Event], bool]]:
+    """Return what the history already has for the time of a recording: keys of fixes, and whether it has an event."""
     summary = recording.summary()
     if summary.start_s is None or summary.end_s is None:
-        return np.empty(0, np.int64), set()
+        return np.empty(0, np.int64), lambda _: False
     begin = datetime.fromtimestamp(summary.start_s, UTC) - _MARGIN
     end = datetime.fromtimestamp(summary.end_s, UTC) + _MARGIN
     span = (pc.field("t") >= begin) & (pc.field("t") <= end)
-    files, events = (
-        [file for file in current(writer.root, writer.site) if str(begin.date()) <= day_of(file) <= str(end.date())]
-        for current in (current_files, current_events)
-    )
+    days = str(begin.date()), str(end.date())
+    files = [file for file in current_files(writer.root, writer.site) if days[0] <= day_of(file) <= days[1]]
     columns = {name: FIX_COLUMNS[name] for name in ("tag", "t")}
     tables = [read_table(file, columns, span) for file in files]
     keys = [_keys(table["tag"].to_numpy(), table["t"].cast(pa.int64()).to_numpy()) for table in tables]
-    return np.concatenate([np.empty(0, np.int64), *keys]), set(read_events(events, span))
+    remembered = span | pc.field("kind").isin(REMEMBERED_KINDS)  # the broker keeps these, perhaps from long before
+    events = set(read_events(current_events(writer.root, writer.site), remembered))
+    ends = defaultdict[Event, list[datetime]](list)
+    for event in events:
+        if event.kind == "offline":
+            ends[replace(event, t=_NEVER)].append(event.t)
+
+    def is_known(event: Event) -> bool:
+        """Whether the history has an event. That a node went offline has the time of arrival, which differs a bit."""
+        return event in events or any(abs(event.t - t) < _SAME for t in ends.get(replace(event, t=_NEVER), ()))
+
+    return np.concatenate([np.empty(0, np.int64), *keys]), is_known
 
 
 def _keys(tag: NDArray[Any], ms: NDArray[np.int64]) -> NDArray[np.int64]:

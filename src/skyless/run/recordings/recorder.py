@@ -18,7 +18,7 @@ from skyless.files import Drops
 from skyless.run.foxglove import SCENE_TOPIC, ellipse, foxglove_schema, location_fix, pose_in_frame, scene, schema_of
 from skyless.run.mqtt.messages import FixMessage, SiteMessage, WrongMessageError
 from skyless.run.recordings.recording import FLOOR_PLAN, JSON, JSON_SCHEMA, NS, PROFILE
-from skyless.run.site_feed import channel_of, decoder_of
+from skyless.run.site_feed import channel_of, message_of
 
 # An MCAP file being written, valid after every flush. Chunks are compressed (zstd); a killed program loses what came
 # after the last flush. A full disk ends the recording: the file is cut back to its last complete chunk.
@@ -209,10 +209,11 @@ class McapRecorder:
             )
             return None
         try:
-            message = decoder_of(channel.payload)(payload)
+            message = message_of(channel, payload)
         except WrongMessageError:
             self.drops["malformed-message"] += 1
             return None
+        assert message is not None  # empty ones are left out above
         self.kinds[channel.kind] += 1
         self.file.add(topic, schema_of(channel.payload), payload, log_ns)
         self._add_views(message, unix_s, log_ns)

@@ -29,7 +29,7 @@ from skyless.run.mqtt.messages import (
     WrongMessageError,
     ZonesMessage,
 )
-from skyless.run.site_feed import Channel, channel_of, decoder_of
+from skyless.run.site_feed import Channel, channel_of, message_of
 
 PROFILE: Final = "skyless"
 JSON: Final = "json"
@@ -399,11 +399,12 @@ class McapRecording:
             if channel is None or channel.payload is None or channel.kind not in kinds or not from_s <= time_s < to_s:
                 continue
             try:
-                message = decoder_of(channel.payload)(payload)
+                message = message_of(channel, payload)
             except WrongMessageError:
                 self.drops["malformed-message"] += 1
                 continue
-            yield Recorded(time_s, channel, topic, message)
+            if message is not None:
+                yield Recorded(time_s, channel, topic, message)
 
     def _may_hold(self, chunk: ChunkIndex, kinds: set[str]) -> bool:
         """Whether a chunk may hold messages of these kinds: its index does not rule them out."""
