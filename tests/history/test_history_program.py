@@ -1,12 +1,15 @@
 """``skyless history run`` against real brokers: killed, with a full disk, and what it takes of a site's messages."""
 
 import asyncio
+import errno
 import multiprocessing
+import os
 import random
 import signal
 import time
 from collections import Counter
 from itertools import count
+from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -188,21 +191,31 @@ async def keeping(stage, folder, log, scenario):
     return node
 
 
-def test_a_full_disk_is_said_and_forgiven(tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
+def test_a_disk_that_takes_nothing_is_said_and_forgiven(tmp_path, monkeypatch, number):
     folder, lines = tmp_path / "history", []
     monkeypatch.setattr(program, "_CHECK_S", 0.05)
     monkeypatch.setattr(program, "_FIRST_FILE_S", 0.1)
-    free_bytes = 0
-    monkeypatch.setattr(writer_module.shutil, "disk_usage", lambda _: SimpleNamespace(free=free_bytes))
+    is_at_fault = True
+    free = lambda _: SimpleNamespace(free=0 if is_at_fault and number == errno.ENOSPC else 10**12)  # noqa: E731
+    monkeypatch.setattr(writer_module.shutil, "disk_usage", free)
+    write_bytes = Path.write_bytes
+
+    def write(file, data):
+        if is_at_fault and file.name == "check.tmp":
+            raise OSError(number, os.strerror(number), str(file))
+        return write_bytes(file, data)
+
+    monkeypatch.setattr(Path, "write_bytes", write)
 
     async def scenario(node):
-        nonlocal free_bytes
+        nonlocal is_at_fault
         publishing = asyncio.ensure_future(stage.publish_fixes())
         await until(lambda: node.state().disk is not None)
         during = node.state()
         await until(lambda: node.state().waiting > during.waiting + 10)
         assert not current_files(folder, SITE)
-        free_bytes = 10**12
+        is_at_fault = False
         await until(lambda: "the history's own nats-server is started again" in lines)
         later = node.state().fixes + 100
         await until(lambda: node.state().fixes > later and current_files(folder, SITE))
@@ -215,7 +228,7 @@ def test_a_full_disk_is_said_and_forgiven(tmp_path, monkeypatch):
     stage = Stage(tmp_path / "broker")
     node = asyncio.run(whole())
     assert lines[:3] == [
-        "the history's files cannot be written: No space left on device",
+        f"the history's files cannot be written: {os.strerror(number)}",
         "the history's files can be written again",
         "the history's own nats-server is started again",
     ]
