@@ -133,7 +133,7 @@ def test_a_tag_has_the_name_of_its_asset_at_this_site(view, times):
         assert len(rows) == 2
         assert [row.tag for row in view.picture().tags] == ["t1", "t2"]
     view.link.deliver(topics.assets_topic(SITE_ID), b"{}")
-    assert view.picture().wrong_messages == 1
+    assert view.picture().unused == {"assets": 1}
 
 
 def test_nothing_is_fresh_without_the_broker(view, times):
@@ -151,7 +151,8 @@ def test_alarms_that_nobody_has_seen_come_first_and_go_with_their_topic(view):
     view.link.deliver(topics.alarm_topic(SITE_ID, "r", "b"), b"")
     view.link.deliver(topics.alarm_topic(SITE_ID, "r", "c"), b"{}")
     assert [one.subject for one in view.picture().alarms] == ["c", "a"]
-    assert view.picture().wrong_messages == 1
+    assert view.picture().unused == {"alarm": 1}
+    assert "not used here alarm 1" in lines(view.picture())
     assert "alarms (2)" in lines(view.picture())
 
 

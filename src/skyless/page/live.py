@@ -147,8 +147,8 @@ class LiveSite:
         self.plans: dict[int | None, bytes] = {}
         """Images of the floors by number; None for the image of the whole site."""
         self.connected = False
-        self.table = SiteTable(clock(), platform.node(), connected=False)
         self.feed = SiteFeed(clock)
+        self.table = SiteTable(clock(), platform.node(), connected=False, drops=self.feed.drops)
         self.state = SiteState(self.table, self.feed.drops)
         self.monitor = ZoneMonitor()
         self.events = EventQueue()

@@ -178,16 +178,19 @@ class Node:
 class SiteTable:
     """The nodes of one site, with their newest messages and the times at which these arrived."""
 
-    def __init__(self, now_s: float, host: str = "", *, connected: bool = True) -> None:
-        """``host``: this computer's name, as nodes state theirs. ``connected``: whether messages can arrive."""
-        self.host = host
+    def __init__(
+        self, now_s: float, host: str = "", *, connected: bool = True, drops: Counter[str] | None = None
+    ) -> None:
+        """``host``: this computer's name, as nodes state theirs. ``connected``: whether messages can arrive.
+
+        ``drops``: where fixes that are not used are counted, by reason, such as a feed's.
+        """
+        self.host, self.drops = host, Counter() if drops is None else drops
         self.site: Site | None = None
         self.fixed: dict[str, Node] = {}
         """Tags of which a fix is known."""
         self.batched: dict[str, Node] = {}
         """Tags of which no message of their own has arrived, as their fixes come in batches."""
-        self.drops: Counter[str] = Counter()
-        """Fixes that were not used, by reason."""
         self.fixes_serial = self.healths_serial = self.statuses_serial = 0
         """Counts of changes. A reader that has the state at one serial asks for what is newer."""
         self.ready_s = now_s

@@ -101,8 +101,8 @@ class Picture(Struct, frozen=True):
     """Unacknowledged alarms first."""
     drops: dict[str, int]
     """Drops at tags and anchors since their start, by reason, the most frequent first."""
-    wrong_messages: int
-    """Number of unreadable messages."""
+    unused: dict[str, int]
+    """Messages that were not used here, by reason: a kind of unreadable messages, or ``late-fix``."""
 
 
 async def site_number(address: MqttAddress, longest_s: float | None) -> int:
@@ -128,7 +128,8 @@ class SiteView:
         """``used_share``: see the page's ``LiveSite``."""
         self.link, self.number, self._clock, self._wall_clock = link, number, clock, wall_clock
         self._used_share = used_share
-        self.table = SiteTable(clock(), platform.node(), connected=False)
+        self.feed = feed = SiteFeed(clock)
+        self.table = SiteTable(clock(), platform.node(), connected=False, drops=feed.drops)
         self.evidence = Evidence(self.table)
         self._monitor = ConditionMonitor(self.evidence)
         self.condition = self._monitor.evaluate(clock())
@@ -136,7 +137,6 @@ class SiteView:
         self._alarms: dict[str, AlarmMessage] = {}
         self._watch: tuple[WatchMessage, float] | None = None  # with its creation time
         self._assets = AssetsMessage(())
-        self.feed = feed = SiteFeed(clock)
         feed.on(SiteMessage, self._on_site)
         feed.on(FixMessage, lambda fix, _: self.evidence.add_fix(fix, clock(), wall_clock()))
         feed.on(StatusMessage, lambda status, _: status and self.evidence.add_status(status, clock()))
@@ -230,7 +230,7 @@ class SiteView:
             ),
             alarms=tuple(sorted(self._alarms.values(), key=_alarm_rank)),
             drops={reason: count for reason, count in drops.most_common() if count and reason not in NOT_DROPS},
-            wrong_messages=self.feed.drops.total(),
+            unused=dict(self.feed.drops),
         )
 
     def _tag_rows(self, tags: list[tuple[str, Node]], now_s: float) -> tuple[TagRow, ...]:
@@ -298,9 +298,9 @@ def drawn(
         head.append(_text(f"and {len(reasons) - _MAX_REASONS} more", "dim"))
     if reasons or condition.text:
         head.append(_text(reasons[0].advice if reasons else condition.text))
-    foot = [_text("drops " + (", ".join(f"{why} {count}" for why, count in picture.drops.items()) or "none"))]
-    if picture.wrong_messages:
-        foot.append(_text(f"unreadable messages {picture.wrong_messages}", "yellow"))
+    foot = [_text(f"drops {_counts(picture.drops) or 'none'}")]
+    if picture.unused:
+        foot.append(_text(f"not used here {_counts(picture.unused)}", "yellow"))
     rows = height - len(head) - len(foot) - 2 - bool(alarms)
     most_alarms = min(len(alarms), max(rows // 4, rows - len(picture.tags) - len(anchors), _MIN_ROWS))
     rows -= most_alarms
@@ -324,6 +324,10 @@ def _title(picture: Picture) -> Text:
     line.append(time.strftime("%H:%M:%S  ", time.localtime(picture.unix_s)))
     line.append(plain(f"{picture.broker} {trouble or 'connected'}"), "red" if trouble else "dim")
     return line
+
+
+def _counts(of: Mapping[str, int]) -> str:
+    return ", ".join(f"{reason} {count}" for reason, count in of.items())
 
 
 def _text(words: str, style: str = "") -> Text:
