@@ -62,10 +62,14 @@ class Evidence:
         """Add a fix of a tag; None for one that is not used (``SiteTable.add_fix``)."""
         node = self.table.add_fix(fix, now_s, batched=batched)
         if node is not None:
-            if ALERTS.get(fix.alert, 0) > ALERTS.get(self.alerts.get(fix.tag), 0):
-                self.alerts[fix.tag] = str(fix.alert)
+            self.note_alert(fix.tag, fix.alert)
             node.ended_unix_s = unix_s - self.ages.add_fix(fix.tag, fix.unix_s, fix.latency_s, now_s)
         return node
+
+    def note_alert(self, tag: str, alert: str | None) -> None:
+        """Note the integrity alert of a fix, if it is worse than those since the last evaluation."""
+        if ALERTS.get(alert, 0) > ALERTS.get(self.alerts.get(tag), 0):
+            self.alerts[tag] = str(alert)
 
     def has_fix(self, tag: Node, now_s: float) -> bool:
         """Whether a tag has a fresh fix, or sleeps."""

@@ -10,7 +10,6 @@ from itertools import count
 from typing import Final, Literal
 
 import msgspec
-import numpy as np
 from msgspec import Struct
 from nats.aio.client import Client
 from nats.aio.msg import Msg
@@ -20,16 +19,28 @@ from nats.js import JetStreamContext
 from nats.js.errors import APIError
 
 from skyless.core.version import installed_version
-from skyless.run.fix_batch import MAX_RECORDS, BadBatchError, Batch, Records, decode_batch, encode_batch, records_of
+from skyless.run.condition.evidence import Evidence
+from skyless.run.condition.monitor import ConditionMonitor
+from skyless.run.fix_batch import (
+    ALERT_BITS,
+    ALERTS,
+    MAX_RECORDS,
+    BadBatchError,
+    Batch,
+    Records,
+    decode_batch,
+    encode_batch,
+    records_of,
+)
 from skyless.run.gather import subjects
-from skyless.run.gather.streams import NEVER_WRITTEN, Names, check_cancelled, make_streams, messages
+from skyless.run.gather.streams import NEVER_WRITTEN, Names, TagName, check_cancelled, make_streams, messages
 from skyless.run.gather.subjects import NatsAddress, connect, rarely
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import RefusedError, kept_messages, trouble_with
-from skyless.run.mqtt.messages import FixMessage, SiteMessage, StatusMessage
+from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, SiteMessage, StatusMessage, TagHealth
 from skyless.run.process import Log, together
-from skyless.run.site_feed import SiteFeed
-from skyless.run.site_table import THRESHOLDS, SiteTable
+from skyless.run.site_feed import Channel, SiteFeed
+from skyless.run.site_table import Health, SiteTable
 
 MAX_WAITING: Final = 100_000
 """Largest number of fixes waiting for the stream; the oldest are dropped and counted beyond it."""
@@ -84,12 +95,10 @@ class Packer:
         return Batch(self._run, next(self._sequences), round(1e6 * now_unix_s), issue, records)
 
 
-# Condition of a site in one word, with reasons, from the messages that pass a gather. Coarser than the page's, for
-# lists of sites.
+# Condition of a site in one word, with reasons, for lists of sites: the page's, and the gather's own.
 
 _DROPS_S: Final = 60.0
 _MAX_WAITING: Final = 5_000
-_MAX_NAMED: Final = 3
 
 ConditionWord = Literal["good", "degraded", "bad"]
 
@@ -99,22 +108,39 @@ class SiteCondition:
 
     def __init__(self, now_s: float) -> None:
         self.site: SiteMessage | None = None
+        self._now_s = now_s
         self._table = SiteTable(now_s)
+        self._evidence = Evidence(self._table)
+        self._monitor = ConditionMonitor(self._evidence)
         self._dropped: deque[tuple[float, int]] = deque()
-        self._feed = SiteFeed()
+        self._feed = SiteFeed(lambda: self._now_s)
         self._feed.on(SiteMessage, lambda message, _: self._on_site(message))
-        self._feed.on(StatusMessage, lambda status, _: status and self._table.add_status(status, time.monotonic()))
+        self._feed.on(StatusMessage, lambda status, _: status and self._evidence.add_status(status, self._now_s))
+        for kind in (TagHealth, AnchorHealth, EtherHealth):
+            self._feed.on(kind, self._on_health)
 
     def _on_site(self, message: SiteMessage | None) -> None:
-        self.site = message or self.site
+        if message is not None:
+            self.site = message
+            self._table.set_site(message.site, self._now_s)
 
-    def on_message(self, topic: str, payload: bytes) -> None:
-        """Process a message with the site or a program's status."""
+    def _on_health(self, health: Health, channel: Channel) -> None:
+        self._table.add_health(channel.who, channel.name, health, self._now_s)
+
+    def on_message(self, topic: str, payload: bytes, now_s: float) -> None:
+        """Process a message with the site, or with a program's status or health."""
+        self._now_s = now_s
         self._feed.receive(topic, payload)
 
-    def on_batch(self, records: Records, now_s: float) -> None:
+    def on_batch(self, records: Records, names: Mapping[int, TagName], now_s: float) -> None:
         """Process the fixes of a batch of this gather or another program."""
-        self._table.hear(map(str, np.unique(records["tag"]).tolist()), now_s)
+        known = {
+            number: names[number].name if number in names else str(number) for number in set(records["tag"].tolist())
+        }
+        self._table.hear(known.values(), now_s)
+        alerts = records["flags"] & ALERT_BITS
+        for number, alert in set(zip(records["tag"][alerts > 0].tolist(), alerts[alerts > 0].tolist(), strict=True)):
+            self._evidence.note_alert(known[number], ALERTS[min(alert, len(ALERTS)) - 1])
 
     def _online(self) -> list[StatusMessage]:
         nodes = (node for kind in self._table.kinds for _, node in self._table.senders(kind))
@@ -131,32 +157,26 @@ class SiteCondition:
     def tags_heard(self, now_s: float) -> int:
         """Tags that are there, by their fixes."""
         self._table.tick(now_s)
-        return sum(not tag.is_gone for tag in self._table.batched.values())
+        return sum(not tag.is_gone for tag in self._table.all("tag").values())
 
     def reasons(self, drops: Mapping[str, int], waiting: int, now_s: float) -> tuple[ConditionWord, list[str]]:
         """Return the condition, and why it is not good. ``drops`` are the gather's since its start."""
         self._dropped.append((now_s, sum(drops.values())))
         while now_s - self._dropped[0][0] > _DROPS_S:
             self._dropped.popleft()
-        bad, degraded = [], []
+        self._table.tick(now_s)
+        condition = self._monitor.evaluate(now_s)
+        found = [reason.text for reason in condition.reasons]
+        is_bad = condition.level == "bad"
         if self.site is None:
-            bad.append("the site is not published: no anchor or emulated air is running")
-        if not self.tags_heard(now_s) and now_s - self._table.ready_s > THRESHOLDS.gone_s:
-            bad.append("no tag has a fix")
-        if offline := self._offline_anchors():
-            named = ", ".join(offline[:_MAX_NAMED]) + (" and others" if len(offline) > _MAX_NAMED else "")
-            degraded.append(f"{len(offline)} of the anchors offline: {named}")
+            is_bad, found = True, ["the site is not published: no anchor or emulated air is running"]
+        elif condition.level == "waiting" and not self._table.in_grace(now_s):
+            is_bad, found = True, [condition.text]
         if waiting > _MAX_WAITING:
-            degraded.append(f"{waiting} fixes wait for the stream")
+            found.append(f"{waiting} fixes wait for the stream")
         if dropped := self._dropped[-1][1] - self._dropped[0][1]:
-            degraded.append(f"{dropped} fixes were dropped in the last minute")
-        return "bad" if bad else "degraded" if degraded else "good", bad + degraded
-
-    def _offline_anchors(self) -> list[str]:
-        """Anchors of the site that are offline by their own status or the broker's last will."""
-        names = [] if self.site is None else [str(anchor.id) for anchor in self.site.site.anchors]
-        found = ((name, self._table.get("anchor", name)) for name in names)
-        return [name for name, anchor in found if anchor is not None and anchor.online is False]
+            found.append(f"{dropped} fixes were dropped in the last minute")
+        return "bad" if is_bad else "degraded" if found else "good", found
 
 
 PERIOD_S: Final = 0.1
@@ -256,8 +276,8 @@ class Gather:
         self._packer.add(name, payload)
 
     def add_message(self, topic: str, payload: bytes) -> None:
-        """Take the site, or a program's status, in the same way."""
-        self._condition.on_message(topic, payload)
+        """Take the site, or a program's status or health, in the same way."""
+        self._condition.on_message(topic, payload, time.monotonic())
         if self._condition.site is not None:
             self._packer.simulated = self._condition.site.simulated
 
@@ -269,7 +289,7 @@ class Gather:
             site = self.site = await self._first_site(client) if self.site is None else self.site
             fixes = await client.subscribe(subjects.at(subjects.JSON_FIXES, site), _QUEUE, self._on_fix)
             await client.subscribe(subjects.at(subjects.FIXES, site), cb=self._on_batch)
-            for pattern in (subjects.STATUSES, subjects.SITES):
+            for pattern in (subjects.STATUSES, subjects.SITES, subjects.HEALTHS):
                 await client.subscribe(subjects.at(pattern, site), cb=self._on_message)
             try:
                 await together(self._send(stream, site), self._summarise(client, site))
@@ -293,8 +313,11 @@ class Gather:
         self.add_fix(subjects.tag_in(message.subject), message.data)
 
     async def _on_batch(self, message: Msg) -> None:
-        with contextlib.suppress(BadBatchError):
-            self._condition.on_batch(decode_batch(message.data).records, time.monotonic())
+        with contextlib.suppress(BadBatchError, Error):
+            batch, names = decode_batch(message.data), self._names
+            if names is not None and batch.names_issue > names.issue:
+                await names.read()
+            self._condition.on_batch(batch.records, {} if names is None else names.tags, time.monotonic())
 
     async def _on_message(self, message: Msg) -> None:
         self.add_message(subjects.topic_of(message.subject), message.data)

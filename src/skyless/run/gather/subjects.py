@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 JSON_FIXES: Final = "skyless.v1.{}.tag.*.fix"
 STATUSES: Final = "skyless.v1.{}.*.*.status"
+HEALTHS: Final = "skyless.v1.{}.*.*.health"
 SITES: Final = "skyless.v1.{}.site"
 FIXES: Final = "skyless.v2.{}.fixes.*"
 """Batches; the last level is the sender's host."""
