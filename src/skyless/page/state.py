@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping
 from itertools import islice
-from typing import Annotated, Any, Final, Generic, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
 import msgspec
 from msgspec import Meta, Struct
@@ -24,7 +24,7 @@ from skyless.run.mqtt.messages import (
     WrongMessageError,
     read_message,
 )
-from skyless.run.site_feed import SiteFeed
+from skyless.run.site_feed import M, Newest, SiteFeed
 from skyless.run.site_table import THRESHOLDS, Node, SiteTable
 from skyless.run.survey.checked_facts import BadFactsError, check_facts
 
@@ -311,43 +311,6 @@ def _row(fix: FixMessage, true_m: Vector | None, ended_unix_s: float) -> list[An
 #
 # The survey program computes; its messages are forwarded here, and pages' requests are checked and published.
 
-_M = TypeVar("_M", SurveyMessage, WatchMessage)
-
-
-class Newest(Generic[_M]):
-    """The newest message of a retained topic, and its age.
-
-    The first one after connecting may be old, and only its own time tells its age. Later ones are new on arrival,
-    whatever their sender's clock.
-    """
-
-    def __init__(self, name: str, clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
-        self.name = name
-        self.message: _M | None = None
-        self._clock, self._wall_clock = clock, wall_clock
-        self._first = True
-        self._made_s = 0.0
-
-    def expect_kept(self) -> None:
-        """Expect that the next message may be a retained one."""
-        self._first = True
-
-    def replace(self, message: _M | None) -> None:
-        """Replace the message; None removes it."""
-        self.message = message
-        self._made_s = self._clock()
-        if self.message is not None and self._first:
-            self._made_s -= max(0.0, self._wall_clock() - self.message.unix_s)
-        self._first = False
-
-    def age_s(self) -> float | None:
-        """Seconds since the message was made, or None without one."""
-        return None if self.message is None else self._clock() - self._made_s
-
-    def encoded(self) -> bytes:
-        """Message for pages."""
-        return encode(self.name, {self.name: self.message, "age_s": self.age_s()})
-
 
 class SiteSurvey:
     """The newest messages of the survey program. Each change is passed to ``broadcast`` for the open pages."""
@@ -361,19 +324,20 @@ class SiteSurvey:
     ) -> None:
         """``name``: of the dashboard on MQTT."""
         self._name, self._broadcast = name, broadcast
-        self.survey = Newest[SurveyMessage]("survey", clock, wall_clock)
+        self.survey = Newest[SurveyMessage](clock, wall_clock)
         """State of the survey program."""
-        self.watch = Newest[WatchMessage]("watch", clock, wall_clock)
+        self.watch = Newest[WatchMessage](clock, wall_clock)
         """Findings of the watch of the anchors."""
 
     def follow(self, feed: SiteFeed) -> None:
         """Get the messages of a feed."""
-        feed.on(SurveyMessage, lambda message, _: self._on(self.survey, message))
-        feed.on(WatchMessage, lambda message, _: self._on(self.watch, message))
+        feed.on(SurveyMessage, lambda message, _: self._on("survey", self.survey, message))
+        feed.on(WatchMessage, lambda message, _: self._on("watch", self.watch, message))
 
     def messages(self) -> dict[str, bytes]:
         """The messages that a new page needs, by kind."""
-        return {one.name: one.encoded() for one in (self.survey, self.watch) if one.message is not None}
+        found = {} if self.survey.message is None else {"survey": _encoded("survey", self.survey)}
+        return found if self.watch.message is None else found | {"watch": _encoded("watch", self.watch)}
 
     def expect_kept(self) -> None:
         """Expect retained messages, as the broker is connected again."""
@@ -402,9 +366,13 @@ class SiteSurvey:
             raise HTTPException(409, f"there is no result {serial}; the newest is {newest.serial}")
         return SurveySaveMessage(self._name, serial)
 
-    def _on(self, newest: Newest[_M], message: _M | None) -> None:
+    def _on(self, name: str, newest: Newest[M], message: M | None) -> None:
         newest.replace(message)
-        self._broadcast(newest.name, newest.encoded())
+        self._broadcast(name, _encoded(name, newest))
+
+
+def _encoded(name: str, newest: Newest[M]) -> bytes:
+    return encode(name, {name: newest.message, "age_s": newest.age_s()})
 
 
 class _SaveRequest(Struct):

@@ -10,7 +10,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable
 from functools import lru_cache
-from typing import Any, Final, Protocol
+from typing import Any, Final, Generic, Protocol, TypeVar
 
 import msgspec
 from msgspec import Struct
@@ -225,3 +225,36 @@ class SiteFeed:
             for act in self._typed.get(type(one.message), ()):
                 act(one.message, one.channel)
         self._at_s = None
+
+
+M = TypeVar("M", messages.SurveyMessage, messages.WatchMessage)
+
+
+class Newest(Generic[M]):
+    """The newest message of a retained kind, and its age.
+
+    The first one after connecting may be old, and only its own time tells its age. Later ones are new on arrival,
+    whatever their sender's clock.
+    """
+
+    def __init__(self, clock: Callable[[], float], wall_clock: Callable[[], float]) -> None:
+        self.message: M | None = None
+        self._clock, self._wall_clock = clock, wall_clock
+        self._first = True
+        self._made_s = 0.0
+
+    def expect_kept(self) -> None:
+        """Expect that the next message may be a retained one."""
+        self._first = True
+
+    def replace(self, message: M | None) -> None:
+        """Replace the message; None removes it."""
+        self.message = message
+        self._made_s = self._clock()
+        if message is not None and self._first:
+            self._made_s -= max(0.0, self._wall_clock() - message.unix_s)
+        self._first = False
+
+    def age_s(self) -> float | None:
+        """Seconds since the message was made, or None without one."""
+        return None if self.message is None else self._clock() - self._made_s

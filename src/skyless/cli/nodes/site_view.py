@@ -42,7 +42,7 @@ from skyless.run.mqtt.messages import (
     WatchMessage,
 )
 from skyless.run.process import keep, together
-from skyless.run.site_feed import Channel, SiteFeed
+from skyless.run.site_feed import Channel, Newest, SiteFeed
 from skyless.run.site_table import THRESHOLDS, Health, Node, SiteTable
 
 if TYPE_CHECKING:
@@ -135,21 +135,21 @@ class SiteView:
         self.condition = self._monitor.evaluate(clock())
         self.site: SiteMessage | None = None
         self._alarms: dict[str, AlarmMessage] = {}
-        self._watch: tuple[WatchMessage, float] | None = None  # with its creation time
+        self._watch = Newest[WatchMessage](clock, wall_clock)
         self._assets = AssetsMessage(())
         feed.on(SiteMessage, self._on_site)
         feed.on(FixMessage, lambda fix, _: self.evidence.add_fix(fix, clock(), wall_clock()))
         feed.on(StatusMessage, lambda status, _: status and self.evidence.add_status(status, clock()))
         for kind in (TagHealth, AnchorHealth, EtherHealth):
             feed.on(kind, self._on_health)
-        feed.on(WatchMessage, lambda watch, _: self._on_watch(watch))
+        feed.on(WatchMessage, lambda watch, _: self._watch.replace(watch))
         feed.on(AssetsMessage, lambda assets, _: self._on_assets(assets))
         feed.on(AlarmMessage, self._on_alarm)
         feed.attach(link, number)
         link.on_state.append(self._on_state)
 
     def _on_state(self, connected: bool) -> None:
-        self._watch = None
+        self._watch.expect_kept()
         self._alarms.clear()  # the broker sends retained alarms again
         self.table.set_connected(connected=connected, now_s=self._clock())
 
@@ -161,12 +161,6 @@ class SiteView:
 
     def _on_health(self, health: Health, channel: Channel) -> None:
         self.evidence.add_health(channel.who, channel.name, health, self._clock(), self._wall_clock())
-
-    def _on_watch(self, message: WatchMessage | None) -> None:
-        """Keep the message with its creation time: the first one after connecting may be an old, retained one."""
-        if message is not None:
-            kept_s = max(0.0, self._wall_clock() - message.unix_s) if self._watch is None else 0.0
-            self._watch = message, self._clock() - kept_s
 
     def _on_assets(self, message: AssetsMessage | None) -> None:
         self._assets = message or AssetsMessage(())
@@ -203,9 +197,9 @@ class SiteView:
         """Update the condition as the page does. ``lag_s``: delay of this call."""
         now_s = self._clock()
         self.table.tick(now_s)
-        watch, made_s = self._watch or (None, now_s)
+        watch, age_s = self._watch.message, self._watch.age_s()
         used, unread_s, refused = self._used_share(now_s), self.link.unread_s, self.link.refused
-        self.condition = self._monitor.evaluate(now_s, lag_s, watch, now_s - made_s, used, unread_s, refused)
+        self.condition = self._monitor.evaluate(now_s, lag_s, watch, age_s, used, unread_s, refused)
 
     def picture(self) -> Picture:
         """The site now."""
