@@ -89,19 +89,23 @@ class Channel(Struct, frozen=True):
     of: Kind | None = None
 
 
+_PATTERNS: Final = defaultdict[tuple[int, str], list[tuple[list[str], Kind]]](list)
+"""Levels of the topics, by their number and the last one."""
+for _kind in KINDS:
+    for _topic in _kind.topics:
+        _levels = _topic.split("/")
+        _PATTERNS[len(_levels), _levels[-1]].append((_levels, _kind))
+
+
 @lru_cache(maxsize=10_000)
 def channel_of(topic: str) -> Channel | None:
     """Parse a topic; None if it is none of a site's messages."""
     if not topic.startswith(f"{ROOT}/"):
         return None
-    site, _, rest = topic.removeprefix(f"{ROOT}/").partition("/")
-    levels = rest.split("/")
-    for kind in KINDS:
-        for pattern in kind.topics:
-            wanted = pattern.split("/")
-            if len(wanted) == len(levels) and all(
-                one in ("+", level) for one, level in zip(wanted, levels, strict=True)
-            ):
+    site, *levels = topic.removeprefix(f"{ROOT}/").split("/")
+    for last in (levels[-1], "+") if levels else ():
+        for wanted, kind in _PATTERNS.get((len(levels), last), ()):
+            if all(one in ("+", level) for one, level in zip(wanted, levels, strict=True)):
                 names = [level for one, level in zip(wanted, levels, strict=True) if one == "+"]
                 who, names = (levels[0], names[-1:]) if kind.name in ("status", "health") else ("", names)
                 return Channel(site, kind.name, "/".join(names), kind.payload, who, kind)

@@ -136,7 +136,7 @@ class Node:
 
     def reports(self, now_s: float) -> bool:
         """Whether the node is online with a fresh health message."""
-        return self.online is not False and now_s - self.health_s < THRESHOLDS.report_s
+        return now_s - self.health_s < THRESHOLDS.report_s and (self.status is None or self.status.online)
 
     def codes_for_s(self, now_s: float) -> float:
         """How long its beacons have had codes, as it states; 0 without codes."""
@@ -187,6 +187,8 @@ class SiteTable:
         """
         self.host, self.drops = host, Counter() if drops is None else drops
         self.site: Site | None = None
+        self.site_anchors: tuple[str, ...] = ()
+        """Names of the site's anchors, as far as admitted."""
         self.fixed: dict[str, Node] = {}
         """Tags of which a fix is known."""
         self.batched: dict[str, Node] = {}
@@ -235,7 +237,8 @@ class SiteTable:
         if self.site is None:
             self.ready_s = now_s
         self.site = site
-        self.site_anchors()
+        names = (*(str(one.id) for one in site.anchors), *(str(one.id) for one in site.unplaced))
+        self.site_anchors = tuple(name for name in names if self.roster.admits("anchor", name))
         tags = site.tags
         self.longest_s = THRESHOLDS.longest_s if tags.longest_silence_s is UNSET else tags.longest_silence_s
         self.longest_of_groups_s = {} if tags.group_silence_s is UNSET else tags.group_silence_s
@@ -248,12 +251,6 @@ class SiteTable:
     def is_bare(self) -> bool:
         """Whether no anchor of the site has a position yet, so that there can be no fixes."""
         return self.site is not None and not self.site.anchors
-
-    def site_anchors(self) -> list[str]:
-        """Names of the site's anchors, as far as admitted."""
-        site = self.site
-        ids = [] if site is None else [*(a.id for a in site.anchors), *(a.id for a in site.unplaced)]
-        return [name for name in map(str, ids) if self.roster.admits("anchor", name)]
 
     def add(self, kind: str, name: str, *, sends: bool = False) -> Node | None:
         """The node of this name, added if need be; None if there are too many. ``sends``: it has sent a message."""
@@ -327,8 +324,11 @@ class SiteTable:
         node.fix = fix
         self.fixed[fix.tag] = node
         self._changed(node)
-        for anchor in fix.anchors:
-            used = self.add("anchor", str(anchor), sends=True)
+        anchors = self._nodes["anchor"]
+        for anchor in map(str, fix.anchors):
+            used = anchors.get(anchor)
+            if used is None or not used.sends:
+                used = self.add("anchor", anchor, sends=True)
             if used is not None:
                 used.used_s = now_s
         return node
@@ -372,7 +372,7 @@ class SiteTable:
 
     def get(self, kind: str, name: str) -> Node | None:
         """The node of this kind and name, if known."""
-        return self.all(kind).get(name)
+        return self._nodes[kind].get(name)
 
     def all(self, kind: str) -> Mapping[str, Node]:
         """All nodes of a kind, by name."""
@@ -421,7 +421,8 @@ class SiteTable:
 
     def is_fresh(self, tag: Node, now_s: float) -> bool:
         """Whether a tag's newest fix is fresh, and its program has not ended since."""
-        return not tag.is_gone and now_s - tag.fix_s < self.fresh_for_s(tag)
+        age_s = now_s - tag.fix_s
+        return not tag.is_gone and (age_s < THRESHOLDS.fresh_s or age_s < self.fresh_for_s(tag))
 
     def is_there(self, tag: Node, now_s: float) -> bool:
         """Whether a tag has had a fix and is not gone."""
@@ -460,7 +461,7 @@ class SiteTable:
 
     def _forget(self, now_s: float) -> None:
         """Forget nodes that have been neither online nor heard for long, but for the site's own anchors."""
-        last_s, anchors = now_s - THRESHOLDS.forgotten_s, self.site_anchors()
+        last_s, anchors = now_s - THRESHOLDS.forgotten_s, self.site_anchors
         for kind, nodes in self._nodes.items():
             for name, node in list(nodes.items()):
                 newest_s = max(node.fix_s, node.health_s, node.since_s or float("-inf"))

@@ -204,7 +204,7 @@ class SiteView:
     def picture(self) -> Picture:
         """The site now."""
         now_s, site = self._clock(), self.site
-        tags, anchors = self.table.senders("tag"), {name: Node(name) for name in self.table.site_anchors()}
+        tags, anchors = self.table.senders("tag"), {name: Node(name) for name in self.table.site_anchors}
         anchors |= dict(self.table.senders("anchor"))
         drops: Counter[str] = Counter()
         for node in (*(node for _, node in tags), *anchors.values()):

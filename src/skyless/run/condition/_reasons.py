@@ -137,7 +137,8 @@ def refused_reason(topic_filters: Collection[str]) -> Reason | None:
 
 def late_reason(evidence: Evidence, ages: Mapping[str, tuple[float, float]]) -> Reason | None:
     """Positions arrive late. ``ages``: from ``FixAges.least_ages_s``."""
-    late = sorted(name for name, (age_s, _) in ages.items() if age_s > LATE_S + _key_wait_s(evidence, name))
+    late = [name for name, (age_s, _) in ages.items() if age_s > LATE_S]
+    late = sorted(name for name in late if ages[name][0] > LATE_S + _key_wait_s(evidence, name))
     if not late:
         return None
     worst = max(late, key=lambda name: ages[name][0])
@@ -325,7 +326,7 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     """Anchors of the site are offline, only cut off from the broker, or not synchronised."""
     if evidence.table.site is None:
         return
-    names = evidence.table.site_anchors()
+    names = evidence.table.site_anchors
     offline, cut_off, idle = _anchors(evidence, now_s)
     if offline:
         which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
@@ -351,7 +352,7 @@ def offline_anchors(evidence: Evidence, now_s: float) -> list[str] | None:
 
 def _anchors(evidence: Evidence, now_s: float) -> tuple[list[str], list[str], list[str]]:
     """Anchors of the site that are offline, those only cut off from the broker, and those not synchronised."""
-    names = evidence.table.site_anchors()
+    names = evidence.table.site_anchors
     offline: list[str] = []
     cut_off: list[str] = []
     idle: list[str] = []

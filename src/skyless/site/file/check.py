@@ -58,8 +58,8 @@ _SLOT = Limits(0, 254, whole=True)
 _MAX_BY_PAIRS: Final = 255  # anchors up to which all pairs are compared one by one
 _DELAY = Limits(0, 65_535, "ticks (15.65 ps)", whole=True)
 
-_SILENCE = Limits(1, 86400, "seconds")
-_GROUP_SILENCE = Limits(1, 86400, "seconds for each group, as {vehicles = 60},")
+_SILENCE = Limits(10, 86400, "seconds")
+_GROUP_SILENCE = Limits(10, 86400, "seconds for each group, as {vehicles = 60},")
 
 SITE_LIMITS: Final = {
     "id": _ADDRESS,
