@@ -26,51 +26,22 @@ from skyless.bridges.prometheus import (
 )
 from skyless.bridges.target import BridgeContext, Hub, Route, TargetUrl
 from skyless.core.errors import SkylessError
-from skyless.run.mqtt.messages import AnchorHealth, Counters, StatusMessage, TagHealth
+from skyless.run.mqtt.messages import Counters, StatusMessage, TagHealth
 from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.web import BridgeLimits
+from support import site_messages
 
 pytestmark = pytest.mark.site
 
-NO_LINK = Counters(0, 0, 0)
 CONTEXT = BridgeContext(print)
 
 
-def tag_health(tag="tag1", uptime_s=10.0, fixes=100, counters=None, mqtt=NO_LINK, **more):
-    values = {
-        "unix_s": 0.0,
-        "method": "joint",
-        "receptions": 2 * fixes,
-        "updates_per_s": 10.0,
-        "reason": None,
-        "first_fix_s": 0.1,
-        "latency_p50_s": 0.001,
-        "latency_p99_s": 0.002,
-        "cpu": 0.05,
-        "memory_bytes": 1000,
-        "phases": (),
-    }
-    return TagHealth(tag=tag, uptime_s=uptime_s, fixes=fixes, counters=counters or {}, mqtt=mqtt, **values | more)
+def tag_health(tag="tag1", fixes=100, uptime_s=10.0, **more):
+    return site_messages.tag_health(tag, fixes=fixes, receptions=2 * fixes, uptime_s=uptime_s, **more)
 
 
-def anchor_health(anchor=2, uptime_s=10.0, sent=100, **more):
-    values = {
-        "unix_s": 0.0,
-        "role": "anchor",
-        "master": 1,
-        "term": 0,
-        "synchronised": True,
-        "offset_s": 0.1,
-        "rate_ppm": -3.0,
-        "offset_std_m": 0.012,
-        "late": 1,
-        "heard": 500,
-        "superframe": 7,
-        "heard_age_s": {},
-        "counters": {"malformed": 3},
-        "mqtt": NO_LINK,
-    }
-    return AnchorHealth(anchor=anchor, uptime_s=uptime_s, sent=sent, **values | more)
+def anchor_health(**more):
+    return site_messages.anchor_health(2, offset_std_m=0.012, sent=100, counters={"malformed": 3}, **more)
 
 
 def read(metrics, now_s=100.0):

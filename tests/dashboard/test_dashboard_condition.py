@@ -10,23 +10,18 @@ from skyless.core.site import UnplacedAnchor
 from skyless.run.condition._reasons import START_S, alert_reasons
 from skyless.run.condition.evidence import Evidence
 from skyless.run.condition.monitor import EVALUATION_S, HOLD_S, ConditionMonitor
-from skyless.run.mqtt.messages import AnchorHealth, Counters, EtherHealth, TagHealth, WatchFinding, WatchMessage
+from skyless.run.mqtt.messages import EtherHealth, WatchFinding, WatchMessage
 from skyless.run.site_table import THRESHOLDS, SiteTable
+from support import site_messages
+from support.site_messages import tag_health
 
 IDS = [anchor.id for anchor in SITE.site.anchors]
-MQTT = Counters(0, 0, 0)
 HOST = "here"
 
 
 def anchor_health(anchor, unix_s, master=1, term=0, **more):
     role = "master" if anchor == master else "anchor"
-    health = AnchorHealth(*(anchor, unix_s, 60.0, role, master, term, True, 0.1, 0.5, 0.01, 9, 0, 9, 7, {}, {}, MQTT))
-    return replace(health, **more)
-
-
-def tag_health(name, unix_s, **more):
-    health = TagHealth(name, unix_s, 60.0, "joint", 400, 390, 400.0, None, 0.1, 1e-3, 2e-3, {}, MQTT, 0.1, 1, ())
-    return replace(health, **more)
+    return site_messages.anchor_health(anchor, unix_s=unix_s, role=role, master=master, term=term, **more)
 
 
 class Hall:
@@ -91,7 +86,7 @@ class Hall:
             for name in self.names:
                 more = {"receptions": self.receptions} | self.tags.get(name, {})
                 sent = unix_s - self.delay_s - self.clock_error_s
-                self.evidence.add_health("tag", name, tag_health(name, sent, **more), self.now_s, unix_s)
+                self.evidence.add_health("tag", name, tag_health(name, unix_s=sent, **more), self.now_s, unix_s)
             if self.air is not None:
                 air = replace(EtherHealth(unix_s, 1.0, 5, 0, {}, {}, 0, 0), **self.air)
                 self.evidence.add_health("ether", "air", air, self.now_s, unix_s)
@@ -344,7 +339,7 @@ def test_the_condition_is_never_good_without_fresh_evidence(steps):
             evidence.add_health("anchor", str(anchor), health, now_s, now_s)
         elif kind == "tag":
             name, late = given_values
-            evidence.add_health("tag", name, tag_health(name, now_s, late=late), now_s, now_s)
+            evidence.add_health("tag", name, tag_health(name, unix_s=now_s, late=late), now_s, now_s)
         condition = monitor.evaluate(now_s, given_values[0] if kind == "evaluate" else 0.0)
         assert condition.level in {"waiting", "good", "warning", "bad"}
         assert (condition.level in {"warning", "bad"}) == bool(condition.reasons)

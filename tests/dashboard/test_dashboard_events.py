@@ -4,7 +4,7 @@ from dashboard_builders import fix, status
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from test_dashboard_condition import anchor_health, tag_health
+from test_dashboard_condition import anchor_health
 
 from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, EventLog
 from skyless.run.condition._reasons import Reason
@@ -12,6 +12,7 @@ from skyless.run.condition.monitor import Condition
 from skyless.run.mqtt.messages import SurveyMessage, WatchFinding, WatchMessage
 from skyless.run.site_table import THRESHOLDS
 from skyless.site.survey.facts import Facts
+from support.site_messages import tag_health
 
 NOW = 1000.0
 
@@ -74,7 +75,7 @@ def test_a_status_that_the_broker_repeats_is_no_start():
 
 def test_nothing_ends_while_nothing_can_be_received():
     log = EventLog()
-    log.on_health("tag", "t1", tag_health("t1", NOW), NOW)
+    log.on_health("tag", "t1", tag_health(), NOW)
     log.on_fix(fix(alert="alert-limit-exceeded"), NOW)
     log.pause(NOW + 60)
     log.tick(NOW + 60.5)
@@ -186,7 +187,7 @@ def test_readers_get_every_event_once_in_order(steps):
     for online, name, wait_s in steps:
         now += wait_s
         log.on_status(status("tag", name, online, unix_s=now), now)
-        log.on_health("tag", name, tag_health(name, now), now)
+        log.on_health("tag", name, tag_health(name), now)
         log.tick(now)
     assert [event.serial for event in events] == list(range(1, log.serial + 1))
     assert [event.unix_s for event in events] == sorted(event.unix_s for event in events)

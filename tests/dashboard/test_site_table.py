@@ -13,9 +13,10 @@ from msgspec.structs import replace
 
 from skyless.core.site import AlarmRule
 from skyless.run.alarms import AlarmEngine
-from skyless.run.mqtt.messages import Counters, TagHealth, Zone
+from skyless.run.mqtt.messages import Zone
 from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.zones import ZoneMonitor
+from support.site_messages import tag_health
 
 REST_S = 600.0
 RATES_S = (0.02, 1.0, 5.0, 10.0, 60.0)
@@ -24,11 +25,6 @@ ROOMS = tuple(
     Zone(name, name, ((x, 0.0), (x + 10.0, 0.0), (x + 10.0, 10.0), (x, 10.0)))
     for name, x in (("a", 0.0), ("b", 20.0), ("c", 40.0))
 )
-
-
-def health(tag="t1", **more):
-    values = (tag, 0.0, 1.0, "joint", 1, 1, 1.0, None, 0.1, None, None, {}, Counters(0, 0, 0), 0.0, 0, ())
-    return replace(TagHealth(*values), **more)
 
 
 def instants(rate, until_s):
@@ -122,7 +118,7 @@ def test_a_tag_that_sleeps_by_its_own_statement_is_asleep_and_then_gone():
     table = SiteTable(0.0)
     for step in range(200):
         table.add_fix(fix(serial=step, unix_s=0.1 * step), 0.1 * step)
-    table.add_health("tag", "t1", health(sleeps_s=3600.0), 20.0)
+    table.add_health("tag", "t1", tag_health(sleeps_s=3600.0), 20.0)
     tag = table.tag("t1")
     assert table.tick(3000.0) == []
     assert table.presence(tag, 3000.0) == "asleep"
@@ -134,7 +130,7 @@ def test_a_tag_that_sleeps_by_its_own_statement_is_asleep_and_then_gone():
 
 def test_a_stated_interval_counts_before_one_is_learnt_and_the_site_states_the_longest():
     table = SiteTable(0.0)
-    table.add_health("tag", "t1", health(interval_s=120.0), 0.0)
+    table.add_health("tag", "t1", tag_health(interval_s=120.0), 0.0)
     table.add_fix(fix(), 0.0)
     tag = table.tag("t1")
     assert (table.fresh_for_s(tag), table.gone_after_s(tag)) == (300.0, 480.0)
@@ -143,7 +139,7 @@ def test_a_stated_interval_counts_before_one_is_learnt_and_the_site_states_the_l
     table.group_of = {}
     assert table.gone_after_s(tag) == 200.0
     for wrong in (-1.0, math.inf):
-        table.add_health("tag", "t1", health(interval_s=wrong, sleeps_s=wrong), 1.0)
+        table.add_health("tag", "t1", tag_health(interval_s=wrong, sleeps_s=wrong), 1.0)
         assert 0.0 <= table.gone_after_s(tag) <= 200.0
 
 
@@ -253,7 +249,7 @@ def test_a_tag_is_never_gone_and_there_at_once(steps):
         elif what in ("lost", "back"):
             table.set_connected(connected=what == "back", now_s=now_s)
         elif what == "sleep":
-            table.add_health("tag", "t1", health(sleeps_s=100.0), now_s)
+            table.add_health("tag", "t1", tag_health(sleeps_s=100.0), now_s)
         elif what == "off":
             went = ["t1"] if table.add_status(status(online=False), now_s) else []
             table.add_status(status(), now_s)
