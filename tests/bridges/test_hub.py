@@ -133,22 +133,6 @@ def test_a_tag_without_a_fix_is_reported_each_second_until_it_has_one_or_is_forg
     assert len(target.none) == 3, "a tag that left a day ago is not spoken of"
 
 
-def test_a_tag_whose_fixes_are_rare_has_none_only_when_some_are_missing():
-    target = Recorded()
-    hub = hub_of(target)
-    for step in range(4):  # a fix every four seconds
-        hub.on_fix(a_fix(serial=step + 1), 4.0 * step)
-        for quarter in range(16):
-            hub.on_tick(4.0 * step + 0.25 * quarter, 100.0 + 4.0 * step + 0.25 * quarter)
-    assert (len(target.fixes), target.seconds) == (4, 16)
-    assert [when_s for _, when_s, _ in target.none] == [102.5, 103.5], "its interval was not known then"
-    target.none.clear()
-    for quarter in range(1, 68):
-        hub.on_tick(12.0 + 0.25 * quarter, 112.0 + 0.25 * quarter)
-    assert [when_s for _, when_s, _ in target.none] == [122.0 + second for second in range(7)]
-    assert target.gone == [("tag1", 128.0)]
-
-
 def test_no_fix_of_a_tag_at_the_targets_own_rate_is_missed_because_it_came_early():
     target = Recorded()
     hub = hub_of(target, hz=50.0)

@@ -110,6 +110,7 @@ class Views:
             assert (is_fresh, sleep_s) == (age_s < fresh_s, 0.0)
             assert is_there == (age_s < gone_s)
             found[name] = answer.presence, answer.zones
+        assert self.watch.condition == self.page.condition
         assert self.page.condition.tags_with_fix == sum(presence == "fresh" for presence, _ in found.values())
         return found
 

@@ -7,7 +7,6 @@ import msgspec
 import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, fix, status
 from msgspec.structs import replace
-from starlette.exceptions import HTTPException
 
 from skyless.core.site import AlarmRule
 from skyless.page._alarms import KEPT_WAIT_S, MAX_SENT, NoAlarmError
@@ -274,25 +273,6 @@ def test_rules_of_the_page_are_stored_checked_and_sent(broker):
     assert live.alarms.rules == ()
 
 
-def test_rules_that_cannot_be_read_are_not_overwritten(broker):
-    live = broker.start("a")
-    broker.publish(topics.alarm_rules_topic(SITE_ID), b'{"rules": [{"id": "x", "kind": "new kind"}]}', retain=True)
-    with pytest.raises(WrongMessageError, match="nothing was overwritten"):
-        live.alarms.store_rules([RULE])
-    broker.publish(topics.alarm_rules_topic(SITE_ID), b"", retain=True)
-    live.alarms.store_rules([RULE])
-    assert live.dropped["alarm_rules"] == 1
-
-
-def test_wrong_messages_are_counted(live, wire):
-    message = AlarmMessage("r/t1/1", "r", "r", "inside", "warning", "t1", 1.0, 1.0, "t1 is in Desk")
-    for payload in (b"\xff", b"{}", msgspec.json.encode(message)):
-        wire.deliver(topics.alarm_topic(SITE_ID, "r", "t2"), payload)
-    wire.deliver(topics.acknowledge_topic(SITE_ID, "r", "t2"), b"[]")
-    assert (live.dropped["alarm"], live.dropped["acknowledge"]) == (3, 1)
-    assert live.alarms.messages == ()
-
-
 def test_pages_are_sent_the_newest_and_those_that_nobody_has_seen_first(live, wire):
     for k in range(MAX_SENT + 7):
         seen = 5.0 if k % 2 else None
@@ -304,13 +284,6 @@ def test_pages_are_sent_the_newest_and_those_that_nobody_has_seen_first(live, wi
     assert unseen == message["alarms"][: len(unseen)]
     assert len(unseen) == (MAX_SENT + 8) // 2
     assert [one["unix_s"] for one in unseen] == sorted((one["unix_s"] for one in unseen), reverse=True)
-
-
-def test_without_a_broker_nothing_can_be_acknowledged(live, wire):
-    one = AlarmMessage("r/t1/1", "r", "r", "inside", "info", "t1", 1.0, 1.0, "")
-    wire.deliver(STATE, one)
-    with pytest.raises(HTTPException):
-        live.acknowledge("r", "t1", "r/t1/1", "Ada")
 
 
 def test_alarms_name_assets(broker):

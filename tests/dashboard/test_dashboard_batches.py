@@ -3,7 +3,6 @@
 import msgspec
 import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, fix, status
-from msgspec.structs import replace
 
 from skyless.core.site import AlarmRule
 from skyless.page._alarms import KEPT_WAIT_S
@@ -99,25 +98,3 @@ def test_the_condition_names_tags_that_batches_have_no_longer_and_forgets_them()
     times.move(THRESHOLDS.longest_s)
     dashboard.run(4.0)
     assert {reason.kind for reason in dashboard.live.condition.reasons} == {"anchors"}
-
-
-def test_alerts_of_batches_are_reasons():
-    dashboard = Dashboard(batched=True)
-    dashboard.live.on_batched_fix(replace(fix("t1"), alert="alert-limit-exceeded"), dashboard.times.now_s)
-    dashboard.run(1.0)
-    assert "limit" in {reason.kind for reason in dashboard.live.condition.reasons}
-
-
-def test_the_same_fix_in_a_message_and_a_batch_counts_once():
-    dashboard = Dashboard(batched=False)
-    dashboard.run(1.0, t1=OUT_M)
-    serial = dashboard.live.table.fixes_serial
-    newest = dashboard.live.table.tag("t1").fix
-    dashboard.live.on_batched_fix(replace(newest, serial=0), dashboard.times.now_s + 0.1)
-    dashboard.live.table.hear(["t1"], dashboard.times.now_s + 0.1)
-    dashboard.run(0.5)
-    assert dashboard.live.table.fixes_serial == serial
-    assert dashboard.live.condition.tags == 1
-    later = replace(newest, serial=0, unix_s=newest.unix_s + 4.0)
-    dashboard.live.on_batched_fix(later, dashboard.times.now_s)  # its messages have ended
-    assert dashboard.live.table.fixes_serial == serial + 1

@@ -209,14 +209,6 @@ def test_a_fault_is_reported_within_4_s_and_gone_within_7(hall, change, back, le
     assert hall.run(7.0).level == "good"
 
 
-def test_the_cause_of_a_missing_fix_is_named(hall):
-    hall.silent, hall.tags = {"t1"}, {"t1": {"reason": "too-few-anchors"}}
-    reason = hall.run(4.0).reasons[0]
-    assert reason.text == "tag t1 has no fix: too few anchors"
-    assert reason.names == ("tag/t1",)
-    assert "offline" in reason.advice
-
-
 def test_each_tag_has_the_cause_that_it_gives():
     """Of some tags, then of all."""
     hall = Hall(("t1", "t2", "t3", "t4")).start()
@@ -224,6 +216,7 @@ def test_each_tag_has_the_cause_that_it_gives():
     hall.tags = {"t1": {"reason": "bad-geometry"}, "t2": {"reason": "no-beacons"}, "t3": {"reason": "no-beacons"}}
     hall.silent = {"t1", "t2", "t3"}
     reason = hall.run(4.0).reasons[0]
+    assert reason.names == ("tag/t1", "tag/t2", "tag/t3")
     assert reason.text == "tags t1, t2 and t3 have no fix: no beacons (tags t2 and t3); bad geometry (tag t1)"
     assert reason.advice.startswith("For tags t2 and t3: It receives no anchor")
     hall.silent = {"t1", "t2", "t3", "t4"}

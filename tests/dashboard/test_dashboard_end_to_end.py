@@ -10,21 +10,13 @@ import time
 import httpx2 as httpx
 import msgspec
 import pytest
-import uvicorn
 import websockets
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix, truth
-from websockets.protocol import State
 
-from skyless.page.app import Services, make_app
-from skyless.page.connections import AccessRules
-from skyless.page.live import IDLE_S
-from skyless.page.playback import Playback
-from skyless.page.sites import LiveSites
 from skyless.run.broker import BrokerSettings, start_broker
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import ZonesMessage
-from skyless.run.web import PAGE as LIMITS
 from support.processes import SKYLESS, free_port, running_program
 
 pytestmark = pytest.mark.site
@@ -174,43 +166,6 @@ async def never_read(port):
     )
     await asyncio.get_running_loop().sock_sendall(sock, ("\r\n".join(lines) + "\r\n\r\n").encode())
     return sock
-
-
-async def test_without_a_broker_the_page_opens_and_shows_it():
-    nobody = f"mqtt://127.0.0.1:{free_port()}"
-    async with dashboard("--mqtt", nobody) as (output, _), live_page(output) as page:
-        assert output["mqtt"] == nobody
-        hello = await next_of(page, "hello")
-        assert (hello["mqtt"], hello["site"]) == (False, None)
-        assert await next_of(page, "mqtt") == {"type": "mqtt", "connected": False, "broker": nobody}
-
-
-def test_idle_connections_shut_nobody_out_and_a_page_too_many_gets_the_reason(live, times):
-    async def check():
-        services = Services(LiveSites(live), Playback(None))
-        with socket.socket() as sock:
-            sock.bind(("127.0.0.1", 0))
-            config = uvicorn.Config(make_app(services, AccessRules()), ws="websockets-sansio", log_config=None)
-            server = uvicorn.Server(config)
-            serving = asyncio.create_task(server.serve(sockets=[sock]))
-            address = f"ws://127.0.0.1:{sock.getsockname()[1]}/live"
-            async with contextlib.AsyncExitStack() as stack:
-                await settled(lambda: server.started)
-                idle = [await stack.enter_async_context(connect(address)) for _ in range(LIMITS.pages_per_address)]
-                await settled(lambda: len(live.pages) == LIMITS.pages_per_address)
-                with pytest.raises(websockets.ConnectionClosed) as closed:
-                    async with connect(address) as refused:
-                        await refused.recv()
-                assert (closed.value.rcvd.code, closed.value.rcvd.reason[:28]) == (1013, "too many pages are open: 100")
-                times.move(IDLE_S)
-                newest = await stack.enter_async_context(connect(address))
-                assert (await next_of(newest, "hello"))["mqtt"] is False
-                await settled(lambda: any(page.state is State.CLOSED for page in idle))
-                assert len(live.pages) == LIMITS.pages_per_address
-                server.should_exit = True
-            await serving
-
-    asyncio.run(asyncio.wait_for(check(), 60.0))
 
 
 async def test_other_machines_need_the_token_that_is_printed():

@@ -70,16 +70,13 @@ def test_the_share_is_of_the_last_two_seconds(tmp_path):
     assert shares[12:] == pytest.approx([1.0] * 5)
 
 
-@pytest.mark.parametrize("text", ["", "cpu 1 2\n", "cpu a b c d e f g h\n", None])
+STILL = "cpu  5 0 5 8 2 0 0 0\n"
+
+
+@pytest.mark.parametrize("text", ["", "cpu 1 2\n", "cpu a b c d e f g h\n", STILL, None])
 def test_a_system_that_does_not_say_gives_no_share(tmp_path, text):
     counters = tmp_path / "stat"
     if text is not None:
         counters.write_text(text, encoding="ascii")
     use = ProcessorUse(counters)
-    assert [use.share(k * USE_WINDOW_S) for k in range(3)] == [None] * 3
-
-
-def test_counters_that_stand_still_give_no_share(tmp_path):
-    write(tmp_path / "stat", busy=10, idle=10)
-    use = ProcessorUse(tmp_path / "stat")
     assert [use.share(k * USE_WINDOW_S) for k in range(3)] == [None] * 3

@@ -57,34 +57,6 @@ def all_is_well(send, times, tags=("t1", "t2"), anchors=range(1, 7)):
         send(topics.health_topic(SITE_ID, "anchor", number), health)
 
 
-@pytest.mark.parametrize("trouble", ["none", "no fix", "anchor", "broker", "late", "alert"])
-def test_the_condition_is_that_of_the_page(trouble, view, live, wire, times):
-    def send(topic, message):
-        view.link.deliver(topic, message)
-        wire.deliver(topic, message)
-
-    live.on_connection(True)
-    wire.deliver(topics.site_topic(SITE_ID), SITE)
-    for step in range(30):
-        tags = ("t1",) if trouble == "no fix" and step > 10 else ("t1", "t2")
-        if tags != ("t1", "t2"):
-            send(topics.health_topic(SITE_ID, "tag", "t2"), tag_health("t2", reason="too-few-anchors"))
-        all_is_well(send, times, tags, range(1, 6) if trouble == "anchor" and step > 10 else range(1, 7))
-        if trouble == "alert" and step == 29:
-            send(topics.fix_topic(SITE_ID, "t1"), fix("t1", times.unix_s, alert="detected-not-excluded"))
-        if trouble == "late":
-            send(topics.fix_topic(SITE_ID, "t2"), fix("t2", times.unix_s, latency_s=0.4))
-        if trouble == "broker" and step == 29:
-            connect(view, False)
-            live.on_connection(False)
-        times.move(0.5)
-        live.tick()
-        view.evaluate()
-    assert view.condition == live.condition
-    assert (view.condition.level == "good") == (trouble == "none")
-    assert view.picture().condition == view.condition
-
-
 def test_a_tag_without_fixes_comes_first_and_its_age_is_in_words(view, times):
     for _ in range(4):
         all_is_well(view.link.deliver, times)
