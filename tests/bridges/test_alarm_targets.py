@@ -223,26 +223,6 @@ def test_one_failing_alarm_does_not_hold_up_another():
         ]
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("webhook+https:", "webhook+https://HOST/PATH"),
-        ("webhook+https://h/?secret_file=/nowhere/s", "cannot be read"),
-        ("webhook+https://h/?key=1", "its keys are"),
-        ("webhook+https://user@h/", "webhook\\+https:"),
-        ("smtp://h", "to="),
-        ("smtp://h?to=nobody", "NAME@HOST"),
-        ("smtp://u:secret@h?to=a@b.c", "password_file"),
-        ("smtps://h?to=a@b.c&password_file=/nowhere/s", "USER@HOST"),
-        ("smtp://u@example.org?to=a@b.c&password_file=/nowhere/s", "starttls"),
-        ("smtp://?to=a@b.c", "HOST"),
-    ],
-)
-def test_wrong_addresses(text, words):
-    with pytest.raises(SkylessError, match=words.replace("webhook+https://", r"webhook\+https://")):
-        open_target(text)
-
-
 @pytest.mark.parametrize(("content", "mode", "words"), [("x", 0o644, "chmod 600"), ("\n", 0o600, "a line of text")])
 def test_a_secret_is_for_its_owner_alone(tmp_path, content, mode, words):
     path = secret_file(tmp_path, content, mode)

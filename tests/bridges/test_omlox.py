@@ -20,10 +20,8 @@ from websockets.asyncio.server import serve
 
 from skyless.bridges import omlox
 from skyless.bridges.omlox import MAX_BATCH, OmloxPush, location
-from skyless.bridges.target import BridgeContext, TargetUrl
-from skyless.bridges.targets import open_route
+from skyless.bridges.target import TargetUrl
 from skyless.core.earth import east_north_up, east_north_up_of
-from skyless.core.errors import SkylessError
 from skyless.core.site import FloorSite
 from skyless.run.mqtt.messages import Asset
 from support.waiting import until
@@ -146,21 +144,3 @@ def test_what_waits_too_long_is_dropped_oldest_first_and_counted(monkeypatch):
     assert [one["position"]["coordinates"][0] for one in push._waiting] == [2.0, 3.0, 4.0]
     assert push.dropped["not-sent"] == 2
     assert {one["source"] for one in push._waiting} == {"skyless-7"}
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("omlox+ws://hub", "it should be omlox+ws://HOST/v2/ws/socket"),
-        ("omlox+wss:/v2/ws/socket", "it should be omlox+wss://HOST/v2/ws/socket"),
-        ("omlox+ws://hub/v2/ws/socket?zone=7", "with a UUID as zone="),
-        ("omlox+ws://hub/v2/ws/socket?token=7", "has 'token'; its keys are hz, tag, token_file, zone"),
-        ("omlox+ws://hub/v2/ws/socket?hz=20", "a number from 0.1 to 10"),
-        ("omlox+ws://hub/v2/ws/socket?token_file=/nowhere/t", "cannot be read"),
-    ],
-)
-def test_a_wrong_address_is_named(text, words):
-    with pytest.raises(SkylessError) as raised:
-        open_route(text, BridgeContext(log=lambda _line: None))
-    assert words in str(raised.value)
-    assert "\n" not in str(raised.value)

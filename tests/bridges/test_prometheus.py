@@ -125,27 +125,21 @@ def test_what_is_known_of_a_tag_and_an_anchor(metrics):
     assert "dashboard" not in str(samples)
 
 
-KEY_METRICS = ("verified", "clock_error", "not_accepted", "codes", "chain_end")
+NOT_HERE = ("position_metres", "verified", "clock_error", "not_accepted", "codes", "chain_end")
 
 
-def test_nothing_is_said_of_keys_where_there_are_none_and_nothing_old():
+def test_nothing_is_said_of_keys_where_there_are_none_nor_of_positions_unasked_and_nothing_old():
     metrics = Metrics()
     metrics.take_fix(a_fix(), 100.0)
     metrics.take_health(tag_health(), 100.0)
     metrics.take_health(anchor_health(), 100.0)
-    assert not any(name in metrics.text(100.0) for name in KEY_METRICS)
+    assert not any(name in metrics.text(100.0) for name in NOT_HERE)
     metrics.take_health(tag_health(trust="open"), 100.0)
     metrics.take_health(anchor_health(chain_ends_unix_s=1.0, code_fault="no-chain"), 100.0)
     samples = read(metrics)
     assert (samples[of_tag("tag_verified")], samples[of_tag("tag_verified_ratio")]) == (0.0, 0.0)
     assert samples["skyless_anchor_codes", ("anchor", "2")] == 0.0
-    assert not any(name in metrics.text(100.0 + 2 * THRESHOLDS.report_s) for name in KEY_METRICS)
-
-
-def test_positions_are_given_on_request_only():
-    metrics = Metrics()
-    metrics.take_fix(a_fix(), 100.0)
-    assert of_tag("tag_position_metres", axis="x") not in read(metrics)
+    assert not any(name in metrics.text(100.0 + 2 * THRESHOLDS.report_s) for name in NOT_HERE)
 
 
 def test_the_age_of_a_killed_tag_grows_from_scrape_to_scrape_and_its_gauges_end(metrics):

@@ -290,6 +290,30 @@ def test_findings_of_the_watch(hall):
     assert "does not report any more" in hall.run(1.0).text
 
 
+def test_tags_that_batches_have_no_longer_are_named_while_silence_means_something_and_then_forgotten():
+    hall = Hall(()).start()
+
+    def hear(seconds, *tags):
+        for _ in range(round(2 * seconds)):
+            unix_s = 1e9 + hall.now_s
+            for tag in tags:
+                hall.evidence.add_fix(fix(tag, unix_s), hall.now_s, unix_s, batched=True)
+            hall.table.hear(tags, hall.now_s)
+            hall.table.tick(hall.now_s)
+            condition = hall.run(0.5)
+        return {reason.kind: reason for reason in condition.reasons}
+
+    assert hear(12.0, "t1", "t2") == {}
+    silent = hear(THRESHOLDS.gone_s + 1.0, "t1")["silent"]
+    assert ("t2" in silent.text, silent.names) == (True, ("tag/t2",))
+    hall.table.set_connected(connected=False, now_s=hall.now_s, batches=True)
+    assert "silent" not in hear(10.0)
+    hall.table.set_connected(connected=True, now_s=hall.now_s, batches=True)
+    assert "no-fixes" in hear(THRESHOLDS.gone_s + 1.0)
+    hall.now_s += THRESHOLDS.longest_s
+    assert hear(4.0) == {}
+
+
 def test_a_stall_of_the_server_blames_no_anchor(hall):
     hall.now_s += 8.0  # nothing could be read meanwhile
     condition = hall.monitor.evaluate(hall.now_s, 8.0)
