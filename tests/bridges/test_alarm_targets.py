@@ -22,7 +22,7 @@ from skyless.bridges.targets import open_route
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.messages import AlarmMessage
 from skyless.run.web import BridgeLimits
-from support.waiting import until
+from support.waiting import running, until
 
 ALARM = AlarmMessage(
     "cold/t1/1795000000000", "cold", "Too long in the cold store", "inside", "critical", "t1",
@@ -48,13 +48,10 @@ def deliver(target, alarms, condition):
     """Give alarms to a target that runs, until something is so."""
 
     async def main():
-        running = asyncio.create_task(target.run())
-        for alarm in alarms:
-            target.on_alarm(alarm)
-        await until(condition)
-        running.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await running
+        async with running(target.run()):
+            for alarm in alarms:
+                target.on_alarm(alarm)
+            await until(condition)
 
     asyncio.run(main())
 
@@ -158,14 +155,11 @@ def test_receivers_that_hang_or_drip_cost_only_their_own_messages(monkeypatch):
         hub.on_site(SITE)
 
         async def main():
-            tasks = [asyncio.create_task(route.target.run()) for route in routes]
-            for k in range(100):
-                hub.on_alarm(replace(ALARM, id=f"cold/t{k}/1"))
-            await until(lambda: routes[2].target.delivered == 100)
-            await until(lambda: sum("no answer" in line for line in lines) >= 2)
-            for task in tasks:
-                task.cancel()
-            await asyncio.gather(*tasks, return_exceptions=True)
+            async with running(*(route.target.run() for route in routes)):
+                for k in range(100):
+                    hub.on_alarm(replace(ALARM, id=f"cold/t{k}/1"))
+                await until(lambda: routes[2].target.delivered == 100)
+                await until(lambda: sum("no answer" in line for line in lines) >= 2)
 
         asyncio.run(main())
         ended.set()

@@ -16,21 +16,14 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
 from skyless.bridges import foxglove
-from skyless.bridges.foxglove import (
-    SUBPROTOCOLS,
-    FoxgloveTarget,
-    Subscribe,
-    Subscription,
-    Unsubscribe,
-    decode_request,
-)
+from skyless.bridges.foxglove import SUBPROTOCOLS, FoxgloveTarget, Subscribe, Subscription, Unsubscribe, decode_request
 from skyless.bridges.target import BridgedSite
 from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
 from skyless.core.site import WallSite
 from skyless.run.mqtt.messages import Zone
 from skyless.run.web import BridgeLimits
-from support.waiting import until
+from support.waiting import running, until
 
 SITE = BridgedSite(
     1, "hall", simulated=False, anchors_m={1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.0)}, georeference=HALL, master=1,
@@ -45,13 +38,9 @@ async def served(site=SITE, origins=()):
     server = FoxgloveTarget("foxglove://:0", "127.0.0.1", 0, origins, unix_time=lambda: FIX.unix_s)
     if site is not None:
         server.on_site(site)
-    running = asyncio.create_task(server.run())
-    try:
+    async with running(server.run()):
         await until(lambda: server.port)
         yield server
-    finally:
-        running.cancel()
-        await asyncio.wait([running])
 
 
 class Client:
@@ -181,13 +170,7 @@ async def test_without_a_georeference_there_is_no_location():
     async with served(msgspec.structs.replace(SITE, georeference=None)) as server, client_of(server) as client:
         server.on_fix(FIX)
         await client.text(advertised("/tag/tag1/ellipse"))
-        assert set(client.channels) == {
-            "/site/scene",
-            "/tf",
-            "/tag/tag1/fix",
-            "/tag/tag1/pose",
-            "/tag/tag1/ellipse",
-        }
+        assert set(client.channels) == {"/site/scene", "/tf", "/tag/tag1/fix", "/tag/tag1/pose", "/tag/tag1/ellipse"}
 
 
 async def test_what_cannot_be_done_is_answered_with_a_status_and_costs_nothing():

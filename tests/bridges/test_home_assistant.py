@@ -9,14 +9,7 @@ import pytest
 from bridged_values import BARE_SITE, SITE, a_fix
 from msgspec.structs import replace
 
-from skyless.bridges.home_assistant import (
-    MAX_ANNOUNCED,
-    SETTLE_S,
-    Announcer,
-    document,
-    make_target,
-    platforms,
-)
+from skyless.bridges.home_assistant import MAX_ANNOUNCED, SETTLE_S, Announcer, document, make_target, platforms
 from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError

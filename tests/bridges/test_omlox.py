@@ -5,7 +5,6 @@ Fields and types are those of the public OpenAPI document, omlox_Hub_API_2.0.0.j
 
 import asyncio
 import json
-from contextlib import asynccontextmanager
 from datetime import datetime
 from math import dist
 from uuid import UUID
@@ -24,7 +23,7 @@ from skyless.bridges.target import TargetUrl
 from skyless.core.earth import east_north_up, east_north_up_of
 from skyless.core.site import FloorSite
 from skyless.run.mqtt.messages import Asset
-from support.waiting import until
+from support.waiting import running, until
 
 FORK = {"tag1": Asset("tag1", "Fork 7"), "tag2": Asset("tag2")}
 HALL = structs.replace(BARE_SITE, assets=FORK, simulated=False)
@@ -63,16 +62,6 @@ def test_course_floor_accuracy_and_what_is_simulated():
     upstairs = location(a_fix(position_m=(1.0, 2.0, 4.5)), structs.replace(HALL, floors=floors), "zone")
     assert (upstairs["floor"], upstairs["position"]["coordinates"]) == (1, [1.0, 2.0, 1.5])
     assert "course" not in upstairs
-
-
-@asynccontextmanager
-async def running(target):
-    task = asyncio.create_task(target.run())
-    try:
-        yield target
-    finally:
-        task.cancel()
-        await asyncio.wait([task])
 
 
 @pytest.mark.parametrize("site", [HALL, structs.replace(HALL, georeference=BERLIN)], ids=["local", "earth"])
@@ -120,7 +109,7 @@ def test_a_hub_gets_batches_with_the_token_and_its_errors_are_told(tmp_path, mon
             push.on_site(HALL)
             for serial in range(1000):
                 push.on_fix(a_fix(serial=serial, position_m=(serial / 100, 2.0, 1.5)))
-            async with running(push):
+            async with running(push.run()):
                 await until(lambda: push.dropped["refused-by-hub"])
                 push.on_fix(a_fix(position_m=(50.0, 2.0, 1.5)))
                 await until(lambda: messages[-1]["payload"][-1]["position"]["coordinates"][0] == 50.0)

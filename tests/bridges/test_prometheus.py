@@ -18,18 +18,14 @@ from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 
 from skyless.bridges import prometheus as prometheus_target
-from skyless.bridges.prometheus import (
-    LATENCY_BOUNDS_S,
-    Rising,
-    SiteMetrics,
-    make_target,
-)
+from skyless.bridges.prometheus import LATENCY_BOUNDS_S, Rising, SiteMetrics, make_target
 from skyless.bridges.target import BridgeContext, Hub, Route, TargetUrl
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.messages import Counters, StatusMessage, TagHealth
 from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.web import BridgeLimits
 from support import site_messages
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
@@ -216,27 +212,31 @@ def test_promtool_finds_nothing(metrics):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+@contextlib.asynccontextmanager
+async def served():
+    """A target that serves at a free port and has a fix."""
+    target = make_target(TargetUrl("prometheus://"), CONTEXT)
+    target.port = 0
+    hub = Hub([Route(target, None, 10.0)], print)
+    hub.on_site(SITE)
+    hub.on_fix(a_fix(), time.monotonic())
+    async with running(target.run()):
+        await until(lambda: target.port)
+        yield target
+
+
 def exchange(*requests):
     """Answers of a target that serves; each request on a connection of its own."""
 
     async def talk():
-        target = make_target(TargetUrl("prometheus://"), CONTEXT)
-        target.port = 0
-        hub = Hub([Route(target, None, 10.0)], print)
-        hub.on_site(SITE)
-        hub.on_fix(a_fix(), time.monotonic())
-        serving = asyncio.ensure_future(target.run())
-        while not target.port:
-            await asyncio.sleep(0.01)
         answers = []
-        for request in requests:
-            reader, writer = await asyncio.open_connection("127.0.0.1", target.port)
-            writer.write(request)
-            writer.write_eof()
-            answers.append(await reader.read())
-            writer.close()
-        serving.cancel()
-        await asyncio.wait([serving])
+        async with served() as target:
+            for request in requests:
+                reader, writer = await asyncio.open_connection("127.0.0.1", target.port)
+                writer.write(request)
+                writer.write_eof()
+                answers.append(await reader.read())
+                writer.close()
         return target, answers
 
     return asyncio.run(talk())
@@ -286,28 +286,17 @@ def test_what_is_no_request_is_counted_and_harms_nobody():
     assert answers[-1].startswith(b"HTTP/1.1 200")
 
 
-def test_connections_that_send_nothing_keep_no_scrape_out_and_end_with_the_server(monkeypatch):
+async def test_connections_that_send_nothing_keep_no_scrape_out_and_end_with_the_server(monkeypatch):
     monkeypatch.setattr(prometheus_target, "LIMITS", BridgeLimits(answer_s=3600.0))
-
-    async def talk():
-        target = make_target(TargetUrl("prometheus://"), CONTEXT)
-        target.port = 0
-        serving = asyncio.ensure_future(target.run())
-        while not target.port:
-            await asyncio.sleep(0.01)
+    async with served() as target:
         silent = [await asyncio.open_connection("127.0.0.1", target.port) for _ in range(100)]
         reader, writer = await asyncio.open_connection("127.0.0.1", target.port)
         writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
-        answer = await reader.read()
-        serving.cancel()
-        await asyncio.wait([serving])
-        for one, other in silent:
-            with contextlib.suppress(ConnectionError):
-                assert await one.read() == b""
-            other.close()
-        return answer
-
-    assert asyncio.run(talk()).startswith(b"HTTP/1.1 200")
+        assert (await reader.read()).startswith(b"HTTP/1.1 200")
+    for one, other in silent:
+        with contextlib.suppress(ConnectionError):
+            assert await one.read() == b""
+        other.close()
 
 
 def test_random_requests_get_an_answer():

@@ -13,11 +13,7 @@ from starlette.websockets import WebSocketDisconnect
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite
 from skyless.page.connections import AccessRules, Guard
-from skyless.page.live import (
-    GONE_S,
-    IDLE_S,
-    TooManyPagesError,
-)
+from skyless.page.live import GONE_S, IDLE_S, TooManyPagesError
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import site_message
 from skyless.run.web import PAGE as LIMITS

@@ -67,14 +67,7 @@ class Hall:
                 continue
             made = unix_s - self.delay_s - self.clock_error_s - self.latency_s
             self.evidence.add_fix(
-                fix(
-                    name,
-                    made,
-                    latency_s=self.latency_s,
-                    alert=self.alert,
-                    anchors=self.used,
-                    serial=self.receptions,
-                ),
+                fix(name, made, latency_s=self.latency_s, alert=self.alert, anchors=self.used, serial=self.receptions),
                 self.now_s,
                 unix_s,
             )

@@ -18,6 +18,7 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import ZonesMessage
 from support.processes import SKYLESS, free_port, running_program
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
@@ -36,14 +37,9 @@ async def dashboard(*arguments):
 async def site(address):
     """A node of the site, which has published the site."""
     link = Link(address, "air", site=SITE_ID, kind="ether")
-    running = asyncio.create_task(link.run())
     link.publish(topics.site_topic(SITE_ID), SITE, qos=1, retain=True)
-    try:
+    async with running(link.run()):
         yield link
-    finally:
-        running.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await running
 
 
 async def walk(link, tags=1, step_s=0.05):
@@ -76,12 +72,6 @@ async def next_of(page, kind_of_message, /, **fields):
     raise AssertionError(f"the connection ended before a {kind_of_message}")
 
 
-async def settled(condition):
-    async with asyncio.timeout(PATIENCE_S):
-        while not condition():
-            await asyncio.sleep(0.01)
-
-
 @pytest.mark.statistical
 async def test_a_site_is_found_shown_and_watched(tmp_path):
     where = BrokerSettings(port=free_port(), data=tmp_path / "broker")
@@ -109,7 +99,7 @@ async def test_a_site_is_found_shown_and_watched(tmp_path):
                     await next_of(page, "state")
                 assert len(overlay.result().json()["values"]) == 48
             assert (event["zone"], event["tag"]) == ("desk", "t0")
-            await settled(lambda: event | {"type": "zone_event"} in [seen | {"type": "zone_event"} for seen in events])
+            await until(lambda: event | {"type": "zone_event"} in [seen | {"type": "zone_event"} for seen in events])
             assert json.loads(zones[-1])["zones"][0]["id"] == "desk"
             await broker.stop()
             assert (await next_of(page, "mqtt"))["connected"] is False

@@ -13,7 +13,6 @@ from msgspec.structs import replace
 from starlette.exceptions import HTTPException
 from websockets.asyncio.client import connect as websocket
 
-from hub.small_hub import client_of, running_hub, site
 from skyless.page import hub
 from skyless.page.live import LiveSite
 from skyless.run.gather.subjects import NatsAddress
@@ -21,7 +20,8 @@ from skyless.run.hub import LISTEN_S, SILENT_S, HubLink, HubSites, make_hub_stre
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import StatusMessage, ZonesMessage
 from support.processes import SKYLESS, running_program
-from support.waiting import until
+from support.small_hub import client_of, running_hub, site
+from support.waiting import running, until
 
 NUMBER = 7
 HALL = msgspec.structs.replace(SITE, site=replace(SITE.site, id=NUMBER))
@@ -67,19 +67,16 @@ async def test_a_site_is_let_go_when_nobody_looks_and_the_next_look_connects_it_
         monkeypatch.setattr(one, "run", lambda *_: asyncio.sleep(60))
     shown = hub.ShownSites(NatsAddress("nats://none"), "here", lambda: LiveSite("here", "nats://none", at_hub=True))
     shown.known.add_site(topics.site_topic(NUMBER), msgspec.json.encode({"site": {"name": "Hall"}}))
-    running = asyncio.ensure_future(shown.run())
-    await asyncio.sleep(0)
-    live = shown.of(str(NUMBER))
-    page = live.open_page()
-    await asyncio.sleep(0.1)
-    assert shown.all == [live]
-    live.pages.discard(page)
-    await until(lambda: not shown.all)
-    assert shown.of(str(NUMBER)) is not live
-    with pytest.raises(HTTPException, match="number of a site at this hub"):
-        shown.of("8")
-    running.cancel()
-    await asyncio.gather(running, return_exceptions=True)
+    async with running(shown.run()):
+        live = shown.of(str(NUMBER))
+        page = live.open_page()
+        await asyncio.sleep(0.1)
+        assert shown.all == [live]
+        live.pages.discard(page)
+        await until(lambda: not shown.all)
+        assert shown.of(str(NUMBER)) is not live
+        with pytest.raises(HTTPException, match="number of a site at this hub"):
+            shown.of("8")
 
 
 @pytest.mark.site
@@ -88,17 +85,14 @@ async def test_a_page_that_is_started_after_a_cut_shows_the_site_and_changes_not
         address = servers.address("plant")
         async with site(tmp_path, servers.leaf("plant", NUMBER)) as broker:
             hub_client, client = await client_of(address), await client_of(broker.nats)
-            async with asyncio.timeout(60):
+            async with asyncio.timeout(60), running(_walk(client)):
                 await make_hub_streams(hub_client, servers, "plant")
-                walking = asyncio.ensure_future(_walk(client))
                 async with httpx.AsyncClient() as http, _dashboard(address, http):
                     await _until(http, "sites", lambda found: found and found[0]["name"] == HALL.site.name)
                     await _until(http, "sites", lambda found: found[0]["condition"] not in {"unknown", "cut"})
                     await _until(http, f"v1/tags?site={NUMBER}", lambda found: found and found[0]["fix"])
                 while (await hub_client.jetstream().stream_info("STATE_7")).state.messages < 3:
                     await asyncio.sleep(0.1)
-                walking.cancel()
-                await asyncio.gather(walking, return_exceptions=True)
             for one in (hub_client, client):
                 await one.close()
         async with httpx.AsyncClient() as http, _dashboard(address, http) as page, asyncio.timeout(60):
