@@ -317,17 +317,12 @@ def test_a_real_history_answers_and_a_question_that_takes_too_long_is_ended(live
         client.app.state.services.past.stop()
 
 
-def test_without_a_history(site):
-    with browser_of(site) as client:
-        answer = client.get(f"{API}/history/tags")
-        assert answer.status_code == 404
-        assert "start the page's server with --history FOLDER" in answer.json()["error"]
-
-
-def test_a_history_without_this_site(site, tmp_path):
-    with browser_of(site, history=tmp_path / "empty") as client:
-        assert client.get(f"{API}/history/tags").status_code == 404
-        assert client.get(f"{API}/history/dwell", params={"from": "soon"}).status_code == 404
+def test_without_a_history_of_this_site(site, tmp_path):
+    for folder, words in ((None, "start the page's server with --history FOLDER"), (tmp_path / "empty", "")):
+        with browser_of(site, history=folder) as client:
+            for question in ("tags", "dwell?from=soon"):
+                answer = client.get(f"{API}/history/{question}")
+                assert (answer.status_code, words in answer.json()["error"]) == (404, True)
 
 
 # Tokens
