@@ -466,14 +466,6 @@ def test_that_a_height_is_assumed_is_logged_where_the_message_cannot_say_it(prof
     assert [("EK3_SRC1_POSZ 1" in line) for line in said] == ([True] if profile == "ardupilot" else [])
 
 
-def test_targets_log_what_they_assume():
-    said = []
-    target = open_route("mavlink+udpout://127.0.0.1:9?profile=px4", BridgeContext(said.append)).target
-    target.on_site(BARE_SITE)
-    target.on_fix(a_fix())
-    assert len([line for line in said if "where north is" in line]) == 1
-
-
 def test_the_heading_of_a_site_that_has_none_can_be_given():
     made = encoder("ardupilot", BARE_SITE, heading_deg=90.0)
     (found,) = parse(b"".join(made.on_fix(a_fix(position_m=(1.0, 2.0, 3.0)))))

@@ -1,5 +1,7 @@
 """Messages of a small site, an MQTT that only remembers, and a client of the server."""
 
+import asyncio
+import json
 from itertools import count
 
 import msgspec
@@ -83,6 +85,17 @@ class Wire:
 
     def topics(self):
         return [topic for topic, *_ in self.published]
+
+
+def drained(live, page=None):
+    """What waits for a page, or for one that is opened now."""
+    page = page or live.open_page()
+    return [json.loads(message) for message in asyncio.run(asyncio.wait_for(page.drain(live.state), 1.0))]
+
+
+def of(kind, messages):
+    """Those of a kind."""
+    return [message for message in messages if message["type"] == kind]
 
 
 HERE = "http://localhost:8080"

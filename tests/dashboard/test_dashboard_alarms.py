@@ -1,11 +1,8 @@
 """Alarms of the live site: one of several dashboards publishes them, and pages are sent them and their rules."""
 
-import asyncio
-import json
-
 import msgspec
 import pytest
-from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, fix, status
+from dashboard_builders import SITE, SITE_ID, SQUARE, Times, Wire, drained, fix, of, status
 from msgspec.structs import replace
 
 from skyless.core.site import AlarmRule
@@ -110,14 +107,6 @@ def broker():
     return broker
 
 
-def sent(live, kind):
-    page = live.open_page()
-    messages = [json.loads(text) for text in asyncio.run(asyncio.wait_for(page.drain(live.state), 1.0))]
-    live.pages.discard(page)
-    (found,) = [message for message in messages if message["type"] == kind]
-    return found
-
-
 def test_an_alarm_is_published_kept_acknowledged_and_cleared(broker):
     live = broker.start("a")
     broker.run(KEPT_WAIT_S - 0.2, IN)
@@ -125,7 +114,7 @@ def test_an_alarm_is_published_kept_acknowledged_and_cleared(broker):
     broker.run(1.2, IN)
     alarm = broker.alarm()
     assert (alarm.rule, alarm.subject, alarm.place, alarm.ended_unix_s) == ("r", "t1", "Desk", None)
-    assert [one["id"] for one in sent(live, "alarms")["alarms"]] == [alarm.id]
+    assert [one["id"] for one in of("alarms", drained(live))[0]["alarms"]] == [alarm.id]
     assert any("alarm r: t1 has been in Desk" in event.text for event in live.log.events)
     with pytest.raises(NoAlarmError):
         live.acknowledge("r", "t1", "another", "Ada")
@@ -137,7 +126,7 @@ def test_an_alarm_is_published_kept_acknowledged_and_cleared(broker):
     assert broker.alarm() is None
     assert broker.happened[-1].ended_unix_s is not None
     assert live.alarms.messages == ()
-    assert sent(live, "alarms") == {"type": "alarms", "alarms": [], "more": 0}
+    assert of("alarms", drained(live))[0] == {"type": "alarms", "alarms": [], "more": 0}
 
 
 def test_of_two_dashboards_one_raises_and_the_other_goes_on(broker):
@@ -243,8 +232,8 @@ def test_an_acknowledgement_that_the_first_did_not_publish_is_published_by_the_n
 def test_rules_of_the_page_are_stored_checked_and_sent(broker):
     live = broker.start("a")
     broker.run(0.2)
-    assert [rule["id"] for rule in sent(live, "alarm_rules")["rules"]] == ["r"]
-    assert [rule["id"] for rule in sent(live, "alarm_rules")["file_rules"]] == ["file"]
+    assert [rule["id"] for rule in of("alarm_rules", drained(live))[0]["rules"]] == ["r"]
+    assert [rule["id"] for rule in of("alarm_rules", drained(live))[0]["file_rules"]] == ["file"]
     new = AlarmRule("quiet", "silent", after_s=5.0)
     live.alarms.store_rules([RULE, new], SITE.site.name)
     broker.run(0.2)
@@ -268,7 +257,7 @@ def test_pages_are_sent_the_newest_and_those_that_nobody_has_seen_first(live, wi
         seen = 5.0 if k % 2 else None
         one = AlarmMessage(f"r/t{k}/{k}", "r", "r", "inside", "info", f"t{k}", k, k, "", acknowledged_unix_s=seen)
         wire.deliver(topics.alarm_topic(SITE_ID, "r", f"t{k}"), one)
-    message = sent(live, "alarms")
+    message = of("alarms", drained(live))[0]
     assert (len(message["alarms"]), message["more"]) == (MAX_SENT, 7)
     unseen = [one for one in message["alarms"] if one["acknowledged_unix_s"] is None]
     assert unseen == message["alarms"][: len(unseen)]

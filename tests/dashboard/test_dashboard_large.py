@@ -4,10 +4,9 @@ import json
 
 import msgspec
 import pytest
-from dashboard_builders import SITE, SITE_ID, fix, status
+from dashboard_builders import SITE, SITE_ID, drained, fix, of, status
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
-from test_dashboard_live import drained, of
 
 from skyless.page.live2 import View
 from skyless.page.state import MAX_ROWS, PageRequest, read_request
@@ -72,7 +71,7 @@ def test_what_is_not_taken_in_is_counted_and_not_judged(live, wire, times, monke
         ("not-shown", "3 tags and 3 anchors are not shown")
     ]
     assert (condition.tags, condition.anchors) == (5, 6)
-    messages = drained(live, live.open_page())
+    messages = drained(live)
     assert len(of("state", messages)[0]["tags"]) == 5
     assert len(of("health", messages)[0]["conditions"]) == 6
     assert [event.text for event in live.log.events if event.name in {"anchor/7", "anchor/8", "anchor/9"}] == []

@@ -1,11 +1,10 @@
 """Messages from MQTT reach the board, the zones and the pages; wrong ones are counted."""
 
-import asyncio
 import json
 
 import msgspec
 import pytest
-from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status, truth
+from dashboard_builders import SITE, SITE_ID, SQUARE, drained, fix, of, status, truth
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 
@@ -19,14 +18,6 @@ HELLO = ("type", "version", "site", "events", "mqtt", "history", "live2", "hub")
 EVENT = topics.zone_event_topic(SITE_ID, "desk")
 
 
-def drained(live, page):
-    return [json.loads(message) for message in asyncio.run(asyncio.wait_for(page.drain(live.state), 1.0))]
-
-
-def of(kind, messages):
-    return [message for message in messages if message["type"] == kind]
-
-
 def enter_the_desk(live, wire):
     live.store_zones((SQUARE,))
     wire.deliver(FIX, fix())
@@ -35,7 +26,7 @@ def enter_the_desk(live, wire):
 
 def test_a_page_first_gets_hello(live, wire):
     wire.deliver(FIX, fix())
-    messages = drained(live, live.open_page())
+    messages = drained(live)
     assert messages[0]["type"] == "hello"
     assert messages[0].keys() == {*HELLO, "thresholds", "zones", "other_zones", "zones_fault"}
     assert (messages[0]["site"], messages[0]["zones"], messages[0]["mqtt"]) == (None, [], False)
@@ -52,7 +43,7 @@ def test_pages_are_sent_the_site_and_the_state_of_the_broker(live, wire):
     assert of("site", messages)[0]["site"]["site"]["name"] == SITE.site.name
     assert of("site", messages)[0]["site"]["simulated"] is True
     assert of("mqtt", messages)[0]["connected"] is True
-    assert drained(live, live.open_page())[0]["site"]["site"]["id"] == SITE_ID
+    assert drained(live)[0]["site"]["site"]["id"] == SITE_ID
 
 
 def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):
@@ -109,7 +100,7 @@ def test_wrong_messages_are_counted_and_change_nothing(live, wire, topic, payloa
     assert live.table.fixes_serial == 0
     assert live.site is None
     assert live.monitor.zones == ()
-    counted = of("health", drained(live, live.open_page()))[0]["dropped"]
+    counted = of("health", drained(live))[0]["dropped"]
     assert counted == {topic.rsplit("/", 1)[-1]: 1}
 
 
@@ -122,7 +113,7 @@ def test_zones_are_retained_and_events_have_quality_of_service_1(live, wire):
     messages = drained(live, page)
     assert of("zones", messages)[0]["zones"][0]["id"] == "desk"
     assert of("zone_event", messages) == [{"type": "zone_event", **event}]
-    assert drained(live, live.open_page())[0]["events"] == [event]
+    assert drained(live)[0]["events"] == [event]
 
 
 def test_the_echo_of_an_own_event_is_not_sent_again(live, wire):
@@ -206,7 +197,7 @@ def test_named_zones_wait_for_the_site(live, wire):
 
 def test_damaged_zones_at_the_broker_are_shown_as_a_fault(live, wire):
     wire.deliver(ZONES, b'{"zones": [{"id": ')
-    fault = drained(live, live.open_page())[0]["zones_fault"]
+    fault = drained(live)[0]["zones_fault"]
     assert ZONES in fault
     assert "\n" not in fault
 
