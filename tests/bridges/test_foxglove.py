@@ -23,6 +23,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.site import WallSite
 from skyless.run.mqtt.messages import Zone
 from skyless.run.web import BridgeLimits
+from support.unread import unread_websocket
 from support.waiting import running, until
 
 SITE = BridgedSite(
@@ -54,26 +55,27 @@ class Client:
     async def ask(self, **request):
         await self._connection.send(json.dumps(request))
 
+    async def _next(self):
+        """The next message if it is of a channel; texts are kept."""
+        data = await asyncio.wait_for(self._connection.recv(), ANSWER_S)
+        if isinstance(data, bytes):
+            return data
+        self.texts.append(json.loads(data))
+        self.channels |= {channel["topic"]: channel for channel in self.texts[-1].get("channels", ())}
+        return None
+
     async def receive(self):
-        """The next message of a channel, as its subscription, its time and its JSON; texts are kept on the way."""
-        while True:
-            data = await asyncio.wait_for(self._connection.recv(), ANSWER_S)
-            if isinstance(data, bytes):
-                operation, subscription, time_ns = struct.unpack_from("<BIQ", data)
-                assert operation == 1
-                return subscription, time_ns, json.loads(data[13:])
-            text = json.loads(data)
-            self.texts.append(text)
-            for channel in text.get("channels", ()):
-                self.channels[channel["topic"]] = channel
+        """The next message of a channel, as its subscription, its time and its JSON."""
+        while (data := await self._next()) is None:
+            pass
+        operation, subscription, time_ns = struct.unpack_from("<BIQ", data)
+        assert operation == 1
+        return subscription, time_ns, json.loads(data[13:])
 
     async def text(self, wanted):
         """The next text that is wanted."""
         while not any(map(wanted, self.texts)):
-            data = json.loads(await asyncio.wait_for(self._connection.recv(), ANSWER_S))
-            self.texts.append(data)
-            for channel in data.get("channels", ()):
-                self.channels[channel["topic"]] = channel
+            assert await self._next() is None
         return next(filter(wanted, self.texts))
 
 
@@ -242,19 +244,11 @@ async def test_a_client_that_never_reads_is_disconnected_and_others_get_every_fi
 
 async def stuck_socket(port, channels):
     """A client that subscribes everything and then never reads."""
-    sock = socket.socket()
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    sock.setblocking(False)
-    loop = asyncio.get_running_loop()
-    await loop.sock_connect(sock, ("127.0.0.1", port))
-    lines = ("GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket", "Connection: Upgrade",
-             "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13",
-             "Sec-WebSocket-Protocol: foxglove.sdk.v1", "", "")  # fmt: skip
-    await loop.sock_sendall(sock, "\r\n".join(lines).encode())
+    sock = await unread_websocket(port, "/", "Sec-WebSocket-Protocol: foxglove.sdk.v1")
     subscriptions = [{"id": number, "channelId": number} for number in channels]
     text = json.dumps({"op": "subscribe", "subscriptions": subscriptions}).encode()
     masked = bytes([0x81, 0x80 | 126]) + struct.pack(">H", len(text)) + bytes(4) + text  # a mask of zeros
-    await loop.sock_sendall(sock, masked)
+    await asyncio.get_running_loop().sock_sendall(sock, masked)
     return sock
 
 

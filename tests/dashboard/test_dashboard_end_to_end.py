@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import json
 import signal
-import socket
 import time
 
 import httpx2 as httpx
@@ -18,6 +17,7 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import ZonesMessage
 from support.processes import SKYLESS, free_port, running_program
+from support.unread import unread_websocket
 from support.waiting import running, until
 
 pytestmark = pytest.mark.site
@@ -128,7 +128,7 @@ async def test_a_page_that_does_not_read_delays_no_other(tmp_path):
     ):
         walking = asyncio.create_task(walk(link, tags=100))
         port = int(output["page"].rstrip("/").rsplit(":", 1)[1])
-        unread = [await never_read(port) for _ in range(3)]
+        unread = [await unread_websocket(port, "/live") for _ in range(3)]
         async with live_page(output) as page:
             await next_of(page, "state")
             for _ in range(80):
@@ -138,24 +138,6 @@ async def test_a_page_that_does_not_read_delays_no_other(tmp_path):
         walking.cancel()
         for sock in unread:
             sock.close()
-
-
-async def never_read(port):
-    """A page whose socket takes little and is never read."""
-    sock = socket.socket()
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    sock.setblocking(False)
-    await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
-    lines = (
-        "GET /live HTTP/1.1",
-        f"Host: 127.0.0.1:{port}",
-        "Connection: Upgrade",
-        "Upgrade: websocket",
-        "Sec-WebSocket-Version: 13",
-        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
-    )
-    await asyncio.get_running_loop().sock_sendall(sock, ("\r\n".join(lines) + "\r\n\r\n").encode())
-    return sock
 
 
 async def test_other_machines_need_the_token_that_is_printed():
