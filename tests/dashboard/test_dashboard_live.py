@@ -6,11 +6,9 @@ import msgspec
 import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, drained, fix, of, status, truth
 from msgspec.structs import replace
-from test_dashboard_condition import anchor_health
 
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import SiteZones, ZoneEvent, ZonesMessage
-from skyless.run.site_table import THRESHOLDS
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)
@@ -65,24 +63,6 @@ def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):
     assert of("health", messages)
     assert not of("state", messages), "there is nothing new"
     assert of("condition", messages)[0]["unix_s"] == times.unix_s
-
-
-@pytest.mark.parametrize("clock_error_s", [0.0, 3600.0, -3600.0])
-def test_a_row_has_the_time_of_its_fix_by_the_servers_clock_however_late_it_comes(live, wire, times, clock_error_s):
-    def time_of_fix(late_s=0.0, error_s=clock_error_s):
-        times.move(0.1 + late_s)  # a late fix does not overtake the one before it
-        wire.deliver(FIX, fix(unix_s=times.unix_s - late_s + error_s, latency_s=0.0))
-        return json.loads(live.state.state_since(live.table.fixes_serial - 1))["tags"][0][15] - times.unix_s
-
-    assert time_of_fix() == pytest.approx(0.0, abs=1e-3)
-    assert time_of_fix(late_s=2.0) == pytest.approx(-2.0, abs=1e-3)
-    assert time_of_fix() == pytest.approx(0.0, abs=1e-3)
-    assert time_of_fix(error_s=clock_error_s - 7200.0) == pytest.approx(0.0, abs=1e-3), "its clock was set back"
-    times.move(500.0)
-    live.tick()
-    page = live.open_page()
-    (state,) = of("state", drained(live, page))
-    assert state["unix_s"] - state["tags"][0][15] == pytest.approx(500.0, abs=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -206,30 +186,3 @@ def test_the_truth_reaches_the_rows(live, wire):
     wire.deliver(topics.truth_topic(SITE_ID), truth(position_m=(2.0, 2.03, 1.0)))
     wire.deliver(FIX, fix(position_m=(2.0, 2.0, 1.0)))
     assert live.state.rows_since(0)[0][10] == pytest.approx(0.03)
-
-
-def test_neither_a_clock_that_is_set_nor_an_absent_broker_nor_a_stall_makes_anchors_silent(live, wire, times):
-    def pass_time(seconds, lag_s=0.0):
-        times.move(seconds)
-        live.tick(lag_s)
-
-    def report():
-        wire.deliver(topics.health_topic(SITE_ID, "anchor", "1"), anchor_health(1, times.unix_s))
-
-    live.on_connection(connected=True)
-    report()
-    times.unix_s += 3600.0
-    pass_time(1.0)
-    live.on_connection(connected=False)
-    for _ in range(20):
-        pass_time(0.5)
-    live.on_connection(connected=True)
-    pass_time(0.5)
-    report()
-    pass_time(8.0, lag_s=8.0)
-    pass_time(0.5)
-    pass_time(0.5)
-    assert [event for event in live.log.events if event.kind == "anchor"] == []
-    pass_time(THRESHOLDS.report_s)
-    (event,) = [event for event in live.log.events if event.kind == "anchor"]
-    assert (event.text, event.unix_s) == ("anchor 1 does not report any more", times.unix_s)
