@@ -230,6 +230,12 @@ def test_the_live_stream(browser, live):
         browser.portal.call(_fix_and_tick, live)
         messages = [socket.receive_json() for _ in range(3)]  # health, condition, state
         assert [message["tags"][0][0] for message in messages if message["type"] == "state"] == ["t1"]
+        (page,) = live.pages
+        browser.portal.call(page.close, "this page was idle")
+        with pytest.raises(WebSocketDisconnect) as closed:
+            while True:
+                socket.receive_json()
+        assert (closed.value.code, closed.value.reason) == (1001, "this page was idle")
 
 
 async def _fix_and_tick(live):

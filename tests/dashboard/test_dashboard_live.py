@@ -9,6 +9,8 @@ from msgspec.structs import replace
 
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import SiteZones, ZoneEvent, ZonesMessage
+from skyless.run.site_feed import KINDS
+from support.site_messages import tag_health
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)
@@ -71,6 +73,7 @@ def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):
         (FIX, b""),
         (topics.site_topic(SITE_ID), replace(SITE, site=replace(SITE.site, id=SITE_ID + 1))),
         (topics.site_topic(SITE_ID), replace(SITE, site=replace(SITE.site, anchors=()))),
+        (topics.assets_topic(SITE_ID), b'{"assets": [{"tag": "a b"}]}'),
         (ZONES, b'{"zones":[{"id":"a","name":"A","polygon_m":[[0,0],[1,1]]}]}'),
     ],
 )
@@ -182,7 +185,18 @@ def test_damaged_zones_at_the_broker_are_shown_as_a_fault(live, wire):
     assert "\n" not in fault
 
 
-def test_the_truth_reaches_the_rows(live, wire):
+def test_what_the_broker_has_cleared_is_no_fault(live, wire):
+    for kind in KINDS:
+        for topic in kind.topics if kind.retained else ():
+            wire.deliver(f"{topics.ROOT}/{SITE_ID}/{topic.replace('+', '1')}", b"")
+    assert not live.dropped
+
+
+def test_the_truth_reaches_the_rows_and_health_the_alarms(live, wire, monkeypatch):
+    heard = []
+    monkeypatch.setattr(live.alarms.engine, "on_health", heard.append)
+    wire.deliver(topics.health_topic(SITE_ID, "tag", "t1"), tag_health())
+    assert heard == [tag_health()]
     wire.deliver(topics.truth_topic(SITE_ID), truth(position_m=(2.0, 2.03, 1.0)))
     wire.deliver(FIX, fix(position_m=(2.0, 2.0, 1.0)))
     assert live.state.rows_since(0)[0][10] == pytest.approx(0.03)

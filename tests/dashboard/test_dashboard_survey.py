@@ -188,6 +188,7 @@ def test_nothing_is_accepted_without_a_broker(browser, wire, live):
         ("PUT", "/api/survey/facts", msgspec.json.encode(FACTS)),
         ("POST", "/api/survey/save", b'{"serial": 3}'),
         ("PUT", "/api/floor_plan", IMAGE),
+        ("POST", "/api/v1/alarms/r/t1/acknowledge", b'{"id": "x", "by": "y"}'),
     ):
         answer = browser.request(method, path, content=body)
         assert answer.status_code == 503
