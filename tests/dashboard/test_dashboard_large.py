@@ -56,7 +56,7 @@ def test_a_healthy_large_site_is_good_and_says_how_many_are_shown(live, wire, ti
     assert len(of("health", messages)[0]["conditions"]) == anchors
     (state,) = of("state", messages)
     assert (len(state["tags"]), state.get("of")) == (min(tags, MAX_ROWS), tags if tags > MAX_ROWS else None)
-    page.ask(PageRequest((-9.0, -9.0, -8.0, -8.0), tags=("t2",)))
+    page.ask(PageRequest((0.0, -9.0, 9.5, -8.0), tags=("t2",)))
     times.move(1.0)
     live.tick()
     (state,) = of("state", drained(live, page)) if tags > MAX_ROWS else [{"inside": 0, "left": state["tags"][1:]}]
