@@ -26,16 +26,18 @@ import uvicorn
 from msgspec.structs import replace
 from playwright.sync_api import sync_playwright
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "dashboard"))
+TESTS = Path(__file__).parents[1] / "tests"
+sys.path[:0] = [str(TESTS), str(TESTS / "dashboard")]
 from dashboard_builders import SITE, SITE_ID, Times, Wire, fix
 from page_browser import CHROMIUM, FLAGS, until
-from test_dashboard_condition import anchor_health, tag_health
+from test_dashboard_condition import anchor_health
 
 from skyless.page.app import Services, make_app
 from skyless.page.connections import AccessRules
 from skyless.page.live import LiveSite
 from skyless.page.sites import LiveSites
 from skyless.run.mqtt import topics
+from support.site_messages import tag_health
 
 QUICK = ((50, 8),)
 SERVER = ((20, 8), (1_900, 8), (3_000, 8), (10_000, 8), (100_000, 8), (3, 1_000), (3, 3_000), (3, 10_000), (250_000, 8))
@@ -86,7 +88,9 @@ class Site:
         for n in range(1 + part, self.anchors + 1, parts):
             self.live.feed.receive(topics.health_topic(SITE_ID, "anchor", str(n)), encode(anchor_health(n, unix_s)))
         for k in range(tags):
-            self.live.feed.receive(topics.health_topic(SITE_ID, "tag", f"t{k}"), encode(tag_health(f"t{k}", unix_s)))
+            self.live.feed.receive(
+                topics.health_topic(SITE_ID, "tag", f"t{k}"), encode(tag_health(f"t{k}", unix_s=unix_s))
+            )
 
 
 def server_row(tags, anchors):

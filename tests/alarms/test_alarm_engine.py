@@ -13,18 +13,10 @@ from skyless.core.alert import Alert
 from skyless.core.site import AlarmRule
 from skyless.run import alarms as engine_module
 from skyless.run.alarms import EVALUATION_S, STOREY_M, AlarmEngine, Concerned, is_over, near_tags
-from skyless.run.mqtt.messages import (
-    Asset,
-    Counters,
-    FixMessage,
-    StatusMessage,
-    TagHealth,
-    WatchFinding,
-    WatchMessage,
-    Zone,
-)
+from skyless.run.mqtt.messages import Asset, StatusMessage, WatchFinding, WatchMessage, Zone
 from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.zones import ZoneMonitor
+from support.site_messages import a_fix, diagonal, tag_health
 
 HALL = Zone("hall", "Hall", ((0.0, 0.0), (10.0, 0.0), (10.0, 10.0), (0.0, 10.0)))
 IN, OUT = (5.0, 5.0), (15.0, 5.0)
@@ -32,12 +24,8 @@ EPOCH_S = 1_795_000_000.0
 
 
 def fix(tag, at_s, place, *, z=1.0, **more):
-    variance = 1e-4
-    covariance = (variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, variance)
-    return FixMessage(
-        tag, 1, EPOCH_S + at_s, at_s, (*place, z), covariance, None, None, 0.01, 1.0, 1.0, 1.0, 1.0,
-        (1, 2, 3, 4), 1.0, 1, 0.01, "joint", False, 0.001, **more,
-    )  # fmt: skip
+    given = {"unix_s": EPOCH_S + at_s, "position_m": (*place, z), "covariance_m2": diagonal(1e-4, 1e-4, 1e-4)}
+    return a_fix(tag, **given | more)
 
 
 class Site:
@@ -243,12 +231,6 @@ def test_protection_levels():
     assert "unknown" in site.last.sentence
 
 
-def health(tag, share):
-    return TagHealth(
-        tag, 0.0, 1.0, "joint", 1, 1, 1.0, None, 0.1, None, None, {}, Counters(0, 0, 0), 0.0, 0, (), battery_share=share
-    )
-
-
 def test_battery():
     site = Site(AlarmRule("r", "battery", limit=0.2, hysteresis=0.1))
     for share, expected in (
@@ -258,7 +240,7 @@ def test_battery():
         (0.25, []),
         (0.4, [("ended", "r", "t")]),
     ):
-        site.hear_health(health("t", share))
+        site.hear_health(tag_health("t", battery_share=share))
         assert site.run(2.0) == expected
     assert site.happened[0][1].sentence == "the battery of t is at 8%; 20% is the least"
 
@@ -275,7 +257,7 @@ def worst_of_levels(values):
 def worst_of_batteries(values):
     site = Site(AlarmRule("r", "battery", limit=0.9))
     for share in values:
-        site.hear_health(health("t", share))
+        site.hear_health(tag_health("t", battery_share=share))
         site.run(0.5)
     return site
 
@@ -423,7 +405,7 @@ RULES = (
 def test_another_engine_goes_on_from_what_is_kept():
     site = Site(*RULES)
     site.places = {"a": IN, "b": (5.5, 5.0), "c": OUT, "d": OUT}
-    site.hear_health(health("a", 0.1))
+    site.hear_health(tag_health("a", battery_share=0.1))
     site.run(2.0)
     del site.places["d"]
     site.run(5.0)

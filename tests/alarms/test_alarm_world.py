@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1])
 def test_every_crossing_silence_and_contact_is_raised_once_and_soon(seed, monkeypatch):
     monkeypatch.setattr(alarm_world, "COUNT", 6)
     monkeypatch.setattr(alarm_world, "RULES", tuple(replace(one, tags=one.tags[:6]) for one in alarm_world.RULES))
@@ -20,7 +20,7 @@ def test_every_crossing_silence_and_contact_is_raised_once_and_soon(seed, monkey
     assert alarm_world.percentile(every, 0.99) <= 1.0
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_server_killed_at_random_raises_nothing_twice_and_loses_no_acknowledgement(seed, monkeypatch):
     monkeypatch.setattr(alarm_world, "COUNT", 4)
     world = alarm_world.World(100.0, seed)

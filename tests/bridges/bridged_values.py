@@ -1,44 +1,27 @@
 """Sites and fixes for tests of bridges."""
 
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from skyless.bridges.target import BridgedSite
 from skyless.core.site import GeoreferenceSite
-from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth
+from skyless.run.mqtt.messages import FixMessage
+from support.site_messages import diagonal
 
 BERLIN = GeoreferenceSite(latitude_deg=52.512345678, longitude_deg=13.326, height_m=34.5, heading_deg=30.0)
 SITE = BridgedSite(7, "hall", True, {1: (0.0, 0.0, 2.5), 2: (6.0, 0.0, 2.5)}, BERLIN)
 BARE_SITE = BridgedSite(7, "hall", True, {1: (0.0, 0.0, 2.5)}, None)
 
 
+FIX = FixMessage(
+    "tag1", 1, 1_795_000_000.25, 12.0, (1.0, 2.0, 1.5), (0.0025, 0.001, 0.0, 0.001, 0.0036, 0.0005, 0.0, 0.0005, 0.01),
+    (0.5, -0.25, 0.125), diagonal(0.01, 0.02, 0.03), 0.13, 3.0, 2.5, 1.5, 2.0, (1, 2, 3, 4, 5, 6), 3.0, 3, 0.03,
+    "joint", False, 0.004,
+)  # fmt: skip
+
+
 def a_fix(**changes):
-    values = dict(  # noqa: C408
-        tag="tag1",
-        serial=1,
-        unix_s=1_795_000_000.25,
-        time_s=12.0,
-        position_m=(1.0, 2.0, 1.5),
-        covariance_m2=(0.0025, 0.001, 0.0, 0.001, 0.0036, 0.0005, 0.0, 0.0005, 0.01),
-        velocity_mps=(0.5, -0.25, 0.125),
-        velocity_covariance=(0.01, 0.0, 0.0, 0.0, 0.02, 0.0, 0.0, 0.0, 0.03),
-        std_m=0.13,
-        gdop=3.0,
-        pdop=2.5,
-        hdop=1.5,
-        vdop=2.0,
-        anchors=(1, 2, 3, 4, 5, 6),
-        chi2=3.0,
-        dof=3,
-        residual_rms_m=0.03,
-        method="joint",
-        height_known=False,
-        latency_s=0.004,
-    )
-    return FixMessage(**values | changes)
-
-
-def tag_health(tag):
-    return TagHealth(tag, 0.0, 1.0, "joint", 1, 1, 1.0, None, 0.1, None, None, {}, Counters(0, 0, 0), 0.0, 0, ())
+    return replace(FIX, **changes)
 
 
 _metres = st.floats(-8000.0, 8000.0)

@@ -16,21 +16,15 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 
 from skyless.bridges import foxglove
-from skyless.bridges.foxglove import (
-    SUBPROTOCOLS,
-    FoxgloveTarget,
-    Subscribe,
-    Subscription,
-    Unsubscribe,
-    decode_request,
-)
+from skyless.bridges.foxglove import SUBPROTOCOLS, FoxgloveTarget, Subscribe, Subscription, Unsubscribe, decode_request
 from skyless.bridges.target import BridgedSite
 from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
 from skyless.core.site import WallSite
 from skyless.run.mqtt.messages import Zone
 from skyless.run.web import BridgeLimits
-from support.waiting import until
+from support.unread import unread_websocket
+from support.waiting import running, until
 
 SITE = BridgedSite(
     1, "hall", simulated=False, anchors_m={1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.0)}, georeference=HALL, master=1,
@@ -45,13 +39,9 @@ async def served(site=SITE, origins=()):
     server = FoxgloveTarget("foxglove://:0", "127.0.0.1", 0, origins, unix_time=lambda: FIX.unix_s)
     if site is not None:
         server.on_site(site)
-    running = asyncio.create_task(server.run())
-    try:
+    async with running(server.run()):
         await until(lambda: server.port)
         yield server
-    finally:
-        running.cancel()
-        await asyncio.wait([running])
 
 
 class Client:
@@ -65,26 +55,27 @@ class Client:
     async def ask(self, **request):
         await self._connection.send(json.dumps(request))
 
+    async def _next(self):
+        """The next message if it is of a channel; texts are kept."""
+        data = await asyncio.wait_for(self._connection.recv(), ANSWER_S)
+        if isinstance(data, bytes):
+            return data
+        self.texts.append(json.loads(data))
+        self.channels |= {channel["topic"]: channel for channel in self.texts[-1].get("channels", ())}
+        return None
+
     async def receive(self):
-        """The next message of a channel, as its subscription, its time and its JSON; texts are kept on the way."""
-        while True:
-            data = await asyncio.wait_for(self._connection.recv(), ANSWER_S)
-            if isinstance(data, bytes):
-                operation, subscription, time_ns = struct.unpack_from("<BIQ", data)
-                assert operation == 1
-                return subscription, time_ns, json.loads(data[13:])
-            text = json.loads(data)
-            self.texts.append(text)
-            for channel in text.get("channels", ()):
-                self.channels[channel["topic"]] = channel
+        """The next message of a channel, as its subscription, its time and its JSON."""
+        while (data := await self._next()) is None:
+            pass
+        operation, subscription, time_ns = struct.unpack_from("<BIQ", data)
+        assert operation == 1
+        return subscription, time_ns, json.loads(data[13:])
 
     async def text(self, wanted):
         """The next text that is wanted."""
         while not any(map(wanted, self.texts)):
-            data = json.loads(await asyncio.wait_for(self._connection.recv(), ANSWER_S))
-            self.texts.append(data)
-            for channel in data.get("channels", ()):
-                self.channels[channel["topic"]] = channel
+            assert await self._next() is None
         return next(filter(wanted, self.texts))
 
 
@@ -181,13 +172,7 @@ async def test_without_a_georeference_there_is_no_location():
     async with served(msgspec.structs.replace(SITE, georeference=None)) as server, client_of(server) as client:
         server.on_fix(FIX)
         await client.text(advertised("/tag/tag1/ellipse"))
-        assert set(client.channels) == {
-            "/site/scene",
-            "/tf",
-            "/tag/tag1/fix",
-            "/tag/tag1/pose",
-            "/tag/tag1/ellipse",
-        }
+        assert set(client.channels) == {"/site/scene", "/tf", "/tag/tag1/fix", "/tag/tag1/pose", "/tag/tag1/ellipse"}
 
 
 async def test_what_cannot_be_done_is_answered_with_a_status_and_costs_nothing():
@@ -259,19 +244,11 @@ async def test_a_client_that_never_reads_is_disconnected_and_others_get_every_fi
 
 async def stuck_socket(port, channels):
     """A client that subscribes everything and then never reads."""
-    sock = socket.socket()
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    sock.setblocking(False)
-    loop = asyncio.get_running_loop()
-    await loop.sock_connect(sock, ("127.0.0.1", port))
-    lines = ("GET / HTTP/1.1", f"Host: 127.0.0.1:{port}", "Upgrade: websocket", "Connection: Upgrade",
-             "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==", "Sec-WebSocket-Version: 13",
-             "Sec-WebSocket-Protocol: foxglove.sdk.v1", "", "")  # fmt: skip
-    await loop.sock_sendall(sock, "\r\n".join(lines).encode())
+    sock = await unread_websocket(port, "/", "Sec-WebSocket-Protocol: foxglove.sdk.v1")
     subscriptions = [{"id": number, "channelId": number} for number in channels]
     text = json.dumps({"op": "subscribe", "subscriptions": subscriptions}).encode()
     masked = bytes([0x81, 0x80 | 126]) + struct.pack(">H", len(text)) + bytes(4) + text  # a mask of zeros
-    await loop.sock_sendall(sock, masked)
+    await asyncio.get_running_loop().sock_sendall(sock, masked)
     return sock
 
 

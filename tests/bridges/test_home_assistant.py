@@ -7,20 +7,10 @@ import random
 import msgspec
 import pytest
 from bridged_values import BARE_SITE, SITE, a_fix
-from hypothesis import given
-from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.bridges.home_assistant import (
-    MAX_ANNOUNCED,
-    SETTLE_S,
-    Announcer,
-    document,
-    make_target,
-    platforms,
-)
+from skyless.bridges.home_assistant import MAX_ANNOUNCED, SETTLE_S, Announcer, document, make_target, platforms
 from skyless.bridges.target import BridgeContext, TargetUrl
-from skyless.bridges.targets import open_route
 from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.address import MqttAddress
@@ -284,33 +274,23 @@ def test_a_name_that_no_tag_may_have_is_dropped(broker, name):
     assert announcer.dropped == {"tag-name": 1}
 
 
-@given(st.binary(max_size=60))
-def test_garbage_from_the_broker_changes_nothing(payload):
-    broker = Broker()
-    announcer = announcer_of(broker)
-    announcer.on_fix(at(1.0))
-    before = dict(broker.kept)
-    assert platforms(payload) == {}
-    for topic in (CONFIG, ZONE, "homeassistant/status"):
-        if payload:
-            broker.deliver(topic, payload)
-    announcer.on_second(101.0)
-    assert broker.kept == before
-
-
-def test_random_documents_raise_nothing():
+def test_random_documents_raise_and_change_nothing(broker):
     """Half of them are a real document with a few bytes changed; ``SKYLESS_FUZZ_FRAMES=1000000`` for a full run."""
     draws = random.Random(5)
     real = document(HALL, "tag1", "status", {"zone_z9": "binary_sensor"})
-    broker = Broker()
-    announcer_of(broker).on_fix(at(1.0))
+    announcer = announcer_of(broker)
+    announcer.on_fix(at(1.0))
+    before = dict(broker.kept)
     for number in range(int(os.environ.get("SKYLESS_FUZZ_FRAMES", "3000"))):
-        noise = bytearray(real if number % 2 else draws.randbytes(draws.randrange(80)))
+        noise = bytearray(real if number % 2 else draws.randbytes(draws.randrange(1, 80)))
         for _ in range(draws.randrange(4)):
-            if noise:
-                noise[draws.randrange(len(noise))] = draws.randrange(256)
-        assert all(isinstance(name, str) for name in platforms(bytes(noise)).values())
-        broker.handlers["skyless/v1/7/tag/+/zone"](ZONE, bytes(noise))
+            noise[draws.randrange(len(noise))] = draws.randrange(256)
+        found = platforms(bytes(noise))
+        assert all(isinstance(name, str) for name in found.values()) if number % 2 else found == {}
+        for topic in (ZONE,) if number % 2 else (ZONE, CONFIG, "homeassistant/status"):
+            broker.deliver(topic, bytes(noise))
+    announcer.on_second(101.0)
+    assert broker.kept == before
 
 
 def test_templates_hold_nothing_of_what_users_name(broker):
@@ -329,20 +309,5 @@ def test_the_broker_is_the_sites_or_the_one_of_the_address(broker):
     assert address("homeassistant://ha.local") == MqttAddress("ha.local", 1883)
     assert address("homeassistant://ann:pw@ha.local?tls=yes") == MqttAddress("ha.local", 8883, True, "ann", "pw")
     assert address("homeassistant://ha.local:99", BridgeContext(print)).port == 99
-
-
-@pytest.mark.parametrize(
-    ("text", "context", "expected"),
-    [
-        ("homeassistant:", BridgeContext(print), r"homeassistant://\[USER"),
-        ("homeassistant:///x", CONTEXT, "should be"),
-        ("homeassistant:?prefix=a+b", CONTEXT, "prefix=a b; it should be"),
-        ("homeassistant:?move_m=-1", CONTEXT, "move_m=-1; it should be a number from 0"),
-        ("homeassistant:?tls=maybe", CONTEXT, "tls=maybe; it should be no or yes"),
-        ("homeassistant://:pw@host", CONTEXT, "should be"),
-    ],
-)
-def test_wrong_addresses_say_what_would_be_right(text, context, expected):
-    with pytest.raises(SkylessError, match=expected) as caught:
-        open_route(text, context)
-    assert "pw" not in str(caught.value)
+    with pytest.raises(SkylessError, match=r"homeassistant://\[USER"):
+        address("homeassistant:", BridgeContext(print))

@@ -3,7 +3,7 @@
 from math import nan
 
 import pytest
-from bridged_values import BARE_SITE, SITE, a_fix, covariances, tag_health
+from bridged_values import BARE_SITE, SITE, a_fix, covariances
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
@@ -23,6 +23,7 @@ from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.messages import StatusMessage
 from skyless.sim.lab import lab_site
+from support.site_messages import tag_health
 
 
 class Recorded(Target):
@@ -132,22 +133,6 @@ def test_a_tag_without_a_fix_is_reported_each_second_until_it_has_one_or_is_forg
     assert len(target.none) == 3, "a tag that left a day ago is not spoken of"
 
 
-def test_a_tag_whose_fixes_are_rare_has_none_only_when_some_are_missing():
-    target = Recorded()
-    hub = hub_of(target)
-    for step in range(4):  # a fix every four seconds
-        hub.on_fix(a_fix(serial=step + 1), 4.0 * step)
-        for quarter in range(16):
-            hub.on_tick(4.0 * step + 0.25 * quarter, 100.0 + 4.0 * step + 0.25 * quarter)
-    assert (len(target.fixes), target.seconds) == (4, 16)
-    assert [when_s for _, when_s, _ in target.none] == [102.5, 103.5], "its interval was not known then"
-    target.none.clear()
-    for quarter in range(1, 68):
-        hub.on_tick(12.0 + 0.25 * quarter, 112.0 + 0.25 * quarter)
-    assert [when_s for _, when_s, _ in target.none] == [122.0 + second for second in range(7)]
-    assert target.gone == [("tag1", 128.0)]
-
-
 def test_no_fix_of_a_tag_at_the_targets_own_rate_is_missed_because_it_came_early():
     target = Recorded()
     hub = hub_of(target, hz=50.0)
@@ -192,14 +177,6 @@ def test_a_target_that_is_for_one_tag_by_the_users_choice_gets_no_other_tags_sta
     assert all_tags.states == ["tag1", "tag1", "tag2", "tag2", "2"]
 
 
-def test_what_a_growing_site_lacks_is_logged_once():
-    said = []
-    hub = Hub([Route(Recorded("earthly:", needs_earth=True), None, 1.0), Route(Recorded(), None, 1.0)], said.append)
-    for anchor in range(5):
-        hub.on_site(structs.replace(BARE_SITE, anchors_m={anchor: (1.0, 0.0, 2.0)}))
-    assert len(said) == 1
-
-
 def test_a_fault_in_one_target_costs_the_others_nothing_and_is_logged_once():
     class Broken(Recorded):
         def on_fix(self, fix):
@@ -222,7 +199,8 @@ def test_a_site_without_georeference_is_refused_with_the_keys_to_add():
     with pytest.raises(SkylessError, match=r"\[georeference\] with latitude_deg, longitude_deg, height_m"):
         alone.on_site(BARE_SITE)
     hub = Hub([Route(earthly, None, 10.0), Route(other, None, 10.0)], said.append)
-    hub.on_site(BARE_SITE)
+    for anchor in range(5):  # a site that grows
+        hub.on_site(structs.replace(BARE_SITE, anchors_m={anchor: (1.0, 0.0, 2.0)}))
     hub.on_fix(a_fix(), 1.0)
     hub.on_tick(4.0, 4.0)
     assert (len(earthly.fixes), len(other.fixes), len(earthly.none), len(other.none)) == (0, 1, 0, 1)

@@ -5,7 +5,6 @@ Fields and types are those of the public OpenAPI document, omlox_Hub_API_2.0.0.j
 
 import asyncio
 import json
-from contextlib import asynccontextmanager
 from datetime import datetime
 from math import dist
 from uuid import UUID
@@ -20,13 +19,11 @@ from websockets.asyncio.server import serve
 
 from skyless.bridges import omlox
 from skyless.bridges.omlox import MAX_BATCH, OmloxPush, location
-from skyless.bridges.target import BridgeContext, TargetUrl
-from skyless.bridges.targets import open_route
+from skyless.bridges.target import TargetUrl
 from skyless.core.earth import east_north_up, east_north_up_of
-from skyless.core.errors import SkylessError
 from skyless.core.site import FloorSite
 from skyless.run.mqtt.messages import Asset
-from support.waiting import until
+from support.waiting import running, until
 
 FORK = {"tag1": Asset("tag1", "Fork 7"), "tag2": Asset("tag2")}
 HALL = structs.replace(BARE_SITE, assets=FORK, simulated=False)
@@ -65,16 +62,6 @@ def test_course_floor_accuracy_and_what_is_simulated():
     upstairs = location(a_fix(position_m=(1.0, 2.0, 4.5)), structs.replace(HALL, floors=floors), "zone")
     assert (upstairs["floor"], upstairs["position"]["coordinates"]) == (1, [1.0, 2.0, 1.5])
     assert "course" not in upstairs
-
-
-@asynccontextmanager
-async def running(target):
-    task = asyncio.create_task(target.run())
-    try:
-        yield target
-    finally:
-        task.cancel()
-        await asyncio.wait([task])
 
 
 @pytest.mark.parametrize("site", [HALL, structs.replace(HALL, georeference=BERLIN)], ids=["local", "earth"])
@@ -122,7 +109,7 @@ def test_a_hub_gets_batches_with_the_token_and_its_errors_are_told(tmp_path, mon
             push.on_site(HALL)
             for serial in range(1000):
                 push.on_fix(a_fix(serial=serial, position_m=(serial / 100, 2.0, 1.5)))
-            async with running(push):
+            async with running(push.run()):
                 await until(lambda: push.dropped["refused-by-hub"])
                 push.on_fix(a_fix(position_m=(50.0, 2.0, 1.5)))
                 await until(lambda: messages[-1]["payload"][-1]["position"]["coordinates"][0] == 50.0)
@@ -146,21 +133,3 @@ def test_what_waits_too_long_is_dropped_oldest_first_and_counted(monkeypatch):
     assert [one["position"]["coordinates"][0] for one in push._waiting] == [2.0, 3.0, 4.0]
     assert push.dropped["not-sent"] == 2
     assert {one["source"] for one in push._waiting} == {"skyless-7"}
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("omlox+ws://hub", "it should be omlox+ws://HOST/v2/ws/socket"),
-        ("omlox+wss:/v2/ws/socket", "it should be omlox+wss://HOST/v2/ws/socket"),
-        ("omlox+ws://hub/v2/ws/socket?zone=7", "with a UUID as zone="),
-        ("omlox+ws://hub/v2/ws/socket?token=7", "has 'token'; its keys are hz, tag, token_file, zone"),
-        ("omlox+ws://hub/v2/ws/socket?hz=20", "a number from 0.1 to 10"),
-        ("omlox+ws://hub/v2/ws/socket?token_file=/nowhere/t", "cannot be read"),
-    ],
-)
-def test_a_wrong_address_is_named(text, words):
-    with pytest.raises(SkylessError) as raised:
-        open_route(text, BridgeContext(log=lambda _line: None))
-    assert words in str(raised.value)
-    assert "\n" not in str(raised.value)

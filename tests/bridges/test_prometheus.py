@@ -18,59 +18,26 @@ from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
 
 from skyless.bridges import prometheus as prometheus_target
-from skyless.bridges.prometheus import (
-    LATENCY_BOUNDS_S,
-    Rising,
-    SiteMetrics,
-    make_target,
-)
+from skyless.bridges.prometheus import LATENCY_BOUNDS_S, Rising, SiteMetrics, make_target
 from skyless.bridges.target import BridgeContext, Hub, Route, TargetUrl
 from skyless.core.errors import SkylessError
-from skyless.run.mqtt.messages import AnchorHealth, Counters, StatusMessage, TagHealth
+from skyless.run.mqtt.messages import Counters, StatusMessage, TagHealth
 from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.web import BridgeLimits
+from support import site_messages
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
-NO_LINK = Counters(0, 0, 0)
 CONTEXT = BridgeContext(print)
 
 
-def tag_health(tag="tag1", uptime_s=10.0, fixes=100, counters=None, mqtt=NO_LINK, **more):
-    values = {
-        "unix_s": 0.0,
-        "method": "joint",
-        "receptions": 2 * fixes,
-        "updates_per_s": 10.0,
-        "reason": None,
-        "first_fix_s": 0.1,
-        "latency_p50_s": 0.001,
-        "latency_p99_s": 0.002,
-        "cpu": 0.05,
-        "memory_bytes": 1000,
-        "phases": (),
-    }
-    return TagHealth(tag=tag, uptime_s=uptime_s, fixes=fixes, counters=counters or {}, mqtt=mqtt, **values | more)
+def tag_health(tag="tag1", fixes=100, uptime_s=10.0, **more):
+    return site_messages.tag_health(tag, fixes=fixes, receptions=2 * fixes, uptime_s=uptime_s, **more)
 
 
-def anchor_health(anchor=2, uptime_s=10.0, sent=100, **more):
-    values = {
-        "unix_s": 0.0,
-        "role": "anchor",
-        "master": 1,
-        "term": 0,
-        "synchronised": True,
-        "offset_s": 0.1,
-        "rate_ppm": -3.0,
-        "offset_std_m": 0.012,
-        "late": 1,
-        "heard": 500,
-        "superframe": 7,
-        "heard_age_s": {},
-        "counters": {"malformed": 3},
-        "mqtt": NO_LINK,
-    }
-    return AnchorHealth(anchor=anchor, uptime_s=uptime_s, sent=sent, **values | more)
+def anchor_health(**more):
+    return site_messages.anchor_health(2, offset_std_m=0.012, sent=100, counters={"malformed": 3}, **more)
 
 
 def read(metrics, now_s=100.0):
@@ -154,27 +121,21 @@ def test_what_is_known_of_a_tag_and_an_anchor(metrics):
     assert "dashboard" not in str(samples)
 
 
-KEY_METRICS = ("verified", "clock_error", "not_accepted", "codes", "chain_end")
+NOT_HERE = ("position_metres", "verified", "clock_error", "not_accepted", "codes", "chain_end")
 
 
-def test_nothing_is_said_of_keys_where_there_are_none_and_nothing_old():
+def test_nothing_is_said_of_keys_where_there_are_none_nor_of_positions_unasked_and_nothing_old():
     metrics = Metrics()
     metrics.take_fix(a_fix(), 100.0)
     metrics.take_health(tag_health(), 100.0)
     metrics.take_health(anchor_health(), 100.0)
-    assert not any(name in metrics.text(100.0) for name in KEY_METRICS)
+    assert not any(name in metrics.text(100.0) for name in NOT_HERE)
     metrics.take_health(tag_health(trust="open"), 100.0)
     metrics.take_health(anchor_health(chain_ends_unix_s=1.0, code_fault="no-chain"), 100.0)
     samples = read(metrics)
     assert (samples[of_tag("tag_verified")], samples[of_tag("tag_verified_ratio")]) == (0.0, 0.0)
     assert samples["skyless_anchor_codes", ("anchor", "2")] == 0.0
-    assert not any(name in metrics.text(100.0 + 2 * THRESHOLDS.report_s) for name in KEY_METRICS)
-
-
-def test_positions_are_given_on_request_only():
-    metrics = Metrics()
-    metrics.take_fix(a_fix(), 100.0)
-    assert of_tag("tag_position_metres", axis="x") not in read(metrics)
+    assert not any(name in metrics.text(100.0 + 2 * THRESHOLDS.report_s) for name in NOT_HERE)
 
 
 def test_the_age_of_a_killed_tag_grows_from_scrape_to_scrape_and_its_gauges_end(metrics):
@@ -251,27 +212,31 @@ def test_promtool_finds_nothing(metrics):
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
+@contextlib.asynccontextmanager
+async def served():
+    """A target that serves at a free port and has a fix."""
+    target = make_target(TargetUrl("prometheus://"), CONTEXT)
+    target.port = 0
+    hub = Hub([Route(target, None, 10.0)], print)
+    hub.on_site(SITE)
+    hub.on_fix(a_fix(), time.monotonic())
+    async with running(target.run()):
+        await until(lambda: target.port)
+        yield target
+
+
 def exchange(*requests):
     """Answers of a target that serves; each request on a connection of its own."""
 
     async def talk():
-        target = make_target(TargetUrl("prometheus://"), CONTEXT)
-        target.port = 0
-        hub = Hub([Route(target, None, 10.0)], print)
-        hub.on_site(SITE)
-        hub.on_fix(a_fix(), time.monotonic())
-        serving = asyncio.ensure_future(target.run())
-        while not target.port:
-            await asyncio.sleep(0.01)
         answers = []
-        for request in requests:
-            reader, writer = await asyncio.open_connection("127.0.0.1", target.port)
-            writer.write(request)
-            writer.write_eof()
-            answers.append(await reader.read())
-            writer.close()
-        serving.cancel()
-        await asyncio.wait([serving])
+        async with served() as target:
+            for request in requests:
+                reader, writer = await asyncio.open_connection("127.0.0.1", target.port)
+                writer.write(request)
+                writer.write_eof()
+                answers.append(await reader.read())
+                writer.close()
         return target, answers
 
     return asyncio.run(talk())
@@ -321,28 +286,17 @@ def test_what_is_no_request_is_counted_and_harms_nobody():
     assert answers[-1].startswith(b"HTTP/1.1 200")
 
 
-def test_connections_that_send_nothing_keep_no_scrape_out_and_end_with_the_server(monkeypatch):
+async def test_connections_that_send_nothing_keep_no_scrape_out_and_end_with_the_server(monkeypatch):
     monkeypatch.setattr(prometheus_target, "LIMITS", BridgeLimits(answer_s=3600.0))
-
-    async def talk():
-        target = make_target(TargetUrl("prometheus://"), CONTEXT)
-        target.port = 0
-        serving = asyncio.ensure_future(target.run())
-        while not target.port:
-            await asyncio.sleep(0.01)
+    async with served() as target:
         silent = [await asyncio.open_connection("127.0.0.1", target.port) for _ in range(100)]
         reader, writer = await asyncio.open_connection("127.0.0.1", target.port)
         writer.write(b"GET /metrics HTTP/1.1\r\n\r\n")
-        answer = await reader.read()
-        serving.cancel()
-        await asyncio.wait([serving])
-        for one, other in silent:
-            with contextlib.suppress(ConnectionError):
-                assert await one.read() == b""
-            other.close()
-        return answer
-
-    assert asyncio.run(talk()).startswith(b"HTTP/1.1 200")
+        assert (await reader.read()).startswith(b"HTTP/1.1 200")
+    for one, other in silent:
+        with contextlib.suppress(ConnectionError):
+            assert await one.read() == b""
+        other.close()
 
 
 def test_random_requests_get_an_answer():

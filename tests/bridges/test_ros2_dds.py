@@ -6,7 +6,6 @@ import random
 import sys
 import threading
 import time
-from contextlib import asynccontextmanager
 
 import pytest
 from bridged_values import BARE_SITE, SITE, a_fix
@@ -14,6 +13,7 @@ from bridged_values import BARE_SITE, SITE, a_fix
 from skyless.bridges.ros2 import MARKERS, POSE, DdsTypes, Ros2Target, RosSettings, make_target
 from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.core.errors import SkylessError
+from support.waiting import running
 
 pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheel here")
 
@@ -41,16 +41,6 @@ def target_of(text, said=None):
     return make_target(TargetUrl(text), BridgeContext((said if said is not None else []).append))
 
 
-@asynccontextmanager
-async def running(target):
-    task = asyncio.create_task(target.run())
-    try:
-        yield
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-
-
 def reader_of(participant, topic, kind, durability=Policy.Durability.Volatile):
     """As a subscriber of ROS asks for it by default."""
     quality = Qos(Policy.Reliability.Reliable(max_blocking_time=0), Policy.History.KeepLast(100), durability)
@@ -68,7 +58,7 @@ async def test_fixes_arrive_in_order_also_where_the_reader_comes_later(domain):
     target = target_of(f"ros2://?domain={domain}")
     participant = DomainParticipant(domain)
     found = []
-    async with running(target):
+    async with running(target.run()):
         target.on_site(SITE)
         serial = 0
         for _ in range(2):
@@ -95,7 +85,7 @@ async def test_fixes_arrive_in_order_also_where_the_reader_comes_later(domain):
 async def test_anchors_last_and_writers_name_their_types_hash(domain):
     target = target_of(f"ros2://?domain={domain}&namespace=hall&frame=map&tf=yes")
     participant = DomainParticipant(domain)
-    async with running(target):
+    async with running(target.run()):
         target.on_site(SITE)
         target.on_fix(a_fix())
         publications = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
@@ -128,7 +118,7 @@ async def test_the_writers_are_gone_once_the_target_has_ended(domain):
                 ours[one.key] = one.sample_info.valid_data
         return list(ours.values())
 
-    async with running(target):
+    async with running(target.run()):
         target.on_site(SITE)
         await until(lambda: seen() == [True])
     await until(lambda: seen() == [False])
@@ -151,7 +141,7 @@ class StuckPublisher:
 async def test_dds_that_waits_holds_nobody_up_and_loses_the_oldest():
     publisher = StuckPublisher()
     target = Ros2Target("ros2://", publisher, RosSettings(), BridgeContext(print))
-    async with running(target):
+    async with running(target.run()):
         target.on_site(BARE_SITE)
         await until(target._waiting.empty)  # the thread waits in the first write
         for serial in range(2000):
@@ -174,7 +164,7 @@ async def test_a_fault_of_dds_is_counted_and_logged_once_for_each_topic():
 
     said = []
     target = Ros2Target("ros2://", Broken(), RosSettings(), BridgeContext(said.append))
-    async with running(target):
+    async with running(target.run()):
         target.on_site(SITE)
         for _ in range(10):
             target.on_fix(a_fix())
@@ -210,7 +200,7 @@ async def test_the_domain_is_that_of_ros(monkeypatch, domain):
     target = target_of("ros2://?namespace=of_ros")
     participant = DomainParticipant(domain)
     reader = BuiltinDataReader(participant, BuiltinTopicDcpsPublication)
-    async with running(target):
+    async with running(target.run()):
         target.on_site(SITE)
         names = set()
         await until(lambda: names.update(one.topic_name for one in reader.take(50)) or "rt/of_ros/anchors" in names)

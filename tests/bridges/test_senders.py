@@ -13,17 +13,13 @@ from skyless.bridges.targets import PtySender, SerialSender, TcpServer, UdpSende
 from skyless.core.errors import SkylessError
 from skyless.radio.serial.serial_port import Pty
 from skyless.run.web import BRIDGES as LIMITS
+from support import waiting
 
 
 @contextlib.asynccontextmanager
 async def running(sender):
-    task = asyncio.ensure_future(sender.run())
-    await asyncio.sleep(0)
-    try:
+    async with waiting.running(sender.run()):
         yield sender
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
 
 
 async def listening(server):

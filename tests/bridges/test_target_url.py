@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.bridges.targets import TARGET_KINDS, open_route
 from skyless.core.errors import SkylessError
+from skyless.run.mqtt.address import MqttAddress
 
-CONTEXT = BridgeContext(log=lambda _line: None)
+CONTEXT = BridgeContext(lambda _line: None, MqttAddress("hall.example", 1883))
 
 
 def test_the_parts_of_an_address():
@@ -47,7 +48,36 @@ WRONG = {
     "nmea+serial://dev/ttyUSB0": "it should be nmea+serial:PATH",
     "nmea+pty://run/gps": "it should be nmea+pty:PATH",
     "foxglove:8765": "it should be foxglove://HOST:PORT",
-    "mavlink+udpout://:14550": "has no profile=; it should be ardupilot",
+    "mavlink+udpout://:14550": "has no profile=; it should be ardupilot, px4 or gps",
+    "mavlink+udpout://?profile=betaflight": "ardupilot, px4 or gps",
+    "mavlink+udpout://?profile=px4&system=0": "system=0; it should be a number from 1 to 255",
+    "mavlink+udpout://?profile=px4&system=1.5": "system=1.5; it should be a whole number from 1 to 255",
+    "mavlink+udpout://?profile=gps&satellites=many": "satellites=many",
+    "mavlink+udpout://?profile=gps&satellites=6.5": "satellites=6.5; it should be a whole number",
+    "mavlink+udpout://?profile=gps&satellites=": "satellites=; it should be a number",
+    "mavlink+udpout://?profile=px4&heading=": "heading=; it should be a number",
+    "mavlink+udpout://?profile=px4&heading=north": "heading=north",
+    "mavlink+udpout://?profile=px4&yaw=3": "yaw",
+    "mavlink+serial:?profile=px4": "PATH@BAUD",
+    "omlox+ws://hub": "it should be omlox+ws://HOST/v2/ws/socket",
+    "omlox+wss:/v2/ws/socket": "it should be omlox+wss://HOST/v2/ws/socket",
+    "omlox+ws://hub/v2/ws/socket?zone=7": "with a UUID as zone=",
+    "omlox+ws://hub/v2/ws/socket?token=7": "has 'token'; its keys are hz, tag, token_file, zone",
+    "omlox+ws://hub/v2/ws/socket?hz=20": "a number from 0.1 to 10",
+    "omlox+ws://hub/v2/ws/socket?token_file=/nowhere/t": "cannot be read",
+    "homeassistant:///x": "should be",
+    "homeassistant:?prefix=a+b": "prefix=a b; it should be",
+    "homeassistant:?move_m=-1": "move_m=-1; it should be a number from 0",
+    "homeassistant:?tls=maybe": "tls=maybe; it should be no or yes",
+    "webhook+https:": "webhook+https://HOST/PATH",
+    "webhook+https://h/?secret_file=/nowhere/s": "cannot be read",
+    "webhook+https://h/?key=1": "its keys are",
+    "webhook+https://user@h/": "webhook+https:",
+    "smtp://h": "to=",
+    "smtp://h?to=nobody": "NAME@HOST",
+    "smtps://h?to=a@b.c&password_file=/nowhere/s": "USER@HOST",
+    "smtp://u@example.org?to=a@b.c&password_file=/nowhere/s": "starttls",
+    "smtp://?to=a@b.c": "HOST",
 }
 
 
@@ -75,6 +105,11 @@ def test_a_password_is_not_shown():
     with pytest.raises(SkylessError) as raised:
         TargetUrl("homeassistant://me:secret@house:99999")
     assert "secret" not in str(raised.value)
-    with pytest.raises(SkylessError, match="it should be jsonl") as raised:
-        open_route("jsonl+tcp://me:secret@:7010", CONTEXT)
-    assert "secret" not in str(raised.value)
+    for text, words in (
+        ("jsonl+tcp://me:secret@:7010", "it should be jsonl"),
+        ("smtp://u:secret@h?to=a@b.c", "password_file"),
+        ("homeassistant://:secret@host", "should be"),
+    ):
+        with pytest.raises(SkylessError, match=words) as raised:
+            open_route(text, CONTEXT)
+        assert "secret" not in str(raised.value)

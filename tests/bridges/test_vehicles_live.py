@@ -15,6 +15,7 @@ from skyless.bridges.mavlink import gps_input, odometry, vision_position_estimat
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
 from skyless.radio.serial.serial_port import Pty
+from support.waiting import running
 
 pymavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
 HEADING_DEG = SITE.georeference.heading_deg
@@ -25,16 +26,11 @@ async def serving(address, logged=()):
     """A target that runs and knows its site; ``logged``: what each line that it logs contains."""
     said = []
     target = open_route(address, BridgeContext(said.append)).target
-    task = asyncio.ensure_future(target.run())
-    await asyncio.sleep(0)
-    target.on_site(SITE)
-    try:
+    async with running(target.run()):
+        target.on_site(SITE)
         yield target
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
-        assert len(said) == len(logged)
-        assert all(words in line for words, line in zip(logged, said, strict=True))
+    assert len(said) == len(logged)
+    assert all(words in line for words, line in zip(logged, said, strict=True))
 
 
 def within(work):

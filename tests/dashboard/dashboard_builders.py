@@ -1,5 +1,7 @@
 """Messages of a small site, an MQTT that only remembers, and a client of the server."""
 
+import asyncio
+import json
 from itertools import count
 
 import msgspec
@@ -12,8 +14,9 @@ from skyless.page.connections import AccessRules
 from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.messages import FixMessage, SiteMessage, StatusMessage, TruthMessage, Zone
+from skyless.run.mqtt.messages import SiteMessage, StatusMessage, TruthMessage, Zone
 from skyless.sim.lab import lab_site
+from support.site_messages import a_fix, diagonal
 
 SITE = SiteMessage(lab_site(100.0), simulated=True, unix_s=1000.0)
 SITE_ID = SITE.site.id
@@ -25,30 +28,10 @@ def fix(
     tag="t1", unix_s=1000.0, position_m=(2.0, 2.0, 1.0), std_m=0.01, velocity_mps=(0.1, 0.0, 0.0), serial=None, **more
 ):
     """A fix; without a number, it has a larger one than those before."""
-    variance = std_m**2 / 2
-    given = {
-        "tag": tag,
-        "serial": next(_SERIALS) if serial is None else serial,
-        "unix_s": unix_s,
-        "time_s": unix_s,
-        "position_m": position_m,
-        "covariance_m2": (variance, 0.0, 0.0, 0.0, variance, 0.0, 0.0, 0.0, 0.0),
-        "velocity_mps": velocity_mps,
-        "velocity_covariance": None,
-        "std_m": std_m,
-        "gdop": 1.0,
-        "pdop": 1.0,
-        "hdop": 1.0,
-        "vdop": None,
-        "anchors": (1, 2, 3, 4),
-        "chi2": 2.5,
-        "dof": 3,
-        "residual_rms_m": 0.01,
-        "method": "joint",
-        "height_known": True,
-        "latency_s": 0.001,
-    }
-    return FixMessage(**(given | more))
+    serial = next(_SERIALS) if serial is None else serial
+    given = {"serial": serial, "unix_s": unix_s, "time_s": unix_s, "position_m": position_m, "std_m": std_m}
+    given |= {"covariance_m2": diagonal(std_m**2 / 2, std_m**2 / 2), "velocity_mps": velocity_mps}
+    return a_fix(tag, **given | more)
 
 
 def truth(unix_s=1000.0, tag="t1", position_m=(2.0, 2.0, 1.0), velocity_mps=(0.0, 0.0, 0.0)):
@@ -102,6 +85,17 @@ class Wire:
 
     def topics(self):
         return [topic for topic, *_ in self.published]
+
+
+def drained(live, page=None):
+    """What waits for a page, or for one that is opened now."""
+    page = page or live.open_page()
+    return [json.loads(message) for message in asyncio.run(asyncio.wait_for(page.drain(live.state), 1.0))]
+
+
+def of(kind, messages):
+    """Those of a kind."""
+    return [message for message in messages if message["type"] == kind]
 
 
 HERE = "http://localhost:8080"

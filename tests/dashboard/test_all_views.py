@@ -1,7 +1,11 @@
-"""One feed, all views: of tags that sleep, at every moment of an hour, each view says the same."""
+"""One feed, all views: of tags that sleep, at every moment of an hour, each view says the same.
+
+A second page gets the fixes in batches alone, and lists them as the first one does.
+"""
 
 import random
 from itertools import pairwise
+from operator import itemgetter
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +17,7 @@ from skyless.bridges.target import Hub, Route, Target, bridged_site
 from skyless.cli.nodes.site_view import SiteView
 from skyless.page.api import questions
 from skyless.page.live import LiveSite
+from skyless.run.fix_batch import FIELDS, fix_of, records_of
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import TagZones, Zone, ZonesMessage
 from skyless.run.mqtt.topics import tag_zones_topic
@@ -23,6 +28,8 @@ ZONES = tuple(
     Zone(name, name, ((x, 0.0), (x + 10.0, 0.0), (x + 10.0, 10.0), (x, 10.0))) for name, x in (("a", 0.0), ("b", 20.0))
 )
 HOUR_S = 3600
+PLACE = itemgetter(1, 2, 3, 15)
+"""Position and time in a row of the page."""
 TAGS = {"often": 1, "rare": 10, "rarer": 60}
 """Seconds between fixes."""
 
@@ -58,11 +65,12 @@ class Views:
     """The page, its HTTP interface, ``skyless watch`` and a bridge, all of the same messages."""
 
     def __init__(self):
-        self.times, self.wires = Times(), (Wire(), Wire())
+        self.times, self.wires = Times(), (Wire(), Wire(), Wire())
         clocks = (lambda: self.times.now_s, lambda: self.times.unix_s)
-        self.page = LiveSite("here", "mqtt://b:1", None, *clocks)
-        self.page.attach(self.wires[0], SITE_ID)
-        self.page.on_connection(connected=True)
+        self.page, self.batched = (LiveSite("here", "mqtt://b:1", None, *clocks) for _ in range(2))
+        for page, wire in ((self.page, self.wires[0]), (self.batched, self.wires[2])):
+            page.attach(wire, SITE_ID)
+            page.on_connection(connected=True)
         self.watch = SiteView(self.wires[1], SITE_ID, *clocks)
         self.wires[1].on_state[0](True)
         site = bridged_site(SITE.whole_site, ZONES, simulated=True)
@@ -70,16 +78,21 @@ class Views:
         self.hub = Hub([Route(self.both, None, 1000.0)], print)
         self.hub.on_site(site)
         self.say(topics.site_topic(SITE_ID), SITE)
-        self.wires[0].deliver(topics.zones_topic(SITE_ID), ZonesMessage(ZONES, SITE.site.name))
+        self.wires[2].deliver(topics.site_topic(SITE_ID), SITE)
+        for wire in (self.wires[0], self.wires[2]):
+            wire.deliver(topics.zones_topic(SITE_ID), ZonesMessage(ZONES, SITE.site.name))
 
     def say(self, topic, message):
-        for wire in self.wires:
+        for wire in self.wires[:2]:
             wire.deliver(topic, message)
 
     def fix(self, tag, place_m):
         one = fix(tag, self.times.unix_s, (*place_m, 1.0))
         self.say(topics.fix_topic(SITE_ID, tag), one)
         self.hub.on_fix(one, self.times.now_s)
+        (record,) = FIELDS.iter_unpack(records_of([(1, one)], simulated=False).tobytes())
+        self.batched.on_batched_fix(fix_of(tag, record), self.times.now_s)
+        self.batched.table.hear([tag], self.times.now_s)
 
     def end(self, tag):
         gone = status("tag", tag, online=False)
@@ -88,6 +101,7 @@ class Views:
 
     def tick(self):
         self.page.tick()
+        self.batched.tick()
         self.watch.evaluate()
         self.hub.on_tick(self.times.now_s, self.times.unix_s)
 
@@ -97,6 +111,7 @@ class Views:
         rows = {row.tag: row for row in self.watch.picture().tags}
         text = self.both.metrics.text(self.times.now_s)
         shown = {row[0]: row for row in self.page.state.rows_since(0)}
+        in_batches = {row[0]: row for row in self.batched.state.rows_since(0)}
         found = {}
         for name, answer in answers.items():
             tag = self.page.table.get("tag", name)
@@ -109,7 +124,12 @@ class Views:
             age_s, (fresh_s, sleep_s, gone_s) = self.times.now_s - tag.fix_s, shown[name][-3:]
             assert (is_fresh, sleep_s) == (age_s < fresh_s, 0.0)
             assert is_there == (age_s < gone_s)
+            if tag.online is not False:  # batches do not tell that a program has ended
+                assert self.batched.presence(name) == answer.presence
+                assert PLACE(in_batches[name]) == pytest.approx(PLACE(shown[name]))
+                assert [zone.id for zone in self.batched.monitor.zones_with(name)] == list(answer.zones)
             found[name] = answer.presence, answer.zones
+        assert self.watch.condition == self.page.condition
         assert self.page.condition.tags_with_fix == sum(presence == "fresh" for presence, _ in found.values())
         return found
 

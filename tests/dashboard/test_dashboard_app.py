@@ -13,11 +13,7 @@ from starlette.websockets import WebSocketDisconnect
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite
 from skyless.page.connections import AccessRules, Guard
-from skyless.page.live import (
-    GONE_S,
-    IDLE_S,
-    TooManyPagesError,
-)
+from skyless.page.live import GONE_S, IDLE_S, TooManyPagesError
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import site_message
 from skyless.run.web import PAGE as LIMITS
@@ -138,12 +134,6 @@ def test_a_wrong_cookie_does_not_help(stranger):
     assert stranger.get("/").status_code == 401
 
 
-def test_programs_may_send_the_token_as_bearers(stranger):
-    assert stranger.get("/api/recordings", headers={"authorization": f"Bearer {TOKEN}"}).status_code == 200
-    assert stranger.get("/api/recordings", headers={"authorization": "Bearer no"}).status_code == 401
-    assert stranger.get("/api/recordings", headers={"authorization": f"Basic {TOKEN}"}).status_code == 401
-
-
 @pytest.mark.parametrize(("host", "status"), [("hall.example:8080", 200), ("10.0.0.1", 200), ("evil.example", 421)])
 def test_strangers_may_call_it_by_its_names_only(stranger, host, status):
     assert stranger.get("/", params={"token": TOKEN}, headers={"host": host}).status_code == status
@@ -240,6 +230,12 @@ def test_the_live_stream(browser, live):
         browser.portal.call(_fix_and_tick, live)
         messages = [socket.receive_json() for _ in range(3)]  # health, condition, state
         assert [message["tags"][0][0] for message in messages if message["type"] == "state"] == ["t1"]
+        (page,) = live.pages
+        browser.portal.call(page.close, "this page was idle")
+        with pytest.raises(WebSocketDisconnect) as closed:
+            while True:
+                socket.receive_json()
+        assert (closed.value.code, closed.value.reason) == (1001, "this page was idle")
 
 
 async def _fix_and_tick(live):
@@ -301,12 +297,6 @@ def test_a_page_that_sends_nothing_for_minutes_is_closed(live, times):
     assert live.pages == {active}
 
 
-def test_hello_holds_the_site(browser, live):
-    live.site = SITE
-    with browser.websocket_connect(SOCKET) as socket:
-        assert socket.receive_json()["site"]["site"]["name"] == SITE.site.name
-
-
 HEADER = st.sampled_from(["host", "origin", "cookie", "authorization", "x-forwarded-host"])
 VALUE = st.binary(max_size=60) | st.sampled_from(
     [b"192.168.1.5", b"localhost:8080", b"skyless=1", b"Bearer x", b"http://["]
@@ -366,15 +356,3 @@ def test_a_tag_whose_covariance_is_none_takes_no_other_off_the_map(browser, live
     first, second = browser.get("/fixes.geojson").json()["features"]
     assert first["properties"]["horizontal_std_m"] == 0.0
     assert second["properties"]["horizontal_std_m"] > 0.0
-
-
-def test_a_site_that_is_nowhere_on_the_earth_says_what_is_missing(browser, live, wire):
-    assert browser.get("/fixes.geojson").status_code == 404
-    wire.deliver(topics.site_topic(SITE_ID), SITE)
-    answer = browser.get("/fixes.geojson")
-    assert answer.status_code == 409
-    assert "[georeference] with latitude_deg, longitude_deg" in answer.json()["error"]
-
-
-def test_strangers_need_the_token_for_positions(stranger):
-    assert stranger.get("/fixes.geojson").status_code == 401

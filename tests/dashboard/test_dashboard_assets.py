@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from dashboard_builders import SITE, SITE_ID, Wire
+from dashboard_builders import SITE, SITE_ID
 
 from skyless.core.errors import SkylessError
 from skyless.page.live import LiveSite
@@ -64,13 +64,6 @@ def test_pages_get_them_first_and_with_each_change(start, wire):
     assert wire.forgotten == [TOPIC]
     wire.deliver(TOPIC, b"")
     assert live.assets.by_tag == {}
-
-
-def test_what_is_on_its_way_is_not_undone_by_what_is_older(start, wire):
-    live = start()
-    live.assets.store((FORKLIFT,))
-    wire.deliver(TOPIC, AssetsMessage((PALLET,), NAME))
-    assert live.assets.by_tag == {"t1": FORKLIFT}
 
 
 def test_a_broker_without_any_is_given_the_files(start, file, wire, times):
@@ -145,23 +138,3 @@ def test_another_sites_are_neither_shown_nor_overwritten(start, wire, file):
         live.assets.store((PALLET,))
     assert kept(wire) == []
     assert not file.exists()
-
-
-def test_what_cannot_be_read_is_not_overwritten(start, wire):
-    live = start()
-    wire.deliver(TOPIC, b'{"assets": [{"tag": "a b"}]}')
-    assert live.dropped["assets"] == 1
-    with pytest.raises(WrongMessageError, match="'a b'"):
-        live.assets.store((PALLET,))
-    wire.deliver(TOPIC, b"")
-    live.assets.store((PALLET,))
-
-
-def test_assets_that_were_stored_before_the_broker_was_known(times):
-    live = LiveSite("here", "mqtt://broker:1", SITE, lambda: times.now_s, lambda: times.unix_s)
-    live.assets.store((PALLET,), NAME)
-    with pytest.raises(WrongMessageError, match="another"):
-        live.assets.store((FORKLIFT,), "another")
-    wire = Wire()
-    live.attach(wire, SITE_ID)
-    assert [asset["tag"] for asset in kept(wire)[-1]["assets"]] == ["t2"]

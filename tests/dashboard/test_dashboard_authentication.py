@@ -9,17 +9,14 @@ from msgspec.structs import replace
 from skyless.core.keys.fault import Fault
 from skyless.run.condition._reasons import authentication_reasons
 from skyless.run.condition.evidence import Evidence
-from skyless.run.mqtt.messages import AnchorHealth, Counters, TagHealth
 from skyless.run.site_table import SiteTable
+from support.site_messages import anchor_health, tag_health
 
 DAY_S = 86400.0
 UNIX_S = 1e9
-MQTT = Counters(0, 0, 0)
-TAG = TagHealth("t", UNIX_S, 60.0, "joint", 400, 390, 400.0, None, 0.1, 1e-3, 2e-3, {}, MQTT, 0.1, 1, ())
+TAG = tag_health("t", unix_s=UNIX_S)
 TRUSTING = replace(TAG, trust="open", is_verified=True)
-ANCHOR = AnchorHealth(
-    1, UNIX_S, 60.0, "anchor", None, None, True, 0.1, 0.5, 0.01, 9, 0, 9, 7, {}, {}, MQTT, mode="free"
-)
+ANCHOR = anchor_health(unix_s=UNIX_S, master=None, term=None, mode="free")
 KEYED = replace(ANCHOR, chain=2, chain_ends_unix_s=UNIX_S + 400 * DAY_S)
 
 

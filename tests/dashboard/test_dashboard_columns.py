@@ -21,7 +21,6 @@ from skyless.page.gathered import Gathered
 from skyless.page.live import LiveSite
 from skyless.page.live2 import Columns, View, anchors_message, conditions_message, tags_message
 from skyless.page.sites import LiveSites
-from skyless.page.state import read_request
 from skyless.run.fix_batch import RECORD
 from skyless.run.gather.subjects import NatsAddress
 
@@ -149,23 +148,6 @@ def test_anchors_and_their_conditions():
     message = conditions_message(anchors, conditions, 7)
     assert struct.unpack_from("<BBHQ", message) == (ord("H"), 0, len(anchors), 7)
     assert list(message[12:]) == [1, 2, 3] + [0] * (len(anchors) - 3)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "",
-        "ping",
-        "{}",
-        '{"view":[0,0,1],"px":[1,1]}',
-        '{"view":[1,0,0,1],"px":[9,9]}',
-        '{"view":[0,0,1e9,1],"px":[9,9]}',
-        '{"view":[0,0,1,1],"px":[0,9]}',
-        '{"view":[0,0,1,1],"px":[9,99999]}',
-    ],
-)
-def test_a_wrong_view_is_none(text):
-    assert read_request(text, View) is None
 
 
 def test_a_page_is_sent_anchors_conditions_and_the_tags_of_its_view(monkeypatch):

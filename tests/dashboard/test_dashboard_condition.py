@@ -10,23 +10,18 @@ from skyless.core.site import UnplacedAnchor
 from skyless.run.condition._reasons import START_S, alert_reasons
 from skyless.run.condition.evidence import Evidence
 from skyless.run.condition.monitor import EVALUATION_S, HOLD_S, ConditionMonitor
-from skyless.run.mqtt.messages import AnchorHealth, Counters, EtherHealth, TagHealth, WatchFinding, WatchMessage
+from skyless.run.mqtt.messages import EtherHealth, WatchFinding, WatchMessage
 from skyless.run.site_table import THRESHOLDS, SiteTable
+from support import site_messages
+from support.site_messages import tag_health
 
 IDS = [anchor.id for anchor in SITE.site.anchors]
-MQTT = Counters(0, 0, 0)
 HOST = "here"
 
 
 def anchor_health(anchor, unix_s, master=1, term=0, **more):
     role = "master" if anchor == master else "anchor"
-    health = AnchorHealth(*(anchor, unix_s, 60.0, role, master, term, True, 0.1, 0.5, 0.01, 9, 0, 9, 7, {}, {}, MQTT))
-    return replace(health, **more)
-
-
-def tag_health(name, unix_s, **more):
-    health = TagHealth(name, unix_s, 60.0, "joint", 400, 390, 400.0, None, 0.1, 1e-3, 2e-3, {}, MQTT, 0.1, 1, ())
-    return replace(health, **more)
+    return site_messages.anchor_health(anchor, unix_s=unix_s, role=role, master=master, term=term, **more)
 
 
 class Hall:
@@ -72,14 +67,7 @@ class Hall:
                 continue
             made = unix_s - self.delay_s - self.clock_error_s - self.latency_s
             self.evidence.add_fix(
-                fix(
-                    name,
-                    made,
-                    latency_s=self.latency_s,
-                    alert=self.alert,
-                    anchors=self.used,
-                    serial=self.receptions,
-                ),
+                fix(name, made, latency_s=self.latency_s, alert=self.alert, anchors=self.used, serial=self.receptions),
                 self.now_s,
                 unix_s,
             )
@@ -91,7 +79,7 @@ class Hall:
             for name in self.names:
                 more = {"receptions": self.receptions} | self.tags.get(name, {})
                 sent = unix_s - self.delay_s - self.clock_error_s
-                self.evidence.add_health("tag", name, tag_health(name, sent, **more), self.now_s, unix_s)
+                self.evidence.add_health("tag", name, tag_health(name, unix_s=sent, **more), self.now_s, unix_s)
             if self.air is not None:
                 air = replace(EtherHealth(unix_s, 1.0, 5, 0, {}, {}, 0, 0), **self.air)
                 self.evidence.add_health("ether", "air", air, self.now_s, unix_s)
@@ -214,14 +202,6 @@ def test_a_fault_is_reported_within_4_s_and_gone_within_7(hall, change, back, le
     assert hall.run(7.0).level == "good"
 
 
-def test_the_cause_of_a_missing_fix_is_named(hall):
-    hall.silent, hall.tags = {"t1"}, {"t1": {"reason": "too-few-anchors"}}
-    reason = hall.run(4.0).reasons[0]
-    assert reason.text == "tag t1 has no fix: too few anchors"
-    assert reason.names == ("tag/t1",)
-    assert "offline" in reason.advice
-
-
 def test_each_tag_has_the_cause_that_it_gives():
     """Of some tags, then of all."""
     hall = Hall(("t1", "t2", "t3", "t4")).start()
@@ -229,6 +209,7 @@ def test_each_tag_has_the_cause_that_it_gives():
     hall.tags = {"t1": {"reason": "bad-geometry"}, "t2": {"reason": "no-beacons"}, "t3": {"reason": "no-beacons"}}
     hall.silent = {"t1", "t2", "t3"}
     reason = hall.run(4.0).reasons[0]
+    assert reason.names == ("tag/t1", "tag/t2", "tag/t3")
     assert reason.text == "tags t1, t2 and t3 have no fix: no beacons (tags t2 and t3); bad geometry (tag t1)"
     assert reason.advice.startswith("For tags t2 and t3: It receives no anchor")
     hall.silent = {"t1", "t2", "t3", "t4"}
@@ -302,6 +283,30 @@ def test_findings_of_the_watch(hall):
     assert "does not report any more" in hall.run(1.0).text
 
 
+def test_tags_that_batches_have_no_longer_are_named_while_silence_means_something_and_then_forgotten():
+    hall = Hall(()).start()
+
+    def hear(seconds, *tags):
+        for _ in range(round(2 * seconds)):
+            unix_s = 1e9 + hall.now_s
+            for tag in tags:
+                hall.evidence.add_fix(fix(tag, unix_s), hall.now_s, unix_s, batched=True)
+            hall.table.hear(tags, hall.now_s)
+            hall.table.tick(hall.now_s)
+            condition = hall.run(0.5)
+        return {reason.kind: reason for reason in condition.reasons}
+
+    assert hear(12.0, "t1", "t2") == {}
+    silent = hear(THRESHOLDS.gone_s + 1.0, "t1")["silent"]
+    assert ("t2" in silent.text, silent.names) == (True, ("tag/t2",))
+    hall.table.set_connected(connected=False, now_s=hall.now_s, batches=True)
+    assert "silent" not in hear(10.0)
+    hall.table.set_connected(connected=True, now_s=hall.now_s, batches=True)
+    assert "no-fixes" in hear(THRESHOLDS.gone_s + 1.0)
+    hall.now_s += THRESHOLDS.longest_s
+    assert hear(4.0) == {}
+
+
 def test_a_stall_of_the_server_blames_no_anchor(hall):
     hall.now_s += 8.0  # nothing could be read meanwhile
     condition = hall.monitor.evaluate(hall.now_s, 8.0)
@@ -344,7 +349,7 @@ def test_the_condition_is_never_good_without_fresh_evidence(steps):
             evidence.add_health("anchor", str(anchor), health, now_s, now_s)
         elif kind == "tag":
             name, late = given_values
-            evidence.add_health("tag", name, tag_health(name, now_s, late=late), now_s, now_s)
+            evidence.add_health("tag", name, tag_health(name, unix_s=now_s, late=late), now_s, now_s)
         condition = monitor.evaluate(now_s, given_values[0] if kind == "evaluate" else 0.0)
         assert condition.level in {"waiting", "good", "warning", "bad"}
         assert (condition.level in {"warning", "bad"}) == bool(condition.reasons)

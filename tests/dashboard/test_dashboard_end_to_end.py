@@ -4,28 +4,21 @@ import asyncio
 import contextlib
 import json
 import signal
-import socket
 import time
 
 import httpx2 as httpx
 import msgspec
 import pytest
-import uvicorn
 import websockets
 from dashboard_builders import SITE, SITE_ID, SQUARE, fix, truth
-from websockets.protocol import State
 
-from skyless.page.app import Services, make_app
-from skyless.page.connections import AccessRules
-from skyless.page.live import IDLE_S
-from skyless.page.playback import Playback
-from skyless.page.sites import LiveSites
 from skyless.run.broker import BrokerSettings, start_broker
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import ZonesMessage
-from skyless.run.web import PAGE as LIMITS
 from support.processes import SKYLESS, free_port, running_program
+from support.unread import unread_websocket
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
@@ -44,14 +37,9 @@ async def dashboard(*arguments):
 async def site(address):
     """A node of the site, which has published the site."""
     link = Link(address, "air", site=SITE_ID, kind="ether")
-    running = asyncio.create_task(link.run())
     link.publish(topics.site_topic(SITE_ID), SITE, qos=1, retain=True)
-    try:
+    async with running(link.run()):
         yield link
-    finally:
-        running.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await running
 
 
 async def walk(link, tags=1, step_s=0.05):
@@ -84,12 +72,6 @@ async def next_of(page, kind_of_message, /, **fields):
     raise AssertionError(f"the connection ended before a {kind_of_message}")
 
 
-async def settled(condition):
-    async with asyncio.timeout(PATIENCE_S):
-        while not condition():
-            await asyncio.sleep(0.01)
-
-
 @pytest.mark.statistical
 async def test_a_site_is_found_shown_and_watched(tmp_path):
     where = BrokerSettings(port=free_port(), data=tmp_path / "broker")
@@ -117,7 +99,7 @@ async def test_a_site_is_found_shown_and_watched(tmp_path):
                     await next_of(page, "state")
                 assert len(overlay.result().json()["values"]) == 48
             assert (event["zone"], event["tag"]) == ("desk", "t0")
-            await settled(lambda: event | {"type": "zone_event"} in [seen | {"type": "zone_event"} for seen in events])
+            await until(lambda: event | {"type": "zone_event"} in [seen | {"type": "zone_event"} for seen in events])
             assert json.loads(zones[-1])["zones"][0]["id"] == "desk"
             await broker.stop()
             assert (await next_of(page, "mqtt"))["connected"] is False
@@ -146,7 +128,7 @@ async def test_a_page_that_does_not_read_delays_no_other(tmp_path):
     ):
         walking = asyncio.create_task(walk(link, tags=100))
         port = int(output["page"].rstrip("/").rsplit(":", 1)[1])
-        unread = [await never_read(port) for _ in range(3)]
+        unread = [await unread_websocket(port, "/live") for _ in range(3)]
         async with live_page(output) as page:
             await next_of(page, "state")
             for _ in range(80):
@@ -156,61 +138,6 @@ async def test_a_page_that_does_not_read_delays_no_other(tmp_path):
         walking.cancel()
         for sock in unread:
             sock.close()
-
-
-async def never_read(port):
-    """A page whose socket takes little and is never read."""
-    sock = socket.socket()
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-    sock.setblocking(False)
-    await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
-    lines = (
-        "GET /live HTTP/1.1",
-        f"Host: 127.0.0.1:{port}",
-        "Connection: Upgrade",
-        "Upgrade: websocket",
-        "Sec-WebSocket-Version: 13",
-        "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
-    )
-    await asyncio.get_running_loop().sock_sendall(sock, ("\r\n".join(lines) + "\r\n\r\n").encode())
-    return sock
-
-
-async def test_without_a_broker_the_page_opens_and_shows_it():
-    nobody = f"mqtt://127.0.0.1:{free_port()}"
-    async with dashboard("--mqtt", nobody) as (output, _), live_page(output) as page:
-        assert output["mqtt"] == nobody
-        hello = await next_of(page, "hello")
-        assert (hello["mqtt"], hello["site"]) == (False, None)
-        assert await next_of(page, "mqtt") == {"type": "mqtt", "connected": False, "broker": nobody}
-
-
-def test_idle_connections_shut_nobody_out_and_a_page_too_many_gets_the_reason(live, times):
-    async def check():
-        services = Services(LiveSites(live), Playback(None))
-        with socket.socket() as sock:
-            sock.bind(("127.0.0.1", 0))
-            config = uvicorn.Config(make_app(services, AccessRules()), ws="websockets-sansio", log_config=None)
-            server = uvicorn.Server(config)
-            serving = asyncio.create_task(server.serve(sockets=[sock]))
-            address = f"ws://127.0.0.1:{sock.getsockname()[1]}/live"
-            async with contextlib.AsyncExitStack() as stack:
-                await settled(lambda: server.started)
-                idle = [await stack.enter_async_context(connect(address)) for _ in range(LIMITS.pages_per_address)]
-                await settled(lambda: len(live.pages) == LIMITS.pages_per_address)
-                with pytest.raises(websockets.ConnectionClosed) as closed:
-                    async with connect(address) as refused:
-                        await refused.recv()
-                assert (closed.value.rcvd.code, closed.value.rcvd.reason[:28]) == (1013, "too many pages are open: 100")
-                times.move(IDLE_S)
-                newest = await stack.enter_async_context(connect(address))
-                assert (await next_of(newest, "hello"))["mqtt"] is False
-                await settled(lambda: any(page.state is State.CLOSED for page in idle))
-                assert len(live.pages) == LIMITS.pages_per_address
-                server.should_exit = True
-            await serving
-
-    asyncio.run(asyncio.wait_for(check(), 60.0))
 
 
 async def test_other_machines_need_the_token_that_is_printed():

@@ -1,17 +1,21 @@
 """The list of events: what happens once stands there once, in order; what was there before is no event."""
 
-from dashboard_builders import fix, status
+import msgspec
+import pytest
+from dashboard_builders import SQUARE, Wire, fix, status
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from test_dashboard_condition import anchor_health, tag_health
+from test_dashboard_condition import anchor_health
 
-from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, EventLog
+from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, EventLog, Kept
 from skyless.run.condition._reasons import Reason
 from skyless.run.condition.monitor import Condition
-from skyless.run.mqtt.messages import SurveyMessage, WatchFinding, WatchMessage
+from skyless.run.mqtt.messages import SurveyMessage, WatchFinding, WatchMessage, WrongMessageError, ZonesMessage
 from skyless.run.site_table import THRESHOLDS, SiteTable
+from skyless.run.zones import read_zones
 from skyless.site.survey.facts import Facts
+from support.site_messages import tag_health
 
 NOW = 1000.0
 
@@ -89,7 +93,7 @@ def test_a_status_that_the_broker_repeats_is_no_start():
 
 def test_nothing_ends_while_nothing_can_be_received():
     log = Log()
-    log.on_health("tag", "t1", tag_health("t1", NOW), NOW)
+    log.on_health("tag", "t1", tag_health(), NOW)
     log.on_fix(fix(alert="alert-limit-exceeded"), NOW)
     log.pause(NOW + 60)
     log.tick(NOW + 60.5)
@@ -108,14 +112,6 @@ def test_times_for_people_follow_their_clock_and_silence_does_not():
     assert [(event.text, event.unix_s) for event in log.events] == [
         ("anchor 3 is online", 1e9 + NOW), ("anchor 3 does not report any more", 2e9 + NOW + 4)
     ]  # fmt: skip
-
-
-def test_a_takeover_names_both_masters():
-    log = Log()
-    for k, master in enumerate((1, 1, 2)):
-        for anchor in (1, 2, 3):
-            log.on_health("anchor", str(anchor), anchor_health(anchor, NOW, master, master), NOW + k)
-    assert texts(log) == ["anchor 2 is the master now, after anchor 1"]
 
 
 def test_a_computer_that_is_busy_again_and_again_is_one_line():
@@ -201,7 +197,7 @@ def test_readers_get_every_event_once_in_order(steps):
     for online, name, wait_s in steps:
         now += wait_s
         log.on_status(status("tag", name, online, unix_s=now), now)
-        log.on_health("tag", name, tag_health(name, now), now)
+        log.on_health("tag", name, tag_health(name), now)
         log.tick(now)
     assert [event.serial for event in events] == list(range(1, log.serial + 1))
     assert [event.unix_s for event in events] == sorted(event.unix_s for event in events)
@@ -214,3 +210,30 @@ def test_the_newest_are_kept():
         log.on_status(status("tag", "t1", online=bool(k % 2), unix_s=NOW), NOW)
     assert len(log.events) == MAX_LOGGED
     assert log.events[-1].serial == log.serial
+
+
+MINE, THEIRS = (ZonesMessage((replace(SQUARE, id=name),)) for name in ("mine", "theirs"))
+
+
+def test_a_kept_list_is_what_was_stored_here_until_another_is_stored_after_it():
+    wire, kept = Wire(), Kept(ZonesMessage(()), read_zones)
+    kept.store(MINE)
+    kept.attach(wire, "zones")
+    assert [(topic, qos, retain) for topic, _, qos, retain in wire.published] == [("zones", 1, True)]
+    for message, is_new in ((THEIRS, False), (MINE, False), (THEIRS, True)):  # older, the echo, newer
+        assert kept.receive(msgspec.json.encode(message)) == is_new
+        assert kept.message == (THEIRS if is_new else MINE)
+    assert wire.forgotten == ["zones"], "it must not come back after a reconnect"
+
+
+def test_a_kept_list_that_cannot_be_read_or_is_not_that_of_the_site_shown_is_not_overwritten():
+    kept = Kept(ZonesMessage(()), read_zones)
+    with pytest.raises(WrongMessageError, match="'Lab'; it should be 'Hall'"):
+        kept.check_store("Lab", "Hall")
+    for payload in (b"{", b'{"zones": [{"id": "/"}]}'):
+        with pytest.raises(WrongMessageError):
+            kept.receive(payload)
+        with pytest.raises(WrongMessageError, match="nothing was overwritten"):
+            kept.check_store("Hall", "Hall")
+    kept.receive(b"")
+    kept.check_store("Hall", "Hall")

@@ -2,7 +2,9 @@
 
 import pytest
 
-from skyless.run.condition.evidence import USE_WINDOW_S, FixAges, ProcessorUse
+from skyless.run.condition.evidence import USE_WINDOW_S, Evidence, FixAges, ProcessorUse
+from skyless.run.site_table import SiteTable
+from support.site_messages import a_fix
 
 UNIX_S = 1e9
 
@@ -31,6 +33,15 @@ def test_the_health_of_a_tag_of_this_computer_counts_more_than_the_quickest_mess
     ages = FixAges()
     run(ages, 0, 5, health=True, rate_hz=1)
     assert run(ages, 5, 8, clock_s=-0.6, health=True, rate_hz=1) == pytest.approx(1e-3, abs=1e-6)
+
+
+@pytest.mark.parametrize("clock_error_s", [0.0, 3600.0, -3600.0])
+def test_the_time_of_a_fix_is_by_the_readers_clock_however_late_it_comes(clock_error_s):
+    evidence = Evidence(SiteTable(0.0))
+    for now_s, late_s in ((0.0, 0.0), (3.0, 2.0), (6.0, 0.0)):
+        unix_s = UNIX_S + now_s
+        tag = evidence.add_fix(a_fix(unix_s=unix_s - late_s + clock_error_s, latency_s=0.0), now_s, unix_s)
+        assert tag.ended_unix_s == pytest.approx(unix_s - late_s, abs=1e-3)
 
 
 def test_figures_of_slow_tags_are_steady_and_end_after_a_while():
@@ -70,16 +81,13 @@ def test_the_share_is_of_the_last_two_seconds(tmp_path):
     assert shares[12:] == pytest.approx([1.0] * 5)
 
 
-@pytest.mark.parametrize("text", ["", "cpu 1 2\n", "cpu a b c d e f g h\n", None])
+STILL = "cpu  5 0 5 8 2 0 0 0\n"
+
+
+@pytest.mark.parametrize("text", ["", "cpu 1 2\n", "cpu a b c d e f g h\n", STILL, None])
 def test_a_system_that_does_not_say_gives_no_share(tmp_path, text):
     counters = tmp_path / "stat"
     if text is not None:
         counters.write_text(text, encoding="ascii")
     use = ProcessorUse(counters)
-    assert [use.share(k * USE_WINDOW_S) for k in range(3)] == [None] * 3
-
-
-def test_counters_that_stand_still_give_no_share(tmp_path):
-    write(tmp_path / "stat", busy=10, idle=10)
-    use = ProcessorUse(tmp_path / "stat")
     assert [use.share(k * USE_WINDOW_S) for k in range(3)] == [None] * 3

@@ -4,28 +4,26 @@ import asyncio
 import contextlib
 import json
 import time
-from collections import Counter
 
 import httpx2 as httpx
 import msgspec
 import pytest
 from dashboard_builders import SITE, SQUARE, fix
-from hub_site import SITE as NUMBER
-from hub_site import TENANT, Servers
 from msgspec.structs import replace
 from starlette.exceptions import HTTPException
 from websockets.asyncio.client import connect as websocket
 
 from skyless.page import hub
 from skyless.page.live import LiveSite
-from skyless.run.gather.node import Gather
-from skyless.run.gather.subjects import NatsAddress, connect
+from skyless.run.gather.subjects import NatsAddress
 from skyless.run.hub import LISTEN_S, SILENT_S, HubLink, HubSites, make_hub_streams
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import StatusMessage, ZonesMessage
 from support.processes import SKYLESS, running_program
-from support.waiting import until
+from support.small_hub import client_of, running_hub, site
+from support.waiting import running, until
 
+NUMBER = 7
 HALL = msgspec.structs.replace(SITE, site=replace(SITE.site, id=NUMBER))
 
 
@@ -69,40 +67,35 @@ async def test_a_site_is_let_go_when_nobody_looks_and_the_next_look_connects_it_
         monkeypatch.setattr(one, "run", lambda *_: asyncio.sleep(60))
     shown = hub.ShownSites(NatsAddress("nats://none"), "here", lambda: LiveSite("here", "nats://none", at_hub=True))
     shown.known.add_site(topics.site_topic(NUMBER), msgspec.json.encode({"site": {"name": "Hall"}}))
-    running = asyncio.ensure_future(shown.run())
-    await asyncio.sleep(0)
-    live = shown.of(str(NUMBER))
-    page = live.open_page()
-    await asyncio.sleep(0.1)
-    assert shown.all == [live]
-    live.pages.discard(page)
-    await until(lambda: not shown.all)
-    assert shown.of(str(NUMBER)) is not live
-    with pytest.raises(HTTPException, match="number of a site at this hub"):
-        shown.of("8")
-    running.cancel()
-    await asyncio.gather(running, return_exceptions=True)
+    async with running(shown.run()):
+        live = shown.of(str(NUMBER))
+        page = live.open_page()
+        await asyncio.sleep(0.1)
+        assert shown.all == [live]
+        live.pages.discard(page)
+        await until(lambda: not shown.all)
+        assert shown.of(str(NUMBER)) is not live
+        with pytest.raises(HTTPException, match="number of a site at this hub"):
+            shown.of("8")
 
 
 @pytest.mark.site
 async def test_a_page_that_is_started_after_a_cut_shows_the_site_and_changes_nothing(tmp_path):
-    servers = Servers(tmp_path)
-    with servers.running("hub"):
-        with servers.running("site"):
-            async with _client(servers.hub) as hub_client, _client(servers.site) as site, asyncio.timeout(60):
-                await make_hub_streams(hub_client, servers.plan, TENANT)
-                gather = asyncio.ensure_future(Gather(servers.site, NUMBER, 10**8, print).run())
-                walking = asyncio.ensure_future(_walk(site))
-                async with httpx.AsyncClient() as http, _dashboard(servers, http):
+    with running_hub(tmp_path) as (servers, _):
+        address = servers.address("plant")
+        async with site(tmp_path, servers.leaf("plant", NUMBER)) as broker:
+            hub_client, client = await client_of(address), await client_of(broker.nats)
+            async with asyncio.timeout(60), running(_walk(client)):
+                await make_hub_streams(hub_client, servers, "plant")
+                async with httpx.AsyncClient() as http, _dashboard(address, http):
                     await _until(http, "sites", lambda found: found and found[0]["name"] == HALL.site.name)
                     await _until(http, "sites", lambda found: found[0]["condition"] not in {"unknown", "cut"})
                     await _until(http, f"v1/tags?site={NUMBER}", lambda found: found and found[0]["fix"])
                 while (await hub_client.jetstream().stream_info("STATE_7")).state.messages < 3:
                     await asyncio.sleep(0.1)
-                walking.cancel()
-                gather.cancel()
-                await asyncio.gather(gather, walking, return_exceptions=True)
-        async with httpx.AsyncClient() as http, _dashboard(servers, http) as page, asyncio.timeout(60):
+            for one in (hub_client, client):
+                await one.close()
+        async with httpx.AsyncClient() as http, _dashboard(address, http) as page, asyncio.timeout(60):
             await _until(http, "sites", lambda found: found and found[0]["condition"] == "cut")
             assert (await http.get("/api/v1/site")).status_code == 404
             async with websocket(f"{page.replace('http', 'ws')}live?site={NUMBER}") as socket:
@@ -139,17 +132,8 @@ async def _walk(site):
 
 
 @contextlib.asynccontextmanager
-async def _client(address):
-    client = await connect(address, "test", print, Counter())
-    try:
-        yield client
-    finally:
-        await client.close()
-
-
-@contextlib.asynccontextmanager
-async def _dashboard(servers, http):
-    command = (*SKYLESS, "dashboard", "--json", "--hub", str(servers.hub).replace("@", f":{servers.hub.password}@"))
+async def _dashboard(address, http):
+    command = (*SKYLESS, "dashboard", "--json", "--hub", str(address).replace("@", f":{address.password}@"))
     async with running_program(*command, stdout=asyncio.subprocess.PIPE) as process:
         page = json.loads(await process.stdout.readline())["page"]
         http.base_url = page

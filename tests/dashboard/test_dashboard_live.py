@@ -1,32 +1,21 @@
 """Messages from MQTT reach the board, the zones and the pages; wrong ones are counted."""
 
-import asyncio
 import json
 
 import msgspec
 import pytest
-from dashboard_builders import SITE, SITE_ID, SQUARE, fix, status, truth
+from dashboard_builders import SITE, SITE_ID, SQUARE, drained, fix, of, status, truth
 from msgspec.structs import replace
-from test_dashboard_condition import anchor_health
 
-from skyless.page.events import MAX_KEPT
-from skyless.page.live import LiveSite
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.messages import SiteZones, WrongMessageError, ZoneEvent, ZonesMessage
-from skyless.run.site_table import THRESHOLDS
+from skyless.run.mqtt.messages import SiteZones, ZoneEvent, ZonesMessage
+from skyless.run.site_feed import KINDS
+from support.site_messages import tag_health
 
 FIX = topics.fix_topic(SITE_ID, "t1")
 ZONES = topics.zones_topic(SITE_ID)
 HELLO = ("type", "version", "site", "events", "mqtt", "history", "live2", "hub")
 EVENT = topics.zone_event_topic(SITE_ID, "desk")
-
-
-def drained(live, page):
-    return [json.loads(message) for message in asyncio.run(asyncio.wait_for(page.drain(live.state), 1.0))]
-
-
-def of(kind, messages):
-    return [message for message in messages if message["type"] == kind]
 
 
 def enter_the_desk(live, wire):
@@ -37,7 +26,7 @@ def enter_the_desk(live, wire):
 
 def test_a_page_first_gets_hello(live, wire):
     wire.deliver(FIX, fix())
-    messages = drained(live, live.open_page())
+    messages = drained(live)
     assert messages[0]["type"] == "hello"
     assert messages[0].keys() == {*HELLO, "thresholds", "zones", "other_zones", "zones_fault"}
     assert (messages[0]["site"], messages[0]["zones"], messages[0]["mqtt"]) == (None, [], False)
@@ -54,7 +43,7 @@ def test_pages_are_sent_the_site_and_the_state_of_the_broker(live, wire):
     assert of("site", messages)[0]["site"]["site"]["name"] == SITE.site.name
     assert of("site", messages)[0]["site"]["simulated"] is True
     assert of("mqtt", messages)[0]["connected"] is True
-    assert drained(live, live.open_page())[0]["site"]["site"]["id"] == SITE_ID
+    assert drained(live)[0]["site"]["site"]["id"] == SITE_ID
 
 
 def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):
@@ -70,62 +59,22 @@ def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):
     assert len(state["tags"]) == 8
     assert next(row for row in state["tags"] if row[0] == "t1")[1] == 4.99
     assert len(of("health", messages)) == 1
-
-
-def test_without_anything_new_there_is_no_state(live, wire, times):
-    page = live.open_page()
-    wire.deliver(FIX, fix())
-    live.tick()
-    assert of("state", drained(live, page))
     times.move(2.0)
     live.tick()
     messages = drained(live, page)
     assert of("health", messages)
-    assert not of("state", messages)
-
-
-@pytest.mark.parametrize("clock_error_s", [0.0, 3600.0, -3600.0])
-def test_a_row_has_the_time_of_its_fix_by_the_servers_clock_however_late_it_comes(live, wire, times, clock_error_s):
-    def time_of_fix(late_s=0.0, error_s=clock_error_s):
-        times.move(0.1 + late_s)  # a late fix does not overtake the one before it
-        wire.deliver(FIX, fix(unix_s=times.unix_s - late_s + error_s, latency_s=0.0))
-        return json.loads(live.state.state_since(live.table.fixes_serial - 1))["tags"][0][15] - times.unix_s
-
-    assert time_of_fix() == pytest.approx(0.0, abs=1e-3)
-    assert time_of_fix(late_s=2.0) == pytest.approx(-2.0, abs=1e-3)
-    assert time_of_fix() == pytest.approx(0.0, abs=1e-3)
-    assert time_of_fix(error_s=clock_error_s - 7200.0) == pytest.approx(0.0, abs=1e-3), "its clock was set back"
-    times.move(500.0)
-    live.tick()
-    page = live.open_page()
-    (state,) = of("state", drained(live, page))
-    assert state["unix_s"] - state["tags"][0][15] == pytest.approx(500.0, abs=1e-2)
-
-
-def test_the_condition_has_the_servers_time(live, times):
-    times.move(77.0)
-    page = live.open_page()
-    assert of("condition", drained(live, page))[0]["unix_s"] == times.unix_s
-    times.move(1.0)
-    live.tick()
-    assert of("condition", drained(live, page))[0]["unix_s"] == times.unix_s
+    assert not of("state", messages), "there is nothing new"
+    assert of("condition", messages)[0]["unix_s"] == times.unix_s
 
 
 @pytest.mark.parametrize(
     ("topic", "payload"),
     [
         (FIX, b""),
-        (FIX, b"null"),
-        (FIX, b"\xff\xfe\x00"),
-        (FIX, b"[" * 10_000),
-        (FIX, fix("somebody-else")),
         (topics.site_topic(SITE_ID), replace(SITE, site=replace(SITE.site, id=SITE_ID + 1))),
         (topics.site_topic(SITE_ID), replace(SITE, site=replace(SITE.site, anchors=()))),
-        (topics.status_topic(SITE_ID, "tag", "t1"), b"{}"),
-        (topics.health_topic(SITE_ID, "tag", "t1"), b'{"tag":1}'),
-        (topics.truth_topic(SITE_ID), b'{"unix_s":"now","tags":{}}'),
+        (topics.assets_topic(SITE_ID), b'{"assets": [{"tag": "a b"}]}'),
         (ZONES, b'{"zones":[{"id":"a","name":"A","polygon_m":[[0,0],[1,1]]}]}'),
-        (EVENT, b'{"zone":"other"}'),
     ],
 )
 def test_wrong_messages_are_counted_and_change_nothing(live, wire, topic, payload):
@@ -134,14 +83,8 @@ def test_wrong_messages_are_counted_and_change_nothing(live, wire, topic, payloa
     assert live.table.fixes_serial == 0
     assert live.site is None
     assert live.monitor.zones == ()
-    counted = of("health", drained(live, live.open_page()))[0]["dropped"]
+    counted = of("health", drained(live))[0]["dropped"]
     assert counted == {topic.rsplit("/", 1)[-1]: 1}
-
-
-def test_health_of_unknown_kinds_and_cleared_statuses_are_no_fault(live, wire):
-    live.feed.receive(topics.health_topic(SITE_ID, "toaster", "1"), b"{}")
-    wire.deliver(topics.status_topic(SITE_ID, "tag", "t1"), b"")
-    assert not live.dropped
 
 
 def test_zones_are_retained_and_events_have_quality_of_service_1(live, wire):
@@ -153,7 +96,7 @@ def test_zones_are_retained_and_events_have_quality_of_service_1(live, wire):
     messages = drained(live, page)
     assert of("zones", messages)[0]["zones"][0]["id"] == "desk"
     assert of("zone_event", messages) == [{"type": "zone_event", **event}]
-    assert drained(live, live.open_page())[0]["events"] == [event]
+    assert drained(live)[0]["events"] == [event]
 
 
 def test_the_echo_of_an_own_event_is_not_sent_again(live, wire):
@@ -166,14 +109,6 @@ def test_the_echo_of_an_own_event_is_not_sent_again(live, wire):
     assert [event["tag"] for event in of("zone_event", drained(live, page))] == ["t9"]
 
 
-def test_events_of_a_slow_page_are_bounded(live, wire):
-    page = live.open_page()
-    for k in range(MAX_KEPT + 10):
-        wire.deliver(EVENT, ZoneEvent("desk", "Desk", f"t{k}", "enter", 1.0, (0.0, 0.0, 0.0)))
-    events = of("zone_event", drained(live, page))
-    assert [event["tag"] for event in events] == [f"t{k}" for k in range(10, MAX_KEPT + 10)]
-
-
 def test_a_second_dashboard_leaves_publishing_to_the_first(live, wire, times):
     wire.deliver(topics.status_topic(SITE_ID, "dashboard", "here"), status("dashboard", "here", unix_s=5.0))
     wire.deliver(topics.status_topic(SITE_ID, "dashboard", "older"), status("dashboard", "older", unix_s=1.0))
@@ -182,40 +117,6 @@ def test_a_second_dashboard_leaves_publishing_to_the_first(live, wire, times):
     times.move(1.1)
     live.tick()
     assert EVENT in wire.topics()
-
-
-def test_a_tag_without_fixes_or_offline_leaves(live, wire, times):
-    live.on_connection(connected=True)
-    enter_the_desk(live, wire)
-    times.move(THRESHOLDS.longest_s)
-    live.tick()
-    assert json.loads(wire.published[-1][1])["kind"] == "leave"
-    wire.deliver(FIX, fix(unix_s=times.unix_s))
-    live.tick()
-    wire.deliver(topics.status_topic(SITE_ID, "tag", "t1"), status(online=False))
-    live.tick()
-    assert [json.loads(payload)["kind"] for topic, payload, *_ in wire.published if topic == EVENT] == [
-        *("enter", "leave"),
-        *("enter", "leave"),
-    ]
-
-
-def test_older_zones_of_the_broker_do_not_undo_zones_on_their_way(live, wire):
-    live.store_zones((SQUARE,))
-    wire.deliver(ZONES, ZonesMessage(()))
-    assert live.monitor.zones == (SQUARE,)
-    wire.deliver(ZONES, ZonesMessage((SQUARE,)))
-    other = replace(SQUARE, name="Sofa")
-    wire.deliver(ZONES, ZonesMessage((other,)))
-    assert live.monitor.zones == (other,)
-    assert wire.forgotten == [ZONES], "another dashboard's zones are newer; ours must not come back after a reconnect"
-
-
-def test_zones_drawn_before_the_site_is_known_are_stored_later(times, wire):
-    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
-    live.store_zones((SQUARE,))
-    live.attach(wire, SITE_ID)
-    assert wire.topics() == [ZONES]
 
 
 def named(name):
@@ -249,13 +150,6 @@ def test_a_site_does_not_show_the_zones_of_another_with_its_number(live, wire):
     assert live.monitor.zones == (sofa,)
 
 
-def test_a_page_that_shows_another_site_does_not_store_its_zones(live, wire):
-    wire.deliver(topics.site_topic(SITE_ID), named("Hall"))
-    with pytest.raises(WrongMessageError, match="'Lab'; it should be 'Hall'"):
-        live.store_zones((SQUARE,), "Lab")
-    assert wire.topics() == []
-
-
 @pytest.mark.parametrize("site_first", [True, False])
 def test_zones_of_before_become_those_of_the_site_that_is_shown(live, wire, site_first):
     messages = [(topics.site_topic(SITE_ID), named("Hall")), (ZONES, b'{"zones":[%s]}' % msgspec.json.encode(SQUARE))]
@@ -284,49 +178,25 @@ def test_named_zones_wait_for_the_site(live, wire):
     assert wire.topics() == []
 
 
-def test_damaged_zones_at_the_broker_are_not_overwritten(live, wire):
-    wire.deliver(topics.site_topic(SITE_ID), named("Hall"))
+def test_damaged_zones_at_the_broker_are_shown_as_a_fault(live, wire):
     wire.deliver(ZONES, b'{"zones": [{"id": ')
-    fault = drained(live, live.open_page())[0]["zones_fault"]
+    fault = drained(live)[0]["zones_fault"]
     assert ZONES in fault
     assert "\n" not in fault
-    with pytest.raises(WrongMessageError, match="nothing was overwritten"):
-        live.store_zones((SQUARE,))
-    assert wire.topics() == []
-    wire.deliver(ZONES, b"")
-    assert drained(live, live.open_page())[0]["zones_fault"] is None
-    live.store_zones((SQUARE,))
-    assert wire.topics() == [ZONES]
 
 
-def test_the_truth_reaches_the_rows(live, wire):
+def test_what_the_broker_has_cleared_is_no_fault(live, wire):
+    for kind in KINDS:
+        for topic in kind.topics if kind.retained else ():
+            wire.deliver(f"{topics.ROOT}/{SITE_ID}/{topic.replace('+', '1')}", b"")
+    assert not live.dropped
+
+
+def test_the_truth_reaches_the_rows_and_health_the_alarms(live, wire, monkeypatch):
+    heard = []
+    monkeypatch.setattr(live.alarms.engine, "on_health", heard.append)
+    wire.deliver(topics.health_topic(SITE_ID, "tag", "t1"), tag_health())
+    assert heard == [tag_health()]
     wire.deliver(topics.truth_topic(SITE_ID), truth(position_m=(2.0, 2.03, 1.0)))
     wire.deliver(FIX, fix(position_m=(2.0, 2.0, 1.0)))
     assert live.state.rows_since(0)[0][10] == pytest.approx(0.03)
-
-
-def test_neither_a_clock_that_is_set_nor_an_absent_broker_nor_a_stall_makes_anchors_silent(live, wire, times):
-    def pass_time(seconds, lag_s=0.0):
-        times.move(seconds)
-        live.tick(lag_s)
-
-    def report():
-        wire.deliver(topics.health_topic(SITE_ID, "anchor", "1"), anchor_health(1, times.unix_s))
-
-    live.on_connection(connected=True)
-    report()
-    times.unix_s += 3600.0
-    pass_time(1.0)
-    live.on_connection(connected=False)
-    for _ in range(20):
-        pass_time(0.5)
-    live.on_connection(connected=True)
-    pass_time(0.5)
-    report()
-    pass_time(8.0, lag_s=8.0)
-    pass_time(0.5)
-    pass_time(0.5)
-    assert [event for event in live.log.events if event.kind == "anchor"] == []
-    pass_time(THRESHOLDS.report_s)
-    (event,) = [event for event in live.log.events if event.kind == "anchor"]
-    assert (event.text, event.unix_s) == ("anchor 1 does not report any more", times.unix_s)

@@ -8,7 +8,6 @@ import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, browser_of, fix, truth
 from starlette.exceptions import HTTPException
 
-from skyless.page.connections import AccessRules
 from skyless.page.live import LiveSite
 from skyless.page.playback import Playback
 from skyless.run.mqtt import topics
@@ -180,17 +179,6 @@ def test_a_recording_is_downloaded_with_its_name_as_far_as_it_is_written(folder)
     with (folder / "first.mcap").open("ab") as file:
         file.write(b"more")
     assert b"".join(growing.pieces()) == before, "as long as was announced, whatever is added meanwhile"
-
-
-def test_a_download_needs_the_token_as_everything_does(folder):
-    rules = AccessRules("correct-horse-battery", remote=True)
-    live = LiveSite("here", "mqtt://broker:1")
-    stranger = browser_of(live, folder, rules=rules, base_url="http://192.168.1.5:8080")
-    assert stranger.get("/api/recordings/first.mcap/file").status_code == 401
-    elsewhere = {"origin": "http://evil.example", "authorization": "Bearer correct-horse-battery"}
-    assert stranger.get("/api/recordings/first.mcap/file", headers=elsewhere).status_code == 403
-    mine = stranger.get("/api/recordings/first.mcap/file", params={"token": "correct-horse-battery"})
-    assert mine.status_code == 200
 
 
 def test_the_events_of_a_recording_are_those_that_a_live_page_would_have_listed(folder):

@@ -1,11 +1,8 @@
 """Several sites on one broker: a page shows one that is alive, of one site only, and another where it is asked to."""
 
-import asyncio
-import json
-
 import msgspec
 import pytest
-from dashboard_builders import SITE, SQUARE, Times, Wire, browser_of
+from dashboard_builders import SITE, SQUARE, Times, Wire, browser_of, drained, of
 from starlette.exceptions import HTTPException
 
 from skyless.page import sites as sites_module
@@ -46,12 +43,6 @@ def stage():
     return Stage()
 
 
-def messages_of(live):
-    """What a page that is opened now gets first, by kind."""
-    drained = asyncio.run(live.open_page().drain(live.state))
-    return {message["type"]: message for message in map(json.loads, drained)}
-
-
 def number_of(live):
     return live.site and live.site.site.id
 
@@ -60,13 +51,13 @@ def test_nothing_of_a_dead_site_is_shown_before_one_is_alive(stage):
     stage.on_broker(s1=0)
     waiting = stage.sites.of(None)
     page = waiting.open_page()
-    first = messages_of(waiting)
-    assert (first["hello"]["site"], stage.wires) == (None, {})
-    assert first["sites"] == {"type": "sites", "shown": None, "sites": [[1, "s1", False]]}
+    first = drained(waiting)
+    assert (of("hello", first)[0]["site"], stage.wires) == (None, {})
+    assert of("sites", first) == [{"type": "sites", "shown": None, "sites": [[1, "s1", False]]}]
     stage.on_broker(s1=0, s5=2)
     assert number_of(waiting) == 5
-    later = [json.loads(message) for message in asyncio.run(page.drain(waiting.state))]
-    assert [message["site"]["site"]["id"] for message in later if message["type"] == "site"] == [5]
+    later = drained(waiting, page)
+    assert [message["site"]["site"]["id"] for message in of("site", later)] == [5]
     assert {"type": "sites", "shown": 5, "sites": [[1, "s1", False], [5, "s5", True]]} in later
     assert list(stage.wires) == [5]
 
@@ -123,7 +114,7 @@ def test_requests_and_pages_are_of_the_site_that_they_name(stage):
 def test_a_server_of_one_site_shows_that_and_offers_none(stage):
     sites = LiveSites(stage.make())
     live = sites.of(None)
-    assert "sites" not in messages_of(live)
+    assert of("sites", drained(live)) == []
     with pytest.raises(HTTPException):
         sites.of("1")
 

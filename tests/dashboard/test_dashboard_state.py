@@ -9,8 +9,9 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.page.state import MAX_HEALTHS, PageRequest, Sent, SiteState
-from skyless.run.mqtt.messages import AnchorHealth, Counters, EtherHealth
+from skyless.run.mqtt.messages import AnchorHealth, EtherHealth
 from skyless.run.site_table import SiteTable
+from support.site_messages import anchor_health
 
 POSITION = ("name", "x_m", "y_m", "z_m", "vx", "vy")
 ERRORS = ("cov_xx", "cov_xy", "cov_yy", "std_m", "error_m", "true_x", "true_y", "anchors_used", "chi2", "fix_unix_s")
@@ -133,12 +134,6 @@ def test_a_restarted_ether_is_accepted():
     assert rows(state)[0]["error_m"] == 0.0
 
 
-def anchor_health(anchor):
-    return AnchorHealth(
-        *(anchor, 0.0, 1.0, "anchor", 1, 0, True, 1e-3, 0.5, 0.01, 1, 0, 1, 7, {"1": 0.1}, {}, Counters(0, 0, 0))
-    )
-
-
 def health(state, sent=None):
     return json.loads(state.new_health(sent or Sent()))
 
@@ -203,7 +198,7 @@ def test_silence_makes_an_anchor_offline_only_while_the_server_can_hear():
 def test_of_many_anchors_a_page_gets_all_conditions_and_the_healths_that_it_names():
     state, sent = State(), Sent()
     for n in range(MAX_HEALTHS + 1):
-        state.add_health(str(n), replace(anchor_health(n), role="master" if n == 7 else "anchor"), 0.0)
+        state.add_health(str(n), anchor_health(n, role="master" if n == 7 else "anchor"), 0.0)
     state.judge(0.0, blind=False)
     first = health(state, sent)
     assert len(first["conditions"]) == MAX_HEALTHS + 1

@@ -1,12 +1,11 @@
 """The server forwards the survey and the watch, and publishes what pages give to the survey program."""
 
-import asyncio
 import json
 import struct
 
 import msgspec
 import pytest
-from dashboard_builders import SITE, SITE_ID, browser_of
+from dashboard_builders import SITE, SITE_ID, browser_of, drained, of
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
@@ -53,23 +52,18 @@ def browser(live):
     return browser_of(live)
 
 
-def drained(live, page, kind):
-    messages = asyncio.run(asyncio.wait_for(page.drain(live.state), 1.0))
-    return [message for message in map(json.loads, messages) if message["type"] == kind]
-
-
 def test_the_survey_and_the_watch_reach_pages(live, wire):
     page = live.open_page()
-    assert drained(live, page, "survey") == []
+    assert of("survey", drained(live, page)) == []
     wire.deliver(SURVEY, survey_message())
     wire.deliver(WATCH, watch_message())
-    (survey,), watch = drained(live, page, "survey"), json.loads(live.survey.messages()["watch"])
+    (survey,), watch = of("survey", drained(live, page)), json.loads(live.survey.messages()["watch"])
     assert survey["survey"] == json.loads(msgspec.json.encode(survey_message()))
     assert watch["watch"]["findings"][0]["sentence"] == "anchor 4 has moved by about 11 cm"
     later = live.open_page()
-    assert drained(live, later, "survey")[0]["survey"]["serial"] == 3
+    assert of("survey", drained(live, later))[0]["survey"]["serial"] == 3
     wire.deliver(SURVEY, b"")  # the program has ended
-    assert drained(live, page, "survey")[-1]["survey"] is None
+    assert of("survey", drained(live, page))[-1]["survey"] is None
 
 
 def test_a_message_that_the_broker_kept_is_as_old_as_it_says(live, wire, times):
@@ -87,14 +81,6 @@ def test_a_message_that_the_broker_kept_is_as_old_as_it_says(live, wire, times):
     assert age_s() == pytest.approx(107.0)
     wire.deliver(SURVEY, survey_message(unix_s=1e9))  # its sender's clock is fast
     assert age_s() == pytest.approx(0.0)
-
-
-@pytest.mark.parametrize("topic", [SURVEY, WATCH])
-@pytest.mark.parametrize("payload", [b"{", b"[]", b'{"unix_s": "x"}', b"\xff", b"null"])
-def test_wrong_messages_are_dropped_and_counted(live, wire, topic, payload):
-    wire.deliver(topic, payload)
-    assert sum(live.dropped.values()) == 1
-    assert live.survey.messages() == {}
 
 
 FACTS = SurveyFactsMessage(
@@ -177,12 +163,12 @@ def test_a_floor_plan_is_retained_and_shown(browser, wire, live):
     assert browser.put("/api/floor_plan", content=IMAGE).json() == {"bytes": len(IMAGE)}
     assert wire.published == [(FLOOR, IMAGE, 1, True)]
     assert browser.get("/api/floor_plan").content == IMAGE
-    digest = drained(live, page, "floor_plan")[0]["digest"]
+    digest = of("floor_plan", drained(live, page))[0]["digest"]
     wire.deliver(FLOOR, IMAGE)  # as the broker returns it
     assert wire.forgotten == []
     wire.deliver(FLOOR, IMAGE + b"0")  # another program's
     assert wire.forgotten == [FLOOR]
-    assert drained(live, page, "floor_plan")[0]["digest"] != digest
+    assert of("floor_plan", drained(live, page))[0]["digest"] != digest
 
 
 @pytest.mark.parametrize(
@@ -202,16 +188,11 @@ def test_nothing_is_accepted_without_a_broker(browser, wire, live):
         ("PUT", "/api/survey/facts", msgspec.json.encode(FACTS)),
         ("POST", "/api/survey/save", b'{"serial": 3}'),
         ("PUT", "/api/floor_plan", IMAGE),
+        ("POST", "/api/v1/alarms/r/t1/acknowledge", b'{"id": "x", "by": "y"}'),
     ):
         answer = browser.request(method, path, content=body)
         assert answer.status_code == 503
         assert "mqtt://broker:1" in answer.json()["error"]
-    assert wire.published == []
-
-
-def test_other_sites_pages_change_nothing(browser, wire):
-    for method, path in (("PUT", "/api/survey/facts"), ("POST", "/api/survey/save"), ("PUT", "/api/floor_plan")):
-        assert browser.request(method, path, headers={"origin": "http://evil.example"}).status_code == 403
     assert wire.published == []
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from dashboard_builders import status
 from msgspec.structs import replace
-from test_dashboard_condition import anchor_health, tag_health
+from test_dashboard_condition import anchor_health
 
 from skyless.run.fix_batch import ALERTS, RECORD
 from skyless.run.gather.node import SiteCondition
@@ -13,6 +13,7 @@ from skyless.run.gather.streams import TagName
 from skyless.run.mqtt.messages import site_message
 from skyless.run.mqtt.topics import health_topic, site_topic, status_topic
 from skyless.sim.lab import lab_site
+from support.site_messages import tag_health
 
 SITE = replace(lab_site(100.0), name="hall")
 ANCHORS = [str(anchor.id) for anchor in SITE.anchors]
@@ -64,9 +65,7 @@ def test_a_tag_without_a_fix_says_why(condition):
     condition.say(status_topic(7, "tag", "ann"), status("tag", "ann"), 0.0)
     for second in range(8):
         condition.second(float(second), 2)
-        condition.say(
-            health_topic(7, "tag", "ann"), replace(tag_health("ann", second), reason="too-few-anchors"), second
-        )
+        condition.say(health_topic(7, "tag", "ann"), tag_health(tag="ann", reason="too-few-anchors"), second)
     assert condition.judged(7.0) == ("degraded", ["tag ann has no fix: too few anchors"])
 
 

@@ -110,15 +110,6 @@ def test_errors_are_as_the_document_says(client, document, route):
     assert asked(client, route, {**query, "site": "60000"}).status_code == 404
 
 
-def test_tags_come_in_pages(client):
-    found, after = [], ""
-    while after is not None:
-        answer = client.get("tags", params={"limit": 3, "after": after}).json()
-        found += [tag["tag"] for tag in answer["tags"]]
-        after = answer["next"]
-    assert found == [*NAMES, "t9"]
-
-
 @given(st.integers(1, 9))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=20)
 def test_pages_have_each_tag_once(client, limit):
@@ -128,8 +119,7 @@ def test_pages_have_each_tag_once(client, limit):
         assert len(answer["tags"]) <= limit
         found += [tag["tag"] for tag in answer["tags"]]
         after = answer["next"]
-    assert found == sorted(set(found))
-    assert len(found) == 8
+    assert found == [*NAMES, "t9"]
 
 
 def test_tags_by_group_zone_and_name(client, site, wire):
@@ -327,17 +317,12 @@ def test_a_real_history_answers_and_a_question_that_takes_too_long_is_ended(live
         client.app.state.services.past.stop()
 
 
-def test_without_a_history(site):
-    with browser_of(site) as client:
-        answer = client.get(f"{API}/history/tags")
-        assert answer.status_code == 404
-        assert "start the page's server with --history FOLDER" in answer.json()["error"]
-
-
-def test_a_history_without_this_site(site, tmp_path):
-    with browser_of(site, history=tmp_path / "empty") as client:
-        assert client.get(f"{API}/history/tags").status_code == 404
-        assert client.get(f"{API}/history/dwell", params={"from": "soon"}).status_code == 404
+def test_without_a_history_of_this_site(site, tmp_path):
+    for folder, words in ((None, "start the page's server with --history FOLDER"), (tmp_path / "empty", "")):
+        with browser_of(site, history=folder) as client:
+            for question in ("tags", "dwell?from=soon"):
+                answer = client.get(f"{API}/history/{question}")
+                assert (answer.status_code, words in answer.json()["error"]) == (404, True)
 
 
 # Tokens
@@ -351,7 +336,8 @@ def test_the_readers_token_reads_and_the_operators_does_all(site, tmp_path, rout
     rules = AccessRules(OPERATOR, READER, remote=remote)
     client = browser_of(site, history=tmp_path, rules=rules, base_url=API + "/")
     assert asked(client, route).status_code == 401
-    assert asked(client, route, headers={"authorization": f"Bearer {READER}x"}).status_code == 401
+    for wrong in (f"Bearer {READER}x", f"Basic {OPERATOR}"):
+        assert asked(client, route, headers={"authorization": wrong}).status_code == 401
     assert asked(client, route, headers={"authorization": f"Bearer {OPERATOR}"}).status_code == 200
     expected = 200 if route.role == "reader" else 403
     assert asked(client, route, headers={"authorization": f"Bearer {READER}"}).status_code == expected
@@ -366,11 +352,6 @@ def test_a_token_in_the_query_becomes_the_cookie_of_its_own_role(site):
     assert client.put("/api/zones", json={"zones": []}).status_code == 403
     assert client.get("site", params={"token": OPERATOR}).status_code == 200
     assert client.put("assets", json={"assets": []}).status_code == 200
-
-
-def test_other_pages_of_a_browser_are_refused(client):
-    answer = client.put("assets", json={"assets": []}, headers={"origin": "http://evil.example"})
-    assert answer.status_code == 403
 
 
 # Fuzz

@@ -21,6 +21,7 @@ from skyless.run.broker import BrokerSettings, start_broker
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
 from support.processes import SKYLESS, free_port, running_program
+from support.waiting import running
 
 pytestmark = pytest.mark.site
 
@@ -36,16 +37,13 @@ async def running_site(folder, *options):
     broker = await start_broker(BrokerSettings(port=free_port(), data=folder / "broker"))
     link = Link(broker.address, "air", site=SITE_ID, kind="ether")
     link.publish(topics.site_topic(SITE_ID), SITE, qos=1, retain=True)
-    work = [asyncio.create_task(link.run()), asyncio.create_task(_walk(link))]
     command = (*SKYLESS, "dashboard", "--json", "--mqtt", str(broker.address), *options)
-    try:
-        async with running_program(*command, stdout=asyncio.subprocess.PIPE) as process:
-            yield json.loads(await asyncio.wait_for(process.stdout.readline(), PATIENCE_S))
-    finally:
-        for task in work:
-            task.cancel()
-        await asyncio.gather(*work, return_exceptions=True)
-        await broker.stop()
+    async with (
+        broker,
+        running(link.run(), _walk(link)),
+        running_program(*command, stdout=asyncio.subprocess.PIPE) as process,
+    ):
+        yield json.loads(await asyncio.wait_for(process.stdout.readline(), PATIENCE_S))
 
 
 async def _walk(link):

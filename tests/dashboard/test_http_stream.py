@@ -58,23 +58,6 @@ async def _show_later(live):
     show(live, live._link, "t5")
 
 
-def test_the_first_fixes_are_not_old(site, wire, times):
-    times.move(4.0)
-    show(site, wire, "t2")
-    times.move(2.0)
-    assert fixed(SiteStream(site, frozenset())) == ["t2"]
-
-
-def test_only_what_is_new(site, wire):
-    reader = SiteStream(site, frozenset())
-    assert fixed(reader) == NAMES
-    assert messages(reader) == []
-    show(site, wire, "t2", x=1.0)
-    show(site, wire, "t2", x=1.5)
-    (message,) = messages(reader)
-    assert [(fix["tag"], fix["position_m"][0]) for fix in message["fixes"]] == [("t2", 1.5)]
-
-
 @given(st.lists(st.lists(st.tuples(st.sampled_from(NAMES), st.floats(0.0, 9.0)), max_size=9), max_size=6))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
 def test_a_reader_that_pauses_gets_the_newest_fix_of_each_tag_once(site, wire, pauses):

@@ -7,27 +7,23 @@ from skyless.cli.nodes.doctor import SiteProbe
 from skyless.cli.nodes.site_view import SiteView
 from skyless.core.ticks import TICK_RATE_HZ
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.messages import AnchorHealth, Counters, Stamp, StampsMessage, TagHealth
-
-NO_LINK = Counters(0, 0, 0)
+from skyless.run.mqtt.messages import Stamp, StampsMessage
+from support.site_messages import anchor_health, tag_health
 
 
 def site_messages(times, missing=(), late_share=0.0, reason=None):
     """What a small site of six anchors and a tag sends in a second."""
     yield topics.site_topic(SITE_ID), SITE
     for number in {*range(1, 7)} - {*missing}:
-        yield topics.health_topic(SITE_ID, "anchor", number), AnchorHealth(
-            number, times.unix_s, 9.0, "anchor", None, None, True, None, None, None, 1, 0, 1, None, {}, {}, NO_LINK,
-            "free", late_share,
-        )  # fmt: skip
+        health = anchor_health(number, unix_s=times.unix_s, mode="free", missed_share=late_share)
+        yield topics.health_topic(SITE_ID, "anchor", number), health
         ticks = round(times.now_s * TICK_RATE_HZ) % (1 << 40)
         stamps = tuple(Stamp(other, ticks, ticks) for other in range(1, 7) if other != number)
         yield topics.stamps_topic(SITE_ID, number), StampsMessage(number, "run", times.unix_s, stamps)
     yield topics.status_topic(SITE_ID, "tag", "t1"), status()
     if reason is None:
         yield topics.fix_topic(SITE_ID, "t1"), fix(unix_s=times.unix_s)
-    health = TagHealth("t1", times.unix_s, 9.0, "joint", 100, 1, 50.0, reason, 0.1, None, None, {}, NO_LINK, 0.1, 1, ())
-    yield topics.health_topic(SITE_ID, "tag", "t1"), health
+    yield topics.health_topic(SITE_ID, "tag", "t1"), tag_health(unix_s=times.unix_s, reason=reason)
 
 
 def examined_site(times, file_site=SITE.site, **wrong):

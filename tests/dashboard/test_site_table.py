@@ -1,7 +1,6 @@
 """Who is there: tags of every rate, asleep or gone, bad input of every kind, and what views make of it."""
 
 import math
-import random
 import time
 import tracemalloc
 
@@ -13,9 +12,10 @@ from msgspec.structs import replace
 
 from skyless.core.site import AlarmRule
 from skyless.run.alarms import AlarmEngine
-from skyless.run.mqtt.messages import Counters, TagHealth, Zone
+from skyless.run.mqtt.messages import Zone
 from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.zones import ZoneMonitor
+from support.site_messages import tag_health
 
 REST_S = 600.0
 RATES_S = (0.02, 1.0, 5.0, 10.0, 60.0)
@@ -24,11 +24,6 @@ ROOMS = tuple(
     Zone(name, name, ((x, 0.0), (x + 10.0, 0.0), (x + 10.0, 10.0), (x, 10.0)))
     for name, x in (("a", 0.0), ("b", 20.0), ("c", 40.0))
 )
-
-
-def health(tag="t1", **more):
-    values = (tag, 0.0, 1.0, "joint", 1, 1, 1.0, None, 0.1, None, None, {}, Counters(0, 0, 0), 0.0, 0, ())
-    return replace(TagHealth(*values), **more)
 
 
 def instants(rate, until_s):
@@ -110,19 +105,11 @@ def test_a_tag_that_walks_through_three_zones_enters_and_leaves_each_once(rate):
     assert stays_s == pytest.approx([10.0 / speed_mps] * len(stays_s), abs=rate + 0.5)
 
 
-@pytest.mark.parametrize("rate", [*RATES_S, BURSTS])
-def test_at_rest_on_an_edge_there_are_no_events(rate):
-    draw = random.Random(1)
-    hall = Hall()
-    hall.run([(at_s, 10.0 + draw.gauss(0.0, 0.003)) for at_s in instants(rate, REST_S)], REST_S)
-    assert len(hall.events) <= 1
-
-
 def test_a_tag_that_sleeps_by_its_own_statement_is_asleep_and_then_gone():
     table = SiteTable(0.0)
     for step in range(200):
         table.add_fix(fix(serial=step, unix_s=0.1 * step), 0.1 * step)
-    table.add_health("tag", "t1", health(sleeps_s=3600.0), 20.0)
+    table.add_health("tag", "t1", tag_health(sleeps_s=3600.0), 20.0)
     tag = table.get("tag", "t1")
     assert table.tick(3000.0) == []
     assert table.presence(tag, 3000.0) == "asleep"
@@ -134,7 +121,7 @@ def test_a_tag_that_sleeps_by_its_own_statement_is_asleep_and_then_gone():
 
 def test_a_stated_interval_counts_before_one_is_learnt_and_the_site_states_the_longest():
     table = SiteTable(0.0)
-    table.add_health("tag", "t1", health(interval_s=120.0), 0.0)
+    table.add_health("tag", "t1", tag_health(interval_s=120.0), 0.0)
     table.add_fix(fix(), 0.0)
     tag = table.get("tag", "t1")
     assert (table.fresh_for_s(tag), table.gone_after_s(tag)) == (300.0, 480.0)
@@ -143,7 +130,7 @@ def test_a_stated_interval_counts_before_one_is_learnt_and_the_site_states_the_l
     table.group_of = {}
     assert table.gone_after_s(tag) == 200.0
     for wrong in (-1.0, math.inf):
-        table.add_health("tag", "t1", health(interval_s=wrong, sleeps_s=wrong), 1.0)
+        table.add_health("tag", "t1", tag_health(interval_s=wrong, sleeps_s=wrong), 1.0)
         assert 0.0 <= table.gone_after_s(tag) <= 200.0
 
 
@@ -206,14 +193,15 @@ def test_a_late_or_repeated_fix_is_counted_and_changes_nothing_and_a_clock_set_b
     assert table.presence(table.get("tag", "t1"), 1.0) == "fresh"
 
 
-def test_two_feeds_of_one_site_give_each_fix_once():
+@pytest.mark.parametrize("batched", [False, True])
+def test_two_feeds_of_one_site_give_each_fix_once(batched):
     hall, twice = Hall(), Hall()
     fixes = [(0.5 * k, 0.1 * k) for k in range(400)]
     hall.run(fixes, 200.0)
     for at_s, x in fixes:
-        for _ in range(2):
-            one = fix(unix_s=1e9 + at_s, position_m=(x, 5.0, 1.0), serial=round(2 * at_s) + 1)
-            if twice.table.add_fix(one, at_s) is not None:
+        one = fix(unix_s=1e9 + at_s, position_m=(x, 5.0, 1.0), serial=round(2 * at_s) + 1)
+        for repeated in (one, replace(one, serial=0) if batched else one):  # a batch has no serials
+            if twice.table.add_fix(repeated, at_s, batched=batched and repeated is not one) is not None:
                 twice.now_s = at_s
                 twice.take(twice.monitor.update(one))
     assert twice.kinds == hall.kinds
@@ -221,7 +209,12 @@ def test_two_feeds_of_one_site_give_each_fix_once():
 
 def test_messages_of_unknown_tags_are_taken_up_to_a_limit_and_a_feed_that_stops_makes_all_gone(monkeypatch):
     monkeypatch.setattr("skyless.run.site_table.MAX_NAMES", {"tag": 100, "anchor": 10})
+    monkeypatch.setattr("skyless.run.site_table.MAX_OTHERS", 3)
     table = SiteTable(0.0)
+    for n in range(9):
+        table.add_status(status(f"kind{n}", "a"), 0.0)
+        table.add_status(status("ether", f"air{n}"), 0.0)
+    assert sum(len(table.all(kind)) for kind in table.kinds) == 3
     for second in range(12):
         for n in range(150):
             table.add_fix(fix(f"t{n}", serial=second + 1, unix_s=float(second), anchors=()), float(second))
@@ -253,7 +246,7 @@ def test_a_tag_is_never_gone_and_there_at_once(steps):
         elif what in ("lost", "back"):
             table.set_connected(connected=what == "back", now_s=now_s)
         elif what == "sleep":
-            table.add_health("tag", "t1", health(sleeps_s=100.0), now_s)
+            table.add_health("tag", "t1", tag_health(sleeps_s=100.0), now_s)
         elif what == "off":
             went = ["t1"] if table.add_status(status(online=False), now_s) else []
             table.add_status(status(), now_s)

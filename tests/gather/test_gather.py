@@ -34,7 +34,7 @@ from skyless.run.mqtt.messages import StatusMessage, site_message
 from skyless.run.mqtt.topics import fix_topic, status_topic
 from skyless.sim.lab import lab_site
 from support.processes import SKYLESS, started
-from support.waiting import until
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
@@ -46,20 +46,16 @@ KEEP_BYTES = 5_000_000_000
 @contextlib.asynccontextmanager
 async def broker(folder, **options):
     settings = BrokerSettings(data=folder / "store", gathered_bytes=KEEP_BYTES, **options)
-    async with await start_broker(settings) as running:
-        yield running
+    async with await start_broker(settings) as server:
+        yield server
 
 
 @contextlib.asynccontextmanager
 async def gathering(address, site=SITE, keep_bytes=KEEP_BYTES):
     lines = []
     node = Gather(address, site, keep_bytes, lines.append)
-    task = asyncio.ensure_future(node.run())
-    try:
+    async with running(node.run()):
         yield node, lines
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
 
 
 @contextlib.asynccontextmanager
@@ -111,46 +107,42 @@ async def stored(address, count, after=-1):
 
 
 async def test_fixes_of_mqtt_and_of_nats_are_in_the_stream_once_and_in_order_and_numbers_survive(tmp_path):
-    async with broker(tmp_path) as running, client_of(running.nats) as client:
-        async with gathering(running.nats):
+    async with broker(tmp_path) as server, client_of(server.nats) as client:
+        async with gathering(server.nats):
             await serving(client)
-            link = Link(running.address, "t", site=SITE, kind="tag")
+            link = Link(server.address, "t", site=SITE, kind="tag")
             task = asyncio.ensure_future(link.run())
             for n in range(50):
                 link.publish(fix_topic(SITE, f"t.{n % 5}"), of_tag(f"t.{n % 5}", n / 1000.0), qos=1)
-            first, names = await stored(running.nats, 50)
+            first, names = await stored(server.nats, 50)
             assert [x for _, _, x in first] == list(range(50))
             assert [names[tag] for _, tag, _ in first] == [f"t.{n % 5}" for n in range(50)]
             task.cancel()
-        async with gathering(running.nats):  # a new process: nothing in memory
+        async with gathering(server.nats):  # a new process: nothing in memory
             await serving(client)
             for n in range(50, 60):
                 await publish(client, f"t.{n % 7}", n / 1000.0)
-            rows, again = await stored(running.nats, 60)
+            rows, again = await stored(server.nats, 60)
         assert [x for _, _, x in rows] == list(range(60))
         assert [again[tag] for _, tag, _ in rows[50:]] == [f"t.{n % 7}" for n in range(50, 60)]
         assert {number: again[number] for number in names} == names
         assert len(set(again.values())) == len(again) == 7
         numbers = [number for number, _, _ in rows]
         assert numbers == sorted(set(numbers))
-        later, _ = await stored(running.nats, 60 - 50, after=rows[49][0])
+        later, _ = await stored(server.nats, 60 - 50, after=rows[49][0])
         assert [x for _, _, x in later] == list(range(50, 60))
 
 
 async def test_two_gathers_share_the_fixes_and_what_one_leaves_the_other_takes(tmp_path):
     """Each fix is in the stream once, under one number of its tag, whoever packed it and while one of them ends."""
-    async with (
-        broker(tmp_path) as running,
-        client_of(running.nats) as client,
-        gathering(running.nats) as (first, _),
-    ):
-        async with gathering(running.nats) as (second, _), asyncio.timeout(20):
+    async with broker(tmp_path) as server, client_of(server.nats) as client, gathering(server.nats) as (first, _):
+        async with gathering(server.nats) as (second, _), asyncio.timeout(20):
             while first._names is None or second._names is None:
                 await asyncio.sleep(0.02)
             for n in range(400):
                 await publish(client, f"t{n % 40}", n / 1000.0)
             await client.flush()
-            rows, names = await stored(running.nats, 400)
+            rows, names = await stored(server.nats, 400)
             assert first.summary.fixes > 0
             assert second.summary.fixes == 400 - first.summary.fixes > 0
             for n in range(400, 600):
@@ -158,21 +150,19 @@ async def test_two_gathers_share_the_fixes_and_what_one_leaves_the_other_takes(t
             await client.flush()
         for n in range(600, 800):
             await publish(client, f"t{n % 40}", n / 1000.0)
-        rows, names = await stored(running.nats, 800)
+        rows, names = await stored(server.nats, 800)
         assert sorted(x for _, _, x in rows) == list(range(800))
         assert all(names[tag] == f"t{x % 40}" for _, tag, x in rows)
         assert len(set(names.values())) == len(names) == 40
-        async with gathering(running.nats, keep_bytes=10**6) as (third, _), asyncio.timeout(20):
+        async with gathering(server.nats, keep_bytes=10**6) as (third, _), asyncio.timeout(20):
             while third._names is None:
                 await asyncio.sleep(0.02)
         info = await client.jetstream().stream_info(subjects.at(subjects.FIX_STREAM, SITE))
         assert info.config.max_bytes == 10**6
 
 
-async def test_programs_that_give_numbers_at_once_give_each_once_and_duplicates_of_a_batch_are_dropped(
-    tmp_path,
-):
-    async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats):
+async def test_programs_that_give_numbers_at_once_give_each_once_and_duplicates_of_a_batch_are_dropped(tmp_path):
+    async with broker(tmp_path) as server, client_of(server.nats) as client, gathering(server.nats):
         await serving(client)
         stream = client.jetstream()
         given = [Names(stream, SITE) for _ in range(3)]
@@ -190,7 +180,7 @@ async def test_programs_that_give_numbers_at_once_give_each_once_and_duplicates_
         for sequence in (1, 1, 2, 1):
             batch = Batch(5, sequence, 1, 1, records)
             await stream.publish(subject, encode_batch(batch), headers={"Nats-Msg-Id": batch.id})
-        rows, _ = await stored(running.nats, 6)
+        rows, _ = await stored(server.nats, 6)
         assert [x for _, _, x in rows] == [7, 8, 9] * 2
         info = await stream.stream_info(subjects.at(subjects.FIX_STREAM, SITE))
         assert info.config.max_bytes == KEEP_BYTES
@@ -199,11 +189,11 @@ async def test_programs_that_give_numbers_at_once_give_each_once_and_duplicates_
 
 async def test_a_full_table_of_names_gives_no_more_numbers(tmp_path, monkeypatch):
     monkeypatch.setattr(names_module, "MAX_NAMES", 2)
-    async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats) as (node, _):
+    async with broker(tmp_path) as server, client_of(server.nats) as client, gathering(server.nats) as (node, _):
         await serving(client)
         for n, tag in enumerate("abcab"):
             await publish(client, tag, n / 1000.0)
-        rows, names = await stored(running.nats, 4)
+        rows, names = await stored(server.nats, 4)
         assert [x for _, _, x in rows] == [0, 1, 3, 4]
         assert names == {1: "a", 2: "b"}
         assert node.summary.drops == {"no-number": 1}
@@ -211,24 +201,24 @@ async def test_a_full_table_of_names_gives_no_more_numbers(tmp_path, monkeypatch
 
 async def test_nothing_that_came_is_lost_when_the_server_was_away(tmp_path):
     """The broker is stopped by a signal while fixes wait, and the gather goes on with the same numbers afterwards."""
-    async with broker(tmp_path) as running, client_of(running.nats) as client, gathering(running.nats) as (node, _):
+    async with broker(tmp_path) as server, client_of(server.nats) as client, gathering(server.nats) as (node, _):
         await serving(client)
         for n in range(5):
             await publish(client, "a", n / 1000.0)
-        await stored(running.nats, 5)
-        os.kill(running.pid, signal.SIGSTOP)
+        await stored(server.nats, 5)
+        os.kill(server.pid, signal.SIGSTOP)
         for n in range(5, 9):
             node._packer.add("a", payload("a", n / 1000.0))
         await asyncio.sleep(0.5)
-        os.kill(running.pid, signal.SIGCONT)
-        rows, names = await stored(running.nats, 9)
+        os.kill(server.pid, signal.SIGCONT)
+        rows, names = await stored(server.nats, 9)
         assert [x for _, _, x in rows] == list(range(9))
         assert names == {1: "a"}
 
 
 async def test_the_site_is_found_and_its_programs_are_counted(tmp_path):
     opened = broker(tmp_path)
-    async with opened as running, client_of(running.nats) as client, gathering(running.nats, None) as (node, _):
+    async with opened as server, client_of(server.nats) as client, gathering(server.nats, None) as (node, _):
         reading = await summaries(client)
 
         async def tell(online, name):
@@ -253,40 +243,36 @@ async def test_the_site_is_found_and_its_programs_are_counted(tmp_path):
 
 
 async def test_what_the_broker_had_kept_before_is_in_the_stream_of_the_state_and_newer_messages_stay(tmp_path):
-    async with asyncio.timeout(60), broker(tmp_path) as running, client_of(running.nats) as client:
-        link = Link(running.address, "1", site=SITE, kind="anchor")
-        task = asyncio.ensure_future(link.run())
-        for n in range(2):
-            for topic in ("zones", "floor_plan/2"):
-                link.publish(f"skyless/v1/{SITE}/{topic}", f"{n}".encode(), qos=1, retain=True)
-            await until(lambda: link.connected and not link.unacknowledged)
-            node = Gather(running.nats, SITE, KEEP_BYTES, print, running.address)
-            gathering = asyncio.ensure_future(node.run())
-            await until(lambda node=node: node.summary.online.get("anchor"))
-            stream = client.jetstream()
-            found, subjects_of_site = {}, ("zones", "floor_plan.2")
-            # Programs may be known as online before the messages that were kept have arrived.
-            while found != dict.fromkeys(subjects_of_site, f"{n}".encode()):
-                for subject in subjects_of_site:
-                    with contextlib.suppress(NotFoundError):
-                        kept = await stream.get_last_msg("STATE_7", f"skyless.v1.{SITE}.{subject}", direct=True)
-                        found[subject] = kept.data
-            gathering.cancel()
-            await asyncio.gather(gathering, return_exceptions=True)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
+    async with asyncio.timeout(60), broker(tmp_path) as server, client_of(server.nats) as client:
+        link = Link(server.address, "1", site=SITE, kind="anchor")
+        async with running(link.run()):
+            for n in range(2):
+                for topic in ("zones", "floor_plan/2"):
+                    link.publish(f"skyless/v1/{SITE}/{topic}", f"{n}".encode(), qos=1, retain=True)
+                await until(lambda: link.connected and not link.unacknowledged)
+                node = Gather(server.nats, SITE, KEEP_BYTES, print, server.address)
+                async with running(node.run()):
+                    await until(lambda node=node: node.summary.online.get("anchor"))
+                    stream = client.jetstream()
+                    found, subjects_of_site = {}, ("zones", "floor_plan.2")
+                    # Programs may be known as online before the messages that were kept have arrived.
+                    while found != dict.fromkeys(subjects_of_site, f"{n}".encode()):
+                        for subject in subjects_of_site:
+                            with contextlib.suppress(NotFoundError):
+                                kept = await stream.get_last_msg("STATE_7", f"skyless.v1.{SITE}.{subject}", direct=True)
+                                found[subject] = kept.data
 
 
 async def test_a_dashboard_reads_batches_and_names_with_the_role_of_a_page(tmp_path):
     create_access(tmp_path / "access", MqttAddress("127.0.0.1", 1))
     roles = read_access(tmp_path / "access")
-    async with broker(tmp_path, roles=roles) as running, client_of(running.nats) as client:
-        page = NatsAddress(running.nats.url, "page", roles["page"])
+    async with broker(tmp_path, roles=roles) as server, client_of(server.nats) as client:
+        page = NatsAddress(server.nats.url, "page", roles["page"])
         gathered = Gathered(page)
         live = LiveSite("here", "mqtt://here:1")
         live.attach(Mock(), SITE)
         task = asyncio.ensure_future(gathered.run(LiveSites(live)))
-        async with gathering(running.nats), asyncio.timeout(20):
+        async with gathering(server.nats), asyncio.timeout(20):
             await serving(client)
             while not gathered.columns(SITE).serial:
                 await publish(client, "a", 1.5)
@@ -305,9 +291,9 @@ async def test_a_dashboard_reads_batches_and_names_with_the_role_of_a_page(tmp_p
 
 
 async def test_more_than_the_server_has_room_for_is_refused(tmp_path):
-    async with broker(tmp_path) as running:
+    async with broker(tmp_path) as server:
         with pytest.raises(SkylessError, match=r"--keep-gb is 1000; it should be less"):
-            await Gather(running.nats, SITE, 10**12, print).run()
+            await Gather(server.nats, SITE, 10**12, print).run()
 
 
 WRONG = (

@@ -7,7 +7,7 @@ from pyarrow import parquet
 
 from skyless.run.fix_batch import RECORD
 from skyless.run.history.layout import current_files
-from skyless.run.mqtt.messages import FixMessage
+from support.site_messages import a_fix, diagonal
 
 DAY_S = 86_400.0
 NOON_S = 1_795_176_000.0
@@ -25,25 +25,8 @@ def records(serials, tag=1, unix_s=None):
 
 def fix(tag="tag1", serial=1, unix_s=NOON_S, position_m=(1.0, 2.0, 3.0), variances=(4e-4, 9e-4, 1e-4), **more):
     """A message."""
-    xx, yy, zz = variances
-    given = {
-        "covariance_m2": (xx, 0.0, 0.0, 0.0, yy, 0.0, 0.0, 0.0, zz),
-        "velocity_mps": None,
-        "velocity_covariance": None,
-        "std_m": (xx + yy + zz) ** 0.5,
-        "gdop": None,
-        "pdop": None,
-        "hdop": None,
-        "vdop": None,
-        "anchors": (1, 2, 3),
-        "chi2": 1.0,
-        "dof": 1,
-        "residual_rms_m": 0.01,
-        "method": "joint",
-        "height_known": False,
-        "latency_s": 0.001,
-    }
-    return FixMessage(tag, serial, unix_s, 0.0, position_m, **given | more)
+    given = {"serial": serial, "unix_s": unix_s, "position_m": position_m, "std_m": sum(variances) ** 0.5}
+    return a_fix(tag, **given | {"covariance_m2": diagonal(*variances), "height_known": False} | more)
 
 
 def in_files(folder, site=1):

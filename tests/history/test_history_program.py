@@ -55,6 +55,7 @@ from skyless.run.recordings.recorder import McapFile
 from skyless.run.recordings.recording import McapRecording
 from skyless.sim.lab import lab_site
 from support.processes import SKYLESS, free_port, running_program
+from support.waiting import running
 from support.waiting import until as until_
 
 pytestmark = pytest.mark.site
@@ -181,13 +182,9 @@ def test_fifty_kills_lose_no_acknowledged_batch_and_double_none(tmp_path):
 async def keeping(stage, folder, log, scenario):
     """Run a node in this process during a scenario."""
     node = HistoryNode(folder, SITE, stage.broker.address, Keep(), log)
-    task = asyncio.ensure_future(node.run())
-    try:
+    async with running(node.run()) as (task,):
         await until(lambda: node.link.connected or task.done())
         await scenario(node)
-    finally:
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
     return node
 
 

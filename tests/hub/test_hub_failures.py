@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 from pyarrow import parquet
-from small_hub import client_of, running_hub, site
 
 from skyless.cli.main import main
 from skyless.run.broker import _program
@@ -31,6 +30,8 @@ from skyless.run.mqtt.address import mqtt_address
 from skyless.run.mqtt.connection import check_broker
 from support.hub_stage import Line
 from support.processes import SKYLESS, free_node_port, free_port, started
+from support.small_hub import client_of, running_hub, site
+from support.waiting import running
 
 SITE, ROWS, RUN = 7, 20, 5
 FIX_STREAM = subjects.at(subjects.FIX_STREAM, SITE)
@@ -57,13 +58,9 @@ class Stage:
             tenant = self.hub.address("plant")
             far = NatsAddress(f"nats://127.0.0.1:{await self.to_history.open()}", tenant.user, tenant.password)
             self.history = HubHistory(self.folder / "history", far, None, Keep(), self.said.append)
-            running = asyncio.ensure_future(self.history.run())
-            try:
+            async with running(self.history.run()):
                 await act(self)
-            finally:
-                running.cancel()
-                await asyncio.gather(running, return_exceptions=True)
-                await client.close()
+            await client.close()
 
     async def send(self, count, clock_s=0.0):
         for _ in range(count):

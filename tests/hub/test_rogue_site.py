@@ -8,7 +8,6 @@ import msgspec
 import numpy as np
 import pytest
 from pyarrow import parquet
-from small_hub import client_of, has_stream, running_hub, site
 
 from skyless.run import hub as hub_program
 from skyless.run.broker import _program
@@ -22,6 +21,7 @@ from skyless.run.history.writer import Keep
 from skyless.run.hub import HubLink, HubSites
 from skyless.run.mqtt.messages import ZonesMessage
 from support.processes import free_port, started
+from support.small_hub import client_of, has_stream, running_hub, site
 
 pytestmark = pytest.mark.site
 

@@ -5,11 +5,11 @@ import json
 
 import pytest
 from nats.errors import NoRespondersError
-from small_hub import client_of, running_hub, site
 
 from skyless.cli.main import main
 from skyless.core.version import installed_version
 from support.processes import SKYLESS, free_port, started
+from support.small_hub import client_of, running_hub, site
 
 pytestmark = pytest.mark.site
 

@@ -11,7 +11,7 @@ from mqtt_brokers import Embedded
 from msgspec import structs
 from node_stage import running
 
-from bridges.bridged_values import BERLIN, a_fix, tag_health
+from bridges.bridged_values import BERLIN, a_fix
 from machines.bench import LAB, tape
 from skyless.bridges.program import BridgeNode, TagBridge, heard_site, run_route
 from skyless.bridges.target import Hub, Route, Target
@@ -24,6 +24,7 @@ from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
 from support.processes import SKYLESS, free_port, running_program
+from support.site_messages import tag_health
 from support.waiting import until
 
 pytestmark = pytest.mark.site

@@ -10,56 +10,43 @@ import signal
 import struct
 import termios
 import time
+from itertools import count
 
 import msgspec
 import pytest
-from mqtt_brokers import Embedded
+from mqtt_brokers import Embedded, running
 
 from skyless.cli.nodes.site_view import site_number
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import AlarmMessage, Counters, FixMessage, SiteMessage, TagHealth
+from skyless.run.mqtt.messages import AlarmMessage, SiteMessage
 from skyless.sim.lab import lab_site
+from support import waiting
 from support.processes import SKYLESS, usual_signals
+from support.site_messages import a_fix, tag_health
 from support.waiting import until
 
 pytestmark = pytest.mark.site
 
 SITE = msgspec.structs.replace(lab_site(), id=9)
-UNIT = (1e-4, 0.0, 0.0, 0.0, 1e-4, 0.0, 0.0, 0.0, 1e-4)
-
-
-def fix(serial):
-    return FixMessage(
-        "t1", serial, time.time(), 0.0, (1.25, 2.5, 0.0), UNIT, None, None, 0.1, None, None, None, None, (1, 2, 3), 0.0,
-        2, 0.0, "joint", True, 1e-3,
-    )  # fmt: skip
 
 
 @contextlib.asynccontextmanager
 async def published_site(folder):
     """A broker, and a tag whose program publishes."""
     broker = Embedded(folder)
-    await broker.start()
     link = Link(broker.address, "t1", site=9, kind="tag")
-    running = asyncio.ensure_future(link.run())
 
     async def publish():
-        serial = 0
-        while True:
-            serial += 1
-            link.publish(topics.fix_topic(9, "t1"), fix(serial))
-            health = TagHealth(
-                "t1", time.time(), 9.0, "joint", 1, serial, 10.0, None, 0.1, None, None, {"bad-fcs": 3},
-                Counters(0, 0, 0), 0.1, 1, (),
-            )  # fmt: skip
+        for serial in count(1):
+            fix = a_fix(serial=serial, unix_s=time.time(), position_m=(1.25, 2.5, 0.0))
+            link.publish(topics.fix_topic(9, "t1"), fix)
+            health = tag_health(unix_s=time.time(), counters={"bad-fcs": 3})
             link.publish(topics.health_topic(9, "tag", "t1"), health)
             await asyncio.sleep(0.1)
 
-    publishing = asyncio.ensure_future(publish())
-    try:
-        await until(lambda: link.connected)
+    async with running(broker, link), waiting.running(publish()):
         alarm = AlarmMessage("r/t1", "r", "Rule", "inside", "critical", "t1", 1.0, 1.0, "Crane is in the cold store")
         for topic, message in (
             (topics.site_topic(9), SiteMessage(SITE, simulated=True, unix_s=time.time())),
@@ -68,11 +55,6 @@ async def published_site(folder):
             link.publish(topic, message, qos=1, retain=True)
         await until(lambda: not link.unacknowledged)
         yield str(broker.address)
-    finally:
-        for task in (publishing, running):
-            task.cancel()
-        await asyncio.gather(publishing, running, return_exceptions=True)
-        await broker.stop()
 
 
 async def said(*arguments):
@@ -131,10 +113,6 @@ async def test_a_site_is_shown_in_a_pipe_as_json_and_on_a_terminal(tmp_path):
 
 
 async def test_a_broker_without_a_site_is_told(tmp_path):
-    broker = Embedded(tmp_path)
-    await broker.start()
-    try:
+    async with running(broker := Embedded(tmp_path)):
         with pytest.raises(SkylessError, match="no program of a site is online"):
             await site_number(broker.address, 0.5)
-    finally:
-        await broker.stop()

@@ -1,6 +1,7 @@
 """Waiting in an event loop."""
 
 import asyncio
+import contextlib
 
 
 async def until(condition, limit_s=20.0):
@@ -8,3 +9,16 @@ async def until(condition, limit_s=20.0):
     async with asyncio.timeout(limit_s):
         while not condition():
             await asyncio.sleep(0.01)
+
+
+@contextlib.asynccontextmanager
+async def running(*work):
+    """Coroutines that run in the block, and are cancelled at its end."""
+    tasks = [asyncio.ensure_future(one) for one in work]
+    await asyncio.sleep(0)
+    try:
+        yield tasks
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)

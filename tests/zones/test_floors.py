@@ -10,12 +10,13 @@ from msgspec.structs import replace
 
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import FloorSite
-from skyless.run.mqtt.messages import FixMessage, SiteMessage, Zone, read_message, site_message
+from skyless.run.mqtt.messages import SiteMessage, Zone, read_message, site_message
 from skyless.run.zones import ZoneMonitor, floor_at
 from skyless.sim.lab import lab_site
 from skyless.site.file.check import plan_files
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
+from support.site_messages import a_fix, diagonal
 
 FLOORS = (FloorSite(-1, -3.0), FloorSite(0, 0.0), FloorSite(2, 6.5))
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(4) + b"IHDR" + (9).to_bytes(4) + (7).to_bytes(4)
@@ -28,20 +29,8 @@ anchors = [{id = 1, x_m = 0, y_m = 0}, {id = 2, x_m = 9, y_m = 0}, {id = 3, x_m 
 
 
 def fix(z_m, height_known=False):
-    covariance = (0.01, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0, 0.0, 0.0 if height_known else 0.01)
-    nothing = dict.fromkeys(("velocity_mps", "velocity_covariance", "gdop", "pdop", "hdop", "vdop"))
-    return FixMessage(
-        **{"tag": "t1", "serial": 1, "unix_s": 1.0, "time_s": 1.0, "position_m": (2.0, 2.0, z_m), **nothing},
-        covariance_m2=covariance,
-        std_m=0.1,
-        anchors=(1, 2, 3),
-        chi2=1.0,
-        dof=1,
-        method="joint",
-        residual_rms_m=0.0,
-        height_known=height_known,
-        latency_s=0.0,
-    )
+    covariance = diagonal(0.01, 0.01, 0.0 if height_known else 0.01)
+    return a_fix(position_m=(2.0, 2.0, z_m), covariance_m2=covariance, height_known=height_known)
 
 
 @given(st.floats(-20.0, 20.0), st.floats(0.0, 5.0))

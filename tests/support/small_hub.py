@@ -12,6 +12,7 @@ from skyless.run.gather.node import Gather
 from skyless.run.gather.subjects import EVENT_STREAM, at
 from skyless.run.hub_files import Hub
 from support.processes import free_node_port, free_port, started
+from support.waiting import running
 
 
 @contextlib.contextmanager
@@ -39,15 +40,13 @@ async def site(folder, leaf, keep_bytes=10**8):
     """The broker of a site with its gather, whose streams are there."""
     place = folder / f"{leaf.tenant}{leaf.site}"
     settings = BrokerSettings(port=free_port(), data=place, gathered_bytes=keep_bytes, hub=leaf)
-    async with await start_broker(settings) as running:
-        gather = asyncio.ensure_future(Gather(running.nats, leaf.site, keep_bytes, print).run())
-        try:
-            client = await client_of(running.nats)
-            async with asyncio.timeout(30):
-                while not await has_stream(client, at(EVENT_STREAM, leaf.site)):
-                    await asyncio.sleep(0.05)
-            await client.close()
-            yield running
-        finally:
-            gather.cancel()
-            await asyncio.gather(gather, return_exceptions=True)
+    async with (
+        await start_broker(settings) as broker,
+        running(Gather(broker.nats, leaf.site, keep_bytes, print).run()),
+    ):
+        client = await client_of(broker.nats)
+        async with asyncio.timeout(30):
+            while not await has_stream(client, at(EVENT_STREAM, leaf.site)):
+                await asyncio.sleep(0.05)
+        await client.close()
+        yield broker
