@@ -1,6 +1,7 @@
 """The page shows a live site: tags move, a silent or lost connection is reported, and the page reconnects."""
 
 import io
+import re
 import time
 
 import page_fake_site as made_up
@@ -71,6 +72,29 @@ def test_a_silent_tag_turns_grey_and_then_leaves_the_map(hall):
       return [2.4, 2.6, 9.9, 10.1].map((age) => freshness(track, track.lastTime + age));
     }""")
     assert kinds == ["fresh", "late", "late", "gone"]
+    late, states, kind, asleep = page.evaluate("""async () => {
+      const { drawTags, visibleTags } = await import("/page/map/tags.js");
+      const { ALERT, COLUMNS, FRESH, GONE, SLEEP } = await import("/page/tracks.js");
+      const { freshness } = await import("/page/clock.js");
+      const track = skyless.live.all.get("robot");
+      const again = (presence) => {
+        const row = Array.from({ length: COLUMNS }, (_, column) => track.value(track.count - 1, column));
+        skyless.live.add([["robot", ...Object.values({ ...row, ...presence, [ALERT]: null })]]);
+      };
+      const label = () => {
+        const words = [];
+        const context = document.createElement("canvas").getContext("2d");
+        context.fillText = (text) => words.push(text);
+        drawTags(context, visibleTags());
+        return words.find((text) => text.includes("robot"));
+      };
+      again({ [GONE]: 1e3 });
+      const [late, states] = [label(), track.count];
+      again({ [SLEEP]: 1e3 });
+      return [late, track.count - states, freshness(track), label()];
+    }""")
+    assert re.fullmatch(r"robot · no fix for [\d.]+ s", late)
+    assert (states, kind, asleep) == (0, "asleep", "robot · asleep")
     page.click("table.tags button:has-text('robot')")
     page.wait_for_selector("text=No fix: too few anchors")
 

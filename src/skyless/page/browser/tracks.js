@@ -66,20 +66,21 @@ export class Track {
   }
 
   /**
-   * Add a row of a state: `[name, x, y, …]`, null for unknown. A row older than the last is ignored, or starts the track
-   * again where a clock was set back.
+   * Add a row of a state: `[name, x, y, …]`, null for unknown. One of the same time replaces the last, as its tag has gone
+   * to sleep or has ended. A row older than the last is ignored, or starts the track again where a clock was set back.
    */
   push(row) {
     const time = row[TIME + 1];
     if (time < this.lastTime - SET_BACK_S) this.start = this.count = 0;
-    if (!Number.isFinite(time) || time <= this.lastTime) return false;
-    if (this.count === this.capacity && this.capacity < MAX_CAPACITY) this.grow();
-    if (this.count === this.capacity) this.start = (this.start + 1) % this.capacity;
-    else this.count += 1;
+    if (!Number.isFinite(time) || time < this.lastTime) return;
+    if (time > this.lastTime) {
+      if (this.count === this.capacity && this.capacity < MAX_CAPACITY) this.grow();
+      if (this.count === this.capacity) this.start = (this.start + 1) % this.capacity;
+      else this.count += 1;
+    }
     const at = ((this.start + this.count - 1) % this.capacity) * COLUMNS;
     for (let column = 0; column < COLUMNS; column++) this.rows[at + column] = row[column + 1] ?? NaN;
     this.rows[at + ALERT] = ALERT_NAMES.indexOf(row[ALERT + 1]);
-    return true;
   }
 
   grow() {

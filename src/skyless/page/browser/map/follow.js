@@ -57,7 +57,7 @@ function describe() {
   if (followed === null) return;
   const track = tracks().all.get(followed);
   const gone = !track || !["fresh", "late", "asleep"].includes(freshness(track));
-  text(byId("following-words"), gone ? `Following ${shownName(followed)}: no fix` : `Following ${shownName(followed)}`);
+  text(byId("following-words"), gone ? `Following ${shownName(followed)}: gone` : `Following ${shownName(followed)}`);
 }
 
 /** Connect the button and the bar. */

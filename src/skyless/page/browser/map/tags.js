@@ -5,7 +5,8 @@ import { faint, palette } from "../theme.js";
 import { state } from "../store.js";
 import { alarmedTags } from "../alarms/model.js";
 import { labelOf } from "../assets/model.js";
-import { CXX, CXY, CYY, HEIGHT_GIVEN, HPL, TRUE_X, TRUE_Y, X, Y, Z } from "../tracks.js";
+import { duration } from "../format.js";
+import { CXX, CXY, CYY, HEIGHT_GIVEN, HPL, TIME, TRUE_X, TRUE_Y, X, Y, Z } from "../tracks.js";
 import { DIMMED, dropLine, ring } from "./anchors.js";
 import { filtering, passes } from "./filter.js";
 import { otherFloor } from "./floors.js";
@@ -164,9 +165,9 @@ function names(context, seen) {
   const wanted = [];
   for (const { track, row: at, fresh, selected, x, y } of seen.toSorted((a, b) => Number(b.selected) - Number(a.selected))) {
     if (seen.length > NAMED && !selected) continue;
+    const silence = fresh === "asleep" ? " · asleep" : ` · no fix for ${duration(now_s() - at[TIME], 1)}`;
     const quiet = fresh === "fresh" || state.connection.phase === "lost";
-    const name = labelOf(track.name);
-    const words = (quiet ? name : `${name} · no fix`) + (view.spatial ? heightWords(at, selected) : "");
+    const words = labelOf(track.name) + (quiet ? "" : silence) + (view.spatial ? heightWords(at, selected) : "");
     wanted.push({ key: track.name, words, x, y, colour: fresh === "fresh" ? palette.text : palette.muted, must: selected });
   }
   const alarmed = alarmedTags();
