@@ -89,12 +89,12 @@ class Channel(Struct, frozen=True):
     of: Kind | None = None
 
 
-_PATTERNS: Final = defaultdict[tuple[int, str], list[tuple[list[str], Kind]]](list)
-"""Levels of the topics, by their number and the last one."""
-for _kind in KINDS:
-    for _topic in _kind.topics:
-        _levels = _topic.split("/")
-        _PATTERNS[len(_levels), _levels[-1]].append((_levels, _kind))
+def _place(levels: list[str]) -> tuple[int, str, str]:
+    return len(levels), levels[0], levels[-1]
+
+
+_KIND_AT: Final = {_place(topic.split("/")): kind for kind in KINDS for topic in kind.topics}
+"""No two kinds have topics of the same length that begin and end alike."""
 
 
 @lru_cache(maxsize=10_000)
@@ -103,13 +103,16 @@ def channel_of(topic: str) -> Channel | None:
     if not topic.startswith(f"{ROOT}/"):
         return None
     site, *levels = topic.removeprefix(f"{ROOT}/").split("/")
-    for last in (levels[-1], "+") if levels else ():
-        for wanted, kind in _PATTERNS.get((len(levels), last), ()):
-            if all(one in ("+", level) for one, level in zip(wanted, levels, strict=True)):
-                names = [level for one, level in zip(wanted, levels, strict=True) if one == "+"]
-                who, names = (levels[0], names[-1:]) if kind.name in ("status", "health") else ("", names)
-                return Channel(site, kind.name, "/".join(names), kind.payload, who, kind)
-    return None
+    if not levels:
+        return None
+    length, first, last = _place(levels)
+    kind = (
+        _KIND_AT.get((length, first, last)) or _KIND_AT.get((length, "+", last)) or _KIND_AT.get((length, first, "+"))
+    )
+    if kind is None:
+        return None
+    name = "/".join(levels[1:] if kind.name == "floor_plan" else levels[1:-1])
+    return Channel(site, kind.name, name, kind.payload, first if kind.name in ("status", "health") else "", kind)
 
 
 def message_of(channel: Channel, payload: bytes) -> Struct | None:
