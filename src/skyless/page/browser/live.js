@@ -209,7 +209,7 @@ const handlers = {
     state.log = [...state.log.filter(({ first }) => !replaced.has(first)), ...newer].slice(-MAX_LOGGED);
     changed("log");
   },
-  health({ whole, anchors, tags, ether, nodes, ages, conditions, waiting }) {
+  health({ whole, anchors, tags, ether, nodes, ages, conditions, waiting, dropped }) {
     const { health } = state;
     if (whole) for (const known of [health.anchors, health.tags, health.nodes, health.conditions]) known.clear();
     if (whole) health.ether = null;
@@ -218,6 +218,7 @@ const handlers = {
     for (const node of nodes) health.nodes.set(`${node.kind}/${node.name}`, node);
     for (const [id, kind] of Object.entries(conditions)) health.conditions.set(Number(id), kind);
     health.ether = ether ?? health.ether;
+    health.dropped = dropped;
     const now = performance.now();
     for (const kind of ["anchors", "tags", "ether"]) {
       if (whole) health.heardMs[kind].clear();

@@ -54,6 +54,7 @@ export const state = {
     anchors: new Map(),
     tags: new Map(),
     ether: null,
+    dropped: {},
     nodes: new Map(),
     conditions: new Map(),
     heardMs: { anchors: new Map(), tags: new Map(), ether: new Map() },

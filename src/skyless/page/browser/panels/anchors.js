@@ -31,14 +31,15 @@ export function start(panel) {
   table.head.cells[5].title = "Anchors that it has received in the last seconds";
   table.head.cells[7].title = "Transmissions that were skipped because they were late";
   const nodes = h("ul", { class: "nodes" });
-  const programs = h("section", {}, h("h2", {}, "Programs"), nodes);
+  const unused = h("p", { class: "fine" });
+  const programs = h("section", {}, h("h2", {}, "Programs"), nodes, unused);
   const note = h("p", { class: "empty" }, "Anchor health is shown on the live site only.");
   const box = h("div", { class: "scroll-x" }, table.element);
   const list = h("ul", { class: "reasons findings" });
   const found = new Rows(list, (_key, finding) => ({ element: h("li", { class: "bad" }, findingWords(finding)) }));
   const rows = table.rows;
   const trying = h("button", { type: "button", class: "quiet", id: "try-places", onclick: startPlacing }, "Try other places …");
-  parts = { panel, note, list, found, box, rows, trying, detail: makeDetail(), programs, nodes: new Rows(nodes, makeNode) };
+  parts = { panel, note, list, found, box, rows, trying, detail: makeDetail(), programs, unused, nodes: new Rows(nodes, makeNode) };
   panel.append(note, list, box, parts.detail.element, h("div", { class: "above" }, trying), programs);
 }
 
@@ -57,6 +58,8 @@ export function show() {
   parts.rows.show([...ids].map((id) => [id, id]));
   parts.detail.show(state.selection.anchor);
   split(parts.panel, parts.box, !parts.detail.element.hidden);
+  const unused = Object.entries(state.health.dropped).map(([reason, count]) => `${number(count)} ${reason}`);
+  text(parts.unused, unused.length ? `Messages that the page server has not used: ${unused.join(", ")}.` : "");
   parts.nodes.show([...state.health.nodes.values()].sort(onlineFirst).map((node) => [`${node.kind}/${node.name}`, node]));
 }
 
@@ -106,26 +109,7 @@ function sigma(value_m) {
 
 function makeDetail() {
   const heading = h("h2", {});
-  const list = facts([
-    "State",
-    "Last report",
-    "Synchronised to",
-    "Slot time led by",
-    "Hops",
-    "Parents",
-    "Codes",
-    "Key chain",
-    "Not accepted",
-    "Term",
-    "Superframe",
-    "Sent",
-    "Late, skipped",
-    "Heard",
-    "Longest not heard",
-    "Uptime",
-    "MQTT",
-    "Other counters",
-  ]);
+  const list = facts();
   const tenths = (value) => number(value, 1);
   const thousandths = (value) => number(value, 3);
   const around = { zero: false };
@@ -141,12 +125,9 @@ function makeDetail() {
     element.hidden = !health;
     if (!health) return;
     text(heading, `Anchor ${id}`);
-    list.show(anchorFacts(id, health));
-    list.grade("Codes", codesOf(health)?.grade ?? "");
-    list.grade("Key chain", chainWords(health)?.grade ?? "");
-    list.grade("Not accepted", "bad");
-    list.grade("State", condition(id) === "good" ? "" : condition(id));
-    list.grade("Last report", "bad");
+    const [codes, chain] = [codesOf(health)?.grade, chainWords(health)?.grade];
+    const grade = condition(id) === "good" ? "" : condition(id);
+    list.show(anchorFacts(id, health), { State: grade, "Last report": "bad", Codes: codes, "Key chain": chain, "Not accepted": "bad" });
     charts.hidden = leads(id) !== "";
     const past = anchorHistory.get(id);
     if (!past || charts.hidden) return;

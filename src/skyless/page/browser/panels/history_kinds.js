@@ -51,7 +51,7 @@ async function askWay({ get, tag, title, signal }) {
 function wayFacts(track, context) {
   const { points } = track;
   if (!points.length) return nothing(context, "There are no positions");
-  const list = facts(["Tag", "Length", "Positions", "Shown", "First", "Last"]);
+  const list = facts();
   list.show({
     Tag: context.title,
     Length: length(track.length_m),
@@ -81,7 +81,7 @@ async function askHeat({ get, tag, title, span, signal }) {
 function heatFacts(map, context) {
   const seconds = map.seconds.reduce((sum, value) => sum + value, 0);
   if (!seconds) return nothing(context, "There are no positions");
-  const list = facts(["Tags", "Time of all tags", "Longest in a cell"]);
+  const list = facts();
   list.show({
     Tags: number(map.tags),
     "Time of all tags": duration(seconds),

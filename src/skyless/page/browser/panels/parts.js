@@ -118,25 +118,23 @@ function sight(table) {
   return { top: Math.max(...boxes.map((box) => box.top)), bottom: Math.min(...boxes.map((box) => box.bottom)) };
 }
 
-/** A list of named facts; what is unknown is left out. */
-export function facts(names) {
+/** A list of named facts, shown in the order given and highlighted by `grades` ("warn", "bad"); what is unknown is left out. */
+export function facts() {
   const element = h("dl", { class: "facts" });
   const boxes = new Map();
-  for (const name of names) {
-    const value = h("dd", {});
-    const box = h("div", { hidden: true }, h("dt", {}, name), value);
-    boxes.set(name, { box, value });
-    element.append(box);
-  }
-  const show = (values) => {
-    for (const [name, { box, value }] of boxes) {
-      box.hidden = values[name] === null || values[name] === undefined;
-      if (!box.hidden) text(value, values[name]);
+  let order = "";
+  const show = (values, grades = {}) => {
+    const names = Object.keys(values).filter((name) => values[name] != null);
+    for (const name of names) if (!boxes.has(name)) boxes.set(name, h("div", {}, h("dt", {}, name), h("dd", {})));
+    if (order !== names.join()) element.replaceChildren(...names.map((name) => boxes.get(name)));
+    order = names.join();
+    for (const name of names) {
+      const value = boxes.get(name).lastChild;
+      text(value, values[name]);
+      value.className = grades[name] ?? "";
     }
   };
-  /** Highlight a fact: "warn", "bad", or not. */
-  const grade = (name, how) => void (boxes.get(name).value.className = how);
-  return { element, show, grade };
+  return { element, show };
 }
 
 /** Show a list and a detail below it, each with its own scrolling; or the list alone. */

@@ -193,33 +193,7 @@ function makeDetail() {
   const heading = h("h2", {});
   const reason = h("p", { class: "reason", hidden: true });
   const edit = h("button", { type: "button", class: "quiet changes", onclick: () => editAssets(state.selection.tag) }, "Edit");
-  const list = facts([
-    "Tag",
-    "Group",
-    "Owner",
-    "Notes",
-    "Zones",
-    "Position",
-    "Height",
-    "Velocity",
-    "Predicted σ",
-    "Error",
-    "Age of the fix",
-    "Rate",
-    "Protection level",
-    "Integrity alert",
-    "Verified",
-    "Not accepted",
-    "Clock",
-    "Anchors used",
-    "Carrier phases",
-    "Time to first fix",
-    "Latency",
-    "Method",
-    "Dropped",
-    "CPU",
-    "Memory",
-  ]);
+  const list = facts();
   const sigma = { name: "σ", colour: "accent" };
   const errors = new Chart("Error and predicted σ", [{ name: "error", colour: "bad" }, sigma], length, 0.02);
   const sigmas = new Chart("Predicted σ", [sigma], length, 0.02);
@@ -264,16 +238,16 @@ function makeDetail() {
     const known = track.at(shown_s(), row, false);
     if (!known) row.fill(NaN);
     const verified = verifiedWords(health, row[VERIFIED_AGE] + age_s(track), row[UNVERIFIED]);
-    list.show({
-      ...assetFacts(track.name),
-      ...(known ? fixFacts(track) : {}),
-      ...(health ? healthFacts(health) : {}),
-      Verified: verified?.words,
-    });
-    list.grade("Verified", verified?.grade ?? "");
-    list.grade("Not accepted", "bad");
-    list.grade("Clock", "bad");
-    list.grade("Integrity alert", (known && Object.values(ALERTS)[row[ALERT]]?.grade) || "");
+    const alert = known && Object.values(ALERTS)[row[ALERT]];
+    list.show(
+      {
+        ...assetFacts(track.name),
+        ...(known ? fixFacts(track, alert) : {}),
+        Verified: verified?.words,
+        ...(health ? healthFacts(health) : {}),
+      },
+      { "Integrity alert": alert?.grade, Verified: verified?.grade, "Not accepted": "bad", Clock: "bad" },
+    );
     showCharts(track);
   };
   return { element, show: showDetail };
@@ -287,7 +261,7 @@ function assetFacts(tag) {
 }
 
 /** What `row` holds, the state of a track. */
-function fixFacts(track) {
+function fixFacts(track, alert) {
   const speed = Math.hypot(row[VX], row[VY]);
   const height = `${metres(row[Z], 2)} m`;
   return {
@@ -297,9 +271,9 @@ function fixFacts(track) {
     "Predicted σ": length(row[STD]),
     Error: row[ERROR] >= 0 ? length(row[ERROR]) : null,
     "Age of the fix": duration(age_s(track), 1),
-    "Protection level": row[HPL] >= 0 ? length(row[HPL]) : null,
-    "Integrity alert": Object.values(ALERTS)[row[ALERT]]?.words,
     "Anchors used": number(row[ANCHORS]),
+    "Protection level": row[HPL] >= 0 ? length(row[HPL]) : null,
+    "Integrity alert": alert?.words,
   };
 }
 
@@ -312,13 +286,13 @@ function healthFacts(health) {
   const { updates_per_s, first_fix_s, latency_p50_s, latency_p99_s, counters, cpu, memory_bytes } = health;
   const dropped = Object.entries(counters).filter(([, count]) => count);
   return {
+    "Not accepted": faultWords(health.faults),
+    Clock: clockWords(health),
     Rate: number(updates_per_s, 0, "Hz"),
     "Time to first fix": first_fix_s == null ? null : duration(first_fix_s),
     Latency: latency_p50_s == null ? null : `${duration(latency_p50_s)}, p99 ${duration(latency_p99_s)}`,
     Method: methodWords(health),
     "Carrier phases": health.carrier_phase_anchors?.length ? `of anchors ${health.carrier_phase_anchors.join(", ")}` : null,
-    "Not accepted": faultWords(health.faults),
-    Clock: clockWords(health),
     Dropped: dropped.map(([name, count]) => `${count} ${name}`).join(", ") || "none",
     CPU: `${(100 * cpu).toFixed(1)} %`,
     Memory: bytes(memory_bytes),

@@ -31,7 +31,7 @@ export function start(panel) {
   const picture = h("div", { id: "phases" });
   const empty = h("p", { class: "empty" });
   const caption = h("p", { class: "count" });
-  const ether = facts(["Transmissions", "Missed now", "Missed in all", "Behind real time", "Receptions lost", "Simulated time"]);
+  const ether = facts();
   const etherBox = h("section", { hidden: true }, h("h2", {}, "Emulated radio channel"), ether.element);
   parts = { picture, empty, caption, ether, etherBox };
   panel.append(h("h2", {}, "Superframe and positioning phases"), caption, picture, empty, about, etherBox);
