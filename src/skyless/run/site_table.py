@@ -65,6 +65,7 @@ _SHORT_S: Final = 1.5
 _MAX_GAPS: Final = 8
 _KNOWN_S: Final = 10.0
 """The interval of a tag heard for a shorter time is unknown: it may send in bursts, with long silence between them."""
+_LEARN_S: Final = 1.0  # shortest time between two looks at the gaps of a tag that sends often
 _MEMORY: Final = 10.0
 """A gap is remembered for this many times its length."""
 _SHARE: Final = 0.15
@@ -89,8 +90,8 @@ class Node:
 
     __slots__ = (
         *("asleep_until_s", "codes_s", "ended_unix_s", "first_s", "fix", "fix_s", "fixes", "gaps"),
-        *("health", "health_s", "health_serial", "heard_s", "is_due", "is_gone", "learnt_s", "name", "previous"),
-        *("row", "sends", "serial", "since_s", "stated_s", "status", "status_serial", "used_s"),
+        *("health", "health_s", "health_serial", "heard_s", "is_due", "is_gone", "learn_s", "learnt_s"),
+        *("name", "previous", "row", "sends", "serial", "since_s", "stated_s", "status", "status_serial", "used_s"),
     )
 
     def __init__(self, name: str) -> None:
@@ -111,6 +112,7 @@ class Node:
         self.heard_s: float | None = None  # arrival of the first fix of all
         self.gaps: list[_Gap] = []  # the last long gaps between fixes
         self.learnt_s = 0.0  # the interval that the gaps show
+        self.learn_s = float("-inf")  # time when they are looked at again, besides after each gap
         self.stated_s = 0.0  # the interval that the tag states
         self.asleep_until_s = float("-inf")
         self.used_s = float("-inf")  # time of the last fix that used this anchor
@@ -157,11 +159,12 @@ class Node:
         if self.heard_s is None:
             self.heard_s = now_s
         elif _SHORT_S < gap_s <= longest_s:
-            self.gaps = [*self.gaps[1 - _MAX_GAPS :], _Gap(now_s, gap_s, self.is_gone)]
+            self.gaps, self.learn_s = [*self.gaps[1 - _MAX_GAPS :], _Gap(now_s, gap_s, self.is_gone)], now_s
         if self.is_gone:
             self.is_gone, self.first_s, self.fixes = False, now_s, 0
         self.fixes += 1
-        if self.gaps:
+        if self.gaps and now_s >= self.learn_s:
+            self.learn_s = now_s + _LEARN_S
             self.gaps = [gap for gap in self.gaps if now_s - gap.end_s <= _MEMORY * gap.length_s]
             rhythms = (gap.length_s for gap in self.gaps if self._is_rhythm(gap.length_s, now_s))
             self.learnt_s = max(rhythms, default=0.0)
