@@ -425,7 +425,9 @@ class SiteTable:
     def is_fresh(self, tag: Node, now_s: float) -> bool:
         """Whether a tag's newest fix is fresh, and its program has not ended since."""
         age_s = now_s - tag.fix_s
-        return not tag.is_gone and (age_s < THRESHOLDS.fresh_s or age_s < self.fresh_for_s(tag))
+        if tag.is_gone or age_s < THRESHOLDS.fresh_s:
+            return not tag.is_gone
+        return (bool(tag.gaps) or tag.stated_s > 0.0) and age_s < self.fresh_for_s(tag)
 
     def is_there(self, tag: Node, now_s: float) -> bool:
         """Whether a tag has had a fix and is not gone."""

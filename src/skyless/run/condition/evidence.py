@@ -73,7 +73,7 @@ class Evidence:
 
     def has_fix(self, tag: Node, now_s: float) -> bool:
         """Whether a tag has a fresh fix, or sleeps."""
-        return self.table.presence(tag, now_s) in ("fresh", "asleep")
+        return tag.asleep_until_s > now_s or self.table.is_fresh(tag, now_s)
 
     def missed(self, now_s: float) -> list[str]:
         """Tags known only from batches that have gone, and not for long."""
