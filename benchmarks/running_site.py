@@ -172,6 +172,8 @@ async def endure(pid, subscriber, seconds):
     await asyncio.sleep(seconds)
     result, processes = subscriber.figures() | {"tags": len(subscriber.tags)}, {}
     for one, (cpu, rss) in before.items():
+        if not one.is_running():  # such as a probe of the system at the start
+            continue
         share = sum(one.cpu_times()[:2]) - sum(cpu[:2])
         memory_mb = [round(rss / 1e6, 1), round(one.memory_info().rss / 1e6, 1)]
         processes[f"{one.pid} {name_of(one)}"] = {"cpu_share": round(share / seconds, 3), "memory_mb": memory_mb}
