@@ -375,7 +375,8 @@ class SiteTable:
 
     def get(self, kind: str, name: str) -> Node | None:
         """The node of this kind and name, if known."""
-        return self._nodes[kind].get(name)
+        nodes = self._nodes.get(kind)
+        return None if nodes is None else nodes.get(name)
 
     def all(self, kind: str) -> Mapping[str, Node]:
         """All nodes of a kind, by name."""
