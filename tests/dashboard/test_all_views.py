@@ -8,8 +8,10 @@ from itertools import pairwise
 from operator import itemgetter
 from types import SimpleNamespace
 
+import msgspec
 import pytest
 from dashboard_builders import SITE, SITE_ID, Times, Wire, fix, status
+from test_dashboard_condition import anchor_health
 
 from skyless.bridges.home_assistant import Announcer
 from skyless.bridges.prometheus import SiteMetrics
@@ -18,6 +20,8 @@ from skyless.cli.nodes.site_view import SiteView
 from skyless.page.api import questions
 from skyless.page.live import LiveSite
 from skyless.run.fix_batch import FIELDS, fix_of, records_of
+from skyless.run.gather.node import SiteCondition
+from skyless.run.gather.streams import TagName
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import TagZones, Zone, ZonesMessage
 from skyless.run.mqtt.topics import tag_zones_topic
@@ -62,7 +66,7 @@ class Both(Target):
 
 
 class Views:
-    """The page, its HTTP interface, ``skyless watch`` and a bridge, all of the same messages."""
+    """The page, its HTTP interface, ``skyless watch``, a bridge and a gather, all of the same messages."""
 
     def __init__(self):
         self.times, self.wires = Times(), (Wire(), Wire(), Wire())
@@ -71,6 +75,7 @@ class Views:
         for page, wire in ((self.page, self.wires[0]), (self.batched, self.wires[2])):
             page.attach(wire, SITE_ID)
             page.on_connection(connected=True)
+        self.gathered, self.judged = SiteCondition(self.times.now_s), ("bad", [])
         self.watch = SiteView(self.wires[1], SITE_ID, *clocks)
         self.wires[1].on_state[0](True)
         site = bridged_site(SITE.whole_site, ZONES, simulated=True)
@@ -85,25 +90,34 @@ class Views:
     def say(self, topic, message):
         for wire in self.wires[:2]:
             wire.deliver(topic, message)
+        self.gathered.on_message(topic, msgspec.json.encode(message), self.times.now_s)
 
     def fix(self, tag, place_m):
         one = fix(tag, self.times.unix_s, (*place_m, 1.0))
         self.say(topics.fix_topic(SITE_ID, tag), one)
         self.hub.on_fix(one, self.times.now_s)
-        (record,) = FIELDS.iter_unpack(records_of([(1, one)], simulated=False).tobytes())
+        records = records_of([(1, one)], simulated=False)
+        self.gathered.on_batch(records, {1: TagName(tag, "here", 0.0)}, self.times.now_s)
+        (record,) = FIELDS.iter_unpack(records.tobytes())
         self.batched.on_batched_fix(fix_of(tag, record), self.times.now_s)
         self.batched.table.hear([tag], self.times.now_s)
 
     def end(self, tag):
         gone = status("tag", tag, online=False)
-        self.say(topics.status_topic(SITE_ID, "tag", tag), gone)
+        for say in (self.say, self.wires[2].deliver):
+            say(topics.status_topic(SITE_ID, "tag", tag), gone)
         self.hub.on_status(gone, self.times.now_s, self.times.unix_s)
 
-    def tick(self):
+    def tick(self, second):
+        for anchor in SITE.site.anchors if second % 3 == 0 else ():
+            health = anchor_health(anchor.id, self.times.unix_s)
+            for say in (self.say, self.wires[2].deliver):
+                say(topics.health_topic(SITE_ID, "anchor", str(anchor.id)), health)
         self.page.tick()
         self.batched.tick()
         self.watch.evaluate()
         self.hub.on_tick(self.times.now_s, self.times.unix_s)
+        self.judged = self.gathered.reasons({}, 0, self.times.now_s)
 
     def compare(self):
         """Check that all views agree on each tag; the words for what they say."""
@@ -130,6 +144,10 @@ class Views:
                 assert [zone.id for zone in self.batched.monitor.zones_with(name)] == list(answer.zones)
             found[name] = answer.presence, answer.zones
         assert self.watch.condition == self.page.condition
+        judged = self.batched.condition
+        assert self.judged[1] == [reason.text for reason in judged.reasons]
+        assert self.judged[0] == {"warning": "degraded"}.get(judged.level, judged.level)
+        assert self.gathered.tags_heard(self.times.now_s) == sum(presence != "gone" for presence, _ in found.values())
         assert self.page.condition.tags_with_fix == sum(presence == "fresh" for presence, _ in found.values())
         return found
 
@@ -148,7 +166,7 @@ def test_all_views_say_the_same_at_every_moment_of_an_hour_with_sleeping_tags():
                 views.fix(name, places[name])
         if second == 3345:
             views.end("rare")
-        views.tick()
+        views.tick(second)
         if second % 5 == 4:
             found = views.compare()
             for name in TAGS:
