@@ -397,7 +397,7 @@ class FakeServer:
             here = health["synchronised"] or health["role"] == "master"
             conditions[name] = "bad" if ages["anchors"][name] > THRESHOLDS.report_s else "good" if here else "warn"
         known = {"anchors": anchors, "tags": tags, "ether": ether, "nodes": nodes, "ages": ages}
-        return {"type": "health", "whole": True, "conditions": conditions, "waiting": [], **known}
+        return {"type": "health", "whole": True, "conditions": conditions, "waiting": [], "dropped": {}, **known}
 
     async def _pongs(self, websocket, lock):
         while True:

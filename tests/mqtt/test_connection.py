@@ -48,7 +48,7 @@ async def test_a_number_that_still_flies_is_not_given_again():
     async with player(b"\x20\x02\x00\x00") as address:
         connection = await open_connection(address, None, Introduction("me", 60))
         first = connection.publish("a", b"", 1, retain=False)
-        connection._client._last_mid = 0xFFFF - 5  # as if so many had been sent since
+        connection._client._last_mid = 0xFFFF - 5  # as if that many had been sent since
         numbers = [connection.publish("a", b"", 1, retain=False) for _ in range(10)]
         assert first not in numbers
         assert len(set(numbers)) == len(numbers)

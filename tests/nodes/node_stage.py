@@ -21,6 +21,7 @@ from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
+from support.waiting import running
 
 LAB = paper_lab_site()
 PLACE_M = (2.0, 3.0, 0.0)
@@ -53,19 +54,6 @@ def played(test):
             runner.run(test(*arguments, **fixtures))
 
     return run
-
-
-@contextlib.asynccontextmanager
-async def running(*parts):
-    """Coroutines that run beside a test and end with it, however that ends."""
-    tasks = [asyncio.ensure_future(part) for part in parts]
-    await asyncio.sleep(0)
-    try:
-        yield tasks
-    finally:
-        for task in tasks:
-            task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)
 
 
 class FakeLink:

@@ -7,7 +7,6 @@ import time
 import pytest
 from mqtt_brokers import Embedded
 from msgspec import structs
-from node_stage import running
 
 from bridges.alarm_receiver import Receiver
 from bridges.bridged_values import a_fix
@@ -20,7 +19,7 @@ from skyless.page.live import LiveSite
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import AlarmRulesMessage, SiteMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import alarm_rules_topic, alarm_topic, fix_topic, site_topic, zones_topic
-from support.waiting import until
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 

@@ -9,7 +9,6 @@ from types import SimpleNamespace
 import pytest
 from mqtt_brokers import Embedded
 from msgspec import structs
-from node_stage import running
 
 from bridges.bridged_values import BERLIN, a_fix
 from machines.bench import LAB, tape
@@ -25,7 +24,7 @@ from skyless.run.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMes
 from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
 from support.processes import SKYLESS, free_port, running_program
 from support.site_messages import tag_health
-from support.waiting import until
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import msgspec
 import pytest
 from msgspec.structs import replace
-from node_stage import FakeLink, running
+from node_stage import FakeLink
 
 from skyless.core.air.beacon import decode
 from skyless.core.any_receiver import new_anchor
@@ -41,6 +41,7 @@ from skyless.site.file.check import image_size
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge, PairRanges, Survey, SurveyedAnchor, Tape
 from skyless.site.survey.surveyed_site import FloorImage, is_record_of, read_record, record_path, save_survey
+from support.waiting import running
 
 pytestmark = pytest.mark.site
 

@@ -7,7 +7,7 @@ from collections import Counter
 import msgspec
 import numpy as np
 import pytest
-from node_stage import LAB, PLACE_M, FakeLink, FakeRadio, receptions, receptions_of, running, undated
+from node_stage import LAB, PLACE_M, FakeLink, FakeRadio, receptions, receptions_of, undated
 
 from skyless.core.air.frame import Reception
 from skyless.radio.interface import Gone, Restarted
@@ -16,6 +16,7 @@ from skyless.run import tag as tag_module
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import Counters, FixMessage, SiteMessage, TagHealth
 from skyless.run.tag import Tag, TagNode, TagSettings
+from support.waiting import running
 
 pytestmark = pytest.mark.site
 

@@ -5,7 +5,6 @@ import json
 
 import pytest
 from mqtt_brokers import Embedded
-from node_stage import running
 from serial_stage import ComputingBoard
 
 from skyless.cli.main import main
@@ -16,7 +15,7 @@ from skyless.run.mqtt.topics import fix_topic, health_topic
 from skyless.run.process import reader as read_messages
 from support.board_tag import ANCHORS, StatusInC, fix_in_c
 from support.processes import SKYLESS, running_program
-from support.waiting import until
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 

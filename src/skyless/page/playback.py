@@ -226,8 +226,7 @@ def _events(path: Path, _of: _Version, stopped: threading.Event) -> RecordedEven
     log = EventLog(table, add=events.append)
 
     def on_status(status: StatusMessage | None) -> None:
-        node = None if status is None else table.add(status.kind, status.name, sends=True)
-        if node is not None and status is not None:
+        if status is not None and (node := table.add(status.kind, status.name, sends=True)) is not None:
             log.on_status(status, node.status, feed.now_s)
             table.add_status(status, feed.now_s)
 

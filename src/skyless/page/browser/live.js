@@ -209,7 +209,7 @@ const handlers = {
     state.log = [...state.log.filter(({ first }) => !replaced.has(first)), ...newer].slice(-MAX_LOGGED);
     changed("log");
   },
-  health({ whole, anchors, tags, ether, nodes, ages, conditions, waiting, dropped = {} }) {
+  health({ whole, anchors, tags, ether, nodes, ages, conditions, waiting, dropped }) {
     const { health } = state;
     if (whole) for (const known of [health.anchors, health.tags, health.nodes, health.conditions]) known.clear();
     if (whole) health.ether = null;

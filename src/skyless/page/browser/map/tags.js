@@ -1,11 +1,11 @@
 /** Tags on the map: ellipses, protection levels, true positions, marks and names. */
 
 import { freshness, now_s, shown_s, stillMotion, tracks } from "../clock.js";
+import { duration } from "../format.js";
 import { faint, palette } from "../theme.js";
 import { state } from "../store.js";
 import { alarmedTags } from "../alarms/model.js";
 import { labelOf } from "../assets/model.js";
-import { duration } from "../format.js";
 import { CXX, CXY, CYY, HEIGHT_GIVEN, HPL, TIME, TRUE_X, TRUE_Y, X, Y, Z } from "../tracks.js";
 import { DIMMED, dropLine, ring } from "./anchors.js";
 import { filtering, passes } from "./filter.js";
@@ -165,7 +165,7 @@ function names(context, seen) {
   const wanted = [];
   for (const { track, row: at, fresh, selected, x, y } of seen.toSorted((a, b) => Number(b.selected) - Number(a.selected))) {
     if (seen.length > NAMED && !selected) continue;
-    const silence = fresh === "asleep" ? " · asleep" : ` · no fix for ${duration(now_s() - at[TIME], 1)}`;
+    const silence = fresh === "asleep" ? " · asleep" : ` · no fix for ${duration(Math.abs(now_s() - at[TIME]), 1)}`;
     const quiet = fresh === "fresh" || state.connection.phase === "lost";
     const words = labelOf(track.name) + (quiet ? "" : silence) + (view.spatial ? heightWords(at, selected) : "");
     wanted.push({ key: track.name, words, x, y, colour: fresh === "fresh" ? palette.text : palette.muted, must: selected });
