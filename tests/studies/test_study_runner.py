@@ -106,6 +106,32 @@ def test_results_stand_in_the_order_of_the_cells():
     assert run_cells(cells(double, range(7)), lambda share: None, 2) == [0, 2, 4, 6, 8, 10, 12]
 
 
+class CellUnderAlarm:
+    """The command line delays Ctrl-C by an alarm, which may come while processes are being started."""
+
+    name, weight_s = "cell", 1.0
+
+    def __init__(self):
+        self.submitted = 0
+
+    @property
+    def function(self):
+        signal.raise_signal(signal.SIGALRM)
+        self.submitted += 1
+        return partial(rest, 60.0)
+
+
+def test_a_delayed_interrupt_waits_until_all_processes_have_been_started():
+    work = [CellUnderAlarm() for _ in range(3)]
+    before = signal.signal(signal.SIGALRM, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            run_cells(work, lambda share: None, 2)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+    assert [one.submitted for one in work] == [1, 1, 1]
+
+
 @pytest.mark.statistical
 def test_a_process_that_dies_is_named():
     with pytest.raises(SkylessError, match="a process died"):

@@ -205,7 +205,8 @@ _WORKERLESS_S: Final = 30.0
 
 _ADDRESS: Final = re.compile(r"((tcp|tls|ws|wss)://)?[^\s/]+:\d{1,5}")
 
-_ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+_ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
+"""SIGALRM among them: the command line delays by it an interrupt that came during an import."""
 
 Reached = Callable[[float], None]
 Keep = Callable[[int, Any], None]
@@ -308,7 +309,7 @@ def _map(submit: Callable[[Cell], Future[Any]], cells: Sequence[Cell], reached: 
 
 @contextmanager
 def _uninterrupted() -> Iterator[None]:
-    """Hold Ctrl-C and SIGTERM back until the block ends; processes started in it never get Ctrl-C, only this one."""
+    """Hold back what ends this process until the block ends; processes that start in it never get Ctrl-C."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
