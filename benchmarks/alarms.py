@@ -1,4 +1,4 @@
-"""Alarms of a simulated site (``tests/alarms/alarm_world.py``): missed, twice, without a cause; how late; their cost.
+"""Alarms of a simulated site (``tests/run/alarm_world.py``): missed, twice, without a cause; how late; their cost.
 
     python benchmarks/alarms.py [--seconds 1400] [--seed 1]
 
@@ -11,7 +11,7 @@ import sys
 import time
 from pathlib import Path
 
-sys.path.append(str(Path(__file__).parents[1] / "tests" / "alarms"))
+sys.path.append(str(Path(__file__).parents[1] / "tests" / "run"))
 
 import alarm_world as world
 from msgspec.structs import replace

@@ -19,9 +19,7 @@ import tempfile
 from functools import partial
 from pathlib import Path
 
-sys.path.extend(
-    str(Path(__file__).parents[1] / folder) for folder in ("firmware", "tests/firmware", "tests/positioning")
-)
+sys.path.extend(str(Path(__file__).parents[1] / folder) for folder in ("firmware", "tests/firmware", "tests/core"))
 
 import numpy as np
 from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, one_by_one, settings_of

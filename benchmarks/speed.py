@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
-sys.path.extend(str(Path(__file__).parents[1] / "tests" / folder) for folder in (".", "positioning"))
+sys.path.extend(str(Path(__file__).parents[1] / "tests" / folder) for folder in (".", "core"))
 
 import numpy as np
 from estimator_builders import Case, begun, episode_of, one_by_one, settings_of
@@ -26,7 +26,6 @@ from pseudoranges import located
 from scipy.optimize import least_squares
 from textbook_filter import TextbookFilter
 
-import synthetic_recordings as synthetic
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.estimator.estimator import Packets
 from skyless.core.estimator.settings import EstimatorSettings
@@ -41,6 +40,7 @@ from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.trajectory import Static
+from support import synthetic_recordings as synthetic
 from support.random_chain import draw_loop, random_chain
 
 NODES, SLOT_S, WARM_S = 7, 2.1e-3, 2.0

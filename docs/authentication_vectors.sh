@@ -1,6 +1,6 @@
 #!/bin/bash
 # Makes authentication_vectors.json with standard tools alone (openssl, xxd): an implementation of docs/authentication.md
-# that shares no line with Skyless. tests/authentication/test_vectors.py compares. Takes a minute.
+# that shares no line with Skyless. tests/core/test_vectors.py compares. Takes a minute.
 set -euo pipefail
 cd "$(dirname "$0")"
 

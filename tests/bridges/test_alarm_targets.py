@@ -12,8 +12,6 @@ from email import message_from_bytes, policy
 import pytest
 from aiosmtpd.controller import Controller
 from aiosmtpd.smtp import AuthResult
-from alarm_receiver import Receiver
-from bridged_values import SITE
 from msgspec.structs import replace
 
 from skyless.bridges import _deliveries
@@ -22,6 +20,8 @@ from skyless.bridges.targets import open_route
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.messages import AlarmMessage
 from skyless.run.web import BridgeLimits
+from support.alarm_receiver import Receiver
+from support.bridged_values import SITE
 from support.waiting import running, until
 
 ALARM = AlarmMessage(

@@ -3,7 +3,6 @@
 import json
 
 import msgspec
-from bridged_values import SITE, a_fix
 
 from skyless.bridges.home_assistant import document
 from skyless.bridges.jsonl import JsonLines
@@ -13,6 +12,7 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import Asset, AssetsMessage, site_message
 from skyless.sim.lab import lab_site
+from support.bridged_values import SITE, a_fix
 
 FORKLIFT = Asset("tag1", "Forklift 1", "forklifts")
 NAMED = msgspec.structs.replace(SITE, assets={"tag1": FORKLIFT})

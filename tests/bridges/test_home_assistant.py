@@ -6,7 +6,6 @@ import random
 
 import msgspec
 import pytest
-from bridged_values import BARE_SITE, SITE, a_fix
 from msgspec.structs import replace
 
 from skyless.bridges.home_assistant import MAX_ANNOUNCED, SETTLE_S, Announcer, document, make_target, platforms
@@ -16,6 +15,7 @@ from skyless.core.errors import SkylessError
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import TagPosition, TagZones, Zone
 from skyless.run.site_table import THRESHOLDS
+from support.bridged_values import BARE_SITE, SITE, a_fix
 
 WEST = Zone("z1", "West", ((0.0, 0.0), (3.0, 0.0), (3.0, 8.0), (0.0, 8.0)))
 EAST = Zone("z2", "East", ((3.0, 0.0), (6.0, 0.0), (6.0, 8.0), (3.0, 8.0)))

@@ -3,7 +3,6 @@
 from math import nan
 
 import pytest
-from bridged_values import BARE_SITE, SITE, a_fix, covariances
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
@@ -23,6 +22,7 @@ from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.messages import StatusMessage
 from skyless.sim.lab import lab_site
+from support.bridged_values import BARE_SITE, SITE, a_fix, covariances
 from support.site_messages import tag_health
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bridged_values import BARE_SITE, BERLIN, SITE, a_fix, fixes, georeferences
 from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec import structs
@@ -39,6 +38,7 @@ from skyless.bridges.target import BridgeContext, open_hub
 from skyless.bridges.targets import open_route
 from skyless.core.earth import geodetic
 from skyless.core.errors import SkylessError
+from support.bridged_values import BARE_SITE, BERLIN, SITE, a_fix, fixes, georeferences
 
 pymavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")
 pymavlink_1 = pytest.importorskip("pymavlink.dialects.v10.ardupilotmega")

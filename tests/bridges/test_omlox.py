@@ -10,7 +10,6 @@ from math import dist
 from uuid import UUID
 
 import pytest
-from bridged_values import BARE_SITE, BERLIN, SITE, a_fix, fixes, georeferences
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
@@ -23,6 +22,7 @@ from skyless.bridges.target import TargetUrl
 from skyless.core.earth import east_north_up, east_north_up_of
 from skyless.core.site import FloorSite
 from skyless.run.mqtt.messages import Asset
+from support.bridged_values import BARE_SITE, BERLIN, SITE, a_fix, fixes, georeferences
 from support.waiting import running, until
 
 FORK = {"tag1": Asset("tag1", "Fork 7"), "tag2": Asset("tag2")}

@@ -12,7 +12,6 @@ import time
 from pathlib import Path
 
 import pytest
-from bridged_values import SITE, a_fix
 from hypothesis import given
 from hypothesis import strategies as st
 from prometheus_client.parser import text_string_to_metric_families
@@ -25,6 +24,7 @@ from skyless.run.mqtt.messages import Counters, StatusMessage, TagHealth
 from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.web import BridgeLimits
 from support import site_messages
+from support.bridged_values import SITE, a_fix
 from support.waiting import running, until
 
 pytestmark = pytest.mark.site

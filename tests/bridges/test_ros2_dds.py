@@ -8,11 +8,11 @@ import threading
 import time
 
 import pytest
-from bridged_values import BARE_SITE, SITE, a_fix
 
 from skyless.bridges.ros2 import MARKERS, POSE, DdsTypes, Ros2Target, RosSettings, make_target
 from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.core.errors import SkylessError
+from support.bridged_values import BARE_SITE, SITE, a_fix
 from support.waiting import running
 
 pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheel here")

@@ -5,7 +5,6 @@ import re
 from fractions import Fraction
 
 import pytest
-from bridged_values import BARE_SITE, SITE, a_fix, fixes, georeferences
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec import structs
@@ -16,6 +15,7 @@ from skyless.bridges.ros2 import DdsTypes, RosEncoder, RosSettings, ros_name, st
 from skyless.bridges.target import floored
 from skyless.core.earth import geodetic, rotated
 from skyless.run.mqtt.messages import AnchorHealth, Counters, TagHealth
+from support.bridged_values import BARE_SITE, SITE, a_fix, fixes, georeferences
 
 EVERY = RosSettings(frame="map", namespace="hall/uwb", transforms=True)
 TYPES = [value for value in vars(ros2).values() if isinstance(value, str) and "/msg/" in value]

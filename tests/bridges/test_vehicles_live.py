@@ -8,13 +8,13 @@ import socket
 import struct
 
 import pytest
-from bridged_values import SITE, a_fix
 from msgspec import structs
 
 from skyless.bridges.mavlink import gps_input, odometry, vision_position_estimate
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import open_route
 from skyless.radio.serial.serial_port import Pty
+from support.bridged_values import SITE, a_fix
 from support.waiting import running
 
 pymavlink = pytest.importorskip("pymavlink.dialects.v20.ardupilotmega")

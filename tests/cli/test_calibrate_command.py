@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from machines.bench import LAB
-from recordings import live_site
 from skyless.cli.main import main
 from skyless.core.ticks import TICK_M
 from skyless.sim.impairments import DelayError
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
 from skyless.site.tables import read_calibration
+from support import live_site
+from support.bench import LAB
 
 pytestmark = pytest.mark.site
 

@@ -11,11 +11,11 @@ from pathlib import Path
 
 import pytest
 
-import synthetic_recordings as synthetic
 from skyless.cli.main import main
 from skyless.run.recordings.recorder import McapFile
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.file.template import site_template
+from support import synthetic_recordings as synthetic
 
 pytestmark = pytest.mark.site
 

@@ -15,12 +15,12 @@ import pytest
 from matplotlib.image import imread
 from msgspec.structs import replace
 
-import synthetic_recordings as synthetic
 from skyless.cli.main import main
 from skyless.cli.replay import FIXES_COLUMNS
 from skyless.core.site import AnchorSite, TagsSite
 from skyless.sim.lab import lab_site
 from skyless.site.file.template import site_template
+from support import synthetic_recordings as synthetic
 
 pytestmark = pytest.mark.site
 

@@ -12,8 +12,6 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from machines.bench import LAB
-from recordings import live_site
 from skyless.cli.main import main
 from skyless.core.errors import SkylessError
 from skyless.core.site import AnchorSite, ScheduleSite, Site
@@ -26,7 +24,9 @@ from skyless.site.file.template import site_template
 from skyless.site.survey.facts import Facts, Gauge, Survey, Tape, count
 from skyless.site.survey.surveyed_site import read_record
 from skyless.site.tables import read_anchors, read_calibration, read_ranges
+from support import live_site
 from support.alignment import aligned_rms_m
+from support.bench import LAB
 
 pytestmark = pytest.mark.site
 

@@ -20,14 +20,14 @@ from pathlib import Path
 import pytest
 from msgspec import structs
 
-from bridges.bridged_values import SITE, a_fix
-from recordings import live_site
 from skyless.bridges.ros2 import POSE
 from skyless.bridges.target import BridgeContext, floored, open_hub
 from skyless.bridges.targets import open_route
 from skyless.cli.main import main
 from skyless.core.earth import geodetic, rotated
 from skyless.run.recordings.recording import McapRecording
+from support import live_site
+from support.bridged_values import SITE, a_fix
 from support.processes import free_port
 
 ROOT = Path(__file__).parents[2]

@@ -15,7 +15,7 @@ from page_browser import THREE_FRAMES, until
 from PIL import Image
 
 from skyless.site.planning.colours import COLOUR_STOPS, scale_of
-from value_colours import colour_of
+from support.value_colours import colour_of
 
 pytestmark = pytest.mark.statistical
 

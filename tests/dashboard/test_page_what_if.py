@@ -13,7 +13,6 @@ import uvicorn
 from msgspec.structs import replace
 from page_browser import until
 
-from recordings import live_site
 from skyless.core.errors import SkylessError
 from skyless.core.estimator import compiled
 from skyless.core.estimator.process import REJECTED, STALE, BatchPacket, BatchRow, Place, Relay
@@ -27,6 +26,7 @@ from skyless.page.playback import Playback
 from skyless.page.sites import LiveSites
 from skyless.page.tasks import WhatIfTask
 from skyless.page.what_if_process import what_if
+from support import live_site
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import wasm_core

@@ -17,7 +17,7 @@ from with_board_sizes import BY_HAND, DOUBLE, FLOAT
 
 sys.path.append(str(Path(__file__).parents[2] / "tools"))
 sys.path.append(str(Path(__file__).parents[1] / "native"))
-sys.path.append(str(Path(__file__).parents[1] / "positioning"))
+sys.path.append(str(Path(__file__).parents[1] / "core"))
 
 from core_build import disturbed, has, input_of, rows_and_state, runner
 from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, one_by_one, settings_of

@@ -17,9 +17,9 @@ if __name__ == "__main__":
 from emulator.build import HAS_HOST_COMPILER, build
 from msgspec.structs import replace
 
-from machines.bench import ROOM, tape
 from skyless.core.site import GeoreferenceSite
 from skyless.core.ticks import wrap
+from support.bench import ROOM, tape
 
 HEARD = np.dtype([("length", "<i4"), ("bytes", "u1", 140), ("rx_ticks", "<i8")], align=True)
 PAUSE_TICKS = 10**9

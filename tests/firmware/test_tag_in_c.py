@@ -5,12 +5,12 @@ from board_stage import BoardStage, needs_compiler
 from emulator.board_library import KEPT_BYTES
 from msgspec.structs import replace
 
-from machines.bench import ROOM, tape
 from skyless.core.air.frame import Diagnostics, after_rmarker_s
 from skyless.core.ticks import from_seconds, to_seconds, wrap
 from skyless.radio.dw1000.radio import OFF
 from skyless.radio.serial.link import ASK_HELLO, ASK_TAG_CONFIG, SET_TAG_CONFIG, BoardSettings, pack
 from skyless.radio.tag_reports import BoardFix
+from support.bench import ROOM, tape
 
 pytestmark = [pytest.mark.site, needs_compiler]
 

@@ -14,14 +14,14 @@ import pytest
 from core_build import damaged_programs, has, input_of
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
-sys.path.insert(0, str(Path(__file__).parents[1] / "positioning"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "core"))
 
 from estimator_builders import MESH, ROOM_M, begun, episode_of, settings_of
 from msgspec.structs import replace
 
-from machines.bench import ROOM, tape
 from skyless.core.tag.receiver import Receiver
 from skyless.sim.impairments import CarrierModel
+from support.bench import ROOM, tape
 
 HEARD = np.dtype([("length", "<i4"), ("bytes", "u1", 140), ("rx_ticks", "<i8")], align=True)
 pytestmark = [pytest.mark.site, pytest.mark.skipif(not has("gcc"), reason="there is no gcc")]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from core_build import EXACT, NATIVE, has
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "positioning"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "core"))
 
 from estimator_builders import LAB_M, ROOM_M, Case, begun, episode_of, nees, rmse, settings_of, tracked
 

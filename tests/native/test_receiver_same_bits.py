@@ -5,13 +5,13 @@ import pytest
 from msgspec.structs import replace
 from test_same_bits import bits
 
-from machines.bench import ROOM, tape
 from skyless.core.air.beacon import decode, encode
 from skyless.core.air.frame import Diagnostics, PackedHeard
 from skyless.core.air.site_pages import site_issue
 from skyless.core.anchor import site_page_for, site_pages_of
 from skyless.core.tag import receiver
 from skyless.core.tag.hearing import hear_frame
+from support.bench import ROOM, tape
 
 pytestmark = pytest.mark.site
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from core_build import NATIVE, disturbed, has, input_of, library_of_all, rows_and_state, runner
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "positioning"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "core"))
 sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 from estimator_builders import LAB_M, MESH, ROOM_M, begun, bytes_in_use, episode_of, one_by_one, settings_of

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "positioning"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "core"))
 
 from estimator_builders import (
     LAB_M,

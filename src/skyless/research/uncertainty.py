@@ -2,7 +2,7 @@
 
 Names follow ``docs/maths.md`` section 1. Everything is in true seconds unless stated otherwise; the tag stands still.
 All formulas are arithmetic on the chain's fields alone and hold element by element for many anchors; the derivation in
-``tests/uncertainty`` puts symbols in.
+``tests/research`` puts symbols in.
 """
 
 import math
@@ -170,8 +170,8 @@ class Variances:
     """The paper's section on uncertainties: variances in s², and of λ in m².
 
     What is printed right stands here. ``CORRECTED`` follows from the paper's own algorithm
-    (``positioning/methods/snapshots.py``) by linearising it; ``tests/uncertainty/test_paper_derivation.py`` does that
-    with symbols, and Monte Carlo draws of the algorithm as it is agree (``tests/paper/test_paper_checks.py``). The
+    (``positioning/methods/snapshots.py``) by linearising it; ``tests/research/test_paper_derivation.py`` does that
+    with symbols, and Monte Carlo draws of the algorithm as it is agree (``tests/research/test_paper_checks.py``). The
     reference packet is taken to be no synchronisation packet, as in the paper; the other cases: ``chain_covariance``.
     ``PRINTED`` is kept to be compared with it; ``docs/errata.md`` explains each difference.
     """

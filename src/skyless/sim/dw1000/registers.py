@@ -1,6 +1,6 @@
 """Registers of the DW1000 and their bits, from sections 7.2 and 2.5 of the User Manual v2.12 ("UM").
 
-The driver has its own table; ``tests/simulation/test_dw1000_tables.py`` compares both with a third.
+The driver has its own table; ``tests/sim/test_dw1000_tables.py`` compares both with a third.
 """
 
 from collections import Counter

@@ -1,0 +1,24 @@
+"""A live site whose time and messages the test gives."""
+
+import pytest
+from dashboard_builders import SITE_ID, Times, Wire
+
+from skyless.page.live import LiveSite
+
+
+@pytest.fixture
+def times():
+    return Times()
+
+
+@pytest.fixture
+def wire():
+    return Wire()
+
+
+@pytest.fixture
+def live(times, wire):
+    """Of a broker that is not connected yet."""
+    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
+    live.attach(wire, SITE_ID)
+    return live
