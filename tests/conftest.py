@@ -1,6 +1,7 @@
 """What all tests share."""
 
 import asyncio
+import contextlib
 import inspect
 import math
 import os
@@ -11,10 +12,13 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
-from support.tiers import TIERS, file_tiers
+from support.tiers import LONG, TIERS, UnitTests, file_tiers
 
 settings.register_profile("skyless", deadline=None, derandomize=True)  # a first call compiles; a run repeats itself
 settings.load_profile("skyless")
+
+
+UNIT_TESTS = UnitTests()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -55,6 +59,25 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if tiers := _tiers(config):
         config.hook.pytest_deselected(items=[item for item in items if _tier(item) not in tiers])
         items[:] = [item for item in items if _tier(item) in tiers]
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
+    with UNIT_TESTS.running(item.nodeid) if _tier(item) == "unit" else contextlib.nullcontext():
+        return (yield)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item: pytest.Item) -> Iterator[None]:
+    with UNIT_TESTS.called(item.user_properties) if _tier(item) == "unit" else contextlib.nullcontext():
+        return (yield)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    reports = terminalreporter.stats.get("passed", [])
+    long = [(took_s, one.nodeid) for one in reports for name, took_s in one.user_properties if name == LONG]
+    for took_s, name in sorted(long, reverse=True):
+        terminalreporter.write_line(f"{took_s:.1f} s of the processor, too long for a unit test: {name}")
 
 
 @pytest.hookimpl(tryfirst=True)

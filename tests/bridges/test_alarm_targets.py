@@ -70,6 +70,7 @@ def secret_file(tmp_path, text="a secret\n", mode=0o600):
     return path
 
 
+@pytest.mark.site
 def test_what_becomes_of_an_alarm_is_posted_in_order_and_signed(tmp_path):
     with Receiver() as receiver:
         path = secret_file(tmp_path)
@@ -87,6 +88,7 @@ def test_what_becomes_of_an_alarm_is_posted_in_order_and_signed(tmp_path):
         assert not verified(b"another", headers, body)
 
 
+@pytest.mark.site
 def test_a_receiver_that_fails_is_asked_again_and_each_time_with_the_same_key():
     with Receiver([500, 503, 429, 408, 200]) as receiver:
         lines = []
@@ -99,6 +101,7 @@ def test_a_receiver_that_fails_is_asked_again_and_each_time_with_the_same_key():
         assert "delivered again" in lines[-1]
 
 
+@pytest.mark.site
 @pytest.mark.parametrize("answer", [400, 404, 410, 301])
 def test_what_a_receiver_refuses_is_not_posted_again(answer):
     with Receiver([answer]) as receiver:
@@ -109,6 +112,7 @@ def test_what_a_receiver_refuses_is_not_posted_again(answer):
         assert target.dropped == {"refused": 1}
 
 
+@pytest.mark.site
 def test_a_receiver_that_is_not_there_is_tried_until_it_is():
     with socket.create_server(("127.0.0.1", 0)) as held:
         port = held.getsockname()[1]
@@ -119,6 +123,7 @@ def test_a_receiver_that_is_not_there_is_tried_until_it_is():
     assert (target.delivered, target.dropped) == (0, {"stopped": 1})
 
 
+@pytest.mark.site
 def test_what_waits_when_the_bridge_stops_is_tried_once_more(monkeypatch):
     monkeypatch.setattr(_deliveries, "FIRST_PAUSE_S", 1000.0)
     lines = []
@@ -129,6 +134,7 @@ def test_what_waits_when_the_bridge_stops_is_tried_once_more(monkeypatch):
         assert (len(receiver.requests), target.delivered, target.dropped) == (4, 1, {"stopped": 2})
 
 
+@pytest.mark.site
 def test_receivers_that_hang_or_drip_cost_only_their_own_messages(monkeypatch):
     monkeypatch.setattr(_deliveries, "TIMEOUT_S", 0.3)
     ended = threading.Event()
@@ -173,6 +179,7 @@ def _drip(connection, ended):
             connection.sendall(b"X: y\r\n")
 
 
+@pytest.mark.site
 def test_the_oldest_of_too_many_is_dropped_and_counted(monkeypatch):
     monkeypatch.setattr(_deliveries, "LIMITS", BridgeLimits(deliveries=5))
     with Receiver() as receiver:
@@ -183,6 +190,7 @@ def test_the_oldest_of_too_many_is_dropped_and_counted(monkeypatch):
         assert target.dropped == {"too-many": 3}
 
 
+@pytest.mark.site
 def test_after_a_day_a_message_is_dropped(monkeypatch):
     monkeypatch.setattr(_deliveries, "KEPT_S", 0.1)
     with Receiver([500] * 1000) as receiver:
@@ -190,6 +198,7 @@ def test_after_a_day_a_message_is_dropped(monkeypatch):
         deliver(target, [ALARM], lambda: target.dropped["too-old"] == 1)
 
 
+@pytest.mark.site
 def test_of_what_the_broker_has_kept_only_active_alarms_that_nobody_has_seen_are_posted():
     old = replace(ALARM, unix_s=1.0)
     with Receiver() as receiver:
@@ -203,6 +212,7 @@ def test_of_what_the_broker_has_kept_only_active_alarms_that_nobody_has_seen_are
         ]
 
 
+@pytest.mark.site
 def test_one_failing_alarm_does_not_hold_up_another():
     with Receiver([500] + [200] * 10) as receiver:
         target = open_target(f"webhook+http://127.0.0.1:{receiver.port}/")
@@ -263,6 +273,7 @@ def mail_server(handler, **settings):
         controller.stop()
 
 
+@pytest.mark.site
 def test_a_mail_when_an_alarm_is_raised_and_when_it_has_ended():
     box = Mailbox(["451 later", "250 OK"])
     with mail_server(box) as port:
@@ -281,6 +292,7 @@ def test_a_mail_when_an_alarm_is_raised_and_when_it_has_ended():
     assert "This site is simulated." in text
 
 
+@pytest.mark.site
 @pytest.mark.parametrize(
     "name", ["x\r\nBcc: eve@example.org\r\n\r\nbody", "=?utf-8?q?=0D=0ABcc:_eve@example.org?=", "\x1b]0;x\x07\x85"]
 )
@@ -295,6 +307,7 @@ def test_a_name_cannot_add_headers(name):
     assert mail["Subject"].isprintable()
 
 
+@pytest.mark.site
 @pytest.mark.parametrize("unix_s", [1e17, -1e17, 1e300])
 def test_a_time_that_is_none_does_not_stop_a_mail(unix_s):
     box = Mailbox()
@@ -304,6 +317,7 @@ def test_a_time_that_is_none_does_not_stop_a_mail(unix_s):
     assert "which is no time" in box.mails[0][1].get_content()
 
 
+@pytest.mark.site
 def test_a_mail_that_is_refused_for_good_is_counted():
     box = Mailbox(["554 no"])
     with mail_server(box) as port:
@@ -312,6 +326,7 @@ def test_a_mail_that_is_refused_for_good_is_counted():
     assert box.mails == []
 
 
+@pytest.mark.site
 def test_who_is_refused_for_now_gets_a_mail_later_and_the_others_get_it_once():
     box = Mailbox(to_bob=["450 later", "250 OK", "550 nobody"])
     with mail_server(box) as port:
@@ -323,6 +338,7 @@ def test_who_is_refused_for_now_gets_a_mail_later_and_the_others_get_it_once():
     assert [people for people, _ in box.mails[2:]] == [["ada@example.org"]]
 
 
+@pytest.mark.site
 def test_user_and_password(tmp_path):
     asked = []
 

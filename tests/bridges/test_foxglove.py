@@ -85,6 +85,7 @@ async def client_of(server, subprotocols=SUBPROTOCOLS):
         yield Client(connection)
 
 
+@pytest.mark.site
 @pytest.mark.parametrize(
     ("host", "origin", "status"),
     [
@@ -120,6 +121,7 @@ def is_status(text):
     return text["op"] == "status"
 
 
+@pytest.mark.site
 @pytest.mark.parametrize("subprotocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])
 def test_a_client_gets_each_form_of_a_fix(subprotocol):
     async def run():
@@ -160,6 +162,7 @@ def test_a_client_gets_each_form_of_a_fix(subprotocol):
         assert found[name].keys() == schema["properties"].keys()
 
 
+@pytest.mark.site
 async def test_a_client_of_another_protocol_is_refused():
     async with served() as server:
         for subprotocols in (["x-something-else"], []):
@@ -168,6 +171,7 @@ async def test_a_client_of_another_protocol_is_refused():
                     pass
 
 
+@pytest.mark.site
 async def test_without_a_georeference_there_is_no_location():
     async with served(msgspec.structs.replace(SITE, georeference=None)) as server, client_of(server) as client:
         server.on_fix(FIX)
@@ -175,6 +179,7 @@ async def test_without_a_georeference_there_is_no_location():
         assert set(client.channels) == {"/site/scene", "/tf", "/tag/tag1/fix", "/tag/tag1/pose", "/tag/tag1/ellipse"}
 
 
+@pytest.mark.site
 async def test_what_cannot_be_done_is_answered_with_a_status_and_costs_nothing():
     async with served() as server, client_of(server) as client:
         for request in (
@@ -197,6 +202,7 @@ async def test_what_cannot_be_done_is_answered_with_a_status_and_costs_nothing()
         assert server.dropped == {"request-not-understood": 5}
 
 
+@pytest.mark.site
 async def test_figures_that_no_tag_publishes_are_dropped():
     async with served() as server, client_of(server) as client:
         server.on_fix(FIX)
@@ -214,6 +220,7 @@ async def test_figures_that_no_tag_publishes_are_dropped():
         assert server.dropped["out-of-range"] >= 4 * 5
 
 
+@pytest.mark.site
 async def test_a_client_that_never_reads_is_disconnected_and_others_get_every_fix(monkeypatch):
     monkeypatch.setattr(foxglove, "STUCK_S", 0.2)
     fixes = 6000
@@ -252,6 +259,7 @@ async def stuck_socket(port, channels):
     return sock
 
 
+@pytest.mark.site
 async def test_more_clients_than_it_serves_are_closed(monkeypatch):
     monkeypatch.setattr(foxglove, "LIMITS", BridgeLimits(clients=1))
     async with served() as server, client_of(server) as first:
@@ -262,6 +270,7 @@ async def test_more_clients_than_it_serves_are_closed(monkeypatch):
         assert server.dropped == {"too-many-clients": 1}
 
 
+@pytest.mark.site
 async def test_a_port_in_use_is_named():
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

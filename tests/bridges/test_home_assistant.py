@@ -208,6 +208,7 @@ def test_two_bridges_that_know_different_zones_do_not_answer_each_other_without_
     assert broker.sent.count(CONFIG) < 6
 
 
+@pytest.mark.site
 def test_the_link_keeps_all_that_is_sent_of_as_many_tags_as_there_may_be():
     zones = tuple(replace(WEST, id=f"z{k:063d}", name=f"{k:0100d}") for k in range(100))
     target = make_target(TargetUrl("homeassistant:"), CONTEXT)

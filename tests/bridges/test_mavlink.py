@@ -474,6 +474,7 @@ def test_the_heading_of_a_site_that_has_none_can_be_given():
         made.on_site(SITE)
 
 
+@pytest.mark.site
 @pytest.mark.parametrize(("key", "lines"), [("&tag=tag2", 0), ("", 1)])
 def test_a_tag_that_the_user_chose_is_not_argued_about(key, lines):
     said = []

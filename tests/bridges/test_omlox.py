@@ -85,6 +85,7 @@ def test_a_trackable_is_the_same_for_ever_and_only_of_a_tag_with_a_name():
     assert "trackables" not in as_json(location(a_fix(tag="tag2"), HALL, "zone"))
 
 
+@pytest.mark.site
 def test_a_hub_gets_batches_with_the_token_and_its_errors_are_told(tmp_path, monkeypatch):
     """The stand-in refuses the first message and closes; after that it only reads."""
     monkeypatch.setattr(omlox, "_PAUSE_S", 0.01)

@@ -28,6 +28,7 @@ async def listening(server):
     return server.port
 
 
+@pytest.mark.site
 async def test_tcp_readers_get_the_greeting_and_then_everything():
     async with running(TcpServer("t:", "127.0.0.1", 0, lambda: [b"hello\n"])) as server:
         port = await listening(server)
@@ -44,6 +45,7 @@ async def test_tcp_readers_get_the_greeting_and_then_everything():
     assert await one.read() == b"", "the end of the server ends its connections"
 
 
+@pytest.mark.site
 async def test_a_tcp_reader_that_never_reads_costs_no_other_a_byte_and_is_disconnected():
     async with running(TcpServer("t:", "127.0.0.1", 0, list)) as server:
         port = await listening(server)
@@ -72,6 +74,7 @@ async def test_a_tcp_reader_that_never_reads_costs_no_other_a_byte_and_is_discon
         held.close()
 
 
+@pytest.mark.site
 async def test_more_connections_than_allowed_are_closed_at_once():
     async with running(TcpServer("t:", "127.0.0.1", 0, list)) as server:
         port = await listening(server)
@@ -84,6 +87,7 @@ async def test_more_connections_than_allowed_are_closed_at_once():
         del held
 
 
+@pytest.mark.site
 async def test_a_port_in_use_is_named():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -91,6 +95,7 @@ async def test_a_port_in_use_is_named():
             await TcpServer("t:", "127.0.0.1", port, list).run()
 
 
+@pytest.mark.site
 async def test_datagrams_arrive_one_by_one_and_none_is_missed_aloud():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as inbox:
         inbox.bind(("127.0.0.1", 0))
@@ -148,6 +153,7 @@ async def test_a_pseudo_terminal_and_its_link_are_there_only_while_it_runs(tmp_p
     assert sender.dropped == {"not-read": 2}
 
 
+@pytest.mark.site
 def test_a_message_longer_than_what_may_wait_reaches_a_reader_for_whom_nothing_waits():
     greeting = b"x" * 200_000 + b"\n"  # a site of thousands of anchors
 

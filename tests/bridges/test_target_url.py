@@ -81,6 +81,7 @@ WRONG = {
 }
 
 
+@pytest.mark.site
 @pytest.mark.parametrize(("text", "words"), WRONG.items())
 def test_a_wrong_address_is_named_with_what_would_be_right(text, words):
     with pytest.raises(SkylessError) as raised:

@@ -126,6 +126,7 @@ def as_float32(value):
     return value
 
 
+@pytest.mark.site
 @pytest.mark.parametrize("profile", NAMES)
 @pytest.mark.parametrize("moving", [True, False])
 def test_mavsdk_decodes_every_field(profile, moving, vehicle):
@@ -206,6 +207,7 @@ async def converse(vehicle, target):
     assert (await vehicle.received.get()).get_type() == "VISION_POSITION_ESTIMATE"
 
 
+@pytest.mark.site
 def test_a_vehicle_on_udp():
     async def work():
         receiver, port = bound()

@@ -66,6 +66,7 @@ def test_there_are_commands():
     assert sum("ranges.csv" in command for command in COMMANDS) >= 6
 
 
+@pytest.mark.site
 @pytest.mark.parametrize("command", [command for command in COMMANDS if "ranges.csv" in command])
 def test_a_command_on_tables_runs(hall, capsys, command):
     assert main(command.split()[1:]) == 0

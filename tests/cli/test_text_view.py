@@ -125,6 +125,7 @@ def test_an_anchor_that_is_silent_comes_first(view, times):
     assert any(line.startswith("3 ") and "silent" in line and "4 s ago" in line for line in lines(view.picture()))
 
 
+@pytest.mark.site
 @settings(max_examples=25)
 @given(st.integers(0, 60), st.integers(0, 60), st.integers(0, 20), st.integers(80, 200), st.integers(24, 60))
 def test_a_picture_fits_and_says_how_many_it_leaves_out(tags, anchors, alarms, width, height):
@@ -157,6 +158,7 @@ def test_long_names_and_figures_keep_their_columns_at_80():
         assert f" {figure}" in line
 
 
+@pytest.mark.site
 @given(st.text())
 def test_nothing_from_the_network_controls_the_terminal(text):
     assert plain(text).isprintable()

@@ -41,6 +41,7 @@ def link(monkeypatch):
     return link
 
 
+@pytest.mark.site
 def test_the_demo_s_own_broker_keeps_nothing_after_its_end(link, monkeypatch):
     settings = []
 
@@ -54,12 +55,14 @@ def test_the_demo_s_own_broker_keeps_nothing_after_its_end(link, monkeypatch):
     assert [asked.temporary for asked in settings] == [True]
 
 
+@pytest.mark.site
 @pytest.mark.parametrize("carrier", [False, True])
 def test_the_ether_simulates_carriers_where_the_demo_is_asked_to(carrier):
     ether = WholeSite(DemoOptions(record="none", carrier=carrier), print)._programs(ADDRESS)[0]
     assert ("--carrier" in ether.arguments) == carrier
 
 
+@pytest.mark.site
 def test_tags_that_are_boards_have_an_emulated_board_and_a_program_that_publishes():
     whole = WholeSite(DemoOptions(record="none", tags=3, boards=2), print)
     programs = {program.name: program.arguments for program in whole._programs(ADDRESS)}

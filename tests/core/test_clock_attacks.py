@@ -72,6 +72,7 @@ def test_frames_are_accepted_again_soon_after_any_step_of_the_host_clock(step_s,
     assert air.verifier.clock.error_s is None or seconds < 1.0
 
 
+@pytest.mark.site
 @settings(max_examples=20, deadline=None)
 @given(
     anchors_s=st.lists(st.floats(-ANCHOR_S, ANCHOR_S), min_size=4, max_size=4),

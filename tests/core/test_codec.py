@@ -34,6 +34,7 @@ def changed(frame, at, value):
     return with_fcs(body)
 
 
+@pytest.mark.site
 @given(beacons())
 @settings(max_examples=300)
 def test_round_trip_over_all_ranges(beacon):
@@ -61,6 +62,7 @@ def test_cut_frames_with_a_right_checksum_are_dropped(beacon, data):
     assert isinstance(decode(with_fcs(body[:cut])), Malformed)
 
 
+@pytest.mark.site
 @given(st.binary(max_size=140))
 @settings(max_examples=300)
 def test_any_bytes_are_a_beacon_or_a_reason(data):
@@ -68,6 +70,7 @@ def test_any_bytes_are_a_beacon_or_a_reason(data):
     assert isinstance(decode(with_fcs(data)), Malformed | Beacon)
 
 
+@pytest.mark.site
 @given(beacons(), st.data())
 @settings(max_examples=300)
 def test_any_changed_byte_with_a_right_checksum_is_a_beacon_that_encodes_again_or_a_reason(beacon, data):
@@ -159,6 +162,7 @@ def test_reserved_flags_drop_the_frame(flag):
     assert decode(changed(frame, FLAGS_AT, frame[FLAGS_AT] | flag)) is Malformed.BAD_FLAGS
 
 
+@pytest.mark.site
 @given(beacons(), st.data())
 @settings(max_examples=200)
 def test_phases_take_the_place_of_the_high_byte_of_stamps(beacon, data):

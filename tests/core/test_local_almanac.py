@@ -168,6 +168,7 @@ def test_the_issue_does_not_depend_on_the_order_of_the_pages():
     assert site_issue((*PAGES[:-1], replace(PAGES[-1], tag_height_m=0.5))) != ISSUE
 
 
+@pytest.mark.site
 def test_strangers_do_not_displace_anchors_that_others_have_received():
     """Neither their positions nor the pages that they state, however many there are."""
     tag, good = Tag(), rotation(600)

@@ -14,6 +14,7 @@ metres = st.floats(-1e6, 1e6)
 EARTH_RADIUS_M = 6_378_137.0
 
 
+@pytest.mark.site
 @given(pages)
 @settings(max_examples=500)
 def test_round_trip(page):
@@ -22,6 +23,7 @@ def test_round_trip(page):
     assert decode_page(data) == page
 
 
+@pytest.mark.site
 @given(metres, metres, metres)
 def test_coordinates_keep_the_millimetre(x_m, y_m, z_m):
     page = decode_page(encode_page(AnchorPage(7, x_m, y_m, z_m, 0)))

@@ -16,6 +16,7 @@ from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.lab import paper_lab_site
 
 
+@pytest.mark.site
 @given(st.lists(st.tuples(beacons(), unsigned(40)), min_size=1, max_size=8))
 def test_no_beacon_raises(received):
     """Frames are drawn over the whole range of every field, all of one site so that their pages are used."""

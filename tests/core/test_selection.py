@@ -92,6 +92,7 @@ def test_receptions_that_an_anchor_relays_show_whether_it_is_there(off_ticks, fi
     assert fitting_relays(t, s, relays(*heard), rx_ticks) == fitting
 
 
+@pytest.mark.site
 @settings(max_examples=20)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 1000)), min_size=400, max_size=500))
 def test_memory_is_bounded_and_those_that_others_receive_stay(rows):

@@ -20,7 +20,7 @@ from skyless.radio.serial.link import decode
 from skyless.radio.tag_reports import AnchorPlace, BoardStatus, board_fix
 from support.board_tag import OriginInC, StatusInC, fix_in_c
 
-pytestmark = pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
+pytestmark = [pytest.mark.site, pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")]
 
 NOISE = st.one_of(st.binary(max_size=300), st.binary(max_size=40).map(lambda piece: piece * 20))
 
@@ -95,7 +95,6 @@ def test_the_link_has_the_same_values_at_both_ends():
     assert {name: known[name] for name in shared} == {name: getattr(link, name) for name in shared}
 
 
-@pytest.mark.site
 @given(st.binary(max_size=300))
 def test_the_checks_are_those_of_the_standard_library_and_of_the_beacons(data):
     assert library().link_crc16(data, len(data)) == crc_hqx(data, 0xFFFF)

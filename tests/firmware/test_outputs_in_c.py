@@ -24,7 +24,7 @@ from skyless.radio.tag_reports import AnchorPlace, BoardReceiver, board_fix
 from skyless.run.mqtt.messages import FixMessage, fix_message
 from support.board_tag import ANCHORS, FixInC, OriginInC, fix_in_c
 
-pytestmark = pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
+pytestmark = [pytest.mark.site, pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")]
 
 NOON_US = 1_790_000_000_123_000
 OUTPUT_MAX_BYTES = 896

@@ -11,7 +11,7 @@ from skyless.core.air.almanac import LONGEST_PERIOD_CODE, gap_ticks
 from skyless.core.air.frame import after_rmarker_s, preamble_s
 from skyless.core.ticks import TICK_RATE_HZ
 
-pytestmark = pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
+pytestmark = [pytest.mark.site, pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")]
 
 COUNTER = 1 << 40
 US = TICK_RATE_HZ * 1e-6

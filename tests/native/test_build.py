@@ -16,6 +16,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 import compile_core
 from skyless.core.native import library
 
+pytestmark = pytest.mark.site
+
 ROOT = Path(__file__).parents[2]
 
 with_cc = pytest.mark.skipif(not has("cc"), reason="there is no cc")

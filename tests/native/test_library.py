@@ -18,7 +18,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 
 import compile_core
 
-pytestmark = pytest.mark.skipif(not has("cc"), reason="there is no cc")
+pytestmark = [pytest.mark.site, pytest.mark.skipif(not has("cc"), reason="there is no cc")]
 
 SOURCE = """
 #include <stdbool.h>

@@ -23,6 +23,8 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
 from translator.body import RefusedError
 from translator.files import translate
 
+pytestmark = pytest.mark.site
+
 ALL = [f for f in vars(translated).values() if inspect.isfunction(f) and f.__module__ == translated.__name__]
 EXPORTED = [f for f in ALL if not f.__name__.startswith("_")]
 OF_NUMBERS = [f for f in EXPORTED if f.__name__ not in ("choose", "work", "stamp", "ignore")]

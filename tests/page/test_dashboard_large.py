@@ -45,6 +45,7 @@ def large(live, wire, times, tags, anchors):
 encoded = msgspec.json.encode
 
 
+@pytest.mark.site
 @pytest.mark.parametrize(("tags", "anchors"), [(3, 3000), (3000, 8)])
 def test_a_healthy_large_site_is_good_and_says_how_many_are_shown(live, wire, times, tags, anchors):
     condition = large(live, wire, times, tags, anchors)

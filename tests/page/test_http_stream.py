@@ -58,6 +58,7 @@ async def _show_later(live):
     show(live, live._link, "t5")
 
 
+@pytest.mark.site
 @given(st.lists(st.lists(st.tuples(st.sampled_from(NAMES), st.floats(0.0, 9.0)), max_size=9), max_size=6))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=50)
 def test_a_reader_that_pauses_gets_the_newest_fix_of_each_tag_once(site, wire, pauses):

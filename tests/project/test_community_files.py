@@ -91,6 +91,7 @@ def test_dependencies_are_updated_every_week_in_groups():
     assert all(update["schedule"] == {"interval": "weekly"} and update["groups"] for update in updates)
 
 
+@pytest.mark.site
 def test_the_script_publishes_nothing():
     done = subprocess.run([ROOT / "scripts" / "publish", "--made"], capture_output=True, text=True, check=False)
     assert done.returncode == 1

@@ -36,6 +36,7 @@ def test_commands_are_known_to_the_program(page):
         program().parse_args(command, print_error=False, exit_on_error=False)
 
 
+@pytest.mark.site
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_targets_can_be_opened(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)

@@ -16,12 +16,8 @@ HOLDS = {
         "test_a_tag_on_a_hostile_channel",
         "test_an_anchor_on_a_hostile_channel",
     ),
-    "firmware": (
-        "test_random_bytes_any_chip_and_damaged_beacons_stop_nothing",
-    ),
-    "native": (
-        "test_sanitizers_find_nothing_and_every_fix_is_a_number",
-    ),
+    "firmware": ("test_random_bytes_any_chip_and_damaged_beacons_stop_nothing",),
+    "native": ("test_sanitizers_find_nothing_and_every_fix_is_a_number",),
     "page": (
         "test_requests_that_are_not_finished_make_room_for_a_reader",
         "test_beyond_the_limit_of_requests_in_work_a_client_is_told",
@@ -36,9 +32,7 @@ HOLDS = {
         "test_a_real_history_answers_and_a_question_that_takes_too_long_is_ended",
         "test_there_are_only_so_many",
     ),
-    "research": (
-        "test_made_up_captures",
-    ),
+    "research": ("test_made_up_captures",),
     "run": (
         "test_any_bytes_as_a_public_key_give_one_line",
         "test_damaged_bytes_are_refused_or_a_batch_and_raise_nothing_else",
@@ -58,9 +52,7 @@ HOLDS = {
         "test_a_full_disk_ends_the_recording_once_and_leaves_a_whole_file",
         "test_damaged_files_do_not_raise",
     ),
-    "site": (
-        "test_no_file_ends_in_anything_but_a_configuration_error",
-    ),
+    "site": ("test_no_file_ends_in_anything_but_a_configuration_error",),
 }
 
 

@@ -41,6 +41,7 @@ async def test_settings_are_read_changed_and_kept():
         assert board.tag.flash == wanted
 
 
+@pytest.mark.site
 async def test_a_board_that_cannot_be_set_up_is_named_in_words():
     async with ComputingBoard() as board:
         with pytest.raises(SkylessError, match="refuses its configuration: it has not these settings"):
@@ -75,6 +76,7 @@ async def test_the_command_shows_what_flash_holds(capsys):
         assert "could not keep them in its flash" in capsys.readouterr().err
 
 
+@pytest.mark.site
 async def test_a_host_s_program_has_the_board_compute_until_its_next_start():
     async with ComputingBoard() as board, radio_events(serial(board)) as host:
         await host.until(Restarted)

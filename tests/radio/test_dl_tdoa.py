@@ -116,6 +116,7 @@ anything = st.builds(
 )
 
 
+@pytest.mark.site
 @given(st.lists(anything, max_size=40))
 def test_any_messages_in_any_order(messages):
     rounds = DtRounds(PLACES_M)

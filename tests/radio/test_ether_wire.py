@@ -48,6 +48,7 @@ def pieces_of(stream, cuts):
     return [stream[begin:end] for begin, end in itertools.pairwise(places)]
 
 
+@pytest.mark.site
 @pytest.mark.parametrize(("said", "decoder"), [(TO_ETHER, to_ether), (FROM_ETHER, from_ether)])
 @given(st.data(), st.lists(st.integers(0, 10_000), max_size=30))
 def test_what_is_said_arrives_however_the_stream_is_cut(said, decoder, data, cuts):

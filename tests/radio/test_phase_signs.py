@@ -165,6 +165,7 @@ def test_phases_of_simulated_chips_close():
     check_signs(heard, CARRIER_CYCLES[5])
 
 
+@pytest.mark.site
 @pytest.mark.parametrize("channel", [1, 3])
 def test_phases_of_recorded_chips_close(recordings, channel):
     path = recordings / "muloc" / "location1_2.npz"

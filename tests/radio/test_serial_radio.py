@@ -114,6 +114,7 @@ async def test_the_counter_is_that_of_the_board():
                 await asyncio.sleep(0.05)
 
 
+@pytest.mark.site
 async def test_a_board_that_is_pulled_out_and_plugged_in_is_found_again(tmp_path):
     place = tmp_path / "board"
     async with radio_events(SerialRadio(str(place), 1_000_000, "tag1")) as host:
@@ -157,6 +158,7 @@ async def test_noise_on_the_line_costs_what_it_hits_and_is_counted():
         assert len(host.of(Restarted)) == 1
 
 
+@pytest.mark.site
 async def test_a_board_of_another_version_is_refused_in_words():
     board = PlayedBoard()
     writer = link.Writer()

@@ -52,6 +52,7 @@ def replayed(path, **asked):
     return skyless.replay(path, anchors=path.with_name("anchors.csv"), **asked).reports["tag"]
 
 
+@pytest.mark.site
 @pytest.mark.parametrize(("version", "candidates"), [(1, False), (2, False), (2, True)])
 def test_a_log_gives_differences_truth_and_heights(write, version, candidates):
     path = write(flight(version, candidates, chosen=not candidates))
@@ -82,6 +83,7 @@ def test_damaged_logs_are_counted(tmp_path_factory, cut, flipped, junk):
     assert sum(recording.drops.values()) > 0
 
 
+@pytest.mark.site
 def test_tables_of_util_hold_other_sensors_beside(write):
     rows = differences()
     lines = [

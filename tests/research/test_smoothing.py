@@ -129,6 +129,7 @@ def heights_of(seconds_s, std_m, zero_m=0.0):
     return np.array(rows)
 
 
+@pytest.mark.site
 def test_a_height_sensor_corrects_the_height(table):
     heights = heights_of(np.arange(0.0, 3000 * synthetic.PERIOD_S, 0.05), 0.01)
     alone, given = replayed(table), replayed(table, heights=heights)
@@ -160,6 +161,7 @@ def test_smoothing_serves_the_command_as_well(table):
     assert later.rmse_3d_m < alone.rmse_3d_m
 
 
+@pytest.mark.site
 def test_a_truth_that_is_late_is_moved(table):
     right, moved = replayed(table), replayed(table, truth_offset_s=0.7)
     assert right.truth_offset_s == pytest.approx(0.0, abs=0.1)

@@ -25,6 +25,7 @@ ASSETS = st.builds(
 LISTS = st.lists(ASSETS, max_size=8, unique_by=lambda asset: asset.tag).map(tuple)
 
 
+@pytest.mark.site
 @given(LISTS)
 def test_a_table_gives_what_was_written(assets):
     check_assets(assets)
@@ -38,6 +39,7 @@ def test_no_cell_is_a_formula(name):
     assert read_csv(written) == (Asset("t1", name=name),)
 
 
+@pytest.mark.site
 @given(LISTS, st.sampled_from([",", ";", "\t"]), st.sampled_from(["", "\ufeff"]), st.sampled_from(["\n", "\r\n"]))
 def test_tables_of_other_programs_are_read(assets, delimiter, mark, end):
     assume(not any(re.match("'[=+@'-]", getattr(asset, name)) for asset in assets for name in COLUMNS))

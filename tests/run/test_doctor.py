@@ -127,6 +127,7 @@ def test_the_clock_is_as_the_system_says(state, result, monkeypatch):
     assert ("2.5 ms" in check.finding) == (result == "ok")
 
 
+@pytest.mark.site
 def test_a_report_has_what_failed_first_and_nothing_that_controls_a_terminal():
     text = _report([Check("a", "ok", "fine."), Check("b", "failed", "x\n\x1b[2Jy.", "do it")])
     assert text.splitlines()[5:] == ["- failed: b: x��[2Jy.", "  do it", "- ok: a: fine."]

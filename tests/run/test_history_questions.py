@@ -399,6 +399,7 @@ def test_days_that_are_thinned(tmp_path):
     )
 
 
+@pytest.mark.site
 def test_sql_sees_every_fix_of_the_range(history, within, tmp_path):
     files = tmp_path / "fixes.csv", tmp_path / "fixes.parquet"
     query = "SELECT * FROM fixes ORDER BY tag, unix_s -- all of them"

@@ -214,6 +214,7 @@ packets = st.builds(
 )
 
 
+@pytest.mark.site
 @given(st.lists(packets, max_size=40))
 def test_arbitrary_packets_never_raise(heard):
     assert all(math.isfinite(tdoa.tdoa_m) for tdoa in hear(PairEngine(), heard))

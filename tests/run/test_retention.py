@@ -4,6 +4,7 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pyarrow as pa
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_fixes import DAY_S, NOON_S, fix, in_files, records
@@ -59,6 +60,7 @@ def test_events_that_are_too_old_go(tmp_path):
     assert len(events_in(tmp_path)) == 3
 
 
+@pytest.mark.site
 def test_readers_see_every_row_once_when_the_work_stops_at_any_operation(tmp_path_factory):
     operation, finished = 0, False
     while not finished:

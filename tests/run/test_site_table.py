@@ -259,6 +259,7 @@ def test_a_tag_is_never_gone_and_there_at_once(steps):
             assert there or not table.is_there(tag, now_s)
 
 
+@pytest.mark.site
 def test_a_hundred_thousand_tags_take_some_bytes_each():
     names = [f"t{n}" for n in range(20_000)]
     tracemalloc.start()

@@ -134,6 +134,7 @@ def test_the_limits_of_chi_square_are_scipys():
     assert {dim: chi2.ppf(0.95, dim) for dim in CHI2_95} == pytest.approx(CHI2_95, rel=1e-12)
 
 
+@pytest.mark.site
 @given(seed=st.integers(0, 99))
 def test_trajectory_errors_are_those_of_evo(seed):
     random = np.random.default_rng(seed)

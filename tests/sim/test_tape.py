@@ -155,6 +155,7 @@ def test_as_many_beacons_and_relays_as_among_anchor_machines():
     assert fixes.count(None) < len(fixes), "a receiver takes them"
 
 
+@pytest.mark.site
 def test_crystals_have_the_variance_of_their_model():
     """A random walk of the rate gains about 1e-9 · t^1.5 / sqrt(3); bounds of four standard deviations."""
     model = OscillatorModel(offset_ppm=0.0, white_fm=2e-11, random_walk_fm=1e-9)
@@ -173,6 +174,7 @@ def test_crystals_have_the_variance_of_their_model():
     assert 0.4e-9 < np.std(gained) < 0.8e-9
 
 
+@pytest.mark.site
 @pytest.mark.parametrize("correlation", [{"correlation_m": 0.5}, {"correlation_s": 0.5}])
 def test_changing_range_errors_have_their_size(correlation):
     tags = [Waypoints([(40.0 + x, 40.0, 1.0), (110.0 + x, 90.0, 1.0)], 1.0) for x in range(4)]

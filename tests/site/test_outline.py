@@ -40,6 +40,7 @@ def outlines(draw):
     )
 
 
+@pytest.mark.site
 @given(outlines(), st.booleans())
 def test_an_outline_is_read_as_written_also_after_a_survey_was_saved(tmp_path_factory, outline_m, in_lines):
     site = replace(LAB, outline_m=outline_m)

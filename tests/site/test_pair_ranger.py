@@ -99,6 +99,7 @@ def test_brackets_are_those_of_one_pair(rows):
 # Statistics
 
 
+@pytest.mark.site
 def test_ranges_their_errors_and_what_pairs_share():
     """20 pieces of 2 s: squared errors over said variances are chi square; TX noise is found with 25 % or better."""
     squares, shares = 0.0, []
@@ -208,6 +209,7 @@ def test_a_counter_that_restarts_costs_a_few_exchanges_and_no_error(forgotten):
     assert np.abs(_errors_m(ranges)).max() < 5.0 * max(math.hypot(pair.std_m, 0.002) for pair in ranges.pairs)
 
 
+@pytest.mark.site
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 1 << 32))
 def test_garbage_between_the_stamps_does_no_harm(seed):

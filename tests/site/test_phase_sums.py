@@ -178,6 +178,7 @@ wild_numbers = st.integers(-(1 << 70), 1 << 70)
         max_size=60,
     )
 )  # fmt: skip
+@pytest.mark.site
 def test_any_legs_raise_nothing(legs):
     watch = PhaseWatch()
     for leg in legs:

@@ -117,6 +117,7 @@ def test_what_costs_accuracy_is_said(load):
     assert "anchors 1, 2, 3: std_m has no effect" in warnings_of(load(stated))[-1]
 
 
+@pytest.mark.site
 def test_ten_thousand_anchors_are_written_and_loaded(load):
     site = grid_site(2000.0, 1125.0, 15.0, 4.0, 1.2)
     assert len(site.anchors) == 9975

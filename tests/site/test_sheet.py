@@ -38,6 +38,7 @@ def test_cables_are_straight_and_along_the_axes():
     assert all(row.cable_m is None for row in mounts(ROOM))
 
 
+@pytest.mark.site
 def test_a_page_for_each_floor_and_more_where_anchors_do_not_fit():
     upstairs = tuple(replace(one, id=one.id + 100, floor=1, z_m=one.z_m + 4.0) for one in ROOM.anchors)
     two = replace(ROOM, anchors=(*ROOM.anchors, *upstairs))

@@ -77,6 +77,7 @@ def test_every_key_of_its_mode_stands_in_the_template(lab, others):
             assert set(table) == set(struct.__struct_fields__) - {"site_time"} - others
 
 
+@pytest.mark.site
 @given(
     st.floats(1, 500),
     st.floats(1, 500),
