@@ -17,6 +17,8 @@ from skyless.core.earth import geodetic, rotated
 from skyless.run.mqtt.messages import AnchorHealth, Counters, TagHealth
 from support.bridged_values import BARE_SITE, SITE, a_fix, fixes, georeferences
 
+pytestmark = pytest.mark.site
+
 EVERY = RosSettings(frame="map", namespace="hall/uwb", transforms=True)
 TYPES = [value for value in vars(ros2).values() if isinstance(value, str) and "/msg/" in value]
 RELEASES = [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED]

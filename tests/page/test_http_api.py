@@ -28,6 +28,8 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import ZoneEvent
 from skyless.run.web import PageLimits
 
+pytestmark = pytest.mark.site
+
 API = f"{HERE}/api/v1"
 SPAN = {"from": "100", "to": "200"}
 QUERIES = {
@@ -299,7 +301,6 @@ def test_a_slow_question_ends_and_holds_up_nothing_else(client, monkeypatch):
     assert client.get("history/tags").json() == {"tags": ["t1", "t2"]}
 
 
-@pytest.mark.site
 def test_a_real_history_answers_and_a_question_that_takes_too_long_is_ended(live, wire, tmp_path, monkeypatch):
     writer = Writer(tmp_path, SITE_ID)
     records = np.zeros(3, RECORD)
@@ -362,7 +363,6 @@ KEYS = st.sampled_from(PARAMETERS.split())
 VALUES = st.text(max_size=20) | st.sampled_from(["1", "-1", "0", "1e308", "nan", "null", "geojson", "t1", "9" * 40])
 
 
-@pytest.mark.site
 @given(st.sampled_from(ROUTES), st.dictionaries(KEYS, VALUES, max_size=4), st.binary(max_size=60) | st.none())
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=100)
 def test_nothing_makes_it_fail(client, route, query, body):
@@ -385,7 +385,6 @@ BODY = st.recursive(
 )
 
 
-@pytest.mark.site
 @given(st.sampled_from([route for route in ROUTES if route.body is not None]), BODY)
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=100)
 def test_no_body_makes_it_fail(client, route, body):

@@ -12,6 +12,8 @@ from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS,
 from skyless.run.history.queries import History
 from skyless.run.history.tables import schema_of
 
+pytestmark = pytest.mark.site
+
 QUESTIONS = {
     "track": lambda history, span: history.track("a", span),
     "heatmap": lambda history, span: history.heatmap(span),

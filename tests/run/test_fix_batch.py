@@ -30,6 +30,8 @@ from skyless.run.fix_batch import (
     records_of,
 )
 
+pytestmark = pytest.mark.site
+
 HEADER = "<4sHHIIQII"
 STATED = "<IHBBQiiifffHHhh"  # as docs/batches.md states them
 u32 = st.integers(0, 2**32 - 1)

@@ -28,6 +28,8 @@ from skyless.run.history.layout import (
 from skyless.run.history.queries import History, sites_in
 from skyless.run.web import HistoryLimits
 
+pytestmark = pytest.mark.site
+
 SITE, TAGS, FIXES = 7, 20, 5000
 MIDNIGHT = datetime(2026, 11, 20, tzinfo=UTC).timestamp()
 BEGIN = MIDNIGHT - 2000.0
@@ -399,7 +401,6 @@ def test_days_that_are_thinned(tmp_path):
     )
 
 
-@pytest.mark.site
 def test_sql_sees_every_fix_of_the_range(history, within, tmp_path):
     files = tmp_path / "fixes.csv", tmp_path / "fixes.parquet"
     query = "SELECT * FROM fixes ORDER BY tag, unix_s -- all of them"

@@ -33,6 +33,8 @@ from skyless.run.keys import (
     site_public_bytes,
 )
 
+pytestmark = pytest.mark.site
+
 SITE = 300
 PRIVATE = Ed25519PrivateKey.generate()
 PUBLIC = SitePublic(SITE, PRIVATE.public_key().public_bytes_raw())

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from skyless.run.mqtt.connection import Limits, Outbox
 
+pytestmark = pytest.mark.site
+
 LIMITS = Limits(topics=3, topic_bytes=60, messages=8, bytes=90, window=4, payload=40)
 
 PUTS = st.tuples(st.sampled_from("abcdef"), st.integers(0, 50), st.integers(0, 1), st.booleans())

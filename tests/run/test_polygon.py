@@ -10,6 +10,8 @@ from matplotlib.path import Path
 
 from skyless.run.zones import area_m2, depth_m, is_simple, perimeter_m
 
+pytestmark = pytest.mark.site
+
 COORDINATE = st.floats(-50.0, 50.0).map(lambda value: round(value, 3))
 POINT = st.tuples(COORDINATE, COORDINATE)
 

@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from skyless.sim.evaluation.figures import ErrorStatistics, ErrorSummary, EvenSample
 
+pytestmark = pytest.mark.site
+
 metres = st.floats(-1e3, 1e3)
 vectors = st.lists(st.tuples(metres, metres, metres), min_size=1, max_size=60)
 

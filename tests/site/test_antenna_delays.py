@@ -5,6 +5,8 @@ from hypothesis import strategies as st
 
 from skyless.site.survey.anchor_errors import ANTENNA_DELAY_STD_M, BLOCKED_M, EXCESS_STD_M, antenna_delays_m
 
+pytestmark = pytest.mark.site
+
 delays = st.lists(st.floats(-0.2, 0.2), min_size=2, max_size=9)
 
 

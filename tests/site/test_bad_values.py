@@ -12,6 +12,8 @@ from skyless.site.survey.legs import mean_ranges
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.solve import run_survey
 
+pytestmark = pytest.mark.site
+
 POSITIONS_M = {1: (0.0, 0.0, 0.0), 2: (6.0, 0.0, 0.0), 3: (6.0, 5.0, 0.0), 4: (0.0, 5.0, 0.0), 5: (3.0, 2.0, 0.0)}
 PAIRS = tuple(
     PairRange(a, b, math.dist(POSITIONS_M[a], POSITIONS_M[b]), 0.01, 10)

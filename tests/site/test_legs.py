@@ -19,6 +19,8 @@ from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
 from skyless.site.survey.legs import LegCollector, RelayMatcher
 
+pytestmark = pytest.mark.site
+
 LAB = paper_lab_site()
 FREE = lab_site()
 PHASES = msgspec.structs.replace(FREE, schedule=msgspec.structs.replace(FREE.schedule, carrier_phase=True))

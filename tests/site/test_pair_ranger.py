@@ -13,6 +13,8 @@ from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 from skyless.site.survey.legs import Leg, bracketed_flight_ticks, earliest_cluster, half_sample_mode
 from skyless.site.survey.pair_ranger import Legs, PairRanger, flights_of
 
+pytestmark = pytest.mark.site
+
 POSITION_M = {1: (0.0, 0.0), 2: (7.0, 0.0), 3: (6.0, 5.0), 4: (-1.0, 6.0)}
 SLOT_S = 2.5e-3
 STAMP_TICKS = 100e-12 * TICK_RATE_HZ
@@ -99,7 +101,6 @@ def test_brackets_are_those_of_one_pair(rows):
 # Statistics
 
 
-@pytest.mark.site
 def test_ranges_their_errors_and_what_pairs_share():
     """20 pieces of 2 s: squared errors over said variances are chi square; TX noise is found with 25 % or better."""
     squares, shares = 0.0, []
@@ -209,7 +210,6 @@ def test_a_counter_that_restarts_costs_a_few_exchanges_and_no_error(forgotten):
     assert np.abs(_errors_m(ranges)).max() < 5.0 * max(math.hypot(pair.std_m, 0.002) for pair in ranges.pairs)
 
 
-@pytest.mark.site
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 1 << 32))
 def test_garbage_between_the_stamps_does_no_harm(seed):

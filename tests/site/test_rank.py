@@ -11,6 +11,8 @@ from skyless.site.survey.facts import Facts, PairRange, PairRanges, Tape
 from skyless.site.survey.solve import run_survey
 from support.drawn_ranges import drawn_ranges
 
+pytestmark = pytest.mark.site
+
 LAB = survey_layouts()["lab"]
 RANGES = drawn_ranges(LAB, 10.0, np.random.default_rng(1))
 SKETCH = {anchor: tuple(row) for anchor, row in zip(LAB.anchors, LAB.position_m.tolist(), strict=True)}
