@@ -3,10 +3,10 @@
 import io
 from pathlib import Path
 
-import page_fake_site as made_up
+import page_site as made_up
 import pytest
 from page_browser import THREE_FRAMES, until
-from page_fake_server import FIRST_FIX_S
+from page_server import FIRST_FIX_S
 from PIL import Image
 
 pytestmark = pytest.mark.statistical

@@ -5,10 +5,10 @@ import json
 from datetime import UTC, datetime
 from pathlib import Path
 
-import page_fake_history as made_up
+import page_history as made_up
 import pytest
 from page_browser import THREE_FRAMES, until
-from page_fake_server import DOCK
+from page_server import DOCK
 
 pytestmark = pytest.mark.statistical
 

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-import page_fake_site as made_up
+import page_site as made_up
 import pytest
 from page_browser import THREE_FRAMES, until
 from PIL import Image

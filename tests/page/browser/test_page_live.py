@@ -4,7 +4,7 @@ import io
 import re
 import time
 
-import page_fake_site as made_up
+import page_site as made_up
 import pytest
 from page_browser import THREE_FRAMES, until
 from PIL import Image

@@ -2,10 +2,10 @@
 
 import time
 
-import page_fake_site as made_up
+import page_site as made_up
 import pytest
 from page_browser import until
-from page_fake_survey import moved, watch
+from page_survey import moved, watch
 
 pytestmark = pytest.mark.statistical
 

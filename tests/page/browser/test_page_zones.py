@@ -5,10 +5,10 @@ import time
 from pathlib import Path
 
 import numpy as np
-import page_fake_site as made_up
+import page_site as made_up
 import pytest
 from page_browser import THREE_FRAMES, until
-from page_fake_server import DOCK
+from page_server import DOCK
 from scipy.spatial import ConvexHull
 
 pytestmark = pytest.mark.statistical

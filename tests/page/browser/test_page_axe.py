@@ -5,10 +5,10 @@ The light theme is checked for what differs from the dark one, its colours.
 What it cannot find, such as the order of the keyboard's focus, is in ``test_page_look.py``.
 """
 
-import page_fake_site as made_up
+import page_site as made_up
 import pytest
 from page_browser import THREE_FRAMES, until
-from page_fake_survey import FakeSurvey
+from page_survey import MadeUpSurvey
 from test_page_alarms import IN_FILE, TOO_NEAR, alarm
 from test_page_assets import asset
 
@@ -120,7 +120,7 @@ def test_the_condition_with_its_reasons(serve, checks):
 
 
 def test_the_set_up(serve, checks):
-    setup = checks(serve(tags=0, placed=False, survey=FakeSurvey()))
+    setup = checks(serve(tags=0, placed=False, survey=MadeUpSurvey()))
     page = setup.page
     page.wait_for_selector("#panel-setup .step")
     for step in page.query_selector_all("#panel-setup .step > summary"):

@@ -15,7 +15,7 @@ NO_FACTS = {
 }  # fmt: skip
 
 
-class FakeSurvey:
+class MadeUpSurvey:
     """Its attributes are the switches of the tests; ``message`` is what the program would publish now."""
 
     def __init__(self, heard=(1, 2, 3, 4, 5, 6), missing=()):

@@ -1,6 +1,6 @@
 """A server of a made-up site for the page's tests and for work on the page.
 
-By hand: ``PYTHONPATH=tests .venv/bin/python tests/dashboard/page_fake_server.py [tags]``, then open what it prints.
+By hand: ``PYTHONPATH=tests .venv/bin/python tests/dashboard/page_server.py [tags]``, then open what it prints.
 """
 
 import asyncio
@@ -14,8 +14,8 @@ import time
 from pathlib import Path
 
 import msgspec
-import page_fake_history
-import page_fake_site as made_up
+import page_history
+import page_site as made_up
 import uvicorn
 from starlette.applications import Starlette
 from starlette.responses import FileResponse, JSONResponse, Response
@@ -34,7 +34,7 @@ PLAN = {"image": "hall.png", "width_m": 24.0, "x_m": 0.0, "y_m": -1.0}
 DOCK = {"id": "dock", "name": "Dock", "polygon_m": [[14, 2.5], [21, 2.5], [21, 6], [14, 6]], "colour": "#c2763a"}
 
 
-class FakeServer:
+class PageServer:
     """Serves on a free port of loopback in a thread of its own; its attributes are the switches of the tests."""
 
     def __init__(
@@ -248,7 +248,7 @@ class FakeServer:
             if not self.history or self.history_error:
                 error = self.history_error or "this server keeps no history"
                 return JSONResponse({"error": error}, status_code=422 if self.history else 404)
-            found, status = page_fake_history.answer(kind, query)
+            found, status = page_history.answer(kind, query)
             return JSONResponse(found, status_code=status)
 
         return Starlette(
@@ -455,7 +455,7 @@ def _usual_port():
 
 
 if __name__ == "__main__":
-    with FakeServer(tags=int(sys.argv[1]) if len(sys.argv) > 1 else 3) as server:
+    with PageServer(tags=int(sys.argv[1]) if len(sys.argv) > 1 else 3) as server:
         print(server.address)  # noqa: T201 - the address is the program's output
         while True:
             time.sleep(3600)

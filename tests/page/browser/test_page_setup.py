@@ -5,7 +5,7 @@ import time
 
 import pytest
 from page_browser import THREE_FRAMES, until
-from page_fake_survey import TRUE, FakeSurvey
+from page_survey import TRUE, MadeUpSurvey
 from PIL import Image
 
 pytestmark = pytest.mark.statistical
@@ -23,7 +23,7 @@ class Site:
     """A site without any position, its survey program, and a page on it."""
 
     def __init__(self, serve, visit, survey=None, **context):
-        self.survey = survey or FakeSurvey()
+        self.survey = survey or MadeUpSurvey()
         self.server = serve(tags=0, zones=(), mode="free", placed=False, survey=self.survey)
         self.visit = visit(self.server, **context)
         self.page = self.visit.page
@@ -74,7 +74,7 @@ def test_the_tab_opens_where_nothing_has_a_position(site):
 
 
 def test_anchors_appear_and_the_picture_grows(site):
-    here = site(FakeSurvey(heard=(1, 2), missing=(3, 4)))
+    here = site(MadeUpSurvey(heard=(1, 2), missing=(3, 4)))
     here.says("2 anchors have been received; too few pairs")
     rows = "[...document.querySelectorAll('#setup-anchors tbody tr')].map((row) => row.innerText.split('\\t'))"
     until(here.page, f"{rows}.length === 4")
@@ -98,7 +98,7 @@ def test_anchors_appear_and_the_picture_grows(site):
 
 
 def test_the_picture_shows_late_pairs_ghosts_and_what_is_not_determined(site):
-    survey = FakeSurvey()
+    survey = MadeUpSurvey()
     here = site(survey)
     drawn = """async () => {
       const { drawSurvey } = await import("/page/map/survey.js");
@@ -317,7 +317,7 @@ def test_a_floor_plan_is_scaled_by_a_typed_distance_and_placed_by_figures(site):
 
 
 def test_the_reasons_are_listed_and_the_verdict_is_good_only_where_nothing_speaks_against_it(site):
-    survey = FakeSurvey()
+    survey = MadeUpSurvey()
     here = site(survey)
     here.says("All 6 anchors are determined and checked")
     good = "document.getElementById('verdict').classList.contains('good')"
@@ -351,7 +351,7 @@ def test_the_reasons_are_listed_and_the_verdict_is_good_only_where_nothing_speak
 
 def test_a_site_in_use_that_nobody_sets_up_has_no_fault(serve, visit):
     """What another survey would leave open is none, until somebody begins one; saving it asks all the same."""
-    survey = FakeSurvey()
+    survey = MadeUpSurvey()
     survey.unchecked, survey.undetermined = "Nothing checks this survey.", (6,)
     page = visit(serve(tags=0, zones=(), mode="free", survey=survey)).page
     until(page, "skyless.state.survey !== null")
@@ -376,7 +376,7 @@ def test_a_site_in_use_without_a_survey_program_has_no_fault(serve, visit):
 
 
 def test_without_heights_the_set_up_is_amber_and_saving_asks(site):
-    survey = FakeSurvey()
+    survey = MadeUpSurvey()
     survey.assumed_heights = ON_THE_FLOOR
     here = site(survey)
     page = here.page
@@ -393,7 +393,7 @@ def test_without_heights_the_set_up_is_amber_and_saving_asks(site):
 
 
 def test_an_old_message_is_reported_as_old(site):
-    survey = FakeSurvey()
+    survey = MadeUpSurvey()
     here = site(survey)
     here.says("determined and checked")
     survey.silent = True
@@ -427,7 +427,7 @@ SURVEYED = """async () => {
 
 
 def test_the_survey_is_saved(site):
-    survey = FakeSurvey()
+    survey = MadeUpSurvey()
     here = site(survey)
     page = here.page
     here.open(4)
@@ -458,7 +458,7 @@ def test_the_survey_is_saved(site):
 
 
 def test_a_weak_result_is_saved_only_on_purpose_and_a_failure_is_shown(site):
-    survey = FakeSurvey()
+    survey = MadeUpSurvey()
     survey.unchecked = "Nothing checks this survey."
     survey.refuse_save = "site.toml cannot be written: the disk is full"
     here = site(survey)
@@ -474,7 +474,7 @@ def test_a_weak_result_is_saved_only_on_purpose_and_a_failure_is_shown(site):
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
 def test_every_step_fits_a_phone_and_is_legible(site, theme):
-    survey = FakeSurvey(missing=(7,))
+    survey = MadeUpSurvey(missing=(7,))
     survey.ambiguous = True
     phone = {"viewport": {"width": 390, "height": 844}, "has_touch": True, "is_mobile": True}
     here = site(survey, color_scheme=theme, **phone)

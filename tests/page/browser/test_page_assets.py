@@ -2,7 +2,7 @@
 
 import time
 
-import page_fake_site as made_up
+import page_site as made_up
 import pytest
 from page_browser import until
 

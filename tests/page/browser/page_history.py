@@ -3,7 +3,7 @@
 import itertools
 import math
 
-import page_fake_site as made_up
+import page_site as made_up
 
 PERIOD_S = 600.0
 PAUSE_S = 120.0
