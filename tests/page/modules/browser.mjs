@@ -86,15 +86,15 @@ export const sockets = [];
 /** What the page has asked for besides, by fetch. */
 export const asked = [];
 const waiting = [];
-const timers = [];
+const timers = new Set();
 
 /** Let time pass; what was to be done meanwhile is done, in steps of a quarter of a second. */
 export function wait(seconds) {
   for (const end = clock.ms + 1e3 * seconds; clock.ms < end; ) {
     clock.ms = Math.min(clock.ms + 250, end);
-    for (const timer of timers.filter(({ due }) => due <= clock.ms)) {
+    for (const timer of [...timers].filter(({ due }) => due <= clock.ms)) {
       if (timer.every) timer.due = clock.ms + timer.every;
-      else timers.splice(timers.indexOf(timer), 1);
+      else timers.delete(timer);
       timer.call();
     }
     frame();
@@ -108,7 +108,7 @@ export function frame() {
 
 function later(call, ms, every = 0) {
   const timer = { call, due: clock.ms + ms, every };
-  timers.push(timer);
+  timers.add(timer);
   return timer;
 }
 
@@ -149,7 +149,7 @@ Object.assign(globalThis, {
   addEventListener() {}, requestAnimationFrame: (call) => waiting.push(call), getComputedStyle: resolved,
   CSS: { supports: () => true }, Path2D: class { addPath() {} }, DOMMatrix: class {}, ImageData: class {},
   location: { href: "http://hall/" }, WebSocket: Socket, performance: { now: () => clock.ms },
-  setInterval: (call, ms) => later(call, ms, ms), setTimeout: later, clearTimeout: (timer) => timers.splice(timers.indexOf(timer), 1),
+  setInterval: (call, ms) => later(call, ms, ms), setTimeout: later, clearTimeout: (timer) => timers.delete(timer),
   fetch: async (address) => (asked.push(String(address)), { status: 200 }), reportError() {},
 }); // prettier-ignore
 
