@@ -35,9 +35,9 @@ export function drawn(draw) {
   return { answer, of, words: of("fillText").map(({ args }) => args[0]) };
 }
 
-class Part {
+export class Part {
   constructor() {
-    Object.assign(this, { children: [], style: {}, dataset: {}, className: "", hidden: false, attributes: {} });
+    Object.assign(this, { id: "", children: [], style: {}, dataset: {}, className: "", hidden: false, disabled: false, does: {} });
     this.classList = { toggle() {}, add() {}, contains: (name) => this.className.split(" ").includes(name) };
   }
   get textContent() {
@@ -56,6 +56,10 @@ class Part {
     for (const child of children) if (child instanceof Part) child.parent = this;
     this.children.push(...children);
   }
+  replaceChildren(...children) {
+    this.children = [];
+    this.append(...children);
+  }
   insertBefore(child, next) {
     child.remove?.();
     child.parent = this;
@@ -64,11 +68,15 @@ class Part {
   remove() {
     if (this.parent) this.parent.children = this.parent.children.filter((child) => child !== this);
   }
-  setAttribute(name, value) {
-    this.attributes[name] = value;
-  }
+  setAttribute() {}
   after() {}
-  addEventListener() {}
+  addEventListener(event, call) {
+    this.does[event] = call;
+  }
+  /** The part in this one that has an identifier. */
+  find(id) {
+    return this.id === id ? this : this.children.reduce((found, child) => found ?? child.find?.(id), undefined);
+  }
   getContext = () => new Drawing();
 }
 
