@@ -1,6 +1,6 @@
 """A server of a made-up site for the page's tests and for work on the page.
 
-By hand: ``PYTHONPATH=tests .venv/bin/python tests/dashboard/page_server.py [tags]``, then open what it prints.
+By hand: ``PYTHONPATH=tests .venv/bin/python tests/page/browser/page_server.py [tags]``, then open what it prints.
 """
 
 import asyncio
@@ -11,12 +11,13 @@ import socket
 import sys
 import threading
 import time
+from collections import defaultdict
 from pathlib import Path
 
 import msgspec
-import page_history
 import page_site as made_up
 import uvicorn
+from page_browser import came
 from starlette.applications import Starlette
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
@@ -28,58 +29,37 @@ from skyless.run.site_table import THRESHOLDS
 from support.processes import free_port
 
 PAGE = Path(skyless.__file__).parent / "page" / "browser"
-RECORDED_S = 90.0
-FIRST_FIX_S = 2.0
-PLAN = {"image": "hall.png", "width_m": 24.0, "x_m": 0.0, "y_m": -1.0}
-DOCK = {"id": "dock", "name": "Dock", "polygon_m": [[14, 2.5], [21, 2.5], [21, 6], [14, 6]], "colour": "#c2763a"}
 
 
 class PageServer:
     """Serves on a free port of loopback in a thread of its own; its attributes are the switches of the tests."""
 
-    def __init__(
-        self, tags=3, rate_hz=10.0, zones=(DOCK,), site=True, floor_plan=None, mode="master", survey=None, placed=True
-    ):
-        self.tags, self.rate_hz, self.site = tags, rate_hz, site
-        self.zones = [dict(zone) for zone in zones]
-        self.floor_plan = floor_plan
-        self.mode = mode
-        self.survey = survey
-        self.placed = placed
-        self.stored = []
-        self.silent_tags = set()
-        self.tag_reports, self.anchor_reports, self.verified = {}, {}, {}
-        """Changes to healths, and how far fixes are verified: age of that and share of other beacons, by tag."""
-        self.refuse = False
-        self.mute = False
-        self.answers_pings = True
-        self.zone_error = None
-        self.condition = made_up.condition()
-        self.log = []
-        self.full = False
-        self.overlay_error = None
-        self.overlay_waits = False
-        self.overlays, self.sheets = [], []
-        self.recorded_plan = None
-        self.recorded_site = True
-        self.recorded_waits = False
-        self.events_note = False
-        self.live2 = None
-        """Answers what a page says on the stream of very many tags; without it there is no such stream."""
-        self.hub = None
-        """What ``/api/sites`` answers; with it the server is at a hub."""
-        self.history = False
-        self.history_error = None
-        self.history_waits = set()
-        """Kinds of questions that are not answered now; and all that were asked, kinds with queries."""
-        self.history_asked = []
-        self.site_name = "Hall 7"
-        self.zone_events = []
+    def __init__(self, **switches):
+        self.tags, self.rate_hz, self.site, self.site_name, self.mode, self.placed = (
+            3,
+            10.0,
+            True,
+            "Hall 7",
+            "master",
+            True,
+        )
+        self.zones, self.zone_events, self.log = [dict(made_up.DOCK)], [], []
         self.assets, self.rules, self.file_rules, self.alarms = [], [], [], []
-        self.more_alarms = 0
-        self.refusal = None
-        """Why assets or rules are refused; the requests that were not are in ``puts``, what pages show in ``asked``."""
-        self.puts, self.asked = [], []
+        self.floor_plan = self.recorded_plan = None
+        """Images."""
+        self.recorded_site, self.events_note, self.history = True, False, False
+        self.condition, self.survey = made_up.condition(), None
+        self.hub = self.live2 = None
+        """What ``/api/sites`` answers, with which the server is at a hub; and what answers pages of very many tags."""
+        self.silent_tags, self.verified = set(), {}
+        self.tag_reports, self.anchor_reports = {}, {}
+        """Tags without fixes, and how far those of others are verified; changes to healths."""
+        self.refuse, self.mute, self.full = False, False, False
+        self.errors, self.waits = {}, set()
+        """By the last word of the path: why requests are refused, and those that are not answered now."""
+        self.asked, self.bodies = [], defaultdict(list)
+        """What pages say that they show; and what they have sent, by the last word of the path."""
+        vars(self).update(switches)
         self.started = time.time()
         self.sockets = {}
         self.port = _usual_port()
@@ -89,9 +69,7 @@ class PageServer:
 
     def __enter__(self):
         self._thread.start()
-        while not (self._server and self._server.started):
-            assert self._thread.is_alive(), f"no server on port {self.port}"
-            time.sleep(0.01)
+        came(lambda: self._server and self._server.started)
         return self
 
     def __exit__(self, *_):
@@ -102,19 +80,32 @@ class PageServer:
     def address(self):
         return f"http://127.0.0.1:{self.port}/"
 
+    def body(self, what, count=1):
+        """The last of so many bodies that pages have sent."""
+        return came(lambda: self.bodies[what][count - 1 :])[-1]
+
     def cut(self):
         """Close every live socket and take no new one until ``refuse`` is false again."""
         self.refuse = True
         for websocket in list(self.sockets):
             asyncio.run_coroutine_threadsafe(websocket.close(1012), self._loop).result(5)
 
-    def send(self, message):
-        """Send a message to every page."""
-        for websocket, lock in list(self.sockets.items()):
-            asyncio.run_coroutine_threadsafe(_send(websocket, lock, message), self._loop).result(5)
+    def send(self, *messages):
+        """Send messages to every page; without any, those of assets, rules and alarms after a change."""
+        for message in messages or self._site_messages():
+            for websocket, lock in list(self.sockets.items()):
+                asyncio.run_coroutine_threadsafe(_send(websocket, lock, message), self._loop).result(5)
 
     def _run(self):
-        config = uvicorn.Config(self._app(), port=self.port, log_level="warning", ws="websockets-sansio")
+        mimetypes.add_type("text/javascript", ".js")
+        routes = [
+            Route("/", self._index),
+            Route("/api/{path:path}", self._api, methods=["GET", "PUT", "POST"]),
+            WebSocketRoute("/live", self._live),
+            WebSocketRoute("/live2", self._live2),
+            Mount("/page", _Modules(directory=PAGE)),
+        ]
+        config = uvicorn.Config(Starlette(routes=routes), port=self.port, log_level="warning", ws="websockets-sansio")
         self._server = uvicorn.Server(config)
         self._server.install_signal_handlers = lambda: None
         asyncio.run(self._serve())
@@ -123,163 +114,88 @@ class PageServer:
         self._loop = asyncio.get_running_loop()
         await self._server.serve()
 
-    def _app(self):
-        mimetypes.add_type("text/javascript", ".js")
+    async def _index(self, request):
+        """With what the real server sends: anything from elsewhere is refused by the browser."""
+        lists = self.hub is not None and "site" not in request.query_params
+        policy = "default-src 'self'; img-src 'self' data: blob:"
+        headers = {"content-security-policy": policy, "cache-control": "no-cache"}
+        return FileResponse(PAGE / ("sites.html" if lists else "index.html"), headers=headers)
 
-        async def index(request):
-            lists = self.hub is not None and "site" not in request.query_params
-            return _guarded(FileResponse(PAGE / ("sites.html" if lists else "index.html")))
+    async def _api(self, request):
+        path, query = request.path_params["path"].removeprefix("v1/").split("/"), dict(request.query_params)
+        kind = path[-1]
+        content = await request.body()
+        while kind in self.waits and not await request.is_disconnected():
+            await asyncio.sleep(0.02)
+        if kind in self.errors:
+            return JSONResponse({"error": self.errors[kind]}, status_code=422)
+        if request.method != "GET":
+            self.bodies[kind].append(json.loads(content) if kind != "floor_plan" else content)
+        found = self._answer(path, query, self.bodies[kind][-1] if request.method != "GET" else None)
+        return found if isinstance(found, Response) else JSONResponse(found)
 
-        async def hub_sites(_request):
-            return JSONResponse(self.hub)
+    def _answer(self, path, query, body):
+        match path:
+            case ["zones" | "assets" | "alarm_rules" as what] if body:
+                key = what.removeprefix("alarm_")
+                setattr(self, key, body[key])
+                return body
+            case ["assets"]:
+                return {"assets": self.assets}
+            case ["alarm_rules"]:
+                return {"rules": self.rules, "file_rules": self.file_rules}
+            case ["alarms", rule, subject, "acknowledge"]:
+                (named,) = [one for one in self.alarms if one["id"] == body["id"]]
+                assert (named["rule"], named["subject"]) == (rule, subject)
+                named |= {"acknowledged_unix_s": time.time(), "acknowledged_by": body["by"]}
+                return body
+            case ["assets.csv" | "sheet"]:
+                return Response(b"a file")
+            case ["sites"]:
+                return self.hub
+            case ["overlay"]:
+                self.bodies["step_m"].append(float(query["step_m"]))
+                return made_up.overlay(query["kind"], float(query["step_m"]))
+            case ["floor_plan"]:
+                return {} if body else Response(self.floor_plan, media_type="image/png")
+            case ["survey", "facts"]:
+                self.survey.use(body)
+            case ["survey", "save"]:
+                self.survey.save(body["serial"])
+            case ["recordings", *rest]:
+                return self._recording(rest, query)
+            case ["history", kind]:
+                self.bodies["history"].append((kind, query))
+                if not self.history:
+                    return JSONResponse({"error": "this server keeps no history"}, status_code=404)
+                found, status = made_up.history(kind, query)
+                return JSONResponse(found, status_code=status)
+        return {}
 
-        async def floor_plan(_request):
-            return Response(self.floor_plan, media_type="image/png")
-
-        async def recorded_plan(_request):
-            if self.recorded_plan is None:
-                return JSONResponse({"error": "no floor plan is known"}, status_code=404)
-            return Response(self.recorded_plan, media_type="image/png")
-
-        async def put_floor_plan(request):
-            self.survey.image = await request.body()
-            return JSONResponse({"bytes": len(self.survey.image)})
-
-        async def put_facts(request):
-            self.survey.use(await request.json())
-            return JSONResponse(self.survey.given[-1])
-
-        async def save(request):
-            self.survey.save((await request.json())["serial"])
-            return JSONResponse({"serial": self.survey.saves[-1]})
-
-        async def overlay(request):
-            query = request.query_params
-            while self.overlay_waits:
-                await asyncio.sleep(0.02)
-            if self.overlay_error:
-                return JSONResponse({"error": self.overlay_error}, status_code=422)
-            body = await request.body()
-            self.overlays.append((float(query["step_m"]), json.loads(body)["anchors"] if body else []))
-            return JSONResponse(made_up.overlay(query["kind"], float(query["step_m"])))
-
-        async def sheet(request):
-            self.sheets.append((await request.json())["anchors"])
-            return Response(b"%PDF-1.7 a sheet", media_type="application/pdf")
-
-        async def put_zones(request):
-            body = await request.json()
-            if self.zone_error:
-                return JSONResponse({"error": self.zone_error}, status_code=400)
-            self.stored.append(body)
-            self.zones = body["zones"]
-            return JSONResponse({"zones": self.zones})
-
-        async def put_assets(request):
-            return await keep(request, "assets")
-
-        async def put_rules(request):
-            return await keep(request, "rules")
-
-        async def keep(request, what):
-            body = await request.json()
-            if self.refusal:
-                return JSONResponse({"error": self.refusal}, status_code=400)
-            self.puts.append(body)
-            setattr(self, what, body[what])
-            return JSONResponse({what: body[what]})
-
-        async def acknowledge(request):
-            body = await request.json()
-            named = [alarm for alarm in self.alarms if alarm["id"] == body["id"]]
-            assert [(one["rule"], one["subject"]) for one in named] == [tuple(request.path_params.values())]
-            named[0] |= {"acknowledged_unix_s": time.time(), "acknowledged_by": body["by"]}
-            self.puts.append(body)
-            return JSONResponse(body)
-
-        async def assets(_request):
-            return JSONResponse({"assets": self.assets})
-
-        async def assets_csv(_request):
-            head = ["tag", "name", "group", "icon", "colour", "owner", "notes"]
-            lines = [head, *([asset.get(key, "") for key in head] for asset in self.assets)]
-            return Response("".join(f"{','.join(line)}\r\n" for line in lines), media_type="text/csv")
-
-        async def alarm_rules(_request):
-            return JSONResponse({"rules": self.rules, "file_rules": self.file_rules})
-
-        async def recordings(_request):
-            start = {"bytes": 48_300_000, "start_unix_s": 1_780_000_000.0, "complete": True}
-            what = {"site": "Hall 7", "tags": 2, "fixes": 1800}
-            return JSONResponse([{"name": "walk.mcap", "duration_s": RECORDED_S, **start, **what}])
-
-        async def recording(request):
-            if request.path_params["name"] != "walk.mcap":
+    def _recording(self, path, query):
+        start, end = made_up.RECORDED_UNIX_S, made_up.RECORDED_UNIX_S + made_up.RECORDED_S
+        match path:
+            case []:
+                known = {"name": "walk.mcap", "duration_s": made_up.RECORDED_S, "bytes": 48_300_000, "complete": True}
+                return [{**known, "start_unix_s": start, "site": "Hall 7", "tags": 2, "fixes": 1800}]
+            case [name] if name != "walk.mcap":
                 return JSONResponse({"error": "there is no such recording"}, status_code=404)
-            start = 1_780_000_000.0
-            site = made_up.site_message(start, PLAN if self.recorded_plan else None) if self.recorded_site else None
-            return JSONResponse({
-                "name": request.path_params["name"], "site": site, "start_unix_s": start,
-                "end_unix_s": start + RECORDED_S, "tags": made_up.names(2), "zones": [DOCK],
-                "fix_spans_unix_s": [[start + FIRST_FIX_S, start + 55.0], [start + 60.0, start + RECORDED_S]],
-            })  # fmt: skip
-
-        async def events(_request):
-            while self.recorded_waits:
-                await asyncio.sleep(0.02)
-            found = made_up.recorded_events(1_780_000_000.0)
-            return JSONResponse({"events": found, "complete": not self.events_note})
-
-        async def file(request):
-            headers = {"Content-Disposition": f"attachment; filename={request.path_params['name']}"}
-            return Response(b"recorded", media_type="application/octet-stream", headers=headers)
-
-        async def states(request):
-            query = request.query_params
-            while self.recorded_waits:
-                await asyncio.sleep(0.02)
-            return JSONResponse({"states": _recorded(float(query["from_s"]), float(query["to_s"]), query["rate_hz"])})
-
-        async def history(request):
-            kind, query = request.path_params["kind"], dict(request.query_params)
-            self.history_asked.append((kind, query))
-            while kind in self.history_waits and not await request.is_disconnected():
-                await asyncio.sleep(0.02)
-            if not self.history or self.history_error:
-                error = self.history_error or "this server keeps no history"
-                return JSONResponse({"error": error}, status_code=422 if self.history else 404)
-            found, status = page_history.answer(kind, query)
-            return JSONResponse(found, status_code=status)
-
-        return Starlette(
-            routes=[
-                Route("/", index),
-                Route("/api/sites", hub_sites),
-                Route("/api/floor_plan", floor_plan),
-                Route("/api/floor_plan", put_floor_plan, methods=["PUT"]),
-                Route("/api/survey/facts", put_facts, methods=["PUT"]),
-                Route("/api/survey/save", save, methods=["POST"]),
-                Route("/api/overlay", overlay, methods=["GET", "POST"]),
-                Route("/api/sheet", sheet, methods=["POST"]),
-                Route("/api/zones", put_zones, methods=["PUT"]),
-                Route("/api/v1/assets", assets),
-                Route("/api/v1/assets", put_assets, methods=["PUT"]),
-                Route("/api/v1/assets.csv", assets_csv),
-                Route("/api/v1/alarm_rules", alarm_rules),
-                Route("/api/v1/alarm_rules", put_rules, methods=["PUT"]),
-                Route("/api/v1/alarms/{rule}/{subject}/acknowledge", acknowledge, methods=["POST"]),
-                Route("/api/recordings", recordings),
-                Route("/api/recordings/{name}", recording),
-                Route("/api/recordings/{name}/events", events),
-                Route("/api/recordings/{name}/file", file),
-                Route("/api/recordings/{name}/states", states),
-                Route("/api/recordings/{name}/floor_plan", recorded_plan),
-                Route("/api/v1/history/{kind}", history),
-                WebSocketRoute("/live", self._live),
-                WebSocketRoute("/live2", self._live2),
-                Mount("/page", _Modules(directory=PAGE)),
-            ]
-        )
+            case [name]:
+                site = (
+                    made_up.site_message(made_up.PLAN if self.recorded_plan else None) if self.recorded_site else None
+                )
+                known = {"name": name, "site": site, "start_unix_s": start, "end_unix_s": end, "tags": made_up.names(2)}
+                spans = [[start + made_up.FIRST_FIX_S, start + 55.0], [start + 60.0, end]]
+                return {**known, "zones": [made_up.DOCK], "fix_spans_unix_s": spans}
+            case [_, "events"]:
+                return {"events": made_up.recorded_events(), "complete": not self.events_note}
+            case [_, "states"]:
+                times = (float(query[key]) for key in ("from_s", "to_s", "rate_hz"))
+                return {"states": made_up.recorded_states(*times)}
+            case [_, "floor_plan"]:
+                return Response(self.recorded_plan, media_type="image/png")
+            case [name, "file"]:
+                return Response(b"recorded", headers={"Content-Disposition": f"attachment; filename={name}"})
 
     async def _live(self, websocket):
         if self.refuse:
@@ -288,15 +204,12 @@ class PageServer:
         if self.full:
             return await websocket.close(1013, "too many pages are open: 100 of this computer, 100 in all")
         lock = asyncio.Lock()
-        await _send(websocket, lock, self._hello())
-        await _send(websocket, lock, {"type": "log", "events": self.log})
-        for message in self.site_messages():
+        for message in (self.hello(), {"type": "log", "events": self.log}, *self._site_messages()):
             await _send(websocket, lock, message)
         self.sockets[websocket] = lock
-        jobs = [
-            asyncio.create_task(job(websocket, lock))
-            for job in (self._states, self._health, self._conditions, self._surveys, self._pongs)
-        ]
+        periods = {self._states: 1 / self.rate_hz, self._health: 1.0, self._condition: 0.2, self._survey: 0.2}
+        jobs = [asyncio.create_task(self._repeat(websocket, lock, *job)) for job in periods.items()]
+        jobs.append(asyncio.create_task(self._read(websocket, lock)))
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             await asyncio.wait(jobs, return_when=asyncio.FIRST_COMPLETED)
         for job in jobs:
@@ -305,107 +218,76 @@ class PageServer:
         self.sockets.pop(websocket, None)
         return None
 
-    def site_messages(self):
-        """The messages of assets, rules and alarms."""
-        return [
-            {"type": "assets", "assets": self.assets},
-            {"type": "alarm_rules", "rules": self.rules, "file_rules": self.file_rules},
-            {"type": "alarms", "alarms": self.alarms, "more": self.more_alarms},
-        ]
-
-    def send_site_messages(self):
-        """Send them to every page, after a change."""
-        for message in self.site_messages():
-            self.send(message)
-
     async def _live2(self, websocket):
         await websocket.accept()
         with contextlib.suppress(WebSocketDisconnect, RuntimeError):
             while True:
-                asked = json.loads(await websocket.receive_text())
-                for message in self.live2(asked):
+                for message in self.live2(json.loads(await websocket.receive_text())):
                     await websocket.send_bytes(message)
 
-    def _hello(self):
-        plan = PLAN if self.floor_plan else None
-        site = made_up.site_message(self.started, plan, self.mode, self.placed) if self.site else None
-        if site:
-            site["site"]["name"] = self.site_name
-        more = {
-            "thresholds": msgspec.to_builtins(THRESHOLDS),
-            "zones": self.zones,
-            "events": self.zone_events,
-            "mqtt": True,
-            "history": self.history,
-            "hub": self.hub is not None,
-            "live2": self.live2 is not None,
-        }
-        return {"type": "hello", "version": "0.1.0", "site": site, **more}
-
-    async def _states(self, websocket, lock):
+    async def _repeat(self, websocket, lock, message, period_s):
         while True:
-            named = enumerate(made_up.names(self.tags))
-            now = time.time()
-            since = now - self.started
-            rows = [
-                made_up.state_row(name, n, since, now, self.verified.get(name, (None, None)))
-                for n, name in named
-                if name not in self.silent_tags
-            ]
-            if rows and not self.mute:
-                await _send(websocket, lock, {"type": "state", "unix_s": now, "tags": rows})
-            await asyncio.sleep(max(0.0, now + 1 / self.rate_hz - time.time()))
+            begin = time.time()
+            if not self.mute and (known := message(begin)):
+                await _send(websocket, lock, known)
+            await asyncio.sleep(max(0.0, begin + period_s - time.time()))
 
-    async def _health(self, websocket, lock):
-        while True:
-            if not self.mute:
-                await _send(websocket, lock, self.health(time.time()))
-            await asyncio.sleep(1.0)
-
-    async def _conditions(self, websocket, lock):
-        while True:
-            if not self.mute and self.condition:
-                await _send(websocket, lock, self.condition | {"unix_s": time.time()})
-            await asyncio.sleep(0.2)
-
-    async def _surveys(self, websocket, lock):
-        while True:
-            if self.survey and not self.survey.silent and not self.mute:
-                await _send(websocket, lock, self.survey.message())
-            await asyncio.sleep(0.2)
-
-    def health(self, now):
-        """A health message: one anchor is not synchronised, and one is offline."""
-        since = now - self.started
-        anchors = [made_up.anchor_health(n, since, now - (20 if n == 8 else 0), n != 5) for n in range(1, 9)]
-        if self.mode != "master":
-            anchors = [made_up.anchor_health_2(n, since, now) for n in range(1, 9)]
-        anchors = [health | self.anchor_reports.get(health["anchor"], {}) for health in anchors]
-        tags = []
-        for number, name in enumerate(made_up.names(self.tags)):
-            reason = "too-few-anchors" if name in self.silent_tags else None
-            tags.append(made_up.tag_health(name, number, since, now, reason) | self.tag_reports.get(name, {}))
-        ether = {"unix_s": now, "simulated_s": since, "transmissions": int(476 * since), "late": 0, "at_anchors": {},
-                 "at_tags": {}, "stalls": 0, "overruns": 0}  # fmt: skip
-        old = self.mode == "master"
-        ages = {"anchors": {str(n): 20.0 if n == 8 and old else 0.1 for n in range(1, 9)}, "ether": {"air": 0.1},
-                "tags": dict.fromkeys(made_up.names(self.tags), 0.1)}  # fmt: skip
-        nodes = made_up.nodes()
-        conditions = {}
-        for health in anchors:
-            name = str(health["anchor"])
-            here = health["synchronised"] or health["role"] == "master"
-            conditions[name] = "bad" if ages["anchors"][name] > THRESHOLDS.report_s else "good" if here else "warn"
-        known = {"anchors": anchors, "tags": tags, "ether": ether, "nodes": nodes, "ages": ages}
-        return {"type": "health", "whole": True, "conditions": conditions, "waiting": [], "dropped": {}, **known}
-
-    async def _pongs(self, websocket, lock):
+    async def _read(self, websocket, lock):
         while True:
             text = await websocket.receive_text()
             if text != "ping":
                 self.asked.append(json.loads(text))
-            elif self.answers_pings and not self.mute:
+            elif not self.mute:
                 await _send(websocket, lock, {"type": "pong"})
+
+    def hello(self):
+        plan = made_up.PLAN if self.floor_plan else None
+        site = made_up.site_message(plan, self.mode, self.placed, name=self.site_name) if self.site else None
+        known = {"type": "hello", "version": "0.1.0", "site": site, "thresholds": msgspec.to_builtins(THRESHOLDS)}
+        known |= {"zones": self.zones, "events": self.zone_events, "mqtt": True, "history": self.history}
+        return {**known, "hub": self.hub is not None, "live2": self.live2 is not None}
+
+    def _site_messages(self):
+        return [
+            {"type": "assets", "assets": self.assets},
+            {"type": "alarm_rules", "rules": self.rules, "file_rules": self.file_rules},
+            {"type": "alarms", "alarms": self.alarms, "more": 0},
+        ]
+
+    def _states(self, now):
+        named = [one for one in enumerate(made_up.names(self.tags)) if one[1] not in self.silent_tags]
+        verified = {name: self.verified.get(name, (None, None)) for _, name in named}
+        rows = [made_up.state_row(name, n, now - self.started, now, verified[name]) for n, name in named]
+        return {"type": "state", "unix_s": now, "tags": rows} if rows else None
+
+    def _health(self, now):
+        """At a site with a master anchor 5 is not synchronised, and 8 is offline."""
+        since, old = now - self.started, {8} if self.mode == "master" else set()
+        anchors = [
+            made_up.anchor_health(n, since, now - 20 * (n in old), self.mode, **self.anchor_reports.get(n, {}))
+            for n in range(1, 9)
+        ]
+        tags = []
+        for number, name in enumerate(made_up.names(self.tags)):
+            reason = "too-few-anchors" if name in self.silent_tags else None
+            tags.append(made_up.tag_health(name, number, since, now, reason=reason, **self.tag_reports.get(name, {})))
+        conditions = {str(one["anchor"]): "good" if one["synchronised"] else "warn" for one in anchors}
+        nodes = [
+            {"online": True, "kind": kind, "name": name, "version": "0.1.0", "host": "hall", "pid": 1, "unix_s": 1.0}
+            for kind, name in (("ether", "air"), ("dashboard", "page"), ("recorder", "demo"))
+        ]
+        ages = {"anchors": {name: 20.0 if int(name) in old else 0.1 for name in conditions}, "ether": {"air": 0.1}}
+        ages["tags"] = dict.fromkeys(made_up.names(self.tags), 0.1)
+        ether = {"unix_s": now, "simulated_s": since, "transmissions": 476, "late": 0, "stalls": 0, "overruns": 0}
+        known = {"type": "health", "whole": True, "waiting": [], "dropped": {}, "anchors": anchors, "tags": tags}
+        conditions |= dict.fromkeys(map(str, old), "bad")
+        return {**known, "conditions": conditions, "ether": ether, "nodes": nodes, "ages": ages}
+
+    def _condition(self, now):
+        return self.condition and self.condition | {"unix_s": now}
+
+    def _survey(self, _now):
+        return self.survey.message() if self.survey and not self.survey.silent else None
 
 
 class _Modules(StaticFiles):
@@ -420,24 +302,6 @@ class _Modules(StaticFiles):
 async def _send(websocket, lock, message):
     async with lock:
         await websocket.send_json(message)
-
-
-def _recorded(from_s, to_s, rate_hz):
-    start, step = 1_780_000_000.0, 1 / float(rate_hz)
-    first, last = int(max(0.0, from_s) / step), int(min(to_s, RECORDED_S) / step)
-    times = [n * step for n in range(first, last + 1) if n * step >= FIRST_FIX_S]
-    named = list(enumerate(made_up.names(2)))
-    return [
-        {"type": "state", "unix_s": start + t, "tags": [made_up.state_row(name, n, t, start + t) for n, name in named]}
-        for t in times
-    ]
-
-
-def _guarded(response):
-    """What the real server sends: anything from elsewhere is refused by the browser."""
-    response.headers["content-security-policy"] = "default-src 'self'; img-src 'self' data: blob:"
-    response.headers["cache-control"] = "no-cache"
-    return response
 
 
 _port = free_port()
