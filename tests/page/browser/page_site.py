@@ -176,7 +176,7 @@ def history(kind, query):
         return {"tag": tag, "points": rows, "fixes": 10 * len(rows), "length_m": 321.0}, 200
     if kind == "heatmap":
         cell_m, columns, rows = float(query["cell_m"]), 8, 5
-        seconds = [0.0 if n % 3 else 0.25 * 1.3**n for n in range(columns * rows)]
+        seconds = [0.0 if n % 3 else 0.5 * 1.2**n for n in range(columns * rows)]
         corner = {"x0_m": 8.0, "y0_m": 5.0, "cell_m": cell_m, "columns": columns, "rows": rows}
         return {**corner, "seconds": seconds, "tags": 2}, 200
     if kind == "dwell":

@@ -1,9 +1,14 @@
-"""The choice of a site in the header, and what the empty map says while no site is alive or kernels are compiled."""
+"""A person chooses a site, of a broker's or of a hub's, and watches one with very many tags."""
 
+import json
+import math
+import struct
+import time
 from urllib.parse import parse_qs, urlsplit
 
+import numpy as np
 import pytest
-from page_browser import until
+from page_browser import PHONE, came
 
 pytestmark = pytest.mark.statistical
 
@@ -16,21 +21,19 @@ def test_the_empty_map_says_which_sites_are_gone(serve, visit):
     server = serve(tags=0, site=False)
     page = visit(server).page
     page.wait_for_selector("#waiting:has-text('Waiting for a site')")
-    until(page, "skyless.state.connection.phase === 'open'")
     server.send(sites(None, [1, "lab", False]))
     page.wait_for_selector("#waiting:has-text('Site 1, lab, was here; none of its programs is online.')")
     assert page.locator("#sites").is_hidden()
 
 
-@pytest.mark.parametrize("width", [1440, 390])
-def test_another_site_is_chosen_in_the_header(serve, visit, width):
+@pytest.mark.parametrize("window", [{"width": 1440, "height": 844}, PHONE])
+def test_another_site_is_chosen_in_the_header(serve, visit, window):
     server = serve(tags=1)
-    visited = visit(server, viewport={"width": width, "height": 844})
-    page, sockets, asked = visited.page, [], []
-    until(page, "skyless.state.liveId !== null")
+    shown = visit(server, viewport=window)
+    page, sockets, asked = shown.page, [], []
     mine = page.evaluate("skyless.state.liveId")
     server.send(sites(mine, [1, "lab", False], [mine, "Hall 7", True]))
-    until(page, "skyless.state.sites.length === 2")
+    shown.until("skyless.state.sites.length === 2")
     assert page.locator("#sites").is_hidden(), "a site that is gone is not offered"
     server.send(sites(mine, [1, "lab", True], [mine, "Hall 7", True]))
     page.wait_for_selector("#sites")
@@ -38,26 +41,26 @@ def test_another_site_is_chosen_in_the_header(serve, visit, width):
     words = page.evaluate("[...document.querySelectorAll('#sites option')].map((o) => [o.text, o.selected])")
     assert words == [["lab (site 1)", False], [f"Hall 7 (site {mine})", True]]
     box = page.locator("#sites").bounding_box()
-    assert 46 <= box["width"] < box["x"] + box["width"] <= width
-    assert page.evaluate("document.documentElement.scrollWidth") <= width
+    assert 46 <= box["width"] < box["x"] + box["width"] <= window["width"]
+    assert page.evaluate("document.documentElement.scrollWidth") <= window["width"]
     page.on("websocket", lambda socket: sockets.append(socket.url))
     page.on("request", lambda request: asked.append(urlsplit(request.url)))
     page.select_option("#sites", "1")
     page.wait_for_url("**/?site=1")
-    until(page, "skyless.state.connection.phase === 'open'")
+    shown.until("skyless.state.connection.phase === 'open' && skyless.state.liveId !== null")
     assert parse_qs(urlsplit(sockets[-1]).query) == {"site": ["1"]}
-    until(page, "skyless.state.liveId !== null")
-    page.evaluate("import('/page/api.js').then((api) => api.overlay('sigma', 1))")
-    until(page, "true")
+    shown.run("api", "return api.overlay('sigma', 1);")
     (query,) = {one.query for one in asked if one.path == "/api/overlay"}
     assert parse_qs(query)["site"] == [str(mine)], "the site that is shown, whichever was asked for"
 
 
-def test_the_sites_at_a_hub_are_listed_and_their_pages_change_nothing(serve, visit):
-    server = serve(tags=1)
-    visited = visit(server)
-    page = visited.page
-    until(page, "skyless.state.site !== null")
+def hub_site(number, condition, reason="", **more):
+    return {"number": number, "name": f"Hall {number}", "condition": condition, "reason": reason, **more}
+
+
+def test_the_sites_at_a_hub_are_listed_and_their_pages_change_nothing(hall):
+    server, visit = hall
+    page = visit.page
     assert page.locator("#draw").is_visible()
     assert page.locator("#all-sites").is_hidden()
     halls = [hub_site(1, "cut", reason="not heard for 3 min"), hub_site(2, "good", tags_heard=9, versions={"0.2": 4})]
@@ -67,9 +70,8 @@ def test_the_sites_at_a_hub_are_listed_and_their_pages_change_nothing(serve, vis
     assert "●" not in page.locator("tr.cut").inner_text()
     page.fill("#find", "hall 2")
     page.wait_for_selector("tr.cut", state="detached")
-    page.keyboard.press("Tab")
-    page.keyboard.press("Tab")  # after the switch of colours
-    page.keyboard.press("Enter")
+    for key in ("Tab", "Tab", "Enter"):  # after the switch of colours
+        page.keyboard.press(key)
     page.wait_for_url("**/?site=2")
     page.wait_for_selector("#all-sites")
     for change in ("#draw", "#tab-setup", "#add-zone"):
@@ -81,5 +83,96 @@ def test_the_sites_at_a_hub_are_listed_and_their_pages_change_nothing(serve, vis
     assert page.locator("tr.good").count() == 0
 
 
-def hub_site(number, condition, reason="", **more):
-    return {"number": number, "name": f"Hall {number}", "condition": condition, "reason": reason, **more}
+# Very many tags: the page asks the binary stream for its view, and draws points, or counts in cells.
+
+POINT = np.dtype([("tag", "<u4"), ("x", "<u2"), ("y", "<u2"), ("sigma_mm", "<u2"), ("age", "u1"), ("alert", "u1")])
+ANCHOR = np.dtype([("id", "<u2"), ("x", "<i4"), ("y", "<i4"), ("z", "<i2"), ("floor", "u1"), ("zero", "u1")])
+LEFT_M, RIGHT_M, Y_M = 3.0, 21.0, 7.0
+
+
+def head(kind, count, unix_us):
+    return struct.pack("<BBHQ", ord(kind), 0, count, unix_us)
+
+
+class Crowd:
+    """Tags at two places of the hall, as points or as counts, and two anchors."""
+
+    def __init__(self):
+        self.asked, self.counted, self.spoilt = [], False, False
+
+    def __call__(self, asked):
+        self.asked.append(asked)
+        unix_us = round(1e6 * (time.time() + 1.0))  # later than any delay that the page reckons with
+        anchors = np.array([(1, 1000, 1000, 280, 0, 0), (2, 8500, 1000, 280, 0, 0)], ANCHOR)
+        found = (self.counts if self.counted else self.points)(asked, unix_us)
+        names = {number: f"t{number}" for number in asked["named"]}
+        named = head("N", len(names), unix_us) + json.dumps(names).encode()
+        tail = [head("A", 2, unix_us) + anchors.tobytes(), found[:-1] if self.spoilt else found]
+        return [named, *tail] if names else tail
+
+    def points(self, asked, unix_us):
+        x0, y0, x1, y1 = asked["view"]
+        points = np.zeros(1000, POINT)
+        points["tag"], points["alert"] = np.arange(1000), 1
+        points["x"] = np.where(points["tag"] % 2, *(round(65535 * (x - x0) / (x1 - x0)) for x in (LEFT_M, RIGHT_M)))
+        points["y"] = round(65535 * (Y_M - y0) / (y1 - y0))
+        points["age"] = np.where(points["tag"] % 2, 0, 40)
+        return head("P", len(points), unix_us) + points.tobytes()
+
+    def counts(self, asked, unix_us):
+        (x0, y0, x1, y1), (wide, high), cell = asked["view"], asked["px"], 8
+        columns, rows = math.ceil(wide / cell), math.ceil(high / cell)
+        counts = np.zeros((rows, columns), "<u2")
+        counts[int((Y_M - y0) / (y1 - y0) * high / cell), int((LEFT_M - x0) / (x1 - x0) * wide / cell)] = 6000
+        counts[0, 0] = 7
+        return struct.pack("<BBHHHQ", ord("B"), cell, columns, rows, 0, unix_us) + counts.tobytes()
+
+
+PIXEL = """
+  const canvas = document.getElementById("moving");
+  const context = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d", { willReadFrequently: true });
+  context.drawImage(canvas, 0, 0);
+  return [...context.getImageData(Math.round(view.px(given[0])), Math.round(view.py(given[1])), 1, 1).data];"""
+
+
+def test_very_many_tags_are_points_or_counts(serve, visit):
+    crowd = Crowd()
+    shown = visit(serve(tags=0, live2=crowd))
+    page = shown.page
+    part = "document.getElementById('part').textContent"
+    shown.until(f"{part} === '1\\u202f000 tags are shown as points'")
+
+    def seen(x_m):
+        shown.frames()
+        return shown.run("map/view", PIXEL, [x_m, Y_M])
+
+    fresh, old = seen(LEFT_M), seen(RIGHT_M)
+    assert [fresh[3], old[3]] == [255, 255]
+    assert max(fresh[:3]) - min(fresh[:3]) > 60 > max(old[:3]) - min(old[:3]), "tags that are not heard are grey"
+
+    # The nearest point is selected; the server is asked for its name.
+    page.mouse.click(*shown.at(LEFT_M, Y_M))
+    shown.until("/^t[0-9]*[13579]$/.test(skyless.state.selection.tag)")
+
+    # The map is moved: points stay where they are in the hall, and the new view is asked for.
+    views = len({tuple(asked["view"]) for asked in crowd.asked})
+    page.focus("#canvas")
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("+")
+    assert seen(LEFT_M) == fresh
+    shown.until(f"{part}.includes('points')")
+    came(lambda: len({tuple(asked["view"]) for asked in crowd.asked}) > views)
+
+    # What is no message changes nothing; more tags than points are counts.
+    crowd.spoilt = crowd.counted = True
+    page.keyboard.press("0")
+    page.wait_for_timeout(300)
+    assert page.evaluate("skyless.state.many.kind") == "P"
+    crowd.spoilt = False
+    page.keyboard.press("-")
+    shown.until(f"{part} === '6\\u202f007 tags, shown as counts: zoom in to see single ones'")
+    assert seen(LEFT_M)[3] > 200 > seen(RIGHT_M)[3]
+
+    # In 3-D there is only the ordinary stream.
+    page.click("#spatial")
+    shown.until(f"!{part}.includes('counts') || document.getElementById('part').hidden")

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import uvicorn
 from msgspec.structs import replace
-from page_browser import until
 
 from recordings import live_site
 from skyless.core.errors import SkylessError
@@ -28,7 +27,7 @@ from skyless.page.sites import LiveSites
 from skyless.page.tasks import WhatIfTask
 from skyless.page.what_if_process import what_if
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+sys.path.insert(0, str(Path(__file__).parents[3] / "tools"))
 import wasm_core
 
 TAG = "a"
@@ -50,9 +49,9 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
-def server(folder, times):
+def server(folder):
     """The page's own server, with that recording."""
-    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
+    live = LiveSite("here", "mqtt://broker:1", None, lambda: 100.0, lambda: 1000.0)
     app = make_app(Services(LiveSites(live), Playback(folder)), AccessRules())
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
