@@ -287,7 +287,7 @@ class PageServer:
         return self.condition and self.condition | {"unix_s": now}
 
     def _survey(self, _now):
-        return self.survey.message() if self.survey and not self.survey.silent else None
+        return self.survey and self.survey.message()
 
 
 class _Modules(StaticFiles):

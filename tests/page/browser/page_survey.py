@@ -15,8 +15,7 @@ class MadeUpSurvey:
     def __init__(self, heard=(1, 2, 3, 4, 5, 6), missing=(), ambiguous=False):
         self.heard, self.missing, self.ambiguous = tuple(heard), tuple(missing), ambiguous
         self.facts = {"dimensions": 2, "heights_m": {}, "tapes": [], "points": {}, "sketch_m": {}, "gauge": None}
-        self.floor_plan = self.unchecked = self.error = self.refuse_save = None
-        self.silent = False
+        self.floor_plan = None
         self.serial, self.saved_serial, self.saved_unix_s = 1, None, None
 
     def use(self, body):
@@ -27,9 +26,7 @@ class MadeUpSurvey:
 
     def save(self, _serial):
         """What the program does when a page has asked it to save."""
-        self.error = self.refuse_save
-        if not self.error:
-            self.saved_serial, self.saved_unix_s = self.serial, time.time()
+        self.saved_serial, self.saved_unix_s = self.serial, time.time()
 
     def message(self):
         """The message that the server forwards."""
@@ -40,7 +37,7 @@ class MadeUpSurvey:
         ]  # fmt: skip
         survey = {
             "unix_s": time.time(), "serial": self.serial, "anchors": ids, "missing": list(self.missing),
-            "duration_s": 1.0, "pairs": pairs, "facts": self.facts, "error": self.error,
+            "duration_s": 1.0, "pairs": pairs, "facts": self.facts, "error": None,
             "survey": self._result(pairs) if len(ids) > 2 else None, "saved_serial": self.saved_serial,
             "saved_unix_s": self.saved_unix_s, "file": "/srv/hall/site.toml", "state": "surveyed",
         }  # fmt: skip
@@ -74,7 +71,7 @@ class MadeUpSurvey:
         tapes = ((1, 4, 0.06, 0.004), (3, 6, 0.004, 0.003))
         return {
             "anchors": anchors, "pairs": [pair | {"excluded": False} for pair in pairs], "range_std_m": 0.03,
-            "redundancy": 4, "unchecked": self.unchecked, "not_determined": [], "notes": [], "assumed_heights": None,
+            "redundancy": 4, "unchecked": None, "not_determined": [], "notes": [], "assumed_heights": None,
             "ambiguities": [ghost | {"positions_m": {"4": [other.real, other.imag, 0.0]}}] if self.ambiguous else [],
             "tapes": [] if taped else [
                 dict(zip(("a", "b", "std_before_m", "std_after_m"), tape, strict=True)) for tape in tapes

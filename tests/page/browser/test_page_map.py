@@ -48,8 +48,14 @@ def test_each_tag_has_an_entry_in_the_legend_beside_the_map_or_on_a_phone_below_
     assert legend["x"] >= room["x"] + room["width"] - 1
     page.click(".tag-marks button:has-text('tag-007')")
     assert page.evaluate("skyless.state.selection.tag") == "tag-007"
+    assert page.locator("#floor").is_hidden()
+    page.fill("#floor-heights", "0; 3.2 6.5")
+    page.press("#floor-heights", "Enter")
     page.reload()
-    shown.until("window.skyless?.state.connection.phase === 'open'")
+    shown.until("document.querySelectorAll('#floor option').length === 4")
+    page.fill("#floor-heights", "ground")
+    page.press("#floor-heights", "Enter")
+    page.wait_for_selector(".toast.bad:has-text('no list of heights')")
     assert page.locator("#legend-body").is_visible()
     assert page.locator(".marks .frame").is_visible()  # of the master's mark
     page.click("#legend summary")
@@ -152,21 +158,6 @@ def test_the_3d_view_turns_zooms_returns_and_shows_the_chosen_floor(hall):
     box = page.locator("#canvas").bounding_box()
     page.mouse.click(box["x"] + x, box["y"] + y)
     visit.until("skyless.state.selection.zone === 'dock'")
-
-
-def test_heights_of_floors_can_be_given_and_are_kept(hall):
-    _, visit = hall
-    page = visit.page
-    page.click("#legend summary")
-    assert page.locator("#floor").is_hidden()
-    page.fill("#floor-heights", "0; 3.2 6.5")
-    page.press("#floor-heights", "Enter")
-    visit.until("document.querySelectorAll('#floor option').length === 4")
-    page.reload()
-    visit.until("document.querySelectorAll('#floor option').length === 4")
-    page.fill("#floor-heights", "ground")
-    page.press("#floor-heights", "Enter")
-    page.wait_for_selector(".toast.bad:has-text('no list of heights')")
 
 
 def test_a_followed_tag_stays_in_the_middle_until_escape(hall):

@@ -230,31 +230,6 @@ def test_a_floor_plan_is_dragged_scaled_placed_and_saved_with_the_survey(site):
     here.visit.forgive()
 
 
-def test_a_weak_result_is_saved_only_on_purpose_and_a_failure_is_shown(site):
-    survey = MadeUpSurvey()
-    survey.unchecked, survey.refuse_save = (
-        "Nothing checks this survey.",
-        "site.toml cannot be written: the disk is full",
-    )
-    here = site(survey)
-    page = here.page
-    here.says("Nothing checks this survey.")
-    assert page.locator("#verdict").get_attribute("class") == "verdict warn"
-    here.open(5)
-    page.wait_for_selector("#why:has-text('Nothing checks this survey.')")
-    here.open(6)
-    page.wait_for_selector("#save-warning:has-text('Nothing checks this survey.')")
-    assert page.locator("#save").is_disabled()
-    page.check("#save-sure")
-    page.click("#save")
-    page.wait_for_selector("#save-state.bad:has-text('the disk is full')")
-    assert len(here.server.bodies["save"]) == 1
-    survey.silent = True
-    here.server.send({**survey.message(), "age_s": 3600.0})  # one that the broker had kept
-    here.says("3600 s")
-    assert page.locator("#save").is_disabled()
-
-
 def test_without_a_survey_program_the_page_shows_how_to_start_it(serve, visit):
     page = visit(serve(tags=0, zones=[], mode="free")).page
     page.click("#tab-setup")
@@ -263,46 +238,23 @@ def test_without_a_survey_program_the_page_shows_how_to_start_it(serve, visit):
 
 
 UNFIT = """() => {
-  const rgb = (css) => {
-    const context = new OffscreenCanvas(1, 1).getContext("2d", { willReadFrequently: true });
-    context.fillStyle = css;
-    context.fillRect(0, 0, 1, 1);
-    return [...context.getImageData(0, 0, 1, 1).data];
-  };
-  const light = ([r, g, b]) => {
-    const part = (v) => ((v /= 255) <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
-    return 0.2126 * part(r) + 0.7152 * part(g) + 0.0722 * part(b);
-  };
-  const behind = (element) => {
-    for (let e = element; e; e = e.parentElement) {
-      const colour = rgb(getComputedStyle(e).backgroundColor);
-      if (colour[3] > 250) return colour;
-    }
-    return [255, 255, 255, 255];
-  };
   const all = (selector) => [...document.querySelectorAll(selector)].filter((e) => e.checkVisibility());
-  const pale = (e) => {
-    const own = [...e.childNodes].some((node) => node.nodeType === 3 && node.textContent.trim());
-    if (!own || e.disabled) return false;
-    const [a, b] = [light(rgb(getComputedStyle(e).color)), light(behind(e))].sort((x, y) => y - x);
-    return (a + 0.05) / (b + 0.05) < 4.5;
-  };
   const small = (e) => {
     const box = e.getBoundingClientRect();
     return box.height < 36 || box.left < 0 || box.right > innerWidth;
   };
   const found = [
     ...all("html, body, #panels, .step-body").filter((e) => e.scrollWidth > e.clientWidth + 1),
-    ...all("#panel-setup *, #picking *").filter(pale),
     ...all("#panel-setup :is(button, select, summary, input:not([type=checkbox]))").filter(small),
   ];
   return found.map((e) => e.id || e.className || e.tagName);
 }"""
-"""What is wider than the phone, what has too little contrast, and what is too small for a finger."""
+"""What is wider than the phone, and what is too small for a finger."""
 
 
 def test_every_step_fits_a_phone_and_a_floor_plan_is_dragged_by_a_finger(site):
-    here = site(MadeUpSurvey(missing=(7,), ambiguous=True), viewport=PHONE, has_touch=True, is_mobile=True)
+    phone = {"viewport": PHONE, "has_touch": True, "is_mobile": True}
+    here = site(MadeUpSurvey(missing=(7,), ambiguous=True), **phone)
     page = here.page
     for step in (1, 2, 3, 5, 6, 4):
         if step > 1:
@@ -310,10 +262,8 @@ def test_every_step_fits_a_phone_and_a_floor_plan_is_dragged_by_a_finger(site):
         if step == 4:
             page.set_input_files("#plan-file", picture())
             here.plan_is("width > 0")
-        for theme in ("dark", "light"):
-            page.emulate_media(color_scheme=theme)
-            page.wait_for_timeout(80)
-            assert page.evaluate(UNFIT) == [], (step, theme)
+        page.wait_for_timeout(80)
+        assert page.evaluate(UNFIT) == [], step
     before = here.plan[0]
     box = page.locator("#canvas").bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2

@@ -1,29 +1,22 @@
 """A person chooses a site, of a broker's or of a hub's, and watches one with very many tags."""
 
-import json
-import math
-import struct
 import time
 from urllib.parse import parse_qs, urlsplit
 
+import msgspec
 import numpy as np
 import pytest
 from page_browser import PHONE, came
+
+from skyless.page import live2
+from skyless.run.fix_batch import RECORD
+from skyless.sim.lab import lab_site
 
 pytestmark = pytest.mark.statistical
 
 
 def sites(shown, *known):
     return {"type": "sites", "shown": shown, "sites": known}
-
-
-def test_the_empty_map_says_which_sites_are_gone(serve, visit):
-    server = serve(tags=0, site=False)
-    page = visit(server).page
-    page.wait_for_selector("#waiting:has-text('Waiting for a site')")
-    server.send(sites(None, [1, "lab", False]))
-    page.wait_for_selector("#waiting:has-text('Site 1, lab, was here; none of its programs is online.')")
-    assert page.locator("#sites").is_hidden()
 
 
 @pytest.mark.parametrize("window", [{"width": 1440, "height": 844}, PHONE])
@@ -85,47 +78,34 @@ def test_the_sites_at_a_hub_are_listed_and_their_pages_change_nothing(hall):
 
 # Very many tags: the page asks the binary stream for its view, and draws points, or counts in cells.
 
-POINT = np.dtype([("tag", "<u4"), ("x", "<u2"), ("y", "<u2"), ("sigma_mm", "<u2"), ("age", "u1"), ("alert", "u1")])
-ANCHOR = np.dtype([("id", "<u2"), ("x", "<i4"), ("y", "<i4"), ("z", "<i2"), ("floor", "u1"), ("zero", "u1")])
 LEFT_M, RIGHT_M, Y_M = 3.0, 21.0, 7.0
 
 
-def head(kind, count, unix_us):
-    return struct.pack("<BBHQ", ord(kind), 0, count, unix_us)
-
-
 class Crowd:
-    """Tags at two places of the hall, as points or as counts, and two anchors."""
+    """The server's messages of tags at two places of the hall; those at the right have not been heard for some seconds."""
 
-    def __init__(self):
-        self.asked, self.counted, self.spoilt = [], False, False
+    def __init__(self, count):
+        self.asked, self.spoilt = [], False
+        self.show(count)
+
+    def show(self, count):
+        """Place so many tags."""
+        records = np.zeros(count, RECORD)
+        records["tag"], records["flags"] = np.arange(count), 1
+        records["position_mm"][:, 1] = 1000 * Y_M
+        records["position_mm"][:, 0] = 1000 * np.where(records["tag"] % 2, LEFT_M, RIGHT_M)
+        self.columns = live2.Columns()
+        for is_left, now_s in ((False, 0.0), (True, 4.0)):
+            self.columns.update(records[records["tag"] % 2 == is_left], now_s)
+        self.columns.names = {number: f"t{number}" for number in range(count)}
 
     def __call__(self, asked):
         self.asked.append(asked)
+        view = msgspec.convert({key: asked[key] for key in ("view", "px", "named")}, live2.View)
         unix_us = round(1e6 * (time.time() + 1.0))  # later than any delay that the page reckons with
-        anchors = np.array([(1, 1000, 1000, 280, 0, 0), (2, 8500, 1000, 280, 0, 0)], ANCHOR)
-        found = (self.counts if self.counted else self.points)(asked, unix_us)
-        names = {number: f"t{number}" for number in asked["named"]}
-        named = head("N", len(names), unix_us) + json.dumps(names).encode()
-        tail = [head("A", 2, unix_us) + anchors.tobytes(), found[:-1] if self.spoilt else found]
-        return [named, *tail] if names else tail
-
-    def points(self, asked, unix_us):
-        x0, y0, x1, y1 = asked["view"]
-        points = np.zeros(1000, POINT)
-        points["tag"], points["alert"] = np.arange(1000), 1
-        points["x"] = np.where(points["tag"] % 2, *(round(65535 * (x - x0) / (x1 - x0)) for x in (LEFT_M, RIGHT_M)))
-        points["y"] = round(65535 * (Y_M - y0) / (y1 - y0))
-        points["age"] = np.where(points["tag"] % 2, 0, 40)
-        return head("P", len(points), unix_us) + points.tobytes()
-
-    def counts(self, asked, unix_us):
-        (x0, y0, x1, y1), (wide, high), cell = asked["view"], asked["px"], 8
-        columns, rows = math.ceil(wide / cell), math.ceil(high / cell)
-        counts = np.zeros((rows, columns), "<u2")
-        counts[int((Y_M - y0) / (y1 - y0) * high / cell), int((LEFT_M - x0) / (x1 - x0) * wide / cell)] = 6000
-        counts[0, 0] = 7
-        return struct.pack("<BBHHHQ", ord("B"), cell, columns, rows, 0, unix_us) + counts.tobytes()
+        found = live2.tags_message(self.columns, view, 4.0, unix_us)
+        named = [live2.names_message(self.columns, view.named, unix_us)] if view.named else []
+        return [*named, live2.anchors_message(lab_site(100.0).anchors, unix_us), found[:-1] if self.spoilt else found]
 
 
 PIXEL = """
@@ -136,7 +116,7 @@ PIXEL = """
 
 
 def test_very_many_tags_are_points_or_counts(serve, visit):
-    crowd = Crowd()
+    crowd = Crowd(1000)
     shown = visit(serve(tags=0, live2=crowd))
     page = shown.page
     part = "document.getElementById('part').textContent"
@@ -164,7 +144,8 @@ def test_very_many_tags_are_points_or_counts(serve, visit):
     came(lambda: len({tuple(asked["view"]) for asked in crowd.asked}) > views)
 
     # What is no message changes nothing; more tags than points are counts.
-    crowd.spoilt = crowd.counted = True
+    crowd.spoilt = True
+    crowd.show(400_000)
     page.keyboard.press("0")
     page.wait_for_timeout(300)
     assert page.evaluate("skyless.state.many.kind") == "P"

@@ -38,7 +38,16 @@ export function drawn(draw) {
 export class Part {
   constructor() {
     Object.assign(this, { id: "", children: [], style: {}, dataset: {}, className: "", hidden: false, disabled: false, does: {} });
-    this.classList = { toggle() {}, add() {}, contains: (name) => this.className.split(" ").includes(name) };
+    this.classList = { toggle: (_name, on) => on, add() {}, contains: (name) => this.className.split(" ").includes(name) };
+  }
+  get cells() {
+    return this.children;
+  }
+  get firstChild() {
+    return this.children[0];
+  }
+  get lastChild() {
+    return this.children.at(-1);
   }
   get textContent() {
     return this.children.map((child) => child.textContent ?? child).join("");
@@ -68,14 +77,24 @@ export class Part {
   remove() {
     if (this.parent) this.parent.children = this.parent.children.filter((child) => child !== this);
   }
-  setAttribute() {}
+  setAttribute(name, value) {
+    if (name === "class") this.className = value;
+  }
+  removeAttribute() {}
+  querySelector() {
+    return null;
+  }
   after() {}
   addEventListener(event, call) {
     this.does[event] = call;
   }
+  /** The parts in this one of which something is true. */
+  all(wanted) {
+    return [...(wanted(this) ? [this] : []), ...this.children.flatMap((child) => child.all?.(wanted) ?? [])];
+  }
   /** The part in this one that has an identifier. */
   find(id) {
-    return this.id === id ? this : this.children.reduce((found, child) => found ?? child.find?.(id), undefined);
+    return this.all((one) => one.id === id)[0];
   }
   getContext = () => new Drawing();
 }
@@ -156,7 +175,8 @@ Object.assign(globalThis, {
   },
   addEventListener() {}, requestAnimationFrame: (call) => waiting.push(call), getComputedStyle: resolved,
   CSS: { supports: () => true }, Path2D: class { addPath() {} }, DOMMatrix: class {}, ImageData: class {},
-  location: { href: "http://hall/" }, WebSocket: Socket, performance: { now: () => clock.ms },
+  localStorage: { kept: {}, getItem(key) { return this.kept[key] ?? null; }, setItem(key, value) { this.kept[key] = value; } },
+  ResizeObserver: class { observe() {} }, location: { href: "http://hall/" }, WebSocket: Socket, performance: { now: () => clock.ms },
   setInterval: (call, ms) => later(call, ms, ms), setTimeout: later, clearTimeout: (timer) => timers.delete(timer),
   fetch: async (address) => (asked.push(String(address)), { status: 200 }), reportError() {},
 }); // prettier-ignore

@@ -282,6 +282,9 @@ test("tags and anchors of other floors are dimmed; floors come from anchors, the
   assert.equal(drawn(drawZones).of("stroke").length, 1);
   state.options.floor = 0;
   assert.equal(drawn(drawZones).of("stroke").length, 0);
+  show();
+  giveHeights("0; 3.2 6.5");
+  assert.deepEqual(floors().map(({ name }) => name), ["floor 0 (from 0 m)", "floor 1 (from 3.2 m)", "floor 2 (from 6.5 m)"]);
   assert.throws(() => giveHeights("ground"), { message: "ground is no list of heights such as 0, 3.2" });
 }); // prettier-ignore
 
