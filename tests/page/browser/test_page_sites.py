@@ -82,28 +82,30 @@ LEFT_M, RIGHT_M, Y_M = 3.0, 21.0, 7.0
 
 
 class Crowd:
-    """The server's messages of tags at two places of the hall; those at the right have not been heard for some seconds."""
+    """The server's messages of tags at two places of the hall; those at the right were heard some seconds ago."""
 
     def __init__(self, count):
         self.asked, self.spoilt = [], False
-        self.show(count)
+        self.show(count, count // 2)
 
-    def show(self, count):
-        """Place so many tags."""
+    def show(self, count, right):
+        """Place so many tags, of which some with even numbers are at the right."""
         records = np.zeros(count, RECORD)
         records["tag"], records["flags"] = np.arange(count), 1
-        records["position_mm"][:, 1] = 1000 * Y_M
-        records["position_mm"][:, 0] = 1000 * np.where(records["tag"] % 2, LEFT_M, RIGHT_M)
+        is_right = (records["tag"] % 2 == 0) & (records["tag"] < 2 * right)
+        records["position_mm"][:, :2] = (
+            np.column_stack([np.where(is_right, RIGHT_M, LEFT_M), np.full(count, Y_M)]) * 1000
+        )
         self.columns = live2.Columns()
-        for is_left, now_s in ((False, 0.0), (True, 4.0)):
-            self.columns.update(records[records["tag"] % 2 == is_left], now_s)
+        self.columns.update(records[is_right], 1.0)
+        self.columns.update(records[~is_right], 5.0)
         self.columns.names = {number: f"t{number}" for number in range(count)}
 
     def __call__(self, asked):
         self.asked.append(asked)
         view = msgspec.convert({key: asked[key] for key in ("view", "px", "named")}, live2.View)
         unix_us = round(1e6 * (time.time() + 1.0))  # later than any delay that the page reckons with
-        found = live2.tags_message(self.columns, view, 4.0, unix_us)
+        found = live2.tags_message(self.columns, view, 5.0, unix_us)
         named = [live2.names_message(self.columns, view.named, unix_us)] if view.named else []
         return [*named, live2.anchors_message(lab_site(100.0).anchors, unix_us), found[:-1] if self.spoilt else found]
 
@@ -145,7 +147,7 @@ def test_very_many_tags_are_points_or_counts(serve, visit):
 
     # What is no message changes nothing; more tags than points are counts.
     crowd.spoilt = True
-    crowd.show(400_000)
+    crowd.show(6007, 0)
     page.keyboard.press("0")
     page.wait_for_timeout(300)
     assert page.evaluate("skyless.state.many.kind") == "P"
