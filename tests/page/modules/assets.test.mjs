@@ -104,7 +104,9 @@ test("the filter leaves tags that are in its zone and are found by tag, name or 
 
 test("alarms: those that nobody has acknowledged first, then those that last, the severest and the newest", async () => {
   const alarms = await load("alarms/model");
-  const alarm = (id, severity, unix_s, acknowledged_unix_s = null, ended_unix_s = null) => ({ id, kind: "silent", subject: id, severity, unix_s, ended_unix_s, acknowledged_unix_s });
+  const alarm = (id, severity, unix_s, acknowledged_unix_s = null, ended_unix_s = null) => {
+    return { id, kind: "silent", subject: id, severity, unix_s, ended_unix_s, acknowledged_unix_s };
+  };
   alarms.receiveAlarms([
     alarm("seen", "critical", 9, 10), alarm("ended", "critical", 8, null, 9), alarm("info", "info", 7),
     alarm("old", "warning", 1), alarm("new", "warning", 2), alarm("worst", "critical", 1),

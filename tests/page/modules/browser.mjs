@@ -167,7 +167,10 @@ function resolved({ style }) {
 }
 
 Object.assign(globalThis, {
-  matchMedia: (query) => ({ get matches() { return query.includes("dark") ? screen.dark : query.includes("motion") && screen.still; }, addEventListener() {} }),
+  matchMedia: (query) => ({
+    get matches() { return query.includes("dark") ? screen.dark : query.includes("motion") && screen.still; },
+    addEventListener() {},
+  }),
   document: {
     documentElement: new Part(), body: new Part(), head: { querySelector: () => byId("title") }, hidden: false,
     baseURI: "http://hall/", createElement: () => new Part(), createElementNS: () => new Part(), getElementById: byId,

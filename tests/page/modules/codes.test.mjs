@@ -45,7 +45,11 @@ test("an anchor shows its codes, its key chain and when that ends", () => {
     [{ ...keyed, code_fault: "clock-wrong" }, ["none: its clock is wrong", "warn"], [/in 400 days/, ""]],
     [{ ...keyed, chain_ends_unix_s: 20.5 * DAY_S }, ["with each beacon", ""], [/in 20 days/, "warn"]],
     [{ ...keyed, chain_ends_unix_s: 5400 }, ["with each beacon", ""], [/in 1 h 30 min/, "warn"]],
-    [{ chain: null, chain_ends_unix_s: -DAY_S, unix_s: 0, code_fault: "no-chain" }, ["none: no key chain holds now", "warn"], [/^ended on 1969-12-3\d$/, "bad"]],
+    [
+      { chain: null, chain_ends_unix_s: -DAY_S, unix_s: 0, code_fault: "no-chain" },
+      ["none: no key chain holds now", "warn"],
+      [/^ended on 1969-12-3\d$/, "bad"],
+    ],
     [{ chain: 1 }, ["with each beacon", ""], [/^number 1$/, ""]],
     [{}, ["none: it has no keys", "warn"], null],
   ]) {

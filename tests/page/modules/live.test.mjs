@@ -65,7 +65,10 @@ test("the pill has the level, the line below it the first reason, and the browse
   for (const [condition, shown, more, mark] of [
     [{}, ["pill good", "Live", "All is well: nothing speaks against the positions shown."], null, "● lab · Skyless"],
     [{ level: "warning", reasons: [OFFLINE] }, ["pill warning", "Warning", "Anchor 8 of 8 is offline."], "What to do", "▲ lab · Skyless"],
-    [{ level: "bad", reasons: [SLOW, OFFLINE] }, ["pill bad", "Fault", "This computer is too slow: the emulated air missed 41 %."], "and 1 more", "✕ lab · Skyless"],
+    [
+      { level: "bad", reasons: [SLOW, OFFLINE] },
+      ["pill bad", "Fault", "This computer is too slow: the emulated air missed 41 %."], "and 1 more", "✕ lab · Skyless",
+    ],
     [{ level: "waiting", text: "no tag is online" }, ["pill waiting", "Waiting", "No tag is online."], null, "○ lab · Skyless"],
   ]) {
     send({ ...GOOD, text: condition.reasons?.[0].text ?? "", ...condition });
@@ -209,7 +212,10 @@ test("a server that sends a part is asked for the view, the tags that are found 
 }); // prettier-ignore
 
 test("news that changes again replaces its last line, and healths that are old are forgotten", () => {
-  const event = (serial, more) => ({ serial, unix_s: serial, kind: "anchor", level: "bad", name: "anchor/8", text: `n ${serial}`, first: serial, count: 1, ...more });
+  const event = (serial, more) => {
+    const usual = { unix_s: serial, kind: "anchor", level: "bad", name: "anchor/8", text: `n ${serial}` };
+    return { serial, ...usual, first: serial, count: 1, ...more };
+  };
   send({ type: "log", events: [event(91), event(92)] });
   send({ type: "log", events: [event(92), event(93, { first: 92, count: 2 })] });
   assert.deepEqual(state.log.slice(-2).map(({ serial }) => serial), [91, 93]);

@@ -62,7 +62,8 @@ test("ellipses have the axes of the covariance, and are seen in 3-D as the proje
     const [xx, xy, yy] = [a * a + b * b, a * c + b * d, c * c + d * d];
     const [major, minor, angle] = view.halfAxes(xx, xy, yy);
     const [long, short, cos, sin] = [(major / sigmas) ** 2, (minor / sigmas) ** 2, Math.cos(angle), Math.sin(angle)];
-    near([long * cos * cos + short * sin * sin, (long - short) * cos * sin, long * sin * sin + short * cos * cos], [xx, xy, yy], 1e-4 * (xx + yy) + 1e-4);
+    const again = [long * cos * cos + short * sin * sin, (long - short) * cos * sin, long * sin * sin + short * cos * cos];
+    near(again, [xx, xy, yy], 1e-4 * (xx + yy) + 1e-4);
   }
   view.setSpatial(true);
   view.orbit(0.7, 0.2);
@@ -104,7 +105,10 @@ test("the outer edge of walls", () => {
   for (const [given, expected] of [
     [[[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3], [0, 3, 0, 0], [2, 0, 2, 3]], [[0, 0], [4, 0], [4, 3], [0, 3]]],
     [[[0, 0, 6, 0], [6, 0, 6, 2], [6, 2, 2, 2], [2, 2, 2, 5], [2, 5, 0, 5], [0, 5, 0, 0]], [[0, 0], [6, 0], [6, 2], [2, 2], [2, 5], [0, 5]]],
-    [[[0, 0, 4, 0], [4, 0, 4, 4], [4, 4, 0, 4], [0, 4, 0, 0], [4, 0, 8, 0], [8, 0, 8, 4], [8, 4, 4, 4]], [[0, 0], [4, 0], [8, 0], [8, 4], [4, 4], [0, 4]]],
+    [
+      [[0, 0, 4, 0], [4, 0, 4, 4], [4, 4, 0, 4], [0, 4, 0, 0], [4, 0, 8, 0], [8, 0, 8, 4], [8, 4, 4, 4]],
+      [[0, 0], [4, 0], [8, 0], [8, 4], [4, 4], [0, 4]],
+    ],
     [[[0, 0, 4, 0], [4, 0, 4, 3], [4, 3, 0, 3]], null],
   ]) {
     const found = closedWalls(walls(given));
@@ -147,7 +151,8 @@ test("the outline of a noisy walk holds it, has few corners and little more area
   const { outlineOf } = await load("map/outline");
   for (const [radius_m, most] of [[4, 40], [400, 100]]) {
     const noise = (n) => 0.25 * ((n * 0.618) % 1) * Math.sin(97 * n);
-    const walked = Array.from({ length: 3000 }, (_, n) => [Math.cos, Math.sin].map((axis, k) => radius_m * axis((2 * Math.PI * n) / 2999) + noise(n + 5 * k)));
+    const axis = (n, k) => radius_m * [Math.cos, Math.sin][k]((2 * Math.PI * n) / 2999) + noise(n + 5 * k);
+    const walked = Array.from({ length: 3000 }, (_, n) => [axis(n, 0), axis(n, 1)]);
     const found = outlineOf(walked, 0.3);
     assert.ok(found.length <= most);
     const left = ([x1, y1], [x2, y2], [x, y]) => ((x2 - x1) * (y - y1) - (y2 - y1) * (x - x1)) / Math.hypot(x2 - x1, y2 - y1);
@@ -157,7 +162,8 @@ test("the outline of a noisy walk holds it, has few corners and little more area
     const bare_m2 = Math.PI * (radius_m + 0.25) ** 2;
     assert.ok(area_m2 < (bare_m2 + 0.3 * 2 * Math.PI * (radius_m + 0.25) + Math.PI * 0.09) * 1.01);
   }
-  assert.throws(() => outlineOf(Array(20).fill([1, 2]), 0.3), { message: "The walk spans 0.00 m²; an outline needs 0.25 m²: walk around the place." });
+  const nowhere = { message: "The walk spans 0.00 m²; an outline needs 0.25 m²: walk around the place." };
+  assert.throws(() => outlineOf(Array(20).fill([1, 2]), 0.3), nowhere);
   assert.throws(() => outlineOf([], 0.3), { message: "The tag had 0 good positions; an outline needs 10." });
 }); // prettier-ignore
 
@@ -170,7 +176,11 @@ function oklab(colour, eye = [[1, 0, 0], [0, 1, 0], [0, 0, 1]]) {
   return times(mix, times(cones, times(eye, linear).map((part) => Math.max(part, 0))).map(Math.cbrt));
 } // prettier-ignore
 /** How readers without one kind of cones see linear red, green and blue (Machado and others, 2009), besides all others. */
-const EYES = [undefined, [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]], [[0.367, 0.861, -0.228], [0.28, 0.673, 0.047], [-0.012, 0.043, 0.969]]]; // prettier-ignore
+const EYES = [
+  undefined,
+  [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+  [[0.367, 0.861, -0.228], [0.28, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+]; // prettier-ignore
 
 test("tags never share colour and mark, also for colour-blind readers, and keep their hue in both themes", async () => {
   const { tagStyle } = await load("map/marks");
@@ -301,14 +311,18 @@ test("active alarms are marked at their anchors, zones and tags, or where a tag 
   const { drawAlarms } = await load("map/alarms");
   const zone = { id: "dock", name: "Dock", polygon_m: [[14, 2.5], [21, 2.5], [21, 6], [14, 6]] };
   state.zones = [zone];
-  const alarm = (kind, subject, more) => ({ id: subject, kind, subject, severity: "warning", unix_s: 1, ended_unix_s: null, position_m: null, ...more });
+  const usual = { severity: "warning", unix_s: 1, ended_unix_s: null, position_m: null };
+  const alarm = (kind, subject, more) => ({ id: subject, kind, subject, ...usual, ...more });
   state.alarms = [
     alarm("anchor-moved", "anchor-8"), alarm("crowded", "zone-dock"), alarm("silent", "gone", { position_m: [3, 5, 1] }),
     alarm("near", "a~gone"), alarm("battery", "b", { ended_unix_s: 2 }),
   ];
   drawAnchors(new Drawing());
   drawTags(new Drawing(), visibleTags());
-  const marks = (still) => drawn((context) => drawAlarms(context, still)).of("arc").filter(({ args }) => args[2] > 10).map(({ args }) => view.toSite(...args));
+  const marks = (still) => {
+    const rings = drawn((context) => drawAlarms(context, still)).of("arc").filter(({ args }) => args[2] > 10);
+    return rings.map(({ args: [x, y] }) => view.toSite(x, y));
+  };
   const [anchor, dock] = marks(true);
   near(anchor, [23, 13]);
   assert.ok(Math.abs(dock[0] - 17.5) < 1e-9 && dock[1] > 4.25);

@@ -22,14 +22,23 @@ function message({ heard = [1, 2, 3, 4, 5, 6], open = [], excluded = [], result,
     const [x_m, y_m] = open.includes(id) ? [null, null] : TRUE[id];
     const sure = x_m !== null;
     const covariance_m2 = sure ? [[0.0025, 0, 0], [0, 0.0004, 0], [0, 0, 0]] : null; // prettier-ignore
-    return { id, determined: sure, x_m, y_m, z_m: 0, std_m: sure ? 0.051 : null, covariance_m2, reason: sure ? null : "it is linked to one other anchor only" };
+    const reason = sure ? null : "it is linked to one other anchor only";
+    return { id, determined: sure, x_m, y_m, z_m: 0, std_m: sure ? 0.051 : null, covariance_m2, reason };
   });
-  const none = { not_determined: [], ambiguities: [], unchecked: null, assumed_heights: null, notes: [], tapes: [], redundancy: 4, range_std_m: 0.03, frame: "" };
-  const survey = heard.length > 2 ? { ...none, anchors, pairs: pairs.map((pair) => ({ ...pair, excluded: excluded.includes(`${pair.a}-${pair.b}`) })), ...result } : null;
-  return { unix_s: 1.8e9, serial: 1, anchors: heard, missing: [], pairs, facts: { gauge: null, ...facts }, error: null, survey, state: "surveyed", file: "/srv/hall/site.toml", saved_serial: null, saved_unix_s: null, ...changes };
+  const none = {
+    not_determined: [], ambiguities: [], unchecked: null, assumed_heights: null, notes: [], tapes: [],
+    redundancy: 4, range_std_m: 0.03, frame: "",
+  }; // prettier-ignore
+  const used = pairs.map((pair) => ({ ...pair, excluded: excluded.includes(`${pair.a}-${pair.b}`) }));
+  return {
+    unix_s: 1.8e9, serial: 1, anchors: heard, missing: [], pairs, facts: { gauge: null, ...facts }, error: null,
+    survey: heard.length > 2 ? { ...none, anchors, pairs: used, ...result } : null, state: "surveyed",
+    file: "/srv/hall/site.toml", saved_serial: null, saved_unix_s: null, ...changes,
+  }; // prettier-ignore
 }
 
-const GHOST = { ambiguities: [{ sentence: "Anchor 4 could as well hang 2.3 m further to the right.", anchors: [4], positions_m: { 4: [10, 6, 0] } }] };
+const OTHER = { sentence: "Anchor 4 could as well hang 2.3 m further to the right.", anchors: [4], positions_m: { 4: [10, 6, 0] } };
+const GHOST = { ambiguities: [OTHER] };
 
 beforeEach(() => {
   Object.assign(state.connection, { phase: "open" });
@@ -126,17 +135,19 @@ test("the picture shows pairs, late pairs, ghosts and anchors without a position
 
 test("typed lengths have a comma or a dot, and a unit or none", async () => {
   const { lengthFault, readLength } = await load("survey/values");
-  for (const [words, value] of [["10,02 m", 10.02], ["250 cm", 2.5], ["2.5", 2.5], ["−3", -3], ["12mm", 0.012], ["2.5o", null], ["ten", null], ["", null], ["1e3", null], [".", null]]) {
-    assert.equal(readLength(words), value, words);
-  }
-  for (const wrong of ["", "ten", "-3", "0,01"]) assert.match(lengthFault(wrong, 0.05, 1000), /should be a number of metres from 0\.05 to 1000, such as 2\.35\.$/);
+  const known = { "10,02 m": 10.02, "250 cm": 2.5, 2.5: 2.5, "−3": -3, "12mm": 0.012 };
+  for (const [words, value] of Object.entries(known)) assert.equal(readLength(words), value, words);
+  for (const words of ["2.5o", "ten", "", "1e3", "."]) assert.equal(readLength(words), null, words);
+  const right = /should be a number of metres from 0\.05 to 1000, such as 2\.35\.$/;
+  for (const wrong of ["", "ten", "-3", "0,01"]) assert.match(lengthFault(wrong, 0.05, 1000), right);
   assert.match(lengthFault("2.5o", -10, 100), /^“2\.5o” should be a number of metres from −10 to 100/);
   assert.equal(lengthFault("10", 0.05, 1000), "");
 }); // prettier-ignore
 
 test("a floor plan is an image of at most 8 MB; it is moved, scaled by points and fitted to anchors", async () => {
   await assert.rejects(laid.readImage({ type: "image/gif", name: "x.gif" }), { message: "“x.gif” should be a PNG or JPEG image." });
-  await assert.rejects(laid.readImage({ type: "image/png", name: "x.png", size: 8_000_001 }), { message: "“x.png” has 8.0 MB; an image should have at most 8 MB." });
+  const large = { type: "image/png", name: "x.png", size: 8_000_001 };
+  await assert.rejects(laid.readImage(large), { message: "“x.png” has 8.0 MB; an image should have at most 8 MB." });
   const at = () => [laid.plan.x_m, laid.plan.y_m, laid.plan.width_m];
   laid.begin({ naturalWidth: 800, naturalHeight: 600 }, {}, "hall.png", [0, 0, 8, 6]);
   assert.deepEqual([at(), laid.height_m()], [[0, 0, 8], 6]);
