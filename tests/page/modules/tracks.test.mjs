@@ -5,7 +5,7 @@ import { test } from "node:test";
 import { clock, load, wait } from "./browser.mjs";
 
 const { COLUMNS, FRESH, GONE, SLEEP, TIME, Track, Tracks } = await load("tracks");
-const { freshness } = await load("clock");
+const { freshness, now_s, resetOffset, updateOffset } = await load("clock");
 const { addHealth, anchorHistory } = await load("history");
 const { state } = await load("store");
 const { noteGap, rowLimit, stall_s } = await load("pace");
@@ -51,6 +51,14 @@ test("the server's times say whether a fix is fresh; one of another clock is not
   track.push(row({ [TIME]: 992, ...times_s, [SLEEP]: 1e3 }));
   assert.deepEqual([track.count, freshness(track, 1000, 1000)], [2, "asleep"], "a state of the same time replaces the last");
 });
+
+test("the quickest message gives the server's time; later ones change it slowly, a clock that was set at once", () => {
+  resetOffset();
+  for (const [unix_s, expected] of [[1000, 1000], [999, 999.998], [1000.5, 1000.5], [900, 900], [5000, 5000], [4999.5, 4999.999]]) {
+    updateOffset(unix_s);
+    assert.ok(Math.abs(now_s() - expected) < 1e-6, `${now_s()} is not ${expected}`);
+  }
+}); // prettier-ignore
 
 test("tags that are silent for long are forgotten, but for those that are named", () => {
   const tracks = new Tracks();
