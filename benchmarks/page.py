@@ -26,7 +26,7 @@ import uvicorn
 from msgspec.structs import replace
 from playwright.sync_api import sync_playwright
 
-sys.path.extend(str(Path(__file__).parents[1] / "tests" / folder) for folder in (".", "dashboard", "page"))
+sys.path.extend(str(Path(__file__).parents[1] / "tests" / folder) for folder in (".", "page", "page/browser", "run"))
 from dashboard_builders import SITE, SITE_ID, Times, Wire, fix
 from page_browser import CHROMIUM, FLAGS, until
 from test_dashboard_condition import anchor_health

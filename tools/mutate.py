@@ -31,6 +31,7 @@ from typing import Any, Final, cast
 
 import msgspec
 import pytest
+from hypothesis import Phase, settings
 from msgspec import Struct
 
 ROOT: Final = Path(__file__).parents[1]
@@ -38,9 +39,9 @@ SOURCE: Final = ROOT / "src" / "skyless"
 TABLE: Final = ROOT / "tests" / "mutants.toml"
 LEAST_SHARE: Final = 0.95
 """Of the mutants that are not equal in effect, those that the tests should find."""
-_SLOWER: Final = 10.0
-"""A mutant's tests that take so many times as long as without it run for ever."""
-_GRACE_S: Final = 10.0
+_SLOWER: Final = 5.0
+"""Tests that take so many times as long as without the mutant run for ever."""
+_GRACE_S: Final = 5.0
 
 _OTHER: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -157,12 +158,10 @@ class Runs:
             self._failed.append(report.nodeid)
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
-        began_s = time.monotonic()
-        reached = _forked(lambda: self._reach(session.items), 3600.0)
-        took_s = time.monotonic() - began_s
-        if reached is None or reached[0]:
-            raise pytest.UsageError(f"tests that fail without a mutant: {reached and reached[0]}")
-        self.lines = {name: frozenset(lines) for name, lines in reached[1].items()}
+        failed, lines, took_s = _forked(lambda: self._reach(session.items), 3600.0)
+        if failed:
+            raise pytest.UsageError(f"tests that fail without a mutant: {failed}")
+        self.lines = {name: frozenset(numbers) for name, numbers in lines.items()}
         functions = [one for one in gc.get_objects() if isinstance(one, FunctionType)]
         functions = [one for one in functions if one.__code__.co_filename == str(self.path)]
         finds: Counter[str] = Counter()  # those that find most begin
@@ -170,15 +169,18 @@ class Runs:
             items = [item for item in session.items if mutant.line in self.lines[item.nodeid]]
             if not self.to_the_end:
                 items.sort(key=lambda item: -finds[item.nodeid])
-            found = _forked(lambda m=mutant, i=items: self._find(m, i, functions), _GRACE_S + _SLOWER * took_s)
+            found = _forked(
+                lambda m=mutant, i=items: self._find(m, i, functions),
+                _GRACE_S + _SLOWER * sum(took_s[item.nodeid] for item in items),
+            )
             self.found.append(["(no end)"] if found is None else found)
             finds.update(self.found[-1])
             if sys.stderr.isatty():
                 print(f"\r{number + 1} of {len(self.mutants)} mutants", end="", file=sys.stderr)
         return True
 
-    def _reach(self, items: list[pytest.Item]) -> Any:  # noqa: ANN401 - names and lines
-        path, lines, now = str(self.path), {}, set()
+    def _reach(self, items: list[pytest.Item]) -> Any:  # noqa: ANN401 - failed tests, lines and durations of all
+        path, lines, took_s, now = str(self.path), {}, {}, set()
 
         def traced(frame: FrameType, event: str, _: Any) -> Any:  # noqa: ANN401 - as sys.settrace has it
             if frame.f_code.co_filename != path:
@@ -190,11 +192,13 @@ class Runs:
         threading.settrace(traced)
         for item, following in zip(items, [*items[1:], None], strict=True):
             now.clear()
+            began_s = time.monotonic()
             sys.settrace(traced)
             item.ihook.pytest_runtest_protocol(item=item, nextitem=following)
             sys.settrace(None)
             lines[item.nodeid] = sorted(now)
-        return self._failed, lines
+            took_s[item.nodeid] = time.monotonic() - began_s
+        return self._failed, lines, took_s
 
     def _find(self, mutant: Mutant, items: list[pytest.Item], functions: list[FunctionType]) -> list[str]:
         for function in functions:
@@ -244,7 +248,8 @@ def judged(module: str, entry: Entry, *, spare: bool, number: int | None = None)
     if number is not None:
         mutants = sorted(random.Random(1).sample(mutants, min(number, len(mutants))), key=lambda one: one.line)
     runs = Runs(path, mutants, to_the_end=spare)
-    options = ["-p", "no:cacheprovider", "-p", "no:timeout", "--tiers", "unit,site"]
+    settings.register_profile("mutants", deadline=None, derandomize=True, phases=(Phase.explicit, Phase.generate))
+    options = ["-p", "no:cacheprovider", "-p", "no:timeout", "--hypothesis-profile=mutants", "--tiers", "unit,site"]
     with redirect_stdout(StringIO()) as said:
         pytest.main([*options, *(str(ROOT / one) for one in entry.tests)], plugins=[runs])
     if len(runs.found) < len(mutants):

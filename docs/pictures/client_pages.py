@@ -17,7 +17,7 @@ from playwright.sync_api import Page, sync_playwright
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parents[1]
-sys.path[:0] = [str(ROOT / "tests" / "dashboard"), str(ROOT / "tests" / "clients")]
+sys.path[:0] = [str(ROOT / "tests" / "page" / "browser"), str(ROOT / "tests" / "clients")]
 
 from client_site import ClientSite, free_port, until  # noqa: E402 (the tests run the same programs)
 from page_browser import CHROMIUM, FLAGS  # noqa: E402

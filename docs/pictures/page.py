@@ -20,7 +20,7 @@ from playwright.sync_api import sync_playwright
 
 FOLDER = Path(__file__).parent
 ROOT = FOLDER.parents[1]
-sys.path.insert(0, str(ROOT / "tests" / "dashboard"))
+sys.path.insert(0, str(ROOT / "tests" / "page" / "browser"))
 
 from page_browser import CHROMIUM, FLAGS, Visit, until  # noqa: E402 (the tests start the same browser)
 

@@ -3,7 +3,6 @@
 import json
 
 import msgspec
-import page_fake_site as made_up
 import pytest
 from dashboard_builders import SITE, SITE_ID, SQUARE, Wire, browser_of, fix, truth
 from starlette.exceptions import HTTPException
@@ -13,6 +12,7 @@ from skyless.page.playback import Playback
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import WatchFinding, WatchMessage, ZonesMessage
 from skyless.run.recordings.recorder import McapFile, McapRecorder
+from support.site_messages import anchor_health
 
 pytestmark = pytest.mark.site
 
@@ -196,9 +196,9 @@ def test_the_events_of_a_recording_are_those_that_a_live_page_would_have_listed(
             for anchor in (1, 2):
                 leads = anchor == 1 if at_s < 3.0 else anchor == 2 and at_s >= 6.0
                 if anchor == 2 or at_s < 3.0:
-                    health = made_up.anchor_health(anchor, at_s, START_S + at_s)
-                    role = {"role": "master" if leads else "anchor", "term": k}
-                    take(topics.health_topic(SITE_ID, "anchor", anchor), health | role, at_s)
+                    role = "master" if leads else "anchor"
+                    health = anchor_health(anchor, unix_s=START_S + at_s, role=role, term=k)
+                    take(topics.health_topic(SITE_ID, "anchor", anchor), health, at_s)
     finding = WatchFinding("moved", (2,), 0.3, 0.01, START_S, "Anchor 2 has moved by 30 cm.")
     take(topics.watch_topic(SITE_ID), WatchMessage(START_S + 13.0, "watching", (finding,), 3), 13.0)
     recorder.file.close()
@@ -220,9 +220,9 @@ def test_the_events_of_a_recording_are_those_that_a_live_page_would_have_listed(
 def test_a_recording_with_a_gap_lists_no_outage(folder):
     recorder = McapRecorder(McapFile(folder / "cut.mcap"))
     for at_s in (0, 1, 2, 3, 60, 61, 62):
-        health = made_up.anchor_health(1, at_s, START_S + at_s)
+        health = anchor_health(1, unix_s=START_S + at_s)
         recorder.add(topics.health_topic(SITE_ID, "anchor", 1), msgspec.json.encode(health), START_S + at_s)
-        health = made_up.anchor_health(2, at_s, START_S + at_s)
+        health = anchor_health(2, unix_s=START_S + at_s)
         recorder.add(topics.health_topic(SITE_ID, "anchor", 2), msgspec.json.encode(health), START_S + at_s + 0.1)
     recorder.file.close()
     assert Playback(folder).events("cut.mcap").events == ()

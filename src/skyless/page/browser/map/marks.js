@@ -2,7 +2,7 @@
  * Marks of tags: 8 colours and 7 shapes in turn, so that the first 56 tags never share both.
  *
  * 8 and 7 have no common divisor: tags with the same shape differ by 7, 14 or 21 in their number, and so in their colours
- * by 1, 2 or 3 steps; colours that far apart differ for colour-blind readers too (`tests/dashboard/test_page_map.py`).
+ * by 1, 2 or 3 steps; colours that far apart differ for colour-blind readers too (`tests/page/modules/map.test.mjs`).
  */
 
 import { s } from "../dom.js";

@@ -1,4 +1,4 @@
-"""What the dashboard's tests share: a live site, one browser, servers of a made-up site, visits nothing may fail in."""
+"""What the tests in a browser share: one browser, servers of a made-up site, visits in which nothing may fail."""
 
 import asyncio
 import contextlib
@@ -6,29 +6,8 @@ from asyncio import events
 from pathlib import Path
 
 import pytest
-from dashboard_builders import SITE_ID, Times, Wire
 from page_browser import CHROMIUM, FLAGS, Visit
-from page_fake_server import FakeServer
-
-from skyless.page.live import LiveSite
-
-
-@pytest.fixture
-def times():
-    return Times()
-
-
-@pytest.fixture
-def wire():
-    return Wire()
-
-
-@pytest.fixture
-def live(times, wire):
-    """Of a broker that is not connected yet."""
-    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
-    live.attach(wire, SITE_ID)
-    return live
+from page_server import PageServer
 
 
 @pytest.fixture(scope="session")
@@ -50,7 +29,7 @@ def chromium():
 def serve():
     """Start a server of a made-up site."""
     with contextlib.ExitStack() as stack:
-        yield lambda **settings: stack.enter_context(FakeServer(**settings))
+        yield lambda **settings: stack.enter_context(PageServer(**settings))
 
 
 @pytest.fixture
@@ -61,7 +40,6 @@ def visit(chromium):
 
     def open_page(server, **context):
         visits.append(Visit(browser, server.address, **context))
-        visits[-1].host = server.address.split("/")[2]
         return visits[-1]
 
     events._set_running_loop(loop)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import uvicorn
 from msgspec.structs import replace
-from page_browser import until
 
 from skyless.core.errors import SkylessError
 from skyless.core.estimator import compiled
@@ -28,7 +27,7 @@ from skyless.page.tasks import WhatIfTask
 from skyless.page.what_if_process import what_if
 from support import live_site
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
+sys.path.insert(0, str(Path(__file__).parents[3] / "tools"))
 import wasm_core
 
 TAG = "a"
@@ -50,9 +49,9 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture
-def server(folder, times):
+def server(folder):
     """The page's own server, with that recording."""
-    live = LiveSite("here", "mqtt://broker:1", None, lambda: times.now_s, lambda: times.unix_s)
+    live = LiveSite("here", "mqtt://broker:1", None, lambda: 100.0, lambda: 1000.0)
     app = make_app(Services(LiveSites(live), Playback(folder)), AccessRules())
     with socket.socket() as sock:
         sock.bind(("127.0.0.1", 0))
@@ -66,13 +65,13 @@ def server(folder, times):
         thread.join()
 
 
-@pytest.fixture
-def prepared(folder):
-    return prepared_of(folder)
-
-
 def prepared_of(folder):
     return what_if(WhatIfTask(str(folder / "lab.mcap"), TAG, live_site.UNIX_S, 3.0))
+
+
+@pytest.fixture(scope="module")
+def prepared(folder):
+    return prepared_of(folder)
 
 
 def on_the_host(found, without=(), moved_m=(0.0, 0.0, 0.0), noise=1.0):
@@ -104,27 +103,27 @@ def on_the_host(found, without=(), moved_m=(0.0, 0.0, 0.0), noise=1.0):
     return rows
 
 
-RECOMPUTE = """async ([name, tag, without, moved, noise]) => {
-  const { whatIf } = await import("/page/api.js");
-  const { recompute } = await import("/page/estimator.js");
-  const found = await whatIf(name, tag, 0, 3);
-  const moved_m = new Map([[found.anchors[0].id, moved]]);
-  const rows = await recompute(found, { without: new Set(without), moved_m, noise });
-  return rows.map(({ used, position_m, hpl_m }) => [used, ...position_m, hpl_m]);
-}"""
+RECOMPUTE = """
+  const found = await api.whatIf(...given.what, 0, 3);
+  const rows = [];
+  for (const { without, moved_m, noise } of given.changes) {
+    const moved = new Map([[found.anchors[0].id, moved_m]]);
+    rows.push(await estimator.recompute(found, { without: new Set(without), moved_m: moved, noise }));
+  }
+  return rows.map((one) => one.map(({ used, position_m }) => [used, ...position_m]));"""
 
 
-@pytest.mark.parametrize("change", [{}, {"without": "first"}, {"moved_m": (0.3, -0.2, 0.1)}, {"noise": 3.0}])
 @pytest.mark.statistical
-def test_the_browser_gives_the_bits_of_the_host(server, prepared, visit, change):
-    change = {name: [prepared.anchors[0].id] if name == "without" else value for name, value in change.items()}
-    expected = on_the_host(prepared, **change)
-    page = visit(server).page
-    moved = list(change.get("moved_m", (0.0, 0.0, 0.0)))
-    rows = page.evaluate(RECOMPUTE, ["lab.mcap", TAG, change.get("without", []), moved, change.get("noise", 1.0)])
-    assert [row[1:4] for row in rows] == expected["position_m"].tolist()
-    assert [row[0] for row in rows] == [outcome not in (REJECTED, STALE) for outcome in expected["outcome"]]
-    assert sum(row[0] for row in rows) > 200
+def test_the_browser_gives_the_bits_of_the_host(server, prepared, visit):
+    nothing = {"without": [], "moved_m": [0.0, 0.0, 0.0], "noise": 1.0}
+    changes = ({}, {"without": [prepared.anchors[0].id]}, {"moved_m": [0.3, -0.2, 0.1]}, {"noise": 3.0})
+    changes = [nothing | change for change in changes]
+    shown = visit(server).run("api estimator", RECOMPUTE, {"what": ["lab.mcap", TAG], "changes": changes})
+    for change, rows in zip(changes, shown, strict=True):
+        expected = on_the_host(prepared, **change)
+        assert [row[1:] for row in rows] == expected["position_m"].tolist(), change
+        assert [row[0] for row in rows] == [outcome not in (REJECTED, STALE) for outcome in expected["outcome"]]
+        assert sum(row[0] for row in rows) > 200
 
 
 def test_nothing_changed_is_what_the_tag_computed(prepared):
@@ -165,23 +164,22 @@ def test_the_dialog(server, visit):
     page = shown.page
     page.click("#tab-recordings")
     page.click(".recording")
-    until(page, "skyless.state.mode === 'replay' && !skyless.state.player.waiting")
+    shown.until("skyless.state.mode === 'replay' && !skyless.state.player.waiting")
     page.click("#what-if")
-    until(page, "document.querySelectorAll('#what-if-figures tr').length === 5", timeout_s=20.0)
+    shown.until("document.querySelectorAll('#what-if-figures tr').length === 5", timeout_s=20.0)
     rows = page.locator("#what-if-dialog table").first.locator("tr")
+    problem = "document.querySelector('#what-if-dialog .problem').textContent"
     for number in (1, 2, 3, 4):
         rows.nth(number).locator("input[type=checkbox]").uncheck()
     page.click("#what-if-run")
-    until(page, "document.querySelector('#what-if-dialog .problem').textContent.includes('needs 3 anchors')")
+    shown.until(f"{problem}.includes('needs 3 anchors')")
     rows.nth(1).locator("input[type=checkbox]").check()
-    page.fill("#what-if-noise", "1000")
-    page.click("#what-if-run")
-    until(page, "document.querySelector('#what-if-dialog .problem').textContent.includes('from 0.1 to 100')")
-    page.fill("#what-if-noise", "2")
-    page.click("#what-if-run")
-    until(page, "document.querySelector('#what-if-dialog .problem').textContent === ''")
+    for noise, said in (("1000", ".includes('from 0.1 to 100')"), ("2", " === ''")):
+        page.fill("#what-if-noise", noise)
+        page.click("#what-if-run")
+        shown.until(f"{problem}{said}")
     page.click("#what-if-dialog > button")
-    until(page, "document.querySelector('#what-if-dialog') === null")
+    shown.until("document.querySelector('#what-if-dialog') === null")
 
 
 def test_the_webassembly_is_of_the_source():
