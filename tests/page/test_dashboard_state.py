@@ -211,6 +211,7 @@ def test_of_many_anchors_a_page_gets_all_conditions_and_the_healths_that_it_name
     assert [one["anchor"] for one in health(state, sent)["anchors"]] == [9]
 
 
+@pytest.mark.site
 @given(
     st.lists(
         st.tuples(

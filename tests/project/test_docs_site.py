@@ -150,7 +150,7 @@ def test_rows_of_a_table_have_as_many_cells_as_its_head(page):
 @current_pages
 def test_files_that_are_named_exist(page):
     names = [name for name in code_spans(page) if re.fullmatch(r"[\w./-]+\.(py|js)|[\w-]+(/[\w-]+)*/", name)]
-    assert [name for name in names if not any(path.endswith(f"/{name}") for path in files())] == []
+    assert [name for name in names if not any(f"/{path}".endswith(f"/{name}") for path in files())] == []
 
 
 @current_pages

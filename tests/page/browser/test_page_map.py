@@ -9,7 +9,7 @@ import pytest
 from page_browser import PHONE
 from PIL import Image
 
-from value_colours import colour_of
+from support.value_colours import colour_of
 
 pytestmark = pytest.mark.statistical
 

@@ -136,6 +136,7 @@ def test_nothing_changed_is_what_the_tag_computed(prepared):
     assert away_m[len(away_m) // 2 :].max() < 0.05
 
 
+@pytest.mark.site
 def test_relays_with_phases_are_recomputed_like_those_without(prepared, tmp_path):
     """Their stamps are short, and whole ones are made of them where they are used."""
     with_phases = prepared_of(recorded_in(tmp_path, carrier_phase=True))

@@ -1,6 +1,6 @@
 """Write ``feed.jsonl``, what the page's server sends of a simulated site: ``python tests/page/modules/record_feed.py``.
 
-The site is that of ``tests/recordings/live_site.py``; the server's clocks stand at the moment of each message, so that
+The site is that of ``tests/support/live_site.py``; the server's clocks stand at the moment of each message, so that
 the same is written each time. The first line has what the library and the page both know: names, and colours of values.
 """
 
@@ -15,15 +15,15 @@ from paho.mqtt.client import topic_matches_sub
 
 sys.path.append(str(Path(__file__).parents[2]))
 
-from recordings import live_site
 from skyless.core.alert import Alert
 from skyless.core.keys.fault import Fault
 from skyless.page.live import LiveSite
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import StatusMessage, Zone
 from skyless.site.planning.colours import COLOUR_STOPS, scale_of
+from support import live_site
 from support.site_messages import anchor_health, tag_health
-from value_colours import colour_of
+from support.value_colours import colour_of
 
 FEED = Path(__file__).with_name("feed.jsonl")
 SITE, TAGS, SECONDS, STEP_S = live_site.SITE, ("a", "b"), 3.0, 0.1
