@@ -158,6 +158,8 @@ class Runs:
             self._failed.append(report.nodeid)
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        if session.testsfailed:
+            raise pytest.UsageError("tests that cannot be collected")
         failed, lines, took_s = _forked(lambda: self._reach(session.items), 3600.0)
         if failed:
             raise pytest.UsageError(f"tests that fail without a mutant: {failed}")

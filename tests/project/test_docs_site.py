@@ -82,7 +82,7 @@ def anchors(page):
 @cache
 def files():
     """All files of the repository's own folders, and their folders, as paths with a slash in front."""
-    found = set()
+    found = {f"/{folder}/" for folder in SOURCES}
     for folder in SOURCES:
         for path in (ROOT / folder).rglob("*"):
             if "__pycache__" not in path.parts:
@@ -150,7 +150,7 @@ def test_rows_of_a_table_have_as_many_cells_as_its_head(page):
 @current_pages
 def test_files_that_are_named_exist(page):
     names = [name for name in code_spans(page) if re.fullmatch(r"[\w./-]+\.(py|js)|[\w-]+(/[\w-]+)*/", name)]
-    assert [name for name in names if not any(f"/{path}".endswith(f"/{name}") for path in files())] == []
+    assert [name for name in names if not any(path.endswith(f"/{name}") for path in files())] == []
 
 
 @current_pages
