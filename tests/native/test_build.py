@@ -7,10 +7,10 @@ import sys
 import tomllib
 from pathlib import Path
 
-import compile_core
 import pytest
 from core_build import NATIVE, needs
 
+import compile_core
 from skyless.core.native import library
 
 ROOT = Path(__file__).parents[2]

@@ -13,7 +13,7 @@ from skyless.core.integrity import HPL
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.lab import paper_lab_site
 
-pytestmark = [pytest.mark.site, needs("gcc")]
+pytestmark = [pytest.mark.statistical, needs("gcc")]
 
 WITH_FLOAT = [sys.executable, Path(__file__).with_name("with_sizes.py"), "float"]
 SLOW = Case(qa=0.02)
@@ -50,7 +50,6 @@ def test_errors_levels_and_starts_are_those_of_double_precision(tmp_path):
         np.testing.assert_allclose(single[name], expected, **limits, err_msg=name)
 
 
-@pytest.mark.statistical
 def test_damaged_packets_leave_numbers():
     """What 64 bits hold may be no number in 32."""
     script = Path(__file__).with_name("test_damaged_packets.py")

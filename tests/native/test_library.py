@@ -5,11 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-import compile_core
 import numpy as np
 import pytest
 from core_build import NATIVE, needs
 
+import compile_core
 from skyless.core.errors import SkylessError
 from skyless.core.native import library
 from skyless.core.native.records import Array, Byte, Bytes, Integers, Reals, Record, Ticks, record

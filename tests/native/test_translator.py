@@ -16,10 +16,9 @@ from core_build import EXACT, needs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skyless.core.native.records import Record, Ticks
 from translator.body import RefusedError
 from translator.files import translate
-
-from skyless.core.native.records import Record, Ticks
 
 FUNCTIONS = [f for f in vars(translated).values() if inspect.isfunction(f) and f.__module__ == translated.__name__]
 EXPORTED = [f for f in FUNCTIONS if not f.__name__.startswith("_")]
@@ -100,9 +99,9 @@ def test_functions_of_records_leave_the_bytes_that_python_leaves(library):
         fill(box, draw)
         box.ticks += draw.choice([0, 1 << 35])
         other = translated.Box.from_buffer_copy(bytes(box))
-        for name, given in (("work", 1.25), ("choose", seed), ("ignore", 3)):
+        for name, argument in (("work", 1.25), ("choose", seed), ("ignore", 3)):
             function = getattr(translated, name)
-            assert bound(library, function)(ctypes.byref(other), given) == function(box, given)
+            assert bound(library, function)(ctypes.byref(other), argument) == function(box, argument)
             assert bytes(other) == bytes(box)
         assert bound(library, translated.stamp)(box.bytes) == translated.stamp(box.bytes)
 

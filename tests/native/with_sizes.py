@@ -15,13 +15,13 @@ import sys
 import tempfile
 from pathlib import Path
 
-ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "tools"))
+sys.path.append(str(Path(__file__).parents[2] / "tools"))
 
 import compile_core
 from skyless.core import ticks
 from skyless.core.native import arithmetic, library, records, views
 
+ROOT = Path(__file__).parents[2]
 SIZES = ROOT / "firmware" / "source" / "core_sizes.h"
 BY_HAND = f'-DSKYLESS_BY_HAND="{SIZES.with_name("core_by_hand.h")}"'
 _INCLUDED = ("-include", "stdbool.h", "-include", str(SIZES))
