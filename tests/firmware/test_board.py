@@ -4,7 +4,8 @@ import ctypes
 import random
 
 import pytest
-from board_stage import (
+from emulator.board_library import places
+from firmware_stage import (
     ASK_HELLO,
     ASK_STATUS,
     CONFIG,
@@ -17,7 +18,6 @@ from board_stage import (
     line_of,
     needs_compiler,
 )
-from emulator.board_library import places
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -49,22 +49,16 @@ def test_a_board_reports_itself_and_is_configured_by_its_host():
     stage = BoardStage(reset_cause=0x82)
     stage.board.begin()
     assert stage.bus.from_board[0] == 0
-    stage.send(ASK_HELLO)
-    stage.turn(2)
-    for hello in stage.reports():
+    for hello in stage.ask(ASK_HELLO, turns=2):
         assert (hello.major, hello.minor, hello.device_id, hello.can_transmit) == (1, 3, b"identity", True)
         assert hello.has_phases
         assert (hello.rate_khz, hello.counter_bits, hello.reset_cause) == (63_897_600, 40, 0x82)
-    stage.send(RX_ON)
-    stage.turn(2)
-    assert stage.reports() == [NotDone(RX_ON, MALFORMED)]
+    assert stage.ask(RX_ON, turns=2) == [NotDone(RX_ON, MALFORMED)]
     stage.config()
     stage.turn(2)
     (status,) = stage.reports()
     assert (status.configured, status.receiving, status.temperature_c, status.supply_v) == (True, False, None, None)
-    stage.send(RX_ON)
-    stage.turn()
-    (status,) = stage.reports()
+    (status,) = stage.ask(RX_ON, turns=1)
     assert (status.configured, status.receiving) == (True, True)
     assert 0 <= difference(wrap(stage.air.ticks), status.ticks) < 200 * 63_898
     assert not +stage.chip.misuse
@@ -101,9 +95,7 @@ def test_a_later_version_may_append_fields_and_add_kinds():
     stage.turn(2)
     (status,) = stage.reports()
     assert (status.configured, status.garbled) == (True, 0)
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert stage.reports()[0].garbled == 1
+    assert stage.ask(ASK_STATUS, turns=1)[0].garbled == 1
 
 
 @pytest.mark.parametrize("size", [1, 98, 125])
@@ -145,9 +137,7 @@ def test_errors_are_counted_and_it_listens_on():
         stage.arrive(FRAME, fault=fault)
         stage.turn(3)
         assert stage.reports() == []
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert stage.reports()[0].errors == 4
+    assert stage.ask(ASK_STATUS, turns=1)[0].errors == 4
     stage.air.pass_s(1e-3)
     stage.arrive(FRAME)
     stage.turn()
@@ -257,9 +247,7 @@ def test_a_chip_that_was_reset_is_reported_and_can_be_configured_again():
     stage.pass_us(POLL_US + 1000)
     late, hello = stage.reports()
     assert (type(late), late.reason, type(hello)) == (TooLate, NOT_READY, Hello)
-    stage.send(ASK_STATUS)
-    stage.turn()
-    (status,) = stage.reports()
+    (status,) = stage.ask(ASK_STATUS, turns=1)
     assert (status.configured, status.receiving, status.ticks) == (False, False, 0)
     stage.pass_us(1_000_000)
     assert stage.air.sent == []
@@ -288,9 +276,7 @@ def test_a_chip_that_looks_right_and_has_lost_its_settings_is_found_soon():
     stage.chip.memory.write(0x1F, 0, b"\0")
     stage.pass_us(CHECK_US + 1000)
     assert kinds(stage.reports()) == [Hello]
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert not stage.reports()[0].configured
+    assert not stage.ask(ASK_STATUS, turns=1)[0].configured
 
 
 def test_a_board_without_a_chip_says_so_and_goes_on():
@@ -323,18 +309,14 @@ def test_a_stuck_interrupt_line_is_reported_and_the_chip_is_polled(stuck):
     stage.tx_at(3000, SHORT)
     stage.pass_us(5000)
     assert kinds(stage.reports()) == [Done]
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert stage.reports()[0].polled
+    assert stage.ask(ASK_STATUS, turns=1)[0].polled
     assert stage.bus.lights & 8
     stage.bus.stuck = None  # and back
     for _ in range(4):
         stage.pass_us(3000)
         stage.arrive(FRAME)
     stage.pass_us(3000)
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert not stage.reports()[-1].polled
+    assert not stage.ask(ASK_STATUS, turns=1)[-1].polled
 
 
 def test_a_sound_interrupt_line_is_never_called_stuck():
@@ -367,9 +349,7 @@ def test_temperature_and_supply_are_measured_in_the_own_slot_where_all_others_se
     stage = BoardStage().ready()
     superframe(stage)
     assert kinds(stage.reports()) == [Heard, Heard, Heard, Done, Heard, Heard, Heard]
-    stage.send(ASK_STATUS)
-    stage.turn()
-    (status,) = stage.reports()
+    (status,) = stage.ask(ASK_STATUS, turns=1)
     assert status.temperature_c == pytest.approx(31.0, abs=1.2)
     assert status.supply_v == pytest.approx(3.3, abs=0.02)
     for _ in range(10):
@@ -400,9 +380,7 @@ def test_where_no_slot_is_free_the_measurement_costs_one_reception_a_minute():
         lost += stage.outcome != "heard"
         stage.turn()
     assert lost <= 1
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert stage.reports()[-1].temperature_c is not None
+    assert stage.ask(ASK_STATUS, turns=1)[-1].temperature_c is not None
 
 
 # What comes from the host may be anything
@@ -429,9 +407,7 @@ def test_nothing_that_a_host_says_stops_a_board(pieces):
         stage.turn(3)
         assert not [one for one in stage.reports() if isinstance(one, str)]
     stage.bus.to_board += b"\0"
-    stage.send(ASK_STATUS)
-    stage.turn(40)
-    assert kinds(stage.reports())[-1] is Status
+    assert kinds(stage.ask(ASK_STATUS, turns=40))[-1] is Status
     assert not +stage.chip.misuse
     assert {one.frame for one in stage.air.sent} <= {SHORT}
 
@@ -447,9 +423,7 @@ def test_a_flood_of_noise_costs_no_reception_and_restarts_the_line():
     assert stage.bus.restarts >= 1
     assert kinds(stage.reports()) == [Heard] * 300
     stage.bus.to_board[:] = b"\0"
-    stage.send(ASK_STATUS)
-    stage.turn(2)
-    assert stage.reports()[-1].garbled > 100
+    assert stage.ask(ASK_STATUS, turns=2)[-1].garbled > 100
 
 
 def test_a_host_that_does_not_read_costs_records_and_they_are_counted():
@@ -462,9 +436,7 @@ def test_a_host_that_does_not_read_costs_records_and_they_are_counted():
     assert stage.board.chip.received == 100
     kept = len(stage.reports())
     assert 0 < kept < 12
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert stage.reports()[0].unsent_records == 100 - kept
+    assert stage.ask(ASK_STATUS, turns=1)[0].unsent_records == 100 - kept
 
 
 def test_the_clock_may_wrap():
