@@ -61,7 +61,8 @@ if __name__ == "__main__":
         use_sizes(sys.argv[1], Path(made))
         del sys.argv[:2]
         if sys.argv[0].endswith(".py"):
-            sys.path[:0] = [str(Path(sys.argv[0]).parent), str(ROOT / "firmware"), str(ROOT / "tests" / "core")]
+            folders = ("firmware", *(f"tests/{room}" for room in ("core", "native", "radio", "firmware")))
+            sys.path[:0] = [str(Path(sys.argv[0]).parent), *(str(ROOT / folder) for folder in folders)]
             runpy.run_path(sys.argv[0], run_name="__main__")
         else:
             runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
