@@ -50,7 +50,7 @@ def numbers(tmp_path_factory):
 
 
 @pytest.mark.parametrize("height_m", [0.0, None])
-def test_damaged_packets_leave_a_fix_that_is_a_number(numbers, height_m):
+def test_sanitizers_find_nothing_and_every_fix_is_a_number(numbers, height_m):
     episode = episode_of(MESH, 120, 3, ROOM_M)
     estimator = begun(episode, settings_of(height_m=height_m, stationary_s=0.5, **ERRORS), ROOM_M, std_m=0.1)
     damaged, accepted, wrong = numbers("damaged", input_of(estimator, episode.packets, ROOM_M))
