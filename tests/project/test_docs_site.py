@@ -79,6 +79,9 @@ def anchors(page):
     return frozenset(found)
 
 
+WRITTEN = {".py", ".js", ".html", ".toml", ".service", ".env"}
+
+
 @cache
 def files():
     """All files of the repository's own folders, and their folders, as paths with a slash in front."""
@@ -96,7 +99,9 @@ def words():
     found = set()
     for name in files():
         path = ROOT / name[1:]
-        if path.suffix in {".py", ".js", ".html", ".toml", ".service", ".env"} or "/scripts/" in name:
+        if path.suffix in {".py", ".js", ".html", ".toml", ".service", ".env"} or (
+            "/scripts/" in name and path.is_file()
+        ):
             found.update(re.findall(r"\w+", path.read_text(encoding="utf-8")))
     found.update(re.findall(r"\w+", (ROOT / "compose.yaml").read_text(encoding="utf-8")))
     return frozenset(found)
