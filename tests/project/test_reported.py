@@ -1,6 +1,5 @@
 """Every test that ``docs/reported.md`` names exists."""
 
-import ast
 import re
 from pathlib import Path
 
@@ -9,6 +8,6 @@ ROOT = Path(__file__).parents[2]
 
 def test_the_tests_are_there():
     named = set(re.findall(r"`(test_\w+)`", (ROOT / "docs" / "reported.md").read_text(encoding="utf-8")))
-    trees = [ast.parse(file.read_text(encoding="utf-8")) for file in (ROOT / "tests").rglob("test_*.py")]
+    texts = (file.read_text(encoding="utf-8") for file in (ROOT / "tests").rglob("test_*.py"))
     assert len(named) > 50
-    assert named - {getattr(node, "name", "") for tree in trees for node in ast.walk(tree)} == set()
+    assert named - {name for text in texts for name in re.findall(r"def (test_\w+)", text)} == set()
