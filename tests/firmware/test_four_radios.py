@@ -47,8 +47,8 @@ def tape():
     for broadcast in world.run(SECONDS):
         for _, reception, _ in broadcast.receptions():
             emulated.append(replace(reception, host_s=world.medium.now_s))
-            told = reception.frame, reception.rx_ticks, reception.diagnostics, world.medium.now_s
-            driver.append(tag.hear(*told, phase_cycles=reception.carrier_phase_cycles))
+            given = reception.frame, reception.rx_ticks, reception.diagnostics, world.medium.now_s
+            driver.append(tag.hear(*given, phase_cycles=reception.carrier_phase_cycles))
     rounded = [
         replace(one, diagnostics=other.diagnostics, carrier_phase_cycles=other.carrier_phase_cycles)
         for one, other in zip(emulated, driver, strict=True)
