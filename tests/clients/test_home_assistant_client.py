@@ -71,9 +71,9 @@ class HomeAssistant:
 
     def __init__(self, python, folder, port, *user):
         environment = {"PATH": "/usr/bin:/bin", "HOME": str(folder)}
-        self._process = Process(python, DRIVER, folder, port, *user, env=environment, cwd=folder)
-        self.lines = self._process.lines
-        self._process.said('"ready"')
+        process = Process(python, DRIVER, folder, port, *user, env=environment, cwd=folder)
+        self.lines, self.stop = process.lines, process.stop
+        process.said('"ready"')
 
     def states(self):
         """By unique id; entities that are gone are left out."""
@@ -90,11 +90,11 @@ class HomeAssistant:
     def state(self, key, tag="tag1"):
         return self.states().get(f"skyless_1_{tag}_{key}", {}).get("state")
 
+    def has_rooms(self):
+        return self.state("room") in {"West", "East"} and self.state("position") == "Hall"
+
     def of_tag(self, tag="tag1"):
         return {name: value["state"] for name, value in self.states().items() if name.startswith(f"skyless_1_{tag}_")}
-
-    def stop(self):
-        self._process.stop()
 
 
 @pytest.fixture
@@ -114,8 +114,8 @@ def make_home(python, tmp_path):
         home.stop()
 
 
-def zones_of(*zones):
-    return msgspec.json.encode(ZonesMessage(zones, "lab"))
+def set_zones(site, *zones):
+    site.publish(ZONES, msgspec.json.encode(ZonesMessage(zones, "lab")), retain=True)
 
 
 def walk(site, xs, tag="walker"):
@@ -132,13 +132,12 @@ def walk(site, xs, tag="walker"):
 
 def test_tags_are_devices_whose_rooms_follow_the_polygons(make_home, tmp_path):
     with ClientSite(tmp_path) as site:
-        site.publish(ZONES, zones_of(WEST, EAST), retain=True)
+        set_zones(site, WEST, EAST)
         site.run("bridge", "homeassistant:").said("bridging")
         home = make_home(site.mqtt_port)
         until(lambda: len(home.of_tag()) == 5)
-        until(lambda: home.state("room") in {"West", "East"})
+        until(home.has_rooms)
         until(lambda: sorted((home.state("zone_z1"), home.state("zone_z2"))) == ["off", "on"])
-        until(lambda: home.state("position") == "Hall")
         until(lambda: home.state("accuracy") not in {"unknown", "unavailable"})
         assert 0.0 < float(home.state("accuracy")) < 0.5
         attributes = home.states()["skyless_1_tag1_position"]["attributes"]
@@ -154,10 +153,10 @@ def test_tags_are_devices_whose_rooms_follow_the_polygons(make_home, tmp_path):
         until(lambda: home.state("room", "walker") == "unavailable")  # it sends no more fixes
 
         before = set(home.states())
-        site.publish(ZONES, zones_of(EAST, WEST.__class__("z1", "Library", WEST.polygon_m)), retain=True)
+        set_zones(site, EAST, Zone("z1", "Library", WEST.polygon_m))
         until(lambda: home.state("room") in {"Library", "East"})
         assert set(home.states()) == before
-        site.publish(ZONES, zones_of(Zone("z1", "All", ((-9, -9), (19, -9), (19, 19), (-9, 19)))), retain=True)
+        set_zones(site, Zone("z1", "All", ((-9, -9), (19, -9), (19, 19), (-9, 19))))
         until(lambda: home.state("room") == "All")
         until(lambda: len(home.of_tag()) == 4)  # the other zone's sensor is removed
 
@@ -167,17 +166,16 @@ def test_tags_are_devices_whose_rooms_follow_the_polygons(make_home, tmp_path):
 
 def test_a_killed_tag_is_unavailable_and_a_restarted_home_assistant_has_all_states(make_home, tmp_path):
     with ClientSite(tmp_path) as site:
-        site.publish(ZONES, zones_of(WEST, EAST), retain=True)
+        set_zones(site, WEST, EAST)
         bridge = site.run("bridge", "homeassistant:")
         home = make_home(site.mqtt_port)
-        until(lambda: home.state("room") in {"West", "East"} and home.state("position") == "Hall")
+        until(home.has_rooms)
         before = set(home.of_tag())
 
         site.tag.kill()
-        took_s = until(lambda: set(home.of_tag().values()) == {"unavailable"}, KILLED_S)
-        print(f"a killed tag is unavailable after {took_s:.1f} s")  # noqa: T201 - for a person who looks
+        until(lambda: set(home.of_tag().values()) == {"unavailable"}, KILLED_S)
         site.start_tag()
-        until(lambda: home.state("room") in {"West", "East"} and home.state("position") == "Hall")
+        until(home.has_rooms)
 
         until(lambda: json.loads(site.retained(ZONE))["usable"])
         status = json.loads(site.retained(CONFIG))["availability"][0]["topic"]
@@ -187,7 +185,7 @@ def test_a_killed_tag_is_unavailable_and_a_restarted_home_assistant_has_all_stat
         until(lambda: site.retained(status) != online)
         site.publish(status, online, retain=True)  # as if the bridge were there, but nothing new can come from it
         home = make_home(site.mqtt_port)
-        until(lambda: home.state("room") in {"West", "East"} and home.state("position") == "Hall")
+        until(home.has_rooms)
         until(lambda: home.state("accuracy") not in {"unknown", "unavailable"})
         assert set(home.of_tag()) == before
 
@@ -196,5 +194,5 @@ def test_a_killed_tag_is_unavailable_and_a_restarted_home_assistant_has_all_stat
         bridge.kill()
         until(lambda: set(home.of_tag().values()) == {"unavailable"}, KILLED_S)
         site.run("bridge", "homeassistant:")
-        until(lambda: home.state("room") in {"West", "East"} and home.state("position") == "Hall")
+        until(home.has_rooms)
         assert set(home.of_tag()) == before

@@ -249,11 +249,11 @@ def test_ros_reads_the_bag(ros, tmp_path):
     assert main(["export", str(recording), "--to", str(tmp_path / "bag")]) == 0
     read = found_by(ros.start(PROGRAM, "bag", tmp_path / "bag" / "bag.mcap"))
     assert read["profile"] == "ros2"
-    assert {coding for _, coding, _, _ in read["messages"]} == {"cdr/ros2msg"}
+    assert {coding for _, coding, _ in read["messages"]} == {"cdr/ros2msg"}
     with McapRecording(recording) as source:
         fixes = list(source.fixes())
     for tag in ("a", "b"):
-        poses = [message for topic, _, _, message in read["messages"] if topic == f"/skyless/{tag}/pose"]
+        poses = [message for topic, _, message in read["messages"] if topic == f"/skyless/{tag}/pose"]
         assert [stamp_of(one) for one in poses] == [exact(fix.unix_s) for fix in fixes if fix.tag == tag]
         assert [xyz(one["pose"]["pose"]["position"]) for one in poses] == [
             fix.position_m for fix in fixes if fix.tag == tag

@@ -179,8 +179,8 @@ class BoardStage:
     def arrive(self, frame, *, fault=None, power_dbm=-80.0, phase_cycles=None):
         """A frame whose end is now; its RX stamp."""
         stamp = wrap(self.air.ticks - from_seconds(after_rmarker_s(len(frame))))
-        told = Diagnostics(power_dbm, power_dbm - 3.0, 1.0)
-        self.outcome = self.chip.receive(frame, stamp, told, fault, carrier_phase_cycles=phase_cycles)
+        powers = Diagnostics(power_dbm, power_dbm - 3.0, 1.0)
+        self.outcome = self.chip.receive(frame, stamp, powers, fault, carrier_phase_cycles=phase_cycles)
         return stamp
 
 

@@ -45,6 +45,12 @@ def test_python_knows_all_fields_of_the_chip_in_c():
     assert places()["chip_bytes"] == ctypes.sizeof(dw1000.DW1000)
 
 
+@pytest.fixture
+def stage():
+    """A board that a host has set up."""
+    return BoardStage().ready()
+
+
 # What it answers
 
 
@@ -83,16 +89,14 @@ RIGHT = bytes((5, 64, 2, 9, 128, 0, 52, 64, 52, 64, 0))
         (TX_AT, bytes(5) + FRAME[:-1] + bytes((FRAME[-1] ^ 1,)), MALFORMED),
     ],
 )
-def test_what_it_cannot_do_is_refused(kind, body, reason):
-    stage = BoardStage().ready()
+def test_what_it_cannot_do_is_refused(stage, kind, body, reason):
     stage.bus.to_board += line_of(kind, body)
     stage.turn(5)
     assert stage.reports() == [NotDone(kind, reason)]
     assert stage.board.chip.state == dw1000.LISTENING
 
 
-def test_a_later_version_may_append_fields_and_add_kinds():
-    stage = BoardStage().ready()
+def test_a_later_version_may_append_fields_and_add_kinds(stage):
     for line in (line_of(CONFIG, RIGHT + b"more"), line_of(0x7E, b"new")):
         stage.bus.to_board += line
     stage.turn(2)
@@ -102,8 +106,7 @@ def test_a_later_version_may_append_fields_and_add_kinds():
 
 
 @pytest.mark.parametrize("size", [1, 98, 125])
-def test_receptions_are_reported_with_the_chips_own_stamp(size):
-    stage = BoardStage().ready()
+def test_receptions_are_reported_with_the_chips_own_stamp(stage, size):
     stage.air.pass_s(1e-3)
     stamp = stage.arrive(frame_of(range(size)))
     stage.turn()
@@ -133,8 +136,7 @@ def test_phases_are_reported_as_long_as_the_host_wants_them(receptions):
     assert not +stage.chip.misuse
 
 
-def test_errors_are_counted_and_it_listens_on():
-    stage = BoardStage().ready()
+def test_errors_are_counted_and_it_listens_on(stage):
     for fault in ("header", "parity", "delimiter", "first-path"):
         stage.air.pass_s(1e-3)
         stage.arrive(FRAME, fault=fault)
@@ -155,8 +157,7 @@ def test_errors_are_counted_and_it_listens_on():
     [(450, 1), (1000, 100), (1200, 37), (3000, 37), (14_700, 1), (14_700, 100), (2_000_000, 37)],
 )
 @pytest.mark.statistical
-def test_frames_leave_at_their_tick_and_the_receiver_is_off_no_longer_than_needed(ahead_us, step_us):
-    stage = BoardStage().ready()
+def test_frames_leave_at_their_tick_and_the_receiver_is_off_no_longer_than_needed(stage, ahead_us, step_us):
     tx_ticks = stage.tx_at(ahead_us, SHORT)
     off_us, reports = 0, []
     if ahead_us > 10_000:
@@ -176,8 +177,7 @@ def test_frames_leave_at_their_tick_and_the_receiver_is_off_no_longer_than_neede
 
 
 @pytest.mark.parametrize(("flags", "lead_us"), [(0, LEAD_US), (1, LEAD_US + 40)])
-def test_a_frame_is_handed_over_earlier_where_receptions_have_phases(flags, lead_us):
-    stage = BoardStage().ready()
+def test_a_frame_is_handed_over_earlier_where_receptions_have_phases(stage, flags, lead_us):
     stage.config(flags)
     stage.send(RX_ON)
     stage.turn(8)
@@ -191,8 +191,7 @@ def test_a_frame_is_handed_over_earlier_where_receptions_have_phases(flags, lead
 
 
 @pytest.mark.parametrize("ahead_us", [120, 0, -1, -5000, -8_000_000])
-def test_what_comes_too_late_is_reported_and_never_sent(ahead_us):
-    stage = BoardStage().ready()
+def test_what_comes_too_late_is_reported_and_never_sent(stage, ahead_us):
     stage.tx_at(ahead_us - 20, SHORT)
     stage.turn(500)
     (late,) = stage.reports()
@@ -201,8 +200,7 @@ def test_what_comes_too_late_is_reported_and_never_sent(ahead_us):
     assert stage.board.chip.state == dw1000.LISTENING
 
 
-def test_every_frame_is_answered_once_and_one_is_held_at_a_time():
-    stage = BoardStage().ready()
+def test_every_frame_is_answered_once_and_one_is_held_at_a_time(stage):
     first = stage.tx_at(5000, SHORT)
     stage.turn(2)
     second = stage.tx_at(9000, SHORT)
@@ -221,8 +219,7 @@ def test_a_tag_or_an_unconfigured_board_sends_nothing():
         assert stage.air.sent == []
 
 
-def test_a_frame_that_comes_shortly_before_ones_own_is_not_lost():
-    stage = BoardStage().ready()
+def test_a_frame_that_comes_shortly_before_ones_own_is_not_lost(stage):
     stage.tx_at(4000, SHORT)
     stage.pass_us(4000 - LEAD_US - 100)
     stage.arrive(FRAME)
@@ -230,8 +227,7 @@ def test_a_frame_that_comes_shortly_before_ones_own_is_not_lost():
     assert kinds(stage.reports()) == [Heard, Done]
 
 
-def test_a_frame_whose_end_the_chip_never_reports_is_cancelled():
-    stage = BoardStage().ready()
+def test_a_frame_whose_end_the_chip_never_reports_is_cancelled(stage):
     stage.air.in_time = False  # the air refuses it, and the chip shows nothing
     stage.tx_at(3000, SHORT)
     stage.pass_us(9000)
@@ -244,8 +240,7 @@ def test_a_frame_whose_end_the_chip_never_reports_is_cancelled():
 # When something fails
 
 
-def test_a_chip_that_was_reset_is_reported_and_can_be_configured_again():
-    stage = BoardStage().ready()
+def test_a_chip_that_was_reset_is_reported_and_can_be_configured_again(stage):
     stage.tx_at(900_000, SHORT)
     stage.turn(4)
     stage.chip.pull_reset()
@@ -264,8 +259,7 @@ def test_a_chip_that_was_reset_is_reported_and_can_be_configured_again():
 
 
 @pytest.mark.parametrize("after_us", [1, 10_000, 14_350, 14_420, 14_600, 14_900])
-def test_a_chip_that_loses_its_supply_before_a_frame_is_due_sends_nothing_wrong(after_us):
-    stage = BoardStage().ready()
+def test_a_chip_that_loses_its_supply_before_a_frame_is_due_sends_nothing_wrong(stage, after_us):
     stage.pass_us(20_000)
     stage.tx_at(15_000, SHORT)
     stage.pass_us(after_us)
@@ -276,8 +270,7 @@ def test_a_chip_that_loses_its_supply_before_a_frame_is_due_sends_nothing_wrong(
     assert TooLate in kinds(stage.reports())
 
 
-def test_a_chip_that_looks_right_and_has_lost_its_settings_is_found_soon():
-    stage = BoardStage().ready()
+def test_a_chip_that_looks_right_and_has_lost_its_settings_is_found_soon(stage):
     stage.chip.memory.write(0x1F, 0, b"\0")
     stage.pass_us(CHECK_US + 1000)
     assert kinds(stage.reports()) == [Hello]
@@ -300,8 +293,7 @@ def test_a_board_without_a_chip_says_so_and_goes_on():
 
 
 @pytest.mark.parametrize("stuck", [True, False])
-def test_a_stuck_interrupt_line_is_reported_and_the_chip_is_polled(stuck):
-    stage = BoardStage().ready()
+def test_a_stuck_interrupt_line_is_reported_and_the_chip_is_polled(stage, stuck):
     stage.bus.stuck = stuck
     for _ in range(8):  # what the slow polls find shows that the line is dead
         stage.arrive(FRAME)
@@ -350,8 +342,7 @@ def superframe(stage, slot_us=2100, slots=7, mine=3):
     stage.pass_us(1e6 * (begin - stage.air.now_s()) + slots * slot_us)
 
 
-def test_temperature_and_supply_are_measured_in_the_own_slot_where_all_others_send():
-    stage = BoardStage().ready()
+def test_temperature_and_supply_are_measured_in_the_own_slot_where_all_others_send(stage):
     superframe(stage)
     assert kinds(stage.reports()) == [Heard, Heard, Heard, Done, Heard, Heard, Heard]
     (status,) = stage.ask(ASK_STATUS, turns=1)
@@ -431,8 +422,7 @@ def test_a_flood_of_noise_costs_no_reception_and_restarts_the_line():
     assert stage.ask(ASK_STATUS, turns=2)[-1].garbled > 100
 
 
-def test_a_host_that_does_not_read_costs_records_and_they_are_counted():
-    stage = BoardStage().ready()
+def test_a_host_that_does_not_read_costs_records_and_they_are_counted(stage):
     stage.bus.room = 1024
     for _ in range(100):
         stage.air.pass_s(1e-3)

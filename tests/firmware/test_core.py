@@ -24,7 +24,7 @@ pytestmark = pytest.mark.site
 WITH_SIZES = [sys.executable, Path(__file__).parents[1] / "native" / "with_sizes.py"]
 SHORT = 4
 """Superframes that Python processes."""
-COUNTED = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "600"))
+COUNTED = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "1000"))
 """Receptions on the chip."""
 EVERY = 10
 """Of how many of them one is compared in all; what differs once differs from then on."""
@@ -46,7 +46,7 @@ def in_use(state):
 def test_both_forms_of_the_covariance_give_the_same_bits_in_python_and_c(tmp_path):
     """A process of its own has the packed form."""
     subprocess.run([*WITH_SIZES, "board-double", __file__, "forms", tmp_path], check=True)
-    program = runner(tmp_path, "gcc", "-O1")
+    program = runner(tmp_path, "gcc", "-O0")
     for name in SITES:
         packed = np.load(tmp_path / f"{name}.npz")
         rows, state = track(program, input_of(*case(name, SHORT)))
@@ -60,7 +60,7 @@ def save_packed(folder):
     programs = {}
     for language, *options in (("c",), ("hand", BY_HAND)):
         (folder / language).mkdir()
-        programs[language] = runner(folder / language, "gcc", "-O1", *BOARD_DOUBLE, *options)
+        programs[language] = runner(folder / language, "gcc", "-O0", *BOARD_DOUBLE, *options)
     for name in SITES:
         estimator, packets, anchors_m = case(name, SHORT)
         found = {language: track(program, input_of(*case(name, SHORT))) for language, program in programs.items()}
@@ -72,6 +72,7 @@ def save_packed(folder):
         np.savez(folder / name, **arrays, **{f"{language}_P": in_use(state) for language, (_, state) in found.items()})
 
 
+@pytest.mark.statistical
 @needs_processor
 @needs("gcc", "clang", "wasm-ld", "node")
 def test_the_chip_this_computer_and_webassembly_give_the_same_bits():

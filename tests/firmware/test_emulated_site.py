@@ -6,6 +6,7 @@ hosts: slots are skipped and counted, and never a frame leaves with a wrong stam
 """
 
 import asyncio
+import contextlib
 import json
 import os
 import random
@@ -261,25 +262,30 @@ class BoardsOnly(EmulatedSite):
 
 
 class Reports:
-    """Lines of JSON that come from a file while the site goes on in virtual time; gpsd has time of its own."""
+    """Lines of JSON that come from files while the site goes on in virtual time; gpsd has time of its own."""
 
-    def __init__(self, file):
-        self._file, self._rest = file, b""
-        os.set_blocking(file, False)
+    def __init__(self, *files):
+        self._rests = dict.fromkeys(files, b"")
+        for file in files:
+            os.set_blocking(file, False)
 
-    async def more(self, wanted, count=3):
-        """The next ones of a kind."""
-        found, deadline = [], time.perf_counter() + PATIENCE_S
+    def _read(self, file):
+        with contextlib.suppress(BlockingIOError):
+            *lines, self._rests[file] = (self._rests[file] + os.read(file, 1 << 20)).split(b"\n")
+            for line in lines:
+                with contextlib.suppress(ValueError):  # the rest of a line, or a record
+                    yield json.loads(line)
+
+    async def more(self, file, wanted, count=3):
+        """The next ones of a kind from a file."""
+        found, deadline, is_first = [], time.perf_counter() + PATIENCE_S, True
         while len(found) < count:
             assert time.perf_counter() < deadline
+            for one in self._rests:
+                found += [report for report in self._read(one) if one == file and not is_first and wanted(report)]
+            is_first = False  # what had come before does not count
             await asyncio.sleep(0.2)
             time.sleep(0.01)
-            try:
-                *lines, self._rest = (self._rest + os.read(self._file, 1 << 20)).split(b"\n")
-            except BlockingIOError:
-                continue
-            whole = [json.loads(line) for line in lines if line.startswith(b"{") and line.strip().endswith(b"}")]
-            found += filter(wanted, whole)
         return found
 
 
@@ -304,7 +310,7 @@ def test_gpsd_and_a_reader_of_json_have_the_tags_positions_through_faults(kind):
                     assert time.perf_counter() < deadline
                     time.sleep(0.1)
                 client.sendall(b'?WATCH={"enable":true,"json":true}\n')
-                reports, fixes = Reports(client.fileno()), Reports(file)
+                reports = Reports(client.fileno(), file)
                 for fault in (None, "anchor", "tag"):
                     if fault == "anchor":
                         await site.stop_host(site.anchors[2])
@@ -313,12 +319,12 @@ def test_gpsd_and_a_reader_of_json_have_the_tags_positions_through_faults(kind):
                         for tag in site.tags:
                             site.brown_out(tag, "both")
                         await asyncio.sleep(1.0)
-                    tpv = (await reports.more(lambda one: one["class"] == "TPV" and "lat" in one))[-1]
-                    gst = (await reports.more(lambda one: one["class"] == "GST"))[-1]
+                    tpv = (await reports.more(client.fileno(), lambda one: one["class"] == "TPV" and "lat" in one))[-1]
+                    gst = (await reports.more(client.fileno(), lambda one: one["class"] == "GST"))[-1]
                     east_m = (tpv["lon"] - longitude_deg) * 111_320.0 * cos(radians(latitude_deg))
                     north_m = (tpv["lat"] - latitude_deg) * 111_270.0
                     assert np.hypot(east_m, north_m) < 3.0 * gst["rms"] < 0.3
-                    last = (await fixes.more(lambda one: "position_m" in one))[-1]
+                    last = (await reports.more(file, lambda one: "position_m" in one))[-1]
                     assert last["tag"] == "tag2"
                     assert np.linalg.norm(np.subtract(last["position_m"], PLACES_M[1])) < 3.0 * last["std_m"] < 0.3
             finally:

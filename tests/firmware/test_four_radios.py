@@ -5,13 +5,14 @@ driver reads them from the chip's model, because chips round them.
 """
 
 from collections import Counter
+from functools import partial
 
-import msgspec
 import pytest
 from chip_stage import TimedNode, WorldAir
 from emulator.seat import Seat
+from firmware_stage import HOST, IMAGE, boards
+from msgspec.structs import replace
 from radio_events import fixes_of
-from site_stage import KINDS, boards
 
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.ticks import from_seconds, wrap
@@ -38,18 +39,18 @@ DELAYS = AntennaDelays()
 @pytest.fixture(scope="module")
 def tape():
     """What the tag's antenna gets, and that as the driver reads it; ``host_s`` is when each frame ended."""
-    faults = msgspec.structs.replace(impairments_of(Request(LAB, nlos=0.1, carrier=True), LAB), diagnostics=True)
+    faults = replace(impairments_of(Request(LAB, nlos=0.1, carrier=True), LAB), diagnostics=True)
     world = World(LAB, lambda number: Anchor(LAB, number), [TagSpec(Static(2.0, 3.0, 0.0))], faults, SEED)
     tag = TimedNode(WorldAir(world.medium, len(LAB.anchors)))
     tag.start()
     emulated, driver = [], []
     for broadcast in world.run(SECONDS):
         for _, reception, _ in broadcast.receptions():
-            emulated.append(msgspec.structs.replace(reception, host_s=world.medium.now_s))
-            told = reception.frame, reception.rx_ticks, reception.diagnostics, world.medium.now_s
-            driver.append(tag.hear(*told, phase_cycles=reception.carrier_phase_cycles))
+            emulated.append(replace(reception, host_s=world.medium.now_s))
+            given = reception.frame, reception.rx_ticks, reception.diagnostics, world.medium.now_s
+            driver.append(tag.hear(*given, phase_cycles=reception.carrier_phase_cycles))
     rounded = [
-        msgspec.structs.replace(one, diagnostics=other.diagnostics, carrier_phase_cycles=other.carrier_phase_cycles)
+        replace(one, diagnostics=other.diagnostics, carrier_phase_cycles=other.carrier_phase_cycles)
         for one, other in zip(emulated, driver, strict=True)
     ]
     return emulated, rounded
@@ -76,16 +77,14 @@ class TapeAir:
         pass
 
 
-def over_a_board(kind, tape):
-    """What a session with such a board reports."""
-    timeline = Timeline()
+@pytest.mark.parametrize("kind", [HOST, IMAGE])
+def test_a_board_gives_the_fixes_of_the_emulated_radio_bit_for_bit(kind, tape):
+    emulated, rounded = tape
+    timeline, events, lines, counters = Timeline(), [], [], Counter()
     air = TapeAir(timeline)
     chip = Chip(air, DELAYS.tx_ticks, DELAYS.rx_ticks, air.now_s)
-    events, counters = [], Counter()
-    lines = []
     session = LinkSession("the line", DELAYS, lines.append, events.append, counters, phases=True)
     board = boards(kind)(Seat(timeline, chip, lambda data: talk(session.on_data, data)))
-    first_s = tape[0].host_s
 
     def talk(call, *values):
         """Let the host do something, and the board get what it writes."""
@@ -94,37 +93,25 @@ def over_a_board(kind, tape):
             board.receive(lines.pop(0))
 
     def arrive(reception):
-        ended = timeline.now_ticks
-        air.reading = wrap(reception.rx_ticks + from_seconds(180e-6)), ended
-        told = reception.frame, reception.rx_ticks, reception.diagnostics
-        chip.receive(*told, carrier_phase_cycles=reception.carrier_phase_cycles)
+        air.reading = wrap(reception.rx_ticks + from_seconds(180e-6)), timeline.now_ticks
+        of_chip = reception.frame, reception.rx_ticks, reception.diagnostics
+        chip.receive(*of_chip, carrier_phase_cycles=reception.carrier_phase_cycles)
         board.notify()
 
     timeline.at(from_seconds(STARTS_S / 2), lambda: talk(session.begin))
-    air.reading = wrap(tape[0].rx_ticks - from_seconds(STARTS_S)), 0
-    for reception in tape:
-        at = from_seconds(STARTS_S + reception.host_s - first_s)
-        timeline.at(at, lambda reception=reception: arrive(reception))
-    for _ in timeline.run(from_seconds(STARTS_S + SECONDS + 0.1)):
-        pass
+    air.reading = wrap(emulated[0].rx_ticks - from_seconds(STARTS_S)), 0
+    for reception in emulated:
+        at = from_seconds(STARTS_S + reception.host_s - emulated[0].host_s)
+        timeline.at(at, partial(arrive, reception))
+    assert list(timeline.run(from_seconds(STARTS_S + SECONDS + 0.1))) == []
     getattr(board, "close", lambda: None)()
     assert set(chip.arrivals) == {"heard"}
     assert not +counters
     assert not +chip.misuse
-    return [event for event in events if isinstance(event, Reception)]
-
-
-def told_of(reception):
-    """What a board says of it but for when it came."""
-    return msgspec.structs.replace(reception, host_s=None)
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_board_gives_the_fixes_of_the_emulated_radio_bit_for_bit(kind, tape):
-    emulated, rounded = tape
-    heard = over_a_board(kind, emulated)
-    assert [told_of(one) for one in heard] == [told_of(one) for one in rounded]
+    heard = [event for event in events if isinstance(event, Reception)]
+    but_for_when = [[replace(one, host_s=None) for one in receptions] for receptions in (heard, rounded)]
+    assert but_for_when[0] == but_for_when[1]
     here = fixes_of(rounded)
-    assert here != fixes_of(msgspec.structs.replace(one, carrier_phase_cycles=None) for one in rounded)
+    assert here != fixes_of(replace(one, carrier_phase_cycles=None) for one in rounded)
     assert sum(fix is not None for fix in here[0]) > 150
     assert fixes_of(heard) == here

@@ -67,17 +67,18 @@ def program(tmp_path_factory):
     return make
 
 
-@pytest.fixture(scope="module")
-def firmware():
-    return build("all")
-
-
 @pytest.fixture
-def started(firmware):
-    """The firmware, and the bytes that it sent first."""
-    stage = LoneBoard(firmware)
-    stage.run(5e-3)
-    return stage
+def start(program):
+    """A function that makes a board with a program, or with the firmware, and lets so much time pass."""
+
+    def make(seconds=None, name=None, clock_ppm=0.0, can_transmit=True, **macros):
+        elf = build("all") if name is None else program(name, **macros)
+        stage = LoneBoard(elf, clock_ppm=clock_ppm, can_transmit=can_transmit)
+        if seconds:
+            stage.run(seconds)
+        return stage
+
+    return make
 
 
 def words(data):
@@ -112,9 +113,8 @@ def is_sound(stage):
 # The line
 
 
-def test_bytes_take_their_time_both_ways(program):
-    stage = LoneBoard(program("START"))
-    stage.run(1e-3)
+def test_bytes_take_their_time_both_ways(start):
+    stage = start(1e-3, "START")
     assert stage.sent == b"\0"
     for value in (10, 20, 255):
         arrived_us = stage.write(bytes((value,)))
@@ -125,17 +125,16 @@ def test_bytes_take_their_time_both_ways(program):
     assert stage.image.misuse.total() == 0
 
 
-def test_a_long_transfer_arrives_record_by_record(started):
-    (zero_us, zero), (hello_us, hello) = started.lines
+def test_a_long_transfer_arrives_record_by_record(start):
+    (zero_us, zero), (hello_us, hello) = start(5e-3).lines
     assert zero == b"\0"
     assert hello[-1] == 0
     assert 0 not in hello[:-1]
     assert hello_us - zero_us >= 10.0 * len(hello) - 0.1
 
 
-def test_the_ring_goes_round_without_the_processor(program):
-    stage = LoneBoard(program("RING"))
-    stage.run(1e-3)
+def test_the_ring_goes_round_without_the_processor(start):
+    stage = start(1e-3, "RING")
     total = 0
     for length in (3, 254, 255, 256, 700):
         data = bytes(1 + at % 250 for at in range(length - 1)) + b"\0"
@@ -147,9 +146,8 @@ def test_the_ring_goes_round_without_the_processor(program):
     assert stage.image.misuse.total() == 0
 
 
-def test_what_comes_to_a_receiver_that_is_off_is_lost_and_counted(program):
-    stage = LoneBoard(program("SLEEP"))
-    stage.run(1e-3)
+def test_what_comes_to_a_receiver_that_is_off_is_lost_and_counted(start):
+    stage = start(1e-3, "SLEEP")
     stage.write(b"abc")
     stage.run(1e-3)
     assert stage.image.misuse == {"uarte-byte-lost": 3}
@@ -158,9 +156,8 @@ def test_what_comes_to_a_receiver_that_is_off_is_lost_and_counted(program):
 # The chip
 
 
-def test_the_chip_answers_over_spi_and_its_line_wakes_the_processor(program):
-    stage = LoneBoard(program("CHIP"))
-    stage.run(2e-3)
+def test_the_chip_answers_over_spi_and_its_line_wakes_the_processor(start):
+    stage = start(2e-3, "CHIP")
     assert stage.sent == r.DEV_ID.reset.to_bytes(4, "little")
     (came_us, _), *_ = stage.lines
     assert came_us > 8 * 5 / 2.0 + 40.0  # five bytes at 2 Mbit/s, four on the line
@@ -181,10 +178,9 @@ def test_the_chip_answers_over_spi_and_its_line_wakes_the_processor(program):
 
 
 @pytest.mark.parametrize("clock_ppm", [0.0, 40.0])
-def test_the_timer_ends_sleeps(program, clock_ppm):
-    stage = LoneBoard(program("SLEEP"), clock_ppm=clock_ppm)
-    stage.run(10e-3)
-    slept = [int.from_bytes(stage.sent[at : at + 4], "little") for at in (0, 4)]
+def test_the_timer_ends_sleeps(start, clock_ppm):
+    stage = start(10e-3, "SLEEP", clock_ppm=clock_ppm)
+    slept = words(stage.sent)
     assert 1003 <= slept[0] <= 1006  # 3 µs to wake up
     assert 53 <= slept[1] <= 56 + 51  # and the first word on the line
     (first_us, _), *_ = stage.lines
@@ -194,20 +190,14 @@ def test_the_timer_ends_sleeps(program, clock_ppm):
 
 
 @pytest.mark.parametrize("macros", [{}, {"AWAKE": 1}])
-def test_a_watchdog_that_is_not_fed_resets(program, macros):
-    stage = LoneBoard(program("WATCHDOG", **macros))
-    stage.run(36e-3)
+def test_a_watchdog_that_is_not_fed_resets_and_a_power_cycle_leaves_no_cause(start, macros):
+    stage = start(36e-3, "WATCHDOG", **macros)
     assert stage.sent == b"\0"
     stage.run(36e-3)
     assert stage.sent == bytes((0, WATCHDOG))
     (start_us, _), (again_us, _) = stage.lines
     assert again_us - start_us == pytest.approx(27e3 + 328 / 32768 * 1e6, abs=60.0)
     assert stage.image.resets == {"watchdog": 1}
-
-
-def test_a_power_cycle_leaves_no_cause(program):
-    stage = LoneBoard(program("WATCHDOG"))
-    stage.run(40e-3)
     stage.image.power_cycle()
     stage.run(5e-3)
     assert stage.sent == bytes((0, WATCHDOG, 0))
@@ -228,9 +218,8 @@ UNDEFINED = '__asm volatile("udf #0")'
         ('__asm volatile("vmov.f32 s0, #1.0")', "PC 0x"),  # with the floating-point unit still off
     ],
 )
-def test_a_fault_ends_in_its_handler(program, forbidden, address):
-    stage = LoneBoard(program("FAULT", FORBIDDEN=forbidden))
-    stage.run(5e-3)
+def test_a_fault_ends_in_its_handler(start, forbidden, address):
+    stage = start(5e-3, "FAULT", FORBIDDEN=forbidden)
     assert stage.sent[0] == 0
     assert stage.sent[2:] == bytes((SOFTWARE, 0x77))
     (fault,) = stage.image.core.faults
@@ -238,18 +227,16 @@ def test_a_fault_ends_in_its_handler(program, forbidden, address):
     assert address in fault
 
 
-def test_a_fault_in_the_handler_is_a_lockup(program):
-    stage = LoneBoard(program("FAULT", FORBIDDEN=UNDEFINED, FAULT_IN_HANDLER=1))
-    stage.run(5e-3)
+def test_a_fault_in_the_handler_is_a_lockup(start):
+    stage = start(5e-3, "FAULT", FORBIDDEN=UNDEFINED, FAULT_IN_HANDLER=1)
     assert stage.sent[2:] == bytes((LOCKUP, 0x77))
     assert len(stage.image.core.faults) == 2
 
 
-def test_a_stack_that_is_too_long_changes_no_variable(program):
+def test_a_stack_that_is_too_long_changes_no_variable(start):
     """Below it is nothing: the processor can neither go on nor enter its handler."""
     beyond = f'__asm volatile("ldr r0, =stack_top-{STACK_BYTES - 8}\\n mov sp, r0\\n push {{r0-r3}}")'
-    stage = LoneBoard(program("FAULT", FORBIDDEN=beyond))
-    stage.run(100e-6)
+    stage = start(100e-6, "FAULT", FORBIDDEN=beyond)
     assert stage.sent[2] == LOCKUP
     assert set(stage.image.resets) == {"lockup"}
 
@@ -264,8 +251,8 @@ def test_a_stack_that_is_too_long_changes_no_variable(program):
         ('__asm volatile("cpsie i\\nwfi")', "PRIMASK"),
     ],
 )
-def test_what_is_not_modelled_is_an_error_that_names_it(program, forbidden, message):
-    stage = LoneBoard(program("SILENT", FORBIDDEN=forbidden))
+def test_what_is_not_modelled_is_an_error_that_names_it(start, forbidden, message):
+    stage = start(None, "SILENT", FORBIDDEN=forbidden)
     with pytest.raises(EmulationError, match=message):
         stage.run(1e-3)
 
@@ -273,13 +260,12 @@ def test_what_is_not_modelled_is_an_error_that_names_it(program, forbidden, mess
 # Instructions
 
 
-def test_conditional_instructions_around_peripherals(program):
-    stage = LoneBoard(program("CONDITIONAL"))
+def test_conditional_instructions_around_peripherals(start):
+    stage = start(None, "CONDITIONAL")
     for _ in range(400):
         stage.run(7.3e-6)  # many stops within the program
     stage.run(5e-3)
-    values = [int.from_bytes(stage.sent[at : at + 4], "little") for at in (0, 4, 8)]
-    assert values == [250, 750, 999]
+    assert words(stage.sent) == [250, 750, 999]
 
 
 def cycles_of_a_turn(program, body, cached):
@@ -335,10 +321,9 @@ def test_code_in_two_lines_of_flash_waits_unless_it_is_cached(program):
 
 
 @pytest.mark.parametrize("milliseconds", [1, 1000, 3_600_000])
-def test_the_clock_goes_on_over_long_sleeps_in_which_nothing_draws_current(program, milliseconds):
+def test_the_clock_goes_on_over_long_sleeps_in_which_nothing_draws_current(start, milliseconds):
     """Within the slow clock's period of 31 us at both ends; two sleeps of an hour, which the clock's wrap allows."""
-    stage = LoneBoard(program("LONG_SLEEP", MILLISECONDS=f"{milliseconds}u"))
-    stage.run(0.301)
+    stage = start(0.301, "LONG_SLEEP", MILLISECONDS=f"{milliseconds}u")
     for _ in range(20):
         stage.run(2e-3 * milliseconds / 20)
         if stage.image.is_asleep and milliseconds > 1 and len(stage.sent) < 16:
@@ -356,8 +341,8 @@ def test_the_clock_goes_on_over_long_sleeps_in_which_nothing_draws_current(progr
     assert is_sound(stage)
 
 
-def test_a_chip_that_sleeps_when_the_processor_restarts_is_woken(started):
-    stage = started
+def test_a_chip_that_sleeps_when_the_processor_restarts_is_woken(start):
+    stage = start(5e-3)
     for octets in ("ec0a0000", "ec0605", "ec0202"):  # no counter; SLEEP_EN and WAKE_SPI; SAVE
         stage.chip.transfer(bytes.fromhex(octets), 2_000_000)
     stage.run(0.1)
@@ -367,7 +352,7 @@ def test_a_chip_that_sleeps_when_the_processor_restarts_is_woken(started):
     assert is_sound(stage)
 
 
-def test_settings_survive_restarts_and_a_cut_at_any_write(program):
+def test_settings_survive_restarts_and_a_cut_at_any_write(start):
     """After a cut there are the new ones, or none; never half of them."""
 
     def write(stage, value, seconds=0.1):
@@ -381,8 +366,7 @@ def test_settings_survive_restarts_and_a_cut_at_any_write(program):
         return stage.sent[sent:]
 
     def begun():
-        stage = LoneBoard(program("SETTINGS"))
-        stage.run(5e-3)
+        stage = start(5e-3, "SETTINGS")
         assert stage.sent[0] == 0
         write(stage, 0x11)
         assert stage.sent[-1] == 0x11
@@ -445,9 +429,8 @@ def test_the_whitening_is_that_of_published_captures():
     assert octets(whitening(37, 128)).hex() == "8dd257a13da766b07531114896" + "77f8e3"
 
 
-def test_an_advertisement_is_sent_on_three_channels_as_a_phone_expects_it(program):
-    stage = LoneBoard(program("ADVERTISE", DATA=",".join(map(str, DATA))))
-    stage.run(10e-3)
+def test_an_advertisement_is_sent_on_three_channels_as_a_phone_expects_it(start):
+    stage = start(10e-3, "ADVERTISE", DATA=",".join(map(str, DATA)))
     assert words(stage.sent) == [1, 0, 1]
     packets = stage.image.advertised
     assert [heard(packet) for packet in packets] == [
@@ -466,8 +449,8 @@ def test_an_advertisement_is_sent_on_three_channels_as_a_phone_expects_it(progra
         (0x53C, 0), (0x554, 36),
     ],
 )  # fmt: skip
-def test_a_wrong_register_is_a_packet_that_no_phone_receives(program, register, wrong):
-    stage = LoneBoard(program("ADVERTISE", DATA=",".join(map(str, DATA))))
+def test_a_wrong_register_is_a_packet_that_no_phone_receives(start, register, wrong):
+    stage = start(None, "ADVERTISE", DATA=",".join(map(str, DATA)))
     set_up = stage.image.radio.enable
 
     def enable():
@@ -481,10 +464,9 @@ def test_a_wrong_register_is_a_packet_that_no_phone_receives(program, register, 
 
 
 @pytest.mark.parametrize("comes", [True, False])
-def test_a_window_on_the_emulated_board(program, comes):
+def test_a_window_on_the_emulated_board(start, comes):
     """The interrupt of the frame, or of the window's end, wakes the processor; what each step takes is the page's."""
-    stage = LoneBoard(program("WINDOW"))
-    stage.run(1.3)
+    stage = start(1.3, "WINDOW")
     while len(stage.sent) < 16:
         stage.run(0.01e-3)
     start_us, sleep_us, wake_us, ask_us = words(stage.sent[:16])
@@ -520,9 +502,9 @@ def records_of(stage):
     return [cobs.decode(line) for line in stage.sent.split(b"\0") if line]
 
 
-def test_the_firmware_receives_and_sends_and_never_uses_half_of_its_stack(firmware):
+def test_the_firmware_receives_and_sends_and_never_uses_half_of_its_stack(start):
     """A configuration, a reception, bytes that are no record, a frame that is sent, and a measurement."""
-    stage = LoneBoard(firmware)
+    stage = start()
     start_radio(stage)
     records = records_of(stage)
     assert [record[0] for record in records] == [1, 5, 5]
@@ -559,11 +541,11 @@ def lights_of(stage, seconds):
     return seen
 
 
-def test_the_lights_say_what_the_page_of_the_firmware_states(firmware):
+def test_the_lights_say_what_the_page_of_the_firmware_states(start):
     page = (FIRMWARE / "README.md").read_text("utf-8")
     stated = re.findall(r"^\| \w+ \((D\d+), pin (\d+)\)", page, re.MULTILINE)
     assert {name: int(pin) for name, pin in stated} == LED_PINS
-    stage = LoneBoard(firmware)
+    stage = start()
     waiting = lights_of(stage, 2.2)
     assert set() in waiting
     assert {"D9"} in waiting
@@ -589,10 +571,10 @@ def test_the_lights_say_what_the_page_of_the_firmware_states(firmware):
     assert "D12" in stage.image.leds
 
 
-def test_a_grounded_pin_makes_a_tag_and_what_the_processors_errata_ask_for_is_done(firmware):
+def test_a_grounded_pin_makes_a_tag_and_what_the_processors_errata_ask_for_is_done(start):
     """Anomalies 108 (RAM in sleep) and 136 (causes that are set besides the reset pin's)."""
     for can_transmit in (True, False):
-        stage = LoneBoard(firmware, can_transmit=can_transmit)
+        stage = start(can_transmit=can_transmit)
         assert not stage.image.keeps_ram
         stage.run(5e-3)
         assert stage.image.keeps_ram
@@ -602,18 +584,18 @@ def test_a_grounded_pin_makes_a_tag_and_what_the_processors_errata_ask_for_is_do
         assert [(one.can_transmit, one.reset_cause) for one in hellos] == [(can_transmit, 0), (can_transmit, 1)]
 
 
-def test_a_crystal_that_never_starts_is_shown(firmware, monkeypatch):
+def test_a_crystal_that_never_starts_is_shown(start, monkeypatch):
     monkeypatch.setattr(peripherals, "HFCLK_START_CYCLES", 1 << 60)
-    stage = LoneBoard(firmware)
+    stage = start()
     for _ in range(5):
         stage.run(0.01)
         assert stage.image.leds == {"D12"}
     assert stage.sent == b""
 
 
-def test_a_line_that_starts_again_in_the_middle_of_bytes_is_not_behind(started):
+def test_a_line_that_starts_again_in_the_middle_of_bytes_is_not_behind(start):
     """Bytes that come while the receiver stops are counted, but get to RAM only when they are flushed."""
-    stage = started
+    stage = start(5e-3)
     stage.write(b"\1\1\0" * 40)
     stage.run(3e-3)
     stage.write(b"\0" + line_of(ASK_STATUS, b""))
@@ -622,8 +604,8 @@ def test_a_line_that_starts_again_in_the_middle_of_bytes_is_not_behind(started):
     assert stage.image.misuse.total() <= 2  # the fifth byte while it stops, after twenty garbled lines and twenty more
 
 
-def test_a_pin_is_high_while_the_firmware_is_awake(firmware):
-    stage = LoneBoard(firmware)
+def test_a_pin_is_high_while_the_firmware_is_awake(start):
+    stage = start()
     seen = set()
     for _ in range(2000):
         stage.run(3.1e-6)
@@ -631,17 +613,17 @@ def test_a_pin_is_high_while_the_firmware_is_awake(firmware):
     assert seen == {(False, False), (False, True), (True, False)}  # not yet an output; awake; asleep
 
 
-def test_a_run_repeats_itself(firmware):
+def test_a_run_repeats_itself(start):
     runs = []
     for _ in range(2):
-        stage = LoneBoard(firmware)
+        stage = start()
         start_radio(stage)
         runs.append((stage.lines, stage.image.core.cycles, stage.image.paths.costs))
     assert runs[0] == runs[1]
 
 
-def test_a_supply_that_fails_cuts_a_record_off_and_lets_the_chip_go(firmware):
-    stage = LoneBoard(firmware)
+def test_a_supply_that_fails_cuts_a_record_off_and_lets_the_chip_go(start):
+    stage = start()
     while not stage.sent:
         stage.run(50e-6)
     stage.image.power_cycle()  # HELLO is on the line

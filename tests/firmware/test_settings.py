@@ -180,16 +180,16 @@ def test_a_tag_that_becomes_a_radio_again_receives_nothing_before_its_host_asks(
 
 def test_a_tag_says_once_a_second_how_it_is():
     stage, _ = started(flash_of(TAG))
-    stage.pass_us(4_500_000)
+    stage.pass_us(2_500_000)
     found = stage.reports()
-    assert [type(one) for one in found] == [BoardStatus] * 4
+    assert [type(one) for one in found] == [BoardStatus] * 2
     assert {one.reason for one in found} == {NoFixReason.NO_BEACONS}
 
 
 @pytest.mark.parametrize(("output", "line"), [(1, rb"\$PSKY,,,5,,,,,,,,U\*..\r\n"), (2, rb'\{"type":"no_fix",.*\}\n')])
 def test_text_comes_in_whole_lines_of_its_own_beside_records(output, line):
     stage, _ = started(flash_of(replace(TAG, output=output)))
-    for _ in range(3):
+    for _ in range(2):
         stage.pass_us(1_100_000)
         stage.send(link.ASK_STATUS)
         stage.turn(8)
@@ -199,8 +199,8 @@ def test_text_comes_in_whole_lines_of_its_own_beside_records(output, line):
             text += piece
         elif piece:
             records += link.Reader().read(piece + b"\0")
-    assert [record[0] for record in records] == [link.STATUS] * 3
-    assert re.fullmatch(rb"(%s){3}" % line, text)
+    assert [record[0] for record in records] == [link.STATUS] * 2
+    assert re.fullmatch(rb"(%s){2}" % line, text)
 
 
 def test_records_of_a_board_that_writes_text_begin_behind_it():

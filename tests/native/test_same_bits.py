@@ -264,39 +264,34 @@ def test_there_is_room_for_all_anchors_and_no_more(states):
 # Packet by packet
 
 
-def with_range_errors(packets, draw):
-    """Each anchor's range is wrong by a constant of its own."""
-    return builders.late(packets, draw.uniform(-0.05, 0.05, packets.anchors.max() + 1)[packets.anchors])
-
-
-def with_late_ones(packets, draw):
-    """Single packets are late; one anchor is for the second third, another for the last quarter."""
-    count = len(packets.anchors)
-    some = np.where(draw.random(count) < 0.05, draw.exponential(1.0, count), 0.0)
-    packets = late_from(builders.late(with_range_errors(packets, draw), some), 2, 0.5, count // 3, 2 * count // 3)
-    return late_from(packets, 4, 1.5, 3 * count // 4)
-
-
-def with_losses(packets, draw):
-    """Half of all is lost; one anchor is silent for the second third, another's clock jumps in the middle."""
-    count = len(packets.anchors)
-    packets = builders.jumped(packets, 1, count // 2, 30.0)
-    is_silent = (packets.anchors == 3) & (np.arange(count) // (count // 3) == 1)
-    return builders.kept(packets, (draw.random(count) > 0.5) & ~is_silent)
-
-
-@pytest.mark.parametrize(
-    ("anchors_m", "height_m", "errors", "changed"),
-    [
-        (LAB_M, 0.0, {}, lambda packets, _: packets),
-        (LAB_M, 0.0, ERRORS, with_late_ones),
-        (ROOM_M, None, ERRORS, with_range_errors),
-        (ROOM_M, 0.0, ERRORS, with_losses),
-    ],
-    ids=["lab", "late", "3-D", "loss"],
-)
-def test_python_and_c_do_the_same_with_every_packet(anchors_m, height_m, errors, changed):
+@pytest.mark.parametrize("name", ["as they are", "late", "3-D", "lost"])
+def test_python_and_c_do_the_same_with_every_packet(name):
     """To and fro between the anchors at some 1 m/s, and at rest for the last third."""
+
+    def with_range_errors(packets):
+        """Each anchor's range is wrong by a constant of its own."""
+        return builders.late(packets, draw.uniform(-0.05, 0.05, packets.anchors.max() + 1)[packets.anchors])
+
+    def with_late_ones(packets):
+        """Single packets are late; one anchor is for the second third, another for the last quarter."""
+        count = len(packets.anchors)
+        some = np.where(draw.random(count) < 0.05, draw.exponential(1.0, count), 0.0)
+        packets = late_from(builders.late(with_range_errors(packets), some), 2, 0.5, count // 3, 2 * count // 3)
+        return late_from(packets, 4, 1.5, 3 * count // 4)
+
+    def with_losses(packets):
+        """Half of all is lost; one anchor is silent for the second third, another's clock jumps in the middle."""
+        count = len(packets.anchors)
+        packets = builders.jumped(packets, 1, count // 2, 30.0)
+        is_silent = (packets.anchors == 3) & (np.arange(count) // (count // 3) == 1)
+        return builders.kept(packets, (draw.random(count) > 0.5) & ~is_silent)
+
+    anchors_m, height_m, errors, changed = {
+        "as they are": (LAB_M, 0.0, {}, lambda packets: packets),
+        "late": (LAB_M, 0.0, ERRORS, with_late_ones),
+        "3-D": (ROOM_M, None, ERRORS, with_range_errors),
+        "lost": (ROOM_M, 0.0, ERRORS, with_losses),
+    }[name]
     frames, draw = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "240")), np.random.default_rng(1)
     time_s = np.minimum(np.arange(frames), 2 * frames // 3)[:, None] * builders.SLOT_S
     low_m, high_m = anchors_m.min(axis=0), anchors_m.max(axis=0)
@@ -308,7 +303,7 @@ def test_python_and_c_do_the_same_with_every_packet(anchors_m, height_m, errors,
     settings = settings_of(height_m=height_m, stationary_s=0.5, **errors)
     in_c, plain = begun(episode, settings, anchors_m), begun(episode, settings, anchors_m)
     outcomes = Counter()
-    for number, packet in enumerate(one_by_one(changed(episode.packets, draw))):
+    for number, packet in enumerate(one_by_one(changed(episode.packets))):
         outcome = process_frame(plain.state, *plain.packet_of(*packet), b"", 0)
         assert (in_c.process(*packet), in_c.rows) == (outcome, plain.rows), f"packet {number}"
         assert bits(in_c.state) == bits(plain.state), f"packet {number}"
@@ -327,43 +322,40 @@ COUNTED = {
 }  # fmt: skip
 
 
-def surveyed(received):
-    """A beacon half a metre from where it was, with other pages."""
-    beacon = decode(received.frame)
-    place = replace(beacon.position, x_m=beacon.position.x_m + 0.5)
-    page, heard = site_page_for(OTHERS, beacon.sequence, beacon.anchor), beacon.heard.packed[:32]
-    changed = replace(beacon, position=place, almanac_issue=site_issue(OTHERS), page=page, weak=0)
-    return replace(received, frame=encode(replace(changed, heard=PackedHeard(heard, beacon.has_phases))))
-
-
-def disturbed_frames(heard, draw):
+@pytest.mark.parametrize("site", [FREE, PHASES], ids=["stamps", "phases"])
+def test_a_receiver_gives_the_same_bits(monkeypatch, site):
     """Frames repeated, damaged, under other names or sites, with other stamps; a survey; a counter that restarts."""
+
+    def surveyed(received):
+        """A beacon half a metre from where it was, with other pages."""
+        beacon = decode(received.frame)
+        place = replace(beacon.position, x_m=beacon.position.x_m + 0.5)
+        page, heard = site_page_for(OTHERS, beacon.sequence, beacon.anchor), beacon.heard.packed[:32]
+        changed = replace(beacon, position=place, almanac_issue=site_issue(OTHERS), page=page, weak=0)
+        return replace(received, frame=encode(replace(changed, heard=PackedHeard(heard, beacon.has_phases))))
+
+    heard, sent, draw = [one.reception for one in tape(site, 1.2)], [], np.random.default_rng(4)
     after = len(heard) // 3
     for number, received in enumerate([*heard[:after], *map(surveyed, heard[after:])]):
         beacon, change = decode(received.frame), draw.random()
         one = replace(received, diagnostics=Diagnostics(-80.0, -80.0 - 14.0 * draw.random()))
         if number > 0.8 * len(heard):  # five seconds back
             one = replace(one, rx_ticks=(one.rx_ticks - 3 * 10**11) % 2**40, host_s=None)
-        yield one
+        sent.append(one)
         soon = replace(one, rx_ticks=one.rx_ticks + 10**6)
         if change < 0.05:
-            yield one
+            sent.append(one)
         elif change < 0.1:
-            yield replace(one, frame=one.frame[:-1] + b"\0", rx_ticks=one.rx_ticks + 10)
+            sent.append(replace(one, frame=one.frame[:-1] + b"\0", rx_ticks=one.rx_ticks + 10))
         elif change < 0.2:
             forged = {"tx_ticks": int(draw.integers(2**40)), "anchor": int(draw.integers(1, 12)), "heard": ()}
-            yield replace(soon, frame=encode(replace(beacon, **forged, weak=0)))
+            sent.append(replace(soon, frame=encode(replace(beacon, **forged, weak=0))))
         elif change < 0.25:
-            yield replace(soon, frame=encode(replace(beacon, site=77)))
+            sent.append(replace(soon, frame=encode(replace(beacon, site=77))))
         elif change < 0.3:
-            yield replace(soon, host_s=1e300)
-
-
-@pytest.mark.parametrize("site", [FREE, PHASES], ids=["stamps", "phases"])
-def test_a_receiver_gives_the_same_bits(monkeypatch, site):
+            sent.append(replace(soon, host_s=1e300))
     in_c, plain, fixes = receiver.Receiver(), receiver.Receiver(), 0
-    heard = [one.reception for one in tape(site, 1.2)]
-    for one in disturbed_frames(heard, np.random.default_rng(4)):
+    for one in sent:
         expected = in_c.hear(one)
         with monkeypatch.context() as patched:
             patched.setattr(receiver, "_hear_frame", hear_frame)
@@ -381,36 +373,31 @@ def test_a_receiver_gives_the_same_bits(monkeypatch, site):
 # Position by position
 
 
-def drawn_problem(draw):
-    """Anchors in a room, in a plane, nearly in a line, or on a lattice; TDoAs with little, much or absurd noise."""
-    anchors = int(draw.integers(3, 10)) if draw.random() < 0.95 else MAX_ANCHORS
-    anchors_m = draw.uniform(0.0, [20.0, 10.0, 5.0], (anchors, 3))
-    shape = int(draw.integers(5))
-    if shape == 1:
-        anchors_m[:, 2] = 2.5
-    elif shape == 2:
-        anchors_m[:, 2] = anchors_m[:, 0] + 10.0 ** draw.uniform(-9.0, 0.0) * draw.normal(size=anchors)
-    elif shape == 3:
-        anchors_m[:, 1:] = anchors_m[:, :1] + 10.0 ** draw.uniform(-7.0, 0.0) * draw.normal(size=(anchors, 2))
-    elif shape == 4:
-        anchors_m = np.round(anchors_m / 4.0) * 4.0
-    tag_m, std_m = draw.uniform(-3.0, [23.0, 13.0, 8.0]), 10.0 ** draw.uniform(-4.0, 0.0)
-    ranges_m = np.linalg.norm(anchors_m - tag_m, axis=1)
-    ranges_m += std_m * draw.choice([0.0, 1.0, 10.0, 300.0]) * draw.normal(size=anchors)
-    flags = {name: bool(draw.integers(2)) for name in ("knows_height", "is_weighted", "has_bounds")}
-    tail = draw.choice([0.0, 1e-9])
-    p = search.LocateProblem(anchors=anchors, **flags, height_m=tag_m[2], low_m=0.0, high_m=5.0, residual_tail=tail)
-    view(p.anchors_m)[:anchors], view(p.tdoa_m)[: anchors - 1] = anchors_m, ranges_m[1:] - ranges_m[0]
-    root = draw.normal(size=(anchors - 1, anchors - 1))
-    covariance = std_m**2 * (1.0 + np.eye(anchors - 1) + 0.1 * root @ root.T)
-    view(p.covariance)[: anchors * (anchors - 1) // 2] = covariance[np.tril_indices(anchors - 1)]
-    return p
-
-
 def test_a_position_has_the_same_bits():
+    """Anchors in a room, in a plane, nearly in a line, or on a lattice; TDoAs with little, much or absurd noise."""
     draw, in_c, kinds, reasons = np.random.default_rng(6), compiled(position.find_position), Counter(), Counter()
     for _ in range(400):
-        ours = drawn_problem(draw)
+        anchors = int(draw.integers(3, 10)) if draw.random() < 0.95 else MAX_ANCHORS
+        anchors_m = draw.uniform(0.0, [20.0, 10.0, 5.0], (anchors, 3))
+        shape = int(draw.integers(5))
+        if shape == 1:
+            anchors_m[:, 2] = 2.5
+        elif shape == 2:
+            anchors_m[:, 2] = anchors_m[:, 0] + 10.0 ** draw.uniform(-9.0, 0.0) * draw.normal(size=anchors)
+        elif shape == 3:
+            anchors_m[:, 1:] = anchors_m[:, :1] + 10.0 ** draw.uniform(-7.0, 0.0) * draw.normal(size=(anchors, 2))
+        elif shape == 4:
+            anchors_m = np.round(anchors_m / 4.0) * 4.0
+        tag_m, std_m = draw.uniform(-3.0, [23.0, 13.0, 8.0]), 10.0 ** draw.uniform(-4.0, 0.0)
+        ranges_m = np.linalg.norm(anchors_m - tag_m, axis=1)
+        ranges_m += std_m * draw.choice([0.0, 1.0, 10.0, 300.0]) * draw.normal(size=anchors)
+        flags = {name: bool(draw.integers(2)) for name in ("knows_height", "is_weighted", "has_bounds")}
+        numbers = {"height_m": tag_m[2], "low_m": 0.0, "high_m": 5.0, "residual_tail": draw.choice([0.0, 1e-9])}
+        ours = search.LocateProblem(anchors=anchors, **flags, **numbers)
+        view(ours.anchors_m)[:anchors], view(ours.tdoa_m)[: anchors - 1] = anchors_m, ranges_m[1:] - ranges_m[0]
+        root = draw.normal(size=(anchors - 1, anchors - 1))
+        covariance = std_m**2 * (1.0 + np.eye(anchors - 1) + 0.1 * root @ root.T)
+        view(ours.covariance)[: anchors * (anchors - 1) // 2] = covariance[np.tril_indices(anchors - 1)]
         theirs, found, found_in_c = type(ours).from_buffer_copy(ours), position.Found(), position.Found()
         reason = position.find_position(ours, found)
         assert in_c(theirs, found_in_c) == reason
