@@ -1,24 +1,19 @@
-"""Floors of a site: which a tag is on, zones that lie on one, and what a site's file may say."""
+"""Floors in a site's file."""
 
 from pathlib import Path
 
 import msgspec
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import FloorSite
-from skyless.run.mqtt.messages import SiteMessage, Zone, read_message, site_message
-from skyless.run.zones import ZoneMonitor, floor_at
+from skyless.run.mqtt.messages import SiteMessage, read_message, site_message
 from skyless.sim.lab import lab_site
 from skyless.site.file.check import plan_files
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
-from support.site_messages import a_fix, diagonal
 
-FLOORS = (FloorSite(-1, -3.0), FloorSite(0, 0.0), FloorSite(2, 6.5))
 PNG = b"\x89PNG\r\n\x1a\n" + bytes(4) + b"IHDR" + (9).to_bytes(4) + (7).to_bytes(4)
 SITE = """
 name = "House"
@@ -26,44 +21,6 @@ id = 3
 master = 1
 anchors = [{id = 1, x_m = 0, y_m = 0}, {id = 2, x_m = 9, y_m = 0}, {id = 3, x_m = 0, y_m = 9, z_m = 8}]
 """
-
-
-def fix(z_m, height_known=False):
-    covariance = diagonal(0.01, 0.01, 0.0 if height_known else 0.01)
-    return a_fix(position_m=(2.0, 2.0, z_m), covariance_m2=covariance, height_known=height_known)
-
-
-@given(st.floats(-20.0, 20.0), st.floats(0.0, 5.0))
-def test_a_tag_without_a_past_is_on_the_floor_below_it(z_m, std_m):
-    expected = -1 if z_m < 0.0 else 0 if z_m < 6.5 else 2
-    assert floor_at(FLOORS, z_m, std_m, None) == expected
-    assert floor_at(FLOORS, z_m, std_m, 77) == expected
-    assert floor_at((), z_m, std_m, 0) is None
-
-
-@given(st.lists(st.floats(-0.9, 0.9), min_size=1, max_size=30), st.sampled_from([(0.0, 0), (6.5, 2)]))
-def test_noise_within_the_margin_changes_no_floor(errors_m, boundary):
-    """At a boundary, with a standard deviation of 0.3 m, so a margin of 0.9 m."""
-    boundary_m, above = boundary
-    below = -1 if above == 0 else 0
-    for start in (below, above):
-        floor = start
-        for error_m in errors_m:
-            floor = floor_at(FLOORS, boundary_m + error_m * 0.999, 0.3, floor)
-        assert floor == start
-    assert floor_at(FLOORS, boundary_m + 1.0, 0.3, below) == above
-    assert floor_at(FLOORS, boundary_m + 2.5, 9.0, below) == above  # however wide, a third of a storey decides
-
-
-def test_a_zone_on_a_floor_holds_its_tags_only():
-    square = ((0.0, 0.0), (4.0, 0.0), (4.0, 4.0), (0.0, 4.0))
-    monitor = ZoneMonitor()
-    monitor.floors = FLOORS
-    monitor.set_zones((Zone("up", "Up", square, floor=2), Zone("all", "All", square)), 0.0)
-    assert {(e.zone, e.kind) for e in monitor.update(fix(1.0))} == {("all", "enter")}
-    assert [(e.zone, e.kind) for e in monitor.update(fix(8.0))] == [("up", "enter")]
-    assert [(e.zone, e.kind) for e in monitor.update(fix(1.0))] == [("up", "leave")]
-    assert {e.zone for e in monitor.update(fix(1.0, height_known=True))} == {"up"}
 
 
 def test_the_file_s_floors_travel_beside_the_site(tmp_path):
