@@ -291,30 +291,34 @@ def test_of_several_zones_the_smallest_comes_first_and_tags_leave_those_that_are
 # Floors
 
 
-FLOORS = (FloorSite(-1, -3.0), FloorSite(0, 0.0), FloorSite(2, 6.5))
+FLOORS = (FloorSite(-1, -3.0), FloorSite(0, 0.0), FloorSite(2, 6.0))
 
 
 @given(st.floats(-20.0, 20.0), st.floats(0.0, 5.0))
 def test_a_tag_without_a_past_is_on_the_floor_below_it(z_m, std_m):
-    expected = -1 if z_m < 0.0 else 0 if z_m < 6.5 else 2
+    expected = -1 if z_m < 0.0 else 0 if z_m < 6.0 else 2
     assert floor_at(FLOORS, z_m, std_m, None) == floor_at(FLOORS, z_m, std_m, 77) == expected
     assert floor_at((), z_m, std_m, 0) is None
 
 
 @pytest.mark.parametrize(
     ("boundary_m", "std_m", "margin_m"),
-    [(6.5, 0.25, 0.75), (0.0, 0.25, 0.75), (0.0, 0.01, 0.1), (0.0, 9.0, 1.0), (6.5, 9.0, 6.5 / 3.0)],
+    [(6.0, 0.25, 0.75), (0.0, 0.25, 0.75), (0.0, 0.01, 0.1), (0.0, 9.0, 1.0), (6.0, 9.0, 2.0)],
 )
 def test_a_tag_changes_floors_at_the_margin_of_three_sigma_that_is_neither_tiny_nor_above_a_third(
     boundary_m, std_m, margin_m
 ):
     low, high = (-1, 0) if boundary_m == 0.0 else (0, 2)
-    within_m, beyond_m = margin_m - 1e-9, margin_m + 1e-9
+    within_m = margin_m - 1e-9
     assert [floor_at(FLOORS, boundary_m + within_m, std_m, one) for one in (low, high)] == [low, high]
     assert [floor_at(FLOORS, boundary_m - within_m, std_m, one) for one in (low, high)] == [low, high]
-    assert floor_at(FLOORS, boundary_m + beyond_m, std_m, low) == high
-    assert floor_at(FLOORS, boundary_m - beyond_m, std_m, high) == low
-    assert floor_at(FLOORS, 9.0 if low == -1 else -3.0, std_m, low if low == -1 else high) == (2 if low == -1 else -1)
+    assert floor_at(FLOORS, boundary_m + margin_m, std_m, low) == high
+    assert floor_at(FLOORS, boundary_m - margin_m, std_m, high) == low
+
+
+def test_a_tag_that_skips_a_floor_has_no_margin():
+    assert floor_at(FLOORS, 6.0, 9.0, -1) == 2
+    assert floor_at(FLOORS, -1e-9, 9.0, 2) == -1
 
 
 def test_a_zone_on_a_floor_holds_its_tags_only():
@@ -326,6 +330,6 @@ def test_a_zone_on_a_floor_holds_its_tags_only():
 
     assert happens(1.0) == {("all", "enter")}
     assert happens(8.0) == {("up", "enter")}
-    assert happens(6.6) == set()  # within the margin, of the height's own deviation
+    assert happens(6.1) == set()  # within the margin, of the height's own deviation
     assert happens(1.0) == {("up", "leave")}
     assert happens(1.0, height_known=True) == {("up", "enter")}
