@@ -23,16 +23,15 @@ anchors = [{id = 1, x_m = 0, y_m = 0}, {id = 2, x_m = 9, y_m = 0}, {id = 3, x_m 
 """
 
 
-def test_the_file_s_floors_travel_beside_the_site(tmp_path):
+def test_floors_are_written_to_a_site_file_and_travel_beside_the_site(tmp_path):
     file = tmp_path / "site.toml"
+    floors = FloorSite(0, 0.0, "Ground"), FloorSite(1, 3.2, 'Ü "1"', "up.png", 24.0, -1.0, 2.0)
     (tmp_path / "up.png").write_bytes(PNG)
-    file.write_text(
-        SITE + '[[floors]]\nnumber = 0\nlow_m = 0.0\n[[floors]]\nnumber = 1\nlow_m = 3.2\nname = "Up"\n'
-        'image = "up.png"\nwidth_m = 24.0\n'
-    )
-    site = load_site(file)
-    assert [floor.name for floor in site.floors] == ["", "Up"]
+    site = replace(lab_site(), floors=floors)
+    file.write_text(site_template(site), encoding="utf-8")
+    assert load_site(file) == site
     assert plan_files(site, file) == {1: tmp_path / "up.png"}
+    assert plan_files(lab_site(), file) == {}
     payload = msgspec.json.encode(site_message(site, simulated=True, unix_s=1.0))
     assert msgspec.json.decode(payload)["site"].keys().isdisjoint({"floors", "outline_m"})
     assert read_message(payload, SiteMessage).whole_site == site
@@ -46,11 +45,7 @@ def test_the_file_s_floors_travel_beside_the_site(tmp_path):
         ("[[floors]]\nnumber = 1\n", "floors[0].low_m", "a number of metres"),
         ("[[floors]]\nnumber = 1.5\nlow_m = 2\n", "floors[0].number", "a whole number"),
         ('[[floors]]\nnumber = 1\nlow_m = 2\nimage = "a.png"\n', "floors[0].width_m", "belong together"),
-        (
-            '[[floors]]\nnumber = 1\nlow_m = 2\nimage = "a.png"\nwidth_m = 3\n',
-            "floors[0].image",
-            "a file that can be read",
-        ),
+        ('[[floors]]\nnumber = 1\nlow_m = 2\nimage = "a.png"\nwidth_m = 3\n', "floors[0].image", "a file that can be"),
         ("[[floors]]\nnumber = 1\nlow_m = 2\nlevel = 3\n", "floors[0].level", "left out"),
     ],
 )
@@ -62,19 +57,3 @@ def test_wrong_floors_are_named(tmp_path, floors, key, right):
     assert refused.value.key == key
     assert right in refused.value.expected
     assert Path(str(refused.value).split(":")[0]).name == "site.toml"
-
-
-def test_a_site_is_written_with_its_floors(tmp_path):
-    file = tmp_path / "site.toml"
-    floors = FloorSite(0, 0.0, "Ground"), FloorSite(1, 3.2, 'Ü "1"', "up.png", 24.0, -1.0, 2.0)
-    (tmp_path / "up.png").write_bytes(PNG)
-    site = replace(lab_site(), floors=floors)
-    file.write_text(site_template(site), encoding="utf-8")
-    assert load_site(file) == site
-
-
-def test_a_site_without_floors_is_as_before(tmp_path):
-    file = tmp_path / "site.toml"
-    file.write_text(SITE)
-    site = load_site(file)
-    assert plan_files(site, file) == {}
