@@ -14,8 +14,8 @@ from support.site_messages import a_fix, diagonal, tag_health
 
 HALL = Zone("hall", "Hall", ((0.0, 0.0), (16.0, 0.0), (16.0, 16.0), (0.0, 16.0)))
 IN, OUT = (5.0, 5.0, 1.0), (25.0, 5.0, 1.0)
-EPOCH_S = 1_795_046_400.0
-"""A Thursday, 00:00 UTC."""
+EPOCH_S = 1_795_053_600.0
+"""A Thursday, 02:00 UTC."""
 STEP_S = 0.25
 """Longer than ``EVALUATION_S``, so that conditions are evaluated in each step, and exact in binary."""
 BEGIN_S = 64.0

@@ -88,7 +88,7 @@ def test_a_tag_that_crosses_a_zone_between_two_evaluations_is_found():
 
 
 def test_hours_end_an_alarm_and_begin_its_time():
-    site = Site(replace(INSIDE, after_s=3.0, hours="00:01-00:02, thu 00:04-00:05"))
+    site = Site(replace(INSIDE, after_s=3.0, hours="02:01-02:02, thu 02:04-02:05"))
     site.places["t"] = IN
     assert site.run(300.0) == [
         (63.0, "raised", "r", "t"), (120.0, "ended", "r", "t"), (243.0, "raised", "r", "t"), (300.0, "ended", "r", "t"),
