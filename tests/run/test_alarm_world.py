@@ -5,14 +5,11 @@ server may be killed at random moments. The time is simulated, so that broker an
 do not count.
 """
 
-import math
 import random
 from bisect import bisect_right
 from collections import defaultdict
 from itertools import pairwise
-from operator import itemgetter
 
-import numpy as np
 import pytest
 from alarm_site import Site
 from msgspec.structs import replace
@@ -21,17 +18,14 @@ from skyless.core.site import AlarmRule
 from skyless.run.alarms import is_over
 from skyless.run.mqtt.messages import Zone
 
-pytestmark = pytest.mark.site
-
 SECONDS = 100.0
-TICK_S = 0.05
-INTERVAL_S = 0.1
-STD_M = 0.01
-SILENCE_S = 2.0
+STEP_S = 0.1
+STD_M = 0.03
+SILENCE_S, LIMIT_M = 2.0, 2.0
 COUNT = 6
 """Tags that walk, tags that fall silent, and pairs that meet."""
+HALL = Zone("hall", "Hall", ((0.0, -10.0), (20.0, -10.0), (20.0, 900.0), (0.0, 900.0)))
 WALKERS, SILENT, FIRSTS = (tuple(f"{letter}{k}" for k in range(COUNT)) for letter in "wsc")
-ZONES = (Zone("hall", "Hall", ((0.0, -10.0), (20.0, -10.0), (20.0, 900.0), (0.0, 900.0))),)
 RULES = [
     replace(rule, clear_after_s=0.5)
     for rule in (
@@ -39,104 +33,91 @@ RULES = [
         AlarmRule("inside", "inside", zone="hall", tags=WALKERS),
         AlarmRule("outside", "outside", zone="hall", tags=WALKERS),
         AlarmRule("silent", "silent", tags=SILENT, after_s=SILENCE_S),
-        AlarmRule("near", "near", limit=2.0, hysteresis=0.3, tags=FIRSTS),
+        AlarmRule("near", "near", limit=LIMIT_M, hysteresis=0.3, tags=FIRSTS),
     )
 ]
 
 
-def shuttle(rng, low_m, high_m, level_m):
-    """Places by time of a way to and fro between two places, at each for a while, and when it crosses a level."""
-    times_s, places_m, crossings_s = [], [], [0.0]
-    at_s, here_m, there_m = 0.0, low_m, high_m
-    while at_s < SECONDS:
-        leave_s = at_s + rng.uniform(1.5, 6.0)
-        arrive_s = leave_s + (high_m - low_m) / rng.uniform(0.8, 2.0)
-        times_s += [at_s, leave_s]
-        places_m += [here_m, here_m]
-        crossings_s.append(leave_s + (arrive_s - leave_s) * (level_m - here_m) / (there_m - here_m))
-        at_s, here_m, there_m = arrive_s, there_m, here_m
-    return lambda now_s: float(np.interp(now_s, times_s, places_m)), list(pairwise(crossings_s))
+class World:
+    """Tags whose state changes at random times, and by rule and subject the spans in which a condition holds."""
 
+    def __init__(self, rng):
+        self.rng, self.changes_s = rng, {}
+        self.spans = {}
+        for walker, silent, first in zip(WALKERS, SILENT, FIRSTS, strict=True):
+            spans = self._spans(walker, (2.0, 6.0))
+            self.spans["outside", walker], self.spans["inside", walker] = spans[::2], spans[1::2]
+            self.spans["near", f"{first}~{first}b"] = self._spans(first, (2.0, 6.0))[::2]
+            silences = self._spans(silent, (0.3, 1.6), (3.0, 8.0))[1::2]  # some are too short to count
+            self.spans["silent", silent] = [(a + SILENCE_S, b) for a, b in silences if b - a > SILENCE_S]
 
-def silences(rng, times_s):
-    """The times without those of silences, some too short to count."""
-    until_s, next_s = -1.0, rng.uniform(2.0, 8.0)
-    for at_s in times_s:
-        if at_s >= next_s:
-            until_s = at_s + rng.choice((rng.uniform(3.0, 8.0), rng.uniform(0.3, 1.6)))
-            next_s = until_s + rng.uniform(2.0, 6.0)
-        if at_s >= until_s:
-            yield at_s
+    def _spans(self, name, *lengths_s):
+        times_s = self.changes_s[name] = [0.0]
+        while times_s[-1] < SECONDS:
+            times_s.append(times_s[-1] + self.rng.uniform(*self.rng.choice(lengths_s)))
+        return list(pairwise(times_s))
 
+    def _beyond_m(self, name, at_s):
+        """Tags go at 1 m/s and are on the line when their state changes; at first they are on its negative side."""
+        times_s = self.changes_s[name]
+        row = bisect_right(times_s, at_s)
+        return (-1.0) ** row * min(1.5, at_s - times_s[row - 1], times_s[row] - at_s)
 
-def world(rng):
-    """Fixes as (time, tag, place), and by rule and subject the spans in which the condition holds."""
-    spans, fixes = {}, []
+    def fixes(self, at_s):
+        """Tags that send a fix now, and where it says that they are."""
+        places = {}
+        for k, (walker, silent, first) in enumerate(zip(WALKERS, SILENT, FIRSTS, strict=True)):
+            places[walker] = self._beyond_m(walker, at_s), 5.0 * k
+            places[first] = 0.0, 1000.0 + 10.0 * k
+            places[f"{first}b"] = LIMIT_M + self._beyond_m(first, at_s), 1000.0 + 10.0 * k
+            if self._beyond_m(silent, at_s) <= 0.0:
+                places[silent] = 3.0, 3000.0 + 5.0 * k
+        return [(tag, (self.rng.gauss(x, STD_M), self.rng.gauss(y, STD_M), 1.0)) for tag, (x, y) in places.items()]
 
-    def sends(tag, x_m, y_m, times_s=None):
-        times_s = times_s or [(k + rng.random() * 0.2) * INTERVAL_S for k in range(int(SECONDS / INTERVAL_S))]
-        fixes.extend((at_s, tag, (rng.gauss(x_m(at_s), STD_M), rng.gauss(y_m, STD_M), 1.0)) for at_s in times_s)
-        return times_s
-
-    for k in range(COUNT):
-        way, crossed = shuttle(rng, -1.5, 1.5, 0.0)
-        spans["outside", f"w{k}"], spans["inside", f"w{k}"] = crossed[::2], crossed[1::2]
-        sends(f"w{k}", way, 5.0 * k)
-        apart, crossed = shuttle(rng, 0.7, 4.5, 2.0)
-        spans["near", f"c{k}~c{k}b"] = crossed[::2]
-        times_s = sends(f"c{k}", lambda _: 0.0, 1000.0 + 10.0 * k)
-        sends(f"c{k}b", apart, 1000.0 + 10.0 * k)
-        heard_s = sends(f"s{k}", lambda _: 3.0, 3000.0 + 5.0 * k, list(silences(rng, times_s)))
-        silent = [(a + SILENCE_S, b) for a, b in pairwise([*heard_s, math.inf]) if b - a > SILENCE_S]
-        spans["silent", f"s{k}"] = silent
-    return sorted(fixes), spans
-
-
-def published(rng, fixes, *, kills):
-    """What is published, with its time; servers are killed every ten seconds on the average, and start again."""
-    kept, happened, site, starts_s, coming = {}, [], None, 0.0, fixes[::-1]
-    for at_s in np.arange(0.0, SECONDS, TICK_S).tolist():
-        if site is None and at_s >= starts_s:
-            site = Site(*RULES, zones=ZONES, kept=kept.values(), now_s=at_s)
-        while coming and coming[-1][0] <= at_s:
-            when_s, tag, place = coming.pop()
-            if site is not None:
-                site.now_s = when_s
+    def published(self, *, kills):
+        """What is published, with its time; servers are killed every ten seconds on the average, and start again."""
+        kept, happened, site, starts_s = {}, [], None, 0.0
+        for step in range(round(SECONDS / STEP_S)):
+            at_s = step * STEP_S
+            fixes = self.fixes(at_s)
+            if site is None and at_s < starts_s:
+                continue
+            site = site or Site(*RULES, zones=(HALL,), kept=kept.values(), now_s=at_s)
+            site.now_s = at_s
+            for tag, place in fixes:
                 site.send(tag, place)
-        if site is None:
-            continue
-        site.now_s = at_s
-        for one in kept.values():
-            if rng.random() < 0.02:
-                site.engine.acknowledge(one.rule, one.subject, one.id, "Ada", site.unix_s)
-        changes, dies = site.tick(), kills and rng.random() < TICK_S / 10.0
-        for what, message in changes[: rng.randrange(len(changes) + 1) if dies else None]:
-            happened.append((at_s, what, message))
-            kept[message.rule, message.subject] = message
-            if is_over(message):
-                del kept[message.rule, message.subject]
-        if dies:
-            site, starts_s = None, at_s + rng.uniform(0.1, 6.0)
-    return happened
+            for one in kept.values():
+                if self.rng.random() < 0.04:
+                    site.engine.acknowledge(one.rule, one.subject, one.id, "Ada", site.unix_s)
+            changes, dies = site.tick(), kills and self.rng.random() < STEP_S / 10.0
+            for what, message in changes[: self.rng.randrange(len(changes) + 1) if dies else None]:
+                happened.append((at_s, what, message))
+                kept[message.rule, message.subject] = message
+                if is_over(message):
+                    del kept[message.rule, message.subject]
+            if dies:
+                site, starts_s = None, at_s + self.rng.uniform(0.1, 6.0)
+        return happened
 
-
-def delays_s(spans, happened):
-    """How late alarms were raised, by rule, subject and number of the span."""
-    found = defaultdict(list)
-    for at_s, what, message in happened:
-        if what == "raised":
-            key = message.rule, message.subject
-            row = bisect_right(spans[key], at_s + 0.3, key=itemgetter(0)) - 1
-            found[(*key, row)].append(at_s - spans[key][row][0])
-    return found
+    def delays_s(self, happened):
+        """How late alarms were raised, by rule, subject and number of the span."""
+        found = defaultdict(list)
+        for at_s, what, message in happened:
+            if what == "raised":
+                begins_s = [begin_s for begin_s, _ in self.spans[message.rule, message.subject]]
+                row = bisect_right(begins_s, at_s + 0.3) - 1
+                found[message.rule, message.subject, row].append(at_s - begins_s[row])
+        return found
 
 
 def test_every_crossing_silence_and_contact_is_raised_once_and_soon():
-    rng = random.Random(1)
-    fixes, spans = world(rng)
-    found = delays_s(spans, published(rng, fixes, kills=False))
+    world = World(random.Random(1))
+    found = world.delays_s(world.published(kills=False))
     expected = {
-        (*key, row) for key, rows in spans.items() for row, (begin_s, _) in enumerate(rows) if begin_s < SECONDS - 1.0
+        (*key, row)
+        for key, spans in world.spans.items()
+        for row, (begin_s, _) in enumerate(spans)
+        if begin_s < SECONDS - 1.0
     }
     assert len(expected) > 150
     assert found.keys() >= expected
@@ -145,12 +126,11 @@ def test_every_crossing_silence_and_contact_is_raised_once_and_soon():
 
 @pytest.mark.parametrize("seed", range(2))
 def test_servers_killed_at_random_raise_nothing_twice_and_lose_no_acknowledgement(seed):
-    rng = random.Random(seed)
-    fixes, spans = world(rng)
-    happened = published(rng, fixes, kills=True)
-    assert max(map(len, delays_s(spans, happened).values())) == 1
+    world = World(random.Random(seed))
+    happened = world.published(kills=True)
+    assert max(map(len, world.delays_s(happened).values())) == 1
     acknowledged = set()
     for _, what, message in happened:
-        assert (message.acknowledged_unix_s is not None) == (what == "acknowledged" or message.id in acknowledged)
         acknowledged |= {message.id} if what == "acknowledged" else set()
+        assert (message.acknowledged_unix_s is not None) == (message.id in acknowledged)
     assert len(acknowledged) > 30
