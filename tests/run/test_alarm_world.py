@@ -20,7 +20,7 @@ from skyless.run.mqtt.messages import Zone
 
 SECONDS = 100.0
 STEP_S = 0.1
-STD_M = 0.03
+STD_M = 0.01
 SILENCE_S, LIMIT_M = 2.0, 2.0
 COUNT = 6
 """Tags that walk, tags that fall silent, and pairs that meet."""
