@@ -37,8 +37,8 @@ from skyless.sim.lab import ideal_lab_site, lab_site
 
 HERE = Path(__file__).parents[1]
 LAUNCHERS = {
-    "board": [HERE / "tests/firmware/with_board_sizes.py", "float"],
-    "float": [HERE / "tests/native/with_float.py"],
+    "board": [HERE / "tests/native/with_sizes.py", "board"],
+    "float": [HERE / "tests/native/with_sizes.py", "float"],
 }
 MARKS = "<!-- accuracy -->\n", "<!-- end of accuracy -->\n"
 FAR_M = 8000.0

@@ -88,6 +88,7 @@ NAVIGATION = {
         "docs/hub",
         "docs/hub_operation",
         "docs/limits",
+        "docs/reported",
         "docs/http",
         "docs/history",
         "docs/phases",

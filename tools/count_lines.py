@@ -10,7 +10,7 @@ ROOT: Final = Path(__file__).parents[1]
 PARTS: Final = {
     "source": ("src/*.py",),
     "page": ("src/*.js", "src/*.css", "src/*.html", ":(exclude)*/vendor/*"),
-    "tests": ("tests/*.py",),
+    "tests": ("tests/*.py", "tests/*.mjs", "tests/*.cjs", "tests/*.c"),
     "documents": ("*.md",),
     "benchmarks": ("benchmarks/*.py",),
 }

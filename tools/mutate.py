@@ -4,6 +4,8 @@
 its own tests, and fails where they find too few. Modules and tests of your choice:
 ``scripts/mutate core/site.py tests/core/test_digest.py``. With ``--spare`` it lists the tests whose lines and mutants
 are all found by others, with ``--number=40`` it takes that many of the mutants, drawn with a fixed seed.
+What a whole measurement depends on is kept in ``tests/mutants_measured.json``, unless ``--only-say`` is given: a test
+of the statistical tier measures again what has changed since.
 
 Mutants: a comparison, ``and`` and ``or``, the condition of an ``if``, plus and minus, a number, a returned value.
 
@@ -24,6 +26,7 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import redirect_stdout, suppress
+from hashlib import sha256
 from io import StringIO
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType
@@ -37,6 +40,7 @@ from msgspec import Struct
 ROOT: Final = Path(__file__).parents[1]
 SOURCE: Final = ROOT / "src" / "skyless"
 TABLE: Final = ROOT / "tests" / "mutants.toml"
+MEASURED: Final = ROOT / "tests" / "mutants_measured.json"
 LEAST_SHARE: Final = 0.95
 """Of the mutants that are not equal in effect, those that the tests should find."""
 _SLOWER: Final = 5.0
@@ -158,6 +162,8 @@ class Runs:
             self._failed.append(report.nodeid)
 
     def pytest_runtestloop(self, session: pytest.Session) -> bool:
+        if session.testsfailed:
+            raise pytest.UsageError("tests that cannot be collected")
         failed, lines, took_s = _forked(lambda: self._reach(session.items), 3600.0)
         if failed:
             raise pytest.UsageError(f"tests that fail without a mutant: {failed}")
@@ -241,6 +247,23 @@ def _forked(work: Any, limit_s: float) -> Any:  # noqa: ANN401 - whatever JSON c
 # What is said.
 
 
+def digest_of(module: str, entry: Entry) -> str:
+    """What a measurement depends on: the module, its tests and the list of its equal mutants."""
+    texts = [(SOURCE / module).read_bytes(), *((ROOT / one).read_bytes() for one in entry.tests)]
+    return sha256(b"\0".join([*texts, msgspec.json.encode(entry)])).hexdigest()[:16]
+
+
+def measured() -> dict[str, str]:
+    """Digest of each module whose tests were last seen to find enough."""
+    found: dict[str, str] = msgspec.json.decode(MEASURED.read_bytes()) if MEASURED.exists() else {}
+    return found
+
+
+def table() -> dict[str, Entry]:
+    """Modules that are measured, with their tests."""
+    return msgspec.convert(tomllib.loads(TABLE.read_text("utf-8")), dict[str, Entry])
+
+
 def judged(module: str, entry: Entry, *, spare: bool, number: int | None = None) -> bool:
     """Measure a module and say which mutants live; whether the tests find enough of them."""
     path = SOURCE / module
@@ -292,15 +315,15 @@ def main() -> int:
     spare = "--spare" in words
     number = next((int(word.partition("=")[2]) for word in words if word.startswith("--number=")), None)
     names = [word.removeprefix("src/skyless/") for word in words if not word.startswith("--")]
-    table = msgspec.convert(tomllib.loads(TABLE.read_text("utf-8")), dict[str, Entry])
+    entries = table()
     modules = [name for name in names if (SOURCE / name).is_file()]
     tests = [name for name in names if name not in modules]
     if missing := [name for name in tests if not (ROOT / name).exists()]:
         print(f"{missing[0]} is no module of src/skyless and no file of tests", file=sys.stderr)
         return 2
     good = True
-    for module in modules or table:
-        entry = table.get(module, Entry([]))
+    for module in modules or entries:
+        entry = entries.get(module, Entry([]))
         if tests:
             entry = msgspec.structs.replace(entry, tests=tests)
         if not entry.tests:
@@ -314,7 +337,12 @@ def main() -> int:
                 sys.stdout.flush()
             finally:
                 os._exit(code)
-        good &= os.waitpid(child, 0)[1] == 0
+        is_good = os.waitpid(child, 0)[1] == 0
+        if is_good and not tests and number is None and "--only-say" not in words:
+            kept = {name: digest for name, digest in measured().items() if name in entries}
+            text = msgspec.json.encode({**kept, module: digest_of(module, entry)}, order="sorted")
+            MEASURED.write_bytes(msgspec.json.format(text) + b"\n")
+        good &= is_good
     return 0 if good else 1
 
 

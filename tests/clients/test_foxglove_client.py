@@ -14,6 +14,8 @@ from skyless.bridges.target import BridgedSite, Hub, Route
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite, WallSite
 from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth
+from support.processes import running_program
+from support.waiting import running, until
 
 ROOT = Path(__file__).parents[2]
 CLIENT = Path(__file__).with_name("foxglove_client.cjs")
@@ -59,21 +61,13 @@ def fix(number):
     )  # fmt: skip
 
 
-async def run(modules, subprotocol):
-    """What the client prints while the fixes go, and then stops."""
-    target = FoxgloveTarget("foxglove://:0", "127.0.0.1", 0)
+@pytest.mark.parametrize("subprotocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])
+async def test_foxgloves_client_gets_every_channel_and_fix(modules, subprotocol):
+    lines, target = [], FoxgloveTarget("foxglove://:0", "127.0.0.1", 0)
     hub = Hub([Route(target, None, float(HZ))], lambda line: None)
-    running = asyncio.create_task(target.run())
-    while target.port == 0:
-        await asyncio.sleep(0.01)
-    hub.on_site(SITE)
-    hub.on_fix(fix(0), 0.0)
-    hub.on_health(HEALTH, 0.0)
-    url = f"ws://127.0.0.1:{target.port}"
-    client = await asyncio.create_subprocess_exec(
-        "node", str(CLIENT), str(modules), url, subprotocol, stdout=asyncio.subprocess.PIPE, limit=1 << 20
-    )
-    lines = []
+
+    def of(event):
+        return [line for line in lines if line["event"] == event]
 
     async def receive(enough):
         while not enough():
@@ -81,37 +75,28 @@ async def run(modules, subprotocol):
             assert line, f"the client ended after {lines[-3:]}"
             lines.append(json.loads(line))
 
-    try:
-        await receive(lambda: len({line["topic"] for line in lines if line["event"] == "channel"}) == len(TOPICS))
-        await receive(lambda: any(line["event"] == "message" and line["topic"] == "/site/scene" for line in lines))
-        async with asyncio.timeout(ANSWER_S):
-            while not all(one.wants(number) for one in target._sessions for number in range(1, len(TOPICS) + 1)):
-                await asyncio.sleep(0.01)
-        for number in range(1, FIXES + 1):
-            hub.on_fix(fix(number), number / HZ)
-            await asyncio.sleep(1 / HZ)
-        hub.on_health(HEALTH, FIXES / HZ)
-        await receive(
-            lambda: any(line.get("topic") == "/tag/tag1/health" for line in lines if line["event"] == "message")
-        )
-    finally:
-        client.terminate()
-        await client.wait()
-        running.cancel()
-        await asyncio.wait([running])
-    return lines
-
-
-@pytest.mark.parametrize("subprotocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])
-def test_foxgloves_client_gets_every_channel_and_fix(modules, subprotocol):
-    lines = asyncio.run(run(modules, subprotocol))
-    assert {line["topic"] for line in lines if line["event"] == "channel"} == TOPICS
-    assert not [line for line in lines if line["event"] in ("error", "status")]
-    messages = [line for line in lines if line["event"] == "message"]
-    assert {message["topic"] for message in messages} == TOPICS
-    assert all(
-        message["valid"] for message in messages if message["topic"] not in ("/tag/tag1/fix", "/tag/tag1/health")
-    )
+    async with running(target.run()):
+        await until(lambda: target.port != 0)
+        hub.on_site(SITE)
+        hub.on_fix(fix(0), 0.0)
+        hub.on_health(HEALTH, 0.0)
+        words = [str(one) for one in (CLIENT, modules, f"ws://127.0.0.1:{target.port}", subprotocol)]
+        async with running_program("node", *words, stdout=asyncio.subprocess.PIPE, limit=1 << 20) as client:
+            await receive(lambda: len({line["topic"] for line in of("channel")}) == len(TOPICS))
+            await receive(lambda: any(line["topic"] == "/site/scene" for line in of("message")))
+            numbers = range(1, len(TOPICS) + 1)
+            await until(lambda: all(one.wants(number) for one in target._sessions for number in numbers), ANSWER_S)
+            for number in range(1, FIXES + 1):
+                hub.on_fix(fix(number), number / HZ)
+                await asyncio.sleep(1 / HZ)
+            hub.on_health(HEALTH, FIXES / HZ)
+            await receive(lambda: any(line["topic"] == "/tag/tag1/health" for line in of("message")))
+    messages = of("message")
+    assert {line["topic"] for line in of("channel")} == {message["topic"] for message in messages} == TOPICS
+    assert not of("error")
+    assert not of("status")
+    own = ("/tag/tag1/fix", "/tag/tag1/health")
+    assert all(message["valid"] for message in messages if message["topic"] not in own)
     for topic in sorted(TOPICS - {"/site/scene", "/tag/tag1/health"}):
         stamps = [int(message["ns"]) for message in messages if message["topic"] == topic]
         assert len(stamps) >= 0.98 * FIXES

@@ -31,8 +31,9 @@ from support.bridged_values import SITE, a_fix
 from support.processes import free_port
 
 ROOT = Path(__file__).parents[2]
-HERE = Path(__file__).parent
+PROGRAM = Path(__file__).with_name("ros2_program.py")
 FOLDER = ROOT / ".venv-clients" / "ros2"
+PYTHON = FOLDER / "bin" / "python"
 MESSAGES = ("diagnostic-msgs", "geometry-msgs", "sensor-msgs", "std-msgs", "visualization-msgs")
 PACKAGES = [
     "ros-kilted-rclpy==9.1.2",
@@ -53,47 +54,44 @@ POSE_HASH = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea
 class Ros:
     """An environment with ROS 2 in a domain of its own."""
 
-    def __init__(self, domain):
-        self.python = FOLDER / "bin" / "python"
+    def __init__(self):
+        self.domain = random.Random().randint(100, 200)
         path = os.pathsep.join([str(FOLDER / "bin"), os.environ.get("PATH", "")])
         without = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
-        self.environment = without | {"ROS_DOMAIN_ID": str(domain), "PATH": path}
-        self.domain = domain
+        self.environment = without | {"ROS_DOMAIN_ID": str(self.domain), "PATH": path}
 
     def start(self, *arguments):
-        pipe = subprocess.PIPE
-        return subprocess.Popen(
-            [str(one) for one in arguments], env=self.environment, stdout=pipe, stderr=pipe, text=True
-        )
+        """Its Python with arguments."""
+        command, pipe = [str(one) for one in (PYTHON, *arguments)], subprocess.PIPE
+        return subprocess.Popen(command, env=self.environment, stdout=pipe, stderr=pipe, text=True)
 
     def listener(self, count):
         """One that listens already."""
-        process = self.start(self.python, HERE / "ros2_listener.py", count, PATIENCE_S)
+        process = self.start(PROGRAM, "listen", count, PATIENCE_S)
         assert "listening" in process.stderr.readline()
         return process
+
+
+def found_by(process, patience_s=2 * PATIENCE_S):
+    """What a program writes when it has ended."""
+    out, said = process.communicate(timeout=patience_s)
+    assert process.returncode == 0, said
+    return json.loads(out)
 
 
 @pytest.fixture(scope="module")
 def ros():
     """ROS 2 from PyPI, installed once."""
-    if not (FOLDER / "bin" / "python").exists():
+    found, probe = Ros(), "import rclpy, mcap, diagnostic_msgs.msg, geometry_msgs.msg, sensor_msgs.msg"
+    if not PYTHON.exists():
         subprocess.run([sys.executable, "-m", "venv", FOLDER], check=True)
-    for attempt in ("offline", "install"):
-        if attempt == "install":
-            pip = subprocess.run(
-                [FOLDER / "bin" / "python", "-m", "pip", "install", "--quiet", *PACKAGES],
-                capture_output=True,
-                text=True,
-                check=False,
-            )
-            if pip.returncode:
-                pytest.skip(f"ROS 2's wheels are not installed (x86-64 Linux only): {pip.stderr.strip()[-200:]}")
-        found = Ros(random.Random().randint(100, 200))
-        probe = "import rclpy, mcap, diagnostic_msgs.msg, geometry_msgs.msg, sensor_msgs.msg, visualization_msgs.msg"
-        done = subprocess.run([found.python, "-c", probe], env=found.environment, capture_output=True, check=False)
+    for install in ([], ["-m", "pip", "install", "--quiet", *PACKAGES]):
+        for arguments in filter(None, (install, ["-c", f"{probe}, visualization_msgs.msg"])):
+            done = found.start(*arguments)
+            _, said = done.communicate()
         if done.returncode == 0:
             return found
-    pytest.skip(f"ROS 2's wheels do not run here: {done.stderr.decode().strip()[-200:]}")
+    pytest.skip(f"ROS 2's wheels (x86-64 Linux only) are not installed or do not run here: {said.strip()[-200:]}")
 
 
 class Feed:
@@ -141,7 +139,7 @@ def door(request, ros, capfd):
             yield feed
         return
     port = free_port()
-    node = ros.start(ros.python, ROOT / "examples/ros2/skyless_node.py", "--ros-args", "-p", f"port:={port}")
+    node = ros.start(ROOT / "examples/ros2/skyless_node.py", "--ros-args", "-p", f"port:={port}")
     try:
         with Feed(f"jsonl+tcp://:{port}?hz=1000", print) as feed:
             while "reading" not in (line := node.stderr.readline()):
@@ -159,82 +157,71 @@ def exact(unix_s):
     return [whole, round((unix_s - whole) * 1e9)]
 
 
-def expect(found, feed):
+def stamp_of(message):
+    return [message["header"]["stamp"][key] for key in ("sec", "nanosec")]
+
+
+def xyz(vector):
+    return tuple(vector[axis] for axis in "xyz")
+
+
+def expect(topics, feed, count):
     """What came is what was given, in order, without holes."""
-    serials = [round(1e3 * position[0]) for _, _, position, _ in found["pose"]]
+    poses, velocities, fixes, (anchors, *_) = topics.values()
+    assert len(poses) >= count
+    serials = [round(1e3 * one["pose"]["pose"]["position"]["x"]) for one in poses]
     assert serials == list(range(serials[0], serials[0] + len(serials))), "one is missing, or the order is wrong"
-    for serial, (stamp, frame, position, covariance) in zip(serials, found["pose"], strict=True):
-        fix = feed.sent[serial]
-        assert (stamp, frame) == (exact(fix.unix_s), "site")
-        assert position == pytest.approx(fix.position_m, abs=1e-9)
+    for serial, one in zip(serials, poses, strict=True):
+        fix, covariance = feed.sent[serial], one["pose"]["covariance"]
+        assert (stamp_of(one), one["header"]["frame_id"]) == (exact(fix.unix_s), "site")
+        assert xyz(one["pose"]["pose"]["position"]) == pytest.approx(fix.position_m, abs=1e-9)
         assert len(covariance) == 36
-        assert [covariance[6 * row + column] for row in range(3) for column in range(3)] == list(
-            floored(fix.covariance_m2)
-        )
+        of_position = [covariance[6 * row + column] for row in range(3) for column in range(3)]
+        assert of_position == list(floored(fix.covariance_m2))
         assert [covariance[7 * row] for row in (3, 4, 5)] == [1e6] * 3
     by_stamp = {tuple(exact(fix.unix_s)): fix for fix in list(feed.sent.values())}
-    assert found["velocity"]
-    for stamp, linear, covariance in found["velocity"]:
-        fix = by_stamp[tuple(stamp)]
-        assert tuple(linear) == fix.velocity_mps
-        assert covariance[:3] == list(fix.velocity_covariance[:3])
-    for stamp, status, where, covariance in found["fix"]:
-        fix = by_stamp[tuple(stamp)]
-        assert status == 0
-        expected = geodetic(fix.position_m, SITE.georeference)
-        assert where[:2] == pytest.approx(expected[:2], abs=1e-11)  # a micrometre
-        assert where[2] == pytest.approx(expected[2], abs=1e-9)
-        assert covariance == pytest.approx(
-            rotated(floored(fix.covariance_m2), SITE.georeference.heading_deg), abs=1e-12
-        )
-    cubes = {number: (x, y, z) for shape, number, x, y, z in found["anchors"][0] if shape == 1}
+    assert velocities
+    for one in velocities:
+        fix = by_stamp[tuple(stamp_of(one))]
+        assert xyz(one["twist"]["twist"]["linear"]) == fix.velocity_mps
+        assert one["twist"]["covariance"][:3] == list(fix.velocity_covariance[:3])
+    for one in fixes:
+        fix = by_stamp[tuple(stamp_of(one))]
+        assert one["status"]["status"] == 0
+        latitude_deg, longitude_deg, height_m = geodetic(fix.position_m, SITE.georeference)
+        expected = pytest.approx((latitude_deg, longitude_deg), abs=1e-11)  # a micrometre
+        assert (one["latitude"], one["longitude"]) == expected
+        assert one["altitude"] == pytest.approx(height_m, abs=1e-9)
+        turned = rotated(floored(fix.covariance_m2), SITE.georeference.heading_deg)
+        assert one["position_covariance"] == pytest.approx(turned, abs=1e-12)
+    cubes = {one["id"]: xyz(one["pose"]["position"]) for one in anchors["markers"] if one["type"] == 1}
     assert cubes == SITE.anchors_m
 
 
-def test_a_subscriber_reads_the_fixes_and_the_hash_of_their_type(ros, door):
-    listener = ros.listener(FEW)
-    out, said = listener.communicate(timeout=2 * PATIENCE_S)
-    found = json.loads(out)
-    assert len(found["pose"]) >= FEW, said
-    expect(found, door)
+def test_a_subscriber_reads_the_fixes_and_the_hash_of_their_type_and_one_that_is_killed_costs_it_nothing(ros, door):
+    victim, other = ros.listener(10_000), ros.listener(6 * FEW)
+    assert "a pose" in victim.stderr.readline()
+    victim.kill()
+    victim.communicate()
+    found = found_by(other)
+    expect(found["topics"], door, 6 * FEW)
+    assert not door.dropped
     (publisher,) = found["publishers"]
-    assert publisher["hash"] == POSE_HASH
-    assert publisher["type"] == POSE
-    assert publisher["reliability"] == "RELIABLE"
+    assert publisher == {"hash": POSE_HASH, "type": POSE, "reliability": "RELIABLE"}
 
 
 def test_a_subscriber_that_was_there_before(ros):
     pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheel here")
     listener = ros.listener(FEW)
     with Feed(f"ros2://?domain={ros.domain}&hz=1000", print) as feed:
-        out, said = listener.communicate(timeout=2 * PATIENCE_S)
-    found = json.loads(out)
-    assert len(found["pose"]) >= FEW, said
-    expect(found, feed)
-
-
-def test_a_subscriber_that_is_killed_costs_the_others_nothing(ros, door):
-    victim, other = ros.listener(10_000), ros.listener(6 * FEW)
-    assert "a pose" in victim.stderr.readline()
-    victim.kill()
-    victim.communicate()
-    out, said = other.communicate(timeout=2 * PATIENCE_S)
-    found = json.loads(out)
-    assert len(found["pose"]) >= 6 * FEW, said
-    expect(found, door)
-    assert not door.dropped
-
-
-def ros2_of(ros):
-    """The real command, if it is anywhere."""
-    command = shutil.which("ros2", path=ros.environment["PATH"])
-    if command is None:
-        pytest.skip("the command ros2 is not installed: the wheels have none (apt-get install ros-kilted-ros2topic)")
-    return command
+        found = found_by(listener)
+    expect(found["topics"], feed, FEW)
 
 
 def test_the_command_ros2_shows_type_rate_and_position(ros, door):
-    command = ros2_of(ros)
+    command = shutil.which("ros2", path=ros.environment["PATH"])
+    if command is None:
+        pytest.skip("the command ros2 is not installed: the wheels have none (apt-get install ros-kilted-ros2topic)")
     pose = "/skyless/tag1/pose"
 
     def ask(*arguments, seconds=30):
@@ -260,26 +247,20 @@ def test_ros_reads_the_bag(ros, tmp_path):
     recording = tmp_path / "walk.mcap"
     live_site.record(recording, live_site.messages(1.0, tags=("a", "b")))
     assert main(["export", str(recording), "--to", str(tmp_path / "bag")]) == 0
-    reader = ros.start(ros.python, HERE / "ros2_bag_reader.py", tmp_path / "bag" / "bag.mcap")
-    out, said = reader.communicate(timeout=PATIENCE_S)
-    assert reader.returncode == 0, said
-    read = json.loads(out)
+    read = found_by(ros.start(PROGRAM, "bag", tmp_path / "bag" / "bag.mcap"))
     assert read["profile"] == "ros2"
     assert {coding for _, coding, _, _ in read["messages"]} == {"cdr/ros2msg"}
     with McapRecording(recording) as source:
         fixes = list(source.fixes())
     for tag in ("a", "b"):
         poses = [message for topic, _, _, message in read["messages"] if topic == f"/skyless/{tag}/pose"]
-        stamps = [[one["header"]["stamp"][key] for key in ("sec", "nanosec")] for one in poses]
-        assert stamps == [exact(fix.unix_s) for fix in fixes if fix.tag == tag]
-        places = [tuple(one["pose"]["pose"]["position"][axis] for axis in "xyz") for one in poses]
-        assert places == [fix.position_m for fix in fixes if fix.tag == tag]
+        assert [stamp_of(one) for one in poses] == [exact(fix.unix_s) for fix in fixes if fix.tag == tag]
+        assert [xyz(one["pose"]["pose"]["position"]) for one in poses] == [
+            fix.position_m for fix in fixes if fix.tag == tag
+        ]
     assert len(structs.asdict(fixes[0])["covariance_m2"]) == 9
 
 
 def test_lines_that_nobody_should_send_do_not_end_the_node(ros):
-    """A million: python tests/clients/ros2_garbage.py 1000000 1, with the Python of .venv-clients/ros2."""
-    run = ros.start(ros.python, HERE / "ros2_garbage.py", 5000, random.randrange(10**6))
-    out, said = run.communicate(timeout=4 * PATIENCE_S)
-    assert run.returncode == 0, said
-    assert json.loads(out)["last"] == {"tag1": 2}, "a fix whose velocity is not finite is a fix"
+    found = found_by(ros.start(PROGRAM, "garbage", 5000, random.randrange(10**6)), 4 * PATIENCE_S)
+    assert found["last"] == {"tag1": 2}, "a fix whose velocity is not finite is a fix"

@@ -3,7 +3,8 @@
 import ctypes
 
 import pytest
-from emulator.build import HAS_HOST_COMPILER
+from emulator.board_library import library
+from firmware_stage import needs_compiler
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -11,7 +12,7 @@ from skyless.core.air.almanac import LONGEST_PERIOD_CODE, gap_ticks
 from skyless.core.air.frame import after_rmarker_s, preamble_s
 from skyless.core.ticks import TICK_RATE_HZ
 
-pytestmark = [pytest.mark.site, pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")]
+pytestmark = [pytest.mark.site, needs_compiler]
 
 COUNTER = 1 << 40
 US = TICK_RATE_HZ * 1e-6
@@ -23,15 +24,10 @@ IDS, SEQUENCES = st.integers(0, 0xFFFF), st.integers(0, 255)
 class Expected(ctypes.Structure):
     _fields_ = (
         ("anchor", ctypes.c_uint16),
-        ("sequence", ctypes.c_uint8),
-        ("period_code", ctypes.c_uint8),
-        ("missed", ctypes.c_uint8),
-        ("has_rate", ctypes.c_bool),
-        ("has_slept", ctypes.c_bool),
-        ("turns", ctypes.c_uint32),
-        ("received", ctypes.c_uint32),
-        ("due_ticks", ctypes.c_uint64),
-        ("age_us", ctypes.c_uint64),
+        *((name, ctypes.c_uint8) for name in ("sequence", "period_code", "missed")),
+        *((name, ctypes.c_bool) for name in ("has_rate", "has_slept")),
+        *((name, ctypes.c_uint32) for name in ("turns", "received")),
+        *((name, ctypes.c_uint64) for name in ("due_ticks", "age_us")),
         ("rate_ppb", ctypes.c_int32),
     )
 
@@ -46,8 +42,6 @@ class Window(ctypes.Structure):
 
 @pytest.fixture(scope="module")
 def schedule_c():
-    from emulator.board_library import library
-
     loaded = library()
     loaded.schedule_gap_ticks.restype = ctypes.c_uint64
     loaded.schedule_next.restype = loaded.schedule_is_done.restype = ctypes.c_bool
@@ -102,12 +96,8 @@ def walk(c, schedule, anchors, now, until, offset=0.0, lost=lambda _: False):
         while sent := anchors.pop(end):
             all_sent.append(sent)
             first = sent[3] - US * (1e6 * preamble_s() - SPARE_US)
-            if (
-                sent[3] >= free
-                and first >= begin
-                and sent[3] + US * 1e6 * after_rmarker_s(100) <= end
-                and not lost(sent)
-            ):
+            is_within = first >= begin and sent[3] + US * 1e6 * after_rmarker_s(100) <= end
+            if sent[3] >= free and is_within and not lost(sent):
                 received.append(sent)
                 note(c, schedule, sent, offset)
                 free = now = sent[3] + US * 1e6 * (after_rmarker_s(100) + 300e-6)

@@ -1,24 +1,23 @@
-"""What tests of the generated C share: a library with all functions, packets, and a program that runs them."""
+"""What tests of the generated C share: episodes and states as a program in C takes them, and that program."""
 
 import ctypes
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "core"))
-
-from estimator_builders import kept, late
+import pytest
+from estimator_builders import LAB_M, ROOM_M, kept, late
 
 from skyless.core.estimator.process import BatchPacket, BatchRow, Place, Relay
 from skyless.core.estimator.state import State
-from skyless.core.native import library
-from skyless.core.native.records import c_type
+from skyless.core.native.library import SOURCE
 
-NATIVE = Path(library.__file__).parent
-EXACT = ("-std=c99", "-ffp-contract=off", "-fno-math-errno")
+NATIVE = SOURCE.parent
+EXACT = ("-std=c99", "-ffp-contract=off", "-fno-math-errno", f"-I{NATIVE}")
+ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
+SITES = {"lab": (LAB_M, 0.0, {}), "room": (ROOM_M, 0.0, ERRORS), "3-D": (ROOM_M, None, ERRORS)}
+"""Anchors, the tag's height if it is known, and the errors that the settings expect."""
 
 RUNNER = """
 #include <stdio.h>
@@ -47,22 +46,24 @@ int main(void) {
 """Reads a state and packets, and writes what becomes of them."""
 
 
-def library_of_all(folder, compiler="gcc", *flags):
-    """A library of all functions, also those that are called inside only."""
-    made = folder / "all.so"
-    own = ("-DINTERNAL=", "-shared", "-fPIC", "-Wl,-Bsymbolic")  # not libc's, which has some of these names as well
-    command = [compiler, *EXACT, *flags, *own, NATIVE / "skyless_core.c", "-o", made]
-    subprocess.run(command, check=True)
-    return ctypes.CDLL(str(made))
+def needs(*programs):
+    """The mark of tests that are skipped where one of these programs is missing."""
+    missing = [program for program in programs if shutil.which(program) is None]
+    return pytest.mark.skipif(bool(missing), reason=f"not installed: {', '.join(missing)}")
 
 
-def runner(folder, compiler, *flags, emulator=()):
-    """The command of the program ``RUNNER``."""
+def runner(folder, compiler, *flags):
+    """The program ``RUNNER``."""
     source, made = folder / "run.c", folder / "run"
     source.write_text(RUNNER)
-    parts = [NATIVE / "skyless_core.c", source]
-    subprocess.run([compiler, *EXACT, *flags, f"-I{NATIVE}", *parts, "-o", made], check=True)
-    return [*emulator, str(made)]
+    subprocess.run([compiler, *EXACT, *flags, NATIVE / "skyless_core.c", source, "-o", made], check=True)
+    return made
+
+
+def in_webassembly(wasm):
+    """The command that does what ``RUNNER`` does by WebAssembly."""
+    sizes = [str(ctypes.sizeof(one)) for one in (State, Place, BatchPacket, Relay, BatchRow)]
+    return ["node", Path(__file__).with_name("run_core.mjs"), wasm, *sizes]
 
 
 def disturbed(episode, seed):
@@ -75,12 +76,11 @@ def disturbed(episode, seed):
 
 def batch_of(packets, places_m):
     """Packets of an episode as the batch takes them: places, packets, relays."""
-    places = np.zeros(len(places_m), np.dtype(Place))
-    places["anchor"], places["position_m"], places["std_m"] = np.arange(len(places_m)), places_m, -1.0
-    given, relays = (
-        np.zeros(len(packets.anchors), np.dtype(BatchPacket)),
-        np.zeros(len(packets.relays), np.dtype(Relay)),
+    places, given, relays = (
+        np.zeros(count, np.dtype(made))
+        for made, count in ((Place, len(places_m)), (BatchPacket, len(packets.anchors)), (Relay, len(packets.relays)))
     )
+    places["anchor"], places["position_m"], places["std_m"] = np.arange(len(places_m)), places_m, -1.0
     given["place"], given["sequence"], given["end"] = packets.anchors, packets.sequences, packets.ends
     given["rx_ticks"], given["tx_ticks"] = packets.rx_ticks, packets.tx_ticks
     given["variance_factor"] = 1.0
@@ -91,31 +91,18 @@ def batch_of(packets, places_m):
 
 def input_of(estimator, packets, places_m):
     """What ``RUNNER`` reads."""
-    places, given, relays = batch_of(packets, places_m)
-    counts = np.array([len(places), len(given), len(relays), 1], np.int32)
-    return b"".join(
-        part.tobytes() for part in (counts, np.frombuffer(estimator.state, np.uint8), places, given, relays)
-    )
+    tables = batch_of(packets, places_m)
+    counts = np.array([*map(len, tables), 1], np.int32)
+    return b"".join([counts.tobytes(), bytes(estimator.state), *(table.tobytes() for table in tables)])
 
 
-def rows_and_state(output, count):
-    """What ``RUNNER`` writes."""
-    size = count * ctypes.sizeof(BatchRow)
-    return np.frombuffer(output[:size], np.dtype(BatchRow)), State.from_buffer_copy(output[size:])
+def track(command, given):
+    """What ``RUNNER`` makes of its input: rows and the state."""
+    output = subprocess.run(command, input=given, capture_output=True, check=True).stdout
+    end = len(output) - ctypes.sizeof(State)
+    return np.frombuffer(output[:end], np.dtype(BatchRow)), State.from_buffer_copy(output[end:])
 
 
-def has(*programs):
-    """Whether all of these programs are here."""
-    return all(shutil.which(program) for program in programs)
-
-
-def damaged_programs(folder):
-    """The two programs beside this file, by name; they end at an access out of bounds, an overflow and the like."""
-    real = ["-DSKYLESS_FLOAT"] if c_type(float) is ctypes.c_float else []
-    checks = ("-O1", "-g", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
-    command, core = ["gcc", *EXACT, *real, *checks, f"-I{NATIVE}"], folder / "core.o"
-    subprocess.run([*command, "-c", NATIVE / "skyless_core.c", "-o", core], check=True)
-    made = {name: folder / name for name in ("damaged", "damaged_frames")}
-    for name, program in made.items():
-        subprocess.run([*command, core, Path(__file__).with_name(f"{name}.c"), "-o", program], check=True)
-    return made
+def same_rows(one, other):
+    """Both signs of zero are the same."""
+    return all(np.array_equal(one[name], other[name]) for name in one.dtype.names)

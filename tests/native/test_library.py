@@ -7,18 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from core_build import NATIVE, has
+from core_build import NATIVE, needs
 
+import compile_core
 from skyless.core.errors import SkylessError
 from skyless.core.native import library
 from skyless.core.native.records import Array, Byte, Bytes, Integers, Reals, Record, Ticks, record
 from skyless.core.native.views import view
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-import compile_core
-
-pytestmark = [pytest.mark.site, pytest.mark.skipif(not has("cc"), reason="there is no cc")]
+pytestmark = [pytest.mark.site, needs("cc")]
 
 SOURCE = """
 #include <stdbool.h>
@@ -48,46 +45,44 @@ class Item(Record):
     ticks: Ticks
 
 
-def scalars(a: int, b: Ticks, c: Byte, d: bool, e: float) -> float:
-    """In Python another result, so that it is seen which one runs."""
-    return -1.0
+def scalars(a: int, b: Ticks, c: Byte, d: bool, e: float) -> float: ...
 
 
-def later(ticks: Ticks) -> Ticks:
-    return -1
+def later(ticks: Ticks) -> Ticks: ...
 
 
-def is_long(item: Item) -> bool:
-    return False
+def is_long(item: Item) -> bool: ...
 
 
 def copy(source: Item, target: Item) -> None: ...
 
 
-def sums(a: Reals, b: Integers, c: Array[Ticks], d: Bytes, e: Array[Item], count: int) -> float:
-    return -1.0
+def sums(a: Reals, b: Integers, c: Array[Ticks], d: Bytes, e: Array[Item], count: int) -> float: ...
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with the source above and its library."""
+    folder = tmp_path_factory.mktemp("library")
+    (folder / "skyless_core.c").write_text(SOURCE)
+    (folder / "skyless_core.h").write_text('#define SKYLESS_EXPORT __attribute__((visibility("default")))\n')
+    compile_core.compiled(folder, "skyless_core", "libskyless_core.so", [])
+    return folder
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """Where the library is, made from the source above."""
-    monkeypatch.delenv("SKYLESS_TARGET", raising=False)
+def folder(made, monkeypatch):
+    """Where the library is looked for."""
     monkeypatch.delenv("SKYLESS_UNCOMPILED", raising=False)
-    (tmp_path / "skyless_core.c").write_text(SOURCE)
-    (tmp_path / "skyless_core.h").write_text('#define SKYLESS_EXPORT __attribute__((visibility("default")))\n')
-    compile_core.compiled(tmp_path, "skyless_core", "libskyless_core.so", [])
-    monkeypatch.setattr(library, "FOLDER", tmp_path)
+    monkeypatch.setattr(library, "FOLDER", made)
     library.library.cache_clear()
-    yield tmp_path
+    yield made
     library.library.cache_clear()
 
 
-def test_numbers_keep_their_size_and_sign(folder):
+def test_numbers_keep_their_size_and_sign_and_records_are_given_in_place(folder):
     assert library.compiled(scalars)(-(2**31), 2**40, 255, True, 0.5) == -(2**31) + 2**40 + 256.5
     assert library.compiled(later)(-(2**62)) == 1 - 2**62
-
-
-def test_records_are_given_in_place(folder):
     item, other = Item(count=-3, length_m=1.5, ticks=2**50), Item()
     assert library.compiled(is_long)(item) is True
     assert library.compiled(is_long)(other) is False
@@ -136,30 +131,22 @@ def test_arrays_of_other_elements_are_refused(folder, place, wrong, message):
         library.compiled(sums)(*given, 3)
 
 
-def test_uncompiled_is_the_python_function(folder, monkeypatch):
+def test_a_library_that_is_not_used_is_missing_or_is_of_another_source(folder, tmp_path, monkeypatch):
     monkeypatch.setenv("SKYLESS_UNCOMPILED", "1")
     assert library.compiled(later) is later
-
-
-def test_a_library_of_another_source_says_so(folder):
-    (folder / "skyless_core.h").write_text("/* changed */\n")
-    with pytest.raises(SkylessError, match=r"made from another skyless_core.c .*install Skyless again.*scripts/core"):
-        library.library(library.CORE)
-
-
-def test_a_missing_library_says_what_to_do(folder):
-    (folder / "libskyless_core.so").unlink()
+    monkeypatch.setattr(library, "FOLDER", tmp_path)
     with pytest.raises(SkylessError, match=r"libskyless_core.so: cannot open.*install Skyless again"):
+        library.library(library.CORE)
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    (tmp_path / "skyless_core.h").write_text("/* changed */\n")
+    with pytest.raises(SkylessError, match=r"made from another skyless_core.c .*install Skyless again.*scripts/core"):
         library.library(library.CORE)
 
 
 def test_that_of_this_checkout_is_made_from_its_source():
     """In a process of its own: this one may run uncompiled."""
-    command = [
-        sys.executable,
-        "-c",
-        "from skyless.core.native.library import library; print(library('skyless_core')._name)",
-    ]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    program = "from skyless.core.native.library import library; print(library('skyless_core')._name)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert Path(done.stdout.strip()).parent == NATIVE

@@ -1,67 +1,132 @@
-"""The estimator's Python and the C that is made from it: the same bits, function by function, compiler by compiler."""
+"""The Python of estimator, receiver and search, and the C that is made from it: the same bits.
+
+Function by function, packet by packet, frame by frame, position by position, and compiler by compiler.
+"""
 
 import ctypes
 import inspect
+import os
 import subprocess
-import sys
+from collections import Counter
 from functools import cache
-from pathlib import Path
 
+import estimator_builders as builders
 import numpy as np
 import pytest
-from core_build import NATIVE, disturbed, has, input_of, library_of_all, rows_and_state, runner
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "core"))
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
-from estimator_builders import LAB_M, MESH, ROOM_M, begun, bytes_in_use, episode_of, one_by_one, settings_of
+from core_build import (
+    ERRORS,
+    EXACT,
+    NATIVE,
+    SITES,
+    disturbed,
+    in_webassembly,
+    input_of,
+    needs,
+    runner,
+    same_rows,
+    track,
+)
+from estimator_builders import LAB_M, MESH, ROOM_M, begun, episode_of, late_from, one_by_one, settings_of
+from msgspec.structs import replace
 
 import wasm_core
 from make_core import EXPORTS, FILES
 from skyless.core.air.almanac import GeoreferencePage, NoisePage, SitePage
-from skyless.core.air.beacon import Beacon, StatedPosition, encode
-from skyless.core.air.frame import Heard, fcs
-from skyless.core.estimator.process import BatchPacket, BatchRow, Packet, Place, Relay
+from skyless.core.air.beacon import Beacon, StatedPosition, decode, encode
+from skyless.core.air.frame import Diagnostics, Heard, PackedHeard, fcs
+from skyless.core.air.site_pages import site_issue
+from skyless.core.anchor import site_page_for, site_pages_of
+from skyless.core.estimator.process import ACCEPTED, Packet, process_frame
 from skyless.core.estimator.state import WORK_ROWS, State
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay
 from skyless.core.native import arithmetic
+from skyless.core.native.library import compiled
 from skyless.core.native.records import MAX_ANCHORS, c_type
 from skyless.core.native.views import view
-from skyless.core.tag import position, search
+from skyless.core.tag import position, receiver, search
+from skyless.core.tag.hearing import hear_frame
+from support.bench import ROOM, tape
 from translator.body import Translator
 from translator.files import translate
 from translator.types import INT, REAL, Elements, Number, Results, Struct, parameter_type
 
-pytestmark = [pytest.mark.site, pytest.mark.skipif(not has("gcc"), reason="there is no gcc")]
+pytestmark = [pytest.mark.site, needs("gcc")]
 
-ERRORS = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
-SITES = [(LAB_M, 0.0, {}), (ROOM_M, 0.0, ERRORS), (ROOM_M, None, ERRORS)]
-FUNCTIONS = Translator(EXPORTS).functions
+TRANSLATOR = Translator(EXPORTS)
+POINTED = ctypes.Structure | ctypes.Array
+
+
+def bits(value):
+    """The bytes of a value, without those between the fields of records and what is not in use of a state."""
+    if isinstance(value, State):
+        parts = (value.levels, value.U, value.G)
+        return builders.bytes_in_use(value) + b"".join(view(part).tobytes() for part in parts)
+    if isinstance(value, POINTED):
+        return np.frombuffer(value, np.uint8)[contents(type(value))].tobytes()
+    return value
+
+
+@cache
+def contents(made):
+    """Which bytes of a type are not between the fields of records."""
+    if issubclass(made, ctypes.Array):
+        return np.tile(contents(made._type_), made._length_)
+    found = np.full(ctypes.sizeof(made), not issubclass(made, ctypes.Structure))
+    for name, kind in getattr(made, "_fields_", ()):
+        begin = getattr(made, name).offset
+        found[begin : begin + ctypes.sizeof(kind)] = contents(kind)
+    return found
+
+
+# The files
 
 
 @pytest.mark.parametrize(("name", "exports", "by_hand"), FILES, ids=[name for name, *_ in FILES])
 def test_the_files_are_what_their_source_makes(name, exports, by_hand):
-    header, source = translate(exports, name, by_hand)
-    assert (NATIVE / f"{name}.h").read_text() == header, "run scripts/core"
-    assert (NATIVE / f"{name}.c").read_text() == source, "run scripts/core"
+    for text, suffix in zip(translate(exports, name, by_hand), ("h", "c"), strict=True):
+        assert (NATIVE / f"{name}.{suffix}").read_text() == text, "run scripts/core"
+    assert name != "skyless_core" or "math.h" not in text, "its bits would depend on the machine"
 
 
-def test_the_core_calls_no_function_whose_bits_depend_on_the_machine():
-    assert "math.h" not in (NATIVE / "skyless_core.c").read_text()
+def test_records_are_as_large_as_in_c(tmp_path):
+    made = TRANSLATOR.records.values()
+    lines = "".join(f'printf("%zu\\n", sizeof({one.__name__}));' for one in made)
+    program = f'#include <stdio.h>\n#include "skyless_core.h"\nint main(void) {{ {lines} return 0; }}'
+    (tmp_path / "sizes.c").write_text(program)
+    subprocess.run(["gcc", f"-I{NATIVE}", tmp_path / "sizes.c", "-o", tmp_path / "sizes"], check=True)
+    found = subprocess.run([tmp_path / "sizes"], capture_output=True, check=True).stdout.split()
+    assert [int(size) for size in found] == [ctypes.sizeof(one) for one in made]
+
+
+# Function by function
+
+SKIPPED = {"track", "find_steady_state", "find_walked", "process_superframe", "process_known"}
+"""Their arguments are tables; the runs below, and the tests of planning and bounds, cover them …"""
+SKIPPED |= {"begin_filter", "add_choice", "complete"}
+"""… and these the frames below."""
+OF_POSITIONS = {module.__name__ for module in (search, position, arithmetic)}
+"""The positions below cover these."""
+ONE_BY_ONE = {name for name, one in TRANSLATOR.functions.items() if one.__module__ not in OF_POSITIONS} - SKIPPED
+REALS = {
+    "integrity_risk": 1e-3, "risk": 1e-5, "dt": 0.02, "elapsed_s": 0.1, "age_s": 0.05, "ratio": 0.7, "sign": 1.0,
+    "kept": 0.9,
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def everything(tmp_path_factory):
-    return library_of_all(tmp_path_factory.mktemp("all"), "gcc", "-O3")
+    """A library of all functions, also those that are called inside only."""
+    made = tmp_path_factory.mktemp("all") / "all.so"
+    own = ("-DINTERNAL=", "-shared", "-fPIC", "-Wl,-Bsymbolic")  # not libc's, which has some of these names as well
+    subprocess.run(["gcc", *EXACT, "-O1", *own, NATIVE / "skyless_core.c", "-o", made], check=True)
+    return ctypes.CDLL(str(made))
 
 
 @pytest.fixture(scope="module")
 def states():
     """States in the middle of things: two and three dimensions, exact and not, with and without a jump."""
     found = []
-    for seed, (anchors_m, height_m, errors) in enumerate(
-        [(LAB_M, 0.0, {}), (ROOM_M, 0.0, ERRORS), (ROOM_M, None, ERRORS)]
-    ):
+    for seed, (anchors_m, height_m, errors) in enumerate(SITES.values()):
         episode = episode_of(MESH, 16, seed + 1, anchors_m)
         estimator = begun(episode, settings_of(height_m=height_m, stationary_s=0.5, **errors), anchors_m, std_m=0.05)
         for packet in one_by_one(disturbed(episode, seed)):
@@ -75,59 +140,23 @@ def drawn_number(name, s, draw, anchor):
     """A number that a parameter of this name may have; where it is an anchor, not another's."""
     ahead = s.status.epoch_ticks + int(draw.integers(1, 10**9))
     where = {
-        "rx_ticks": ahead,
-        "tx_ticks": s.anchors[anchor].tx_ticks + int(draw.integers(1, 10**9)),
-        "packet_rx_ticks": ahead - 10**9,
-        "impulses_ticks": s.status.epoch_ticks,
-        "now": ahead,
-        "superframe": 10**9,
-        "subticks": int(draw.integers(0, 2**48)),
-        "kind": int(draw.integers(3)),
-        "axes": s.dim,
-        "state": int(draw.integers(s.n)),
-        "value": anchor + s.dim,
-        "index": int(draw.integers(s.layout.end)),
-        "count": min(s.count, 5),
-        "vectors": 1,
-        "faults": 3 * s.count,
-        "end": 20,
-        "begin": 0,
-        "dim": s.dim,
-        "range_errors": int(draw.integers(3)),
-        "identifier": 77,
-        "master": (anchor + 1) % s.count,
-        "other": (anchor + 2) % s.count,
-        "sender": (anchor + 1) % s.count,
-        "b": (anchor + 1) % s.count,
-        "row": 3,
-        "k": 0,
-        "packed_bytes": 16,
-        "length": 117 - int(draw.integers(4) == 0),
-        "at": 20,
-        "axis": int(draw.integers(3)),
-        "bits": 40,
-        "size": 3,
-    }
+        "rx_ticks": ahead, "tx_ticks": s.anchors[anchor].tx_ticks + int(draw.integers(1, 10**9)), "now": ahead,
+        "packet_rx_ticks": ahead - 10**9, "impulses_ticks": s.status.epoch_ticks, "superframe": 10**9,
+        "subticks": int(draw.integers(0, 2**48)), "kind": int(draw.integers(3)), "axes": s.dim, "dim": s.dim,
+        "state": int(draw.integers(s.n)), "value": anchor + s.dim, "index": int(draw.integers(s.layout.end)),
+        "count": min(s.count, 5), "faults": 3 * s.count, "vectors": 1, "begin": 0, "end": 20, "identifier": 77,
+        "range_errors": int(draw.integers(3)), "length": 117 - int(draw.integers(4) == 0), "row": 3, "k": 0, "at": 20,
+        "packed_bytes": 16, "axis": int(draw.integers(3)), "bits": 40, "size": 3, "other": (anchor + 2) % s.count,
+        **dict.fromkeys(("master", "sender", "b"), (anchor + 1) % s.count),
+    }  # fmt: skip
     return where.get(name, anchor)
 
 
-REALS = {
-    "integrity_risk": 1e-3,
-    "risk": 1e-5,
-    "dt": 0.02,
-    "elapsed_s": 0.1,
-    "age_s": 0.05,
-    "ratio": 0.7,
-    "sign": 1.0,
-    "kept": 0.9,
-}
-
-
-def arguments(function, s, draw):
+def arguments(function, state, seed):
     """What a function is called with; the state is the first."""
+    s, draw = State.from_buffer_copy(state), np.random.default_rng(seed)
     found, anchor = [], int(draw.integers(s.count))
-    for name, hint in hints(function).items():
-        kind = parameter_type(hint)
+    for name, kind in parameters(function).items():
         if kind == Struct(State):
             found.append(s)
         elif isinstance(kind, Struct):
@@ -141,6 +170,12 @@ def arguments(function, s, draw):
         else:
             found.append((ctypes.c_double * 512)(*draw.normal(size=512)) if kind.element == REAL else frame_of(draw))
     return found
+
+
+def parameters(function):
+    """The translator's types of them."""
+    hints = inspect.get_annotations(function, eval_str=True)
+    return {name: parameter_type(hint) for name, hint in hints.items() if name != "return"}
 
 
 def frame_of(draw):
@@ -163,10 +198,8 @@ def drawn_record(made, s, draw):
         one.place.anchor, one.place.std_m = a.identifier, -1.0
         view(one.place.position_m)[:] = view(a.position_m)
         one.sequence, one.variance_factor, one.master = 7, 1.5, s.anchors[0].identifier
-        one.rx_ticks, one.tx_ticks = (
-            s.status.epoch_ticks + 10**8,
-            a.tx_ticks + s.status.epoch_ticks + 10**8 - a.rx_ticks,
-        )
+        one.rx_ticks = s.status.epoch_ticks + 10**8
+        one.tx_ticks = a.tx_ticks + one.rx_ticks - a.rx_ticks
         one.subticks, one.report_variance_m2 = 12345, 1e-3
     elif made is PlannedMessage:
         one.anchor, one.share, one.late_m = int(draw.integers(s.count)), 0.7, 0.1
@@ -177,100 +210,41 @@ def drawn_record(made, s, draw):
     return one
 
 
-FEW = 6
-
-
-def fill(one, draw):
-    """Small numbers in all fields, so that they fit any table, and stamps of seconds."""
-    for name, kind in one._fields_:
+def fill(value, draw):
+    """Small numbers in all fields and in the first elements, so that they fit any table, and stamps of seconds."""
+    few, is_record = 6, isinstance(value, ctypes.Structure)
+    for name, kind in value._fields_ if is_record else [(at, value._type_) for at in range(min(few, len(value)))]:
         if name == "parent":
-            view(one.parent)[:] = np.arange(-1, len(one.parent) - 1)
-        elif issubclass(kind, ctypes.Structure | ctypes.Array):
-            fill_elements(getattr(one, name), draw)
-        elif name == "dim":
-            one.dim = int(draw.integers(2, 4))
-        elif name == "bits":
-            one.bits = 40
+            view(value.parent)[:] = np.arange(-1, len(value.parent) - 1)
+        elif issubclass(kind, POINTED):
+            fill(getattr(value, name) if is_record else value[name], draw)
         else:
-            setattr(one, name, drawn_scalar(kind, draw))
+            number = draw.integers(2 * 10**11) if kind is ctypes.c_int64 else draw.integers(1, few)
+            number = draw.normal(0.0, 10.0) if kind is ctypes.c_double else kind(int(number)).value
+            number = {"dim": int(draw.integers(2, 4)), "bits": 40}.get(name, number)
+            setattr(value, name, number) if is_record else value.__setitem__(name, number)
 
 
-def fill_elements(array, draw):
-    if isinstance(array, ctypes.Structure):
-        fill(array, draw)
-        return
-    for place in range(min(FEW, len(array))):
-        if issubclass(array._type_, ctypes.Structure | ctypes.Array):
-            fill_elements(array[place], draw)
-        else:
-            array[place] = drawn_scalar(array._type_, draw)
-
-
-def drawn_scalar(kind, draw):
-    if kind is ctypes.c_int64:
-        return int(draw.integers(2 * 10**11))
-    return float(draw.normal(0.0, 10.0)) if kind is ctypes.c_double else kind(int(draw.integers(1, FEW))).value
-
-
-def hints(function):
-    found = inspect.get_annotations(function, eval_str=True)
-    return {name: hint for name, hint in found.items() if name != "return"}
-
-
-def bits(value):
-    if isinstance(value, State):
-        return bytes_in_use(value) + view(value.levels).tobytes() + view(value.U).tobytes() + view(value.G).tobytes()
-    if isinstance(value, ctypes.Structure | ctypes.Array):
-        return np.frombuffer(value, np.uint8)[contents(type(value))].tobytes()
-    return value
-
-
-@cache
-def contents(made):
-    """Which bytes of a type are not between the fields of records."""
-    if issubclass(made, ctypes.Array):
-        return np.tile(contents(made._type_), made._length_)
-    found = np.full(ctypes.sizeof(made), not issubclass(made, ctypes.Structure))
-    for name, kind in getattr(made, "_fields_", ()):
-        begin = getattr(made, name).offset
-        found[begin : begin + ctypes.sizeof(kind)] = contents(kind)
-    return found
-
-
-SKIPPED = {"track", "find_steady_state", "find_walked", "process_superframe", "process_known"}
-"""Their arguments are tables; the runs below, and the tests of planning and bounds, cover them …"""
-SKIPPED |= {"begin_filter", "add_choice", "complete"}
-"""… and these ``test_receiver_same_bits``."""
-OF_POSITIONS = {module.__name__ for module in (search, search, position, search, arithmetic, search, arithmetic)}
-"""``test_position_same_bits`` covers these."""
-ONE_BY_ONE = {name for name, function in FUNCTIONS.items() if function.__module__ not in OF_POSITIONS}
-POINTED = ctypes.Structure | ctypes.Array
-
-
-@pytest.mark.parametrize("name", sorted(ONE_BY_ONE - SKIPPED))
+@pytest.mark.parametrize("name", sorted(ONE_BY_ONE))
 def test_a_function_gives_the_same_bits(everything, states, name):
-    function = FUNCTIONS[name]
+    function = TRANSLATOR.functions[name]
     called = everything[f"skyless_{name}" if function in EXPORTS else name]
-    returned = inspect.get_annotations(function, eval_str=True)["return"]
+    hints = inspect.get_annotations(function, eval_str=True)
+    returned = hints["return"]
     kind = None if returned is None else parameter_type(returned)
     if isinstance(kind, Results):
         items = [(f"item_{k}", ctypes.c_double) for k in range(len(kind.items))]
         called.restype = type("Results", (ctypes.Structure,), {"_fields_": items})
-    elif isinstance(kind, Struct):
-        called.restype = ctypes.c_void_p
     else:
-        called.restype = None if kind is None else c_type(returned)
+        called.restype = ctypes.c_void_p if isinstance(kind, Struct) else kind and c_type(returned)
     called.argtypes = [
-        ctypes.c_void_p if isinstance(parameter_type(hint), Elements | Struct) else c_type(hint)
-        for hint in hints(function).values()
+        ctypes.c_void_p if isinstance(one, Elements | Struct) else c_type(hints[name])
+        for name, one in parameters(function).items()
     ]
     for seed, state in enumerate(states * 4):
-        ours = arguments(function, State.from_buffer_copy(state), np.random.default_rng(seed))
-        theirs = arguments(function, State.from_buffer_copy(state), np.random.default_rng(seed))
+        ours, theirs = arguments(function, state, seed), arguments(function, state, seed)
         expected = function(*ours)
-        found = called(
-            *(ctypes.byref(one) if isinstance(one, ctypes.Structure | ctypes.Array) else one for one in theirs)
-        )
+        found = called(*(ctypes.byref(one) if isinstance(one, POINTED) else one for one in theirs))
         assert [bits(one) for one in ours] == [bits(one) for one in theirs]
         if isinstance(kind, Results):
             found = tuple(getattr(found, name) for name, _ in items)
@@ -278,70 +252,204 @@ def test_a_function_gives_the_same_bits(everything, states, name):
             assert np.array_equal(np.array(expected, float), np.array(found, float), equal_nan=True)
 
 
-# Other compilers and processors
-
-
-@pytest.fixture(scope="module")
-def episode():
-    packets = disturbed(episode_of(MESH, 60, 5, ROOM_M), 9)
-    estimator = begun(episode_of(MESH, 60, 5, ROOM_M), settings_of(height_m=None, **ERRORS), ROOM_M, std_m=0.1)
-    given = input_of(estimator, packets, ROOM_M)
-    rows = estimator.track(packets, has_levels=True)
-    return given, rows, estimator.state
-
-
-TARGETS = {
-    "gcc -O2": ("gcc", "-O2"),
-    "gcc -O3 native": ("gcc", "-O3", "-march=native"),
-    "clang -O3": ("clang", "-O3"),
-    "aarch64": ("aarch64-linux-gnu-gcc", "-O3", "-static"),
-}
-
-
-@pytest.mark.parametrize("target", TARGETS)
-def test_all_compilers_and_processors_give_the_same_bits(target, episode, tmp_path):
-    compiler, *flags = TARGETS[target]
-    emulator = ("qemu-aarch64",) if compiler.startswith("aarch64") else ()
-    if not has(compiler, *emulator):
-        pytest.skip(f"{' or '.join((compiler, *emulator))} is not here")
-    given, rows, state = episode
-    done = subprocess.run(
-        runner(tmp_path, compiler, *flags, emulator=emulator), input=given, capture_output=True, check=True
-    )
-    found, theirs = rows_and_state(done.stdout, len(rows))
-    assert bits(state) == bits(theirs)
-    for name in rows.dtype.names:
-        assert np.array_equal(rows[name], found[name])
-
-
-@pytest.mark.skipif(not has("clang", "wasm-ld", "node"), reason="clang, lld or node is not here")
-def test_webassembly_gives_the_same_bits(episode, tmp_path):
-    wasm_core.build(tmp_path / "core.wasm")
-    given, rows, state = episode
-    sizes = [str(ctypes.sizeof(one)) for one in (State, Place, BatchPacket, Relay, BatchRow)]
-    command = ["node", Path(__file__).with_name("run_core.mjs"), tmp_path / "core.wasm", *sizes]
-    done = subprocess.run(command, input=given, capture_output=True, check=True)
-    found, theirs = rows_and_state(done.stdout, len(rows))
-    assert bits(state) == bits(theirs)
-    for name in rows.dtype.names:
-        assert np.array_equal(rows[name], found[name])
-
-
-def test_records_are_as_large_as_in_c(tmp_path):
-    made = Translator(EXPORTS).records.values()
-    lines = "".join(f'printf("%zu\\n", sizeof({one.__name__}));' for one in made)
-    (tmp_path / "sizes.c").write_text(
-        f'#include <stdio.h>\n#include "skyless_core.h"\nint main(void) {{ {lines} return 0; }}'
-    )
-    subprocess.run(["gcc", f"-I{NATIVE}", tmp_path / "sizes.c", "-o", tmp_path / "sizes"], check=True)
-    found = subprocess.run([tmp_path / "sizes"], capture_output=True, check=True).stdout.split()
-    assert [int(size) for size in found] == [ctypes.sizeof(one) for one in made]
-
-
 def test_there_is_room_for_all_anchors_and_no_more(states):
     s, packet = State.from_buffer_copy(states[2]), Packet()
     packet.place.std_m = -1.0
     for anchor in range(100, 100 + MAX_ANCHORS):
         room, packet.place.anchor = s.count < MAX_ANCHORS, anchor
-        assert (FUNCTIONS["present"](s, packet.place) >= 0) == room
+        assert (TRANSLATOR.functions["present"](s, packet.place) >= 0) == room
     assert s.count == MAX_ANCHORS
+
+
+# Packet by packet
+
+
+def with_range_errors(packets, draw):
+    """Each anchor's range is wrong by a constant of its own."""
+    return builders.late(packets, draw.uniform(-0.05, 0.05, packets.anchors.max() + 1)[packets.anchors])
+
+
+def with_late_ones(packets, draw):
+    """Single packets are late; one anchor is for the second third, another for the last quarter."""
+    count = len(packets.anchors)
+    some = np.where(draw.random(count) < 0.05, draw.exponential(1.0, count), 0.0)
+    packets = late_from(builders.late(with_range_errors(packets, draw), some), 2, 0.5, count // 3, 2 * count // 3)
+    return late_from(packets, 4, 1.5, 3 * count // 4)
+
+
+def with_losses(packets, draw):
+    """Half of all is lost; one anchor is silent for the second third, another's clock jumps in the middle."""
+    count = len(packets.anchors)
+    packets = builders.jumped(packets, 1, count // 2, 30.0)
+    is_silent = (packets.anchors == 3) & (np.arange(count) // (count // 3) == 1)
+    return builders.kept(packets, (draw.random(count) > 0.5) & ~is_silent)
+
+
+@pytest.mark.parametrize(
+    ("anchors_m", "height_m", "errors", "changed"),
+    [
+        (LAB_M, 0.0, {}, lambda packets, _: packets),
+        (LAB_M, 0.0, ERRORS, with_late_ones),
+        (ROOM_M, None, ERRORS, with_range_errors),
+        (ROOM_M, 0.0, ERRORS, with_losses),
+    ],
+    ids=["lab", "late", "3-D", "loss"],
+)
+def test_python_and_c_do_the_same_with_every_packet(anchors_m, height_m, errors, changed):
+    """To and fro between the anchors at some 1 m/s, and at rest for the last third."""
+    frames, draw = int(os.environ.get("SKYLESS_FUZZ_FRAMES", "240")), np.random.default_rng(1)
+    time_s = np.minimum(np.arange(frames), 2 * frames // 3)[:, None] * builders.SLOT_S
+    low_m, high_m = anchors_m.min(axis=0), anchors_m.max(axis=0)
+    swing_m = 0.4 * (high_m - low_m) * np.sin(draw.uniform(0.2, 0.4, 3) * time_s + draw.uniform(0.0, 6.0, 3))
+    path_m = (low_m + high_m) / 2.0 + swing_m
+    if height_m is not None:
+        path_m[:, 2] = height_m
+    episode = episode_of(MESH, frames // len(anchors_m), 1, anchors_m, path_m=path_m)
+    settings = settings_of(height_m=height_m, stationary_s=0.5, **errors)
+    in_c, plain = begun(episode, settings, anchors_m), begun(episode, settings, anchors_m)
+    outcomes = Counter()
+    for number, packet in enumerate(one_by_one(changed(episode.packets, draw))):
+        outcome = process_frame(plain.state, *plain.packet_of(*packet), b"", 0)
+        assert (in_c.process(*packet), in_c.rows) == (outcome, plain.rows), f"packet {number}"
+        assert bits(in_c.state) == bits(plain.state), f"packet {number}"
+        outcomes[outcome] += 1
+    assert outcomes[ACCEPTED] > frames / 3
+
+
+# Frame by frame
+
+FREE = replace(ROOM, schedule=replace(ROOM.schedule, mode="free", rate_hz=60.0))
+PHASES = replace(FREE, schedule=replace(FREE.schedule, carrier_phase=True))
+OTHERS = site_pages_of(replace(FREE, tags=replace(FREE.tags, height_m=0.1)))
+"""Pages by which the height is known."""
+COUNTED = {
+    "moved-anchor", "duplicate", "bad-fcs", "impossible-stamp", "foreign-site", "impossible-host-time", "counter-jump",
+}  # fmt: skip
+
+
+def surveyed(received):
+    """A beacon half a metre from where it was, with other pages."""
+    beacon = decode(received.frame)
+    place = replace(beacon.position, x_m=beacon.position.x_m + 0.5)
+    page, heard = site_page_for(OTHERS, beacon.sequence, beacon.anchor), beacon.heard.packed[:32]
+    changed = replace(beacon, position=place, almanac_issue=site_issue(OTHERS), page=page, weak=0)
+    return replace(received, frame=encode(replace(changed, heard=PackedHeard(heard, beacon.has_phases))))
+
+
+def disturbed_frames(heard, draw):
+    """Frames repeated, damaged, under other names or sites, with other stamps; a survey; a counter that restarts."""
+    after = len(heard) // 3
+    for number, received in enumerate([*heard[:after], *map(surveyed, heard[after:])]):
+        beacon, change = decode(received.frame), draw.random()
+        one = replace(received, diagnostics=Diagnostics(-80.0, -80.0 - 14.0 * draw.random()))
+        if number > 0.8 * len(heard):  # five seconds back
+            one = replace(one, rx_ticks=(one.rx_ticks - 3 * 10**11) % 2**40, host_s=None)
+        yield one
+        soon = replace(one, rx_ticks=one.rx_ticks + 10**6)
+        if change < 0.05:
+            yield one
+        elif change < 0.1:
+            yield replace(one, frame=one.frame[:-1] + b"\0", rx_ticks=one.rx_ticks + 10)
+        elif change < 0.2:
+            forged = {"tx_ticks": int(draw.integers(2**40)), "anchor": int(draw.integers(1, 12)), "heard": ()}
+            yield replace(soon, frame=encode(replace(beacon, **forged, weak=0)))
+        elif change < 0.25:
+            yield replace(soon, frame=encode(replace(beacon, site=77)))
+        elif change < 0.3:
+            yield replace(soon, host_s=1e300)
+
+
+@pytest.mark.parametrize("site", [FREE, PHASES], ids=["stamps", "phases"])
+def test_a_receiver_gives_the_same_bits(monkeypatch, site):
+    in_c, plain, fixes = receiver.Receiver(), receiver.Receiver(), 0
+    heard = [one.reception for one in tape(site, 1.2)]
+    for one in disturbed_frames(heard, np.random.default_rng(4)):
+        expected = in_c.hear(one)
+        with monkeypatch.context() as patched:
+            patched.setattr(receiver, "_hear_frame", hear_frame)
+            found = plain.hear(one)
+        said = [fix and (fix.rows, fix.time_s, fix.anchors) for fix in (found, expected)]
+        assert said[0] == said[1]
+        assert bits(plain.tag) == bits(in_c.tag)
+        assert (plain.reason, plain.counters) == (in_c.reason, in_c.counters)
+        fixes += found is not None
+    assert fixes > 100
+    assert plain.almanac.pages.site.tag_height_m == 0.1
+    assert plain.counters.keys() >= COUNTED
+
+
+# Position by position
+
+
+def drawn_problem(draw):
+    """Anchors in a room, in a plane, nearly in a line, or on a lattice; TDoAs with little, much or absurd noise."""
+    anchors = int(draw.integers(3, 10)) if draw.random() < 0.95 else MAX_ANCHORS
+    anchors_m = draw.uniform(0.0, [20.0, 10.0, 5.0], (anchors, 3))
+    shape = int(draw.integers(5))
+    if shape == 1:
+        anchors_m[:, 2] = 2.5
+    elif shape == 2:
+        anchors_m[:, 2] = anchors_m[:, 0] + 10.0 ** draw.uniform(-9.0, 0.0) * draw.normal(size=anchors)
+    elif shape == 3:
+        anchors_m[:, 1:] = anchors_m[:, :1] + 10.0 ** draw.uniform(-7.0, 0.0) * draw.normal(size=(anchors, 2))
+    elif shape == 4:
+        anchors_m = np.round(anchors_m / 4.0) * 4.0
+    tag_m, std_m = draw.uniform(-3.0, [23.0, 13.0, 8.0]), 10.0 ** draw.uniform(-4.0, 0.0)
+    ranges_m = np.linalg.norm(anchors_m - tag_m, axis=1)
+    ranges_m += std_m * draw.choice([0.0, 1.0, 10.0, 300.0]) * draw.normal(size=anchors)
+    flags = {name: bool(draw.integers(2)) for name in ("knows_height", "is_weighted", "has_bounds")}
+    tail = draw.choice([0.0, 1e-9])
+    p = search.LocateProblem(anchors=anchors, **flags, height_m=tag_m[2], low_m=0.0, high_m=5.0, residual_tail=tail)
+    view(p.anchors_m)[:anchors], view(p.tdoa_m)[: anchors - 1] = anchors_m, ranges_m[1:] - ranges_m[0]
+    root = draw.normal(size=(anchors - 1, anchors - 1))
+    covariance = std_m**2 * (1.0 + np.eye(anchors - 1) + 0.1 * root @ root.T)
+    view(p.covariance)[: anchors * (anchors - 1) // 2] = covariance[np.tril_indices(anchors - 1)]
+    return p
+
+
+def test_a_position_has_the_same_bits():
+    draw, in_c, kinds, reasons = np.random.default_rng(6), compiled(position.find_position), Counter(), Counter()
+    for _ in range(400):
+        ours = drawn_problem(draw)
+        theirs, found, found_in_c = type(ours).from_buffer_copy(ours), position.Found(), position.Found()
+        reason = position.find_position(ours, found)
+        assert in_c(theirs, found_in_c) == reason
+        numbers = [np.frombuffer(one, float).copy() for one in (found, ours, found_in_c, theirs)]
+        for one in numbers:
+            one[np.isnan(one)] = np.nan  # what is no number has the same bits everywhere then
+        assert [one.tobytes() for one in numbers[:2]] == [one.tobytes() for one in numbers[2:]]
+        kinds[ours.kind] += 1
+        reasons[reason] += 1
+    assert min(kinds[kind] for kind in (search.FREE, search.HEIGHT, search.PLANE)) > 50
+    expected = ("FOUND", "IMPOSSIBLE", "MIRROR", "RESIDUALS", "SINGULAR", "UNCERTAIN")
+    assert min(reasons[getattr(position, name)] for name in expected) > 2
+
+
+# Compiler by compiler
+
+
+@pytest.mark.parametrize(
+    ("compiler", "flags", "emulator"),
+    [
+        pytest.param("gcc", ["-O1"], [], marks=needs("gcc")),
+        pytest.param("gcc", ["-O3", "-march=native"], [], marks=needs("gcc")),
+        pytest.param("clang", ["-O3"], [], marks=needs("clang")),
+        pytest.param("aarch64-linux-gnu-gcc", ["-O2", "-static"], ["qemu-aarch64"],
+                     marks=needs("aarch64-linux-gnu-gcc", "qemu-aarch64")),
+        pytest.param("WebAssembly", [], [], marks=needs("clang", "wasm-ld", "node")),
+    ],
+)  # fmt: skip
+def test_all_compilers_and_processors_give_the_same_bits(compiler, flags, emulator, tmp_path):
+    episode = episode_of(MESH, 60, 5, ROOM_M)
+    packets = disturbed(episode, 9)
+    estimator = begun(episode, settings_of(height_m=None, **ERRORS), ROOM_M, std_m=0.1)
+    given = input_of(estimator, packets, ROOM_M)
+    rows = estimator.track(packets, has_levels=True)
+    if compiler == "WebAssembly":
+        wasm_core.build(tmp_path / "core.wasm")
+        command = in_webassembly(tmp_path / "core.wasm")
+    else:
+        command = [*emulator, runner(tmp_path, compiler, *flags)]
+    found, state = track(command, given)
+    assert bits(state) == bits(estimator.state)
+    assert same_rows(rows, found)

@@ -12,21 +12,16 @@ from pathlib import Path
 
 import pytest
 import translated
-from core_build import EXACT, has
+from core_build import EXACT, needs
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.core.native.records import Record, Ticks
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "tools"))
-
 from translator.body import RefusedError
 from translator.files import translate
 
-pytestmark = pytest.mark.site
-
-ALL = [f for f in vars(translated).values() if inspect.isfunction(f) and f.__module__ == translated.__name__]
-EXPORTED = [f for f in ALL if not f.__name__.startswith("_")]
+FUNCTIONS = [f for f in vars(translated).values() if inspect.isfunction(f) and f.__module__ == translated.__name__]
+EXPORTED = [f for f in FUNCTIONS if not f.__name__.startswith("_")]
 OF_NUMBERS = [f for f in EXPORTED if f.__name__ not in ("choose", "work", "stamp", "ignore")]
 REALS = st.floats(-1e6, 1e6) | st.sampled_from([0.0, -0.0, 0.5, 1.0, -1.0])
 VALUES = {int: st.integers(-40, 40), Ticks: st.integers(-(2**40), 2**40), float: REALS, bool: st.booleans()}
@@ -34,21 +29,23 @@ TYPES = {int: ctypes.c_int32, Ticks: ctypes.c_int64, float: ctypes.c_double, boo
 WARNINGS = ("-Wall", "-Wextra", "-Wdouble-promotion", "-Werror", "-Wno-unused-function")
 
 
+COMPILER = ("gcc", *EXACT, "-O2", *WARNINGS)
+
+
+def write(folder, name, *what):
+    """The files of translated functions."""
+    for text, suffix in zip(translate(what[0], name, *what[1:]), ("h", "c"), strict=True):
+        (folder / f"{name}.{suffix}").write_text(text)
+
+
 @pytest.fixture(scope="module")
-def files(tmp_path_factory):
+def library(tmp_path_factory):
+    """The functions of ``translated``; in single precision they compile without a warning, too."""
     folder = tmp_path_factory.mktemp("translated")
-    for text, suffix in zip(translate(EXPORTED, "examples"), ("h", "c"), strict=True):
-        (folder / f"examples.{suffix}").write_text(text)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def library(files):
-    if not has("gcc"):
-        pytest.skip("there is no gcc")
-    command = ["gcc", *EXACT, "-O2", *WARNINGS, "-shared", "-fPIC", "examples.c", "-o", "examples.so"]
-    subprocess.run(command, cwd=files, check=True)
-    return ctypes.CDLL(str(files / "examples.so"))
+    write(folder, "examples", EXPORTED)
+    subprocess.run([*COMPILER, "-shared", "-fPIC", "examples.c", "-o", "examples.so"], cwd=folder, check=True)
+    subprocess.run([*COMPILER, "-DSKYLESS_FLOAT", "-c", "examples.c", "-o", "other.o"], cwd=folder, check=True)
+    return ctypes.CDLL(str(folder / "examples.so"))
 
 
 def bound(library, function):
@@ -60,6 +57,8 @@ def bound(library, function):
     return made
 
 
+@pytest.mark.site
+@needs("gcc")
 @pytest.mark.parametrize("function", OF_NUMBERS, ids=lambda f: f.__name__)
 def test_functions_of_numbers_give_the_bits_that_python_gives(library, function):
     hints = typing.get_type_hints(function, include_extras=True)
@@ -92,19 +91,19 @@ def drawn(kind, draw):
     return draw.uniform(-9, 9) if kind is ctypes.c_double else draw.randrange(2 if kind is ctypes.c_bool else 99)
 
 
-@pytest.mark.parametrize("seed", range(20))
-def test_functions_of_records_leave_the_bytes_that_python_leaves(library, seed):
-    draw, box = random.Random(seed), translated.Box()
-    fill(box, draw)
-    box.ticks += draw.choice([0, 1 << 35])
-    other = translated.Box.from_buffer_copy(bytes(box))
-    assert bound(library, translated.work)(ctypes.byref(other), 1.25) == translated.work(box, 1.25)
-    assert bound(library, translated.choose)(ctypes.byref(other), seed) == translated.choose(box, seed)
-    assert bytes(other) == bytes(box)
-    assert bound(library, translated.stamp)(box.bytes) == translated.stamp(box.bytes)
-    bound(library, translated.ignore)(ctypes.byref(other), 3)
-    translated.ignore(box, 3)
-    assert bytes(other) == bytes(box)
+@pytest.mark.site
+@needs("gcc")
+def test_functions_of_records_leave_the_bytes_that_python_leaves(library):
+    for seed in range(20):
+        draw, box = random.Random(seed), translated.Box()
+        fill(box, draw)
+        box.ticks += draw.choice([0, 1 << 35])
+        other = translated.Box.from_buffer_copy(bytes(box))
+        for name, argument in (("work", 1.25), ("choose", seed), ("ignore", 3)):
+            function = getattr(translated, name)
+            assert bound(library, function)(ctypes.byref(other), argument) == function(box, argument)
+            assert bytes(other) == bytes(box)
+        assert bound(library, translated.stamp)(box.bytes) == translated.stamp(box.bytes)
 
 
 OF_SIZES = """
@@ -130,32 +129,27 @@ def function(one: Sized) -> int:
 """
 
 
-@pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
-@pytest.mark.parametrize(
-    ("flags", "length", "half"),
-    [((), 3 + 32, 32), (("-DMAX_RELAYS=9",), 3 + 9, 9), (("-DMAX_RELAYS=9", "-DPACKED=true"), 3 + 4, 4)],
-)
-def test_what_follows_from_sizes_has_those_of_the_compiler(tmp_path, flags, length, half):
+@pytest.mark.site
+@needs("gcc")
+def test_what_follows_from_sizes_has_those_of_the_compiler(tmp_path):
     """And a function that a target has by hand is its own."""
     module = module_of(tmp_path, OF_SIZES)
-    for text, suffix in zip(translate([module.function], "sized", [module.by_hand]), ("h", "c"), strict=True):
-        (tmp_path / f"sized.{suffix}").write_text(text)
+    write(tmp_path, "sized", [module.function], [module.by_hand])
     (tmp_path / "hand.h").write_text("INTERNAL int32_t by_hand(Sized *one) { return 100 + (one == 0); }\n")
     (tmp_path / "run.c").write_text(
         '#include <stdio.h>\n#include "sized.h"\nint main(void) { Sized one; '
         'printf("%d %d", (int)(sizeof one / sizeof(double)), (int)skyless_function(&one)); }\n'
     )
-    for own, found in ((), 1), (('-DSKYLESS_BY_HAND="hand.h"',), 100):
-        command = ["gcc", *EXACT, *flags, *own, "sized.c", "run.c", "-o", "run"]
-        subprocess.run(command, cwd=tmp_path, check=True)
+    less, by_hand = "-DMAX_RELAYS=9", '-DSKYLESS_BY_HAND="hand.h"'
+    for flags, length, result in (
+        ((), 3 + 32, 32 + 1),
+        ((by_hand,), 3 + 32, 32 + 100),
+        ((less,), 3 + 9, 9 + 1),
+        ((less, "-DPACKED=true", by_hand), 3 + 4, 4 + 100),
+    ):
+        subprocess.run(["gcc", *EXACT, *flags, "sized.c", "run.c", "-o", "run"], cwd=tmp_path, check=True)
         output = subprocess.run([tmp_path / "run"], capture_output=True, text=True, check=True).stdout
-        assert output == f"{length} {half + found}"
-
-
-@pytest.mark.skipif(not has("gcc"), reason="there is no gcc")
-def test_single_precision_compiles_without_warnings(files):
-    command = ["gcc", *EXACT, *WARNINGS, "-DSKYLESS_FLOAT", "-c", "examples.c", "-o", "other.o"]
-    subprocess.run(command, cwd=files, check=True)
+        assert output == f"{length} {result}"
 
 
 HEAD = """\
@@ -235,21 +229,7 @@ def module_of(folder, text):
     return module
 
 
-def translate_text(folder, text):
-    return translate([module_of(folder, text).function], "refused")
-
-
-@pytest.mark.parametrize("statement", REFUSED)
-def test_what_is_outside_the_subset_is_refused_with_its_line(tmp_path, statement):
-    used = " return x if on else float(y)\n" if statement.startswith("y") else " return x\n"
-    with pytest.raises(RefusedError) as refused:
-        translate_text(tmp_path, f"{HEAD} {statement}\n{used}")
-    path, line, reason = str(refused.value).split(":", 2)
-    assert Path(path).parent == tmp_path
-    assert HEAD.count("\n") <= int(line) <= HEAD.count("\n") + 2 + statement.count("\n")
-    assert REFUSED[statement] in reason
-
-
+PLAIN = "from typing import Annotated\nfrom skyless.core.native.records import *\n"
 SIGNATURES = {
     "def function(x) -> None:": "need a type",
     "def function(x: float):": "need a type",
@@ -259,19 +239,29 @@ SIGNATURES = {
     "def function(x: float) -> Reals:": "returns an array",
     "def function(x: float) -> tuple[str, int]:": "str is no type of C",
 }
+CASES = [(f"{PLAIN}{signature}\n    pass\n", 3, 3, reason) for signature, reason in SIGNATURES.items()]
+"""Modules, the first and the last line that may be named, and the reason."""
+for statement, reason in REFUSED.items():
+    used = " return x if on else float(y)\n" if statement.startswith("y") else " return x\n"
+    first = HEAD.count("\n")
+    CASES.append((f"{HEAD} {statement}\n{used}", first, first + 2 + statement.count("\n"), reason))
 
 
-@pytest.mark.parametrize("signature", SIGNATURES)
-def test_signatures_outside_the_subset_are_refused(tmp_path, signature):
-    text = f"from typing import Annotated\nfrom skyless.core.native.records import *\n{signature}\n    pass\n"
-    with pytest.raises(RefusedError, match=r"refused_\d+\.py:3: ") as refused:
-        translate_text(tmp_path, text)
-    assert SIGNATURES[signature] in str(refused.value)
+@pytest.mark.parametrize(("text", "first", "last", "reason"), CASES)
+def test_what_is_outside_the_subset_is_refused_with_its_line(tmp_path, text, first, last, reason):
+    with pytest.raises(RefusedError) as refused:
+        translate([module_of(tmp_path, text).function], "refused")
+    path, line, said = str(refused.value).split(":", 2)
+    assert Path(path).parent == tmp_path
+    assert first <= int(line) <= last
+    assert reason in said
 
 
 def test_two_functions_or_constants_of_one_name_are_refused(tmp_path):
     functions = "def _one() -> int:\n return 1\ndef one() -> int:\n return 2\n"
-    with pytest.raises(RefusedError, match="two functions are called one"):
-        translate_text(tmp_path, f"{functions}def function() -> int:\n return _one() + one()\n")
-    with pytest.raises(RefusedError, match="another constant of this name is 1"):
-        translate_text(tmp_path, "A = 1\n_A = 2\ndef function() -> int:\n return A + _A\n")
+    for text, reason in (
+        (f"{functions}def function() -> int:\n return _one() + one()\n", "two functions are called one"),
+        ("A = 1\n_A = 2\ndef function() -> int:\n return A + _A\n", "another constant of this name is 1"),
+    ):
+        with pytest.raises(RefusedError, match=reason):
+            translate([module_of(tmp_path, text).function], "refused")

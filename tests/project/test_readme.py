@@ -128,7 +128,7 @@ ELSEWHERE = {
     + "test_a_pipe_gets_the_places_and_the_tables_once_also_when_it_is_terminated_and_a_tag_is_a_board",
     **dict.fromkeys(
         ("gpsd -N -n /dev/ttyACM0", "cgps"),
-        "tests/firmware/test_board_and_gpsd.py::"
+        "tests/firmware/test_outputs.py::"
         "test_gpsd_has_the_position_and_its_errors_whether_the_board_knows_the_time_or_not",
     ),
     "mosquitto_sub -t 'skyless/#' -v": MQTT,

@@ -5,13 +5,14 @@ from datetime import UTC, datetime
 import numpy as np
 import pyarrow as pa
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from made_fixes import DAY_S, NOON_S, fix, in_files, records
 from pyarrow import parquet
 from test_writer import dying
 
 from skyless.run.fix_batch import records_of
+from skyless.run.history import writer as writer_module
 from skyless.run.history.layout import Place, current_events, current_files, file_name, rows_of, site_folder
 from skyless.run.history.tables import Event, fix_table
 from skyless.run.history.writer import Keep, Writer, thinned, tidy
@@ -52,6 +53,13 @@ def test_a_day_that_is_over_becomes_one_file_and_old_ones_go(tmp_path):
     assert not list(site_folder(tmp_path, 1).glob(f"day={datetime.fromtimestamp(NOON_S - 31 * DAY_S, UTC).date()}"))
     everything = set(site_folder(tmp_path, 1).glob("**/day=*/*"))
     assert everything == {*current_files(tmp_path, 1), *current_events(tmp_path, 1)}
+
+
+def test_files_that_are_large_together_are_not_joined(tmp_path, monkeypatch):
+    monkeypatch.setattr(writer_module, "JOINED_ROWS", 5)
+    filled(tmp_path, (-1,), files=4)
+    tidy(tmp_path, 1, KEEP, NOON_S)
+    assert [rows_of(file) for file in current_files(tmp_path, 1)] == [(1, 4), (5, 8)]
 
 
 def test_events_that_are_too_old_go(tmp_path):
@@ -116,6 +124,7 @@ def test_of_a_moving_tag_one_in_ten_seconds_stays_and_of_one_at_rest_one_in_a_mi
 
 
 @settings(max_examples=50)
+@example([(1, 0, 0), (1, 20_000, 500), (2, 0, 0), (2, 20_000, 501)])
 @given(
     st.lists(st.tuples(st.integers(1, 3), st.integers(0, 200_000), st.integers(-3000, 3000)), min_size=1, max_size=60)
 )
@@ -140,12 +149,13 @@ def test_thinning_keeps_rows_of_every_tag_and_minute(rows):
         assert parts(kept, 60).count((tag, minute)) == expected
 
 
-def test_a_day_is_thinned_once_and_keeps_its_numbers(tmp_path):
-    filled(tmp_path, (-9, -8))
+def test_a_day_is_joined_and_thinned_once_and_keeps_its_numbers(tmp_path):
+    filled(tmp_path, (-8, -7))
     tidy(tmp_path, 1, KEEP, NOON_S)
     files = current_files(tmp_path, 1)
     before = {file: file.stat().st_mtime_ns for file in files}
     assert [rows_of(file) for file in files] == [(1, 6), (7, 12)]
+    assert [writer_module.THINNED in parquet.read_metadata(file).metadata for file in files] == [True, False]
     tidy(tmp_path, 1, KEEP, NOON_S)
     assert {file: file.stat().st_mtime_ns for file in current_files(tmp_path, 1)} == before
 
@@ -157,7 +167,7 @@ def test_the_place_in_the_stream_outlasts_joining_thinning_and_the_last_row(tmp_
         writer.fixes.add(records([number], writer.number(fix(), NOON_S)), NOON_S)
         writer.write()
     writer.close()
-    for days, files, rows in ((1, 1, [1, 2, 3]), (8, 1, [1]), (31, 1, []), (40, 1, [])):
+    for days, files, rows in ((1, 1, [1, 2, 3]), (8, 1, [1]), (30, 1, [1]), (31, 1, []), (40, 1, [])):
         tidy(tmp_path, 1, KEEP, NOON_S + DAY_S * days)
         assert (len(current_files(tmp_path, 1)), in_files(tmp_path)) == (files, rows)
         writer = Writer(tmp_path, 1)

@@ -130,10 +130,15 @@ def test_what_cannot_become_a_file_waits_and_then_becomes_files(tmp_path, monkey
             writer.fixes.add(records([serial], tag), NOON_S)
             with pytest.raises(OSError, match="No space"):
                 writer.write()
-    assert (writer.waiting, in_files(tmp_path)) == (100, [])
+        writer.events.add((Event(datetime.fromtimestamp(NOON_S, UTC), "enter", "ann", "z1"),), NOON_S)
+    assert (writer.waiting, in_files(tmp_path)) == (101, [])
     writer.close()
     assert in_files(tmp_path) == [*range(1, 101)]
-    assert len(current_files(tmp_path, 1)) == 5
+    assert [rows_of(file) for file in current_files(tmp_path, 1)] == [(n, n + 19) for n in range(1, 101, 20)]
+    writer = Writer(tmp_path, 1)
+    writer.fixes.add(records([101], tag), NOON_S)
+    assert (writer.waiting, writer.fixes.taken) == (1, 1)
+    writer.close()
 
 
 def test_only_one_writes(tmp_path):

@@ -75,6 +75,7 @@ def test_corners_that_are_not_in_their_order_are_found(outline_m):
         ("[[0, 0], [6, 0], [6, 8], [0, 0]]", "outline_m[0]", "elsewhere than the corner before it"),
         ("[[0, 0], [6, 8], [6, 0], [0, 8]]", "outline_m", "no two sides meet"),
         ("[[0, 0], [3, 0], [6, 0]]", "outline_m", "in order"),
+        ("[[0, 0], [0.0009, 0], [6, 8]]", "outline_m[1]", "elsewhere than the corner before it"),
     ],
 )
 def test_a_wrong_outline_is_refused_by_its_key(tmp_path, outline, key, right):

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import AccuracySite
 from skyless.sim.lab import lab_site, paper_lab_site
-from skyless.site.file.check import SITE_LIMITS
+from skyless.site.file.check import HALF_WRAP_S, SITE_LIMITS
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
 
@@ -157,6 +158,29 @@ def test_a_mistake_is_named(refused, text, key, value, right):
     error = refused(text)
     assert (error.key, error.value) == (key, value)
     assert right in error.expected
+
+
+LEAST_SLOT_S = air_time_s(MAX_FRAME_BYTES) + 0.0004
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        THREE + anchor(8, 0.001, 0),
+        "outline_m = [[0, 0], [0.001, 0], [9, 9]]\n" + THREE,
+        "outline_m = [[0, 0], [0.002, 0], [0, 1]]\n" + THREE,
+        "[schedule]\nframes_per_node = 85\n" + THREE,
+        f"[schedule]\nguard_s = 0.0004\nslot_s = {LEAST_SLOT_S!r}\n" + THREE,
+    ],
+)
+def test_exactly_at_a_limit_all_is_well(load, text):
+    assert load(HEAD + text).name == "x"
+
+
+def test_a_superframe_of_half_a_wrap_is_too_long(refused):
+    slot_s = HALF_WRAP_S / 128
+    error = refused(HEAD + f"[schedule]\nslots = 128\nslot_s = {slot_s!r}\n" + THREE)
+    assert (error.key, error.value) == ("schedule.slot_s", slot_s)
 
 
 @pytest.mark.parametrize(

@@ -251,7 +251,7 @@ class Writer:
 # Daily maintenance: join small files, thin old ones, remove those that are too old. It is safe against kills: a joined
 # file's name covers the files that it replaces (``layout.py``), and a thinned file replaces the original atomically.
 
-_JOINED_ROWS: Final = 2_000_000
+JOINED_ROWS: Final = 2_000_000
 """Rows of a joined file: it must fit into memory several times."""
 
 _MOVING_MS: Final = 10_000
@@ -308,7 +308,7 @@ def _groups(files: Iterable[Path]) -> Iterator[tuple[list[Path], int, int]]:
     group, first, last = list[Path](), 0, 0
     for file in files:
         begin, end = rows_of(file) or (0, 0)
-        if group and (begin != last + 1 or end - first >= _JOINED_ROWS):
+        if group and (begin != last + 1 or end - first >= JOINED_ROWS):
             yield group, first, last
             group = []
         group, first, last = [*group, file], first if group else begin, end

@@ -439,8 +439,10 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     at = 2
     while at + 9 <= len(data) and data[at] == 0xFF:
         marker = data[at + 1]
-        if marker == 0xFF or marker in _STANDALONE:  # padding, or a marker without a segment
-            at += 1 if marker == 0xFF else 2
+        if marker == 0xFF:  # padding
+            at += 1
+        elif marker in _STANDALONE:  # a marker without a segment
+            at += 2
         elif marker in _START_OF_FRAME:
             return _positive(int.from_bytes(data[at + 7 : at + 9], "big"), int.from_bytes(data[at + 5 : at + 7], "big"))
         else:

@@ -2,13 +2,16 @@
 
 import ctypes
 import random
+from collections import Counter
 
 import pytest
-from board_stage import (
+from emulator.board_library import CBoard, places
+from firmware_stage import (
     ASK_HELLO,
     ASK_STATUS,
     CONFIG,
     DELAYS,
+    DEVICE_ID,
     RX_ON,
     TICKS_PER_US,
     TX_AT,
@@ -17,9 +20,9 @@ from board_stage import (
     line_of,
     needs_compiler,
 )
-from emulator.board_library import places
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
 from skyless.core.ticks import difference, wrap
 from skyless.radio.dw1000 import radio as dw1000
@@ -49,22 +52,16 @@ def test_a_board_reports_itself_and_is_configured_by_its_host():
     stage = BoardStage(reset_cause=0x82)
     stage.board.begin()
     assert stage.bus.from_board[0] == 0
-    stage.send(ASK_HELLO)
-    stage.turn(2)
-    for hello in stage.reports():
+    for hello in stage.ask(ASK_HELLO, turns=2):
         assert (hello.major, hello.minor, hello.device_id, hello.can_transmit) == (1, 3, b"identity", True)
         assert hello.has_phases
         assert (hello.rate_khz, hello.counter_bits, hello.reset_cause) == (63_897_600, 40, 0x82)
-    stage.send(RX_ON)
-    stage.turn(2)
-    assert stage.reports() == [NotDone(RX_ON, MALFORMED)]
+    assert stage.ask(RX_ON, turns=2) == [NotDone(RX_ON, MALFORMED)]
     stage.config()
     stage.turn(2)
     (status,) = stage.reports()
     assert (status.configured, status.receiving, status.temperature_c, status.supply_v) == (True, False, None, None)
-    stage.send(RX_ON)
-    stage.turn()
-    (status,) = stage.reports()
+    (status,) = stage.ask(RX_ON, turns=1)
     assert (status.configured, status.receiving) == (True, True)
     assert 0 <= difference(wrap(stage.air.ticks), status.ticks) < 200 * 63_898
     assert not +stage.chip.misuse
@@ -101,9 +98,7 @@ def test_a_later_version_may_append_fields_and_add_kinds():
     stage.turn(2)
     (status,) = stage.reports()
     assert (status.configured, status.garbled) == (True, 0)
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert stage.reports()[0].garbled == 1
+    assert stage.ask(ASK_STATUS, turns=1)[0].garbled == 1
 
 
 @pytest.mark.parametrize("size", [1, 98, 125])
@@ -145,9 +140,7 @@ def test_errors_are_counted_and_it_listens_on():
         stage.arrive(FRAME, fault=fault)
         stage.turn(3)
         assert stage.reports() == []
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert stage.reports()[0].errors == 4
+    assert stage.ask(ASK_STATUS, turns=1)[0].errors == 4
     stage.air.pass_s(1e-3)
     stage.arrive(FRAME)
     stage.turn()
@@ -157,8 +150,10 @@ def test_errors_are_counted_and_it_listens_on():
 # When it sends
 
 
-@pytest.mark.parametrize("ahead_us", [450, 1000, 1200, 3000, 14_700, 2_000_000])
-@pytest.mark.parametrize("step_us", [1, 37, 100])
+@pytest.mark.parametrize(
+    ("ahead_us", "step_us"),
+    [(450, 1), (1000, 100), (1200, 37), (3000, 37), (14_700, 1), (14_700, 100), (2_000_000, 37)],
+)
 @pytest.mark.statistical
 def test_frames_leave_at_their_tick_and_the_receiver_is_off_no_longer_than_needed(ahead_us, step_us):
     stage = BoardStage().ready()
@@ -257,9 +252,7 @@ def test_a_chip_that_was_reset_is_reported_and_can_be_configured_again():
     stage.pass_us(POLL_US + 1000)
     late, hello = stage.reports()
     assert (type(late), late.reason, type(hello)) == (TooLate, NOT_READY, Hello)
-    stage.send(ASK_STATUS)
-    stage.turn()
-    (status,) = stage.reports()
+    (status,) = stage.ask(ASK_STATUS, turns=1)
     assert (status.configured, status.receiving, status.ticks) == (False, False, 0)
     stage.pass_us(1_000_000)
     assert stage.air.sent == []
@@ -288,9 +281,7 @@ def test_a_chip_that_looks_right_and_has_lost_its_settings_is_found_soon():
     stage.chip.memory.write(0x1F, 0, b"\0")
     stage.pass_us(CHECK_US + 1000)
     assert kinds(stage.reports()) == [Hello]
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert not stage.reports()[0].configured
+    assert not stage.ask(ASK_STATUS, turns=1)[0].configured
 
 
 def test_a_board_without_a_chip_says_so_and_goes_on():
@@ -323,18 +314,14 @@ def test_a_stuck_interrupt_line_is_reported_and_the_chip_is_polled(stuck):
     stage.tx_at(3000, SHORT)
     stage.pass_us(5000)
     assert kinds(stage.reports()) == [Done]
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert stage.reports()[0].polled
+    assert stage.ask(ASK_STATUS, turns=1)[0].polled
     assert stage.bus.lights & 8
     stage.bus.stuck = None  # and back
     for _ in range(4):
         stage.pass_us(3000)
         stage.arrive(FRAME)
     stage.pass_us(3000)
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert not stage.reports()[-1].polled
+    assert not stage.ask(ASK_STATUS, turns=1)[-1].polled
 
 
 def test_a_sound_interrupt_line_is_never_called_stuck():
@@ -367,9 +354,7 @@ def test_temperature_and_supply_are_measured_in_the_own_slot_where_all_others_se
     stage = BoardStage().ready()
     superframe(stage)
     assert kinds(stage.reports()) == [Heard, Heard, Heard, Done, Heard, Heard, Heard]
-    stage.send(ASK_STATUS)
-    stage.turn()
-    (status,) = stage.reports()
+    (status,) = stage.ask(ASK_STATUS, turns=1)
     assert status.temperature_c == pytest.approx(31.0, abs=1.2)
     assert status.supply_v == pytest.approx(3.3, abs=0.02)
     for _ in range(10):
@@ -400,9 +385,7 @@ def test_where_no_slot_is_free_the_measurement_costs_one_reception_a_minute():
         lost += stage.outcome != "heard"
         stage.turn()
     assert lost <= 1
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert stage.reports()[-1].temperature_c is not None
+    assert stage.ask(ASK_STATUS, turns=1)[-1].temperature_c is not None
 
 
 # What comes from the host may be anything
@@ -429,9 +412,7 @@ def test_nothing_that_a_host_says_stops_a_board(pieces):
         stage.turn(3)
         assert not [one for one in stage.reports() if isinstance(one, str)]
     stage.bus.to_board += b"\0"
-    stage.send(ASK_STATUS)
-    stage.turn(40)
-    assert kinds(stage.reports())[-1] is Status
+    assert kinds(stage.ask(ASK_STATUS, turns=40))[-1] is Status
     assert not +stage.chip.misuse
     assert {one.frame for one in stage.air.sent} <= {SHORT}
 
@@ -447,9 +428,7 @@ def test_a_flood_of_noise_costs_no_reception_and_restarts_the_line():
     assert stage.bus.restarts >= 1
     assert kinds(stage.reports()) == [Heard] * 300
     stage.bus.to_board[:] = b"\0"
-    stage.send(ASK_STATUS)
-    stage.turn(2)
-    assert stage.reports()[-1].garbled > 100
+    assert stage.ask(ASK_STATUS, turns=2)[-1].garbled > 100
 
 
 def test_a_host_that_does_not_read_costs_records_and_they_are_counted():
@@ -462,9 +441,7 @@ def test_a_host_that_does_not_read_costs_records_and_they_are_counted():
     assert stage.board.chip.received == 100
     kept = len(stage.reports())
     assert 0 < kept < 12
-    stage.send(ASK_STATUS)
-    stage.turn()
-    assert stage.reports()[0].unsent_records == 100 - kept
+    assert stage.ask(ASK_STATUS, turns=1)[0].unsent_records == 100 - kept
 
 
 def test_the_clock_may_wrap():
@@ -475,3 +452,161 @@ def test_the_clock_may_wrap():
         stage.arrive(FRAME)
         stage.turn(2)
     assert kinds(stage.reports()) == [Done, Heard] * 20
+
+
+# All of it in any order
+
+FAULTS = st.sampled_from([None, None, None, "header", "parity", "delimiter", "first-path"])
+
+
+class Fire(RuleBasedStateMachine):
+    """Whatever comes in which order."""
+
+    @initialize(ticks=st.integers(0, 2**40 - 1), can_transmit=st.booleans())
+    def begin(self, ticks, can_transmit):
+        self.can_transmit = can_transmit
+        self.stage = BoardStage(ticks=ticks, can_transmit=can_transmit).ready()
+        self.serial = 0
+        self.asked = {}
+        """Frames that the host has asked for, by their stamps."""
+        self.arrived = {}
+        """Stamps of frames that came to the antenna."""
+        self.answers = Counter()
+        self.seen = 0
+
+    def new_frame(self, size):
+        self.serial += 1
+        return frame_of(self.serial.to_bytes(4, "little") + bytes(size))
+
+    # The air
+
+    @rule(us=st.integers(0, 4000))
+    def pass_time(self, us):
+        self.stage.pass_us(us)
+
+    @rule(us=st.integers(0, 60_000), step_us=st.integers(1, 400))
+    def turn_late(self, us, step_us):
+        """A processor that is slow: time passes between its turns."""
+        self.stage.turn(us // (10 * step_us) + 1, step_us)
+
+    @rule(fault=FAULTS, size=st.integers(1, 110))
+    def arrive(self, fault, size):
+        frame = self.new_frame(size)
+        self.arrived[frame] = self.stage.arrive(frame, fault=fault)
+        assert self.stage.outcome not in ("suspect", "without-microcode")
+
+    @rule(in_time=st.booleans())
+    def let_the_air_refuse(self, in_time):
+        self.stage.air.in_time = in_time
+
+    # What fails
+
+    @rule()
+    def lose_the_chips_supply(self):
+        self.stage.chip.pull_reset()
+
+    @rule(stuck=st.sampled_from([None, None, True, False]))
+    def stick_the_interrupt_line(self, stuck):
+        self.stage.bus.stuck = stuck
+
+    @rule(present=st.sampled_from([True, True, False]))
+    def unsolder_the_chip(self, present):
+        self.stage.bus.present = present
+
+    @rule()
+    def reset_the_processor(self):
+        stage = self.stage
+        stage.chip.pull_reset()  # main.c does so first of all
+        stage.board = CBoard(stage.bus, can_transmit=self.can_transmit, device_id=DEVICE_ID, reset_cause=2)
+        stage.board.begin()
+
+    @rule(room=st.sampled_from([0, 50, 1 << 30]))
+    def fill_the_line(self, room):
+        self.stage.bus.room = room
+
+    # The host
+
+    @rule(ahead_us=st.one_of(st.integers(-3000, 20_000), st.integers(0, 1000)), size=st.integers(1, 119))
+    def ask_for_a_frame(self, ahead_us, size):
+        frame = self.new_frame(size)
+        tx_ticks = wrap((wrap(self.stage.air.ticks + round(ahead_us * TICKS_PER_US)) & ~0x1FF) + DELAYS.tx_ticks)
+        if tx_ticks not in self.asked:
+            self.asked[tx_ticks] = frame
+            self.stage.tx_at(ahead_us, frame)
+
+    @rule(kind=st.sampled_from([ASK_HELLO, ASK_STATUS, RX_ON, 0x7F]))
+    def command(self, kind):
+        self.stage.send(kind)
+
+    @rule()
+    def configure(self):
+        self.stage.config()
+        self.stage.send(RX_ON)
+
+    @rule(noise=st.binary(max_size=60))
+    def make_noise(self, noise):
+        self.stage.bus.to_board += noise
+
+    # What must hold
+
+    @invariant()
+    def reports_are_true(self):
+        stage = self.stage
+        for one in stage.reports():
+            assert not isinstance(one, str), one
+            if isinstance(one, Heard):
+                assert self.arrived.pop(one.frame) == one.rx_ticks
+            elif isinstance(one, Done):
+                assert (one.dx_ticks & ~0x1FF) + DELAYS.tx_ticks in (one.tx_ticks, one.tx_ticks + 2**40)
+                assert one.tx_ticks in {sent.tx_ticks for sent in stage.air.sent}
+            if isinstance(one, Done | TooLate):
+                self.answers[one.dx_ticks] += 1
+                assert self.answers[one.dx_ticks] == 1, "a frame is answered once"
+
+    @invariant()
+    def nothing_wrong_is_sent(self):
+        for sent in self.stage.air.sent:
+            assert self.asked[sent.tx_ticks] == sent.frame
+        assert self.stage.chip.transceiver.counts["sent-with-other-settings"] == 0
+        assert self.can_transmit or not self.stage.air.sent
+
+    def teardown(self):
+        """When all is sound again, a host that asks for the state finds the board working."""
+        if not hasattr(self, "stage"):
+            return
+        stage = self.stage
+        stage.bus.stuck, stage.bus.present, stage.bus.room, stage.air.in_time = None, True, 1 << 30, True
+        stage.bus.to_board += b"\0"
+        while stage.bus.to_board:  # each configuration takes 8 ms
+            stage.pass_us(10_000)
+        stage.pass_us(250_000)  # a chip that has lost its settings is found
+        self.reports_are_true()
+        stage.bus.to_board += b"\0" + line_of(ASK_HELLO, b"\1\1")
+        stage.config()
+        stage.send(RX_ON)
+        stage.pass_us(20_000)
+        self.reports_are_true()
+        for _ in range(2):
+            stage.pass_us(5000)
+            self.arrive(None, 50)
+            assert stage.outcome == "heard"
+            stage.pass_us(1000)
+            received = stage.board.chip.received
+            assert received >= 1
+            self.reports_are_true()
+            sent = stage.board.chip.sent
+            self.ask_for_a_frame(4000, 60)
+            stage.pass_us(8000)
+            assert stage.board.chip.sent == sent + self.can_transmit
+            self.reports_are_true()
+        stage.send(ASK_STATUS)
+        stage.pass_us(100)
+        status = stage.reports()[-1]
+        assert isinstance(status, Status)
+        assert (status.configured, status.receiving, status.polled) == (True, True, False)
+        self.nothing_wrong_is_sent()
+        assert not stage.chip.misuse.keys() - {"spi-too-fast", "radio-without-pll"}  # of a chip that was just reset
+
+
+Fire.TestCase.settings = settings(max_examples=40, stateful_step_count=50, deadline=None)
+TestBoardUnderFire = pytest.mark.statistical(Fire.TestCase)

@@ -1,15 +1,21 @@
-"""A tag by itself on the air of a site, with the firmware's loop on this computer, and a host that speaks to it."""
+"""A tag by itself: on the air of a site, with a host that speaks to it, and in a simulated room, from its start on."""
 
+import numpy as np
 import pytest
-from board_stage import BoardStage, needs_compiler
 from emulator.board_library import KEPT_BYTES
+from emulator.site.host_board import HostBoard
+from emulator.site.tag_world import TagWorld
+from firmware_stage import BoardStage, needs_compiler
 from msgspec.structs import replace
 
 from skyless.core.air.frame import Diagnostics, after_rmarker_s
 from skyless.core.ticks import from_seconds, to_seconds, wrap
 from skyless.radio.dw1000.radio import OFF
-from skyless.radio.serial.link import ASK_HELLO, ASK_TAG_CONFIG, SET_TAG_CONFIG, BoardSettings, pack
+from skyless.radio.serial.link import ASK_HELLO, ASK_TAG_CONFIG, SET_TAG_CONFIG, BoardSettings, Reader, decode, pack
 from skyless.radio.tag_reports import BoardFix
+from skyless.sim.evaluation.fleet import world_of
+from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
+from skyless.sim.lab import lab_site
 from support.bench import ROOM, tape
 
 pytestmark = [pytest.mark.site, needs_compiler]
@@ -61,14 +67,11 @@ class TagStage(BoardStage):
 
 @pytest.mark.parametrize("predicts", [0, 1])
 def test_a_tag_that_sleeps_says_a_fix_and_sleeps_again(predicts):
-    stage = TagStage(predicts=predicts).hear(0.0, 3.0)
+    """An advertisement after a sleep has no position from before it."""
+    stage = TagStage(predicts=predicts, bluetooth_ms=100).hear(0.0, 3.0)
     assert len(stage.fixes) > 5
     assert stage.chip.asleep_s > 0.9 * SLEEP_S * len(stage.fixes)
     assert not stage.chip.misuse
-
-
-def test_an_advertisement_after_a_sleep_has_no_position_from_before_it():
-    stage = TagStage(bluetooth_ms=100).hear(0.0, 3.0)
     ages_ms = [10 * int.from_bytes(data[12:14], "little") for data in stage.bus.advertised]
     assert len(ages_ms) >= len(stage.fixes)
     assert max(ages_ms) < 1000 * SLEEP_S
@@ -115,3 +118,33 @@ def test_the_time_of_fixes_counts_sleeps_without_a_fix_once():
     after_s, after = stage.hear(1.0, 3.0).fixes[-1]
     assert after_s > 45.0
     assert after.time_s - before.time_s == pytest.approx(after_s - before_s, abs=0.05)
+
+
+@pytest.mark.parametrize("predicts", [0, 1])
+def test_a_tag_in_a_room_is_awake_after_its_start_and_then_sleeps_between_fixes_that_are_right(predicts):
+    request, site, sleep_s = Request(lab_site(), seed=4, room=Room()), lab_site(), 0.4
+    world = world_of(site, trajectories_of(request), replace(impairments_of(request, site), diagnostics=True), 4)
+    settings = BoardSettings(mode=1, sleep_ms=int(1000 * sleep_s), superframes=2, predicts=predicts)
+    fixes, reader = [], Reader()
+
+    def said(now_s, data):
+        for found in map(decode, reader.read(data)):
+            if isinstance(found, BoardFix):
+                error_m = np.linalg.norm((found.fix.position_m - one.truth_m)[:2])
+                fixes.append((now_s, error_m, np.inf if found.fix.hpl_m is None else found.fix.hpl_m))
+
+    one = TagWorld(world, HostBoard, said, settings, 1.0)
+    one.run(AWAKE_S)
+    assert (len(fixes) > 1, one.chip.asleep_s) == (True, 0.0)
+    one.run(AWAKE_S + 2 * sleep_s)
+    fixes.clear()
+    receiving_s, asleep_s = one.chip.receiving_s, one.chip.asleep_s
+    one.run(AWAKE_S + 14 * sleep_s)
+    times_s, errors_m, levels_m = np.array(fixes).T
+    assert 6 <= len(fixes) <= 12
+    assert np.diff(times_s).min() > sleep_s
+    assert errors_m.max() < 0.5
+    assert np.all(errors_m < levels_m)
+    assert one.chip.asleep_s - asleep_s > 0.6 * 12 * sleep_s
+    assert (one.chip.receiving_s - receiving_s) / len(fixes) < (0.02 if predicts else 0.2)
+    assert not +one.chip.misuse

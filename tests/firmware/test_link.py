@@ -8,7 +8,8 @@ from binascii import crc_hqx
 import pytest
 from cobs import cobs
 from emulator.board_library import library
-from emulator.build import FIRMWARE, HAS_HOST_COMPILER
+from emulator.build import FIRMWARE
+from firmware_stage import line_of, needs_compiler
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,10 +21,7 @@ from skyless.radio.serial.link import decode
 from skyless.radio.tag_reports import AnchorPlace, BoardStatus, board_fix
 from support.board_tag import OriginInC, StatusInC, fix_in_c
 
-pytestmark = [pytest.mark.site, pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")]
-
-NOISE = st.one_of(st.binary(max_size=300), st.binary(max_size=40).map(lambda piece: piece * 20))
-
+pytestmark = [pytest.mark.site, needs_compiler]
 
 LINE = ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_void_p, ctypes.c_uint32)
 
@@ -67,25 +65,6 @@ class Writer:
         return record[:-2]
 
 
-class Reader:
-    def __init__(self):
-        self._reader = ReaderInC()
-
-    def read(self, data, cuts=()):
-        found = []
-        for begin, end in itertools.pairwise([0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]):
-            at = begin
-            while at < end:
-                at += library().link_read(ctypes.byref(self._reader), data[at:end], end - at)
-                if self._reader.length:
-                    found.append(bytes(self._reader.record[: self._reader.length]))
-        return found
-
-    @property
-    def faults(self):
-        return self._reader.garbled
-
-
 def test_the_link_has_the_same_values_at_both_ends():
     known, header = {}, (FIRMWARE / "source" / "link.h").read_text("utf-8")
     for name, text in re.findall(r"^#define LINK_(\w+) (.+?)(?: */\*.*)?$", header, re.MULTILINE):
@@ -97,12 +76,9 @@ def test_the_link_has_the_same_values_at_both_ends():
 
 @given(st.binary(max_size=300))
 def test_the_checks_are_those_of_the_standard_library_and_of_the_beacons(data):
+    """Published for the nine digits: 0x29B1 of CRC-16/IBM-3740; 0x2189 of CRC-16/KERMIT, the FCS's relative."""
     assert library().link_crc16(data, len(data)) == crc_hqx(data, 0xFFFF)
     assert library().link_fcs(data, len(data)).to_bytes(2, "little") == fcs(data)
-
-
-def test_the_check_is_the_published_one():
-    """CRC-16/IBM-3740: 0x29B1 over the nine digits; CRC-16/KERMIT, the FCS's relative: 0x2189."""
     assert library().link_crc16(b"123456789", 9) == 0x29B1
     assert library().link_fcs(b"123456789", 9) == 0x2189
 
@@ -136,13 +112,13 @@ def test_what_a_tag_says_arrives_as_it_was():
         assert decode(writer.write(kind, bytes(body))) == value
 
 
-WRONG_FIXES = [
-    {"reason": 1}, {"levels": 4}, {"risk": 0.2}, {"risk": float("nan")}, {"alert_limit_m": -1.0},
-    {"covariance_m2": (float("nan"),) * 6}, {"mean_square_m2": -1.0},
-]  # fmt: skip
-
-
-@pytest.mark.parametrize("wrong", WRONG_FIXES)
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"reason": 1}, {"levels": 4}, {"risk": 0.2}, {"risk": float("nan")}, {"alert_limit_m": -1.0},
+        {"covariance_m2": (float("nan"),) * 6}, {"mean_square_m2": -1.0},
+    ],
+)  # fmt: skip
 def test_a_fix_that_cannot_be_is_malformed(wrong):
     assert decode(bytes((link.FIX, 0)) + fix_in_c(**wrong).sent()) == "malformed-record"
     assert decode(bytes((link.FIX, 0)) + fix_in_c().sent()[:-1]) == "malformed-record"
@@ -154,11 +130,7 @@ def test_numbers_wrap_at_256():
     assert numbers == [number % 256 for number in range(300)]
 
 
-def lines(bodies):
-    records = [bytes((kind, number & 0xFF)) + body for number, (kind, body) in enumerate(bodies)]
-    return records, [cobs.encode(one + crc_hqx(one, 0xFFFF).to_bytes(2, "big")) + b"\0" for one in records]
-
-
+NOISE = st.one_of(st.binary(max_size=300), st.binary(max_size=40).map(lambda piece: piece * 20))
 RECORDS = st.lists(st.tuples(st.integers(0, 255), st.binary(max_size=246)), max_size=12)
 CUTS = st.lists(st.integers(0, 5000), max_size=20)
 
@@ -166,10 +138,16 @@ CUTS = st.lists(st.integers(0, 5000), max_size=20)
 @given(NOISE, RECORDS, CUTS)
 def test_both_ends_find_the_same_in_anything(noise, bodies, cuts):
     """And all records before the noise."""
-    records, sent = lines(bodies)
-    data = b"".join(sent) + noise + b"\0" + b"".join(sent) + b"\0"
-    reader, host = Reader(), link.Reader()
-    found = reader.read(data, cuts)
+    records = [bytes((kind, number & 0xFF)) + body for number, (kind, body) in enumerate(bodies)]
+    sent = b"".join(line_of(kind, body, number & 0xFF) for number, (kind, body) in enumerate(bodies))
+    data = sent + noise + b"\0" + sent + b"\0"
+    reader, host, found = ReaderInC(), link.Reader(), []
+    for begin, end in itertools.pairwise([0, *sorted(cut % (len(data) + 1) for cut in cuts), len(data)]):
+        at = begin
+        while at < end:
+            at += library().link_read(ctypes.byref(reader), data[at:end], end - at)
+            if reader.length:
+                found.append(bytes(reader.record[: reader.length]))
     assert found == list(host.read(data))
     assert found[: len(records)] == records
-    assert reader.faults == host.garbled + host.overlong
+    assert reader.garbled == host.garbled + host.overlong

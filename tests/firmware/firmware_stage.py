@@ -1,29 +1,48 @@
-"""The firmware's loop, compiled for this computer, on the chip's model in an air whose clock a test moves."""
+"""What tests of the firmware share: its loop on this computer, on the chip's model in an air whose clock a test moves.
 
+And boards for an emulated site.
+"""
+
+import re
 from binascii import crc_hqx
+from functools import cache, partial
+from importlib.util import find_spec
 from itertools import count
 
 import pytest
 from chip_stage import HandClock
 from cobs import cobs
 from emulator.board_library import CBoard, Processor
-from emulator.build import HAS_HOST_COMPILER
+from emulator.build import FIRMWARE, HAS_ARM_COMPILER, HAS_HOST_COMPILER, build
+from emulator.site.emulated_site import EmulatedSite
+from emulator.site.host_board import HostBoard
+from emulator.site.serial_wire import WireSettings
+from emulator.site.virtual_time import run_on
+from msgspec.structs import replace
 
 from skyless.core.air.frame import Diagnostics, after_rmarker_s, fcs
+from skyless.core.site import ScheduleSite
 from skyless.core.ticks import TICK_RATE_HZ, from_seconds, wrap
 from skyless.radio.interface import AntennaDelays
 from skyless.radio.serial.link import decode
 from skyless.sim.dw1000.chip import Chip
+from skyless.sim.evaluation.scenarios import Request, trajectories_of
+from skyless.sim.lab import paper_lab_site
 
 DELAYS = AntennaDelays(16_500, 16_300)
 TICKS_PER_US = TICK_RATE_HZ / 1e6
 DEVICE_ID = b"identity"
 SLOW_HZ, FAST_HZ = 2_000_000, 8_000_000
 
-HELLO, RX, TX_DONE, TX_LATE, STATUS, REFUSED, RX_PHASE = range(1, 8)
 ASK_HELLO, CONFIG, TX_AT, RX_ON, ASK_STATUS = range(0x41, 0x46)
+STACK_BYTES = int(re.search(r"^STACK_BYTES = (\d+);", (FIRMWARE / "dwm1001.ld").read_text("utf-8"), re.MULTILINE)[1])
 
 needs_compiler = pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")
+needs_processor = pytest.mark.skipif(
+    not HAS_ARM_COMPILER or find_spec("unicorn") is None,
+    reason="gcc-arm-none-eabi, make or the package unicorn is not installed",
+)
+HOST, IMAGE = pytest.param("host", marks=needs_compiler), pytest.param("image", marks=needs_processor)
 
 
 def line_of(kind, body, number=0):
@@ -43,7 +62,6 @@ class Bus(Processor):
         self.air, self.chip = air, chip
         self.hz = SLOW_HZ
         self.to_board, self.from_board = bytearray(), bytearray()
-        self.transactions = []
         self.restarts = 0
         self.room = 1 << 30
         self.advertised = []
@@ -52,7 +70,6 @@ class Bus(Processor):
         self.present = True
 
     def transfer(self, out):
-        self.transactions.append(out)
         self.air.pass_s(8 * len(out) / self.hz)
         return self.chip.transfer(out, self.hz) if self.present else bytes(len(out))
 
@@ -82,9 +99,6 @@ class Bus(Processor):
         self.from_board += line
         return True
 
-    def set_rate(self, baud):
-        self.baud = baud
-
     def restart_line(self):
         self.restarts += 1
         self.to_board.clear()
@@ -109,6 +123,12 @@ class BoardStage:
 
     def send(self, kind, body=b""):
         self.bus.to_board += line_of(kind, body, next(self._numbers) & 0xFF)
+
+    def ask(self, kind, body=b"", turns=8):
+        """What the board says to a command."""
+        self.send(kind, body)
+        self.turn(turns)
+        return self.reports()
 
     def config(self, flags=0):
         words = (128).to_bytes(2, "little"), *(d.to_bytes(2, "little") for d in (DELAYS.tx_ticks, DELAYS.rx_ticks))
@@ -162,3 +182,35 @@ class BoardStage:
         told = Diagnostics(power_dbm, power_dbm - 3.0, 1.0)
         self.outcome = self.chip.receive(frame, stamp, told, fault, carrier_phase_cycles=phase_cycles)
         return stamp
+
+
+# Whole sites
+
+
+def site_of(kind, slot_ms, seed=1, trajectories=None, site=None, made=EmulatedSite):
+    """A site of boards: the C on this computer, or the ARM image on an emulated processor.
+
+    The host's C gets bytes in pieces, because each wakes its thread.
+    """
+    site = site or replace(paper_lab_site(), schedule=ScheduleSite(slot_s=1e-3 * slot_ms))
+    paths = trajectories or trajectories_of(Request(site, seed=seed))
+    return made(site, paths, boards(kind), seed=seed, wire=WireSettings(piece_bytes=64 if kind == "host" else 1))
+
+
+@cache
+def boards(kind):
+    if kind == "host":
+        return HostBoard
+    from emulator.processor.nrf52832 import Image
+
+    return partial(Image, elf=build("all"))
+
+
+def play(site, script):
+    """Run ``script(site)`` with everything started, until it ends."""
+
+    async def whole():
+        async with site:
+            await script(site)
+
+    run_on(site.medium.timeline, whole())

@@ -1,5 +1,6 @@
-"""What a tag on a board says, against the decoders and the arithmetic of Python."""
+"""What a tag on a board says, against the decoders and the arithmetic of Python, and to the real gpsd."""
 
+import asyncio
 import ctypes
 import json
 from datetime import UTC, datetime
@@ -10,7 +11,7 @@ import numpy as np
 import pynmeagps
 import pytest
 from emulator.board_library import library
-from emulator.build import HAS_HOST_COMPILER
+from firmware_stage import needs_compiler
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -20,14 +21,16 @@ from skyless.bridges.target import is_usable
 from skyless.core.earth import geodetic
 from skyless.core.fix import NoFixReason
 from skyless.core.site import GeoreferenceSite
+from skyless.radio.serial.serial_port import Pty
 from skyless.radio.tag_reports import AnchorPlace, BoardReceiver, board_fix
 from skyless.run.mqtt.messages import FixMessage, fix_message
 from support.board_tag import ANCHORS, FixInC, OriginInC, fix_in_c
+from support.gpsd import GPSD, gpsd
 
-pytestmark = [pytest.mark.site, pytest.mark.skipif(not HAS_HOST_COMPILER, reason="make and gcc are not installed")]
+pytestmark = [pytest.mark.site, needs_compiler]
 
-NOON_US = 1_790_000_000_123_000
 OUTPUT_MAX_BYTES = 896
+HALL = OriginInC(525_130_000, 134_000_000, 40_000, 250_000_000)
 
 
 def small(limit):
@@ -70,31 +73,23 @@ def message_of(fix):
     return fix_message(f"tag{fix.tag}", fix.serial, receiver.take(report), fix.unix_us / 1e6, report.latency_s)
 
 
-def matrix(six):
-    return tuple(six[at] for at in (0, 1, 2, 1, 3, 4, 2, 4, 5))
-
-
 @given(fixes())
-def test_a_record_holds_the_fix(fix):
-    message = message_of(fix)
+def test_a_record_and_a_line_of_json_hold_the_fix(fix):
+    message, matrix = message_of(fix), (0, 1, 2, 1, 3, 4, 2, 4, 5)
     assert message.position_m == tuple(mm / 1000 for mm in fix.position_mm)
     assert message.velocity_mps == tuple(mm / 1000 for mm in fix.velocity_mmps)
-    assert message.covariance_m2 == matrix(fix.covariance_m2)
-    assert message.velocity_covariance == matrix(fix.velocity_covariance)
+    assert message.covariance_m2 == tuple(fix.covariance_m2[at] for at in matrix)
+    assert message.velocity_covariance == tuple(fix.velocity_covariance[at] for at in matrix)
     assert message.anchors == tuple(number for number, _ in ANCHORS)
     assert message.time_s == pytest.approx(fix.time_ticks / 63.8976e9)
-
-
-@given(fixes())
-def test_a_line_of_json_says_what_the_host_s_program_says(fix):
-    line = written("json", fix)
-    found, meant = msgspec.json.decode(line, type=FixMessage), message_of(fix)
-    assert list(json.loads(line)) == list(msgspec.structs.asdict(meant))
+    line, meant = written("json", fix), msgspec.structs.asdict(message)
+    assert list(json.loads(line)) == list(meant)
     assert line.endswith("}\n")
-    for name, value in msgspec.structs.asdict(meant).items():
+    found = msgspec.json.decode(line, type=FixMessage)
+    for name, value in meant.items():
         got = getattr(found, name)
         if name.endswith("dop"):
-            assert got == pytest.approx(value, rel=1e-2, abs=1e-3) or meant.gdop > 10.0  # far from all anchors
+            assert got == pytest.approx(value, rel=1e-2, abs=1e-3) or message.gdop > 10.0  # far from all anchors
         elif isinstance(value, float) or (isinstance(value, tuple) and name != "anchors"):
             assert got == pytest.approx(value, rel=1e-5, abs=6e-5), name
         else:
@@ -107,19 +102,15 @@ def test_single_precision_dilutions_are_those_of_double():
         assert getattr(found, name) == pytest.approx(getattr(meant, name), abs=1e-3)
 
 
-@pytest.mark.parametrize(("place", "reason"), list(enumerate(NoFixReason, 1)))
-def test_no_fix_is_a_line_with_its_reason(place, reason):
-    line = msgspec.json.decode(written("json", fix_in_c(reason=place, unix_us=5_000_000)), type=NoFixLine)
-    assert line == NoFixLine("tag4", 5.0, reason.value)
-
-
-HALL = OriginInC(525_130_000, 134_000_000, 40_000, 250_000_000)
+def test_no_fix_is_a_line_with_its_reason():
+    for place, reason in enumerate(NoFixReason, 1):
+        line = written("json", fix_in_c(reason=place, unix_us=5_000_000))
+        assert msgspec.json.decode(line, type=NoFixLine) == NoFixLine("tag4", 5.0, reason.value)
 
 
 def as_site(origin):
-    return GeoreferenceSite(
-        *(origin.latitude_e7 / 1e7, origin.longitude_e7 / 1e7, origin.height_mm / 1e3, origin.heading_e7 / 1e7)
-    )
+    angles_deg = (origin.latitude_e7 / 1e7, origin.longitude_e7 / 1e7)
+    return GeoreferenceSite(*angles_deg, origin.height_mm / 1e3, origin.heading_e7 / 1e7)
 
 
 def parsed(text):
@@ -154,17 +145,13 @@ def test_sentences_say_what_the_bridge_s_sentences_say(fix):
         assert abs((rmc.cog - meant["RMC"].cog + 180.0) % 360.0 - 180.0) < 0.02
 
 
-def test_a_board_that_has_not_been_told_the_time_leaves_it_empty():
+def test_dates_are_those_of_the_calendar_and_empty_on_a_board_that_does_not_know_the_time():
     found = parsed(written("nmea", fix_in_c(has_origin=True, origin=HALL)))
     assert [message.time for message in found.values()] == [""] * 3
     assert found["RMC"].date == ""
-
-
-@pytest.mark.parametrize("unix_s", [951_782_400, 1_709_164_800, 1_790_000_000, 2_000_000_000])
-def test_dates_are_those_of_the_calendar(unix_s):
-    found = parsed(written("nmea", fix_in_c(has_origin=True, origin=HALL, unix_us=unix_s * 1_000_000)))
-    rmc = found["RMC"]
-    assert datetime.combine(rmc.date, rmc.time, UTC).timestamp() == unix_s
+    for unix_s in (951_782_400, 1_709_164_800, 1_790_000_000, 2_000_000_000):
+        rmc = parsed(written("nmea", fix_in_c(has_origin=True, origin=HALL, unix_us=unix_s * 1_000_000)))["RMC"]
+        assert datetime.combine(rmc.date, rmc.time, UTC).timestamp() == unix_s
 
 
 def test_the_own_sentence_has_the_local_position_also_without_a_georeference():
@@ -196,13 +183,7 @@ def test_an_advertisement_fits_and_holds_the_fix(reason, verified, age_ms, fix):
     fix.reason, fix.is_verified = reason, verified
     data = ctypes.create_string_buffer(31)
     library().advertisement_write(ctypes.byref(fix), age_ms, data)
-    length, kind, company, mark, version = (
-        data.raw[0],
-        data.raw[1],
-        *(data.raw[at : at + 2] for at in (2, 4)),
-        data.raw[6],
-    )
-    assert (length, kind, company, mark, version) == (26, 0xFF, b"\xff\xff", b"SK", 1)
+    assert data.raw[:7] == bytes((26, 0xFF)) + b"\xff\xff" + b"SK" + b"\1"  # length, kind, company, mark, version
     numbers = [int.from_bytes(data.raw[at : at + 2], "little") for at in (7, 9, 12)]
     assert numbers == [fix.site, fix.tag, min(age_ms // 10, 0xFFFF)]
     place_cm = [int.from_bytes(data.raw[at : at + 3], "little", signed=True) for at in (14, 17, 20)]
@@ -218,7 +199,7 @@ def test_an_advertisement_fits_and_holds_the_fix(reason, verified, age_ms, fix):
     assert hpl_cm == (0xFFFF if message.hpl_m is None else pytest.approx(100 * message.hpl_m, abs=0.51))
 
 
-@pytest.mark.parametrize(("rate_hz", "fixes_hz"), [(50, 397), (10, 397), (1, 100), (25, 20), (0, 397)])
+@pytest.mark.parametrize(("rate_hz", "fixes_hz"), [(50, 397), (1, 100), (25, 20), (0, 397)])
 def test_the_rate_of_an_output_gives_evenly_spaced_fixes(rate_hz, fixes_hz):
     slot, given_s = ctypes.c_int64(-(2**63)), []
     for number in range(10 * fixes_hz):
@@ -228,3 +209,34 @@ def test_the_rate_of_an_output_gives_evenly_spaced_fixes(rate_hz, fixes_hz):
     wanted_hz = min(rate_hz or fixes_hz, fixes_hz)
     assert len(given_s) == 10 * wanted_hz
     assert np.abs(np.diff(given_s) - 1 / wanted_hz).max() < 1.001 / fixes_hz
+
+
+@pytest.mark.skipif(GPSD is None, reason="gpsd is not installed: apt-get install gpsd")
+@pytest.mark.parametrize("knows_time", [True, False])
+async def test_gpsd_has_the_position_and_its_errors_whether_the_board_knows_the_time_or_not(knows_time):
+    pty, tpvs, gsts = Pty(), [], []
+    pty.start(lambda data: None)
+    try:
+        async with gpsd(pty.path) as client, asyncio.timeout(60):
+            await client.receive(lambda report: report["class"] == "WATCH")
+            number = 0
+            while len(tpvs) < 10 or len(gsts) < 10:
+                number += 1
+                unix_us = knows_time * (1_790_000_000_000_000 + 100_000 * number)
+                pty.send(written("nmea", fix_in_c(has_origin=True, origin=HALL, unix_us=unix_us)).encode())
+                try:
+                    report = await asyncio.wait_for(client.receive(lambda one: one["class"] in ("TPV", "GST")), 0.1)
+                except TimeoutError:
+                    continue
+                {"TPV": tpvs, "GST": gsts}[report["class"]].append(report)
+    finally:
+        pty.close()
+    latitude_deg, longitude_deg, height_m = geodetic((4.0, 3.0, 1.2), as_site(HALL))
+    last = tpvs[-1]
+    north_m = (last["lat"] - latitude_deg) * 111_270.0
+    east_m = (last["lon"] - longitude_deg) * 111_320.0 * cos(radians(latitude_deg))
+    assert hypot(north_m, east_m) < 0.002  # sigma is 2 cm
+    assert last["altHAE"] == pytest.approx(height_m, abs=0.002)
+    assert last["mode"] == 3
+    assert (gsts[-1]["alt"], gsts[-1]["rms"]) == pytest.approx((0.03, 0.02), abs=1e-3)
+    assert ("time" in last, "time" in gsts[-1]) == (knows_time, knows_time)

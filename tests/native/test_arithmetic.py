@@ -1,21 +1,16 @@
-"""Cholesky's method and rotations of columns against NumPy."""
+"""Cholesky's method and rotations of columns against NumPy; tails of distributions against SciPy."""
 
 import ctypes
+import math
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.special import chdtrc, erfcx, ndtr, ndtri
 
-from skyless.core.native.arithmetic import (
-    DEPENDENT,
-    Columns,
-    factorise,
-    least_squares,
-    orthogonalise,
-    solve,
-    solve_lower,
-)
+from skyless.core.native import arithmetic
+from skyless.core.native.arithmetic import DEPENDENT, FAR_TAIL, chi2_tail, factorise, least_squares, normal_tail
 from skyless.core.native.views import view
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -38,9 +33,9 @@ def drawn_columns(seed, rows, columns, dependence):
 
 
 def columns_of(A):
-    m = Columns(rows=len(A), columns=A.shape[1])
+    m = arithmetic.Columns(rows=len(A), columns=A.shape[1])
     view(m.A)[: m.rows, : m.columns] = A
-    orthogonalise(m)
+    arithmetic.orthogonalise(m)
     return m
 
 
@@ -53,11 +48,11 @@ def test_factors_and_solutions(seed, size, spread):
     assert factorise(L, size)
     expected = np.linalg.cholesky(A)
     scale = np.sqrt(A.diagonal())[:, None]
-    np.testing.assert_allclose(np.array(L) / scale.repeat(size, 1)[np.tril_indices(size)],
-                               (expected / scale)[np.tril_indices(size)], atol=1e-12)  # fmt: skip
-    for function, solution in ((solve, np.linalg.solve(A, b)), (solve_lower, np.linalg.solve(expected, b))):
+    lower = np.tril_indices(size)
+    np.testing.assert_allclose(np.array(L) / scale.repeat(size, 1)[lower], (expected / scale)[lower], atol=1e-12)
+    for name, solution in (("solve", np.linalg.solve(A, b)), ("solve_lower", np.linalg.solve(expected, b))):
         x = reals(b)
-        function(L, size, x)
+        getattr(arithmetic, name)(L, size, x)
         np.testing.assert_allclose(x, solution, rtol=1e-6, atol=1e-9 * np.abs(solution).max())
 
 
@@ -99,3 +94,22 @@ def test_least_squares(seed, rows, columns, dependence):
 @pytest.mark.parametrize("A", [np.zeros((3, 2)), np.ones((4, 3)), [[1.0, 2.0]], [[0.0, 1.0], [0.0, 1.0], [0.0, 3.0]]])
 def test_dependent_columns_have_no_solution(A):
     assert not least_squares(columns_of(np.array(A)), reals(np.ones(4)), reals(np.zeros(4)))
+
+
+@given(z=st.floats(-9.0, 37.0), tail=st.floats(1e-300, 0.4999), dof=st.integers(1, 100), chi2=st.floats(0.0, 1399.0))
+def test_tails_and_quantiles_are_those_of_scipy(z, tail, dof, chi2):
+    assert normal_tail(z) == pytest.approx(ndtr(-z), rel=1e-12)
+    assert arithmetic.normal_quantile(tail) == pytest.approx(-ndtri(tail), rel=1e-12, abs=1e-12)
+    assert chi2_tail(dof, chi2) == pytest.approx(chdtrc(dof, chi2), rel=1e-11, abs=1e-250)
+
+
+@given(mean=st.floats(-60.0, 60.0), sigma=st.floats(1e-3, 1e3))
+def test_the_mean_of_what_is_positive(mean, sigma):
+    expected = mean + math.sqrt(2.0 / math.pi) / erfcx(-mean / math.sqrt(2.0))
+    assert arithmetic.mean_if_positive(mean * sigma, sigma) == pytest.approx(sigma * expected, rel=1e-11)
+
+
+def test_far_tails_are_none_and_series_and_fraction_meet():
+    assert [chi2_tail(3, chi2) for chi2 in (1400.0, 1e300, np.inf)] == [0.0] * 3
+    for mean in (-FAR_TAIL, FAR_TAIL):
+        assert normal_tail(mean) == pytest.approx(normal_tail(mean * (1.0 - 1e-14)), rel=1e-12)
