@@ -8,10 +8,17 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 
-from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, EventLog, Kept
+from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, TAKEOVER_S, EventLog, EventQueue, Kept, publisher_rank
 from skyless.run.condition._reasons import Reason
 from skyless.run.condition.monitor import Condition
-from skyless.run.mqtt.messages import SurveyMessage, WatchFinding, WatchMessage, WrongMessageError, ZonesMessage
+from skyless.run.mqtt.messages import (
+    SurveyMessage,
+    WatchFinding,
+    WatchMessage,
+    WrongMessageError,
+    ZoneEvent,
+    ZonesMessage,
+)
 from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.zones import read_zones
 from skyless.site.survey.facts import Facts
@@ -237,3 +244,33 @@ def test_a_kept_list_that_cannot_be_read_or_is_not_that_of_the_site_shown_is_not
             kept.check_store("Hall", "Hall")
     kept.receive(b"")
     kept.check_store("Hall", "Hall")
+
+
+EVENT = ZoneEvent("desk", "Desk", "t1", "enter", 1000.0, (1.0, 2.0, 3.0))
+
+
+def test_the_dashboard_that_is_online_longest_publishes_first():
+    dashboards = [
+        status("dashboard", "dead", online=False, unix_s=1.0),
+        status("dashboard", "young", unix_s=9.0),
+        status("dashboard", "old", unix_s=5.0),
+    ]
+    assert publisher_rank("old", dashboards) == 0
+    assert publisher_rank("young", dashboards) == 1
+    assert publisher_rank("unknown", dashboards) == 0
+    assert publisher_rank("alone", []) == 0
+
+
+@pytest.mark.parametrize("rank", [0, 1])
+def test_an_event_is_published_once_by_the_first_dashboard_or_else_by_the_next(rank):
+    """Of one event another dashboard's is heard in time, of the other one only one that is not the same."""
+    queue, other = EventQueue(), replace(EVENT, tag="t2")
+    queue.schedule([EVENT, other], rank, 10.0)
+    assert queue.pop_due(10.0 + 0.9 * TAKEOVER_S) == ([] if rank else [EVENT, other])
+    heard = replace(EVENT, unix_s=1000.1) if rank else EVENT
+    assert queue.add_published(heard) == bool(rank), "at first it is the echo"
+    assert not queue.add_published(heard)
+    assert queue.add_published(replace(other, kind="leave"))
+    assert queue.pop_due(10.0 + TAKEOVER_S) == ([other] if rank else [])
+    assert queue.pop_due(100.0) == []
+    assert set(queue.recent) == {heard, other, replace(other, kind="leave")}

@@ -132,7 +132,7 @@ class _Rule:
 
     def __init__(self, rule: AlarmRule, assets: Mapping[str, Asset], before: "_Rule | None") -> None:
         """Take over the cases of ``before`` if it has the same kind and zone."""
-        self.rule, self.hours = rule, read_hours(rule.hours)
+        self.rule, self.hours, self.limit = rule, read_hours(rule.hours), rule.limit or 0.0
         self.concerned, self.others = Concerned(rule.tags, assets), Concerned(rule.others, assets)
         self.distances_m: dict[str, float] = {}
         """Distances of near pairs, by subject."""
@@ -170,14 +170,13 @@ class AlarmEngine:
         self._members: defaultdict[str, set[str]] = defaultdict(set)
         self._rules: dict[str, _Rule] = {}
         self._zones_s = -math.inf  # when the zones last changed
-        self._resumed_s: dict[str, float] = {}  # subjects of resumed alarms, and when they were
-        self._forget_due_s = 0.0
+        self._resumed_s: dict[str, float] = {}  # tags of resumed alarms, and when these were resumed
         self._changed: dict[str, None] = {}  # tags with something new since the last evaluation
         self._anchors: dict[RuleKind, dict[str, str]] = {}
         """Subjects for which a condition on anchors holds, each with a sentence, by kind of rule."""
         self._changes: list[Change] = []
-        self._blind_s = self._evaluated_s = self._updated_s = -math.inf
-        self._unix_offset_s = 0.0
+        self._blind_s = self._evaluated_s = self._updated_s = self._forget_due_s = -math.inf
+        self._unix_offset_s = math.nan  # until the first tick
 
     # The site
 
@@ -251,7 +250,7 @@ class AlarmEngine:
             unstated = math.inf if "unknown" in message.sentence else None  # JSON has no infinity
             case.add(message.kind, unstated if message.worst is None else message.worst)
             if is_new:
-                self._resumed_s[message.subject] = now_s
+                self._resumed_s |= dict.fromkeys(message.subject.split("~"), now_s)
         self._evaluate_all()
 
     @property
@@ -306,7 +305,7 @@ class AlarmEngine:
         """Subjects for which a condition may have begun to hold."""
         match own.rule.kind:
             case "near":
-                reach_m = (own.rule.limit or 0.0) + own.rule.hysteresis
+                reach_m = own.limit + own.rule.hysteresis
                 there = ((n, tag.fix) for n, tag in self._table.fixed.items() if self._table.is_there(tag, now_s))
                 places_m = {name: fix.position_m for name, fix in there if fix is not None}
                 near = near_tags(places_m, own.concerned, own.others, reach_m)
@@ -326,7 +325,7 @@ class AlarmEngine:
     ) -> bool | None:
         """Whether the condition holds; None if unknown, so that the case stays unchanged."""
         rule, tag, inside = own.rule, self._table.get("tag", subject), self._members[own.rule.zone or ""]
-        limit, hysteresis = rule.limit or 0.0, rule.hysteresis if held else 0.0
+        limit, hysteresis = own.limit, rule.hysteresis if held else 0.0
         if rule.zone is not None and rule.zone not in self._zones:
             return False
         match rule.kind:
@@ -369,7 +368,7 @@ class AlarmEngine:
     def _is_settled(self, tag: Node, now_s: float) -> bool:
         """Whether it is known which zones a tag is outside."""
         since_s = max(tag.first_s, self._zones_s)
-        return tag.fixes > 1 and tag.fix_s > since_s and now_s - since_s >= SETTLE_S
+        return tag.fix_s > since_s and now_s - since_s >= SETTLE_S
 
     @staticmethod
     def _battery(tag: Node | None) -> float | None:
@@ -468,7 +467,7 @@ class AlarmEngine:
         self._keep(message, "raised")
 
     def _update(self, message: AlarmMessage, own: _Rule, worst: float | None) -> None:
-        is_longer = (worst or 0.0) >= _LONGER * (message.worst or 0.0) + UPDATE_S
+        is_longer = worst is not None and worst >= _LONGER * (message.worst or 0.0) + UPDATE_S
         if is_longer if own.rule.kind in _LASTING else worst != message.worst or own.rule.kind == "anchor-moved":
             sentence = self._sentence(own, message.subject, worst, "updated") or message.sentence
             if sentence != message.sentence:
@@ -525,11 +524,11 @@ class AlarmEngine:
 
     def _sentence(self, own: _Rule, subject: str, worst: float | None, what: What) -> str:
         """The sentence of an alarm; empty if its value is no longer known."""
-        rule, limit, zone = own.rule, own.rule.limit or 0.0, self._zone_name(own.rule.zone)
+        rule, limit, zone = own.rule, own.limit, self._zone_name(own.rule.zone)
         if worst is None and what != "raised" and rule.kind != "anchor-moved":
             return ""
         who = " and ".join(map(self._who, subject.split("~")))
-        anchor, was = subject.replace("-", " ", 1), what != "raised"
+        anchor, was = subject.replace("-", " "), what != "raised"
         value, least, most = worst or 0.0, " at the least" if was else "", " at the most" if was else ""
         lasting = f" for {_span(value)}" if value >= 1.0 and rule.kind in _LASTING else ""
         be = "was" if what == "ended" else "has been" if lasting else "is"

@@ -72,7 +72,7 @@ def depth_m(point: Point, polygon: Polygon) -> float:
             inside = not inside
         along_x, along_y = x2 - x1, y2 - y1
         length2 = along_x * along_x + along_y * along_y
-        share = ((x - x1) * along_x + (y - y1) * along_y) / length2 if length2 > 0.0 else 0.0
+        share = ((x - x1) * along_x + (y - y1) * along_y) / (length2 or math.inf)  # the square of 1e-200 m is 0
         share = min(max(share, 0.0), 1.0)
         away_x, away_y = x1 + share * along_x - x, y1 + share * along_y - y
         least = min(least, away_x * away_x + away_y * away_y)
@@ -88,11 +88,14 @@ def is_simple(polygon: Polygon) -> bool:
 
 def _touch(a: Point, b: Point, c: Point, d: Point) -> bool:
     """Whether the segments a–b and c–d have a point in common."""
-    if max(a[0], b[0]) < min(c[0], d[0]) or max(c[0], d[0]) < min(a[0], b[0]):
-        return False
-    if max(a[1], b[1]) < min(c[1], d[1]) or max(c[1], d[1]) < min(a[1], b[1]):
-        return False
-    return _turn(a, b, c) * _turn(a, b, d) <= 0.0 and _turn(c, d, a) * _turn(c, d, b) <= 0.0
+    return (
+        max(a[0], b[0]) >= min(c[0], d[0])
+        and max(c[0], d[0]) >= min(a[0], b[0])
+        and max(a[1], b[1]) >= min(c[1], d[1])
+        and max(c[1], d[1]) >= min(a[1], b[1])
+        and _turn(a, b, c) * _turn(a, b, d) <= 0.0
+        and _turn(c, d, a) * _turn(c, d, b) <= 0.0
+    )
 
 
 def _turn(a: Point, b: Point, c: Point) -> float:
@@ -145,7 +148,7 @@ def _faults(zone: Zone) -> Iterator[str]:
         yield "has a colour that is neither #rrggbb nor a name"
     if not 3 <= len(corners) <= _MAX_CORNERS:
         yield f"has {len(corners)} corners; it should have 3 to {_MAX_CORNERS}"
-    if not all(math.isfinite(value) and abs(value) <= _MAX_CORNER_M for corner in corners for value in corner):
+    if not all(abs(value) <= _MAX_CORNER_M for corner in corners for value in corner):
         yield f"has a corner that is not finite or farther than {_MAX_CORNER_M:g} m"
     if not is_simple(corners):
         yield "crosses or touches itself"
@@ -224,10 +227,11 @@ class ZoneMonitor:
         tag.position_m = fix.position_m
         std_z_m = math.sqrt(max(fix.covariance_m2[8], 0.0))
         tag.floor = None if fix.height_known else floor_at(self.floors, fix.position_m[2], std_z_m, tag.floor)
+        margin_m = max(MIN_MARGIN_M, _MARGIN_SIGMAS * horizontal_ellipse(fix.covariance_m2)[0])
         return [
             _event(zone.zone, fix.tag, tag, fix.unix_s, entered=zone.zone.id in tag.inside)
             for zone in self._monitored.values()
-            if _crossed(tag, zone, fix)
+            if _crossed(tag, zone, fix, margin_m)
         ]
 
     def zones_with(self, name: str) -> list[Zone]:
@@ -261,13 +265,9 @@ def floor_at(floors: tuple[FloorSite, ...], z_m: float, std_m: float, before: in
     return before if abs(z_m - boundary_m) < margin_m else floors[row].number
 
 
-def _crossed(tag: _TagState, zone: _MonitoredZone, fix: FixMessage) -> bool:
+def _crossed(tag: _TagState, zone: _MonitoredZone, fix: FixMessage, margin_m: float) -> bool:
     """Whether the tag has changed sides; if so, ``tag.inside`` is updated."""
     zone_id, unix_s, beyond_m = zone.zone.id, fix.unix_s, zone.beyond_m(tag)
-    if beyond_m <= 0.0:
-        tag.beyond_since_s.pop(zone_id, None)
-        return False
-    margin_m = max(MIN_MARGIN_M, _MARGIN_SIGMAS * horizontal_ellipse(fix.covariance_m2)[0])
     margin_m = min(margin_m, zone.max_margin_m)
     if beyond_m < 0.5 * margin_m:
         tag.beyond_since_s.pop(zone_id, None)

@@ -12,8 +12,7 @@ from msgspec.structs import replace
 from skyless.core.errors import ConfigurationError
 from skyless.core.site import AlarmRule
 from skyless.page._alarms import read_rules
-from skyless.run.alarms import Concerned
-from skyless.run.mqtt.messages import AlarmRulesMessage, Asset, WrongMessageError, site_message
+from skyless.run.mqtt.messages import AlarmRulesMessage, WrongMessageError, site_message
 from skyless.sim.lab import lab_site
 from skyless.site.alarm_rules import MAX_RULES, BadAlarmRulesError, check_rules, read_hours
 from skyless.site.file.load import load_site
@@ -86,27 +85,27 @@ def test_wrong_hours(text):
     [
         ({"id": "a b", "kind": "silent", "after_s": 5.0}, "id", "letters, digits"),
         ({"id": "", "kind": "silent", "after_s": 5.0}, "id", "letters, digits"),
-        ({"id": "a", "kind": "inside"}, "zone", "id of a zone"),
-        ({"id": "a", "kind": "inside", "zone": "a/b"}, "zone", "id of a zone"),
-        ({"id": "a", "kind": "inside", "zone": "z", "limit": 1.0}, "limit", "left out"),
-        ({"id": "a", "kind": "silent"}, "after_s", "from 1"),
-        ({"id": "a", "kind": "near"}, "limit", "distance in metres"),
-        ({"id": "a", "kind": "near", "limit": 0.0}, "limit", "distance in metres"),
-        ({"id": "a", "kind": "crowded", "zone": "z", "limit": 1.5}, "limit", "whole number"),
-        ({"id": "a", "kind": "battery", "limit": 20.0}, "limit", "share"),
-        ({"id": "a", "kind": "battery", "limit": 0.2, "hysteresis": 2.0}, "hysteresis", "from 0"),
-        ({"id": "a", "kind": "anchor-offline", "tags": ("t",)}, "tags", "left out"),
-        ({"id": "a", "kind": "silent", "after_s": 5.0, "tags": ("group:",)}, "tags", "group:NAME"),
-        ({"id": "a", "kind": "near", "limit": 1.0, "others": ("x y",)}, "others", "group:NAME"),
-        ({"id": "a", "kind": "silent", "after_s": 5.0, "hours": "never"}, "hours", "mon-fri"),
-        ({"id": "a", "kind": "silent", "after_s": 5.0, "name": "two\nlines"}, "name", "a line"),
+        ({"kind": "inside"}, "zone", "id of a zone"),
+        ({"kind": "inside", "zone": "a/b"}, "zone", "id of a zone"),
+        ({"kind": "inside", "zone": "z", "limit": 1.0}, "limit", "left out"),
+        ({"kind": "silent"}, "after_s", "from 1"),
+        ({"kind": "near"}, "limit", "distance in metres"),
+        ({"kind": "near", "limit": 0.0}, "limit", "distance in metres"),
+        ({"kind": "crowded", "zone": "z", "limit": 1.5}, "limit", "whole number"),
+        ({"kind": "battery", "limit": 20.0}, "limit", "share"),
+        ({"kind": "battery", "limit": 0.2, "hysteresis": 2.0}, "hysteresis", "from 0"),
+        ({"kind": "anchor-offline", "tags": ("t",)}, "tags", "left out"),
+        ({"kind": "silent", "after_s": 5.0, "tags": ("group:",)}, "tags", "group:NAME"),
+        ({"kind": "near", "limit": 1.0, "others": ("x y",)}, "others", "group:NAME"),
+        ({"kind": "silent", "after_s": 5.0, "hours": "never"}, "hours", "mon-fri"),
+        ({"kind": "silent", "after_s": 5.0, "name": "two\nlines"}, "name", "a line"),
     ],
 )
 def test_a_wrong_rule_names_rule_key_value_and_what_is_right(fields, key, words):
     with pytest.raises(BadAlarmRulesError) as caught:
-        check_rules([AlarmRule("good", "anchor-moved"), AlarmRule(**fields)])
+        check_rules([AlarmRule("good", "anchor-moved"), AlarmRule(**{"id": "a"} | fields)])
     error = caught.value
-    assert (error.row, error.rule, error.key) == (1, fields["id"], key)
+    assert (error.row, error.rule, error.key) == (1, fields.get("id", "a"), key)
     assert words in str(error)
 
 
@@ -121,17 +120,11 @@ def test_identifiers_are_unique_also_among_those_of_the_file():
 
 
 @given(st.binary(max_size=60) | st.just(b'{"rules": [{"id": "x", "kind": "other"}]}'))
-def test_any_payload_gives_rules_or_an_error(payload):
+def test_a_message_gives_rules_or_an_error(payload):
+    message = AlarmRulesMessage((AlarmRule("a", "near", limit=2.0, tags=("group:people",)),), "hall")
+    assert read_rules(msgspec.json.encode(message)) == message
     with contextlib.suppress(WrongMessageError, BadAlarmRulesError):
         assert read_rules(payload).rules is not None
-
-
-def test_groups_are_those_of_the_assets():
-    assets = {"t1": Asset("t1", group="people"), "t2": Asset("t2", group="forklifts")}
-    concerned = Concerned(("group:people", "t3"), assets)
-    assert [name in concerned for name in ("t1", "t2", "t3", "t4")] == [True, False, True, False]
-    assert "anything" in Concerned((), assets)
-    assert "t1" not in Concerned(("group:nobody",), assets)
 
 
 FILE_RULE = (
@@ -139,20 +132,19 @@ FILE_RULE = (
 )
 
 
-def test_rules_of_a_site_file_travel_beside_the_site(tmp_path):
-    site = lab_site()
-    text = 'name = "s"\nid = 1\nmaster = 1\n' + "".join(
-        f"[[anchors]]\nid = {a.id}\nx_m = {a.x_m}\ny_m = {a.y_m}\nz_m = {a.z_m}\n" for a in site.anchors
-    )
-    (tmp_path / "s.toml").write_text(text + FILE_RULE)
-    loaded = load_site(tmp_path / "s.toml")
-    message = site_message(loaded, simulated=True, unix_s=1.0)
+def test_rules_are_written_to_a_site_file_and_travel_beside_the_site(tmp_path):
+    near = AlarmRule("near", "near", name='Fork "7" – near', limit=2.5, tags=("group:forks",), others=("t1", "t2"))
+    cold = AlarmRule("cold", "inside", zone="cold", after_s=600.0, severity="critical", hours="22:00-06:00")
+    site = replace(lab_site(), alarms=(near, cold))
+    path = tmp_path / "s.toml"
+    path.write_text(site_template(site))
+    assert load_site(path).alarms == (near, cold)
+    message = site_message(site, simulated=True, unix_s=1.0)
     sent = msgspec.json.decode(msgspec.json.encode(message))
     assert "alarms" not in sent["site"]  # earlier versions refuse it there
-    assert [rule["id"] for rule in sent["alarms"]] == ["cold"]
-    assert message.whole_site == loaded
-    plain = site_message(site, simulated=True, unix_s=1.0)
-    assert plain.whole_site == site
+    assert [rule["id"] for rule in sent["alarms"]] == ["near", "cold"]
+    assert message.whole_site == site
+    assert site_message(lab_site(), simulated=True, unix_s=1.0).whole_site == lab_site()
 
 
 @pytest.mark.parametrize(
@@ -168,16 +160,3 @@ def test_a_wrong_rule_in_a_site_file(tmp_path, wrong, words):
     (tmp_path / "s.toml").write_text(head + FILE_RULE.replace('kind = "inside"', wrong))
     with pytest.raises(ConfigurationError, match=words):
         load_site(tmp_path / "s.toml")
-
-
-def test_the_message_of_rules_is_read_whole():
-    message = AlarmRulesMessage((AlarmRule("a", "near", limit=2.0, tags=("group:people",)),), "hall")
-    assert read_rules(msgspec.json.encode(message)) == message
-
-
-def test_a_site_file_that_is_written_has_the_rules(tmp_path):
-    near = AlarmRule("near", "near", name='Fork "7" – near', limit=2.5, tags=("group:forks",), others=("t1", "t2"))
-    rules = (near, AlarmRule("cold", "inside", zone="cold", after_s=600.0, severity="critical", hours="22:00-06:00"))
-    path = tmp_path / "s.toml"
-    path.write_text(site_template(replace(lab_site(), alarms=rules)))
-    assert load_site(path).alarms == rules
