@@ -10,6 +10,8 @@ from skyless.core.errors import SkylessError
 from skyless.radio.dw1000 import radio as dw1000
 from skyless.radio.dw1000.spi import SpiBus
 
+pytestmark = pytest.mark.site
+
 DEVICE_ID = b"\x30\x01\xca\xde"
 
 

@@ -56,7 +56,8 @@ async def test_fixes_states_and_alerts_of_a_board_are_published_and_written_as_l
     assert fix.latency_s == pytest.approx(0.00197)
     assert (fix.verified_until_s, fix.unverified) == (fix.time_s, 0.0)
     assert (health.method, health.fixes, health.receptions) == ("joint", 2, 218)
-    assert health.counters == {"overload": 7, "overload-superframe": 2, "dropped-on-board": 9}
+    counters = {name: count for name, count in health.counters.items() if name != "late-fix"}  # on a busy machine
+    assert counters == {"overload": 7, "overload-superframe": 2, "dropped-on-board": 9}
 
 
 @pytest.mark.parametrize(

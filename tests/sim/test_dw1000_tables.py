@@ -13,6 +13,8 @@ from skyless.sim.dw1000 import transceiver
 from skyless.sim.dw1000.chip import Chip, ModelBus, Sensors
 from skyless.sim.dw1000.registers import decode_header
 
+pytestmark = pytest.mark.site
+
 NOT_PUBLISHED = {
     *("STD_NOISE", "FP_AMPL2", "FP_AMPL3", "CIR_PWR"),  # parts of RX_FQUAL, see below
     *("AGC_CTRL", "EXT_SYNC", "DRX_CONF", "TX_CAL", "FS_CTRL", "AON", "OTP_IF", "LDE_IF", "PMSC"),  # files
