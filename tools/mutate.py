@@ -3,9 +3,9 @@
 ``scripts/mutate`` measures the modules of ``tests/mutants.toml``, ``scripts/mutate run/alarms.py`` one of them, with
 its own tests, and fails where they find too few. Modules and tests of your choice:
 ``scripts/mutate core/site.py tests/core/test_digest.py``. With ``--spare`` it lists the tests whose lines and mutants
-are all found by others, with ``--number=40`` it takes that many of the mutants, drawn with a fixed seed.
-What a whole measurement depends on is kept in ``tests/mutants_measured.json``, unless ``--only-say`` is given: a test
-of the statistical tier measures again what has changed since.
+are all found by others.
+What a whole measurement depends on is kept in ``tests/mutants_measured.json``: a test of the statistical tier measures
+again what has changed since.
 
 Mutants: a comparison, ``and`` and ``or``, the condition of an ``if``, plus and minus, a number, a returned value.
 
@@ -13,6 +13,7 @@ The tests are imported once. Each mutant is a fork of that process, in which the
 those tests run that reach the changed line.
 """
 
+import argparse
 import ast
 import gc
 import os
@@ -44,7 +45,7 @@ MEASURED: Final = ROOT / "tests" / "mutants_measured.json"
 LEAST_SHARE: Final = 0.95
 """Of the mutants that are not equal in effect, those that the tests should find."""
 _SLOWER: Final = 5.0
-"""Tests that take so many times as long as without the mutant run for ever."""
+"""Tests that take this many times as long as without the mutant are taken to run for ever."""
 _GRACE_S: Final = 5.0
 
 _OTHER: Final[dict[type[ast.cmpop], type[ast.cmpop]]] = {
@@ -92,7 +93,9 @@ def mutants_of(path: Path) -> list[Mutant]:
         code = compile(ast.fix_missing_locations(tree), str(path), "exec")
         first = min([function.lineno, *(one.lineno for one in function.decorator_list)])
         changed = next(one for one in _codes(code) if (one.co_firstlineno, one.co_name) == (first, function.name))
-        found.append(Mutant(node.lineno, f"{before} -> {_shown(node)}", (changed.co_qualname, first), changed))
+        where = f" in {text.splitlines()[node.lineno - 1].strip()}" if isinstance(node, ast.Constant) else ""
+        name = f"{before} -> {_shown(node)}{where}"
+        found.append(Mutant(node.lineno, name, (changed.co_qualname, first), changed))
     return found
 
 
@@ -233,14 +236,16 @@ def _forked(work: Any, limit_s: float) -> Any:  # noqa: ANN401 - whatever JSON c
             os._exit(0)
     os.close(writer)
     text, end_s = b"", time.monotonic() + limit_s
-    while select.select([reader], [], [], max(0.0, end_s - time.monotonic()))[0]:
-        if not (part := os.read(reader, 1 << 16)):
-            break
-        text += part
-    os.close(reader)
-    with suppress(ProcessLookupError):
-        os.killpg(child, signal.SIGKILL)
-    os.waitpid(child, 0)
+    try:
+        while select.select([reader], [], [], max(0.0, end_s - time.monotonic()))[0]:
+            if not (part := os.read(reader, 1 << 16)):
+                break
+            text += part
+    finally:  # also after Ctrl-C, which the child does not get
+        os.close(reader)
+        with suppress(ProcessLookupError):
+            os.killpg(child, signal.SIGKILL)
+        os.waitpid(child, 0)
     return msgspec.json.decode(text) if text else None
 
 
@@ -311,34 +316,35 @@ def _say_spare(runs: Runs) -> None:
 
 def main() -> int:
     """Measure the modules that are asked for, each in a process of its own."""
-    words = sys.argv[1:]
-    spare = "--spare" in words
-    number = next((int(word.partition("=")[2]) for word in words if word.startswith("--number=")), None)
-    names = [word.removeprefix("src/skyless/") for word in words if not word.startswith("--")]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="modules below src/skyless; files of tests")
+    parser.add_argument("--spare", action="store_true", help="list the tests that find nothing of their own")
+    parser.add_argument("--number", type=int, help="so that fewer mutants are tried: this number, always the same ones")
+    parser.add_argument("--only-say", action="store_true", help="do not write tests/mutants_measured.json")
+    asked = parser.parse_args()
     entries = table()
+    names = [name.removeprefix("src/skyless/") for name in asked.names]
     modules = [name for name in names if (SOURCE / name).is_file()]
     tests = [name for name in names if name not in modules]
-    if missing := [name for name in tests if not (ROOT / name).exists()]:
-        print(f"{missing[0]} is no module of src/skyless and no file of tests", file=sys.stderr)
-        return 2
+    for name in tests:
+        if not (ROOT / name).exists():
+            parser.error(f"{name} is no module of src/skyless and no file of tests")
+    for module in modules:
+        if not tests and module not in entries:
+            parser.error(f"{module} is not in {TABLE.relative_to(ROOT)}; name its tests, too")
     good = True
     for module in modules or entries:
-        entry = entries.get(module, Entry([]))
-        if tests:
-            entry = msgspec.structs.replace(entry, tests=tests)
-        if not entry.tests:
-            print(f"{module} is not in {TABLE.relative_to(ROOT)}; name its tests, too", file=sys.stderr)
-            return 2
+        entry = msgspec.structs.replace(entries.get(module, Entry([])), **({"tests": tests} if tests else {}))
         child = os.fork()
         if child == 0:
             code = 3
             try:
-                code = 0 if judged(module, entry, spare=spare, number=number) else 1
+                code = 0 if judged(module, entry, spare=asked.spare, number=asked.number) else 1
                 sys.stdout.flush()
             finally:
                 os._exit(code)
         is_good = os.waitpid(child, 0)[1] == 0
-        if is_good and not tests and number is None and "--only-say" not in words:
+        if is_good and not (tests or asked.number or asked.only_say):
             kept = {name: digest for name, digest in measured().items() if name in entries}
             text = msgspec.json.encode({**kept, module: digest_of(module, entry)}, order="sorted")
             MEASURED.write_bytes(msgspec.json.format(text) + b"\n")

@@ -170,7 +170,7 @@ class Variances:
     """The paper's section on uncertainties: variances in s², and of λ in m².
 
     What is printed right stands here. ``CORRECTED`` follows from the paper's own algorithm
-    (``positioning/methods/snapshots.py``) by linearising it; ``tests/research/test_paper_derivation.py`` does that
+    (``core/protocol1/snapshots.py``) by linearising it; ``tests/research/test_paper_derivation.py`` does that
     with symbols, and Monte Carlo draws of the algorithm as it is agree (``tests/research/test_paper_checks.py``). The
     reference packet is taken to be no synchronisation packet, as in the paper; the other cases: ``chain_covariance``.
     ``PRINTED`` is kept to be compared with it; ``docs/errata.md`` explains each difference.

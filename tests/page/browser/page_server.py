@@ -81,7 +81,7 @@ class PageServer:
         return f"http://127.0.0.1:{self.port}/"
 
     def body(self, what, count=1):
-        """The last of so many bodies that pages have sent."""
+        """The last of the bodies that pages have sent, once there are ``count``."""
         return came(lambda: self.bodies[what][count - 1 :])[-1]
 
     def cut(self):

@@ -89,7 +89,7 @@ class Crowd:
         self.show(count, count // 2)
 
     def show(self, count, right):
-        """Place so many tags, of which some with even numbers are at the right."""
+        """Place ``count`` tags: the first ``right`` with even numbers at the right, the others at the left."""
         records = np.zeros(count, RECORD)
         records["tag"], records["flags"] = np.arange(count), 1
         is_right = (records["tag"] % 2 == 0) & (records["tag"] < 2 * right)
