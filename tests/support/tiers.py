@@ -31,8 +31,8 @@ _OUTSIDE = {"subprocess.Popen", "os.posix_spawn", "os.fork", "os.exec", "os.syst
 LONG = "seconds of the processor"
 _LIMIT_S = 1.0
 _CERTAINLY = 10.0
-"""Tests above the limit are listed; those that take this many times the limit are refused. Between the two a test may be
-the first that needs what is made once, such as Matplotlib or Hypothesis's strategies: up to 3 s on a busy machine."""
+"""Tests above the limit are listed; those that take this many times the limit are refused. Between the two a test may
+be the first that needs what is made once, such as Matplotlib or Hypothesis's strategies: up to 3 s on a busy machine."""
 _LOOP_S = 0.04
 """What ``_loop`` takes on the machine on which the limit is meant: a core of a usual cloud server."""
 
