@@ -32,7 +32,7 @@ LONG = "seconds of the processor"
 _LIMIT_S = 1.0
 _CERTAINLY = 10.0
 """Tests above the limit are listed; those that take this many times the limit are refused. Between the two a test may
-be the first that needs what is made once, such as Matplotlib or Hypothesis's strategies: up to 3 s on a busy machine."""
+be the first that needs what is made once, such as Matplotlib or Hypothesis's strategies: up to 3 s."""
 _LOOP_S = 0.04
 """What ``_loop`` takes on the machine on which the limit is meant: a core of a usual cloud server."""
 
