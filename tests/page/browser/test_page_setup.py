@@ -45,7 +45,9 @@ class Site:
         self.until(f"{POSITIONS}.then((at) => {condition})")
 
     def plan_is(self, condition):
-        self.until(f"{PLAN}.then(([x, y, width]) => {condition})")
+        """Wait for a plan of which this holds; there is none before its picture is read."""
+        holds = f"(([x, y, width]) => {condition})"
+        self.until(f"{PLAN}.then((plan) => plan !== null && {holds}(plan))")
 
     @property
     def plan(self):
