@@ -76,6 +76,8 @@ class Mutant(Struct, frozen=True):
     function: tuple[str, int]
     """Qualified name and first line of the outermost function that contains the place."""
     code: CodeType
+    text: str
+    """The module with that place changed."""
 
 
 # Mutants of a module.
@@ -88,15 +90,26 @@ def mutants_of(path: Path) -> list[Mutant]:
     for number in range(len(list(_places(ast.parse(text))))):
         tree = ast.parse(text)
         function, node = list(_places(tree))[number]
-        before = _shown(node)
+        before, part = _shown(node), node.test if isinstance(node, ast.If | ast.IfExp) else node
+        begin, end = _offset(text, part.lineno, part.col_offset), _offset(text, part.end_lineno, part.end_col_offset)
         _change(node)
+        after = ast.unparse(node.test if isinstance(node, ast.If | ast.IfExp) else node)
+        after = after if isinstance(node, ast.Return) else f"({after})"
         code = compile(ast.fix_missing_locations(tree), str(path), "exec")
         first = min([function.lineno, *(one.lineno for one in function.decorator_list)])
         changed = next(one for one in _codes(code) if (one.co_firstlineno, one.co_name) == (first, function.name))
         where = f" in {text.splitlines()[node.lineno - 1].strip()}" if isinstance(node, ast.Constant) else ""
         name = f"{before} -> {_shown(node)}{where}"
-        found.append(Mutant(node.lineno, name, (changed.co_qualname, first), changed))
+        changed_text = (text.encode()[:begin] + after.encode() + text.encode()[end:]).decode()
+        found.append(Mutant(node.lineno, name, (changed.co_qualname, first), changed, changed_text))
     return found
+
+
+def _offset(text: str, line: int | None, column: int | None) -> int:
+    """Number of bytes before a place, as ``ast`` names it."""
+    assert line is not None
+    assert column is not None
+    return sum(len(one.encode()) for one in text.splitlines(keepends=True)[: line - 1]) + column
 
 
 def _places(tree: ast.AST, function: ast.FunctionDef | ast.AsyncFunctionDef | None = None) -> Iterator[Any]:

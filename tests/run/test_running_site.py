@@ -60,7 +60,7 @@ class Trial:
 
         The observer and the ether see that of themselves; of the master the others do, which depose it after 53 ms.
         """
-    for attempt in (1, 2, 3):
+        for attempt in (1, 2, 3):
             before = self.stood_still()
             try:
                 await fault(self)
