@@ -1,4 +1,4 @@
-"""The solver on noisy data: against SciPy, against its own covariance, and how often it ends well."""
+"""The solver on noisy data: against SciPy, dense matrices and its own covariance, and how often it ends well."""
 
 import math
 
@@ -7,8 +7,11 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from skyless.core.clock_filter import stamp_variances_m2
 from skyless.core.fix import NoFixReason
+from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covariance, literal_delayed_covariance
 from skyless.core.tag.position import NoSolution, Solution, locate
+from support.dense_covariance import position_covariance
 
 pytestmark = pytest.mark.site
 
@@ -18,6 +21,7 @@ LAB_3D = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
 P1, P2 = np.array([3.0, 4.0, 0.0]), np.array([1.2, 1.6, 0.0])
 LITERAL = (np.diag([5.0, 9, 13, 17, 21]) + 1) / 15
 """Shape of the paper's covariance: own variances that grow with the slot, and the tag's reference in common."""
+KAPPA = np.arange(1, 6) / 6.0
 
 
 def tdoas(anchors, p):
@@ -40,6 +44,9 @@ def test_the_minimum_is_the_one_that_scipy_finds(anchors, height, weighted):
     for measured in draws(11, anchors, p, covariance, 60):
         solution = locate(anchors, measured, covariance, height_m=height, weighted=weighted, z_bounds_m=(0, 3))
         assert isinstance(solution, Solution), solution
+        here = [solution.position_m]
+        dense = position_covariance(anchors, here, covariance, height_known=height is not None, weighted=weighted)[0]
+        np.testing.assert_allclose(solution.covariance_m2, dense, rtol=1e-7, atol=1e-12)
 
         def residuals(x, measured=measured):
             return whiten @ (measured - tdoas(anchors, np.append(x, p[dims:])))
@@ -63,6 +70,7 @@ def test_the_minimum_is_the_one_that_scipy_finds(anchors, height, weighted):
         (LAB, P1, 0.0, 0.02),
         (LAB, P2, 0.0, 0.02),
         (LAB_3D, np.array([2.0, 3.0, 1.2]), None, 0.01),
+        (LAB_3D, np.array([1.7, 2.9, 1.0]), 1.0, 0.01),
         (LAB, np.array([2.0, 3.0, 1.5]), None, 0.01),  # one plane: the unfolded covariance
     ],
 )
@@ -97,14 +105,6 @@ def test_the_covariance_is_that_of_the_estimates(anchors, p, height, std, weight
         assert chi2s.mean() == pytest.approx(dof, abs=5 * math.sqrt(2 * dof / count))
     else:
         assert chi2s.mean() > dof  # only the weighted estimate minimises it
-
-
-def test_weights_pay():
-    covariance = 0.02**2 * LITERAL
-    best = locate(LAB, tdoas(LAB, P2), covariance, height_m=0)
-    plain = locate(LAB, tdoas(LAB, P2), covariance, height_m=0, weighted=False)
-    difference = plain.covariance_m2[:2, :2] - best.covariance_m2[:2, :2]
-    assert np.linalg.eigvalsh(difference).min() > 0
 
 
 @pytest.mark.parametrize("std", [0.1, 0.5])
@@ -160,3 +160,21 @@ def test_chi2_rejects_about_as_often_as_it_says():
         for measured in draws(41, LAB, P1, covariance, count)
     ]
     assert np.mean(rejected) == pytest.approx(tail, abs=5 * math.sqrt(tail * (1 - tail) / count))
+
+
+@pytest.mark.parametrize(
+    ("covariance", "weighted", "at_p1_cm", "at_p2_cm"),
+    [
+        (literal_covariance, False, 5.36, 5.46),
+        (literal_delayed_covariance, False, 3.60, 3.63),
+        (literal_covariance, True, 5.16, 5.29),
+        (bracketed_covariance, True, 3.41, 3.59),
+    ],
+    ids=["literal", "literal-delayed", "weighted", "bracketed"],
+)
+def test_the_covariance_predicts_the_simulated_lab(covariance, weighted, at_p1_cm, at_p2_cm):
+    """The column "predicted σ" of docs/maths.md section 5: 100 ps, one fix per superframe."""
+    tx, rx = stamp_variances_m2(100e-12, 100e-12)
+    predicted = position_covariance(LAB, [P1, P2], covariance(KAPPA, tx, rx), height_known=True, weighted=weighted)
+    sigma_cm = 100.0 * np.sqrt(np.trace(predicted, axis1=1, axis2=2))
+    np.testing.assert_allclose(sigma_cm, [at_p1_cm, at_p2_cm], atol=0.008)

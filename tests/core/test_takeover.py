@@ -16,7 +16,7 @@ from skyless.core.protocol1.clock import MAX_CHANCE, MasterWatch, SiteTime, is_n
 from skyless.core.ticks import TICK_S, Unwrapper
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import AnchorOutage, Outage
-from support.bench import EVERY_METHOD, LAB, ROOM, SNAPSHOTS, Stage, assert_honest
+from support.bench import EVERY_METHOD, LAB, SNAPSHOTS, Stage, assert_honest
 
 pytestmark = pytest.mark.site
 
@@ -187,14 +187,6 @@ def test_snapshot_methods_turn_to_the_new_master(method):
     assert last.anchors[0] == 2
     assert len(last.anchors) == 6
     assert len([1 for true_s, *_ in story.fixes[0] if true_s > 3.5]) > 0.95 * 1.5 / SUPERFRAME_S
-
-
-def test_in_three_dimensions():
-    tags = ((3.0, 4.0, 1.2),)
-    story = Story(Stage(ROOM, 2, tags, anchor_outages=off((1, 2.0, 3.0))), 5.0, tags)
-    assert [reign[:2] for reign in story.reigns()] == [(0, 1), (1, 2)]
-    story.assert_tags_ride_through(longest_gap_s=2 * SUPERFRAME_S)
-    assert len(story.fixes[0][-1][1].anchors) == 8
 
 
 @pytest.mark.statistical
