@@ -26,17 +26,10 @@ from scipy.stats import binom, chi2
 
 from skyless.core.alert import Alert
 from skyless.core.estimator import faults
-from skyless.core.estimator.faults import explained_chi2, fade_faults, fault_chi2, open_faults, whiten
+from skyless.core.estimator.faults import explained_chi2, fade_faults, fault_chi2, open_faults
 from skyless.core.estimator.levels import FIRST_TEST, protect
 from skyless.core.estimator.settings import TUNING
-from skyless.core.estimator.state import (
-    ALL_RANGE_ERRORS,
-    FAULT_KINDS,
-    LASTING,
-    add_anchor,
-    make_uncertain,
-    new_state,
-)
+from skyless.core.estimator.state import ALL_RANGE_ERRORS, FAULT_KINDS, LASTING, add_anchor, make_uncertain
 from skyless.core.integrity import CONTRADICTED, HPL, IntegrityRequirement, integrity_of, limits_of
 from skyless.core.native.views import view
 from skyless.core.ticks import TICK_M, TICK_S
@@ -138,17 +131,6 @@ def test_without_faults_their_test_is_chi_squared():
         freedom += np.count_nonzero(known)
     low, high = chi2.ppf([0.0005, 0.9995], freedom)
     assert low < total < high
-
-
-def test_products_of_whitened_vectors_are_solutions():
-    draw = np.random.default_rng(1)
-    root, right = draw.normal(size=(5, 7)), draw.normal(size=(3, 5))
-    M = root @ root.T
-    state = new_state(settings_of(MESH))
-    work = view(state.work)[:8, :5]
-    work[:] = np.vstack([M, right])
-    whiten(state, 5, 3)
-    np.testing.assert_allclose(work[5:] @ work[5:].T, right @ np.linalg.solve(M, right.T), rtol=1e-9)
 
 
 def test_how_much_one_or_two_faults_explain():

@@ -167,11 +167,7 @@ def forged_frames():
 def received_at(frame, near: Received, host_s):
     """A frame that a tag receives some time after another one."""
     later = from_seconds(host_s - near.reception.host_s)
-    return replace(
-        near,
-        is_genuine=False,
-        reception=Reception(frame, wrap(near.reception.rx_ticks + later), host_s),
-    )
+    return replace(near, is_genuine=False, reception=Reception(frame, wrap(near.reception.rx_ticks + later), host_s))
 
 
 @settings(max_examples=int(os.environ.get("SKYLESS_FUZZ_FRAMES", "3000")) // 200, deadline=None)

@@ -21,9 +21,7 @@ pytestmark = pytest.mark.statistical
 
 HOURS = 24.0 if os.environ.get("SKYLESS_LONG") == "1" else 0.5
 SLOW = replace(
-    LAB,
-    schedule=replace(LAB.schedule, slot_s=60e-3),
-    noise=replace(LAB.noise, white_fm=1e-11, random_walk_fm=1e-10),
+    LAB, schedule=replace(LAB.schedule, slot_s=60e-3), noise=replace(LAB.noise, white_fm=1e-11, random_walk_fm=1e-10)
 )
 """Six slots of 60 ms, with better crystals: between two messages of an anchor lie 0.36 s."""
 

@@ -46,17 +46,6 @@ def test_check_value_of_the_catalogue():
     assert fcs(b"123456789") == bytes.fromhex("8921")
 
 
-def test_example_of_the_standard():
-    # IEEE 802.15.4, clause 7.2.10: an acknowledgment whose bits b0 first are 0100000000000000 01010110
-    # has the FCS 0010011110011110.
-    def bits(text):
-        return bytes(int(text[at : at + 8][::-1], 2) for at in range(0, len(text), 8))
-
-    acknowledgment = bits("010000000000000001010110")
-    assert fcs(acknowledgment) == bits("0010011110011110")
-    assert is_intact(acknowledgment + fcs(acknowledgment))
-
-
 @given(st.binary(max_size=125))
 def test_bit_by_bit_division_agrees(data):
     register = 0

@@ -11,16 +11,7 @@ from msgspec.structs import asdict, replace
 from skyless.core.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.core.air.site_pages import decode_page, encode_page
 from skyless.core.protocol1.almanac import AlmanacAssembly, almanac_issue, page_for, pages_of
-from skyless.core.site import (
-    EXACT,
-    AccuracySite,
-    AnchorSite,
-    GeoreferenceSite,
-    NoiseSite,
-    ScheduleSite,
-    Site,
-    TagsSite,
-)
+from skyless.core.site import EXACT, AccuracySite, AnchorSite, GeoreferenceSite, NoiseSite, ScheduleSite, Site, TagsSite
 from skyless.site.file.check import SITE_LIMITS
 
 

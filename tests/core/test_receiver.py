@@ -1,17 +1,15 @@
 """The tag's machine: cold starts, faults injected into what it hears, and fixes that are never silently wrong."""
 
-from collections import Counter
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.core.air.almanac import AccuracyPage, AnchorPage, NoisePage, SchedulePage
+from skyless.core.air.almanac import AccuracyPage, AnchorPage
 from skyless.core.any_receiver import AnyReceiver as Receiver
 from skyless.core.fix import NoFixReason
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
 from skyless.core.native.records import MAX_NEIGHBOURS
-from skyless.core.protocol1 import receiver as protocol1
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import MasterTime, decode
 from skyless.core.protocol1.snapshots import SnapshotMethod
@@ -317,27 +315,10 @@ def test_another_accuracy_page_starts_again_with_its_settings():
 
 
 @pytest.mark.parametrize("method", EVERY_METHOD)
-@pytest.mark.parametrize("gap_s", [3.0, 20.0, 3600.0])
+@pytest.mark.parametrize("gap_s", [3.0, 20.0])
 def test_gaps_with_host_time(method, gap_s):
-    """The radio is deaf for so long; the site goes on. A long gap is told at the seconds around it only."""
-    if gap_s > 100.0:
-        heard = list(tape(LAB, 2.0))
-        ticks = round(gap_s * TICK_RATE_HZ)
-
-        def on(one):
-            beacon = decode(one.frame)
-            time = beacon.master_time
-            heard_ticks = beacon.master_heard and replace(
-                beacon.master_heard, rx_ticks=wrap(beacon.master_heard.rx_ticks + ticks)
-            )
-            time = time and replace(time, tx_subticks_master=wrap(time.tx_subticks_master + (ticks << 8), 48))
-            fields = {"tx_ticks": wrap(beacon.tx_ticks + ticks), "master_time": time, "master_heard": heard_ticks}
-            fields["superframe"] = beacon.superframe + round(gap_s / SUPERFRAME_S)
-            return replace(later(one, gap_s), frame=changed(one.frame, **fields))
-
-        heard = [one for one in heard if one.host_s < 1.0] + [on(one) for one in heard if one.host_s > 1.0]
-    else:
-        heard = [one for one in tape(LAB, 2.0 + gap_s) if not 1.0 < one.host_s < 1.0 + gap_s]
+    """The radio is deaf for so long; the site goes on."""
+    heard = [one for one in tape(LAB, 2.0 + gap_s) if not 1.0 < one.host_s < 1.0 + gap_s]
     receiver = Receiver(method)
     fixes = listen(receiver, heard)
     times = np.array([fix.time_s for fix in fixes])
@@ -520,16 +501,6 @@ def test_a_master_in_a_late_slot():
         fixes = listen(Receiver(method), heard)
         assert len(fixes) > 55
         assert len(fixes[-1].anchors) == 6
-
-
-def test_what_the_almanac_says_is_taken_from_the_air():
-    receiver = protocol1.Receiver("bracketed")
-    listen(receiver, tape())
-    assert receiver.almanac.complete
-    assert isinstance(receiver.almanac.schedule, SchedulePage)
-    assert isinstance(receiver.almanac.noise, NoisePage)
-    assert receiver.almanac.anchors_m == {a.id: (a.x_m, a.y_m, a.z_m) for a in LAB.anchors}
-    assert receiver.counters == Counter(heard=len(tape()), fixes=receiver.counters["fixes"])
 
 
 @pytest.mark.statistical

@@ -223,29 +223,22 @@ def test_too_few_anchors(count, height):
     assert f"{4 if height is None else 3} anchors are needed, {count} are there" in solution.detail
 
 
-@pytest.mark.parametrize("height", [None, 0.0])
 @pytest.mark.parametrize(
-    "anchors",
+    ("anchors", "place", "heights", "std"),
     [
-        np.column_stack([np.arange(6), 2 * np.arange(6), np.zeros(6)]),
-        np.full((6, 3), 4.0),
-        np.array([(1, 2, 0)] * 3 + [(4, 5, 0)] * 3),
+        (np.column_stack([np.arange(6), 2 * np.arange(6), np.zeros(6)]), (1, 5, 2), (None, 0.0), 1e-3),
+        (np.full((6, 3), 4), (1, 5, 2), (None, 0.0), 1e-3),
+        (np.array([(1, 2, 0)] * 3 + [(4, 5, 0)] * 3), (1, 5, 2), (None, 0.0), 1e-3),
+        (LAB[[0, 1, 3, 4]], (3, 4, 0), (None,), 1e-3),
+        *((LAB, (3, 4 + distance, 0), (0.0,), 0.1) for distance in (1e4, 1e6, 1e8)),
     ],
+    ids=["line", "point", "two points", "centre of a circle", "far", "farther", "farthest"],
 )
-def test_anchors_in_one_line_or_one_point(anchors, height):
-    anchors = anchors.astype(float)
-    refused(locate(anchors, tdoas(anchors, [1, 5, 2]), sigma(5), height_m=height), NoFixReason.BAD_GEOMETRY)
-
-
-def test_a_circle_says_nothing_of_the_height_above_its_centre():
-    circle = LAB[[0, 1, 3, 4]]
-    refused(locate(circle, np.zeros(3), sigma(3)), NoFixReason.BAD_GEOMETRY)
-
-
-@pytest.mark.parametrize("distance", [1e4, 1e6, 1e8])
-def test_a_tag_too_far_outside(distance):
-    p = np.array([3.0, 4.0 + distance, 0.0])
-    refused(locate(LAB, tdoas(LAB, p), sigma(5, 0.1), height_m=0), NoFixReason.BAD_GEOMETRY)
+def test_bad_geometry(anchors, place, heights, std):
+    measured = tdoas(anchors.astype(float), np.array(place, float))
+    for height in heights:
+        covariance = sigma(len(measured), std)
+        refused(locate(anchors.astype(float), measured, covariance, height_m=height), NoFixReason.BAD_GEOMETRY)
 
 
 def test_an_impossible_tdoa_is_no_fix():

@@ -168,8 +168,7 @@ def test_three_deaths_in_a_row_and_time_goes_on(seed):
 
 
 def test_master_and_successor_die_at_once():
-    tags = (CENTRE,)
-    story = Story(Stage(LAB, 3, tags, anchor_outages=off((1, 2.0), (2, 2.0))), 4.0, tags)
+    story = Story(Stage(LAB, 3, (CENTRE,), anchor_outages=off((1, 2.0), (2, 2.0))), 4.0, (CENTRE,))
     (_, (term, master, taken_s)) = story.reigns()
     assert (term, master) == (1, 3)
     assert taken_s - 2.0 < 4 * SUPERFRAME_S + 2 * SUPERFRAME_S / 6
