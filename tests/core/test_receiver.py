@@ -1,6 +1,5 @@
 """The tag's machine: cold starts, faults injected into what it hears, and fixes that are never silently wrong."""
 
-
 import numpy as np
 import pytest
 from msgspec.structs import replace
