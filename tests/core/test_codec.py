@@ -180,13 +180,6 @@ def test_short_stamps_are_those_nearest_to_what_is_expected(rx_ticks, off_ticks)
     assert Heard(1, 0, rx_ticks).rx_ticks_near(expected_ticks) == rx_ticks
 
 
-def test_a_decoder_of_before_drops_beacons_with_phases():
-    """Its reserved flags were 0xF0, and it dropped a frame in which one was set."""
-    frame = encode(replace(FULL, heard=tuple(replace(one, phase_cycles=0.5) for one in FULL.heard), has_phases=True))
-    assert frame[FLAGS_AT] & 0xF0
-    assert not encode(FULL)[FLAGS_AT] & 0xF0
-
-
 @pytest.mark.parametrize("others", [(3000,), (5, 5)])
 def test_impossible_relays_drop_the_frame(others):
     sound = replace(FULL, heard=tuple(Heard(7 + k, 1, 2) for k in range(len(others))), weak=0, page=None)

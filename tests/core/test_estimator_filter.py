@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from estimator_builders import (
+    BIASED,
     LAB_M,
     MESH,
     PLAIN,
@@ -48,9 +49,6 @@ from skyless.research.studies.efficiency import EPISODE_SPEED_STD_MPS, WHITE_FM
 from skyless.research.uncertainty import BoundSettings, tracking_bound
 
 pytestmark = pytest.mark.site
-
-BIASED = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
-"""Errors of survey and ranges that a real room has."""
 
 
 @pytest.mark.parametrize("errors", [{}, BIASED], ids=["exact", "range errors"])
