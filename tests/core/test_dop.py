@@ -23,6 +23,16 @@ def test_regular_polygon_seen_from_its_centre(corners):
     assert [dops.gdop, dops.pdop, dops.hdop, dops.vdop, dops.tdop] == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    "solid", [np.vstack([np.eye(3), -np.eye(3)]), 2.0 * np.indices((2, 2, 2)).reshape(3, 8).T - 1.0]
+)
+def test_octahedron_and_cube_seen_from_their_centre(solid):
+    n = len(solid)
+    dops = dilution_of_precision(solid + [10.0, -20.0, 30.0], [10, -20, 30], height_known=False)
+    expected = [math.sqrt(10 / n), 3 / math.sqrt(n), math.sqrt(6 / n), math.sqrt(3 / n), 1 / math.sqrt(n)]
+    assert [dops.gdop, dops.pdop, dops.hdop, dops.vdop, dops.tdop] == pytest.approx(expected, rel=1e-12)
+
+
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(4, 12), height_known=st.booleans())
 def test_random_geometries_against_numpy(seed, n, height_known):
     draw = np.random.default_rng(seed)

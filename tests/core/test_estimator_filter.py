@@ -1,11 +1,5 @@
 """The estimator's filter against a textbook's, its time update in closed form, bits, and anchors that come and go."""
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from estimator_builders import (
@@ -213,28 +207,6 @@ def test_packed_relays_are_those_listed():
         assert bits(getattr(seen(listed.state), part)) == bits(getattr(seen(packed.state), part))
 
 
-def streamed_motions():
-    episode = episode_of(MESH, 10)
-    estimator, motions = begun(episode, settings_of(MESH, **BIASED)), []
-    for packet in one_by_one(late(episode.packets, np.where(np.arange(60) == 40, 0.6, 0.0))):
-        estimator.process(*packet)
-        motions.append(estimator.motion()[0].tolist())
-    return motions
-
-
-def test_without_the_compiler_the_states_are_the_same_to_rounding():
-    script = "import json, test_estimator_filter as t; print(json.dumps(t.streamed_motions()))"
-    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    plain = subprocess.run(
-        [sys.executable, "-c", script],
-        env={**os.environ, "SKYLESS_UNCOMPILED": "1", "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    np.testing.assert_allclose(json.loads(plain.stdout), streamed_motions(), rtol=0.0, atol=1e-8)
-
-
 @pytest.mark.parametrize("epoch", [2**40 - 3, 2**56, -(2**50)])
 def test_the_epoch_does_not_matter(epoch):
     packets = (episode := episode_of(MESH, 50)).packets
@@ -382,20 +354,6 @@ def test_states_come_and_go_as_rows_and_columns_of_a_matrix(steps, dim):
         np.testing.assert_array_equal(s.packets[at], old.packets[was])
         assert s.anchors["identifier"].tolist() == anchors
         fill(s, random)
-
-
-def test_an_anchor_that_leaves_takes_nothing_with_it():
-    episode = episode_of(MESH, 60)
-    estimator = begun(episode, settings_of(MESH, **BIASED))
-    estimator.track(episode.packets)
-    size, others = where(estimator).end, [0, 1, 3, 4, 5]
-    before, clocks = estimator.motion(), [estimator.clock(k) for k in others]
-    estimator.remove_anchor(2)
-    assert size - where(estimator).end == 2 + 3 + 2
-    for ours, theirs in zip(estimator.motion(), before, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-    assert [estimator.clock(k) for k in others] == clocks
-    assert estimator.clock(2) is None
 
 
 def test_only_anchors_in_view_count():

@@ -81,7 +81,6 @@ def genuine_of(tape):
 
 
 @pytest.mark.parametrize("name", FORGERIES)
-@pytest.mark.statistical
 def test_no_forged_frame_moves_a_verified_fix_or_an_anchor(name):
     tape, air = air_of(FORGERIES[name])
     noise, _ = air_of(FORGERIES[name], is_noise=True)

@@ -106,17 +106,18 @@ def test_anchors_that_nobody_has_received_take_no_part(tag):
     assert tag.almanac.pages is None
 
 
-def test_pages_of_a_minority_are_not_used(tag):
-    false_pages = (*PAGES[:-1], replace(PAGES[-1], tag_height_m=17.0))
-    mixed = [one for pair in zip(rotation(60), rotation(60, (8, 9), false_pages), strict=True) for one in pair]
-    tag.run(mixed)
-    assert tag.almanac.pages.site == PAGES[-1]
+FALSE_PAGE = replace(PAGES[-1], tag_height_m=17.0)
 
 
-def test_a_page_that_does_not_fit_the_issue_is_passed_over(tag):
-    false_page = replace(PAGES[-1], tag_height_m=17.0)
-    mixed = [one for n, good in enumerate(rotation(60)) for one in (beacon(4 + n % 5, false_page), good)]
-    tag.run(mixed)
+@pytest.mark.parametrize(
+    "false",
+    [
+        list(rotation(60, (8, 9), (*PAGES[:-1], FALSE_PAGE))),  # a minority
+        [beacon(4 + n % 5, FALSE_PAGE) for n in range(60)],  # it does not fit the issue
+    ],
+)
+def test_false_pages_are_passed_over(tag, false):
+    tag.run([one for pair in zip(false, rotation(60), strict=True) for one in pair])
     assert tag.almanac.pages.site == PAGES[-1]
 
 
