@@ -28,7 +28,7 @@ def test_regular_polygon_seen_from_its_centre(corners):
 )
 def test_octahedron_and_cube_seen_from_their_centre(solid):
     n = len(solid)
-    dops = dilution_of_precision(solid + [10.0, -20.0, 30.0], [10, -20, 30], height_known=False)
+    dops = dilution_of_precision(np.add(solid, [10.0, -20.0, 30.0]), [10, -20, 30], height_known=False)
     expected = [math.sqrt(10 / n), 3 / math.sqrt(n), math.sqrt(6 / n), math.sqrt(3 / n), 1 / math.sqrt(n)]
     assert [dops.gdop, dops.pdop, dops.hdop, dops.vdop, dops.tdop] == pytest.approx(expected, rel=1e-12)
 
