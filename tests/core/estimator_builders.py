@@ -28,6 +28,8 @@ ROOM_M = np.array([(x, y, 2.5 if k % 2 else 0.5) for k, (x, y) in enumerate(CORN
 """Eight anchors at alternating heights."""
 
 EXACT = {"survey_std_m": 0.0, "range_std_m": 0.0, "slope_std_m": 0.0, "place_std_m": 0.0}
+BIASED = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
+"""Errors of survey and ranges that a real room has."""
 
 
 class Case(Struct, frozen=True):

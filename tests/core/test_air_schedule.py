@@ -23,12 +23,6 @@ def test_the_papers_rate():
     assert schedule.messages_per_s(7) == pytest.approx(476.0, abs=0.5)
 
 
-def test_slots_for_a_host_on_spi():
-    schedule = schedule_of(site((None,) * 6, slot_s=2.5e-3))
-    assert schedule.superframe_ticks * TICK_S == pytest.approx(15e-3, abs=1e-15)
-    assert schedule.messages_per_s(6) == pytest.approx(400.0)
-
-
 def test_pair_of_the_paper_in_every_superframe():
     schedule = schedule_of(site(frames_per_node=2))
     assert schedule.slots == 14

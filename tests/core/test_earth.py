@@ -1,4 +1,6 @@
-"""Points of a site on the Earth, against the textbook's conversion in the other direction."""
+"""Points of a site on the Earth, against the textbook's conversion in the other direction, and ellipses of errors."""
+
+import math
 
 import numpy as np
 import pytest
@@ -6,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from skyless.core.earth import east_north_up, east_north_up_of, geodetic, rotated
+from skyless.core.earth import east_north_up, east_north_up_of, geodetic, horizontal_ellipse, rotated
 from skyless.core.site import GeoreferenceSite
 
 A_M, F = 6_378_137.0, 1 / 298.257223563
@@ -85,3 +87,28 @@ def test_a_covariance_turns_as_the_vectors_do(values, heading_deg):
     assert np.array(rotated(tuple(covariance.ravel()), heading_deg)).reshape(3, 3) == pytest.approx(
         turn @ covariance @ turn.T, abs=1e-9
     )
+
+
+lengths_m = st.floats(0.001, 30.0)
+
+
+@given(long_m=lengths_m, short_m=lengths_m, turned=st.floats(0.0, math.pi))
+def test_the_longer_axis_points_where_the_variance_is_largest(long_m, short_m, turned):
+    c, s = math.cos(turned), math.sin(turned)
+    xx, yy = (c * long_m) ** 2 + (s * short_m) ** 2, (s * long_m) ** 2 + (c * short_m) ** 2
+    xy = c * s * (long_m**2 - short_m**2)
+    longer, shorter, direction = horizontal_ellipse((xx, xy, 0.0, xy, yy, 0.0, 0.0, 0.0, 1.0))
+    assert longer == pytest.approx(max(long_m, short_m))
+    assert shorter == pytest.approx(min(long_m, short_m), rel=1e-3)
+
+    def std_m(angle):
+        x, y = math.cos(angle), math.sin(angle)
+        return math.sqrt(max(x * x * xx + 2.0 * x * y * xy + y * y * yy, 0.0))
+
+    assert std_m(direction) == pytest.approx(longer)
+
+
+def test_a_covariance_that_is_none_has_an_ellipse_all_the_same():
+    assert horizontal_ellipse((0.0,) * 9) == (0.0, 0.0, 0.0)
+    longer, shorter, _ = horizontal_ellipse((1.0, 5.0, 0.0, 5.0, 1.0, 0.0, 0.0, 0.0, 0.0))
+    assert (longer, shorter) == (pytest.approx(math.sqrt(6.0)), 0.0)

@@ -1,14 +1,9 @@
 """The estimator's filter against a textbook's, its time update in closed form, bits, and anchors that come and go."""
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from estimator_builders import (
+    BIASED,
     LAB_M,
     MESH,
     PLAIN,
@@ -48,9 +43,6 @@ from skyless.research.studies.efficiency import EPISODE_SPEED_STD_MPS, WHITE_FM
 from skyless.research.uncertainty import BoundSettings, tracking_bound
 
 pytestmark = pytest.mark.site
-
-BIASED = {"survey_std_m": 0.02, "range_std_m": 0.03, "slope_std_m": 0.05, "place_std_m": 0.005}
-"""Errors of survey and ranges that a real room has."""
 
 
 @pytest.mark.parametrize("errors", [{}, BIASED], ids=["exact", "range errors"])
@@ -111,14 +103,8 @@ def test_the_covariance_is_the_bound_of_what_has_come_in(case):
     episode = episode_of(case, 100)
     run = tracked(begun(episode, settings_of(case)), episode.packets)
     noise = {"white_fm": WHITE_FM, "random_walk_fm": case.random_walk_fm, "qa": case.qa}
-    stage = BoundSettings(
-        case.noise_ps * 1e-12,
-        **noise,
-        slot_s=SLOT_S,
-        speed_std_mps=EPISODE_SPEED_STD_MPS,
-        mesh=case.mesh,
-        at_once=False,
-    )
+    start = {"speed_std_mps": EPISODE_SPEED_STD_MPS, "mesh": case.mesh, "at_once": False}
+    stage = BoundSettings(case.noise_ps * 1e-12, **noise, slot_s=SLOT_S, **start)
     bound = tracking_bound(LAB_M, episode.path_m, stage)
     ratio = np.trace(run.covariances[5::6][-20:], axis1=1, axis2=2) / np.trace(bound[-20:], axis1=1, axis2=2)
     assert seen(run.estimator.state).status["relays_rejected"] < 10
@@ -210,40 +196,15 @@ def test_packed_relays_are_those_listed():
     for name, anchor_m in zip(names.tolist(), LAB_M, strict=True):
         packed.know_anchor(name, anchor_m)
     for anchor, sequence, rx_ticks, tx_ticks, relays in one_by_one(episode.packets):
+        named = [(9, 1, 5), *((names[sender], number, stamp) for sender, number, stamp in relays)]
         frame_relays = b"".join(
-            HEARD.pack(name, number & 0xFF, stamp & 0xFFFFFFFF, stamp >> 32 & 0xFF)
-            for name, number, stamp in [
-                (9, 1, 5),
-                *((names[sender], number, stamp) for sender, number, stamp in relays),
-            ]
+            HEARD.pack(name, number & 0xFF, stamp & 0xFFFFFFFF, stamp >> 32 & 0xFF) for name, number, stamp in named
         )
         outcome = listed.process(anchor, sequence, rx_ticks, tx_ticks, relays)
         assert outcome == packed.process(int(names[anchor]), sequence, rx_ticks, tx_ticks, packed=frame_relays)
     assert seen(listed.state).status["relays_used"] > 100
     for part in ("x", "P", "V", "information", "evidence", "packets", "links", "status"):
         assert bits(getattr(seen(listed.state), part)) == bits(getattr(seen(packed.state), part))
-
-
-def streamed_motions():
-    episode = episode_of(MESH, 10)
-    estimator, motions = begun(episode, settings_of(MESH, **BIASED)), []
-    for packet in one_by_one(late(episode.packets, np.where(np.arange(60) == 40, 0.6, 0.0))):
-        estimator.process(*packet)
-        motions.append(estimator.motion()[0].tolist())
-    return motions
-
-
-def test_without_the_compiler_the_states_are_the_same_to_rounding():
-    script = "import json, test_estimator_filter as t; print(json.dumps(t.streamed_motions()))"
-    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    plain = subprocess.run(
-        [sys.executable, "-c", script],
-        env={**os.environ, "SKYLESS_UNCOMPILED": "1", "PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    np.testing.assert_allclose(json.loads(plain.stdout), streamed_motions(), rtol=0.0, atol=1e-8)
 
 
 @pytest.mark.parametrize("epoch", [2**40 - 3, 2**56, -(2**50)])
@@ -260,25 +221,28 @@ def test_the_epoch_does_not_matter(epoch):
     assert np.array_equal(seen(near.state).P, seen(far.state).P)
 
 
-def standing(frames, place_m, seed=4):
-    """Packets to a tag at rest, of clocks that all run alike; receptions are relayed by the next anchor's packet."""
-    draw, n = np.random.default_rng(seed), len(LAB_M)
-    senders = np.arange(frames) % n
-    tx_ticks = np.rint((np.arange(frames) + 1) * SLOT_S * TICK_RATE_HZ).astype(np.int64)
-    sent_m, noise_m, relay_m = draw.normal(0.0, 0.03, (3, frames))
-    rx_ticks = tx_ticks + ticks(np.linalg.norm(place_m - LAB_M[senders], axis=1) + sent_m + noise_m)
-    of, by = np.arange(frames - 1), senders[1:]
-    way_m = np.linalg.norm(LAB_M[by] - LAB_M[senders[of]], axis=1)
-    heard = tx_ticks[of] + ticks(way_m + sent_m[of] + relay_m[of])
-    relays = np.column_stack([by, senders[of], of // n % 256, heard])
-    return Packets(senders, np.arange(frames) // n % 256, rx_ticks, tx_ticks, relays, np.arange(frames))
+def along(path_m, senders, anchors_m=LAB_M, seed=4):
+    """Packets to a tag on a way, of clocks that all run alike; receptions are relayed by the next anchor's packet."""
+    draw, frames = np.random.default_rng(seed), np.arange(len(senders))
+    tx_ticks = np.rint((frames + 1) * SLOT_S * TICK_RATE_HZ).astype(np.int64)
+    sent_m, noise_m, relay_m = draw.normal(0.0, 0.03, (3, len(frames)))
+    rx_ticks = tx_ticks + ticks(np.linalg.norm(path_m - anchors_m[senders], axis=1) + sent_m + noise_m)
+    of = np.flatnonzero(senders[:-1] != senders[1:])
+    by = senders[of + 1]
+    way_m = np.linalg.norm(anchors_m[by] - anchors_m[senders[of]], axis=1)
+    relays = np.column_stack([by, senders[of], of % 256, tx_ticks[of] + ticks(way_m + sent_m[of] + relay_m[of])])
+    return Packets(senders, frames % 256, rx_ticks, tx_ticks, relays, np.searchsorted(of + 1, frames, side="right"))
+
+
+def standing(frames, seed=4):
+    return along(np.array([3.0, 4.0, 0.0]), np.arange(frames) % len(LAB_M), seed=seed)
 
 
 def test_at_rest_nothing_is_learnt_of_how_range_errors_grow():
     """The range at which the slope counts once followed the estimate's noise, and the slope was at −0.28 by now."""
     estimator = Estimator(settings_of(Case(qa=0.3), **BIASED), LAB_M)
     estimator.start(0, np.array([3.0, 4.0]), 1e-2 * np.eye(2), 0.01)
-    run = tracked(estimator, standing(40_000, np.array([3.0, 4.0, 0.0]), 12))
+    run = tracked(estimator, standing(40_000, 12))
     slope = where(estimator).slope
     assert abs(seen(estimator.state).x[slope]) < seen(estimator.state).P[slope, slope] ** 0.5
     assert seen(estimator.state).status["faults_opened"] == 0
@@ -290,7 +254,7 @@ def test_at_rest_nothing_is_learnt_of_how_range_errors_grow():
 @pytest.mark.statistical
 def test_a_million_packets_leave_the_covariance_sound(errors):
     """Forty minutes at rest: the same 15 s again and again, on counters that go on."""
-    packets, place_m = standing(1024 * 6, np.array([3.0, 4.0, 0.0])), [3.0, 4.0]
+    packets, place_m = standing(1024 * 6), [3.0, 4.0]
     estimator = Estimator(settings_of(Case(qa=0.3), **errors), LAB_M)
     estimator.start(0, np.array(place_m), 1e-2 * np.eye(2), 0.01)
     step, early = round(1024 * 6 * SLOT_S * TICK_RATE_HZ), None
@@ -392,36 +356,12 @@ def test_states_come_and_go_as_rows_and_columns_of_a_matrix(steps, dim):
         fill(s, random)
 
 
-def test_an_anchor_that_leaves_takes_nothing_with_it():
-    episode = episode_of(MESH, 60)
-    estimator = begun(episode, settings_of(MESH, **BIASED))
-    estimator.track(episode.packets)
-    size, others = where(estimator).end, [0, 1, 3, 4, 5]
-    before, clocks = estimator.motion(), [estimator.clock(k) for k in others]
-    estimator.remove_anchor(2)
-    assert size - where(estimator).end == 2 + 3 + 2
-    for ours, theirs in zip(estimator.motion(), before, strict=True):
-        np.testing.assert_array_equal(ours, theirs)
-    assert [estimator.clock(k) for k in others] == clocks
-    assert estimator.clock(2) is None
-
-
 def test_only_anchors_in_view_count():
     """A tag along a hundred anchors of which six are received at a time."""
     anchors_m = np.array([(3.0 * k, 4.0 * (k % 2), 0.0) for k in range(100)])
     frames = np.arange(94 * 60)
     path_m = np.column_stack([7.0 + 3.0 * frames / 60.0, np.full(len(frames), 1.0), np.zeros(len(frames))])
-    senders, draw = frames // 60 + frames % 6, np.random.default_rng(1)
-    tx_ticks = np.rint((frames + 1) * SLOT_S * TICK_RATE_HZ).astype(np.int64)
-    flight_m = np.linalg.norm(path_m - anchors_m[senders], axis=1)
-    sent_m, noise_m, relay_m = draw.normal(0.0, 0.03, (3, len(frames)))
-    of = np.flatnonzero(senders[:-1] != senders[1:])
-    by = senders[of + 1]
-    way_m = np.linalg.norm(anchors_m[by] - anchors_m[senders[of]], axis=1)
-    heard = tx_ticks[of] + ticks(way_m + sent_m[of] + relay_m[of])
-    relays = np.column_stack([by, senders[of], of % 256, heard])
-    ends = np.searchsorted(of + 1, frames, side="right")
-    packets = Packets(senders, frames % 256, tx_ticks + ticks(flight_m + sent_m + noise_m), tx_ticks, relays, ends)
+    packets = along(path_m, frames // 60 + frames % 6, anchors_m, 1)
     estimator = Estimator(settings_of(MESH, drop_s=0.1), anchors_m)
     estimator.start(int(packets.rx_ticks[0]), path_m[0, :2], 1e-4 * np.eye(2), 400.0)
     estimator.track(packets)
@@ -450,30 +390,27 @@ def test_a_new_anchor_is_told_of_first():
 # Relays and strange packets
 
 
-def test_relays_of_packets_that_the_tag_has_missed_are_passed_over():
-    episode = episode_of(MESH, 30)
-    packets = episode.packets
-    other = packets.relays.copy()
-    other[:, 2] = (other[:, 2] + 100) % 256
-    bare = replace(packets, relays=np.empty((0, 4), np.int64), ends=np.zeros_like(packets.ends))
-    received, alone = (begun(episode, settings_of(MESH)) for _ in range(2))
-    received.track(replace(packets, relays=other))
-    alone.track(bare)
-    assert same(received.state, alone.state)
-    assert seen(received.state).status["relays_used"] == seen(received.state).status["relays_rejected"] == 0
+def without_relays(packets):
+    return replace(packets, relays=np.empty((0, 4), np.int64), ends=np.zeros_like(packets.ends))
 
 
-def test_a_relay_counts_once():
-    episode = episode_of(MESH, 30)
-    packets = episode.packets
+def test_relays_of_missed_packets_are_passed_over_and_others_count_once():
+    packets, missed = (episode := episode_of(MESH, 30)).packets, episode.packets.relays.copy()
+    missed[:, 2] = (missed[:, 2] + 100) % 256
     doubled = np.argsort(np.tile(owners(packets), 2), kind="stable")
     twice = replace(packets, relays=np.tile(packets.relays, (2, 1))[doubled], ends=2 * packets.ends)
-    once, again = (begun(episode, settings_of(MESH)) for _ in range(2))
-    once.track(packets)
-    again.track(twice)
-    assert seen(once.state).status["relays_used"] > 800
-    assert np.array_equal(seen(once.state).x, seen(again.state).x)
-    assert np.array_equal(seen(once.state).P, seen(again.state).P)
+    pairs = [(without_relays(packets), replace(packets, relays=missed)), (packets, twice)]
+    used = []
+    for one, other in pairs:
+        once, again = (begun(episode, settings_of(MESH)) for _ in range(2))
+        once.track(one)
+        again.track(other)
+        assert np.array_equal(seen(once.state).x, seen(again.state).x)
+        assert np.array_equal(seen(once.state).P, seen(again.state).P)
+        used.append((once, again))
+    assert same(used[0][0].state, used[0][1].state)
+    assert seen(used[0][1].state).status["relays_used"] == seen(used[0][1].state).status["relays_rejected"] == 0
+    assert seen(used[1][0].state).status["relays_used"] > 800
 
 
 def test_relays_of_oneself_and_of_nonsense_do_no_harm():
@@ -493,10 +430,9 @@ def test_relays_that_come_two_superframes_late_still_help_and_do_not_deceive():
     for seed in range(60):
         packets = (episode := episode_of(MESH, 80, seed)).packets
         ends = np.concatenate([np.zeros(12, np.int64), packets.ends[:-12]])
-        none = replace(packets, relays=np.empty((0, 4), np.int64), ends=np.zeros_like(ends))
         runs = [begun(episode, settings_of(MESH), seed=seed) for _ in range(2)]
         runs[0].track(replace(packets, relays=packets.relays[: ends[-1]], ends=ends))
-        runs[1].track(none)
+        runs[1].track(without_relays(packets))
         (x, P), (_, alone) = (run.motion() for run in runs)
         error = x[:2] - episode.path_m[-1, :2]
         squares.append(error @ np.linalg.solve(P[:2, :2], error))

@@ -29,12 +29,8 @@ def test_rows_are_position_covariance_quality_velocity_and_its_covariance():
     assert fix.velocity_covariance.tolist() == [[19, 20, 21], [22, 23, 24], [25, 26, 27]]
     assert fix.std_m == pytest.approx(math.sqrt(4 + 8 + 12))
     assert (fix.hpl_m, fix.vpl_m, fix.integrity_risk, fix.alert) == (None,) * 4
-
-
-def test_methods_without_velocity_have_none():
-    fix = fix_of(QUALITY + 1)
-    assert fix.velocity_mps is None
-    assert fix.velocity_covariance is None
+    without = fix_of(QUALITY + 1)
+    assert without.velocity_mps is without.velocity_covariance is None
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,6 @@ def genuine_of(tape):
 
 
 @pytest.mark.parametrize("name", FORGERIES)
-@pytest.mark.statistical
 def test_no_forged_frame_moves_a_verified_fix_or_an_anchor(name):
     tape, air = air_of(FORGERIES[name])
     noise, _ = air_of(FORGERIES[name], is_noise=True)
@@ -167,11 +166,7 @@ def forged_frames():
 def received_at(frame, near: Received, host_s):
     """A frame that a tag receives some time after another one."""
     later = from_seconds(host_s - near.reception.host_s)
-    return replace(
-        near,
-        is_genuine=False,
-        reception=Reception(frame, wrap(near.reception.rx_ticks + later), host_s),
-    )
+    return replace(near, is_genuine=False, reception=Reception(frame, wrap(near.reception.rx_ticks + later), host_s))
 
 
 @settings(max_examples=int(os.environ.get("SKYLESS_FUZZ_FRAMES", "3000")) // 200, deadline=None)

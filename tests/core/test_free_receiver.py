@@ -62,13 +62,16 @@ def a_beacon(**fields):
 
 
 def test_a_tag_that_knows_nothing_has_fixes_at_once_and_they_are_honest():
-    receiver, first = Receiver(), None
+    receiver, made = Receiver(), []
     for one in free_tape():
         fix = receiver.hear(one.reception)
         if fix is not None:
-            first = one.host_s if first is None else first
+            made.append((one.host_s, fix.time_s))
             assert_honest(fix, one.truth_m)
-    assert first < 0.3
+    assert made[0][0] < 0.3
+    times = [time_s for _, time_s in made]
+    assert all(later > earlier for earlier, later in pairwise(times))
+    assert times[-1] - times[0] == pytest.approx(free_tape()[-1].host_s, abs=0.1)
     assert drops(receiver) <= {"unconfirmed-anchor"}
     assert receiver.site == FREE.id
 
@@ -129,35 +132,54 @@ def test_a_tag_without_fixes_tries_the_other_protocol():
 
 
 def test_a_foreign_site_that_was_there_first_does_not_hold_the_tag():
-    falses = false_frames(
-        60.0, lambda n, tx_ticks: a_beacon(site=77, tx_ticks=tx_ticks, sequence=n & 0xFF, position=None)
-    )
-    late = [one for one in free_tape() if one.host_s > 0.5]
-    receiver = Receiver()
-    made = fixes_of(receiver, merged(late, falses))
+    def foreign(n, tx_ticks):
+        return a_beacon(site=77, tx_ticks=tx_ticks, sequence=n & 0xFF, position=None)
+
+    late, receiver = [one for one in free_tape() if one.host_s > 0.5], Receiver()
+    made = fixes_of(receiver, merged(late, false_frames(60.0, foreign)))
     assert receiver.site == FREE.id
     first_s = min(one.host_s for one in late if (one.frame, one.rx_ticks) in made)
     assert first_s < 0.5 + 0.3
     assert receiver.counters["site-change"] == 1
 
 
-def test_false_pages_of_a_stranger_have_no_effect():
-    """40 times a second, under the site's issue and under others."""
-    sound = site_issue(site_pages_of(FREE))
-    pages = [SitePage(4, 17.0), NoisePage(1e-6, 1e-6, 1e-7, 1e-7)]
+def false_page(n, tx_ticks):
+    """Of a stranger, under the site's issue and under others."""
+    issue = site_issue(site_pages_of(FREE)) if n % 2 else (n * 7919) & 0xFFFF
+    page = (SitePage(4, 17.0), NoisePage(1e-6, 1e-6, 1e-7, 1e-7))[n % 2]
+    position = StatedPosition(1, 2, 3)
+    return a_beacon(tx_ticks=tx_ticks, sequence=n & 0xFF, almanac_issue=issue, page=page, position=position)
 
-    def false_page(n, tx_ticks):
-        issue = sound if n % 2 else (n * 7919) & 0xFFFF
-        return a_beacon(
-            tx_ticks=tx_ticks,
-            sequence=n & 0xFF,
-            almanac_issue=issue,
-            page=pages[n % 2],
-            position=StatedPosition(1, 2, 3),
-        )
 
-    counters = undisturbed(false_frames(40.0, false_page))
-    assert counters["unconfirmed-anchor"] > 50
+def forged_stamp(n, tx_ticks):
+    """Under the name of an anchor, so often that between two of its own beacons there may be three."""
+    return a_beacon(tx_ticks=tx_ticks, sequence=n & 0xFF, anchor=FREE.anchors[1].id)
+
+
+def copy_under_another_name(n, _):
+    """With all that the anchor has relayed, some milliseconds later."""
+    honest = free_tape()[::8]
+    beacon = beacon_of(honest[min(n * len(honest) // 80, len(honest) - 1)])
+    return replace(beacon, anchor=STRANGER, position=StatedPosition(50.0, 50.0, 1.0), sequence=n & 0xFF)
+
+
+def another_identifier(n, tx_ticks):
+    return a_beacon(tx_ticks=tx_ticks, sequence=0, anchor=1000 + n, almanac_issue=n, page=None)
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "make", "first_s", "reasons", "least"),
+    [
+        (40.0, false_page, 0.0, ("unconfirmed-anchor",), 50),
+        (120.0, forged_stamp, 0.3, ("impossible-stamp", "duplicate"), 140),
+        (40.0, copy_under_another_name, 0.3, ("unconfirmed-anchor", "impossible-stamp"), 40),
+        (500.0, another_identifier, 0.0, ("unconfirmed-anchor",), 500),
+    ],
+)
+def test_false_frames_have_no_effect_and_are_counted(rate_hz, make, first_s, reasons, least):
+    counters = undisturbed(false_frames(rate_hz, make, first_s=first_s))
+    assert sum(counters[reason] for reason in reasons) > least
+    assert make is not forged_stamp or counters["anchor-restart"] == 0
 
 
 def test_one_anchor_that_sends_false_pages_has_no_effect():
@@ -171,42 +193,6 @@ def test_one_anchor_that_sends_false_pages_has_no_effect():
     made = fixes_of(receiver, falses)
     assert list(made.values())[-100:] == list(fixes_of(Receiver(), free_tape()).values())[-100:]
     assert receiver.almanac.pages.site.tag_height_m == FREE.tags.height_m
-
-
-def test_forged_stamps_under_the_name_of_an_anchor_are_dropped():
-    """40 times a second, more often than its own beacons between two of which there may be three."""
-    name = FREE.anchors[1].id
-    counters = undisturbed(
-        false_frames(
-            120.0, lambda n, tx_ticks: replace(a_beacon(tx_ticks=tx_ticks, sequence=n & 0xFF), anchor=name), 2.0, 0.3
-        )
-    )
-    assert counters["impossible-stamp"] + counters["duplicate"] > 140
-    assert counters["anchor-restart"] == 0
-
-
-def test_a_copy_of_a_beacon_under_another_name_is_not_there():
-    """With all that the anchor has relayed, 40 times a second, some milliseconds later."""
-    honest = free_tape()[::8]
-
-    def copy(n, _):
-        beacon = beacon_of(honest[min(n * len(honest) // 80, len(honest) - 1)])
-        return replace(beacon, anchor=STRANGER, position=StatedPosition(50.0, 50.0, 1.0), sequence=n & 0xFF)
-
-    counters = undisturbed(false_frames(40.0, copy, 2.0, 0.3))
-    assert counters["unconfirmed-anchor"] + counters["impossible-stamp"] > 40
-
-
-def test_a_flood_of_identifiers_does_not_displace_the_anchors():
-    counters = undisturbed(
-        false_frames(
-            500.0,
-            lambda n, tx_ticks: replace(
-                a_beacon(tx_ticks=tx_ticks, sequence=0, heard=()), anchor=1000 + n, almanac_issue=n, page=None
-            ),
-        )
-    )
-    assert counters["unconfirmed-anchor"] > 500
 
 
 def test_an_anchor_without_a_position_is_counted_and_its_relays_confirm_others():
@@ -226,89 +212,61 @@ def test_a_moved_anchor_counts_once_it_is_stated_twice_in_a_row():
         with_beacon(one, position=StatedPosition(50.0, 50.0, 2.0)) if k == first else one for k, one in enumerate(heard)
     ]
     assert list(fixes_of(Receiver(), once).values()) == list(fixes_of(Receiver(), heard).values())
-    receiver = Receiver()
-    fixes_of(
-        receiver,
-        [with_beacon(one, position=StatedPosition(1.0, 2.0, 3.0)) if one.anchor == moved else one for one in heard],
-    )
+    there, receiver = StatedPosition(1.0, 2.0, 3.0), Receiver()
+    fixes_of(receiver, [with_beacon(one, position=there) if one.anchor == moved else one for one in heard])
     assert receiver.heard_site.anchors_m[moved] == (1.0, 2.0, 3.0)
 
 
 def test_changed_pages_are_used_when_most_anchors_state_them():
     changed_site = replace(FREE, georeference=GeoreferenceSite(48.0, 11.0, 500.0, 10.0))
-    old, new = free_tape(), free_tape(changed_site)
-    receiver = Receiver()
-    switch_s = 1.0
-    mixed = [one for one in old if one.host_s < switch_s] + [one for one in new if one.host_s >= switch_s]
-    made = fixes_of(receiver, mixed)
+    receiver, old, new = Receiver(), free_tape(), free_tape(changed_site)
+    made = fixes_of(receiver, [one for one in old if one.host_s < 1.0] + [one for one in new if one.host_s >= 1.0])
     assert receiver.almanac.pages.georeference.latitude_deg == 48.0
     assert len(made) > 550  # nothing that the estimator assumes has changed: it has gone on
 
 
 def test_another_height_makes_another_method():
-    changed = site_pages_of(replace(FREE, tags=replace(FREE.tags, height_m=0.2)))
-    receiver = Receiver()
+    changed, receiver = site_pages_of(replace(FREE, tags=replace(FREE.tags, height_m=0.2))), Receiver()
     fixes_of(receiver, [one for one in free_tape() if one.host_s < 1.0])
     before_m = receiver.method.course.settings.height_m
-    later = [
-        with_beacon(
-            one, almanac_issue=site_issue(changed), page=site_page_for(changed, beacon_of(one).sequence, one.anchor)
-        )
-        for one in free_tape()
-        if one.host_s >= 1.0
-    ]
+
+    def with_changed(one):
+        page = site_page_for(changed, beacon_of(one).sequence, one.anchor)
+        return with_beacon(one, almanac_issue=site_issue(changed), page=page)
+
+    later = [with_changed(one) for one in free_tape() if one.host_s >= 1.0]
     assert len(fixes_of(receiver, later)) > 100
     assert receiver.almanac.issue == site_issue(changed)
     assert receiver.method.course.settings.height_m == 0.2 != before_m
 
 
+def assert_goes_on(before, rest):
+    whole = Receiver()
+    fixes_of(whole, before)
+    again = whole.copied()
+    assert fixes_of(again, rest) == fixes_of(whole, rest)
+    assert again.counters == whole.counters
+
+
 def test_a_copy_goes_on_with_the_same_bits():
-    heard, whole = free_tape(), Receiver()
+    """Also after a change of the period, where anchors are silent for longer than the method allows."""
     for cut in (3, 12, 40, 400):
-        whole = Receiver()
-        for one in heard[:cut]:
-            whole.hear(one.reception)
-        again = whole.copied()
-        rest = heard[cut : cut + 60]
-        assert fixes_of(again, rest) == fixes_of(whole, rest)
-        assert again.counters == whole.counters
-
-
-def test_a_copy_after_a_change_of_the_period_goes_on_with_the_same_bits():
-    """The method goes on as it was made, also where anchors are silent for longer than it allows."""
+        assert_goes_on(free_tape()[:cut], free_tape()[cut : cut + 60])
     slower = period_code(1.0)
     changed = [with_beacon(one, period_code=slower) if one.host_s > 1.0 else one for one in free_tape(seconds=4.0)]
     cut = next(k for k, one in enumerate(changed) if one.host_s > 1.5)
-    whole = Receiver()
-    fixes_of(whole, changed[:cut])
-    again = whole.copied()
     silent = {anchor.id for anchor in FREE.anchors[:2]}
-    rest = [one for one in changed[cut:] if one.anchor not in silent or one.host_s > 2.8]
-    assert fixes_of(again, rest) == fixes_of(whole, rest)
+    assert_goes_on(changed[:cut], [one for one in changed[cut:] if one.anchor not in silent or one.host_s > 2.8])
 
 
 def test_relays_of_a_weak_first_path_are_not_used():
-    late = [
-        with_beacon(
-            one,
-            weak=(1 << len(beacon_of(one).heard)) - 1,
-            heard=tuple(Relay(r.anchor, r.sequence, wrap(r.rx_ticks + 60)) for r in beacon_of(one).heard),
-        )
-        if one.host_s > 1.0
-        else one
-        for one in free_tape()
-    ]
+    def with_late_relays(one):
+        late = tuple(Relay(r.anchor, r.sequence, wrap(r.rx_ticks + 60)) for r in beacon_of(one).heard)
+        return with_beacon(one, weak=(1 << len(late)) - 1, heard=late)
+
     receiver = Receiver()
-    fixes_of(receiver, late)
+    fixes_of(receiver, [with_late_relays(one) if one.host_s > 1.0 else one for one in free_tape()])
     assert receiver.method.estimator.state.status.relays_rejected < 20
-
-
-def test_fixes_follow_one_another_by_the_tags_own_clock():
-    receiver = Receiver()
-    times = [fix.time_s for one in free_tape() if (fix := receiver.hear(one.reception)) is not None]
-    assert all(later > earlier for earlier, later in pairwise(times))
-    assert times[-1] - times[0] == pytest.approx(free_tape()[-1].host_s, abs=0.1)
-    assert np.isfinite(times).all()
 
 
 @pytest.mark.parametrize("pause_s", [0.0, 1.5])
@@ -346,11 +304,8 @@ def test_a_foreign_site_of_more_anchors_delays_the_first_fix_but_does_not_hold_t
 
 def test_one_radio_of_many_names_that_measures_truly_changes_no_page():
     """Twelve names that relay true receptions of anchors in use: they join, but are no majority."""
-    heard, pages = (
-        free_tape(),
-        tuple(replace(page, tag_height_m=17.0) if isinstance(page, SitePage) else page for page in site_pages_of(FREE)),
-    )
-    tag = heard[0]
+    heard, tag = free_tape(), free_tape()[0]
+    pages = [replace(page, tag_height_m=17.0) if isinstance(page, SitePage) else page for page in site_pages_of(FREE)]
 
     def name(n, tx_ticks):
         now = from_seconds(0.5 + (n + 0.37) / 60.0)

@@ -21,9 +21,7 @@ pytestmark = pytest.mark.statistical
 
 HOURS = 24.0 if os.environ.get("SKYLESS_LONG") == "1" else 0.5
 SLOW = replace(
-    LAB,
-    schedule=replace(LAB.schedule, slot_s=60e-3),
-    noise=replace(LAB.noise, white_fm=1e-11, random_walk_fm=1e-10),
+    LAB, schedule=replace(LAB.schedule, slot_s=60e-3), noise=replace(LAB.noise, white_fm=1e-11, random_walk_fm=1e-10)
 )
 """Six slots of 60 ms, with better crystals: between two messages of an anchor lie 0.36 s."""
 
@@ -43,14 +41,14 @@ def test_no_jump_in_hours():
         impairments_of(Request(SLOW), SLOW), oscillator=OscillatorModel(white_fm=1e-11, random_walk_fm=1e-10)
     )
     fleet = Fleet(SLOW, [Static(3.0, 4.0)], impairments, 1, FleetSettings("joint", 1e-3))
-    restarts, largest_m, largest_sigmas, squares, fixes, last_s = 0, 0.0, 0.0, 0.0, 0, -1.0
+    restarts, largest_sigmas, squares, fixes, last_s = 0, 0.0, 0.0, 0, -1.0
     for judged in fleet.run(HOURS * 3600.0):
         if judged.time_s < 10.0:
             continue
         fix = judged.fix
         error_m = math.hypot(judged.error_m[0], judged.error_m[1])
         normalised = normalised_squared(judged.error_m, fix.covariance_m2)
-        largest_m, largest_sigmas = max(largest_m, error_m), max(largest_sigmas, normalised**0.5)
+        largest_sigmas = max(largest_sigmas, normalised**0.5)
         assert largest_sigmas < 6.5, f"{error_m:.3f} m at {judged.time_s:.1f} s"
         squares += normalised
         fixes += 1
@@ -60,11 +58,6 @@ def test_no_jump_in_hours():
         assert isinstance(machine, Anchor)
         restarts += machine.counters["clock-restart"]
     wraps = [clock.local_ticks // WRAP_TICKS for clock in fleet.world.medium.clocks]
-    print(  # noqa: T201 (pytest -s shows the figures)
-        f"\n{HOURS:g} h: {fixes} fixes, {sum(wraps)} wraps of {len(wraps)} counters, largest error {largest_m:.4f} m "
-        f"({largest_sigmas:.2f} sigma), normalised error squared per dimension {squares / fixes / 2:.3f}, "
-        f"drops {fleet.drops}"
-    )
     assert min(wraps) >= int(HOURS * 3600.0 / 17.21) - 1
     assert restarts == 0
     assert fleet.receivers[0].counters["anchor-restart"] == 0

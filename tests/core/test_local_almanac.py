@@ -74,6 +74,11 @@ class Tag:
         return [self.hear(one, start + n * STEP, is_confirmed) for n, one in enumerate(beacons)]
 
 
+@pytest.fixture
+def tag():
+    return Tag()
+
+
 def test_pages_of_a_site_in_the_order_of_their_types():
     assert [type(page) for page in PAGES] == [NoisePage, AccuracyPage, SitePage]
     assert PAGES[-1].pages == 3
@@ -81,61 +86,51 @@ def test_pages_of_a_site_in_the_order_of_their_types():
     assert earth[-1].pages == len(earth) == 4
 
 
-def test_three_anchors_make_the_pages_complete_in_two_rounds():
-    tag = Tag()
-    almanac = tag.almanac
+def test_three_anchors_make_the_pages_complete_in_two_rounds(tag):
     changes = tag.run(rotation(9))
     assert changes.count(True) == 1
     assert changes.index(True) < 5
-    assert (almanac.pages.noise, almanac.pages.accuracy, almanac.pages.site) == PAGES
-    assert almanac.issue == ISSUE
+    assert (tag.almanac.pages.noise, tag.almanac.pages.accuracy, tag.almanac.pages.site) == PAGES
+    assert tag.almanac.issue == ISSUE
 
 
-def test_two_anchors_count_only_once_they_are_all_for_a_second():
-    tag = Tag()
+def test_two_anchors_count_only_once_they_are_all_for_a_second(tag):
     before = int(PRESENT_TICKS / STEP)
     changes = tag.run(rotation(before + 40, (1, 2)))
     assert not any(changes[:before])
     assert any(changes)
 
 
-def test_anchors_that_nobody_has_received_take_no_part():
-    tag = Tag()
-    almanac = tag.almanac
+def test_anchors_that_nobody_has_received_take_no_part(tag):
     assert not any(tag.run(rotation(60), is_confirmed=False))
-    assert almanac.pages is None
+    assert tag.almanac.pages is None
 
 
-def test_pages_of_a_minority_are_not_used():
-    tag = Tag()
-    almanac = tag.almanac
-    false_pages = (*PAGES[:-1], replace(PAGES[-1], tag_height_m=17.0))
-    mixed = [one for pair in zip(rotation(60), rotation(60, (8, 9), false_pages), strict=True) for one in pair]
-    tag.run(mixed)
-    assert almanac.pages.site == PAGES[-1]
+FALSE_PAGE = replace(PAGES[-1], tag_height_m=17.0)
 
 
-def test_a_page_that_does_not_fit_the_issue_is_passed_over():
-    tag = Tag()
-    almanac = tag.almanac
-    false_page = replace(PAGES[-1], tag_height_m=17.0)
-    mixed = [one for n, good in enumerate(rotation(60)) for one in (beacon(4 + n % 5, false_page), good)]
-    tag.run(mixed)
-    assert almanac.pages.site == PAGES[-1]
+@pytest.mark.parametrize(
+    "false",
+    [
+        list(rotation(60, (8, 9), (*PAGES[:-1], FALSE_PAGE))),  # a minority
+        [beacon(4 + n % 5, FALSE_PAGE) for n in range(60)],  # it does not fit the issue
+    ],
+)
+def test_false_pages_are_passed_over(tag, false):
+    tag.run([one for pair in zip(false, rotation(60), strict=True) for one in pair])
+    assert tag.almanac.pages.site == PAGES[-1]
 
 
-def test_another_issue_of_the_majority_replaces_the_pages_once_they_are_complete():
-    tag = Tag()
-    almanac = tag.almanac
+def test_another_issue_of_the_majority_replaces_the_pages_once_they_are_complete(tag):
     tag.run(rotation(12))
     changed = (replace(PAGES[0], rx_stamp_s=2e-10), *PAGES[1:])
     changes = tag.run(rotation(12, pages=changed), start=from_seconds(1.0))
     assert changes.count(True) == 1
-    assert almanac.pages.noise.rx_stamp_s == pytest.approx(2e-10)
+    assert tag.almanac.pages.noise.rx_stamp_s == pytest.approx(2e-10)
 
 
-def test_a_position_is_used_at_once_and_another_one_when_it_comes_twice_in_a_row():
-    tag, moved = Tag(), StatedPosition(9.0, 2.0, 3.0, 0.05)
+def test_a_position_is_used_at_once_and_another_one_when_it_comes_twice_in_a_row(tag):
+    moved = StatedPosition(9.0, 2.0, 3.0, 0.05)
     tag.run([beacon(1), beacon(1, position=moved), beacon(1), beacon(1, position=moved)])
     assert tag.almanac.points_m() == {1: (1.0, 2.0, 3.0)}
     tag.run([beacon(1, position=moved)])
@@ -143,8 +138,7 @@ def test_a_position_is_used_at_once_and_another_one_when_it_comes_twice_in_a_row
     assert tag.neighbours.rows[tag.neighbours.row].place.std_mm == 50
 
 
-def test_an_anchor_without_a_position_has_none():
-    tag = Tag()
+def test_an_anchor_without_a_position_has_none(tag):
     tag.run([beacon(1, position=None)])
     assert tag.almanac.points_m() == {}
     tag.run([beacon(1), beacon(1, position=None)])
@@ -169,10 +163,9 @@ def test_the_issue_does_not_depend_on_the_order_of_the_pages():
 
 
 @pytest.mark.site
-def test_strangers_do_not_displace_anchors_that_others_have_received():
+def test_strangers_do_not_displace_anchors_that_others_have_received(tag):
     """Neither their positions nor the pages that they state, however many there are."""
-    tag, good = Tag(), rotation(600)
-    almanac = tag.almanac
+    good = rotation(600)
     for n, one in enumerate(good):
         if n % 300 == 0:
             tag.hear(one, n * STEP // 5)
@@ -183,8 +176,8 @@ def test_strangers_do_not_displace_anchors_that_others_have_received():
     assert tag.neighbours.count == MAX_NEIGHBOURS
     assert any(one.issue == ISSUE for one in tag.pages.collected)
     tag.run(rotation(9), start=from_seconds(4.0))
-    assert almanac.pages is not None
-    assert almanac.issue == ISSUE
+    assert tag.almanac.pages is not None
+    assert tag.almanac.issue == ISSUE
 
 
 @given(

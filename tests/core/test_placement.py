@@ -108,7 +108,7 @@ def test_a_tag_without_fixes_gets_them_when_anchors_get_positions():
     assert receiver.counters["no-position"] > 100
 
 
-def test_others_go_on_while_one_anchor_has_moved():
+def test_others_go_on_while_one_anchor_has_moved_and_it_joins_again():
     site = site_of("free")
     before = replace(site, anchors=(*site.anchors[:5], replace(site.anchors[5], x_m=0.5)))
     fixes, _, receiver = run(site, before, 3, 0.0, after=site, delays_ticks={})
@@ -116,11 +116,6 @@ def test_others_go_on_while_one_anchor_has_moved():
     assert 6 not in receiver.method.estimator.anchors  # for ten seconds, in which the others might follow
     assert longest_gap_s(fixes[:, 0], PLACED_S) < 0.05
     assert np.sqrt(np.mean(np.sum((fixes[fixes[:, 0] > 3.0, 1:] - TAG_M) ** 2, axis=1))) < 0.04
-
-
-def test_one_anchor_that_has_moved_joins_again():
-    site = site_of("free")
-    before = replace(site, anchors=(*site.anchors[:5], replace(site.anchors[5], x_m=0.5)))
     fixes, _, receiver = run(site, before, 3, 0.0, PLACED_S + 10.5, after=site, delays_ticks={})
     assert 6 in receiver.method.estimator.anchors
     assert longest_gap_s(fixes[:, 0], PLACED_S) < 0.05

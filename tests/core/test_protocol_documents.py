@@ -23,8 +23,7 @@ from skyless.core.air.beacon import (
 from skyless.core.air.frame import Heard, Malformed, PackedHeard, air_time_s
 from skyless.core.air.site_pages import MIN_ANCHORS
 from skyless.core.native.records import MAX_ANCHORS_IN_USE, MAX_NEIGHBOURS, MAX_PAGES, MAX_SENDERS
-from skyless.core.protocol1 import beacon as protocol1_beacon
-from skyless.core.protocol1 import beacon as protocol1_codec
+from skyless.core.protocol1 import beacon as protocol1
 from skyless.core.protocol1.almanac import page_for, pages_of
 from skyless.core.site import AnchorSite, Site
 from skyless.core.ticks import to_seconds
@@ -46,7 +45,7 @@ class Document:
         return re.search(rf"```{language}\n(.*?)```", self.text, re.DOTALL)[1]
 
 
-FIRST = Document("protocol.md", protocol1_beacon.Beacon, (protocol1_codec.decode, protocol1_codec.encode), 24)
+FIRST = Document("protocol.md", protocol1.Beacon, (protocol1.decode, protocol1.encode), 24)
 SECOND = Document("protocol2.md", Beacon, (decode, encode), 20)
 each_document = pytest.mark.parametrize("document", [FIRST, SECOND], ids=["protocol 1", "protocol 2"])
 
@@ -91,11 +90,8 @@ def test_example_carries_the_page_of_its_turn():
     anchors = tuple(AnchorSite(number, 6.0, 4.125, 2.5) for number in range(1, 8))
     pages = pages_of(Site("lab", 42, 1, anchors))
     assert len(pages) == 10
-    assert (
-        page_for(pages, FIRST.stated["superframe"], FIRST.stated["slot"])
-        == AnchorPage(4, 6.0, 4.125, 2.5, 3)
-        == pages[6]
-    )
+    carried = page_for(pages, FIRST.stated["superframe"], FIRST.stated["slot"])
+    assert carried == pages[6] == AnchorPage(4, 6.0, 4.125, 2.5, 3)
 
 
 @pytest.mark.parametrize("reason", sorted({*Malformed} - {Malformed.BAD_PERIOD}))

@@ -24,10 +24,6 @@ def received(choice, *rows, start=0):
     return [choose_site(choice, key, anchor, start + number * STEP) for number, (key, anchor) in enumerate(rows)]
 
 
-def test_the_first_site_is_used():
-    assert received(SiteChoice(), (HOME, 1), (HOME, 2)) == [CHANGED, USED]
-
-
 def test_until_there_are_fixes_the_site_with_more_anchors_is_used():
     choice = SiteChoice()
     uses = received(choice, (OTHER, 9), (OTHER, 9), (HOME, 1), (HOME, 1), (HOME, 2), (OTHER, 9))

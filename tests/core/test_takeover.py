@@ -16,7 +16,7 @@ from skyless.core.protocol1.clock import MAX_CHANCE, MasterWatch, SiteTime, is_n
 from skyless.core.ticks import TICK_S, Unwrapper
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.impairments import AnchorOutage, Outage
-from support.bench import EVERY_METHOD, LAB, ROOM, SNAPSHOTS, Stage, assert_honest
+from support.bench import EVERY_METHOD, LAB, SNAPSHOTS, Stage, assert_honest
 
 pytestmark = pytest.mark.site
 
@@ -52,11 +52,11 @@ def walled(rule):
 class Story:
     """What happened on the air: every beacon with its true time, and every fix beside the truth."""
 
-    def __init__(self, stage, until_s, tags=(), method="joint"):
-        self.stage, self.until_s = stage, until_s
+    def __init__(self, until_s, seed=1, tags=(CENTRE,), method="joint", stage=None, **how):
+        self.until_s, self.stage = until_s, stage or Stage(LAB, seed, tags, **how)
         self.receivers = [AnyReceiver(method) for _ in tags]
         self.beacons, self.fixes = [], [[] for _ in tags]
-        for broadcast in stage.world.run(until_s):
+        for broadcast in self.stage.world.run(until_s):
             true_s = (broadcast.emission_ticks + broadcast.emission_fraction) * TICK_S
             beacon = decode(broadcast.frame)
             self.beacons.append((true_s, broadcast.emission_ticks, broadcast.emission_fraction, beacon))
@@ -122,8 +122,7 @@ def quiet(stage):
 @pytest.mark.parametrize("seed", [1, 2])
 def test_the_next_one_takes_over_within_three_superframes(off_s, seed):
     """Three of the master's beacons must be missed; then comes the successor's slot."""
-    tags = (CENTRE, WALL)
-    story = Story(Stage(LAB, seed, tags, anchor_outages=off((1, off_s))), 4.0, tags)
+    story = Story(4.0, seed, (CENTRE, WALL), anchor_outages=off((1, off_s)))
     (*_, started_s), (term, master, taken_s) = story.reigns()
     assert (term, master) == (1, 2)
     assert started_s < 5 * SUPERFRAME_S
@@ -145,8 +144,7 @@ def test_three_deaths_in_a_row_and_time_goes_on(seed):
     The old master returns as an ordinary anchor each time, and is in use again.
     """
     outages = off((1, 2.0, 3.0), (2, 4.0, 5.0), (1, 6.0, 7.0))
-    tags = (CENTRE,)
-    story = Story(quiet(Stage(LAB, seed, tags, anchor_outages=outages)), 8.5, tags)
+    story = Story(8.5, stage=quiet(Stage(LAB, seed, (CENTRE,), anchor_outages=outages)))
     assert [reign[:2] for reign in story.reigns()] == [(0, 1), (1, 2), (2, 1), (3, 2)]
     jumps = list(story.jumps())
     assert len(jumps) == 3
@@ -168,8 +166,7 @@ def test_three_deaths_in_a_row_and_time_goes_on(seed):
 
 
 def test_master_and_successor_die_at_once():
-    tags = (CENTRE,)
-    story = Story(Stage(LAB, 3, tags, anchor_outages=off((1, 2.0), (2, 2.0))), 4.0, tags)
+    story = Story(4.0, 3, anchor_outages=off((1, 2.0), (2, 2.0)))
     (_, (term, master, taken_s)) = story.reigns()
     assert (term, master) == (1, 3)
     assert taken_s - 2.0 < 4 * SUPERFRAME_S + 2 * SUPERFRAME_S / 6
@@ -180,21 +177,12 @@ def test_master_and_successor_die_at_once():
 @pytest.mark.parametrize("method", SNAPSHOTS)
 def test_snapshot_methods_turn_to_the_new_master(method):
     """They need two rounds of its beacons; the old master's return costs nothing."""
-    tags = (CENTRE,)
-    story = Story(Stage(LAB, 3, tags, anchor_outages=off((1, 2.0, 3.0))), 5.0, tags, method)
+    story = Story(5.0, 3, method=method, anchor_outages=off((1, 2.0, 3.0)))
     story.assert_tags_ride_through(longest_gap_s=10 * SUPERFRAME_S)
     last = story.fixes[0][-1][1]
     assert last.anchors[0] == 2
     assert len(last.anchors) == 6
     assert len([1 for true_s, *_ in story.fixes[0] if true_s > 3.5]) > 0.95 * 1.5 / SUPERFRAME_S
-
-
-def test_in_three_dimensions():
-    tags = ((3.0, 4.0, 1.2),)
-    story = Story(Stage(ROOM, 2, tags, anchor_outages=off((1, 2.0, 3.0))), 5.0, tags)
-    assert [reign[:2] for reign in story.reigns()] == [(0, 1), (1, 2)]
-    story.assert_tags_ride_through(longest_gap_s=2 * SUPERFRAME_S)
-    assert len(story.fixes[0][-1][1].anchors) == 8
 
 
 @pytest.mark.statistical
@@ -204,16 +192,15 @@ def test_fixes_stay_as_honest_as_they_say():
     24 runs of two tags; errors last about a tenth of a second and anchors' clocks are common to both tags, so they
     count for 24·5 independent pairs: the mean of the square over two axes has one sigma √(1/120) = 0.09.
     """
-    tags, squares = (CENTRE, WALL), {"before": [], "through": [], "after": []}
+    squares = {"before": [], "through": [], "after": []}
     for seed in range(24):
-        story = Story(Stage(LAB, 100 + seed, tags, anchor_outages=off((1, 2.0))), 3.2, tags)
+        story = Story(3.2, 100 + seed, (CENTRE, WALL), anchor_outages=off((1, 2.0)))
         for true_s, fix, truth_m in itertools.chain(*story.fixes):
             if true_s > 1.4:
                 part = "before" if true_s < 2.0 else "through" if true_s < 2.5 else "after"
                 error_m = (fix.position_m - truth_m)[:2]
                 squares[part].append(error_m @ np.linalg.solve(fix.covariance_m2[:2, :2], error_m) / 2.0)
     means = {part: float(np.mean(values)) for part, values in squares.items()}
-    print(means)  # noqa: T201 (pytest -s shows the figures)
     assert all(0.5 < mean < 1.0 + 4 * 0.09 for mean in means.values())
 
 
@@ -264,8 +251,7 @@ def test_a_living_master_is_believed_dead_next_to_never(loss, others):
 @pytest.mark.parametrize("seed", [1, 2])
 @pytest.mark.statistical
 def test_half_of_all_frames_lost_for_minutes(seed):
-    stage = Stage(LAB, seed, channel=lossy(0.5))
-    story = Story(stage, 100.0)
+    story = Story(100.0, seed, (), channel=lossy(0.5))
     assert [reign[:2] for reign in story.reigns()] == [(0, 1)]
     assert len(story.beacons) > 0.99 * 6 * 100.0 / SUPERFRAME_S * 0.98
 
@@ -273,8 +259,7 @@ def test_half_of_all_frames_lost_for_minutes(seed):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_a_death_with_half_of_all_frames_lost(seed):
     """Noticed after some ten superframes, and tags, which lose as much, still ride through."""
-    tags = (CENTRE,)
-    story = Story(Stage(LAB, seed, tags, channel=lossy(0.5), anchor_outages=off((1, 5.0, 7.0))), 9.0, tags)
+    story = Story(9.0, seed, channel=lossy(0.5), anchor_outages=off((1, 5.0, 7.0)))
     reigns = story.reigns()
     assert reigns[0][:2] == (0, 1)
     assert 5.0 < reigns[1][2] < 5.0 + 30 * SUPERFRAME_S
@@ -286,14 +271,14 @@ def test_a_death_with_half_of_all_frames_lost(seed):
 def test_a_deaf_anchor_deposes_nobody_at_once():
     """It hears nothing for 0.3 s: that is no news of the master's death."""
     rule = walled(lambda sender, listener, time_s: listener == 2 and 2.0 < time_s < 2.3)
-    story = Story(Stage(LAB, 1, make=rule), 3.0)
+    story = Story(3.0, tags=(), make=rule)
     assert [reign[:2] for reign in story.reigns()] == [(0, 1)]
 
 
 def test_an_anchor_that_does_not_hear_the_master_deposes_nobody():
     """Others tell it that the master lives."""
     rule = walled(lambda sender, listener, time_s: (sender, listener) == (1, 2) and time_s > 2.0)
-    story = Story(Stage(LAB, 1, make=rule), 6.0)
+    story = Story(6.0, tags=(), make=rule)
     assert [reign[:2] for reign in story.reigns()] == [(0, 1)]
     assert 2.5 < story.times_of(2).max() < 3.3
 
@@ -303,8 +288,7 @@ def test_an_anchor_that_does_not_hear_the_master_deposes_nobody():
 
 def test_the_next_one_starts_the_site_when_the_first_does_not_come():
     """And the configured master, once there, joins as an ordinary anchor."""
-    tags = (CENTRE,)
-    story = Story(Stage(LAB, 2, tags, anchor_outages=off((1, 0.0, 2.0))), 4.0, tags)
+    story = Story(4.0, 2, anchor_outages=off((1, 0.0, 2.0)))
     ((term, master, started_s),) = story.reigns()
     assert (term, master) == (0, 2)
     assert 0.5 < started_s < 0.53
@@ -315,7 +299,7 @@ def test_the_next_one_starts_the_site_when_the_first_does_not_come():
 
 
 def test_when_the_first_two_do_not_come():
-    story = Story(Stage(LAB, 2, anchor_outages=off((1, 0.0), (2, 0.0))), 1.5)
+    story = Story(1.5, 2, tags=(), anchor_outages=off((1, 0.0), (2, 0.0)))
     ((term, master, started_s),) = story.reigns()
     assert (term, master) == (0, 3)
     assert 0.75 < started_s < 0.78
@@ -325,8 +309,7 @@ def test_when_the_first_two_do_not_come():
 def test_the_whole_site_restarts(method):
     """Terms count from 0 again and time begins anew: tags come back within a second, and rightly."""
     outages = off((1, 1.0, 1.5), *((anchor, 3.0, 3.2) for anchor in range(1, 7)))
-    tags = (CENTRE,)
-    story = Story(Stage(LAB, 2, tags, anchor_outages=outages), 5.5, tags, method)
+    story = Story(5.5, 2, method=method, anchor_outages=outages)
     assert [beacon.term for *_, beacon in story.beacons if beacon.anchor == 2][-1] == 0
     assert {beacon.term for true_s, *_, beacon in story.beacons if 2.0 < true_s < 3.0} == {1}
     late = [true_s for true_s, *_ in story.fixes[0] if true_s > 3.2]
@@ -339,7 +322,7 @@ def test_the_whole_site_restarts(method):
 def test_two_anchors():
     """One alone does not depose a master that it merely does not hear, but in the end carries the site's time on."""
     pair = replace(LAB, anchors=LAB.anchors[:2])
-    story = Story(quiet(Stage(pair, 1, anchor_outages=off((1, 2.0, 4.0)))), 6.0)
+    story = Story(6.0, tags=(), stage=quiet(Stage(pair, 1, anchor_outages=off((1, 2.0, 4.0)))))
     assert [reign[:2] for reign in story.reigns()] == [(0, 1), (1, 2)]
     assert 2.5 < story.reigns()[1][2] < 2.6
     assert story.times_of(1).max() > 5.9
@@ -355,8 +338,7 @@ def test_two_anchors():
 def test_a_parted_site_comes_together_by_term(method):
     """Anchors 1 to 3 and 4 to 6 do not hear each other for 3 s: each part has its master, and the newer term wins."""
     rule = walled(lambda sender, listener, time_s: (sender < 4) != (listener < 4) and 2.0 < time_s < 5.0)
-    tags = (CENTRE,)
-    story = Story(Stage(LAB, 1, tags, make=rule), 7.0, tags, method)
+    story = Story(7.0, method=method, make=rule)
     assert [reign[:2] for reign in story.reigns()] == [(0, 1), (1, 4)]
     last = [beacon for true_s, *_, beacon in story.beacons if beacon.master == 1][-1]
     assert next(true_s for true_s, *_, beacon in story.beacons if beacon == last) < 5.0 + 4 * SUPERFRAME_S
@@ -373,8 +355,7 @@ def test_a_parted_site_comes_together_by_term(method):
 def test_two_that_take_over_at_once_are_told_apart_by_their_order():
     """Anchors 2 and 3 do not hear each other around the master's death, so both believe to be the next."""
     rule = walled(lambda sender, listener, time_s: {sender, listener} == {2, 3} and 1.9 < time_s < 2.2)
-    tags = (CENTRE,)
-    story = Story(Stage(LAB, 1, tags, make=rule, anchor_outages=off((1, 2.0))), 4.0, tags)
+    story = Story(4.0, make=rule, anchor_outages=off((1, 2.0)))
     assert [reign[:2] for reign in story.reigns()] == [(0, 1), (1, 2), (1, 3)]
     assert {m.clock(None).master for m in story.stage.machines.values() if m.id != 1} == {2}
     assert [true_s for true_s, *_, beacon in story.beacons if beacon.master == 3][-1] < 2.2
@@ -396,9 +377,8 @@ def test_a_master_whose_host_stood_still(frozen_s):
         def next_transmission_ticks(self, now_ticks):
             return None if self.frozen() else super().next_transmission_ticks(now_ticks)
 
-    tags = (CENTRE,)
-    stage = Stage(LAB, 1, tags, make=Frozen)
-    story = Story(stage, 4.0 + frozen_s, tags)
+    stage = Stage(LAB, 1, (CENTRE,), make=Frozen)
+    story = Story(4.0 + frozen_s, stage=stage)
     assert [reign[:2] for reign in story.reigns()] == [(0, 1), (1, 2)]
     woken = [beacon for true_s, *_, beacon in story.beacons if beacon.anchor == 1 and true_s > 2.0 + frozen_s]
     assert {(beacon.term, beacon.master) for beacon in woken} == {(1, 2)}
@@ -412,8 +392,7 @@ def test_a_stale_master_is_not_believed(method):
     rule = walled(
         lambda sender, listener, time_s: 2.0 < time_s < 4.0 and (listener == 1 or (sender == 1 and time_s < 2.2))
     )
-    tags = (CENTRE,)
-    story = Story(Stage(LAB, 1, tags, make=rule), 6.0, tags, method)
+    story = Story(6.0, method=method, make=rule)
     assert [reign[:2] for reign in story.reigns()] == [(0, 1), (1, 2)]
     assert all(story.stage.machines[anchor].counters["stale-master"] > 50 for anchor in range(2, 7))
     assert story.stage.machines[1].clock(None).master == 2
@@ -438,13 +417,12 @@ def test_terms_are_compared_as_serial_numbers():
 
 def test_a_takeover_past_term_255():
     """The site lives in term 255 when its master dies."""
-    tags = (CENTRE,)
-    stage = Stage(LAB, 1, tags, anchor_outages=off((1, 2.0, 3.0)))
+    stage = Stage(LAB, 1, (CENTRE,), anchor_outages=off((1, 2.0, 3.0)))
     for _ in stage.world.run(0.05):
         pass
     machine = stage.machines[1]
     machine._election.master_term = replace(machine._election.master_term, term=255)
-    story = Story(stage, 4.0, tags)
+    story = Story(4.0, stage=stage)
     assert [reign[:2] for reign in story.reigns()] == [(255, 1), (0, 2)]
     assert {m.clock(None).term for m in stage.machines.values()} == {0}
     story.assert_tags_ride_through()

@@ -38,12 +38,6 @@ def test_difference_of_wrapped_times(earlier, data, bits):
     assert ticks.difference(*wrapped, bits) == step
 
 
-@given(st.integers(0, 2**40 - 1), st.integers(0, 2**40 - 1))
-def test_difference_changes_sign_with_its_arguments(one, other):
-    forward, back = ticks.difference(one, other), ticks.difference(other, one)
-    assert forward == -back or forward == back == -HALF
-
-
 @given(anytime, steps, widths)
 def test_nearest_finds_the_time_near_the_expected_one(time, error, bits):
     error >>= 40 - bits  # less than half a wrap

@@ -1,4 +1,4 @@
-"""The whole simulation, anchors, ether and tags, once compiled and once as plain Python."""
+"""The estimator alone and the whole simulation, anchors, ether and tags, once compiled and once as plain Python."""
 
 import json
 import os
@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from estimator_builders import BIASED, MESH, begun, episode_of, late, one_by_one, settings_of
 
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.lab import paper_lab_site
@@ -24,17 +25,25 @@ def positions(until_s=0.25):
     return found
 
 
-def test_without_the_compiler_the_whole_simulation_is_the_same_to_rounding():
-    """Anchors, ether and tags as plain Python, in a process of their own."""
-    script = "import json, test_without_compiler as t; print(json.dumps(t.positions()))"
-    plain = subprocess.run(
-        [sys.executable, "-c", script],
-        env={**os.environ, "SKYLESS_UNCOMPILED": "1", "PYTHONPATH": str(Path(__file__).parent)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+def motions_of_an_episode():
+    """What an estimator says after each packet."""
+    episode = episode_of(MESH, 10)
+    estimator, motions = begun(episode, settings_of(MESH, **BIASED)), []
+    for packet in one_by_one(late(episode.packets, np.where(np.arange(60) == 40, 0.6, 0.0))):
+        estimator.process(*packet)
+        motions.append(estimator.motion()[0].tolist())
+    return motions
+
+
+def test_without_the_compiler_all_is_the_same_to_rounding():
+    """As plain Python, in a process of its own."""
+    script = "import json, test_without_compiler as t; print(json.dumps([t.positions(), t.motions_of_an_episode()]))"
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    env = {**os.environ, "SKYLESS_UNCOMPILED": "1", "PYTHONPATH": path}
+    plain = subprocess.run([sys.executable, "-c", script], env=env, capture_output=True, check=True)
     compiled = positions()
-    for method, rows in json.loads(plain.stdout).items():
+    plain_positions, motions = json.loads(plain.stdout)
+    for method, rows in plain_positions.items():
         assert len(rows) > 6
         np.testing.assert_allclose(rows, compiled[method], rtol=0.0, atol=1e-6)
+    np.testing.assert_allclose(motions, motions_of_an_episode(), rtol=0.0, atol=1e-8)

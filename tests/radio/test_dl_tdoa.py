@@ -9,25 +9,18 @@ from msgspec.structs import replace
 
 from skyless.core.air.masterless_packets import Packet, Relay
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
-from skyless.radio.foreign.uci import (
-    MAX_ANCHORS_KEPT,
-    MAX_ROUNDS_AT_ONCE,
-    DtMessage,
-    DtMessageType,
-    DtRounds,
-    host_time_s,
-)
+from skyless.radio.foreign import uci
 
 PLACES_M = {1: (0.0, 0.0, 2.0), 2: (6.0, 0.0, 2.0), 3: (6.0, 8.0, 2.0)}
-POLL = DtMessage(None, 1, DtMessageType.POLL, 7, 0, 2**40 - 500, 1000, False)
+POLL = uci.DtMessage(None, 1, uci.DtMessageType.POLL, 7, 0, 2**40 - 500, 1000, False)
 RESPONSE = replace(
-    POLL, address=2, kind=DtMessageType.RESPONSE, tx_ticks=300, rx_ticks_tag=9000, responder_reply_ticks=1000
+    POLL, address=2, kind=uci.DtMessageType.RESPONSE, tx_ticks=300, rx_ticks_tag=9000, responder_reply_ticks=1000
 )
-FINAL = replace(POLL, kind=DtMessageType.FINAL, tx_ticks=2**39, rx_ticks_tag=20_000)
+FINAL = replace(POLL, kind=uci.DtMessageType.FINAL, tx_ticks=2**39, rx_ticks_tag=20_000)
 
 
 def test_a_response_relays_the_poll_and_the_final_message_the_responses():
-    rounds = DtRounds()
+    rounds = uci.DtRounds()
     poll = rounds.on_message(POLL)
     assert poll == Packet(None, 1, poll.sequence, 2**40 - 500, 1000, ())
     one = rounds.on_message(replace(RESPONSE, flight_ticks=1280.0, initiator_reply_ticks=5000))
@@ -40,21 +33,21 @@ def test_a_response_relays_the_poll_and_the_final_message_the_responses():
 
 
 def test_a_response_that_is_reported_twice_is_relayed_once():
-    rounds = DtRounds()
+    rounds = uci.DtRounds()
     for message in (POLL, *[replace(RESPONSE, initiator_reply_ticks=5000)] * 2):
         rounds.on_message(message)
     assert len(rounds.on_message(FINAL).relays) == 1
 
 
 def test_a_final_message_without_responses_relays_nothing():
-    rounds = DtRounds()
+    rounds = uci.DtRounds()
     rounds.on_message(POLL)
     assert rounds.on_message(FINAL).relays == ()
 
 
 @pytest.mark.parametrize("states_positions", [True, False])
 def test_in_the_common_time_the_poll_arrives_one_flight_after_it_left(states_positions):
-    rounds = DtRounds(None if states_positions else PLACES_M)
+    rounds = uci.DtRounds(None if states_positions else PLACES_M)
     stated_m = PLACES_M if states_positions else dict.fromkeys(PLACES_M)
     rounds.on_message(replace(POLL, common_time=True, position_m=stated_m[1]))
     flight = dist(PLACES_M[1], PLACES_M[3]) / TICK_M
@@ -63,7 +56,7 @@ def test_in_the_common_time_the_poll_arrives_one_flight_after_it_left(states_pos
     )
     assert packet.relays == (Relay(1, packet.sequence, (2**40 - 500 + round(flight)) % 2**40, flight),)
     assert packet.position_m == stated_m[3]
-    assert DtRounds().on_message(replace(RESPONSE, common_time=True)) == "message-without-poll"
+    assert uci.DtRounds().on_message(replace(RESPONSE, common_time=True)) == "message-without-poll"
 
 
 @pytest.mark.parametrize(
@@ -80,13 +73,13 @@ def test_in_the_common_time_the_poll_arrives_one_flight_after_it_left(states_pos
     ],
 )
 def test_messages_of_no_use_have_a_reason(messages, reason):
-    rounds = DtRounds()
+    rounds = uci.DtRounds()
     assert [rounds.on_message(message) for message in messages][-1] == reason
 
 
 def test_addresses_that_change_for_ever_hide_no_newer_position():
-    rounds = DtRounds()
-    for address in range(3 * MAX_ANCHORS_KEPT):
+    rounds = uci.DtRounds()
+    for address in range(3 * uci.MAX_ANCHORS_KEPT):
         rounds.on_message(replace(POLL, address=address, common_time=True, position_m=PLACES_M[1]))
     response = replace(RESPONSE, address=2**16, common_time=True, position_m=PLACES_M[2])
     assert isinstance(rounds.on_message(response), Packet)
@@ -94,16 +87,16 @@ def test_addresses_that_change_for_ever_hide_no_newer_position():
 
 @pytest.mark.parametrize(("stamp", "host_s"), [(2**40 - 1, None), (2**40, 2**40 / TICK_RATE_HZ)])
 def test_a_counter_of_40_bits_given_in_64_is_no_host_s_time(stamp, host_s):
-    assert host_time_s(stamp) == pytest.approx(host_s)
+    assert uci.host_time_s(stamp) == pytest.approx(host_s)
 
 
 stamps = st.integers(0, 2**40 - 1)
 replies = st.integers(0, 2**32 - 1)
 anything = st.builds(
-    DtMessage,
+    uci.DtMessage,
     st.none(),
     st.integers(0, 2**64 - 1),
-    st.sampled_from(DtMessageType),
+    st.sampled_from(uci.DtMessageType),
     st.integers(0, 3),
     st.integers(0, 3) | st.integers(0, 2**64 - 1),
     stamps,
@@ -119,19 +112,19 @@ anything = st.builds(
 @pytest.mark.site
 @given(st.lists(anything, max_size=40))
 def test_any_messages_in_any_order(messages):
-    rounds = DtRounds(PLACES_M)
+    rounds = uci.DtRounds(PLACES_M)
     for message in messages:
         packet = rounds.on_message(message)
         if isinstance(packet, Packet):
             assert (packet.anchor, packet.rx_ticks) == (message.address, message.rx_ticks_tag)
             assert all(0 <= relay.rx_ticks < 2**40 for relay in packet.relays)
         else:
-            assert message.kind is not DtMessageType.POLL
+            assert message.kind is not uci.DtMessageType.POLL
 
 
 def test_what_is_kept_of_rounds_is_bounded():
-    rounds = DtRounds()
-    for number in range(3 * MAX_ROUNDS_AT_ONCE):
+    rounds = uci.DtRounds()
+    for number in range(3 * uci.MAX_ROUNDS_AT_ONCE):
         rounds.on_message(replace(POLL, round=number))
-    assert isinstance(rounds.on_message(replace(RESPONSE, round=3 * MAX_ROUNDS_AT_ONCE - 1)), Packet)
+    assert isinstance(rounds.on_message(replace(RESPONSE, round=3 * uci.MAX_ROUNDS_AT_ONCE - 1)), Packet)
     assert rounds.on_message(replace(RESPONSE, round=0)) == "message-without-poll"

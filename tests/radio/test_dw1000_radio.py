@@ -240,36 +240,24 @@ async def test_what_answers_but_is_no_dw1000_is_reported_in_words(monkeypatch):
         assert len(host.events) == 1
 
 
+FORM = r"it should be spi:BUS\.DEVICE, as spi:0\.0,irq=25"
+
+
 @pytest.mark.parametrize(
-    "spec",
-    ["spi:", "spi:0", "spi:a.b", "spi:0.0,irq", "spi:0.0,irq=x", "spi:0.0,pin=3", "spi:0.0,chip=gpiochip0"],
+    ("spec", "words"),
+    [
+        *((f"spi:{end}", FORM) for end in ("", "0", "a.b", "0.0,irq", "0.0,irq=x", "0.0,pin=3", "0.0,chip=gpiochip0")),
+        ("spi:0.0,irq=1,irq=2", "it should give irq once"),
+        ("spi:0.0,irq=1,chip=/dev/a,chip=/dev/a", "it should give chip once"),
+        *((f"spi:0.0,hz={rate}", "hz from 2000000 to 20000000") for rate in (1, 1_999_999, 20_000_001)),
+        ("model:127.0.0.1:99999", r"it should be model:HOST\[:PORT\] with a port from 1 to 65535"),
+        ("model:socket://here:7784", r"it should be .*:HOST\[:PORT\], and socket://here is no host"),
+        ("ether:socket://here:7784", r"it should be .*:HOST\[:PORT\], and socket://here is no host"),
+    ],
 )
-def test_names_of_chips_that_cannot_be(spec):
-    with pytest.raises(SkylessError, match=r"it should be spi:BUS\.DEVICE, as spi:0\.0,irq=25"):
+def test_names_of_chips_and_ethers_that_cannot_be(spec, words):
+    with pytest.raises(SkylessError, match=words):
         open_radios(spec, "tag", ("tag1",))
-
-
-@pytest.mark.parametrize(("options", "key"), [("irq=1,irq=2", "irq"), ("irq=1,chip=/dev/a,chip=/dev/a", "chip")])
-def test_an_option_of_a_chip_is_given_once(options, key):
-    with pytest.raises(SkylessError, match=f"it should give {key} once"):
-        open_radios(f"spi:0.0,{options}", "tag", ("tag1",))
-
-
-@pytest.mark.parametrize("rate", [1, 1_999_999, 20_000_001])
-def test_a_speed_that_no_chip_takes_is_named_at_once(rate):
-    with pytest.raises(SkylessError, match="hz from 2000000 to 20000000"):
-        open_radios(f"spi:0.0,hz={rate}", "tag", ("tag1",))
-
-
-def test_a_model_of_a_wrong_port_is_called_a_model():
-    with pytest.raises(SkylessError, match=r"it should be model:HOST\[:PORT\] with a port from 1 to 65535"):
-        open_radios("model:127.0.0.1:99999", "tag", ("tag1",))
-
-
-@pytest.mark.parametrize("driver", ["model", "ether"])
-def test_an_address_is_no_host_of_an_ether(driver):
-    with pytest.raises(SkylessError, match=r"it should be .*:HOST\[:PORT\], and socket://here is no host"):
-        open_radios(f"{driver}:socket://here:7784", "tag", ("tag1",))
 
 
 @pytest.fixture

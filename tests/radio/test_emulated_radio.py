@@ -165,14 +165,6 @@ async def test_a_radio_finds_an_ether_that_starts_late_and_one_that_starts_again
         assert all(one != other for one, other in itertools.pairwise(told))
 
 
-async def test_a_cancelled_radio_leaves_the_air():
-    async with OpenAir() as air:
-        async with nodes(air.port, "tag", "tag1") as (tag,):
-            await tag.until(Restarted)
-            assert set(air.ether.truth(0.0).tags) == {"tag1"}
-        await until(lambda: not air.ether.truth(0.0).tags)
-
-
 async def test_a_name_that_the_ether_has_not_or_that_is_taken_is_reported_and_asked_for_again():
     async with OpenAir() as air, nodes(air.port, "tag", "tag1") as (first,):
         await first.until(Restarted)

@@ -92,27 +92,21 @@ def test_records_come_out_however_the_stream_is_cut(count, cuts):
     assert (reader.garbled, reader.overlong) == (0, 0)
 
 
-@given(TICKS, SIXTEEN, SIXTEEN, SIXTEEN, FRAMES)
-def test_a_reception_comes_back(ticks, rx_power, first_path, offset, frame):
-    (record,), _ = read(link.Writer().rx(ticks, rx_power, first_path, offset, frame))
-    assert record[0] == link.RX
-    assert int.from_bytes(record[2:7], "little") == ticks
-    assert struct.unpack_from("<hhh", record, 7) == (rx_power, first_path, offset)
-    assert record[link.RX_FRAME_AT :] == frame
-
-
-@given(TICKS, SIXTEEN, st.integers(0, 0xFFFF), FRAMES)
-def test_a_reception_with_a_phase_comes_back(ticks, power, phase, frame):
-    (record,), _ = read(link.Writer().rx(ticks, power, power, power, frame, phase))
-    assert record[0] == link.RX_PHASE
-    assert struct.unpack_from("<3hH", record, 7) == (power, power, power, phase)
+@given(TICKS, st.tuples(SIXTEEN, SIXTEEN, SIXTEEN), st.integers(0, 0xFFFF), FRAMES)
+def test_a_reception_comes_back_with_a_phase_or_without(ticks, levels, phase, frame):
+    (record,), _ = read(link.Writer().rx(ticks, *levels, frame, phase))
+    (without,), _ = read(link.Writer().rx(ticks, *levels, frame))
+    assert (record[0], without[0]) == (link.RX_PHASE, link.RX)
+    assert record[2:7] == without[2:7] == ticks.to_bytes(5, "little")
+    assert struct.unpack_from("<3hH", record, 7) == (*levels, phase)
+    assert struct.unpack_from("<3h", without, 7) == levels
+    assert without[link.RX_FRAME_AT :] == frame
     heard = decode(record)
     if not frame:
         assert heard == "malformed-record"
         return
-    assert heard == Heard(ticks, link.from_steps(power, power, power), frame, phase / 2**16)
+    assert heard == Heard(ticks, link.from_steps(*levels), frame, phase / 2**16)
     assert link.to_turn(heard.carrier_phase_cycles) == phase
-    (without,), _ = read(link.Writer().rx(ticks, power, power, power, frame))
     assert decode(without) == msgspec.structs.replace(heard, carrier_phase_cycles=None)
 
 

@@ -17,7 +17,6 @@ from skyless.core.errors import SkylessError
 from skyless.core.protocol1.anchor import Anchor
 from skyless.radio.foreign.foreign_radios import ListenerRadio
 from skyless.radio.interface import AntennaDelays, Gone, Late, Restarted, Sent
-from skyless.radio.serial import link
 from skyless.radio.serial.serial_port import Pty
 from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.run.board import ListenerProtocol
@@ -158,22 +157,6 @@ async def test_noise_on_the_line_costs_what_it_hits_and_is_counted():
         assert len(host.of(Restarted)) == 1
 
 
-@pytest.mark.site
-async def test_a_board_of_another_version_is_refused_in_words():
-    board = PlayedBoard()
-    writer = link.Writer()
-
-    def answer(data):
-        board.pty.send(writer.record(link.HELLO, bytes([7, 3])))
-
-    board.protocol.on_host_data = answer
-    async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
-        assert "has version 7.3 of the serial link, this program 1.3" in (await host.until(Gone)).reason
-        await asyncio.sleep(1.2)
-        assert len(host.events) == 1
-        assert host.radio.now_ticks() is None
-
-
 async def test_a_port_that_is_taken_or_no_port_is_reported_in_words():
     async with linked() as (board, _), radio_events(SerialRadio(board.pty.name, 1_000_000, "tag2")) as second:
         assert "is used by another program" in (await second.until(Gone)).reason
@@ -243,11 +226,6 @@ def test_ports_that_cannot_be_are_reported_at_once(spec, right):
     assert spec in str(told.value)
 
 
-def test_a_sniffer_s_port_is_one_of_this_computer_too():
-    with pytest.raises(SkylessError, match="a serial port of this computer"):
-        open_sniffers("sniffer:socket://10.0.0.1:4000", ("drone",))
-
-
 def test_ports_that_nobody_can_look_at_are_opened_to_be_reported_why(tmp_path, monkeypatch):
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
 
@@ -271,6 +249,8 @@ def test_names_of_ports():
         ("/dev/a", "1", delays[0]),
         ("/dev/b", "2", delays[1]),
     ]
+    with pytest.raises(SkylessError, match="a serial port of this computer"):
+        open_sniffers("sniffer:socket://10.0.0.1:4000", ("drone",))
     (sniffer,) = open_sniffers("sniffer:/dev/c", ("t",))
     assert (sniffer._port.path, sniffer._port.baud) == ("/dev/c", 115_200)
     for driver in ("listener", "sniffer"):

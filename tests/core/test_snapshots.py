@@ -1,17 +1,14 @@
-"""The paper's TDoA and the bracketed one: exact on ideal clocks, and as noisy as the corrected theory says."""
+"""The paper's two-message synchronisation, its TDoA and the bracketed one, on ideal and noisy clocks.
+
+Exact on ideal ones, and as noisy as the corrected theory says on others.
+"""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skyless.core.protocol1.snapshots import (
-    bracketed_covariance,
-    bracketed_tdoa,
-    literal_covariance,
-    literal_delayed_covariance,
-    literal_tdoa,
-)
+from skyless.core.protocol1 import snapshots
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 
 pytestmark = pytest.mark.site
@@ -47,8 +44,8 @@ def test_ideal_clocks_give_the_difference_of_ranges(rm, ri, rt, slot, range_im, 
     m, s, a, r, tag_m, tof = stamps(
         (1 + rm, 1 + ri, 1 + rt), (epoch, 3 * epoch + 7, 5), delay, range_im, range_i, range_m
     )
-    first, delayed = literal_tdoa(*m, *s, *a, *r, *tag_m, tof)
-    bracketed = bracketed_tdoa(*m, *s, *a, *r, tag_m[1], tof)
+    first, delayed = snapshots.literal_tdoa(*m, *s, *a, *r, *tag_m, tof)
+    bracketed = snapshots.bracketed_tdoa(*m, *s, *a, *r, tag_m[1], tof)
     expected = (range_i - range_m) / TICK_M
     for value in (first, delayed, bracketed):
         assert value == pytest.approx(expected, abs=6.0)
@@ -65,17 +62,60 @@ def test_standard_deviations_are_the_corrected_theorys():
         for k in range(draws):
             noise = tuple(sigma * generator.standard_normal(10))
             m, s, a, r, tag_m, tof = stamps((1.0, 1.0, 1.0), (0, 0, 0), slot * SUPERFRAME / 6, 5.0, 4.0, 3.0, noise)
-            values[k, :2] = literal_tdoa(*m, *s, *a, *r, *tag_m, tof)
-            values[k, 2] = bracketed_tdoa(*m, *s, *a, *r, tag_m[1], tof)
+            values[k, :2] = snapshots.literal_tdoa(*m, *s, *a, *r, *tag_m, tof)
+            values[k, 2] = snapshots.bracketed_tdoa(*m, *s, *a, *r, tag_m[1], tof)
         theory = [
             np.sqrt(covariance(kappa, sigma_m2, sigma_m2)[0, 0])
-            for covariance in (literal_covariance, literal_delayed_covariance, bracketed_covariance)
+            for covariance in (
+                snapshots.literal_covariance,
+                snapshots.literal_delayed_covariance,
+                snapshots.bracketed_covariance,
+            )
         ]
         np.testing.assert_allclose(values.std(axis=0) * TICK_M, theory, rtol=4.0 / np.sqrt(2 * draws))
 
 
 def test_covariance_of_two_anchors_is_the_shared_stamp_of_the_reference():
     sigma2 = 0.01
-    covariance = literal_covariance(np.array([1 / 6, 5 / 6]), sigma2, sigma2)
+    covariance = snapshots.literal_covariance(np.array([1 / 6, 5 / 6]), sigma2, sigma2)
     assert covariance[0, 1] == sigma2
     assert covariance[0, 0] == pytest.approx(2 * sigma2 * ((7 / 6) ** 2 + (1 / 6) ** 2 + 1))
+
+
+interval_s = st.floats(1e-3, 20.0)
+
+
+@given(ppm, ppm, interval_s, st.floats(0.5, 200.0), st.floats(-1.0, 1.0))
+def test_an_anchors_time_is_converted_up_to_the_systematic_error(rate_m, rate_i, spacing_s, range_m, later_s):
+    """The error left is e_im = (1 - ν_i)·δ/ν̄ (eq:AnchorSync), 2 mm at 100 m and 20 ppm (docs/maths.md section 4)."""
+    spacing = spacing_s * TICK_RATE_HZ
+    tof = range_m / TICK_M
+    master, anchor = 1.0 + rate_m, 1.0 + rate_i
+    tx2, rx2 = round(master * spacing), round(anchor * spacing)
+    rate, offset = snapshots.synchronise(0, tx2, 0, rx2, tof)
+    when = later_s * TICK_RATE_HZ
+    converted = snapshots.to_master(anchor * (when - tof), rate, offset)
+    systematic = (1.0 - anchor) * tof / rate
+    rounding = 3.0 * (1.0 + abs(later_s) / spacing_s)
+    assert converted - master * when == pytest.approx(systematic, abs=rounding)
+
+
+@given(st.lists(st.integers(-1000, 1000), min_size=3, max_size=3), interval_s, st.floats(0, 1e5))
+def test_averaging_the_two_offsets_changes_nothing(noise, spacing_s, tof):
+    """docs/maths.md E2: with a single two-point rate both offsets are the same for any noise."""
+    spacing = round(spacing_s * TICK_RATE_HZ)
+    tx, rx = float(spacing + noise[0]), float(spacing + noise[1])
+    rate = snapshots.relative_rate(rx, tx)
+    first = snapshots.relative_offset(0.0, 0.0, rate, tof)
+    delayed = snapshots.relative_offset(rx, tx, rate, tof)
+    assert delayed == pytest.approx(first, abs=1e-3)
+    assert snapshots.synchronise(0, int(tx), 0, int(rx), tof)[1] == pytest.approx(first, abs=1e-3)
+
+
+@given(st.integers(0, 2**55), st.integers(0, 2**55))
+def test_the_origin_of_the_counters_does_not_matter(epoch_master, epoch_anchor):
+    near = snapshots.synchronise(0, 959_000_000, 0, 959_003_000, 1234.5)
+    far = snapshots.synchronise(
+        epoch_master, epoch_master + 959_000_000, epoch_anchor, epoch_anchor + 959_003_000, 1234.5
+    )
+    assert far == near

@@ -1,24 +1,16 @@
-import itertools
-import random
+"""The almanac of protocol 1: its pages and issue, in which slot each is sent, and how a tag puts them together."""
 
-import msgspec
+import itertools
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from msgspec.structs import asdict, replace
 
 from skyless.core.air.almanac import AccuracyPage, AnchorPage, GeoreferencePage, NoisePage, SchedulePage
 from skyless.core.air.site_pages import decode_page, encode_page
-from skyless.core.protocol1.almanac import almanac_issue, page_for, pages_of
-from skyless.core.site import (
-    EXACT,
-    AccuracySite,
-    AnchorSite,
-    GeoreferenceSite,
-    NoiseSite,
-    ScheduleSite,
-    Site,
-    TagsSite,
-)
+from skyless.core.protocol1.almanac import AlmanacAssembly, almanac_issue, page_for, pages_of
+from skyless.core.site import EXACT, AccuracySite, AnchorSite, GeoreferenceSite, NoiseSite, ScheduleSite, Site, TagsSite
 from skyless.site.file.check import SITE_LIMITS
 
 
@@ -88,15 +80,6 @@ def test_all_anchors_heard_fill_the_almanac_in_a_few_superframes(anchors, earth,
         assert receptions_until_complete(pages, heard) is not None
 
 
-@pytest.mark.parametrize("anchors", [4, 7, 16, 40, 200])
-def test_a_few_anchors_heard_at_random_fill_it_in_due_time(anchors):
-    # Each superframe another four of the slots: as if pages were drawn, n ln n receptions and some n more.
-    rng = random.Random(anchors)
-    pages = pages_of(site(anchors))
-    heard = ((superframe, slot) for superframe in range(10_000) for slot in rng.sample(range(anchors), 4))
-    assert receptions_until_complete(pages, heard) < 12 * len(pages)
-
-
 @pytest.mark.parametrize("end", ["low", "high"])
 def test_whatever_a_site_file_may_say_fits_the_pages(end):
     def at_end(*keys):
@@ -124,11 +107,10 @@ def test_accuracy_of_a_site_file_comes_back_as_it_was():
     for accuracy in (AccuracySite(), EXACT, AccuracySite(0.0153, 0.1, 0.0007, 1.2345, 0.35, 12.3)):
         (page,) = (page for page in pages_of(site(accuracy=accuracy)) if isinstance(page, AccuracyPage))
         heard = decode_page(encode_page(page))
-        assert AccuracySite(**msgspec.structs.asdict(heard)) == accuracy
+        assert AccuracySite(**asdict(heard)) == accuracy
 
 
 def test_issue_is_the_same_for_the_same_contents():
-    assert almanac_issue(pages_of(site())) == almanac_issue(pages_of(site()))
     quantised = tuple(decode_page(encode_page(page)) for page in pages_of(site()))
     assert almanac_issue(quantised) == almanac_issue(pages_of(site()))
     assert 0 <= almanac_issue(pages_of(site())) <= 255
@@ -138,21 +120,10 @@ def test_issue_depends_on_every_page():
     pages = pages_of(site(anchors=9))
     issue = almanac_issue(pages)
     for at, page in enumerate(pages):
-        moved = msgspec.structs.replace(page, **changed_field(page))
+        field = next(name for name in ("z_m", "slots", "survey_std_m", "white_fm") if hasattr(page, name))
+        moved = replace(page, **{field: getattr(page, field) * 2})
         assert almanac_issue((*pages[:at], moved, *pages[at + 1 :])) != issue
     assert almanac_issue(pages[::-1]) != issue
-
-
-def changed_field(page):
-    match page:
-        case AnchorPage():
-            return {"z_m": page.z_m + 0.001}
-        case SchedulePage():
-            return {"slots": page.slots + 1}
-        case AccuracyPage():
-            return {"survey_std_m": page.survey_std_m + 0.001}
-        case _:
-            return {"white_fm": page.white_fm * 2}
 
 
 def test_issue_spreads_over_all_values():
@@ -162,3 +133,106 @@ def test_issue_spreads_over_all_values():
         counts[almanac_issue((AnchorPage(1, number / 1000, 0.0, 0.0, 0),))] += 1
     chi_squared = sum((count - 2000 / 256) ** 2 / (2000 / 256) for count in counts)
     assert chi_squared < 255 + 5 * (2 * 255) ** 0.5
+
+
+SCHEDULE = SchedulePage(2**27, 3, 1, 1, 3, 1.2)
+NOISE = NoisePage(1e-10, 1e-10, 2e-11, 1e-9)
+ROOM = AccuracyPage(**asdict(AccuracySite()))
+SURVEYED = AccuracyPage(0.001, 0.02, 0.0, 0.03, 1.0, 50.0)
+EARTH = GeoreferencePage(52.0, 4.0, 3.0, 90.0)
+ANCHORS = tuple(AnchorPage(number, float(number), 0.5, 2.5, number - 1) for number in (1, 2, 3))
+PAGES = (SCHEDULE, NOISE, *ANCHORS)
+MOVED = replace(ANCHORS[1], x_m=9.0)
+
+
+@pytest.fixture
+def almanac():
+    """Filled under issue 7."""
+    almanac = AlmanacAssembly()
+    for page in PAGES:
+        almanac.add_page(7, page)
+    return almanac
+
+
+def test_fills_page_by_page():
+    almanac = AlmanacAssembly()
+    assert (almanac.issue, almanac.anchors_m, almanac.schedule, almanac.noise) == (None, {}, None, None)
+    assert almanac.georeference is None
+    changes = []
+    for page in (None, *ANCHORS, SCHEDULE, NOISE):
+        assert not almanac.complete
+        changes.append(almanac.add_page(7, page))
+    assert changes == [False, True, True, True, True, True]
+    assert almanac.complete
+    assert almanac.issue == 7
+    assert almanac.anchors_m == {1: (1.0, 0.5, 2.5), 2: (2.0, 0.5, 2.5), 3: (3.0, 0.5, 2.5)}
+    assert (almanac.schedule, almanac.noise, almanac.georeference) == (SCHEDULE, NOISE, None)
+    assert almanac.add_page(7, EARTH)
+    assert almanac.georeference == EARTH
+
+
+def test_the_known_is_no_news(almanac):
+    held = almanac.anchors_m
+    assert not any(almanac.add_page(7, page) for page in (*PAGES, None))
+    assert almanac.anchors_m is held
+
+
+def test_one_corrupt_issue_cannot_wipe_the_book(almanac):
+    for corrupt_issue in (8, 9, 10, 8, 8 ^ 255):
+        assert not almanac.add_page(corrupt_issue, MOVED)
+        assert almanac.complete
+        assert not almanac.add_page(7, NOISE)
+    assert not almanac.add_page(8, None)
+    assert not almanac.add_page(9, None)  # those in a row must agree
+    assert almanac.issue == 7
+    assert almanac.anchors_m[2] == (2.0, 0.5, 2.5)
+
+
+def test_new_issue_in_two_frames_starts_a_new_book(almanac):
+    almanac.add_page(7, EARTH)
+    assert not almanac.add_page(8, MOVED)
+    assert almanac.add_page(8, ANCHORS[0])
+    assert almanac.issue == 8
+    assert almanac.anchors_m == {1: (1.0, 0.5, 2.5), 2: (9.0, 0.5, 2.5)}
+    assert (almanac.schedule, almanac.noise, almanac.georeference, almanac.complete) == (None, None, None, False)
+
+
+def test_only_a_page_heard_twice_replaces_the_first(almanac):
+    held = almanac.anchors_m
+    assert not almanac.add_page(7, MOVED)
+    assert not almanac.add_page(7, ANCHORS[1])  # as it was: the one before was corrupt
+    assert not almanac.add_page(7, MOVED)
+    assert almanac.anchors_m[2] == (2.0, 0.5, 2.5)
+    assert not almanac.add_page(7, ANCHORS[0])
+    assert almanac.add_page(7, MOVED)
+    assert almanac.anchors_m[2] == (9.0, 0.5, 2.5)
+    assert held[2] == (2.0, 0.5, 2.5)
+
+
+def test_book_that_began_with_a_corrupt_frame_heals():
+    almanac = AlmanacAssembly()
+    almanac.add_page(99, MOVED)
+    for _ in range(2):
+        for page in PAGES:
+            almanac.add_page(7, page)
+    assert almanac.complete
+    assert almanac.anchors_m[2] == (2.0, 0.5, 2.5)
+
+
+def test_accuracy_is_the_rooms_until_it_is_heard(almanac):
+    assert almanac.complete
+    assert AlmanacAssembly().accuracy == almanac.accuracy == ROOM
+    assert almanac.add_page(7, SURVEYED)
+    assert almanac.accuracy == SURVEYED
+    assert not almanac.add_page(7, SURVEYED)
+    assert not almanac.add_page(7, ROOM)
+    assert almanac.accuracy == SURVEYED
+    assert almanac.add_page(7, ROOM)
+    assert almanac.accuracy == ROOM
+
+
+def test_accuracy_goes_with_its_issue(almanac):
+    almanac.add_page(7, SURVEYED)
+    assert not almanac.add_page(8, None)
+    assert almanac.add_page(8, None)  # an issue may come without pages
+    assert (almanac.accuracy, almanac.anchors_m) == (ROOM, {})
