@@ -58,6 +58,11 @@ class Recorded(Target):
         await asyncio.Event().wait()
 
 
+def bridge_to(target, said=print, rate_hz=50.0, *, simulated=False):
+    """Tags of the same process, bridged to one target."""
+    return TagBridge(Hub([Route(target, None, rate_hz)], said), lambda: simulated, said)
+
+
 @contextlib.asynccontextmanager
 async def brokered(folder):
     """A broker, and a link that plays the site's programs."""
@@ -148,8 +153,8 @@ async def reader_of(port):
 @pytest.mark.parametrize("georeference", [None, BERLIN])
 def test_a_tag_learns_its_site_from_the_air_with_the_georeference_where_one_is_sent(georeference):
     site = structs.replace(LAB, georeference=georeference)
-    target, said = Recorded(), []
-    bridge = TagBridge(Hub([Route(target, None, 50.0)], said.append), lambda: True, said.append)
+    target = Recorded()
+    bridge = bridge_to(target, simulated=True)
     receiver = AnyReceiver()
     for heard in tape(site, 2.0, 1, (3.0, 4.0, 0.0)):
         receiver.hear(Reception(heard.frame, heard.rx_ticks, heard.host_s))
@@ -170,13 +175,15 @@ def test_a_tag_learns_its_site_from_the_air_with_the_georeference_where_one_is_s
     assert target.fixes == [a_fix()]
 
 
-def test_tags_that_know_different_anchors_of_a_large_site_make_one_site():
-    target = Recorded()
-    bridge = TagBridge(Hub([Route(target, None, 50.0)], print), lambda: False, print)
+@pytest.mark.parametrize(("other", "anchors"), [({2: (9.0, 0.0, 2.0)}, [[1], [1, 2]]), ({1: (0.0, 0.0, 2.0)}, [[1]])])
+def test_what_tags_know_of_a_site_is_joined_whether_they_know_other_anchors_or_missed_its_page(other, anchors):
+    target, page = Recorded(), GeoreferencePage(50.0, 8.0, 100.0, 0.0)
+    bridge = bridge_to(target)
     for _ in range(3):
-        bridge.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, simulated=False))
-        bridge.on_site(heard_site(5, {2: (9.0, 0.0, 2.0)}, simulated=False))
-    assert [sorted(site.anchors_m) for site in target.sites] == [[1], [1, 2]]
+        bridge.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, page, simulated=False))
+        bridge.on_site(heard_site(5, other, None, simulated=False))
+    assert [sorted(site.anchors_m) for site in target.sites] == anchors
+    assert {site.georeference.latitude_deg for site in target.sites} == {50.0}
 
 
 def heard_by(site, latitude_deg=50.0):
@@ -187,7 +194,7 @@ def heard_by(site, latitude_deg=50.0):
 
 def test_no_fix_of_another_site_than_the_one_that_targets_know_is_given():
     target = Recorded()
-    bridge = TagBridge(Hub([Route(target, None, 1e3)], print), lambda: False, print)
+    bridge = bridge_to(target, rate_hz=1e3)
     walking, staying = heard_by(5), heard_by(5)
     bridge.on_health(tag_health("tag1"), walking)
     bridge.on_health(tag_health("tag2"), staying)
@@ -208,19 +215,9 @@ def test_no_fix_of_another_site_than_the_one_that_targets_know_is_given():
     assert [fix.tag for fix in target.fixes] == ["tag2", "tag1"]
 
 
-def test_a_tag_that_has_missed_the_page_about_the_earth_does_not_undo_what_another_has_heard():
-    target = Recorded()
-    bridge = TagBridge(Hub([Route(target, None, 50.0)], print), lambda: False, print)
-    page = GeoreferencePage(50.0, 8.0, 100.0, 0.0)
-    for _ in range(3):
-        bridge.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, page, simulated=False))
-        bridge.on_site(heard_site(5, {1: (0.0, 0.0, 2.0)}, None, simulated=False))
-    assert [site.georeference.latitude_deg for site in target.sites] == [50.0]
-
-
 def test_after_a_change_of_site_the_page_about_the_earth_is_awaited_again():
     target = Recorded()
-    bridge = TagBridge(Hub([Route(target, None, 50.0)], print), lambda: False, print)
+    bridge = bridge_to(target)
     receiver = heard_by(5)
     bridge.on_health(tag_health("tag1"), receiver)
     bridge._sites["tag1"]._complete_s -= 10.0
@@ -231,7 +228,7 @@ def test_after_a_change_of_site_the_page_about_the_earth_is_awaited_again():
 
 def test_that_no_target_can_serve_a_growing_site_is_logged_once():
     said = []
-    bridge = TagBridge(Hub([Route(Recorded(refuses=True), None, 50.0)], said.append), lambda: False, said.append)
+    bridge = bridge_to(Recorded(refuses=True), said.append)
     for anchor in range(5):
         bridge.on_site(heard_site(5, {anchor: (1.0 * anchor, 0.0, 2.0)}, simulated=False))
     assert said == ["test: needs more"]

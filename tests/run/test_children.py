@@ -29,6 +29,16 @@ async def stop(task):
     await asyncio.wait([task])
 
 
+async def first_line(monkeypatch, code, name, **options):
+    """What is logged first of a program that runs this Python."""
+    said = []
+    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", code))
+    task = asyncio.ensure_future(Child(Program(name, (), **options), said.append).run())
+    await until(lambda: said or task.done(), 10)
+    await stop(task)
+    return said[0]
+
+
 async def test_a_program_that_is_killed_is_started_again_and_logged():
     said = []
     child = Child(Program("air", ("ether", "--mqtt", "none", "--listen", f"127.0.0.1:{free_port()}")), said.append)
@@ -88,14 +98,9 @@ async def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last
 @pytest.mark.parametrize("is_held", [False, True])
 async def test_what_a_killed_program_wrote_last_is_not_taken_for_why_it_ended(monkeypatch, code, message, is_held):
     """Also where it dies in the middle of a line, or its own child holds its standard error open."""
-    said = []
     hold = "import subprocess; subprocess.Popen(['sleep', '5'])" if is_held else "pass"
-    end = "sys.stderr.flush(); os.kill(os.getpid(), 9)"
-    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", f"import os, sys; {hold}; {code}; {end}"))
-    task = asyncio.ensure_future(Child(Program("tag 2", ()), said.append).run())
-    await until(lambda: said, 10)
-    assert said[0] == f"tag 2 ended (signal 9); {message}; started again"
-    await stop(task)
+    code = f"import os, sys; {hold}; {code}; sys.stderr.flush(); os.kill(os.getpid(), 9)"
+    assert await first_line(monkeypatch, code, "tag 2") == f"tag 2 ended (signal 9); {message}; started again"
 
 
 async def test_a_program_that_will_not_end_is_made_to(monkeypatch):
@@ -111,25 +116,14 @@ async def test_a_program_that_will_not_end_is_made_to(monkeypatch):
 
 
 async def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypatch):
-    said = []
-    command = "import sys; sys.stderr.write('x' * 1_000_000)"
-    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", command))
-    child = Child(Program("page", ()), said.append)
-    task = asyncio.ensure_future(child.run())
-    await until(lambda: said or task.done(), 10)
-    assert said[0].startswith("page ended (exit code 0); its last message")
-    assert 500 < len(said[0]) < 1100
-    await stop(task)
+    line = await first_line(monkeypatch, "import sys; sys.stderr.write('x' * 1_000_000)", "page")
+    assert line.startswith("page ended (exit code 0); its last message")
+    assert 500 < len(line) < 1100
 
 
 async def test_what_a_program_writes_is_logged_as_it_comes_where_that_is_asked_for(monkeypatch):
-    said = []
-    command = "import sys, time; print('disk full', file=sys.stderr, flush=True); time.sleep(60)"
-    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", command))
-    task = asyncio.ensure_future(Child(Program("history", (), logs_lines=True), said.append).run())
-    await until(lambda: said or task.done(), 10)
-    assert said == ["history: disk full"]
-    await stop(task)
+    code = "import sys, time; print('disk full', file=sys.stderr, flush=True); time.sleep(60)"
+    assert await first_line(monkeypatch, code, "history", logs_lines=True) == "history: disk full"
 
 
 async def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_when_it_logs_it(monkeypatch, tmp_path):

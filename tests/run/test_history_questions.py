@@ -355,8 +355,7 @@ def test_what_cannot_be_answered_is_said(history, ask, error):
     ],
 )
 def test_what_is_too_much_is_refused_with_what_would_do(history, monkeypatch, limits, ask, error):
-    for module in (queries, queries):
-        monkeypatch.setattr(module, "LIMITS", HistoryLimits(**limits))
+    monkeypatch.setattr(queries, "LIMITS", HistoryLimits(**limits))
     with pytest.raises(SkylessError, match=error):
         ask(history)
 

@@ -1,9 +1,12 @@
 """The link against real brokers: what it promises to nodes when brokers and processes die, freeze and come back."""
 
 import asyncio
+import contextlib
 import logging
+import shutil
 import signal
 import socket
+import subprocess
 import sys
 import threading
 
@@ -76,7 +79,7 @@ async def test_a_retained_message_reaches_later_subscribers_also_of_a_broker_tha
 def move(broker, to):
     """Let a broker listen where another one did."""
     if hasattr(broker, "settings"):
-        broker.settings = msgspec.structs.replace(broker.settings, port=to.address.port)
+        broker.settings = replace(broker.settings, port=to.address.port)
     else:
         text = broker.file.read_text(encoding="utf-8").replace(f"listener {broker.port}", f"listener {to.port}")
         broker.file.write_text(text, encoding="utf-8")
@@ -99,7 +102,6 @@ async def test_what_the_broker_has_kept_comes_before_what_replaces_it(make_broke
 
 NODE = """
 import asyncio, sys
-from skyless.run.mqtt.address import USERS, Role
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 link = Link(MqttAddress("127.0.0.1", int(sys.argv[1])), "t1", site=7, kind="tag", keepalive_s=1)
@@ -300,7 +302,7 @@ async def test_a_broker_frozen_for_longer_than_the_keepalive_is_left_and_found_a
 
 async def test_tls_trusts_only_the_given_certificate(make_broker, certificate):
     broker = make_broker(certificate=certificate[0], key=certificate[1])
-    trusting = msgspec.structs.replace(broker.address, ca=certificate[0])
+    trusting = replace(broker.address, ca=certificate[0])
     tag = tag_link(trusting)
     async with running(broker, tag):
         await check_broker(trusting)
@@ -313,7 +315,7 @@ async def test_tls_trusts_only_the_given_certificate(make_broker, certificate):
 
 async def test_a_wrong_password_is_reported_without_showing_it(make_broker, caplog):
     broker = make_broker(user="ann", password="right-word")
-    wrong = msgspec.structs.replace(broker.address, password="wrong-word")
+    wrong = replace(broker.address, password="wrong-word")
     async with running(broker, tag_link(broker.address)):
         with pytest.raises(
             SkylessError, match=r"wrong user name or password.*; the password goes in SKYLESS_MQTT"
@@ -330,9 +332,6 @@ async def test_a_wrong_password_is_reported_without_showing_it(make_broker, capl
 @pytest.fixture
 def certificate(tmp_path):
     """A self-made certificate and its key."""
-    import shutil
-    import subprocess
-
     if shutil.which("openssl") is None:
         pytest.skip("openssl is not installed")
     files = tmp_path / "certificate.pem", tmp_path / "key.pem"
@@ -405,7 +404,7 @@ def connecting():
 async def test_a_flood_through_tls_arrives_completely(make_broker, certificate, qos):
     """TLS hands over more at once than the socket announces."""
     broker = make_broker(certificate=certificate[0], key=certificate[1])
-    address = msgspec.structs.replace(broker.address, ca=certificate[0])
+    address = replace(broker.address, ca=certificate[0])
     inbox = Inbox(address, "skyless/v1/7/tag/#", qos=qos, keepalive_s=600)
     tag = tag_link(address)
     async with running(broker, inbox.link, tag):
@@ -530,3 +529,49 @@ async def test_a_full_broker_is_named_as_the_reason_and_asked_again(tmp_path, ro
         await until(lambda: inbox.link.refused == ({"elsewhere"} if role else set()))
         assert caplog.text.count("has refused a subscription") == 2, "each is said once"
         await stopped(task)
+
+
+# To what only plays the broker
+
+
+@contextlib.asynccontextmanager
+async def player(answer):
+    """Where something gives one answer, whoever comes, and then listens without a word."""
+
+    async def serve(reader, writer):
+        writer.write(answer)
+        while await reader.read(65_536):
+            pass
+        writer.close()
+
+    async with await asyncio.start_server(serve, "127.0.0.1", 0) as server:
+        yield MqttAddress("127.0.0.1", server.sockets[0].getsockname()[1])
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        (1, "answer is not MQTT"),
+        (2, "refuses: Client identifier not valid"),
+        (3, "refuses: Server unavailable"),
+        (4, "refuses: wrong user name or password; the address has no user: it should be USER@HOST"),
+        (5, "refuses: wrong user name or password, or no permission; the address has no user"),
+        (99, "refuses: "),
+    ],
+)
+async def test_each_refusal_of_the_standard_is_reported(code, reason):
+    """MQTT 3.1.1, table 3.1."""
+    async with player(bytes((0x20, 2, 0, code))) as address:
+        with pytest.raises(SkylessError, match=reason):
+            await check_broker(address)
+
+
+async def test_a_number_that_still_flies_is_not_given_again():
+    async with player(b"\x20\x02\x00\x00") as address:
+        connection = await open_connection(address, None, Introduction("me", 60))
+        first = connection.publish("a", b"", 1, retain=False)
+        connection._client._last_mid = 0xFFFF - 5  # as if that many had been sent since
+        numbers = [connection.publish("a", b"", 1, retain=False) for _ in range(10)]
+        assert first not in numbers
+        assert len(set(numbers)) == len(numbers)
+        connection.abort("enough")

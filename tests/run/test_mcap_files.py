@@ -154,18 +154,14 @@ def test_an_ellipse_covers_two_standard_deviations():
     turn = np.array([[0.8, -0.6], [0.6, 0.8]])
     covariance = np.zeros((3, 3))
     covariance[:2, :2] = turn @ np.diag([0.09, 0.01]) @ turn.T
-    fix = next(McapRecordingOf(SAID).fixes())
+    fix = fixes_of(SAID)[0]
     axes_m, yaw = ellipse_of(msgspec.structs.replace(fix, covariance_m2=tuple(covariance.ravel())))
     assert axes_m == pytest.approx((4 * 0.3, 4 * 0.1))
     assert np.tan(yaw) == pytest.approx(0.75)
 
 
-class McapRecordingOf:
-    def __init__(self, said):
-        self.said = said
-
-    def fixes(self):
-        return (msgspec.json.decode(p, type=FixMessage) for _, topic, p in self.said if topic.endswith("/fix"))
+def fixes_of(said):
+    return [msgspec.json.decode(payload, type=FixMessage) for _, topic, payload in said if topic.endswith("/fix")]
 
 
 def test_a_recording_gives_back_what_was_said(whole):
@@ -179,7 +175,7 @@ def test_a_recording_gives_back_what_was_said(whole):
         assert recording.site.site == SITE
         assert recording.zones is None
         fixes = list(recording.fixes())
-        assert fixes == list(McapRecordingOf(SAID).fixes())
+        assert fixes == fixes_of(SAID)
         some = list(recording.fixes(UNIX_S + 0.9, UNIX_S + 1.2, ["b"]))
         assert some == [f for f in fixes if f.tag == "b" and UNIX_S + 0.9 <= f.unix_s < UNIX_S + 1.2]
         assert len(some) > 5
@@ -192,14 +188,14 @@ def test_a_growing_file_is_read_as_far_as_it_goes(tmp_path):
     recorder = record(path, SAID[:half], close=False)
     with McapRecording(path) as recording:
         fixes = list(recording.fixes())
-        assert fixes == list(McapRecordingOf(SAID[:half]).fixes())
+        assert fixes == fixes_of(SAID[:half])
         assert not recording.summary().finished
         for s, topic, payload in SAID[half:]:
             recorder.add(topic, payload, s)
         recorder.file.close()
         recording.refresh()
         assert recording.summary().finished
-        assert list(recording.fixes()) == list(McapRecordingOf(SAID).fixes())
+        assert list(recording.fixes()) == fixes_of(SAID)
 
 
 SMALL = [one for one in SAID if "/tag/" not in one[1] or one[1].endswith("a/fix")][:40]

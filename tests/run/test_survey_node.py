@@ -124,6 +124,13 @@ def true_survey(anchors=tuple(POSITIONS_M)):
     return Survey(found, (), 0.03, 3, None, (), (), (), "true", None, ())
 
 
+@pytest.fixture
+def file(tmp_path):
+    file = tmp_path / "lab.toml"
+    file.write_text(TEXT, encoding="utf-8")
+    return file
+
+
 @pytest.mark.statistical
 def test_ranges_come_of_the_stamps_that_anchors_publish():
     live = live_after(6.0)
@@ -218,9 +225,7 @@ class Stage:
         self.now_s += 0.001
 
 
-async def test_results_are_published_and_saved_and_anchors_get_their_placement(monkeypatch, tmp_path):
-    file = tmp_path / "lab.toml"
-    file.write_text(TEXT, encoding="utf-8")
+async def test_results_are_published_and_saved_and_anchors_get_their_placement(monkeypatch, tmp_path, file):
     site = load_site(file)
     stage = Stage(monkeypatch, site=site, file=file)
     facts = Facts(gauge=Gauge(1, 2, 4))
@@ -274,9 +279,7 @@ async def test_a_second_survey_names_the_sites_before_it(monkeypatch):
     assert stage.node.saved.written == ()  # there is no file
 
 
-async def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, tmp_path):
-    file = tmp_path / "lab.toml"
-    file.write_text(TEXT, encoding="utf-8")
+async def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, file):
     stage = Stage(monkeypatch, site=load_site(file), file=file)
 
     def refused(serial):
@@ -433,10 +436,8 @@ async def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_h
 
 
 @pytest.mark.parametrize("failing", [1, 2, 3, 4])
-def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch, failing):
+def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch, failing, file):
     """The image of the floor, the site's file before, the survey's record, and the site's file."""
-    file = tmp_path / "lab.toml"
-    file.write_text(TEXT, encoding="utf-8")
     written = []
     write_bytes = Path.write_bytes
 
