@@ -119,54 +119,6 @@ def test_a_tag_that_sleeps_by_its_own_statement_is_asleep_and_then_gone():
     assert table.gone_after_s(tag) < 4 * 3600.0, "the sleep was no gap in its rhythm"
 
 
-def test_a_stated_interval_counts_before_one_is_learnt_and_the_site_states_the_longest():
-    table = SiteTable(0.0)
-    table.add_health("tag", "t1", tag_health(interval_s=120.0), 0.0)
-    table.add_fix(fix(), 0.0)
-    tag = table.get("tag", "t1")
-    assert (table.fresh_for_s(tag), table.gone_after_s(tag)) == (300.0, 480.0)
-    table.longest_s, table.longest_of_groups_s, table.group_of = 200.0, {"vans": 90.0}, {"t1": "vans"}
-    assert (table.fresh_for_s(tag), table.gone_after_s(tag)) == (90.0, 90.0)
-    table.group_of = {}
-    assert table.gone_after_s(tag) == 200.0
-    for wrong in (-1.0, math.inf):
-        table.add_health("tag", "t1", tag_health(interval_s=wrong, sleeps_s=wrong), 1.0)
-        assert 0.0 <= table.gone_after_s(tag) <= 200.0
-
-
-def test_one_outage_of_a_tag_changes_nothing_and_silence_of_the_broker_is_nobodys():
-    table, serial = SiteTable(0.0), 0
-    for step in range(4000):
-        serial += 1
-        table.add_fix(fix(serial=serial, unix_s=0.1 * step), 0.1 * step)
-    assert table.tick(420.0) == ["t1"]
-    table.add_fix(fix(serial=serial + 1, unix_s=430.0), 430.0)
-    assert table.gone_after_s(table.get("tag", "t1")) == THRESHOLDS.gone_s
-    table.set_connected(connected=False, now_s=431.0)
-    assert table.tick(5000.0) == []
-    table.set_connected(connected=True, now_s=5000.0)
-    assert (table.tick(5009.0), table.tick(5010.5)) == ([], ["t1"])
-
-
-def test_an_absence_is_no_rhythm_however_short_the_time_before_and_two_alike_are_one():
-    table, serial = SiteTable(0.0), 0
-
-    def stay(begin_s, end_s):
-        nonlocal serial
-        for step in range(round(10 * begin_s), round(10 * end_s)):
-            serial += 1
-            table.add_fix(fix(serial=serial, unix_s=0.1 * step), 0.1 * step)
-            table.tick(0.1 * step)
-        return table.gone_after_s(table.get("tag", "t1"))
-
-    assert stay(0.0, 60.0) == THRESHOLDS.gone_s
-    assert table.tick(200.0) == ["t1"]
-    assert stay(360.0, 380.0) == THRESHOLDS.gone_s
-    assert table.tick(391.0) == ["t1"]
-    assert stay(680.0, 700.0) == THRESHOLDS.longest_s
-    assert stay(10_000.0, 10_020.0) == THRESHOLDS.gone_s
-
-
 def test_a_tag_that_comes_and_goes_is_looked_at_once():
     table = SiteTable(0.0)
     for n in range(50):
@@ -179,18 +131,6 @@ def test_a_tag_that_comes_and_goes_is_looked_at_once():
 
 
 # Bad input: each has its sentence in docs/live_site.md
-
-
-def test_a_late_or_repeated_fix_is_counted_and_changes_nothing_and_a_clock_set_back_is_followed():
-    table = SiteTable(0.0)
-    first = fix(serial=5, unix_s=1000.0)
-    table.add_fix(first, 0.0)
-    for old in (first, replace(first, serial=4, unix_s=999.5)):
-        assert table.add_fix(old, 0.5) is None
-    assert (table.drops["late-fix"], table.get("tag", "t1").fix) == (2, first)
-    for serial, unix_s in ((6, 995.0), (7, 1e9), (8, 1000.0), (1, 1.0), (2, 4e12)):  # set back, years ahead, restarted
-        assert table.add_fix(fix(serial=serial, unix_s=unix_s), 1.0) is not None
-    assert table.presence(table.get("tag", "t1"), 1.0) == "fresh"
 
 
 @pytest.mark.parametrize("batched", [False, True])
@@ -221,15 +161,6 @@ def test_messages_of_unknown_tags_are_taken_up_to_a_limit_and_a_feed_that_stops_
     assert (len(table.fixed), table.roster.left_out("tag", 12.0)) == (100, 50)
     assert sorted(table.tick(30.0)) == sorted(table.fixed)
     assert table.tick(31.0) == []
-
-
-def test_what_has_gone_is_forgotten_after_a_day_with_room_for_others():
-    table = SiteTable(0.0)
-    table.add_fix(fix("t1"), 0.0)
-    table.add_status(status("tag", "t2"), 0.0)
-    table.tick(THRESHOLDS.forgotten_s + 100.0)
-    assert (table.get("tag", "t1"), table.fixed, table.get("tag", "t2") is not None) == (None, {}, True)
-    assert not table.roster.size("tag") > 1
 
 
 @given(st.lists(st.tuples(st.floats(0.0, 2000.0), st.sampled_from(["fix", "tick", "lost", "back", "sleep", "off"]))))
