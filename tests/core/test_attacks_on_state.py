@@ -15,9 +15,7 @@ from skyless.core.keys.chain import SECTION_INTERVALS, mac_of
 from skyless.core.keys.fault import Fault
 from skyless.core.keys.verifier import Verifier
 from skyless.core.ticks import from_seconds, wrap
-from skyless.sim.lab import lab_site
 
-SITE_FILE = lab_site()
 OWN = 4
 START_S = TIMING.start_s(FIRST + SECTION_INTERVALS // 2) + 0.02
 

@@ -29,10 +29,8 @@ def near(value):
 
 def test_a_state_is_warm_after_two_packets_of_each_anchor():
     s = state()
-    warm = []
-    for s.status.packets in (0, 8, 9):
-        warm.append(monitor.is_warm(s))
-    assert warm == [False, False, True]
+    for s.status.packets, is_warm in ((0, False), (8, False), (9, True)):
+        assert monitor.is_warm(s) is is_warm
 
 
 # Jumps

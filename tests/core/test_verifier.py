@@ -29,17 +29,16 @@ class Listener:
         certificates = [KEYS.certificate(FIRST), KEYS.certificate(FIRST + SECTION_INTERVALS)]
         self.verifier = Verifier(SITE, PUBLIC, 0.1, self.counters, **{"certificates": certificates, **options})
 
-    def hear(self, interval, *, present=NOW, anchor=1, sequence=0, key=None, late_s=0.0, keys=KEYS):
-        """A frame of an interval, received when the latest interval that any anchor can have begun is ``present``.
+    def hear(self, interval, *, present=NOW, anchor=1, sequence=0, key=None, keys=KEYS):
+        """A frame, received when ``present`` is the latest interval that any anchor can have begun.
 
-        ``key``: an interval whose key it discloses. ``late_s``: how long after it was sent it arrives.
+        ``key``: an interval whose key it discloses.
         """
         unix_s = TIMING.start_s(present) + 0.5 * TIMING.interval_s - 0.1 - TIMING.anchor_lead_s
         at_s = unix_s - START_S + 5.0
         disclosed = None if key is None else KEYS.key(key)
-        return self.verifier.add(
-            *received(frame(anchor, sequence, at_s - late_s, interval, key=disclosed, keys=keys), at_s), unix_s
-        )
+        sent = frame(anchor, sequence, at_s, interval, key=disclosed, keys=keys)
+        return self.verifier.add(*received(sent, at_s), unix_s)
 
     def decided(self):
         return [(one.beacon.sequence, fault) for one, fault in self.verifier.decided()]
@@ -90,9 +89,8 @@ def test_keys_in_time_are_followed_without_end():
         for anchor in range(4):
             listener.hear(interval, present=interval, anchor=anchor, key=interval - TIMING.lag)
             assert listener.verifier.keys.newest == interval - TIMING.lag
-    wrong = beacon(1, 1, 0.0, bytes(16))
     assert "forged-key" not in listener.counters
-    listener.verifier._on_key(wrong.page.key, NOW + 90, 1, TIMING, is_early=False)
+    listener.verifier._on_key(bytes(16), NOW + 90, 1, TIMING, is_early=False)
     assert listener.counters["forged-key"] == 1
 
 

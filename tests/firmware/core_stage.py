@@ -3,8 +3,8 @@
 import ctypes
 
 from emulator.build import build
-from emulator.processor.cortex_m4 import RAM_BASE, Core
-from emulator.processor.elf import code_of, symbols_of
+from emulator.processor.cortex_m4 import Core
+from emulator.processor.elf import symbols_of
 
 _SYSTEM_CONTROL = (0xE000E000, 0x1000)
 _FLASH_CONTROL = (0x4001E000, 0x1000)
@@ -18,7 +18,6 @@ class BoardCore:
     def __init__(self):
         self.elf = build("core")
         self._at = {name: at for at, _, name in symbols_of(self.elf)}
-        self._stack_bytes = int.from_bytes(code_of(self.elf)[:4], "little") - RAM_BASE
         self.processor = Core(self.elf, [_FLASH_CONTROL, _SYSTEM_CONTROL], self._load, self._store)
         assert self.processor.run(_FOREVER) == "sleep"
 
@@ -46,11 +45,6 @@ class BoardCore:
         assert (stopped, self.processor.faults) == ("sleep", [])
         outcome = int.from_bytes(self.processor.load(self._at["core_outcome"], 4), "little", signed=True)
         return outcome, self.processor.cycles - before
-
-    @property
-    def stack_bytes(self):
-        """What has been used of the stack."""
-        return self._stack_bytes - self.processor.unused_stack_bytes
 
     def cycles_by_function(self):
         """Since they were last asked for, the most first."""

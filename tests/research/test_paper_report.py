@@ -27,7 +27,6 @@ TINY = Plan(
     draws=20_000,
 )
 VOID = {"meta", "link", "br", "img", "input", "hr"}
-NO_CLOSING_NEEDED = {"path", "use", "rect", "image", "defs"}
 
 
 @pytest.fixture(scope="module")

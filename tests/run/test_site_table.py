@@ -105,20 +105,6 @@ def test_a_tag_that_walks_through_three_zones_enters_and_leaves_each_once(rate):
     assert stays_s == pytest.approx([10.0 / speed_mps] * len(stays_s), abs=rate + 0.5)
 
 
-def test_a_tag_that_sleeps_by_its_own_statement_is_asleep_and_then_gone():
-    table = SiteTable(0.0)
-    for step in range(200):
-        table.add_fix(fix(serial=step, unix_s=0.1 * step), 0.1 * step)
-    table.add_health("tag", "t1", tag_health(sleeps_s=3600.0), 20.0)
-    tag = table.get("tag", "t1")
-    assert table.tick(3000.0) == []
-    assert table.presence(tag, 3000.0) == "asleep"
-    assert (table.tick(3625.0), table.presence(tag, 3625.0)) == ([], "late")
-    assert table.tick(3631.0) == ["t1"]
-    table.add_fix(fix(serial=300, unix_s=4000.0), 4000.0)
-    assert table.gone_after_s(tag) < 4 * 3600.0, "the sleep was no gap in its rhythm"
-
-
 def test_a_tag_that_comes_and_goes_is_looked_at_once():
     table = SiteTable(0.0)
     for n in range(50):

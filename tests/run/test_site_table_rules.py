@@ -148,6 +148,14 @@ def test_a_tag_sleeps_until_the_time_that_it_stated():
         assert tag.stated_s == believed_s
 
 
+def test_a_sleep_is_no_gap_in_a_tag_s_rhythm():
+    table, tag = table_with(*each_second(0, 20))
+    table.add_health("tag", "t1", tag_health(sleeps_s=100.0), 20.0)
+    assert table.tick(119.0) == []
+    heard(table, 121.0)
+    assert (tag.gaps, tag.fixes) == ([], 22)
+
+
 def test_silence_counts_as_long_as_both_feeds_can_bring_something():
     table, tag = table_with(*each_second(0, 50))
     table.set_connected(connected=True, now_s=51.0)

@@ -206,7 +206,7 @@ class Stage:
 
     async def view(self):
         """Note when batches arrive at the hub, by core NATS, until cancelled."""
-        client = self._viewer = await connect(self.address, "viewer", quiet, Counter())
+        client = await connect(self.address, "viewer", quiet, Counter())
 
         async def note(_message):
             self.arrivals.append(time.monotonic())
@@ -216,11 +216,6 @@ class Stage:
             await asyncio.Event().wait()
         finally:
             await client.close()
-
-    def by_viewer(self):
-        """The servers, first the one that the viewer is connected to."""
-        own = self._ports.index(self._viewer.connected_url.port)
-        return self.servers[own:] + self.servers[:own]
 
     async def stop_sending(self):
         """Nothing is sent any more, and the last batch is acknowledged."""
