@@ -1,18 +1,20 @@
 """Put faults into the product, one at a time, and see whether the tests find them.
 
 ``scripts/faults`` draws ten places of the source, always the same ones (``--seed`` others), changes each in a copy of
-the working tree as ``scripts/mutate`` changes a module, and runs the tests there: those of the fault's own room first,
-then all others, until one fails. ``--only-say`` prints the faults; so one can put them in by hand.
+the last commit as ``scripts/mutate`` changes a module, and runs the tests there: those of the fault's own room first,
+then all others, until one fails. It should pass without the fault. ``--only-say`` lists the faults.
 """
 
 import argparse
 import random
+import shlex
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
 from typing import Final
 
+import pytest
 from msgspec import Struct
 
 from mutate import ROOT, SOURCE, Mutant, mutants_of
@@ -50,29 +52,45 @@ def drawn(number: int, seed: int) -> list[Fault]:
 
 
 def found_by(copy: Path, fault: Fault) -> str:
-    """The first test that fails with a fault in the copy; empty if none does."""
+    """The first test that fails with a fault in the copy, and passes without it; empty if none does."""
+    own = f"tests/{fault.room}" if (copy / "tests" / fault.room).is_dir() else "tests/project"
     (copy / fault.file).write_text(fault.mutant.text, "utf-8")
-    try:
-        if fault.room == "core":  # also in what is compiled from it
-            for tool in ("make_core.py", "compile_core.py"):
-                _run(copy, f"SKYLESS_UNCOMPILED=1 PYTHONPATH=src .venv/bin/python tools/{tool}")
-        own = f"tests/{fault.room}" if (copy / "tests" / fault.room).is_dir() else "tests/project"
-        for tests in (f"-n 2 --tiers unit,site {own}", f"-n 2 --tiers unit,site --ignore={own}", "--tiers live"):
-            said = _run(copy, f".venv/bin/pytest -x -q --tb=no -rfE {tests}")
-            failed = [line.split()[1] for line in said.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-            if failed:
-                return failed[0]
-    finally:
-        _run(copy, "git checkout -q .")
+    _compile(copy, fault)
+    test = ""
+    for options in (f"-n 2 --tiers unit,site {own}", f"-n 2 --tiers unit,site --ignore={own}", "--tiers live"):
+        test = test or _first_failure(copy, options)
+    (copy / fault.file).write_bytes((ROOT / fault.file).read_bytes())
+    _compile(copy, fault)
+    if test and _first_failure(copy, f"--tiers unit,site,live {shlex.quote(test)}"):
+        raise SystemExit(f"{test} fails without a fault")
+    return test
+
+
+def _compile(copy: Path, fault: Fault) -> None:
+    """Make what is compiled from the core again."""
+    if fault.room == "core":
+        for tool in ("make_core.py", "compile_core.py"):
+            _run(copy, f"SKYLESS_UNCOMPILED=1 PYTHONPATH=src .venv/bin/python tools/{tool}")
+
+
+def _first_failure(copy: Path, options: str) -> str:
+    """The first test that fails; empty if all pass."""
+    code, said = _run(copy, f".venv/bin/pytest -x -q --tb=no -rfE {options}")
+    for line in said.splitlines():
+        if line.startswith(("FAILED ", "ERROR ")):
+            return line.split(" ", 1)[1].split(" - ")[0]
+    if code not in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
+        raise SystemExit(f"the tests do not run: {said}")
     return ""
 
 
-def _run(copy: Path, command: str) -> str:
-    """Run a command in the copy as a user's shell would, and return what it said."""
+def _run(copy: Path, command: str) -> tuple[int, str]:
+    """Run a command in the copy as a user's shell would; its exit status, and what it said."""
     shell = f". scripts/environment; forget_developers_settings; make_environment dev; {command}"
-    return subprocess.run(
+    ended = subprocess.run(
         ["bash", "-c", shell], cwd=copy, check=False, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-    ).stdout
+    )
+    return ended.returncode, ended.stdout
 
 
 def main() -> int:

@@ -462,7 +462,7 @@ def test_an_anchor_lies_about_its_stamps(method, error_ns):
 
 
 @pytest.mark.parametrize(
-    "told", [{4: MasterTime(77, 1.0)}, {4: lie(1e-6), 5: lie(2e-6)}], ids=["constant", "two liars"]
+    "told", [{4: MasterTime(77, 1.0)}, {4: lie(1e-6), 5: lie(2e-6)}], ids=["constant", "two wrong"]
 )
 def test_a_wrong_time_of_the_master_at_the_start_gives_no_wrong_fix(told):
     """By it the start does not go while raw stamps lead to more anchors."""

@@ -169,13 +169,13 @@ REVOKED = ChainKeys(chain(serial=1)).certificate(FIRST)
 
 def test_a_revoked_chain_is_reported_rather_than_what_else_its_anchor_does():
     listener = Listener(least_serial=2, certificates=[])
-    told = []
+    found = []
     for after, certificate in ((0, REVOKED), (1, None), (5, REVOKED), (FAULT_TICKS + 4, None), (FAULT_TICKS + 5, None)):
         sent = beacon(1, 0, 0.0)
         sent = sent if certificate is None else Beacon(SITE, 1, 0, 0, 0, 0x20, None, (), 0, None, certificate)
         listener.verifier.add(sent, Reception(b"", wrap(10**9 + after), after * TICK_S), START_S)
-        told.append(listener.verifier.faults()[1])
-    assert told == [Fault.REVOKED_CHAIN] * 4 + [Fault.NO_CODE]
+        found.append(listener.verifier.faults()[1])
+    assert found == [Fault.REVOKED_CHAIN] * 4 + [Fault.NO_CODE]
     listener.verifier.newest_ticks += FAULT_TICKS - 1
     assert listener.verifier.faults() == {1: Fault.NO_CODE}
     listener.verifier.newest_ticks += 1

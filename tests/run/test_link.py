@@ -536,7 +536,7 @@ async def test_a_full_broker_is_named_as_the_reason_and_asked_again(tmp_path, ro
 
 @contextlib.asynccontextmanager
 async def player(answer):
-    """Where something gives one answer, whoever comes, and then listens without a word."""
+    """Where something gives every client one answer, and then listens without a word."""
 
     async def serve(reader, writer):
         writer.write(answer)

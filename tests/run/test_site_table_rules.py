@@ -196,7 +196,7 @@ def test_a_program_has_begun_with_its_first_online_status_or_health():
     tag = table.get("tag", "t1")
     table.add_health("tag", "t1", tag_health(), 2.0)
     assert (tag.since_s, tag.health_serial, table.healths_serial) == (1.0, 2, 2)
-    told = []
+    found = []
     for now_s, online, started_s in (
         (3.0, True, 1.0),
         (4.0, True, 1.0),
@@ -205,9 +205,9 @@ def test_a_program_has_begun_with_its_first_online_status_or_health():
         (7.0, True, 2.0),
     ):
         assert table.add_status(status(online=online, unix_s=started_s), now_s) is False
-        told.append(tag.since_s)
+        found.append(tag.since_s)
         assert tag.online is online
-    assert told == [3.0, 3.0, 5.0, 5.0, 7.0]
+    assert found == [3.0, 3.0, 5.0, 5.0, 7.0]
     assert (tag.status_serial, table.statuses_serial) == (5, 5)
 
 
@@ -252,12 +252,12 @@ def test_nodes_are_in_natural_order():
 def test_an_anchor_s_beacons_have_codes_since_the_first_health_with_a_chain_and_no_fault():
     table = SiteTable(0.0)
     stated = [(None, None), (1, None), (1, None), (1, "no-time"), (None, "no-time"), (1, None)]
-    told = []
+    found = []
     for now_s, (chain, fault) in enumerate(stated):
         table.add_health("anchor", "1", anchor_health(chain=chain, code_fault=fault), float(now_s))
-        told.append(table.get("anchor", "1").codes_s)
+        found.append(table.get("anchor", "1").codes_s)
         assert now_s or table.get("anchor", "1").codes_for_s(9.0) == 0.0
-    assert told == [None, 1.0, 1.0, None, None, 5.0]
+    assert found == [None, 1.0, 1.0, None, None, 5.0]
     assert table.get("anchor", "1").codes_for_s(8.0) == 3.0
 
 
