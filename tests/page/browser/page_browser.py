@@ -16,18 +16,22 @@ FLAGS = [
 ]
 
 
-def came(value, limit_s=6.0):
+LIMIT_S = 40.0
+"""A busy machine may take seconds for anything; only what never comes is an error."""
+
+
+def came(value):
     """What a function returns, as soon as it is true."""
-    end = time.monotonic() + limit_s
+    end = time.monotonic() + LIMIT_S
     while not (found := value()):
         assert time.monotonic() < end, "it has not come"
         time.sleep(0.02)
     return found
 
 
-def until(page, expression, arg=None, timeout_s=6.0):
+def until(page, expression, arg=None):
     """Wait for something in the page. Playwright's own waiting needs ``eval``, which the page's policy forbids."""
-    end = time.monotonic() + timeout_s
+    end = time.monotonic() + LIMIT_S
     while not page.evaluate(expression, arg):
         assert time.monotonic() < end, f"never: {expression}"
         time.sleep(0.03)
@@ -70,9 +74,9 @@ class Visit:
         own = ("Failed to load resource", "WebSocket connection", "getImageData")
         self.problems[:] = [text for text in self.problems if not any(words in text for words in own)]
 
-    def until(self, expression, arg=None, timeout_s=6.0):
+    def until(self, expression, arg=None):
         """Wait for something in the page."""
-        until(self.page, expression, arg, timeout_s)
+        until(self.page, expression, arg)
 
     def run(self, modules, body, given=None):
         """What statements of JavaScript return that use modules of the page by their last names."""

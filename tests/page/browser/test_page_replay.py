@@ -78,7 +78,7 @@ def test_it_plays_from_the_first_fix_to_the_end_and_anywhere_and_does_not_look_l
     page.select_option("#speed", "8")  # beyond what was fetched first, to the end, and again from the first fix
     replay.place_slider(60.0)
     page.click("#play")
-    replay.until("!skyless.state.player.playing", timeout_s=15.0)
+    replay.until("!skyless.state.player.playing")
     assert replay.at_s == 90.0
     assert replay.is_shown()
     page.click("#play")

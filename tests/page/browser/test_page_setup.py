@@ -39,7 +39,7 @@ class Site:
         return came(lambda: wanted(self.survey.facts) and self.survey.facts)
 
     def says(self, words):
-        self.page.wait_for_selector(f"#verdict:has-text('{words}')", timeout=9e3)
+        self.page.wait_for_selector(f"#verdict:has-text('{words}')")
 
     def positions_are(self, condition):
         self.until(f"{POSITIONS}.then((at) => {condition})")
@@ -107,7 +107,7 @@ def test_axes_are_named_by_lists_and_mirrored(site):
     here.given(lambda facts: facts["gauge"] == {"origin": 4, "x_axis": 6, "left": None})
     here.positions_are("Math.hypot(...at[4]) < 1e-9")
     before = page.evaluate(POSITIONS)
-    page.click("#mirror")
+    page.locator("#mirror").press("Enter")
     gauge = here.given(lambda facts: facts["gauge"]["left"] is not None)["gauge"]
     here.positions_are(f"at[{gauge['left']}][1] > 0")
     side = 1 if gauge["origin"] == 4 else -1

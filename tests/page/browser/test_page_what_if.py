@@ -167,7 +167,7 @@ def test_the_dialog(server, visit):
     page.click(".recording")
     shown.until("skyless.state.mode === 'replay' && !skyless.state.player.waiting")
     page.click("#what-if")
-    shown.until("document.querySelectorAll('#what-if-figures tr').length === 5", timeout_s=20.0)
+    shown.until("document.querySelectorAll('#what-if-figures tr').length === 5")
     rows = page.locator("#what-if-dialog table").first.locator("tr")
     problem = "document.querySelector('#what-if-dialog .problem').textContent"
     for number in (1, 2, 3, 4):
