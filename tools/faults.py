@@ -52,13 +52,14 @@ def drawn(number: int, seed: int) -> list[Fault]:
 
 
 def found_by(copy: Path, fault: Fault) -> str:
-    """The first test that fails with a fault in the copy, and passes without it; empty if none does."""
+    """The first test that fails twice with a fault in the copy, and passes without it; empty if none does."""
     own = f"tests/{fault.room}" if (copy / "tests" / fault.room).is_dir() else "tests/project"
     (copy / fault.file).write_text(fault.mutant.text, "utf-8")
     _compile(copy, fault)
     test = ""
     for options in (f"-n 2 --tiers unit,site {own}", f"-n 2 --tiers unit,site --ignore={own}", "--tiers live"):
-        test = test or _first_failure(copy, options)
+        if not test and (failed := _first_failure(copy, options)):
+            test = failed if _first_failure(copy, f"--tiers unit,site,live {shlex.quote(failed)}") else ""
     (copy / fault.file).write_bytes((ROOT / fault.file).read_bytes())
     _compile(copy, fault)
     if test and _first_failure(copy, f"--tiers unit,site,live {shlex.quote(test)}"):
