@@ -242,13 +242,13 @@ def test_an_anchor_in_use_that_is_not_in_the_table_stays():
     assert replaced_by(t, s, (0, 0, 0)) == -1
 
 
-@pytest.mark.parametrize("least_frames", [0, 1, 2])
+@pytest.mark.parametrize("least_frames", [0, 2])
 def test_memory_is_bounded_and_those_that_others_receive_stay(least_frames):
-    """Strangers come with any number of frames; anchors 1 to 9 are relayed by an anchor in use all the time."""
+    """Strangers come with any number of frames; anchors 1 to 9 are relayed by an anchor in use every 1.5 s."""
     draw, t = np.random.default_rng(1), Neighbours()
-    for number in range(450):
-        rx_ticks = number * from_seconds(0.01)
-        if number % 20 == 0:
+    for number in range(600):
+        rx_ticks = 5 * number * MS
+        if number % 300 == 0:
             add_relays(t, relays(*range(1, 10)), rx_ticks)
             for anchor in range(1, 10):
                 t.rows[find_neighbour(t, anchor)].frames = 2
