@@ -77,8 +77,8 @@ def search(count=0, *, turns=2, height_m=1.0, late=0, late_m=0.0):
     return q
 
 
-def go_on(q, anchor, count, turn=2, **late):
-    return try_start(q, sent(anchor, turn, **late), relayed_by(anchor, turn, range(1, count + 1)))
+def go_on(q, anchor, count, turn=2):
+    return try_start(q, sent(anchor, turn), relayed_by(anchor, turn, range(1, count + 1)))
 
 
 def packet_of(anchor, rx_ticks=0, *, tx_ticks=0, sequence=0, position_m=(0.0, 0.0, 0.0)):
