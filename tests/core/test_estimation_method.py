@@ -131,26 +131,6 @@ def test_an_open_start_is_repeated_once_its_errors_fit(seed):
     assert all(fix.hpl_m is not None and np.hypot(*error[:2]) < fix.hpl_m for _, fix, error in fixes[-300:])
 
 
-def neighbours_only(observation, n):
-    """An anchor that receives only those beside it."""
-    near = {(observation.anchor + 1) % n, (observation.anchor - 1) % n}
-    return replace(observation, relays=tuple(r for r in observation.relays if r[0] in near))
-
-
-def test_clocks_lead_from_anchor_to_anchor():
-    episode = episode_of(CALM, 60)
-    observations = [neighbours_only(o, len(LAB_M)) for o in observations_of(episode.packets)]
-    fixes = list(fixes_of(Estimation(settings_of(CALM)), observations, episode.path_m))
-    assert fixes[0][0] < 3 * len(LAB_M)
-    assert max(np.linalg.norm(error) for _, _, error in fixes) < 0.2
-
-
-def test_without_any_link_between_clocks_there_is_no_start():
-    method = Estimation(settings_of(MESH))
-    bare = [replace(o, relays=()) for o in observations_of(episode_of(MESH, 30).packets)]
-    assert {method.update(o) for o in bare} <= {NoFixReason.TOO_FEW_ANCHORS, NoFixReason.ACQUIRING}
-
-
 def test_an_anchor_that_was_never_received_joins_later():
     episode = episode_of(CALM, 60)
     method = Estimation(settings_of(CALM))
