@@ -168,7 +168,7 @@ def page_row(browser, tags, anchors, seconds):
     with served(tags, anchors) as address:
         page = browser.new_page(viewport={"width": 1440, "height": 900})
         page.goto(address)
-        until(page, f"window.skyless?.live.sorted.length >= {min(tags, 500)}", timeout_s=60.0)
+        until(page, f"window.skyless?.live.sorted.length >= {min(tags, 500)}")
         time.sleep(5.0)
         session = page.context.new_cdp_session(page)
         session.send("Performance.enable", {"timeDomain": "threadTicks"})
