@@ -10,7 +10,7 @@ from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covar
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.machine import cores
 from skyless.research.studies.efficiency import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path
-from skyless.research.uncertainty import BoundSettings, tracking_bound
+from skyless.research.uncertainty import BoundSettings, Chain, tracking_bound
 from skyless.sim.lab import paper_lab_site
 from support.dense_covariance import position_covariance
 
@@ -145,3 +145,17 @@ def test_more_information_never_makes_the_bound_worse():
 def test_a_path_must_have_whole_superframes():
     with pytest.raises(ValueError, match="7 positions, no multiple of 6 anchors"):
         tracking_bound(LAB, np.zeros((7, 3)), settings_of())
+
+
+def test_stamps_of_perfect_anchors_are_the_masters_readings_when_they_sent():
+    """Nothing is left by the synchronisation of anchors whose clocks run at the true rate."""
+    delay_s, spacing_s = np.array([0.01, 0.02]), np.array([0.1, 0.3])
+    one = np.ones(2)
+    chain = Chain(
+        master_offset_s=3.0, master_rate=1.5, tag_offset_s=0.0, tag_rate=1.0, anchor_offset_s=7.0 * one,
+        anchor_rate=one, anchor_tof_s=0.1 * one, tag_tof_s=0.2 * one, tag_master_tof_s=0.3, sync_s=1.0,
+        sync_spacing_s=0.5, reference_s=2.0, delay_s=delay_s, spacing_s=spacing_s, sigma_master_s=1e-10,
+        sigma_anchor_s=1e-10, sigma_tag_s=1e-10,
+    )  # fmt: skip
+    sent_s = 2.0 + delay_s + np.array([0.0 * one, spacing_s])
+    np.testing.assert_allclose([chain.X1, chain.X2], 3.0 + 1.5 * sent_s)
