@@ -65,7 +65,7 @@ def relayed_by(anchor, turn, others):
 
 
 def search(count=0, *, turns=2, height_m=1.0, late=0, late_m=0.0):
-    """A search that has so many turns of these anchors' packets; those of one may be late."""
+    """A search after this number of turns of the anchors' packets; those of one may be late."""
     q = Acquisition(
         knows_height=height_m is not None, height_m=height_m or 0.0, variance_m2=0.0008, max_age_s=0.5,
         speed_std_mps=2.0, error_variance_m2=0.0001, tuning=TUNING,

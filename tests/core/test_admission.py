@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from skyless.core.air.beacon import Beacon, fields_of
 from skyless.core.air.frame import Heard
@@ -242,19 +244,23 @@ def test_an_anchor_in_use_that_is_not_in_the_table_stays():
     assert replaced_by(t, s, (0, 0, 0)) == -1
 
 
-@pytest.mark.parametrize("least_frames", [0, 2])
-def test_memory_is_bounded_and_those_that_others_receive_stay(least_frames):
-    """Strangers come with any number of frames; anchors 1 to 9 are relayed by an anchor in use every 1.5 s."""
-    draw, t = np.random.default_rng(1), Neighbours()
-    for number in range(600):
-        rx_ticks = 5 * number * MS
-        if number % 300 == 0:
+@pytest.mark.site
+@settings(max_examples=20)
+@given(
+    st.lists(st.tuples(st.integers(0, 3), st.integers(1, 1000)), min_size=400, max_size=500), st.sampled_from([20, 190])
+)
+def test_memory_is_bounded_and_those_that_others_receive_stay(rows, every):
+    """Strangers come with any number of frames; an anchor in use relays anchors 1 to 9 every 0.2 s or 1.9 s."""
+    t = Neighbours()
+    for number, (frames, stranger) in enumerate(rows):
+        rx_ticks = number * 10 * MS
+        if number % every == 0:
             add_relays(t, relays(*range(1, 10)), rx_ticks)
             for anchor in range(1, 10):
                 t.rows[find_neighbour(t, anchor)].frames = 2
-        identifier = 1000 + 100 * number + int(draw.integers(1000))
+        identifier = 1000 + 100 * number + stranger
         t.row = neighbour_of(t, identifier, rx_ticks)
-        t.rows[t.row].frames = int(draw.integers(least_frames, 4))
+        t.rows[t.row].frames = frames
         assert t.rows[t.row].anchor == identifier
     identifiers = {t.rows[row].anchor for row in range(t.count)}
     assert len(identifiers) == t.count == MAX_NEIGHBOURS

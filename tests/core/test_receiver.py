@@ -375,6 +375,23 @@ def test_the_tags_own_counter_starts_anew(method):
     assert receiver.counters["counter-jump"] == 1
 
 
+@pytest.mark.parametrize("method", EVERY_METHOD)
+@pytest.mark.parametrize("bit", [34, 37, 38, 39])
+def test_a_damaged_stamp_of_the_tag_is_as_if_its_frame_had_not_come(method, bit):
+    heard = [replace(one, host_s=None) for one in tape(LAB, 1.5)]
+    damaged, spared = Receiver(method), Receiver(method)
+    place = len(heard) // 2
+    for number, one in enumerate(heard):
+        flipped = replace(one, rx_ticks=one.rx_ticks ^ (1 << bit)) if number == place else one
+        fix = damaged.hear(flipped.reception)
+        if number != place:
+            other = spared.hear(one.reception)
+            assert (fix is None) is (other is None)
+            assert fix is None or fix.position_m.tolist() == other.position_m.tolist()
+    assert damaged.counters["counter-jump"] == 0
+    assert fix is not None
+
+
 # Other sites, liars, forgers
 
 
@@ -445,12 +462,12 @@ def test_an_anchor_lies_about_its_stamps(method, error_ns):
 
 
 @pytest.mark.parametrize(
-    "told", [{4: MasterTime(77, 1.0)}, {4: lie(1e-6), 5: lie(2e-6)}], ids=["constant", "two wrong"]
+    "stated", [{4: MasterTime(77, 1.0)}, {4: lie(1e-6), 5: lie(2e-6)}], ids=["constant", "two wrong"]
 )
-def test_a_wrong_time_of_the_master_at_the_start_gives_no_wrong_fix(told):
+def test_a_wrong_time_of_the_master_at_the_start_gives_no_wrong_fix(stated):
     """By it the start does not go while raw stamps lead to more anchors."""
     heard = [one for one in tape() if one.host_s > 0.3]
-    for anchor, master_time in told.items():
+    for anchor, master_time in stated.items():
         heard = tampered(heard, anchor, master_time=master_time)
     assert len(listen(Receiver(), heard)) > 0.75 * len(heard)
 
