@@ -42,6 +42,8 @@ class Packet(Struct, frozen=True, gc=False):
     """Sender's position as it reports it."""
     carrier_phase_cycles: float | None = None
     """Carrier phase as the tag received it (``Reception.carrier_phase_cycles``)."""
+    claims_common_time: bool = False
+    """Whether its sender states that ``tx_ticks`` is in a time common to all anchors."""
 
 
 class PairTdoa(Struct, frozen=True, gc=False):

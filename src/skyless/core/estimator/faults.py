@@ -14,7 +14,7 @@ anchor's range error, which gives the state that the filter would have if that e
 
 from typing import Final
 
-from skyless.core.estimator.kalman import open_direction, reset_state
+from skyless.core.estimator.kalman import motion_noise, open_direction, reset_state
 from skyless.core.estimator.state import (
     ALL_RANGE_ERRORS,
     AXES,
@@ -325,7 +325,7 @@ def has_phase(s: State, anchor: int) -> bool:
 
 def horizontal_variance_m2(s: State, ahead_s: float) -> float:
     """Sum of the variances of x and y after ``ahead_s`` without receptions."""
-    total = 2.0 * s.settings.qa * s.status.q_scale * ahead_s * ahead_s * ahead_s / 3.0
+    total = 2.0 * motion_noise(s) * ahead_s * ahead_s * ahead_s / 3.0
     for axis in range(2):
         speed = s.layout.velocity + axis
         total += s.P[at(axis, axis)] + ahead_s * (2.0 * s.P[at(axis, speed)] + ahead_s * s.P[at(speed, speed)])

@@ -33,16 +33,13 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     """
     status, settings, where = s.status, s.settings, s.layout
     dt = min((rx_ticks - status.epoch_ticks) * TICK_S, LONGEST_S)
-    speed_squared = 0.0
-    for axis in range(s.dim):
-        speed_squared += square(s.x[where.velocity + axis])
-    status.walked_m += sqrt(speed_squared) * dt
+    status.walked_m += sqrt(_speed_squared(s)) * dt
     if status.obstruction > 0.0:
         status.obstruction *= exp(-dt / s.tuning.obstruction_memory_s)
     for axis in range(s.dim):
         status.line_m[axis] += s.x[where.velocity + axis] * dt
     _advance(s, dt)
-    motion, white_m2 = settings.qa * status.q_scale, settings.white * dt
+    motion, white_m2 = motion_noise(s), settings.white * dt
     if is_stationary(s):
         motion *= s.tuning.stationary_noise_share
     square_s, cube_s = dt * dt / 2.0, dt * dt * dt / 3.0
@@ -60,6 +57,19 @@ def predict(s: State, rx_ticks: Ticks) -> None:
         for other in range(where.offset, one + 1):
             _add_noise(s, one, other, white_m2 + walk * cube_s, walk * square_s, walk * dt)
     status.epoch_ticks = rx_ticks
+
+
+def _speed_squared(s: State) -> float:
+    """Square of the tag's speed."""
+    total = 0.0
+    for axis in range(s.dim):
+        total += square(s.x[s.layout.velocity + axis])
+    return total
+
+
+def motion_noise(s: State) -> float:
+    """Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need."""
+    return s.settings.qa * max(s.status.q_scale, _speed_squared(s) / square(s.tuning.walking_mps))
 
 
 def is_stationary(s: State) -> bool:

@@ -230,7 +230,10 @@ def adapt_process_noise(s: State, normalised: float) -> None:
         lag_square += square(status.lag[axis])
     lag_square *= (2.0 - gain) / gain
     status.lag_square += tuning.forgetting * (lag_square - status.lag_square)
-    status.q_scale = _adapted(s, status.q_scale, status.lag_square > tuning.lag_limit, tuning.max_scale)
+    if lag_square > tuning.sudden_lag:
+        status.q_scale = min(2.0 * status.q_scale, tuning.max_scale)
+    else:
+        status.q_scale = _adapted(s, status.q_scale, status.lag_square > tuning.lag_limit, tuning.max_scale)
     status.common_mean += gain * (normalised - status.common_mean)
     is_clock_off = _is_off_zero(s, status.common_mean)
     status.walk_scale = _adapted(s, status.walk_scale, is_clock_off, tuning.max_walk_scale)

@@ -39,7 +39,11 @@ class Tuning(Record):
     max_scale: float = 100.0
     """Largest factor on the process noise of motion, and on that of a range error that has jumped."""
     lag_limit: float = 3.5
-    """Mean square of the innovations along the axes (1 if the filter is right) beyond which that noise grows."""
+    """Mean square of the innovations along the axes (1 if the filter is right) beyond which that noise grows …"""
+    sudden_lag: float = 9.0
+    """… and the square of their running mean beyond which it doubles with each innovation."""
+    walking_mps: float = 4.0
+    """Speed above which that noise is at least its setting × (speed over this)², as turns then accelerate more [m/s]."""
     better_known: float = 0.8
     """The position of a tag at rest is updated once its variance has shrunk to this fraction."""
     stationary_noise_share: float = 2e-7

@@ -170,6 +170,8 @@ INTERNAL void learn_lasting(State *s, real *m, real weight, real shown);
 INTERNAL void forget_lasting(State *s, int32_t anchor);
 INTERNAL void weigh_zero(State *s, int32_t anchor, real weight);
 INTERNAL void predict(State *s, int64_t rx_ticks);
+INTERNAL real speed_squared(State *s);
+INTERNAL real motion_noise(State *s);
 INTERNAL bool is_stationary(State *s);
 INTERNAL void advance(State *s, real dt);
 INTERNAL void advance_packed(State *s, int32_t values, real dt);
@@ -2033,11 +2035,7 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     EstimatorSettings *settings = &s->settings;
     Layout *where = &s->layout;
     real dt = min_real((real)(rx_ticks - status->epoch_ticks) * TICK_S, LONGEST_S);
-    real speed_squared = REAL(0.0);
-    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        speed_squared += square(s->x[where->velocity + axis]);
-    }
-    status->walked_m += SQRT(speed_squared) * dt;
+    status->walked_m += SQRT(speed_squared(s)) * dt;
     if (status->obstruction > REAL(0.0)) {
         status->obstruction *= exp_(-dt / s->tuning.obstruction_memory_s);
     }
@@ -2045,7 +2043,7 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
         status->line_m[axis] += s->x[where->velocity + axis] * dt;
     }
     advance(s, dt);
-    real motion = settings->qa * status->q_scale;
+    real motion = motion_noise(s);
     real white_m2 = settings->white * dt;
     if (is_stationary(s)) {
         motion *= s->tuning.stationary_noise_share;
@@ -2070,6 +2068,20 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
         }
     }
     status->epoch_ticks = rx_ticks;
+}
+
+/* Square of the tag's speed. */
+INTERNAL real speed_squared(State *s) {
+    real total = REAL(0.0);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        total += square(s->x[s->layout.velocity + axis]);
+    }
+    return total;
+}
+
+/* Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need. */
+INTERNAL real motion_noise(State *s) {
+    return s->settings.qa * max_real(s->status.q_scale, speed_squared(s) / square(s->tuning.walking_mps));
 }
 
 /* Whether the tag has shown no motion for long enough to count as stationary.
@@ -2817,7 +2829,7 @@ INTERNAL bool relays_fit(State *s) {
 
 /* Sum of the variances of x and y after ``ahead_s`` without receptions. */
 INTERNAL real horizontal_variance_m2(State *s, real ahead_s) {
-    real total = REAL(2.0) * s->settings.qa * s->status.q_scale * ahead_s * ahead_s * ahead_s / REAL(3.0);
+    real total = REAL(2.0) * motion_noise(s) * ahead_s * ahead_s * ahead_s / REAL(3.0);
     for (int32_t axis = 0; axis < 2; axis++) {
         int32_t speed = s->layout.velocity + axis;
         total += s->P[at(axis, axis)] + ahead_s * (REAL(2.0) * s->P[at(axis, speed)] + ahead_s * s->P[at(speed,
@@ -3097,7 +3109,11 @@ INTERNAL void adapt_process_noise(State *s, real normalised) {
     }
     lag_square *= (REAL(2.0) - gain) / gain;
     status->lag_square += tuning->forgetting * (lag_square - status->lag_square);
-    status->q_scale = adapted(s, status->q_scale, status->lag_square > tuning->lag_limit, tuning->max_scale);
+    if (lag_square > tuning->sudden_lag) {
+        status->q_scale = min_real(REAL(2.0) * status->q_scale, tuning->max_scale);
+    } else {
+        status->q_scale = adapted(s, status->q_scale, status->lag_square > tuning->lag_limit, tuning->max_scale);
+    }
     status->common_mean += gain * (normalised - status->common_mean);
     bool is_clock_off = is_off_zero(s, status->common_mean);
     status->walk_scale = adapted(s, status->walk_scale, is_clock_off, tuning->max_walk_scale);
@@ -6804,14 +6820,15 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .alert_limit_m = (real)__builtin_nan("")}, .tuning = {.restart_m = REAL(300.0), .start_walk_scale =
             REAL(100.0), .mean_gain = REAL(0.05), .noise_growth = REAL(1.2), .max_walk_scale = REAL(10000.0),
             .noise_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row = REAL(8.0), .steady_walk_scale = REAL(4.0),
-            .max_scale = REAL(100.0), .lag_limit = REAL(3.5), .better_known = REAL(0.8), .stationary_noise_share =
-            REAL(2e-07), .stationary_std_mps = REAL(0.01), .held_step_m = REAL(0.15), .held_max_m = REAL(0.4),
-            .curvature_share = REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02), .wrong_nis = REAL(2.0),
-            .slow_forgetting = REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5),
-            .difference_huber = REAL(1.0), .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share =
-            REAL(0.5), .suspect = REAL(3.0), .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0),
-            .first_change_scale = REAL(10.0), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk =
-            REAL(0.004), .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5),
+            .max_scale = REAL(100.0), .lag_limit = REAL(3.5), .sudden_lag = REAL(9.0), .walking_mps = REAL(4.0),
+            .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07), .stationary_std_mps = REAL(0.01),
+            .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share = REAL(0.01), .slope_from_m =
+            REAL(4.0), .forgetting = REAL(0.02), .wrong_nis = REAL(2.0), .slow_forgetting = REAL(0.005),
+            .late_often_share = REAL(0.02), .reception_huber = REAL(1.5), .difference_huber = REAL(1.0),
+            .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share = REAL(0.5), .suspect = REAL(3.0),
+            .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0), .first_change_scale =
+            REAL(10.0), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk = REAL(0.004),
+            .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5),
             .obstructed_std_m = REAL(0.05), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1), .place_first =
             REAL(20.0), .place_samples = REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 = REAL(0.0012),
             .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3), .recent_std_m =

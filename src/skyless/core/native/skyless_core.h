@@ -676,8 +676,11 @@ typedef struct Tuning {
     /* Largest factor on the random walk of a clock at which an anchor's report is used: its filter assumes 1. */
     real steady_walk_scale;
     real max_scale;  /* Largest factor on the process noise of motion, and on that of a range error that has jumped. */
-    /* Mean square of the innovations along the axes (1 if the filter is right) beyond which that noise grows. */
+    /* Mean square of the innovations along the axes (1 if the filter is right) beyond which that noise grows … */
     real lag_limit;
+    real sudden_lag;  /* … and the square of their running mean beyond which it doubles with each innovation. */
+    /* Speed above which that noise is at least its setting × (speed over this)², as turns then accelerate more [m/s]. */
+    real walking_mps;
     real better_known;  /* The position of a tag at rest is updated once its variance has shrunk to this fraction. */
     real stationary_noise_share;  /* Fraction of the process noise of motion kept at rest: 5 cm within half a minute. */
     real stationary_std_mps;  /* Standard deviation of the velocity of a tag at rest [m/s]. */

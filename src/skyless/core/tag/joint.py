@@ -101,6 +101,13 @@ class Estimation:
         """Whether there is no position yet."""
         return self.course.is_starting
 
+    def expect_period(self, period_s: float) -> None:
+        """Let a search for a start expect anchors that send once in this time."""
+        if period_s != self.course.superframe_s:
+            self.course.superframe_s = period_s
+            fill_ages(self.course.settings, period_s)
+            _begin_course(self.course, self.search)
+
     def clock(self, anchor: int) -> tuple[int, float, float] | None:
         """Tag's clock minus an anchor's: whole ticks, the rest in m, rate in m/s. None if it is not in the state."""
         return self._estimator.clock(anchor)

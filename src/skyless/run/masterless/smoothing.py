@@ -25,7 +25,7 @@ from skyless.core.any_receiver import SiteBeacon, decode_any
 from skyless.core.arrays import Indices, Matrix, Vector
 from skyless.core.errors import SkylessError
 from skyless.core.estimator.compiled import find_anchor
-from skyless.core.estimator.kalman import is_stationary, range_error_decay
+from skyless.core.estimator.kalman import is_stationary, motion_noise, range_error_decay
 from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import covariances
 from skyless.core.fix import POSITION, VELOCITY, Fix, NoFixReason
@@ -211,7 +211,7 @@ def _transition(tracking: DifferenceTracking, event: Event, states: _States) -> 
         decays.append(_decay(states.change + column, kept, variance))
         if kept_constant < 1.0:
             decays.append(_decay(states.constant + column, kept_constant, settings.range_std_m**2))
-    q = settings.qa * status.q_scale * (TUNING.stationary_noise_share if is_stationary(s) else 1.0)
+    q = motion_noise(s) * (TUNING.stationary_noise_share if is_stationary(s) else 1.0)
     return dt_s, q, decays
 
 

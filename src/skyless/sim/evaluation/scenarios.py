@@ -296,10 +296,11 @@ def _walk(request: Request, index: int) -> Trajectory:
     """Walk in a loop between random points inside the box, turning gently at each."""
     low, high = _walkable_box(request.site, walked_floor(request.site, request.tags or 1, index))
     generator = np.random.default_rng([request.seed, index])
-    points = [generator.uniform(low, high)]
+    points, shortest_m = [generator.uniform(low, high)], np.linalg.norm(high - low) / 4.0
     while len(points) < WAYPOINTS:
         point = generator.uniform(low, high)
-        if np.linalg.norm(point - points[-1]) > np.linalg.norm(high - low) / 4.0:
+        neighbours = [points[-1], points[0]] if len(points) == WAYPOINTS - 1 else [points[-1]]
+        if all(np.linalg.norm(point - other) > shortest_m for other in neighbours):
             points.append(point)
     return _smooth_path(points, request.speed_mps or 1.0)
 
