@@ -155,7 +155,7 @@ class Tuning(Record):
 
     # Starts, and what is lost
     start_age_s: float = 0.5
-    """Older packets are not used for a start; in longer superframes, only for the rate of the clock [s]."""
+    """Older packets are not used for a start, unless the superframe is longer [s]."""
     curved_std: float = 0.1
     """Fraction of the mean range beyond which ranges are curved within a standard deviation, and updates would make the
     filter overconfident in a wrong position. There is no level then, and no prediction."""
@@ -175,8 +175,10 @@ class Tuning(Record):
     """After a longer silence the state is worse than a new start [s]."""
     slow_superframe_s: float = 0.2
     """In longer superframes, where a new start takes seconds, a silence may widen the state more [s] …"""
-    slow_curved_std: float = 0.2
-    """… up to this fraction of the mean range."""
+    slow_curved_std: float = 0.7
+    """… up to this fraction of the mean range …"""
+    slow_start_std: float = 2.0
+    """… and a start, which goes back to the packets before, up to this multiple of it; otherwise up to 1."""
     longest_superframe_s: float = 2.0
     """In longer superframes a tag may move by metres: each round of packets is a start of its own [s]."""
     heights_in_row: float = 20

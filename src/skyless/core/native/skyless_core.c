@@ -5901,7 +5901,7 @@ INTERNAL void choose_pairs(Acquisition *q, int64_t now) {
     q->pair_count = 0;
     for (int32_t place = 0, place_end = q->count; place < place_end; place++) {
         real age_s = (real)(now - q->heard[place].newer.packet.rx_ticks) * TICK_S;
-        if (q->heard[place].count == 2 && age_s < q->tuning.start_age_s) {
+        if (q->heard[place].count == 2 && age_s < q->start_age_s) {
             q->pairs[q->pair_count] = place;
             q->pair_count += 1;
         }
@@ -6375,6 +6375,7 @@ INTERNAL void begin_search(Course *c, Acquisition *q) {
     q->high_m = settings->highest_m;
     q->variance_m2 = settings->tx_variance_m2 + settings->rx_variance_m2;
     q->max_age_s = max_real(tuning->start_age_s, REAL(2.5) * c->superframe_s);
+    q->start_age_s = max_real(tuning->start_age_s, c->superframe_s);
     q->speed_std_mps = settings->start_speed_std_mps;
     q->error_variance_m2 = square(settings->range_std_m) + square(settings->survey_std_m);
     q->rival_count = 0;
@@ -6518,9 +6519,9 @@ INTERNAL bool begin_filter(Course *c, State *s, Acquisition *q, Relays *relays) 
     real speed_m2ps2 = square(c->settings.start_speed_std_mps);
     real moved_m2 = square((real)(start->rx_ticks_tag - begin_ticks) * TICK_S) * speed_m2ps2;
     use_only(c, q);
-    real horizontal_m2 = inflation * start->covariance_m2[0][0] + moved_m2 + (inflation * start->covariance_m2[1][1] +
-            moved_m2);
-    if (horizontal_m2 > square(mean_range_m(c, start->position_m))) {
+    real horizontal_m2 = inflation * (start->covariance_m2[0][0] + start->covariance_m2[1][1]) + REAL(2.0) * moved_m2;
+    real part = c->superframe_s > tuning->slow_superframe_s ? tuning->slow_start_std : REAL(1.0);
+    if (horizontal_m2 > square(part * mean_range_m(c, start->position_m))) {
         return false;
     }
     c->is_starting = false;
@@ -6837,17 +6838,17 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s = REAL(0.5), .curved_std = REAL(0.1),
             .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s = REAL(1.0), .start_margin =
             REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0), .slow_superframe_s = REAL(0.2),
-            .slow_curved_std = REAL(0.2), .longest_superframe_s = REAL(2.0), .heights_in_row = REAL(20.0),
-            .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late = REAL(2.0), .late_penalty =
-            REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s = REAL(1.0), .median_difference_std_m
-            = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5), .height_margin_m = REAL(1.0),
-            .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0), .zero_variance_m2 = REAL(10000.0),
-            .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006), .phase_mesh_std_m = REAL(0.0012),
-            .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02),
-            .phase_former_s = REAL(0.5), .phases_in_row = REAL(4.0), .uncovered_chi2 = REAL(240.0), .max_open_level_std
-            = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2
-            = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true, .misfit = -1, .relays_may_contradict =
-            true, .may_begin_again = true};
+            .slow_curved_std = REAL(0.7), .slow_start_std = REAL(2.0), .longest_superframe_s = REAL(2.0),
+            .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late =
+            REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s =
+            REAL(1.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),
+            .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
+            .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
+            .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =
+            REAL(0.1), .phase_step_m = REAL(0.02), .phase_former_s = REAL(0.5), .phases_in_row = REAL(4.0),
+            .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m
+            = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting
+            = true, .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
     t->owner.qa = qa;
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;

@@ -746,8 +746,7 @@ typedef struct Tuning {
     real pair_relays;  /* Relays in each direction after which their mean is a range. */
     /* Number of such ranges beyond ``suspect``, more than at the other end, that mark an anchor as misplaced. */
     real misplaced_pairs;
-    /* Older packets are not used for a start; in longer superframes, only for the rate of the clock [s]. */
-    real start_age_s;
+    real start_age_s;  /* Older packets are not used for a start, unless the superframe is longer [s]. */
     /* Fraction of the mean range beyond which ranges are curved within a standard deviation, and updates would make the
      * filter overconfident in a wrong position. There is no level then, and no prediction. */
     real curved_std;
@@ -766,7 +765,9 @@ typedef struct Tuning {
     real longest_silence_s;  /* After a longer silence the state is worse than a new start [s]. */
     /* In longer superframes, where a new start takes seconds, a silence may widen the state more [s] … */
     real slow_superframe_s;
-    real slow_curved_std;  /* … up to this fraction of the mean range. */
+    real slow_curved_std;  /* … up to this fraction of the mean range … */
+    /* … and a start, which goes back to the packets before, up to this multiple of it; otherwise up to 1. */
+    real slow_start_std;
     /* In longer superframes a tag may move by metres: each round of packets is a start of its own [s]. */
     real longest_superframe_s;
     real heights_in_row;  /* Consecutive heights that do not fit at which the position is wrong. */
@@ -1210,6 +1211,7 @@ typedef struct Acquisition {
     real high_m;
     real variance_m2;  /* Variance of a TX and an RX timestamp together. */
     real max_age_s;
+    real start_age_s;  /* Packets that are older are used only for rates. */
     real speed_std_mps;  /* Assumed standard deviation of the tag's speed. */
     real error_variance_m2;  /* Variance of survey and range errors. */
     Tuning tuning;

@@ -98,6 +98,8 @@ class Acquisition(Record):
     variance_m2: float
     """Variance of a TX and an RX timestamp together."""
     max_age_s: float
+    start_age_s: float
+    """Packets that are older are used only for rates."""
     speed_std_mps: float
     """Assumed standard deviation of the tag's speed."""
     error_variance_m2: float
@@ -291,7 +293,7 @@ def _choose_pairs(q: Acquisition, now: Ticks) -> None:
     q.pair_count = 0
     for place in range(q.count):
         age_s = (now - q.heard[place].newer.packet.rx_ticks) * TICK_S
-        if q.heard[place].count == 2 and age_s < q.tuning.start_age_s:
+        if q.heard[place].count == 2 and age_s < q.start_age_s:
             q.pairs[q.pair_count] = place
             q.pair_count += 1
 

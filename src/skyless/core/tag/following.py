@@ -264,6 +264,7 @@ def _begin_search(c: Course, q: Acquisition) -> None:
     q.low_m, q.high_m = settings.lowest_m, settings.highest_m
     q.variance_m2 = settings.tx_variance_m2 + settings.rx_variance_m2
     q.max_age_s = max(tuning.start_age_s, 2.5 * c.superframe_s)
+    q.start_age_s = max(tuning.start_age_s, c.superframe_s)
     q.speed_std_mps = settings.start_speed_std_mps
     q.error_variance_m2 = square(settings.range_std_m) + square(settings.survey_std_m)
     q.rival_count = 0
@@ -392,10 +393,9 @@ def _begin_filter(c: Course, s: State, q: Acquisition, relays: Relays) -> bool:
     begin_ticks, speed_m2ps2 = b.packets[0].packet.rx_ticks, square(c.settings.start_speed_std_mps)
     moved_m2 = square((start.rx_ticks_tag - begin_ticks) * TICK_S) * speed_m2ps2
     _use_only(c, q)
-    horizontal_m2 = (
-        inflation * start.covariance_m2[0][0] + moved_m2 + (inflation * start.covariance_m2[1][1] + moved_m2)
-    )
-    if horizontal_m2 > square(_mean_range_m(c, start.position_m)):
+    horizontal_m2 = inflation * (start.covariance_m2[0][0] + start.covariance_m2[1][1]) + 2.0 * moved_m2
+    part = tuning.slow_start_std if c.superframe_s > tuning.slow_superframe_s else 1.0
+    if horizontal_m2 > square(part * _mean_range_m(c, start.position_m)):
         return False
     c.is_starting = False
     c.newest_ticks = c.started_ticks = b.packets[b.count - 1].packet.rx_ticks
