@@ -129,6 +129,8 @@ class ReplayResult(Result, frozen=True, eq=False):
         for pair, by_m in report.contradictions_m.items():
             nearer = "nearer" if by_m < 0.0 else "farther"
             yield f"anchors {pair}", f"range each other {abs(by_m):.2f} m {nearer} than the table has them"
+        for note in report.notes:
+            yield "note", note
         for pair, distance_m in self.summary.get("anchor_distances_m", {}).items():
             yield f"distance {pair}", f"{distance_m:.3f} m"
 

@@ -656,6 +656,7 @@ def _packet(message: DtMessage, relays: tuple[Relay, ...]) -> Packet:
         message.rx_ticks_tag,
         relays,
         message.position_m,
+        claims_common_time=message.common_time,
     )
 
 

@@ -144,6 +144,11 @@ class Pipeline:
         return ()
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """What is wrong with the anchors, in sentences."""
+        return ()
+
+    @property
     def drops(self) -> Counter[str]:
         """What could not be used, by reason."""
         return Counter() if self._engine is None else Counter(self._engine.drops)
@@ -244,6 +249,11 @@ class ByPackets(Pipeline):
         self._tracking.tracking.update_height(height.height_m, height.std_m)
 
     @property
+    def notes(self) -> tuple[str, ...]:
+        """See ``Pipeline``."""
+        return self._tracking.notes
+
+    @property
     def drops(self) -> Counter[str]:
         """See ``Pipeline``."""
         return self._tracking.drops
@@ -322,6 +332,8 @@ class ReplayReport(Figures, frozen=True, kw_only=True):
     """Input of the filter, one of ``MEASUREMENTS``; None for the receptions of a site."""
     contradictions_m: dict[str, float] = field(default_factory=dict)
     """Pairs of anchors whose own ranging contradicts the table: how much farther (if negative, nearer) they are."""
+    notes: tuple[str, ...] = ()
+    """What is wrong with the anchors, in sentences."""
 
 
 def common_figures(
@@ -539,6 +551,7 @@ class CaptureReplay:
             method=filtered if own is None else getattr(own, "__name__", "own"),
             measurements=f"{self.measurements} and phases" if self._has_phases else self.measurements,
             contradictions_m={f"{a}-{b}": metres for (a, b), metres in by_m},
+            notes=self._pipeline.notes,
         )
 
 

@@ -29,6 +29,7 @@ from skyless.core.ticks import (
 )
 from skyless.run.masterless.difference_tracking import DIFFERENCES, Corners, is_within, neighbourhood_m
 from skyless.run.masterless.pair_engine import MAX_ANCHORS, remember
+from skyless.run.masterless.stamp_watch import StampWatch
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
 
 MASTERLESS_RANDOM_WALK_FM: Final = 5e-9
@@ -60,7 +61,7 @@ DL_TDOA_ONE_WAY: Final = DL_TDOA.changed(
 their clocks then, so it counts, with the survey's, as an error of the tag's range."""
 
 PERIOD_S: Final = 0.15
-"""Period of the slowest anchors, as assumed by the filter: they send 6 to 60 times per second."""
+"""Least period of anchors that the filter assumes; some send once a second."""
 
 RELAY_MAX_AGE_S: Final = 0.5
 """Greatest age of a relayed packet's reception, as a 7-bit sequence number recurs."""
@@ -68,20 +69,31 @@ RELAY_MAX_AGE_S: Final = 0.5
 RESTART_IN_ROW: Final = 3
 """Consecutive impossible stamps of an anchor that mean that its counter has restarted."""
 
+NOT_CALIBRATED: Final = (
+    "The anchors are not calibrated: no protection level. Record the tag at a known place, and use skyless calibrate "
+    "--at, or state each anchor's bias_m in their table, 0 where it is known to be."
+)
+
 BACK_IN_ROW: Final = 8
 """Consecutive packets from before the newest that mean that the tag's counter has restarted."""
+
+
+def spelled(anchor: int) -> str:
+    return f"{anchor:04X}"
 
 
 class _Anchor:
     """One anchor at the tag: its position, its newest stamps, and the stamps of its latest packets."""
 
-    __slots__ = ("anchor_m", "heard", "impossible", "position_m", "rx_ticks", "tx_ticks")
+    __slots__ = ("anchor_m", "heard", "impossible", "period_ticks", "position_m", "rx_ticks", "tx_ticks")
 
     def __init__(self, position_m: Point, tx_ticks: int, rx_ticks: int) -> None:
         self.position_m = position_m
         self.anchor_m = np.array(position_m)
         self.tx_ticks, self.rx_ticks = tx_ticks, rx_ticks
         self.impossible = 0
+        self.period_ticks = LAST_TICKS
+        """Shortest time between two packets."""
         self.heard: dict[int, tuple[int, int]] = {}
         """Sequence number → unwrapped (tx_ticks of the anchor, rx_ticks of the tag)."""
 
@@ -91,6 +103,7 @@ class _Anchor:
         if tx_ticks is None:
             self.impossible += 1
             return False
+        self.period_ticks = min(self.period_ticks, rx_ticks - self.rx_ticks)
         self.tx_ticks, self.rx_ticks, self.impossible = tx_ticks, rx_ticks, 0
         return True
 
@@ -111,7 +124,8 @@ class PacketTracking:
 
         ``tx_bits``: width of the anchors' stamps. ``calibration`` is subtracted from the tag's receptions; without one
         the anchors' antenna delays are estimated from their ranging of each other. ``one_way``: settings to use until
-        two anchors have relayed each other.
+        two anchors have relayed each other, for DL-TDoA; its fixes have no protection level without a calibration, as
+        constants of half a metre are usual.
         """
         self.reason = NoFixReason.NO_BEACONS
         self.time_s = 0.0
@@ -134,6 +148,8 @@ class PacketTracking:
         self._both_ways = settings
         self._pairs: set[tuple[int, int]] | None = None if one_way is None else set()
         """Pairs of listener and sender in relays, until two anchors have relayed each other."""
+        self._watch, self._faults = StampWatch(), 0
+        self._is_calibrated = calibration is not None or one_way is None
         self._tracking = self._new_tracking()
         self._area_m: Corners = ((), ())
         self._drops: Counter[str] = Counter()
@@ -165,6 +181,19 @@ class PacketTracking:
         """Pairs of anchors whose own ranging contradicts the positions; fixes then have no protection level."""
         return self._delays.contradictions_m
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What is wrong with the anchors, in sentences."""
+        own = [
+            f"Anchor {spelled(anchor)} runs on its own clock ({ppm:+.1f} ppm): its time base is lost."
+            for anchor, ppm in sorted(self._watch.own_clocks_ppm.items())
+        ]
+        flips = [
+            f"Stamps of anchor {spelled(anchor)} flip between two values {gap_m:.1f} m apart: no protection level."
+            for anchor, gap_m in sorted(self._watch.flips_m.items())
+        ]
+        return (*own, *flips, *(() if self._is_calibrated else (NOT_CALIBRATED,)))
+
     def on_packet(self, packet: Packet) -> Fix | None:
         """Process one packet. Returns a fix, or None with the ``reason``.
 
@@ -174,6 +203,20 @@ class PacketTracking:
         anchor = self._unwrap(packet)
         if anchor is None:
             return None
+        fault = self._watch.check(
+            packet.anchor, anchor.rx_ticks, anchor.tx_ticks, claims_common_time=packet.claims_common_time
+        )
+        if self._watch.changes > self._faults:
+            self._faults = self._watch.changes
+            self._begin_again()
+        if fault is not None:
+            self._drops[fault] += 1
+            self.reason = NoFixReason.RESIDUALS
+            return None
+        if self._tracking.is_starting:
+            periods = sorted([one.period_ticks for one in self._anchors.values() if one.period_ticks < LAST_TICKS])
+            if periods:
+                self._tracking.expect_period(max(periods[len(periods) // 2] * TICK_S, PERIOD_S))
         relays, phases = [], []
         for relay in packet.relays:
             rx_ticks = self._relayed(packet.anchor, anchor, relay)
@@ -195,8 +238,8 @@ class PacketTracking:
             _phase_of(packet),
             tuple(phases),
         )
-        if self._delays.contradictions_m:
-            self._tracking.estimator.withhold_levels()
+        is_sure = self._is_calibrated and self._watch.is_ready and not self._watch.flips_m
+        self._tracking.estimator.withhold_levels(not is_sure or bool(self._delays.contradictions_m))
         fix = self._tracking.update(observation)
         self.used = isinstance(fix, Fix)
         if not isinstance(fix, Fix):
@@ -212,10 +255,14 @@ class PacketTracking:
         assert self._pairs is not None
         if (sender, listener) in self._pairs:
             self._settings, self._pairs = self._both_ways, None
-            self._count_relays()
-            self._tracking = self._new_tracking()
+            self._begin_again()
         else:
             self._pairs.add((listener, sender))
+
+    def _begin_again(self) -> None:
+        """Search for a new start."""
+        self._count_relays()
+        self._tracking = self._new_tracking()
 
     def _new_tracking(self) -> Estimation:
         return Estimation(self._settings, self._z_bounds_m, self._time, PERIOD_S)
@@ -242,7 +289,7 @@ class PacketTracking:
         if abs(rx_ticks) > LAST_TICKS:
             self._drops["impossible-host-time"] += 1
             self._tag_clock, self._newest_rx_ticks = Unwrapper(), None
-            self._anchors.clear()
+            self._forget()
             return None
         if self._newest_rx_ticks is None:
             fix_time_s(self._time, rx_ticks, rx_ticks)
@@ -283,8 +330,13 @@ class PacketTracking:
         self._back_in_row += 1
         if self._back_in_row < BACK_IN_ROW:
             return False
-        self._anchors.clear()
+        self._forget()
         return True
+
+    def _forget(self) -> None:
+        """Forget all stamps, as the tag's counter has restarted."""
+        self._anchors.clear()
+        self._watch.forget()
 
     def _position_of(self, packet: Packet) -> Point | None:
         """The sender's position: as surveyed, else as stated in this or an earlier packet."""
