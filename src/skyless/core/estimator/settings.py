@@ -43,7 +43,7 @@ class Tuning(Record):
     sudden_lag: float = 9.0
     """… and the square of their running mean beyond which it doubles with each innovation."""
     walking_mps: float = 4.0
-    """Speed above which that noise is at least its setting × (speed over this)², as turns then accelerate more [m/s]."""
+    """Speed above which that noise is at least its setting × (speed over this)², for turns [m/s]."""
     better_known: float = 0.8
     """The position of a tag at rest is updated once its variance has shrunk to this fraction."""
     stationary_noise_share: float = 2e-7

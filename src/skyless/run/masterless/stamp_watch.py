@@ -9,12 +9,15 @@ from typing import Final
 
 import numpy as np
 
-from skyless.core.ticks import TICK_M, TICK_S
+from skyless.core.ticks import TICK_M, TICK_S, from_seconds
 
 OWN_RATE: Final = 2e-7
 """Difference of rates that no motion explains: 60 m/s."""
 OWN_IN_ROW: Final = 3
 """Consecutive packets with such a rate that show that a time base is lost, or without one that it is back."""
+
+COMPARED_TICKS: Final = from_seconds(3.0)
+"""Rates of packets that are older are not compared, as the tag's crystal warms."""
 
 WINDOW: Final = 16
 """Newest packets of an anchor that are compared."""
@@ -38,6 +41,9 @@ OFTEN: Final = 0.2
 """Share of late packets from which on an anchor's stamps are said to flip. Fewer are single late packets."""
 
 
+_ALL: Final = (1 << WINDOW) - 1
+
+
 class _Stamps:
     """An anchor's newest stamps."""
 
@@ -56,7 +62,8 @@ class _Stamps:
         self.time_s: deque[float] = deque([0.0], WINDOW)
         self.late_m: deque[float] = deque([0.0], WINDOW)
         """By how much each packet is later than at a constant clock error."""
-        self.bends: deque[bool] = deque(maxlen=WINDOW)
+        self.bends = 0
+        """Bits of the packets in the window, the newest lowest: whether each is off the line through the two before."""
         self.gap_m = self.late_share = 0.0
         self.packets = 1
 
@@ -115,7 +122,8 @@ class StampWatch:
 
     def _runs_on_its_own(self, one: _Stamps) -> bool:
         """Whether an anchor's clock has another rate than those of most others, of which there are two at least."""
-        rates = sorted([other.rate for other in self._stamps.values() if other.rate])
+        after = one.rx_ticks - COMPARED_TICKS
+        rates = sorted([other.rate for other in self._stamps.values() if other.rate and other.rx_ticks > after])
         off = one.rate - rates[len(rates) // 2]
         is_off = len(rates) > 2 and abs(off) > OWN_RATE
         one.off_in_row = one.off_in_row + 1 if is_off != (one.own_rate != 0.0) else 0
@@ -132,14 +140,14 @@ def _is_late(one: _Stamps, elapsed_s: float, change_m: float) -> bool:
     if elapsed_s > LONGEST_GAP_S:
         times_s.clear()
         late_m.clear()
-        one.bends.clear()
+        one.bends = 0
     times_s.append(times_s[-1] + elapsed_s if times_s else 0.0)
     late_m.append(late_m[-1] + change_m if late_m else 0.0)
     if len(times_s) > 2:
         before_mps = (late_m[-2] - late_m[-3]) / (times_s[-2] - times_s[-3])
-        one.bends.append(abs(late_m[-1] - late_m[-2] - before_mps * elapsed_s) > BEND_M)
+        one.bends = (one.bends << 1 | (abs(late_m[-1] - late_m[-2] - before_mps * elapsed_s) > BEND_M)) & _ALL
     fewest = 1 if one.gap_m > 0.0 else FEWEST
-    if sum(one.bends) < fewest or len(times_s) < FIRST:
+    if one.bends.bit_count() < fewest or len(times_s) < FIRST:
         return False
     above_m, gap_m = two_values(np.array(times_s), np.array(late_m), fewest)
     one.gap_m = gap_m or one.gap_m
