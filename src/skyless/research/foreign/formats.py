@@ -15,8 +15,7 @@ from skyless.core.arrays import Array
 from skyless.core.errors import ConfigurationError
 from skyless.core.ticks import TICK_BITS
 from skyless.files import Drops, has_columns, header_of, open_source, read_head
-from skyless.radio.foreign import bitcraze, fira
-from skyless.research.foreign import _phones as phones
+from skyless.radio.foreign import bitcraze, fira, phones
 from skyless.research.foreign import crazyflie, datasets
 from skyless.research.foreign import crazyflie as bitcraze_captures
 from skyless.research.foreign import datasets as muloc

@@ -1,0 +1,142 @@
+"""A phone that sends its DL-TDoA records while it measures: a server for lines of JSON, by TCP or as WebSocket messages.
+
+One port serves both: a connection whose first line is that of an HTTP request is a WebSocket's. There is one phone; a
+new connection takes the place of the old one, as phones come back without having said goodbye.
+"""
+
+import asyncio
+import logging
+import os
+import re
+from asyncio import StreamReader, StreamWriter
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final, Protocol
+
+from skyless.core.air.masterless_packets import Packet, Point
+from skyless.core.errors import SkylessError
+from skyless.files import CHUNK_BYTES, MAX_LINE_BYTES, LineCutter
+from skyless.radio.foreign.fira import AnchorFrame
+from skyless.radio.foreign.phones import Phone
+from skyless.radio.interface import Gone, Hint, Restarted, ignore
+
+FIRST_LINE_S: Final = 10.0
+"""For how long a connection may be without a first line."""
+
+MAX_CONNECTIONS: Final = 16
+"""Connections at once, those without a first line included; further ones are ended."""
+
+_REQUEST: Final = re.compile(rb"[A-Z]+ \S+ HTTP/\d")
+
+_quiet = logging.getLogger("skyless.radio.phone")
+_quiet.addHandler(logging.NullHandler())
+_quiet.propagate = False
+"""Connections that break are no news."""
+
+
+class _Messages(Protocol):
+    """Cuts what a connection sends into messages."""
+
+    def feed(self, chunk: bytes, /) -> Iterator[bytes]:
+        """Messages that end in this piece."""
+
+
+class PhoneRadio:
+    """One phone's DL-TDoA measurements, as packets.
+
+    Packets carry the phone's own time where its stamps have more than 40 bits, and no time otherwise: they are those
+    that the same records in a file give.
+    """
+
+    lead_s = 0.0
+
+    def __init__(self, host: str, port: int, name: str, anchors_m: Mapping[int, Point], frame: AnchorFrame) -> None:
+        """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these."""
+        self.name = name
+        self.port = port
+        """The port in use; with 0 given, known once the server runs."""
+        self.counters: Counter[str] = Counter()
+        self.frame = frame
+        self._host = host
+        self._records = Phone(self.counters, anchors_m, frame)
+        self._listener: Callable[[Packet | Restarted | Gone | Hint], None] = ignore
+        self._connections: set[StreamWriter] = set()
+        self._phone: StreamWriter | None = None
+
+    async def run(self, listener: Callable[[Packet | Restarted | Gone | Hint], None]) -> None:
+        """Receive until cancelled. Raises SkylessError if it cannot listen there."""
+        self._listener = listener
+        try:
+            server = await asyncio.start_server(self._serve, self._host, self.port)
+        except OSError as error:
+            reason = os.strerror(error.errno) if error.errno is not None and error.errno > 0 else error
+            raise SkylessError(f"--radio cannot listen on {self._host}:{self.port}: {reason}") from None
+        self.port = server.sockets[0].getsockname()[1]
+        listener(Hint(f"waits for a phone at {self._host}:{self.port}"))
+        try:
+            await server.serve_forever()
+        finally:
+            for writer in self._connections:
+                writer.transport.abort()
+
+    def advice(self) -> str:
+        """Where to look if nothing is received."""
+        return f"the phone at {self._host}:{self.port} sends no records; does its session with anchors go on?"
+
+    async def _serve(self, reader: StreamReader, writer: StreamWriter) -> None:
+        """Serve one connection until it ends or is replaced."""
+        if len(self._connections) >= MAX_CONNECTIONS:
+            self.counters["too-many-connections"] += 1
+            writer.transport.abort()
+            return
+        self._connections.add(writer)
+        try:
+            await self._receive(reader, writer)
+        except OSError:  # it broke, or sent no first line in time
+            pass
+        finally:
+            self._connections.discard(writer)
+            writer.close()
+            if self._phone is writer:
+                self._phone = None
+                self._listener(Gone("the phone has ended its connection"))
+
+    async def _receive(self, reader: StreamReader, writer: StreamWriter) -> None:
+        data = await asyncio.wait_for(_first_line(reader), FIRST_LINE_S)
+        messages: _Messages = LineCutter(self.counters)
+        if _REQUEST.match(data):
+            try:
+                from skyless.radio.foreign.phone_websocket import WebSocketMessages  # noqa: PLC0415 - an extra
+            except ImportError:
+                self._listener(Hint("a phone asks for a WebSocket, which needs skyless[page]; lines by TCP do not"))
+                return
+            messages = WebSocketMessages(writer, self.counters, _quiet)
+        while data:
+            for message in messages.feed(data):
+                self._take(writer)
+                for packet in self._records.on_message(message):
+                    self._listener(packet)
+            await writer.drain()
+            if writer.is_closing():
+                return
+            data = await reader.read(CHUNK_BYTES)
+
+    def _take(self, writer: StreamWriter) -> None:
+        """Let this connection be the phone's."""
+        if self._phone is writer:
+            return
+        if self._phone is not None:
+            self._phone.transport.abort()
+        self._phone = writer
+        self._listener(Restarted())
+
+
+async def _first_line(reader: StreamReader) -> bytes:
+    """What has come when the first line has, or when it is too long to be one."""
+    data = b""
+    while b"\n" not in data and len(data) <= MAX_LINE_BYTES:
+        chunk = await reader.read(CHUNK_BYTES)
+        data += chunk
+        if not chunk:
+            break
+    return data
