@@ -196,25 +196,28 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     """Radio of the tags. ether:HOST:PORT: the emulated air of skyless ether. serial:PATH: a board of Skyless.
     spi:BUS.DEVICE,irq=PIN,reset=PIN: a DW1000 on this computer's SPI. model:HOST:PORT: a model of one on that air.
     listener:PATH: the listener of uwb-apps. sniffer:PATH: a Bitcraze sniffer, for TDoA2 and TDoA3 systems.
-    uci:PATH: a FiRa board whose DL-TDoA session as a tag goes on.
+    uci:PATH: a FiRa board whose DL-TDoA session as a tag goes on. phone://HOST:PORT: where this computer waits for a
+    phone's DL-TDoA records, lines of JSON by TCP or WebSocket (0.0.0.0 for a phone in the network; port 7470 by
+    default).
     Several tags have several paths, with commas; PATH@BAUD gives another rate."""
     method: Method = DEFAULT_METHOD
-    """How positions are computed (sniffers and FiRa boards: always joint)."""
+    """How positions are computed (sniffers, FiRa boards, phones: always joint)."""
     qa: Positive | None = None
     """Process noise for the tags' motion: spectral density of the acceleration in m²/s³ (joint); by default 0.3."""
     dynamics: Dynamics | None = None
     """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     tag_height_std: NotNegative | None = None
     """Standard deviation of the tags' height from the one that is given, in metres, which fixes and levels then
-    count (joint); 0 by default, for sniffers and FiRa boards 0.5 where the height is only taken for the anchors'."""
+    count (joint); 0 by default, for sniffers, FiRa boards and phones 0.5 where the height is only taken for the
+    anchors'."""
     publish_hz: Annotated[float, number(above=0.0, most=1000.0)] = 50.0
     """Fixes a second and tag at most, on MQTT and on standard output; all of them count in the tag's health."""
     site_id: SiteId | None = None
-    """Number of the site, the only one to listen to; by default the first one heard. For sniffers and FiRa boards what
-    topics call the system, by default 0; it should be no other site's."""
+    """Number of the site, the only one to listen to; by default the first one heard. For sniffers, FiRa boards and
+    phones what topics call the system, by default 0; it should be no other site's."""
     anchors: Path | None = None
-    """Table of anchors of another system (sniffers and FiRa boards): id,x_m,y_m,z_m, as skyless replay and calibrate
-    take it. FiRa boards need none where anchors state their positions."""
+    """Table of anchors of another system (sniffers, FiRa boards, phones): id,x_m,y_m,z_m, as skyless replay and
+    calibrate take it. FiRa boards and phones need none where anchors state their positions."""
     to: Annotated[tuple[str, ...], Text(lambda _, text: text, many=True)] = ()
     """Where fixes go as well, without a broker: a program or device of another kind; may be given several times.
     skyless bridge --help lists the targets, as nmea+tcp://:10110."""
@@ -229,8 +232,8 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     clock_bound_ms: Annotated[float | None, number(above=0.0, most=10_000.0)] = None
     """How far this computer's clock may be from those of the anchors, in ms; 100 by default (with --site-key)."""
     tag_height: str | None = None
-    """The tags' height (sniffers and FiRa boards): metres, free (estimated) or auto, the default: estimated unless the
-    anchors lie too flat, then theirs."""
+    """The tags' height (sniffers, FiRa boards, phones): metres, free (estimated) or auto, the default: estimated unless
+    the anchors lie too flat, then theirs."""
 
 
 @app.default
@@ -261,11 +264,11 @@ def tag(
     if receives_packets(asked.radio):
         asked.leave_out(
             *("site_key", "trust", "clock_bound_ms", "integrity_risk", "alert_limit_m", "max_acceleration_mps2"),
-            why="it is not for sniffers and FiRa boards",
+            why="it is not for sniffers, FiRa boards and phones",
         )
         tags = _on_sniffers
     else:
-        why = "it is for sniffers and FiRa boards; other tags hear from the air where anchors stand"
+        why = "it is for sniffers, FiRa boards and phones; other tags hear from the air where anchors stand"
         asked.leave_out("anchors", "tag_height", why=why)
         tags = _on_radios
     if asked.from_board:
@@ -362,7 +365,7 @@ def _on_sniffers(
 
 
 def _system(asked: TagOptions) -> "PacketTagSettings":
-    """Settings that sniffers, and some FiRa boards, cannot receive from the air. Raises SkylessError."""
+    """Settings that sniffers, and some FiRa boards and phones, cannot receive from the air. Raises SkylessError."""
     from skyless.core.geometry import GUESSED_STD_M, plane_height_m
     from skyless.run.masterless.packet_tags import TDOA_SITE, PacketTagSettings
     from skyless.site.tables import read_anchors, read_calibration

@@ -1,7 +1,7 @@
-"""A phone that sends its DL-TDoA records while it measures: a server for lines of JSON, by TCP or as WebSocket messages.
+"""A phone that sends its DL-TDoA records while it measures: a server for lines of JSON, by TCP or WebSocket.
 
-One port serves both: a connection whose first line is that of an HTTP request is a WebSocket's. There is one phone; a
-new connection takes the place of the old one, as phones come back without having said goodbye.
+One port serves both: a connection whose first line is that of an HTTP request is a WebSocket's. There is one phone: the
+first message of a new connection ends the old one, as phones come back without having said goodbye.
 """
 
 import asyncio
@@ -20,11 +20,8 @@ from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.phones import Phone
 from skyless.radio.interface import Gone, Hint, Restarted, ignore
 
-FIRST_LINE_S: Final = 10.0
-"""For how long a connection may be without a first line."""
-
 MAX_CONNECTIONS: Final = 16
-"""Connections at once, those without a first line included; further ones are ended."""
+"""Connections at once; for a further one the oldest that is not the phone's is ended."""
 
 _REQUEST: Final = re.compile(rb"[A-Z]+ \S+ HTTP/\d")
 
@@ -39,6 +36,9 @@ class _Messages(Protocol):
 
     def feed(self, chunk: bytes, /) -> Iterator[bytes]:
         """Messages that end in this piece."""
+
+    def finish(self) -> None:
+        """Count what has no end."""
 
 
 class PhoneRadio:
@@ -60,7 +60,7 @@ class PhoneRadio:
         self._host = host
         self._records = Phone(self.counters, anchors_m, frame)
         self._listener: Callable[[Packet | Restarted | Gone | Hint], None] = ignore
-        self._connections: set[StreamWriter] = set()
+        self._connections: dict[StreamWriter, None] = {}
         self._phone: StreamWriter | None = None
 
     async def run(self, listener: Callable[[Packet | Restarted | Gone | Hint], None]) -> None:
@@ -76,7 +76,7 @@ class PhoneRadio:
         try:
             await server.serve_forever()
         finally:
-            for writer in self._connections:
+            for writer in self._connections:  # a server waits for its connections to end
                 writer.transport.abort()
 
     def advice(self) -> str:
@@ -87,22 +87,21 @@ class PhoneRadio:
         """Serve one connection until it ends or is replaced."""
         if len(self._connections) >= MAX_CONNECTIONS:
             self.counters["too-many-connections"] += 1
-            writer.transport.abort()
-            return
-        self._connections.add(writer)
+            next(one for one in self._connections if one is not self._phone).transport.abort()
+        self._connections[writer] = None
         try:
             await self._receive(reader, writer)
-        except OSError:  # it broke, or sent no first line in time
-            pass
+        except OSError:
+            pass  # it broke
         finally:
-            self._connections.discard(writer)
+            del self._connections[writer]
             writer.close()
             if self._phone is writer:
                 self._phone = None
                 self._listener(Gone("the phone has ended its connection"))
 
     async def _receive(self, reader: StreamReader, writer: StreamWriter) -> None:
-        data = await asyncio.wait_for(_first_line(reader), FIRST_LINE_S)
+        data = await _first_line(reader)
         messages: _Messages = LineCutter(self.counters)
         if _REQUEST.match(data):
             try:
@@ -111,15 +110,14 @@ class PhoneRadio:
                 self._listener(Hint("a phone asks for a WebSocket, which needs skyless[page]; lines by TCP do not"))
                 return
             messages = WebSocketMessages(writer, self.counters, _quiet)
-        while data:
+        while data and not writer.is_closing():
             for message in messages.feed(data):
                 self._take(writer)
                 for packet in self._records.on_message(message):
                     self._listener(packet)
             await writer.drain()
-            if writer.is_closing():
-                return
             data = await reader.read(CHUNK_BYTES)
+        messages.finish()
 
     def _take(self, writer: StreamWriter) -> None:
         """Let this connection be the phone's."""

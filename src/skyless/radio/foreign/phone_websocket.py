@@ -6,7 +6,6 @@ from logging import Logger
 
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Request
-from websockets.protocol import State
 from websockets.server import ServerProtocol
 
 from skyless.files import MAX_LINE_BYTES, Drops
@@ -25,19 +24,27 @@ class WebSocketMessages:
 
     def feed(self, chunk: bytes, /) -> Iterator[bytes]:
         """Messages that end in this piece; ends the connection after a goodbye or a fault."""
-        self._protocol.receive_data(chunk)
-        for event in self._protocol.events_received():
-            if isinstance(event, Request):
-                self._protocol.send_response(self._protocol.accept(event))
+        protocol = self._protocol
+        protocol.receive_data(chunk)
+        for event in protocol.events_received():
+            if isinstance(event, Request) and protocol.parser_exc is None:
+                protocol.send_response(protocol.accept(event))
+            elif protocol.handshake_exc is not None:
+                break  # what follows a request that was refused
             elif isinstance(event, Frame) and event.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
                 self._parts += event.data
                 if event.fin:
                     message, self._parts = self._parts, b""
                     yield message
-        for data in self._protocol.data_to_send():
+        for data in protocol.data_to_send():
             if data:
                 self._writer.write(data)
-        if self._protocol.handshake_exc is not None or self._protocol.parser_exc is not None:
+        if protocol.handshake_exc is not None or protocol.parser_exc is not None:
             self._drops["malformed-connection"] += 1
-        if self._protocol.close_expected() or self._protocol.state is State.CLOSED:
+        if protocol.close_expected():
             self._writer.close()
+
+    def finish(self) -> None:
+        """Count a message without its end."""
+        if self._parts:
+            self._drops["unfinished-message"] += 1
