@@ -23,7 +23,7 @@ from skyless.files import Drops, open_source
 from skyless.research.calibration.options import CalibrateOptions, First, Stay
 from skyless.research.foreign import datasets
 from skyless.research.foreign.formats import FORMATS, Recording, format_of, open_recording
-from skyless.research.replays.inputs import flight_height, known_anchors, known_truth
+from skyless.research.replays.inputs import flight_height, known_anchors, known_truth, stated_anchors
 from skyless.research.replays.site import SITE_FORMAT, reception_of, recorded_site, recorded_truth
 from skyless.run.masterless.pair_engine import PairEngine
 from skyless.run.mqtt.messages import ReceptionsMessage, StampsMessage
@@ -234,7 +234,9 @@ def biases_of(asked: CalibrateOptions) -> Biases:
     path = Path(asked.file)
     truth = None if asked.stays else known_truth(path, asked)
     above_m, (anchors_m, height_m) = flight_height(asked.above_m, truth), known_anchors(asked.anchors, asked.site)
-    with open_recording(path, asked.format, asked.listener) as recording:
+    kind = format_of(path, asked.format)
+    with open_recording(path, kind.name, asked.listener, anchors_m or None) as recording:
+        anchors_m = anchors_m or stated_anchors(path, kind)
         position_from = partial(positions_of, asked, truth, above_m, height_m)
         differences, drops = gather(tdoas_of(recording, anchors_m), anchors_m, position_from, asked.first)
         name = recording.format.name
@@ -365,7 +367,11 @@ def ranges_of(
         raise ConfigurationError(path, "format", known.name, f"one with stamps of anchors: {SITE_FORMAT}, {stamped}")
     part = _Part(PairRanger(known.tx_bits, block_s, on_block=on_block), from_s, to_s, on_progress)
     drops = _add_receptions(path, part) if known.name == "avalue" else _add_packets(path, known.name, part)
-    return RecordedRanges(part.finish(), part.ranger, known.name, None, dict(drops + part.drops()))
+    ranges = part.finish()
+    if known.is_dl_tdoa and not ranges.pairs:
+        right = "one whose anchors range each other: here their positions are those that messages state, or of a table"
+        raise ConfigurationError(path, "the recording", "without ranges between anchors", right)
+    return RecordedRanges(ranges, part.ranger, known.name, None, dict(drops + part.drops()))
 
 
 class _Part:

@@ -26,6 +26,7 @@ from skyless.research.replays.inputs import (
     known_anchors,
     known_heights,
     known_truth,
+    stated_anchors,
 )
 from skyless.research.replays.options import DIFFERENCES_MADE, PACKETS, ReplayOptions
 from skyless.run.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
@@ -292,9 +293,6 @@ FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcra
 _MAX_WITHOUT_ANCHORS: Final = 20_000
 """A recording that carries anchor positions has one within this many records."""
 
-_MAX_TO_FIND_ANCHORS: Final = 2_000
-"""Every anchor of a DL-TDoA recording is heard within this many records."""
-
 
 class ReplayReport(Figures, frozen=True, kw_only=True):
     """Result of a replay: metres and seconds, None if unknown."""
@@ -355,7 +353,7 @@ class CaptureReplay:
         self._truth = known_truth(Path(asked.file), asked)
         if not self._anchors_m:
             _check_carries_anchors(asked)
-        self.known_m = self._anchors_m or _stated_anchors(asked, kind)
+        self.known_m = self._anchors_m or stated_anchors(asked.file, kind)
         """Positions at the recording's beginning, for time differences; packets carry theirs, which may change."""
         self.height_m, self._height_std_m, self.height_note = height_to_hold(
             asked.tag_height_m, self.known_m, site_height_m, self._truth, kind.name
@@ -564,15 +562,6 @@ def how_to_find_anchors(file: str | Path, kind: Format) -> str:
     """The command that finds the anchors of a recording in which they range each other; otherwise empty."""
     ranges = kind.tx_bits is not None and not kind.is_dl_tdoa
     return f"; skyless survey --recording {file} --out anchors.csv finds them" if ranges else ""
-
-
-def _stated_anchors(asked: ReplayOptions, kind: Format) -> dict[int, Point]:
-    """Positions stated by the anchors of a DL-TDoA recording."""
-    if not kind.is_dl_tdoa:
-        return {}
-    with open_recording(asked.file, asked.format) as recording:
-        packets = [record for record in islice(recording, _MAX_TO_FIND_ANCHORS) if isinstance(record, Packet)]
-    return {packet.anchor: packet.position_m for packet in packets if packet.position_m is not None}
 
 
 def distances_of(file: str | Path, name: str) -> dict[str, float]:
