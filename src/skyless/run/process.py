@@ -22,12 +22,12 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import IO, Any, Final
 
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
 
 from skyless.core.site import Site
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import NODE_KEEPALIVE_S, RESEND_S, Handler, Link
-from skyless.run.mqtt.messages import SiteMessage, WrongMessageError, read_message, site_message
+from skyless.run.mqtt.messages import SiteMessage, System, WrongMessageError, read_message, site_message
 from skyless.run.mqtt.topics import floor_plan_topic, plan_of_floor_topic, site_topic
 
 HEALTH_S: Final = 1.0
@@ -216,10 +216,14 @@ class SitePublisher:
     """
 
     def __init__(
-        self, site: Site, is_simulated: Callable[[], bool], plans: Mapping[int | None, Path] | None = None
+        self,
+        site: Site,
+        is_simulated: Callable[[], bool],
+        plans: Mapping[int | None, Path] | None = None,
+        system: System | UnsetType = UNSET,
     ) -> None:
         """``plans`` are the images of the floors by number, or of the whole site by None."""
-        self._site, self._is_simulated, self._plans = site, is_simulated, dict(plans or {})
+        self._site, self._is_simulated, self._plans, self._system = site, is_simulated, dict(plans or {}), system
         self._restarts: int | None = None
         self._simulated = False
         self._published: SiteMessage | None = None
@@ -239,7 +243,9 @@ class SitePublisher:
         """Publish the site if it is new or due, retained for later subscribers."""
         now_s = time.monotonic()
         if self._published is None or self._published.simulated is not self._simulated:
-            self._published = site_message(self._site, simulated=self._simulated, unix_s=time.time())
+            self._published = site_message(
+                self._site, simulated=self._simulated, unix_s=time.time(), system=self._system
+            )
         elif now_s < self._repeat_s:
             return
         self._repeat_s = now_s + RESEND_S * random.uniform(0.5, 1.0)

@@ -156,7 +156,7 @@ class SiteView:
     def _on_site(self, message: SiteMessage | None, _channel: Channel) -> None:
         if message is not None:
             self.site = message
-            self.table.set_site(message.site, self._clock())
+            self.table.set_site(message.site, self._clock(), addresses=message.has_addresses)
             self.table.set_assets(self._named())
 
     def _on_health(self, health: Health, channel: Channel) -> None:
@@ -220,7 +220,13 @@ class SiteView:
             condition=self.condition,
             tags=self._tag_rows(tags, now_s),
             anchors=tuple(
-                sorted((_anchor_row(*one, now_s) for one in anchors.items()), key=lambda row: row.state not in GONE)
+                sorted(
+                    (
+                        _anchor_row(name, node, now_s)
+                        for name, node in zip(self.table.spelled(anchors), anchors.values(), strict=True)
+                    ),
+                    key=lambda row: row.state not in GONE,
+                )
             ),
             alarms=tuple(sorted(self._alarms.values(), key=_alarm_rank)),
             drops={reason: count for reason, count in drops.most_common() if count and reason not in NOT_DROPS},

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Coroutine, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TextIO
 
@@ -39,6 +40,7 @@ from skyless.run.open_radio import (
 from skyless.run.process import Log, together
 from skyless.run.tag import Tags, TagSettings
 from skyless.sim.evaluation.request import ProtectionOptions
+from skyless.site.anchor_names import anchor_name
 
 if TYPE_CHECKING:
     from skyless.core.air.masterless_packets import Point
@@ -75,8 +77,11 @@ class LineOptions(Options, frozen=True, kw_only=True):
     json: bool = False
     """Write one JSON object for each fix on standard output, a line each, as on MQTT."""
 
-    def lines(self, log: Log) -> "FixLines | None":
-        """The writer of the requested lines; None if none are requested. Raises SkylessError."""
+    def lines(self, log: Log, *, addresses: bool = False) -> "FixLines | None":
+        """The writer of the requested lines; None if none are requested. Raises SkylessError.
+
+        ``addresses``: the anchors' identifiers are MAC addresses.
+        """
         asked = {"print": self.print, "csv": self.csv, "json": self.json}
         chosen = [name for name, is_asked in asked.items() if is_asked]
         if len(chosen) > 1:
@@ -85,8 +90,12 @@ class LineOptions(Options, frozen=True, kw_only=True):
             return None
         if sys.stdout is None:
             raise SkylessError(f"--{chosen[0]} writes on standard output, which is closed")
-        line = {"print": line_for_people, "csv": csv_row, "json": to_json}[chosen[0]]
-        return FixLines(line, ",".join(CSV_COLUMNS) if self.csv else None, log)
+        makers: dict[str, Callable[[FixMessage], str]] = {
+            "print": line_for_people,
+            "csv": partial(csv_row, addresses=addresses),
+            "json": to_json,
+        }
+        return FixLines(makers[chosen[0]], ",".join(CSV_COLUMNS) if self.csv else None, log)
 
 
 def line_for_people(fix: FixMessage) -> str:
@@ -99,13 +108,13 @@ def line_for_people(fix: FixMessage) -> str:
     return f"{moment}  {fix.tag}  x {x_m:.3f}  y {y_m:.3f}  {height}  ± {cm(fix.std_m)}{alert}"
 
 
-def csv_row(fix: FixMessage) -> str:
+def csv_row(fix: FixMessage, *, addresses: bool = False) -> str:
     """The values of ``CSV_COLUMNS``; empty for missing ones, anchors separated by spaces."""
     velocity = (None, None, None) if fix.velocity_mps is None else fix.velocity_mps
     moved = [_figure(value) for value in (*fix.position_m, fix.std_m, *velocity)]
     levels = [_figure(value) for value in (fix.latency_s, fix.hpl_m, fix.vpl_m)]
     trust = [_figure(value) for value in (fix.time_s, fix.verified_until_s, fix.unverified)]
-    anchors = " ".join(map(str, fix.anchors))
+    anchors = " ".join(anchor_name(anchor, addresses=addresses) for anchor in fix.anchors)
     return ",".join([f"{fix.unix_s:.6f}", fix.tag, *moved, anchors, *levels, fix.alert or "", *trust])
 
 
@@ -255,7 +264,7 @@ def tag(
     names
         Names of one or more tags: letters, digits, - and _.
     """
-    address, lines = broker.address(), shown.lines(log)
+    address, lines = broker.address(), shown.lines(log, addresses=hears_positions(asked.radio))
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
         given = repr(" ".join(names)) if names else "missing"
         raise SkylessError(

@@ -524,6 +524,7 @@ class CaptureReplay:
         total = self.recording.drops + self._pipeline.drops
         drops = {name: count for name, count in sorted(total.items()) if count}
         by_m = sorted(self._pipeline.contradictions_m.items())
+        name = self.recording.format.anchor_name
         own, filtered = self._asked.estimator, "joint-smoothed" if self._asked.smooth else "joint"
         return ReplayReport(
             format=self.recording.format.name,
@@ -536,7 +537,7 @@ class CaptureReplay:
             pairs=pairs,
             method=filtered if own is None else getattr(own, "__name__", "own"),
             measurements=f"{self.measurements} and phases" if self._has_phases else self.measurements,
-            contradictions_m={f"{a}-{b}": metres for (a, b), metres in by_m},
+            contradictions_m={f"{name(a)}-{name(b)}": metres for (a, b), metres in by_m},
         )
 
 

@@ -22,6 +22,9 @@ Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """3 × 3, row by row."""
 
+System = Literal["tdoa", "dl-tdoa"]
+"""Other systems, none with a master; in dl-tdoa, FiRa's, anchors are called by their MAC addresses."""
+
 MAX_LEASES: Final = 64
 MAX_LEASE_S: Final = 60.0
 
@@ -40,6 +43,13 @@ class SiteMessage(Struct, frozen=True):
     """The storeys, where the site's file has them."""
     alarms: tuple[AlarmRule, ...] = ()
     """The alarm rules in the site's file."""
+    system: System | UnsetType = UNSET
+    """Whose anchors they are; omitted for Skyless's own."""
+
+    @property
+    def has_addresses(self) -> bool:
+        """Whether the anchors' identifiers are MAC addresses."""
+        return self.system == "dl-tdoa"
 
     @property
     def whole_site(self) -> Site:
@@ -47,11 +57,11 @@ class SiteMessage(Struct, frozen=True):
         return replace(self.site, outline_m=self.outline_m, floors=self.floors, alarms=self.alarms or UNSET)
 
 
-def site_message(site: Site, *, simulated: bool, unix_s: float) -> SiteMessage:
+def site_message(site: Site, *, simulated: bool, unix_s: float, system: System | UnsetType = UNSET) -> SiteMessage:
     """Make the message of a site, with outline, floors and alarm rules in their own fields."""
     inner = replace(site, outline_m=UNSET, floors=UNSET, alarms=UNSET)
     alarms = () if site.alarms is UNSET else site.alarms
-    return SiteMessage(inner, simulated, unix_s, site.outline_m, site.floors, alarms)
+    return SiteMessage(inner, simulated, unix_s, site.outline_m, site.floors, alarms, system)
 
 
 class StatusMessage(Struct, frozen=True):
