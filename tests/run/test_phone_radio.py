@@ -233,8 +233,11 @@ def test_pages_other_requests_and_too_long_messages_are_refused_and_cost_nobody_
             phone = await stage.tcp()
             phone.write(b"".join(LINES[:450]))
             await stage.until(lambda: len(stage.packets) == 450)
-            with pytest.raises(InvalidStatus, match="403"):
-                await stage.websocket(origin="https://page.example").__aenter__()
+            for origin in ("https://page.example", "http://127.0.0.1:1", "http://[", "null"):
+                with pytest.raises(InvalidStatus, match="403"):
+                    await stage.websocket(origin=origin).__aenter__()
+            async with stage.websocket(origin=f"http://127.0.0.1:{stage.radio.port}"):
+                pass  # as some libraries for apps state it
             reader, writer = await asyncio.open_connection("127.0.0.1", stage.radio.port)
             writer.write(b"POST / HTTP/1.1\r\nHost: here\r\n\r\n" + LINES[450])
             assert not (await reader.read()).startswith(b"HTTP/1.1 101")
@@ -250,7 +253,7 @@ def test_pages_other_requests_and_too_long_messages_are_refused_and_cost_nobody_
             return stage.radio.counters
 
     counted = asyncio.run(run())
-    assert counted == {"malformed-connection": 3, "too-many-connections": 2}
+    assert counted == {"page-refused": 4, "malformed-connection": 2, "too-many-connections": 2}
 
 
 def test_what_cannot_be_a_phone_is_said_clearly():

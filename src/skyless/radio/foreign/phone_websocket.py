@@ -1,8 +1,12 @@
 """The WebSocket of a phone; needs the package websockets."""
 
 from asyncio import StreamWriter
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from http import HTTPStatus
+from ipaddress import ip_address
 from logging import Logger
+from typing import Final
+from urllib.parse import urlsplit
 
 from websockets.frames import Frame, Opcode
 from websockets.http11 import Request
@@ -10,16 +14,16 @@ from websockets.server import ServerProtocol
 
 from skyless.files import MAX_LINE_BYTES, Drops
 
+_CONTENT: Final = (Opcode.TEXT, Opcode.BINARY, Opcode.CONT)
+
 
 class WebSocketMessages:
-    """Cuts what a WebSocket's client sends into messages, and answers it.
-
-    Pages in browsers are refused: they state their origin, and apps do not.
-    """
+    """Cuts what a WebSocket's client sends into messages, and answers it; pages in browsers are refused."""
 
     def __init__(self, writer: StreamWriter, drops: Drops, logger: Logger) -> None:
         self._writer, self._drops = writer, drops
-        self._protocol = ServerProtocol(origins=[None], max_size=MAX_LINE_BYTES, logger=logger)
+        self._protocol = ServerProtocol(max_size=MAX_LINE_BYTES, logger=logger)
+        self._is_open = False
         self._parts = b""
 
     def feed(self, chunk: bytes, /) -> Iterator[bytes]:
@@ -28,10 +32,8 @@ class WebSocketMessages:
         protocol.receive_data(chunk)
         for event in protocol.events_received():
             if isinstance(event, Request) and protocol.parser_exc is None:
-                protocol.send_response(protocol.accept(event))
-            elif protocol.handshake_exc is not None:
-                break  # what follows a request that was refused
-            elif isinstance(event, Frame) and event.opcode in (Opcode.TEXT, Opcode.BINARY, Opcode.CONT):
+                self._answer(event)
+            elif self._is_open and isinstance(event, Frame) and event.opcode in _CONTENT:
                 self._parts += event.data
                 if event.fin:
                     message, self._parts = self._parts, b""
@@ -39,12 +41,36 @@ class WebSocketMessages:
         for data in protocol.data_to_send():
             if data:
                 self._writer.write(data)
-        if protocol.handshake_exc is not None or protocol.parser_exc is not None:
+        if protocol.parser_exc is not None or protocol.handshake_exc is not None:
             self._drops["malformed-connection"] += 1
         if protocol.close_expected():
             self._writer.close()
+
+    def _answer(self, request: Request) -> None:
+        if _is_page(request.headers.get_all("Origin"), request.headers.get_all("Host")):
+            self._drops["page-refused"] += 1
+            response = self._protocol.reject(HTTPStatus.FORBIDDEN, "pages may not connect\n")
+        else:
+            response = self._protocol.accept(request)
+        self._is_open = response.status_code == HTTPStatus.SWITCHING_PROTOCOLS
+        self._protocol.send_response(response)
 
     def finish(self) -> None:
         """Count a message without its end."""
         if self._parts:
             self._drops["unfinished-message"] += 1
+
+
+def _is_page(origins: Sequence[str], hosts: Sequence[str]) -> bool:
+    """Whether a request comes from a page of a browser.
+
+    Apps state no origin, or this server's address; a page could only state that under a name that leads here.
+    """
+    if not origins:
+        return False
+    try:
+        origin = urlsplit(origins[0])
+        ip_address(origin.hostname or "")
+    except ValueError:
+        return True
+    return [origin.netloc.lower()] != [host.lower() for host in hosts]
