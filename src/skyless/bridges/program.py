@@ -127,7 +127,7 @@ class BridgeNode:
         site = self._site.whole_site
         zones = zones_of(self._zones, site.name).zones
         assets = assets_at(self._assets, site.name)
-        self.hub.table.set_site(site, time.monotonic(), addresses=self._site.has_addresses)
+        self.hub.table.set_site(site, time.monotonic(), addresses=self._site.system == "dl-tdoa")
         self.hub.table.set_assets(assets)
         try:
             bridged = bridged_site(site, zones, simulated=self._site.simulated, assets=assets)

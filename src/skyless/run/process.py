@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import IO, Any, Final
 
 from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
 
 from skyless.core.site import Site
 from skyless.run.mqtt.address import MqttAddress
@@ -216,14 +217,12 @@ class SitePublisher:
     """
 
     def __init__(
-        self,
-        site: Site,
-        is_simulated: Callable[[], bool],
-        plans: Mapping[int | None, Path] | None = None,
-        system: System | UnsetType = UNSET,
+        self, site: Site, is_simulated: Callable[[], bool], plans: Mapping[int | None, Path] | None = None
     ) -> None:
         """``plans`` are the images of the floors by number, or of the whole site by None."""
-        self._site, self._is_simulated, self._plans, self._system = site, is_simulated, dict(plans or {}), system
+        self._site, self._is_simulated, self._plans = site, is_simulated, dict(plans or {})
+        self.system: System | UnsetType = UNSET
+        """Whose anchors they are, if not Skyless's own."""
         self._restarts: int | None = None
         self._simulated = False
         self._published: SiteMessage | None = None
@@ -243,9 +242,8 @@ class SitePublisher:
         """Publish the site if it is new or due, retained for later subscribers."""
         now_s = time.monotonic()
         if self._published is None or self._published.simulated is not self._simulated:
-            self._published = site_message(
-                self._site, simulated=self._simulated, unix_s=time.time(), system=self._system
-            )
+            message = site_message(self._site, simulated=self._simulated, unix_s=time.time())
+            self._published = replace(message, system=self.system)
         elif now_s < self._repeat_s:
             return
         self._repeat_s = now_s + RESEND_S * random.uniform(0.5, 1.0)

@@ -23,7 +23,7 @@ from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.arrays import Array
 from skyless.core.errors import ConfigurationError
 from skyless.files import finite, read_lines
-from skyless.site.anchor_names import IDENTIFIER, anchor_name, is_address, read_anchor
+from skyless.site.anchor_names import anchor_name, is_address, read_anchor
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.site.survey.facts import PairRanges
 from skyless.site.survey.legs import mean_ranges
@@ -67,7 +67,7 @@ class _Row(Struct, frozen=True, gc=False):
         try:
             return read_anchor(self.fields[column], addresses=self.addresses)
         except ValueError:
-            raise self.wrong(column, IDENTIFIER) from None
+            raise self.wrong(column, "a whole number, one after 0x, or a MAC address, as C974") from None
 
     def wrong(self, column: str, expected: str) -> ConfigurationError:
         return ConfigurationError(self.path, f"line {self.line}, column {column}", self.fields[column], expected)

@@ -60,11 +60,9 @@ class BiasResult(Result, frozen=True, eq=False):
     def corrected_file(self) -> str:
         """The table of anchors with the biases in it, as ``skyless calibrate --out`` writes it. Raises SkylessError."""
         known = self.found.estimate.calibration()
-        return (
-            new_table(self.found.anchors_m, known, addresses=self.found.addresses)
-            if self.table is None
-            else calibrated_table(self.table, known)
-        )
+        if self.table is not None:
+            return calibrated_table(self.table, known)
+        return new_table(self.found.anchors_m, known, addresses=self.found.addresses)
 
     def to_dataframe(self) -> "DataFrame":
         """One row per anchor: ``anchor``, ``bias_m``, ``std_m``, ``noise_m``, ``count``.

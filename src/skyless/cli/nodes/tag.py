@@ -78,10 +78,7 @@ class LineOptions(Options, frozen=True, kw_only=True):
     """Write one JSON object for each fix on standard output, a line each, as on MQTT."""
 
     def lines(self, log: Log, *, addresses: bool = False) -> "FixLines | None":
-        """The writer of the requested lines; None if none are requested. Raises SkylessError.
-
-        ``addresses``: the anchors' identifiers are MAC addresses.
-        """
+        """The writer of the requested lines, if any; ``addresses``: anchors have MAC addresses. Raises SkylessError."""
         asked = {"print": self.print, "csv": self.csv, "json": self.json}
         chosen = [name for name, is_asked in asked.items() if is_asked]
         if len(chosen) > 1:
@@ -90,12 +87,9 @@ class LineOptions(Options, frozen=True, kw_only=True):
             return None
         if sys.stdout is None:
             raise SkylessError(f"--{chosen[0]} writes on standard output, which is closed")
-        makers: dict[str, Callable[[FixMessage], str]] = {
-            "print": line_for_people,
-            "csv": partial(csv_row, addresses=addresses),
-            "json": to_json,
-        }
-        return FixLines(makers[chosen[0]], ",".join(CSV_COLUMNS) if self.csv else None, log)
+        rows = partial(csv_row, addresses=addresses)
+        line = rows if self.csv else line_for_people if self.print else to_json
+        return FixLines(line, ",".join(CSV_COLUMNS) if self.csv else None, log)
 
 
 def line_for_people(fix: FixMessage) -> str:

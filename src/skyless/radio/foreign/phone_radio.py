@@ -5,13 +5,12 @@ first message of a new connection ends the old one, as phones come back without 
 """
 
 import asyncio
-import logging
 import os
 import re
 from asyncio import StreamReader, StreamWriter
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from typing import Final, Protocol
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Final
 
 from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.errors import SkylessError
@@ -20,35 +19,17 @@ from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.phones import Phone
 from skyless.radio.interface import Gone, Hint, Restarted, ignore
 
+if TYPE_CHECKING:
+    from skyless.radio.foreign.phone_websocket import WebSocketMessages
+
 MAX_CONNECTIONS: Final = 16
 """Connections at once; for a further one the oldest that is not the phone's is ended."""
 
 _REQUEST: Final = re.compile(rb"[A-Z]+ \S+ HTTP/\d")
 
-_quiet = logging.getLogger("skyless.radio.phone")
-_quiet.addHandler(logging.NullHandler())
-_quiet.propagate = False
-"""Connections that break are no news."""
-
-
-class _Messages(Protocol):
-    """Cuts what a connection sends into messages."""
-
-    def feed(self, chunk: bytes, /) -> Iterator[bytes]:
-        """Messages that end in this piece."""
-
-    def finish(self) -> None:
-        """Count what has no end."""
-
 
 class PhoneRadio:
-    """One phone's DL-TDoA measurements, as packets.
-
-    Packets carry the phone's own time where its stamps have more than 40 bits, and no time otherwise: they are those
-    that the same records in a file give.
-    """
-
-    lead_s = 0.0
+    """One phone's DL-TDoA measurements: the packets that the same records in a file give, in the phone's own time."""
 
     def __init__(self, host: str, port: int, name: str, anchors_m: Mapping[int, Point], frame: AnchorFrame) -> None:
         """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these."""
@@ -101,15 +82,17 @@ class PhoneRadio:
                 self._listener(Gone("the phone has ended its connection"))
 
     async def _receive(self, reader: StreamReader, writer: StreamWriter) -> None:
-        data = await _first_line(reader)
-        messages: _Messages = LineCutter(self.counters)
+        data = chunk = await reader.read(CHUNK_BYTES)
+        while chunk and b"\n" not in data and len(data) <= MAX_LINE_BYTES:
+            data += (chunk := await reader.read(CHUNK_BYTES))
+        messages: LineCutter | WebSocketMessages = LineCutter(self.counters)
         if _REQUEST.match(data):
             try:
-                from skyless.radio.foreign.phone_websocket import WebSocketMessages  # noqa: PLC0415 - an extra
+                from skyless.radio.foreign import phone_websocket  # noqa: PLC0415 - an extra
             except ImportError:
                 self._listener(Hint("a phone asks for a WebSocket, which needs skyless[page]; lines by TCP do not"))
                 return
-            messages = WebSocketMessages(writer, self.counters, _quiet)
+            messages = phone_websocket.WebSocketMessages(writer, self.counters)
         while data and not writer.is_closing():
             for message in messages.feed(data):
                 self._take(writer)
@@ -117,7 +100,8 @@ class PhoneRadio:
                     self._listener(packet)
             await writer.drain()
             data = await reader.read(CHUNK_BYTES)
-        messages.finish()
+        if isinstance(messages, LineCutter):
+            messages.finish()
 
     def _take(self, writer: StreamWriter) -> None:
         """Let this connection be the phone's."""
@@ -127,14 +111,3 @@ class PhoneRadio:
             self._phone.transport.abort()
         self._phone = writer
         self._listener(Restarted())
-
-
-async def _first_line(reader: StreamReader) -> bytes:
-    """What has come when the first line has, or when it is too long to be one."""
-    data = b""
-    while b"\n" not in data and len(data) <= MAX_LINE_BYTES:
-        chunk = await reader.read(CHUNK_BYTES)
-        data += chunk
-        if not chunk:
-            break
-    return data

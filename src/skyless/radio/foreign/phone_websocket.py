@@ -4,7 +4,7 @@ from asyncio import StreamWriter
 from collections.abc import Iterator, Sequence
 from http import HTTPStatus
 from ipaddress import ip_address
-from logging import Logger
+from logging import NullHandler, getLogger
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -15,14 +15,17 @@ from websockets.server import ServerProtocol
 from skyless.files import MAX_LINE_BYTES, Drops
 
 _CONTENT: Final = (Opcode.TEXT, Opcode.BINARY, Opcode.CONT)
+_quiet = getLogger("skyless.radio.phone")  # connections that break are no news
+_quiet.addHandler(NullHandler())
+_quiet.propagate = False
 
 
 class WebSocketMessages:
     """Cuts what a WebSocket's client sends into messages, and answers it; pages in browsers are refused."""
 
-    def __init__(self, writer: StreamWriter, drops: Drops, logger: Logger) -> None:
+    def __init__(self, writer: StreamWriter, drops: Drops) -> None:
         self._writer, self._drops = writer, drops
-        self._protocol = ServerProtocol(max_size=MAX_LINE_BYTES, logger=logger)
+        self._protocol = ServerProtocol(max_size=MAX_LINE_BYTES, logger=_quiet)
         self._is_open = False
         self._parts = b""
 
@@ -54,11 +57,6 @@ class WebSocketMessages:
             response = self._protocol.accept(request)
         self._is_open = response.status_code == HTTPStatus.SWITCHING_PROTOCOLS
         self._protocol.send_response(response)
-
-    def finish(self) -> None:
-        """Count a message without its end."""
-        if self._parts:
-            self._drops["unfinished-message"] += 1
 
 
 def _is_page(origins: Sequence[str], hosts: Sequence[str]) -> bool:

@@ -140,8 +140,8 @@ class Phone:
                 records += found
         packets = []
         for record in _in_order(records):
-            found_message = self._android(record) if record.measurement_type is None else self._ios(record)
-            packet = found_message if isinstance(found_message, str) else self._rounds.on_message(found_message)
+            stated = self._android(record) if record.measurement_type is None else self._ios(record)
+            packet = stated if isinstance(stated, str) else self._rounds.on_message(stated)
             if isinstance(packet, Packet):
                 packets.append(packet)
             else:
@@ -226,14 +226,10 @@ def _in_order(records: list[_Record]) -> list[_Record]:
     """Records of one message by their RX stamps; those without one come first, to be counted."""
     if len(records) < 2:
         return records
-    stamps = {id(one): _rx_ticks(one) for one in records}
-    first = next((stamp for stamp in stamps.values() if stamp is not None), 0)
-
-    def since_first(record: _Record) -> int:
-        stamp = stamps[id(record)]
-        return -TICK_MASK if stamp is None else _ahead(stamp, first)
-
-    return sorted(records, key=since_first)
+    stamps = [_rx_ticks(one) for one in records]
+    first = next((stamp for stamp in stamps if stamp is not None), 0)
+    ahead = [-TICK_MASK if stamp is None else _ahead(stamp, first) for stamp in stamps]
+    return [records[number] for number in sorted(range(len(records)), key=ahead.__getitem__)]
 
 
 def _rx_ticks(record: _Record) -> int | None:

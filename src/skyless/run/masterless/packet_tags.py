@@ -23,7 +23,7 @@ from skyless.radio.interface import Gone, Hint, Restarted
 from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog
 from skyless.run.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.messages import Counters, FixMessage, System, TagHealth
+from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth
 from skyless.run.mqtt.topics import fix_topic, health_topic
 from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import HEALTH_S, Log, SitePublisher, Usage, every, keep, link_of, together
@@ -194,7 +194,6 @@ class PacketTags:
         self._simulated, self._on_anchors = simulated, on_anchors
         self._heard_m: dict[int, Point] = {}
         site = site_of(settings)
-        self._system: System = "dl-tdoa" if isinstance(radios[0], UciRadio | PhoneRadio) else "tdoa"
         self._site_publisher = None if site is None else self._new_publisher(site)
 
     async def run(self) -> None:
@@ -260,4 +259,6 @@ class PacketTags:
             self._site_publisher = self._new_publisher(site)
 
     def _new_publisher(self, site: Site) -> SitePublisher:
-        return SitePublisher(site, self._simulated, system=self._system)
+        publisher = SitePublisher(site, self._simulated)
+        publisher.system = "dl-tdoa" if isinstance(self.nodes[0].radio, UciRadio | PhoneRadio) else "tdoa"
+        return publisher

@@ -47,21 +47,16 @@ class SiteMessage(Struct, frozen=True):
     """Whose anchors they are; omitted for Skyless's own."""
 
     @property
-    def has_addresses(self) -> bool:
-        """Whether the anchors' identifiers are MAC addresses."""
-        return self.system == "dl-tdoa"
-
-    @property
     def whole_site(self) -> Site:
         """The site as in its file."""
         return replace(self.site, outline_m=self.outline_m, floors=self.floors, alarms=self.alarms or UNSET)
 
 
-def site_message(site: Site, *, simulated: bool, unix_s: float, system: System | UnsetType = UNSET) -> SiteMessage:
+def site_message(site: Site, *, simulated: bool, unix_s: float) -> SiteMessage:
     """Make the message of a site, with outline, floors and alarm rules in their own fields."""
     inner = replace(site, outline_m=UNSET, floors=UNSET, alarms=UNSET)
     alarms = () if site.alarms is UNSET else site.alarms
-    return SiteMessage(inner, simulated, unix_s, site.outline_m, site.floors, alarms, system)
+    return SiteMessage(inner, simulated, unix_s, site.outline_m, site.floors, alarms)
 
 
 class StatusMessage(Struct, frozen=True):
