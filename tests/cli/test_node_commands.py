@@ -43,6 +43,8 @@ def test_anchors_of_a_site_that_relays_phases_ask_their_radios_for_them(key, pha
         (f"tag {'x' * 33}", "1 to 32 letters"),
         ("tag t --method magic", "it should be one of literal"),
         ("tag t --radio serial:", "it should name one port, as serial:/dev/ttyACM0"),
+        ("tag t u --radio phone://0.0.0.0", "it is one phone, which is one tag, not 2"),
+        ("tag t --radio phone://0.0.0.0:x", "it should be phone://HOST[:PORT] with a port from 1 to 65535"),
         ("tag t --radio sniffer:/dev/ttyACM0", "--anchors is missing; a sniffer needs a table"),
         ("tag t --anchors a.csv", "--anchors is 'a.csv'; it should be left out: it is for sniffers"),
         ("tag t --radio wifi:x", "it should be ether:HOST[:PORT], serial:PATH[@BAUD]"),

@@ -16,10 +16,9 @@ from skyless.core.air.masterless_packets import Packet
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
-from skyless.radio.foreign import fira
+from skyless.radio.foreign import fira, phones
 from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.uci import DtMeasurement, DtMessageType, GeodeticPoint, SessionInfo, encode_wgs84
-from skyless.research.foreign import _phones as phones
 from skyless.research.foreign.formats import open_recording
 from skyless.research.replays.captures import CaptureReplay
 from skyless.research.replays.options import ReplayOptions

@@ -250,7 +250,7 @@ def test_wrong_keys_are_refused_before_anything_runs(tmp_path, capsys, case, wor
         (["--clock-bound-ms", "20"], "--clock-bound-ms needs --site-key"),
         (["--site-key", "KEYS", "--site-id", "9"], "--site-id is 9, but"),
         (["--site-key", "none"], "none is missing"),
-        (["--site-key", "KEYS", "--radio", "sniffer:/dev/null"], "it is not for sniffers and FiRa boards"),
+        (["--site-key", "KEYS", "--radio", "sniffer:/dev/null"], "it is not for sniffers, FiRa boards and phones"),
     ],
 )
 def test_wrong_options_of_a_tag_are_refused(tmp_path, capsys, arguments, words):

@@ -71,6 +71,7 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     (fix_topic, fix, _), *_, (site_topic, told, retained), (health_topic, health, _) = links[0].published
     assert retained["retain"]
     assert (site_topic, told.site.id, told.simulated) == ("skyless/v1/7/site", 7, False)
+    assert told.system == "tdoa"
     assert {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in told.site.anchors} == hall.ANCHORS_M
     assert (fix_topic, health_topic) == ("skyless/v1/7/tag/one/fix", "skyless/v1/7/tag/one/health")
     assert isinstance(fix, FixMessage)
@@ -104,6 +105,14 @@ def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_reported_as_su
     tags._publish_health()
     sites = [message for _, message, _ in links[0].published if isinstance(message, SiteMessage)]
     assert [site.simulated for site in sites] == [False, True, False]
+
+
+def test_a_phone_s_anchors_are_told_as_those_of_fira(monkeypatch, links):
+    monkeypatch.setattr(packet_tags, "link_of", FakeLink)
+    radios = open_sniffers("phone://127.0.0.1", ("one",), hall.ANCHORS_M)
+    PacketTags(SETTINGS, radios, None, print, simulated=lambda: False)._publish_health()
+    (told,) = [message for _, message, _ in links[0].published if isinstance(message, SiteMessage)]
+    assert told.system == "dl-tdoa"
 
 
 def test_a_table_that_no_site_can_have_is_not_reported():

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 from zlib import crc32
 
-from msgspec import Struct, structs
+from msgspec import UNSET, Struct, structs
 
 from skyless.bridges.target import SILENCE_CHECK_S, BridgedSite, Hub, Route, bridged_site
 from skyless.core.air.almanac import GeoreferencePage
@@ -127,10 +127,11 @@ class BridgeNode:
         site = self._site.whole_site
         zones = zones_of(self._zones, site.name).zones
         assets = assets_at(self._assets, site.name)
-        self.hub.table.set_site(site, time.monotonic())
+        self.hub.table.set_site(site, time.monotonic(), addresses=self._site.system == "dl-tdoa")
         self.hub.table.set_assets(assets)
         try:
-            self.hub.on_site(bridged_site(site, zones, simulated=self._site.simulated, assets=assets))
+            bridged = bridged_site(site, zones, simulated=self._site.simulated, assets=assets)
+            self.hub.on_site(bridged if self._site.system is UNSET else structs.replace(bridged, master=None))
         except SkylessError as error:
             if self._refused is not None and not self._refused.done():
                 self._refused.set_exception(error)

@@ -2,6 +2,7 @@
 
 import csv
 import sys
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -110,6 +111,7 @@ def _replayed(asked: ReplayOptions, output: _Output, name: str = "") -> tuple[in
     check_output("plot", output.plot, *inputs, output.fixes_csv)
     check_picture(output.plot)
     from skyless.cli.api.replay import replay_recording
+    from skyless.research.foreign.formats import format_of
 
     with ExitStack() as until_done:
         reach = until_done.enter_context(progress_bar("replaying"))
@@ -122,7 +124,8 @@ def _replayed(asked: ReplayOptions, output: _Output, name: str = "") -> tuple[in
             write = csv.writer(until_done.enter_context(new_table(output.fixes_csv))).writerow
             of_site = given in METHODS
             write((*FIXES_COLUMNS, "tag") if of_site else FIXES_COLUMNS)
-            return lambda tag, time_s, fix: write([*_row(time_s, fix), *([tag] if of_site else [])])
+            name = str if of_site else format_of(asked.file, asked.format).anchor_name
+            return lambda tag, time_s, fix: write([*_row(time_s, fix, name), *([tag] if of_site else [])])
 
         result = replay_recording(replace(asked, progress=reach), begin)
     if output.plot is not None:
@@ -197,8 +200,8 @@ def _likely_reason(report: "ReplayReport", asked: ReplayOptions) -> str:
     return found + (f" ({dropped(report.drops)})" if report.drops else "")
 
 
-def _row(time_s: float, fix: "Fix") -> list[str]:
-    """A fix as a row of ``FIXES_COLUMNS``."""
+def _row(time_s: float, fix: "Fix", name: Callable[[int], str]) -> list[str]:
+    """A fix as a row of ``FIXES_COLUMNS``; ``name`` is that of an anchor."""
     velocity = ("", "", "") if fix.velocity_mps is None else (f"{value:.5g}" for value in fix.velocity_mps)
     covariance = fix.covariance_m2[[0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
     return [
@@ -207,7 +210,7 @@ def _row(time_s: float, fix: "Fix") -> list[str]:
         *velocity,
         *(f"{value:.5g}" for value in covariance),
         str(len(fix.anchors)),
-        " ".join(map(str, fix.anchors)),
+        " ".join(map(name, fix.anchors)),
         f"{fix.chi2:.4g}",
         f"{fix.residual_rms_m:.4g}",
         *("" if level is None else f"{level:.4g}" for level in (fix.hpl_m, fix.vpl_m, fix.integrity_risk)),

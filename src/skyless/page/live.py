@@ -244,7 +244,7 @@ class LiveSite:
     def _use_site(self, message: SiteMessage) -> None:
         self.site = message
         self.monitor.floors = () if message.floors is UNSET else message.floors
-        self.table.set_site(message.site, self._clock())
+        self.table.set_site(message.site, self._clock(), addresses=message.system == "dl-tdoa")
         self.alarms.on_site(message)
         self.assets.on_site(message.site.name)
 

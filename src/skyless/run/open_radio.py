@@ -16,6 +16,7 @@ from skyless.run.process import Log
 if TYPE_CHECKING:
     from skyless.radio.dw1000.spi import SpiPort
     from skyless.radio.foreign.foreign_radios import SnifferRadio, UciRadio
+    from skyless.radio.foreign.phone_radio import PhoneRadio
 
 # ruff: noqa: PLC0415 - a tag loads its own kind of radio only
 
@@ -25,8 +26,9 @@ _FOREIGN_BAUD: Final = 115_200
 """Baud rate of listeners and FiRa boards; a real sniffer's USB port accepts any rate."""
 _EXPECTED: Final = (
     "ether:HOST[:PORT], serial:PATH[@BAUD], spi:BUS.DEVICE[,irq=PIN][,reset=PIN], model:HOST[:PORT], "
-    "listener:PATH[@BAUD], sniffer:PATH[@BAUD] or uci:PATH[@BAUD]"
+    "listener:PATH[@BAUD], sniffer:PATH[@BAUD], uci:PATH[@BAUD] or phone://HOST[:PORT]"
 )
+PHONE_PORT: Final = 7470
 
 
 def is_simulated(spec: str) -> bool:
@@ -45,12 +47,12 @@ def is_ether(spec: str) -> bool:
 
 def receives_packets(spec: str) -> bool:
     """Whether a radio of that name receives packets of another system instead of beacons."""
-    return spec.split(":", 1)[0] in ("sniffer", "uci")
+    return spec.split(":", 1)[0] in ("sniffer", "uci", "phone")
 
 
 def hears_positions(spec: str) -> bool:
     """Whether the receptions of a radio of that name may state anchor positions."""
-    return spec.split(":", 1)[0] == "uci"
+    return spec.split(":", 1)[0] in ("uci", "phone")
 
 
 def open_radios(
@@ -103,7 +105,7 @@ def open_radios(
             SerialRadio(*ports[i], name, settings[i], transmits=transmits, phases=phases, computing=computing)
             for i, name in enumerate(names)
         )
-    if driver in ("listener", "sniffer", "uci") and kind == "anchor":
+    if driver in ("listener", "sniffer", "uci", "phone") and kind == "anchor":
         raise SkylessError(f"--radio is {spec!r}; it should be one that can transmit: a {driver} only listens")
     if driver == "listener":
         from skyless.radio.foreign.foreign_radios import ListenerRadio
@@ -115,8 +117,8 @@ def open_radios(
 
 def open_sniffers(
     spec: str, names: tuple[str, ...], anchors_m: Mapping[int, Point] | None = None
-) -> "tuple[SnifferRadio | UciRadio, ...]":
-    """Create sniffers or FiRa boards for the tags of one process, in the order of their names.
+) -> "tuple[SnifferRadio | UciRadio | PhoneRadio, ...]":
+    """Create sniffers, FiRa boards or the phone for the tags of one process, in the order of their names.
 
     ``anchors_m``: known positions of the system's anchors. Raises SkylessError.
     """
@@ -124,6 +126,13 @@ def open_sniffers(
     from skyless.radio.foreign.foreign_radios import SnifferRadio, UciRadio
 
     driver, _, where = spec.partition(":")
+    if driver == "phone":
+        from skyless.radio.foreign.phone_radio import PhoneRadio
+
+        host, port = host_and_port(spec, where.removeprefix("//"), PHONE_PORT)
+        if len(names) != 1:
+            raise SkylessError(f"--radio is {spec!r}; it is one phone, which is one tag, not {len(names)}")
+        return (PhoneRadio(host, port, names[0], anchors_m or {}, AnchorFrame()),)
     ports = zip(_ports(spec, where, _FOREIGN_BAUD, names), names, strict=True)
     if driver == "sniffer":
         return tuple(SnifferRadio(*port, name) for port, name in ports)
@@ -201,11 +210,11 @@ def host_and_port(spec: str, where: str, default_port: int) -> tuple[str, int]:
     """Parse HOST[:PORT] of a radio's name; the host defaults to 127.0.0.1. Raises SkylessError."""
     host, colon, digits = where.rpartition(":") if where.count(":") != 0 else (where, "", "")
     port = int(digits) if digits.isdecimal() and len(digits) < 6 else 0
-    driver = spec.partition(":")[0]
+    scheme = spec.removesuffix(where)
     if colon and not 0 < port < 65_536:
-        raise SkylessError(f"--radio is {spec!r}; it should be {driver}:HOST[:PORT] with a port from 1 to 65535")
+        raise SkylessError(f"--radio is {spec!r}; it should be {scheme}HOST[:PORT] with a port from 1 to 65535")
     if "/" in host:
-        raise SkylessError(f"--radio is {spec!r}; it should be {driver}:HOST[:PORT], and {host} is no host")
+        raise SkylessError(f"--radio is {spec!r}; it should be {scheme}HOST[:PORT], and {host} is no host")
     return host.strip("[]") or "127.0.0.1", port or default_port
 
 

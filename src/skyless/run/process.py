@@ -22,12 +22,13 @@ from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import IO, Any, Final
 
-from msgspec import Struct
+from msgspec import UNSET, Struct, UnsetType
+from msgspec.structs import replace
 
 from skyless.core.site import Site
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import NODE_KEEPALIVE_S, RESEND_S, Handler, Link
-from skyless.run.mqtt.messages import SiteMessage, WrongMessageError, read_message, site_message
+from skyless.run.mqtt.messages import SiteMessage, System, WrongMessageError, read_message, site_message
 from skyless.run.mqtt.topics import floor_plan_topic, plan_of_floor_topic, site_topic
 
 HEALTH_S: Final = 1.0
@@ -220,6 +221,8 @@ class SitePublisher:
     ) -> None:
         """``plans`` are the images of the floors by number, or of the whole site by None."""
         self._site, self._is_simulated, self._plans = site, is_simulated, dict(plans or {})
+        self.system: System | UnsetType = UNSET
+        """Whose anchors they are, if not Skyless's own."""
         self._restarts: int | None = None
         self._simulated = False
         self._published: SiteMessage | None = None
@@ -239,7 +242,8 @@ class SitePublisher:
         """Publish the site if it is new or due, retained for later subscribers."""
         now_s = time.monotonic()
         if self._published is None or self._published.simulated is not self._simulated:
-            self._published = site_message(self._site, simulated=self._simulated, unix_s=time.time())
+            message = site_message(self._site, simulated=self._simulated, unix_s=time.time())
+            self._published = replace(message, system=self.system)
         elif now_s < self._repeat_s:
             return
         self._repeat_s = now_s + RESEND_S * random.uniform(0.5, 1.0)

@@ -19,6 +19,7 @@ from msgspec.structs import replace
 
 from skyless.core.site import Site
 from skyless.run.mqtt.messages import AnchorHealth, Asset, EtherHealth, FixMessage, StatusMessage, TagHealth
+from skyless.site.anchor_names import anchor_name
 
 Health = TagHealth | AnchorHealth | EtherHealth
 Presence = Literal["fresh", "late", "asleep", "gone"]
@@ -190,6 +191,7 @@ class SiteTable:
         """
         self.host, self.drops = host, Counter() if drops is None else drops
         self.site: Site | None = None
+        self._addresses = False
         self.site_anchors: tuple[str, ...] = ()
         """Names of the site's anchors, as far as admitted."""
         self.fixed: dict[str, Node] = {}
@@ -235,8 +237,9 @@ class SiteTable:
         """Whether all messages can arrive; otherwise silence means nothing."""
         return self.connected and self.batches_connected
 
-    def set_site(self, site: Site, now_s: float) -> None:
-        """Update the site, and with it the expected anchors."""
+    def set_site(self, site: Site, now_s: float, *, addresses: bool = False) -> None:
+        """Update the site, and with it the expected anchors; ``addresses``: these are called by their MAC addresses."""
+        self._addresses = addresses
         if self.site is None:
             self.ready_s = now_s
         self.site = site
@@ -249,6 +252,12 @@ class SiteTable:
     def set_assets(self, assets: Mapping[str, Asset]) -> None:
         """Update the groups of tags."""
         self.group_of = {tag: asset.group for tag, asset in assets.items()} if self.longest_of_groups_s else {}
+
+    def spelled(self, anchors: Iterable[str]) -> list[str]:
+        """Names of anchors for people, of those in messages and topics."""
+        return [
+            anchor_name(int(name), addresses=True) if self._addresses and name.isdecimal() else name for name in anchors
+        ]
 
     @property
     def is_bare(self) -> bool:

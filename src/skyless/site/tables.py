@@ -1,6 +1,7 @@
 """Users' CSV tables of anchors, truth, ranges and heights. Other columns are ignored.
 
-Anchors: ``id,x_m,y_m,z_m``, optionally with a calibration. Truth: ``t_s,x_m,y_m,z_m`` and, if measured, the attitude
+Anchors: ``id,x_m,y_m,z_m``, optionally with a calibration. An id is as in ``anchor_names``; in a table in which one is
+a MAC address with a letter, so are all of 4 or 16 digits. Truth: ``t_s,x_m,y_m,z_m`` and, if measured, the attitude
 ``qx,qy,qz,qw``; or the listener's positions in a table of MILUV passive ticks (``gt_L_…``). Ranges of a survey:
 ``anchor_a,anchor_b,range_m``, one row for each range in either direction. Heights: ``id,z_m``.
 All functions raise ConfigurationError, which names file, line, column and value of the fault.
@@ -22,6 +23,7 @@ from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.arrays import Array
 from skyless.core.errors import ConfigurationError
 from skyless.files import finite, read_lines
+from skyless.site.anchor_names import anchor_name, is_address, read_anchor
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 from skyless.site.survey.facts import PairRanges
 from skyless.site.survey.legs import mean_ranges
@@ -50,6 +52,8 @@ class _Row(Struct, frozen=True, gc=False):
     line: int
     fields: dict[str, str]
     """By column."""
+    addresses: bool = False
+    """Whether identifiers of 4 or 16 digits are MAC addresses, without a letter too."""
 
     def number(self, column: str, limit_m: float = inf) -> float:
         """A finite number, within ± ``limit_m``."""
@@ -59,15 +63,11 @@ class _Row(Struct, frozen=True, gc=False):
         return value
 
     def identifier(self, column: str = "id") -> int:
-        """An anchor's identifier, decimal or hexadecimal after 0x."""
-        field = self.fields[column]
+        """An anchor's identifier."""
         try:
-            identifier = int(field, 0) if field.lower().startswith("0x") else int(field)
+            return read_anchor(self.fields[column], addresses=self.addresses)
         except ValueError:
-            identifier = -1
-        if identifier < 0:
-            raise self.wrong(column, "a whole number, or a hexadecimal one after 0x")
-        return identifier
+            raise self.wrong(column, "a whole number, one after 0x, or a MAC address, as C974") from None
 
     def wrong(self, column: str, expected: str) -> ConfigurationError:
         return ConfigurationError(self.path, f"line {self.line}, column {column}", self.fields[column], expected)
@@ -85,6 +85,8 @@ def _rows(path: str | PathLike[str], *headers: Sequence[str]) -> Iterator[_Row]:
         raise ConfigurationError(path, "line 1", ",".join(names), f"a header with {','.join(headers[0])}")
     if any(names.count(name) > 1 for name in wanted):
         raise ConfigurationError(path, "line 1", ",".join(names), "a header with different names")
+    ids = [number for number, name in enumerate(names) if name in ("id", *RANGE_COLUMNS[:2])]
+    addresses = any(is_address(row[number].strip()) for row in table[1:] for number in ids if number < len(row))
     for line, row in enumerate(table[1:], start=2):
         if not any(field.strip() for field in row):
             continue
@@ -92,7 +94,7 @@ def _rows(path: str | PathLike[str], *headers: Sequence[str]) -> Iterator[_Row]:
             if wanted is LISTENER_COLUMNS:
                 continue
             raise ConfigurationError(path, f"line {line}", ",".join(row), f"{len(names)} columns as in the header")
-        yield _Row(path, line, {name: field.strip() for name, field in zip(names, row, strict=True)})
+        yield _Row(path, line, {name: field.strip() for name, field in zip(names, row, strict=True)}, addresses)
 
 
 def _empty(path: str | PathLike[str], what: str) -> ConfigurationError:
@@ -210,11 +212,14 @@ def calibrated_table(path: str | PathLike[str], calibration: DifferenceCalibrati
     return out.getvalue()
 
 
-def new_table(anchors_m: Mapping[int, Point], calibration: DifferenceCalibration) -> str:
-    """A new table of anchors with their calibration."""
+def new_table(anchors_m: Mapping[int, Point], calibration: DifferenceCalibration, *, addresses: bool = False) -> str:
+    """A new table of anchors with their calibration; ``addresses``: identifiers are MAC addresses."""
+    names = {anchor: anchor_name(anchor, addresses=addresses) for anchor in anchors_m}
+    if addresses and not any(map(is_address, names.values())):  # they would be read as numbers
+        names = {anchor: f"0x{name}" for anchor, name in names.items()}
     rows = [",".join((*ANCHOR_COLUMNS, *CALIBRATION_COLUMNS))]
     for anchor, position_m in sorted(anchors_m.items()):
-        rows.append(",".join((str(anchor), *map(str, position_m), *_fields(calibration.anchors.get(anchor)))))
+        rows.append(",".join((names[anchor], *map(str, position_m), *_fields(calibration.anchors.get(anchor)))))
     return "\n".join(rows) + "\n"
 
 

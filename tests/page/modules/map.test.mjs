@@ -298,6 +298,11 @@ test("tags and anchors of other floors are dimmed; floors come from anchors, the
   assert.throws(() => giveHeights("ground"), { message: "ground is no list of heights such as 0, 3.2" });
 }); // prettier-ignore
 
+test("the map calls the master so at Skyless's own sites only, and FiRa's anchors by their MAC addresses", () => {
+  const words = (system) => (show({ master: 1 }, { system }), new Set(drawn(drawAnchors).words));
+  assert.deepEqual([words(undefined).has("1 master"), words("tdoa").has("1"), words("dl-tdoa").has("0001")], [true, true, true]);
+});
+
 test("anchors above each other have one line of names, or that of the chosen floor", () => {
   const lower = twoFloors().slice(0, 8).filter(({ floor }) => !floor);
   show({ master: null, anchors: [...lower, ...lower.map((one) => ({ ...one, id: one.id + 4, floor: 1, z_m: 6 }))] });

@@ -121,6 +121,10 @@ test("an anchor has figures while it is heard; of one that is offline only what 
   assert.deepEqual([anchors.facts({ anchor: 3 }).State[0], anchors.facts({ anchor: 3 })["Synchronised to"]], ["not synchronised", undefined]);
   send({ ...HELLO, site: { ...HELLO.site, site: { ...HELLO.site.site, schedule: { ...HELLO.site.site.schedule, mode: "free" } } } });
   assert.deepEqual(anchors.rows()[0].slice(1, 3), ["on the air", "1"], "no master at a site without one");
+  send({ ...HELLO, site: { ...HELLO.site, system: "tdoa" } });
+  assert.deepEqual(anchors.rows()[0].slice(1, 3), ["on the air", "1"], "nor at another system's");
+  send({ ...HELLO, site: { ...HELLO.site, system: "dl-tdoa" } });
+  assert.equal(anchors.rows()[0][2], "0001", "FiRa's anchors are called by their MAC addresses");
 }); // prettier-ignore
 
 test("what the watch finds is listed, and marks its anchors", () => {

@@ -60,7 +60,9 @@ class BiasResult(Result, frozen=True, eq=False):
     def corrected_file(self) -> str:
         """The table of anchors with the biases in it, as ``skyless calibrate --out`` writes it. Raises SkylessError."""
         known = self.found.estimate.calibration()
-        return new_table(self.found.anchors_m, known) if self.table is None else calibrated_table(self.table, known)
+        if self.table is not None:
+            return calibrated_table(self.table, known)
+        return new_table(self.found.anchors_m, known, addresses=self.found.addresses)
 
     def to_dataframe(self) -> "DataFrame":
         """One row per anchor: ``anchor``, ``bias_m``, ``std_m``, ``noise_m``, ``count``.
@@ -80,7 +82,7 @@ class BiasResult(Result, frozen=True, eq=False):
             figure, axes = panel(f"{self.path.name}: constants of the anchors, zero is their mean")
             at = np.arange(len(self.anchors))
             axes.bar(at, 100.0 * self.bias_m, yerr=100.0 * self.std_m, color=BLUE, capsize=3.0)
-            axes.set_xticks(at, [str(anchor) for anchor in self.anchors])
+            axes.set_xticks(at, [self.found.name_of(anchor) for anchor in self.anchors.tolist()])
             axes.set(xlabel="anchor", ylabel="signals seem late by, in cm")
         return figure
 
@@ -94,7 +96,10 @@ class BiasResult(Result, frozen=True, eq=False):
         found = self.found.estimate
         for one in found.anchors:
             value = "not determined" if one.bias_m is None else f"{cm(one.bias_m)} ± {cm(one.std_m)}"
-            yield f"anchor {one.anchor}", f"{value}; noise {cm(one.noise_m)}, {one.count} differences"
+            yield (
+                f"anchor {self.found.name_of(one.anchor)}",
+                f"{value}; noise {cm(one.noise_m)}, {one.count} differences",
+            )
         yield "zero", "of biases only differences can be seen; the zero is the mean of the constants"
         yield "noise of a difference", f"{cm(found.noise_before_m)} before, {cm(found.noise_m)} after"
         if found.slope_m is not None:

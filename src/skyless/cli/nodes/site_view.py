@@ -156,7 +156,7 @@ class SiteView:
     def _on_site(self, message: SiteMessage | None, _channel: Channel) -> None:
         if message is not None:
             self.site = message
-            self.table.set_site(message.site, self._clock())
+            self.table.set_site(message.site, self._clock(), addresses=message.system == "dl-tdoa")
             self.table.set_assets(self._named())
 
     def _on_health(self, health: Health, channel: Channel) -> None:
@@ -206,6 +206,7 @@ class SiteView:
         now_s, site = self._clock(), self.site
         tags, anchors = self.table.senders("tag"), {name: Node(name) for name in self.table.site_anchors}
         anchors |= dict(self.table.senders("anchor"))
+        named = zip(self.table.spelled(anchors), anchors.values(), strict=True)
         drops: Counter[str] = Counter()
         for node in (*(node for _, node in tags), *anchors.values()):
             if node.reports(now_s) and isinstance(node.health, TagHealth | AnchorHealth):
@@ -219,9 +220,7 @@ class SiteView:
             trouble=self.link.trouble,
             condition=self.condition,
             tags=self._tag_rows(tags, now_s),
-            anchors=tuple(
-                sorted((_anchor_row(*one, now_s) for one in anchors.items()), key=lambda row: row.state not in GONE)
-            ),
+            anchors=tuple(sorted((_anchor_row(*one, now_s) for one in named), key=lambda row: row.state not in GONE)),
             alarms=tuple(sorted(self._alarms.values(), key=_alarm_rank)),
             drops={reason: count for reason, count in drops.most_common() if count and reason not in NOT_DROPS},
             unused=dict(self.feed.drops),

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Coroutine, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TextIO
 
@@ -39,6 +40,7 @@ from skyless.run.open_radio import (
 from skyless.run.process import Log, together
 from skyless.run.tag import Tags, TagSettings
 from skyless.sim.evaluation.request import ProtectionOptions
+from skyless.site.anchor_names import anchor_name
 
 if TYPE_CHECKING:
     from skyless.core.air.masterless_packets import Point
@@ -75,8 +77,8 @@ class LineOptions(Options, frozen=True, kw_only=True):
     json: bool = False
     """Write one JSON object for each fix on standard output, a line each, as on MQTT."""
 
-    def lines(self, log: Log) -> "FixLines | None":
-        """The writer of the requested lines; None if none are requested. Raises SkylessError."""
+    def lines(self, log: Log, *, addresses: bool = False) -> "FixLines | None":
+        """The writer of the requested lines, if any; ``addresses``: anchors have MAC addresses. Raises SkylessError."""
         asked = {"print": self.print, "csv": self.csv, "json": self.json}
         chosen = [name for name, is_asked in asked.items() if is_asked]
         if len(chosen) > 1:
@@ -85,7 +87,8 @@ class LineOptions(Options, frozen=True, kw_only=True):
             return None
         if sys.stdout is None:
             raise SkylessError(f"--{chosen[0]} writes on standard output, which is closed")
-        line = {"print": line_for_people, "csv": csv_row, "json": to_json}[chosen[0]]
+        rows = partial(csv_row, addresses=addresses)
+        line = rows if self.csv else line_for_people if self.print else to_json
         return FixLines(line, ",".join(CSV_COLUMNS) if self.csv else None, log)
 
 
@@ -99,13 +102,13 @@ def line_for_people(fix: FixMessage) -> str:
     return f"{moment}  {fix.tag}  x {x_m:.3f}  y {y_m:.3f}  {height}  ± {cm(fix.std_m)}{alert}"
 
 
-def csv_row(fix: FixMessage) -> str:
+def csv_row(fix: FixMessage, *, addresses: bool = False) -> str:
     """The values of ``CSV_COLUMNS``; empty for missing ones, anchors separated by spaces."""
     velocity = (None, None, None) if fix.velocity_mps is None else fix.velocity_mps
     moved = [_figure(value) for value in (*fix.position_m, fix.std_m, *velocity)]
     levels = [_figure(value) for value in (fix.latency_s, fix.hpl_m, fix.vpl_m)]
     trust = [_figure(value) for value in (fix.time_s, fix.verified_until_s, fix.unverified)]
-    anchors = " ".join(map(str, fix.anchors))
+    anchors = " ".join(anchor_name(anchor, addresses=addresses) for anchor in fix.anchors)
     return ",".join([f"{fix.unix_s:.6f}", fix.tag, *moved, anchors, *levels, fix.alert or "", *trust])
 
 
@@ -196,25 +199,28 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     """Radio of the tags. ether:HOST:PORT: the emulated air of skyless ether. serial:PATH: a board of Skyless.
     spi:BUS.DEVICE,irq=PIN,reset=PIN: a DW1000 on this computer's SPI. model:HOST:PORT: a model of one on that air.
     listener:PATH: the listener of uwb-apps. sniffer:PATH: a Bitcraze sniffer, for TDoA2 and TDoA3 systems.
-    uci:PATH: a FiRa board whose DL-TDoA session as a tag goes on.
+    uci:PATH: a FiRa board whose DL-TDoA session as a tag goes on. phone://HOST:PORT: where this computer waits for a
+    phone's DL-TDoA records, lines of JSON by TCP or WebSocket (0.0.0.0 for a phone in the network; port 7470 by
+    default).
     Several tags have several paths, with commas; PATH@BAUD gives another rate."""
     method: Method = DEFAULT_METHOD
-    """How positions are computed (sniffers and FiRa boards: always joint)."""
+    """How positions are computed (sniffers, FiRa boards, phones: always joint)."""
     qa: Positive | None = None
     """Process noise for the tags' motion: spectral density of the acceleration in m²/s³ (joint); by default 0.3."""
     dynamics: Dynamics | None = None
     """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     tag_height_std: NotNegative | None = None
     """Standard deviation of the tags' height from the one that is given, in metres, which fixes and levels then
-    count (joint); 0 by default, for sniffers and FiRa boards 0.5 where the height is only taken for the anchors'."""
+    count (joint); 0 by default, for sniffers, FiRa boards and phones 0.5 where the height is only taken for the
+    anchors'."""
     publish_hz: Annotated[float, number(above=0.0, most=1000.0)] = 50.0
     """Fixes a second and tag at most, on MQTT and on standard output; all of them count in the tag's health."""
     site_id: SiteId | None = None
-    """Number of the site, the only one to listen to; by default the first one heard. For sniffers and FiRa boards what
-    topics call the system, by default 0; it should be no other site's."""
+    """Number of the site, the only one to listen to; by default the first one heard. For sniffers, FiRa boards and
+    phones what topics call the system, by default 0; it should be no other site's."""
     anchors: Path | None = None
-    """Table of anchors of another system (sniffers and FiRa boards): id,x_m,y_m,z_m, as skyless replay and calibrate
-    take it. FiRa boards need none where anchors state their positions."""
+    """Table of anchors of another system (sniffers, FiRa boards, phones): id,x_m,y_m,z_m, as skyless replay and
+    calibrate take it. FiRa boards and phones need none where anchors state their positions."""
     to: Annotated[tuple[str, ...], Text(lambda _, text: text, many=True)] = ()
     """Where fixes go as well, without a broker: a program or device of another kind; may be given several times.
     skyless bridge --help lists the targets, as nmea+tcp://:10110."""
@@ -229,8 +235,8 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     clock_bound_ms: Annotated[float | None, number(above=0.0, most=10_000.0)] = None
     """How far this computer's clock may be from those of the anchors, in ms; 100 by default (with --site-key)."""
     tag_height: str | None = None
-    """The tags' height (sniffers and FiRa boards): metres, free (estimated) or auto, the default: estimated unless the
-    anchors lie too flat, then theirs."""
+    """The tags' height (sniffers, FiRa boards, phones): metres, free (estimated) or auto, the default: estimated unless
+    the anchors lie too flat, then theirs."""
 
 
 @app.default
@@ -252,7 +258,7 @@ def tag(
     names
         Names of one or more tags: letters, digits, - and _.
     """
-    address, lines = broker.address(), shown.lines(log)
+    address, lines = broker.address(), shown.lines(log, addresses=hears_positions(asked.radio))
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
         given = repr(" ".join(names)) if names else "missing"
         raise SkylessError(
@@ -261,11 +267,11 @@ def tag(
     if receives_packets(asked.radio):
         asked.leave_out(
             *("site_key", "trust", "clock_bound_ms", "integrity_risk", "alert_limit_m", "max_acceleration_mps2"),
-            why="it is not for sniffers and FiRa boards",
+            why="it is not for sniffers, FiRa boards and phones",
         )
         tags = _on_sniffers
     else:
-        why = "it is for sniffers and FiRa boards; other tags hear from the air where anchors stand"
+        why = "it is for sniffers, FiRa boards and phones; other tags hear from the air where anchors stand"
         asked.leave_out("anchors", "tag_height", why=why)
         tags = _on_radios
     if asked.from_board:
@@ -362,7 +368,7 @@ def _on_sniffers(
 
 
 def _system(asked: TagOptions) -> "PacketTagSettings":
-    """Settings that sniffers, and some FiRa boards, cannot receive from the air. Raises SkylessError."""
+    """Settings that sniffers, and some FiRa boards and phones, cannot receive from the air. Raises SkylessError."""
     from skyless.core.geometry import GUESSED_STD_M, plane_height_m
     from skyless.run.masterless.packet_tags import TDOA_SITE, PacketTagSettings
     from skyless.site.tables import read_anchors, read_calibration

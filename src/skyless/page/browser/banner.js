@@ -4,7 +4,7 @@
  * banner replaces the sentence.
  */
 
-import { on, select, state } from "./store.js";
+import { anchorName, on, select, state } from "./store.js";
 import { counts, criticals } from "./alarms/model.js";
 import { Rows, byId, h, text } from "./dom.js";
 import { now_s } from "./clock.js";
@@ -127,7 +127,7 @@ function makeReason() {
 function makeLink(name) {
   const [kind, id] = [name.slice(0, name.indexOf("/")), name.slice(name.indexOf("/") + 1)];
   const go = () => (openTab(`${kind}s`), select(kind, kind === "anchor" ? Number(id) : id));
-  return { element: h("button", { type: "button", class: "quiet", onclick: go }, `Show ${kind} ${id}`) };
+  return { element: h("button", { type: "button", class: "quiet", onclick: go }, `Show ${kind} ${kind === "anchor" ? anchorName(id) : id}`) };
 }
 
 function makeFigure(name) {

@@ -152,9 +152,15 @@ export function healthAge_s(kind, name) {
   return heard === undefined ? Infinity : (performance.now() - heard) / 1e3;
 }
 
-/** The site of a message, with the outline and the floors that stand beside it there; null without one. */
+/** The site of a message, with what stands beside it there; null without one. */
 export function siteOf(message) {
-  return message ? { ...message.site, outline_m: message.outline_m, floors: message.floors } : null;
+  const { site, outline_m, floors, system } = message ?? {};
+  return site ? { ...site, outline_m, floors, system } : null;
+}
+
+/** What people call an anchor: its number, or one of FiRa's by its MAC address. */
+export function anchorName(id) {
+  return state.site?.system === "dl-tdoa" ? Number(id).toString(16).toUpperCase().padStart(4, "0") : String(id);
 }
 
 /** Whether the page may change the site. */

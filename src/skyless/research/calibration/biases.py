@@ -23,12 +23,13 @@ from skyless.files import Drops, open_source
 from skyless.research.calibration.options import CalibrateOptions, First, Stay
 from skyless.research.foreign import datasets
 from skyless.research.foreign.formats import FORMATS, Recording, format_of, open_recording
-from skyless.research.replays.inputs import flight_height, known_anchors, known_truth
+from skyless.research.replays.inputs import flight_height, known_anchors, known_truth, stated_anchors
 from skyless.research.replays.site import SITE_FORMAT, reception_of, recorded_site, recorded_truth
 from skyless.run.masterless.pair_engine import PairEngine
 from skyless.run.mqtt.messages import ReceptionsMessage, StampsMessage
 from skyless.run.recordings.recording import HostClock, McapRecording, Recorded, is_mcap, tags_to_replay
 from skyless.sim.evaluation.figures import EvenSample, TruthTrack
+from skyless.site.anchor_names import anchor_name
 from skyless.site.survey.estimate import CalibrationEstimate, Differences, estimate
 from skyless.site.survey.facts import PairBlock, PairRanges
 from skyless.site.survey.legs import AnchorLeg, LegCollector, RelayedDifferences, RelayMatcher
@@ -207,12 +208,20 @@ class Biases(Struct, frozen=True):
     """Latest positions of the anchors."""
     drops: dict[str, int]
     """Unusable differences, by reason."""
+    addresses: bool = False
+    """Whether identifiers are MAC addresses."""
+
+    def name_of(self, anchor: int) -> str:
+        """The name of an anchor for people."""
+        return anchor_name(anchor, addresses=self.addresses)
 
     @property
     def notes(self) -> list[str]:
         """Sentences for the user about doubtful results."""
         found = self.estimate
-        notes = [f"anchor {one.anchor} is not determined: {one.reason}" for one in found.anchors if one.reason]
+        notes = [
+            f"anchor {self.name_of(one.anchor)} is not determined: {one.reason}" for one in found.anchors if one.reason
+        ]
         if found.rejected > _MANY_OUTLIERS * (found.used + found.rejected):
             part = found.rejected / (found.used + found.rejected)
             notes.append(f"{part:.0%} of the differences are outliers: calibrate where every anchor is in sight")
@@ -234,7 +243,9 @@ def biases_of(asked: CalibrateOptions) -> Biases:
     path = Path(asked.file)
     truth = None if asked.stays else known_truth(path, asked)
     above_m, (anchors_m, height_m) = flight_height(asked.above_m, truth), known_anchors(asked.anchors, asked.site)
-    with open_recording(path, asked.format, asked.listener) as recording:
+    kind = format_of(path, asked.format)
+    with open_recording(path, kind.name, asked.listener, anchors_m or None) as recording:
+        anchors_m = anchors_m or stated_anchors(path, kind)
         position_from = partial(positions_of, asked, truth, above_m, height_m)
         differences, drops = gather(tdoas_of(recording, anchors_m), anchors_m, position_from, asked.first)
         name = recording.format.name
@@ -244,7 +255,7 @@ def biases_of(asked: CalibrateOptions) -> Biases:
             f"no time difference could be used ({reasons or 'the recording gives none'}); --truth or --at should say "
             "where the tag was, and --anchors or --site where the anchors are"
         )
-    return Biases(name, estimate(differences), anchors_m, drops)
+    return Biases(name, estimate(differences), anchors_m, drops, kind.is_dl_tdoa)
 
 
 def tdoas_of(recording: Recording, anchors_m: Mapping[int, Point]) -> Iterator[PairTdoa]:
@@ -361,8 +372,11 @@ def ranges_of(
         return _of_site(path, identifier, part)
     known = format_of(path, format_name)
     if known.tx_bits is None:
-        stamped = ", ".join(one.name for one in FORMATS if one.tx_bits is not None)
+        stamped = ", ".join(one.name for one in FORMATS if one.tx_bits is not None and not one.is_dl_tdoa)
         raise ConfigurationError(path, "format", known.name, f"one with stamps of anchors: {SITE_FORMAT}, {stamped}")
+    if known.is_dl_tdoa:
+        right = "of a system whose anchors all range each other; here positions are those that messages state"
+        raise ConfigurationError(path, "format", known.name, f"{right}, or those of --anchors")
     part = _Part(PairRanger(known.tx_bits, block_s, on_block=on_block), from_s, to_s, on_progress)
     drops = _add_receptions(path, part) if known.name == "avalue" else _add_packets(path, known.name, part)
     return RecordedRanges(part.finish(), part.ranger, known.name, None, dict(drops + part.drops()))

@@ -26,6 +26,7 @@ from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import Site
 from skyless.research.replays.options import RecordingOptions
+from skyless.site.anchor_names import read_anchor
 from skyless.site.survey.facts import Facts, Gauge, Point, TagReceived, Tape
 from skyless.site.tables import read_heights
 
@@ -76,7 +77,7 @@ def _metres(name: str, text: str, counts: tuple[int, ...], part: str | None = No
 def _anchor(name: str, text: str, part: str) -> int:
     """Parse an anchor's identifier in ``part`` of a text. Raises SkylessError."""
     try:
-        return int(part, 0) if part.strip().lower().startswith("0x") else int(part)
+        return read_anchor(part.strip())
     except ValueError:
         raise SkylessError(f"{name} is {text!r}; {part!r} should be the identifier of an anchor") from None
 

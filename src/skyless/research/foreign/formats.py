@@ -15,13 +15,13 @@ from skyless.core.arrays import Array
 from skyless.core.errors import ConfigurationError
 from skyless.core.ticks import TICK_BITS
 from skyless.files import Drops, has_columns, header_of, open_source, read_head
-from skyless.radio.foreign import bitcraze, fira
-from skyless.research.foreign import _phones as phones
+from skyless.radio.foreign import bitcraze, fira, phones
 from skyless.research.foreign import crazyflie, datasets
 from skyless.research.foreign import crazyflie as bitcraze_captures
 from skyless.research.foreign import datasets as muloc
 from skyless.research.foreign import datasets as starloc
 from skyless.research.foreign import datasets as tdoa_tables
+from skyless.site.anchor_names import anchor_name
 from skyless.site.tables import Truth, read_truth
 
 Record = Packet | PairTdoa
@@ -56,6 +56,10 @@ class Format:
     """Selectable channels; with one selected, packets have carrier phases."""
     delays_ticks: int = 0
     """Antenna delays of a sender and a receiver together, if its stamps include them."""
+
+    def anchor_name(self, anchor: int) -> str:
+        """The name of an anchor for people."""
+        return anchor_name(anchor, addresses=self.is_dl_tdoa)
 
 
 _bitcraze: Final = partial(Format, tx_bits=bitcraze.STAMP_BITS, delays_ticks=bitcraze.ANTENNA_DELAYS_TICKS)

@@ -26,6 +26,7 @@ from skyless.research.replays.inputs import (
     known_anchors,
     known_heights,
     known_truth,
+    stated_anchors,
 )
 from skyless.research.replays.options import DIFFERENCES_MADE, PACKETS, ReplayOptions
 from skyless.run.masterless.difference_tracking import DIFFERENCES, DifferenceTracking
@@ -302,9 +303,6 @@ FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcra
 _MAX_WITHOUT_ANCHORS: Final = 20_000
 """A recording that carries anchor positions has one within this many records."""
 
-_MAX_TO_FIND_ANCHORS: Final = 2_000
-"""Every anchor of a DL-TDoA recording is heard within this many records."""
-
 
 class ReplayReport(Figures, frozen=True, kw_only=True):
     """Result of a replay: metres and seconds, None if unknown."""
@@ -367,7 +365,7 @@ class CaptureReplay:
         self._truth = known_truth(Path(asked.file), asked)
         if not self._anchors_m:
             _check_carries_anchors(asked)
-        self.known_m = self._anchors_m or _stated_anchors(asked, kind)
+        self.known_m = self._anchors_m or stated_anchors(asked.file, kind)
         """Positions at the recording's beginning, for time differences; packets carry theirs, which may change."""
         self.height_m, self._height_std_m, self.height_note = height_to_hold(
             asked.tag_height_m, self.known_m, site_height_m, self._truth, kind.name
@@ -538,6 +536,7 @@ class CaptureReplay:
         total = self.recording.drops + self._pipeline.drops
         drops = {name: count for name, count in sorted(total.items()) if count}
         by_m = sorted(self._pipeline.contradictions_m.items())
+        name = self.recording.format.anchor_name
         own, filtered = self._asked.estimator, "joint-smoothed" if self._asked.smooth else "joint"
         return ReplayReport(
             format=self.recording.format.name,
@@ -550,7 +549,7 @@ class CaptureReplay:
             pairs=pairs,
             method=filtered if own is None else getattr(own, "__name__", "own"),
             measurements=f"{self.measurements} and phases" if self._has_phases else self.measurements,
-            contradictions_m={f"{a}-{b}": metres for (a, b), metres in by_m},
+            contradictions_m={f"{name(a)}-{name(b)}": metres for (a, b), metres in by_m},
             notes=self._pipeline.notes,
         )
 
@@ -577,15 +576,6 @@ def how_to_find_anchors(file: str | Path, kind: Format) -> str:
     """The command that finds the anchors of a recording in which they range each other; otherwise empty."""
     ranges = kind.tx_bits is not None and not kind.is_dl_tdoa
     return f"; skyless survey --recording {file} --out anchors.csv finds them" if ranges else ""
-
-
-def _stated_anchors(asked: ReplayOptions, kind: Format) -> dict[int, Point]:
-    """Positions stated by the anchors of a DL-TDoA recording."""
-    if not kind.is_dl_tdoa:
-        return {}
-    with open_recording(asked.file, asked.format) as recording:
-        packets = [record for record in islice(recording, _MAX_TO_FIND_ANCHORS) if isinstance(record, Packet)]
-    return {packet.anchor: packet.position_m for packet in packets if packet.position_m is not None}
 
 
 def distances_of(file: str | Path, name: str) -> dict[str, float]:

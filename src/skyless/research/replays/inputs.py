@@ -2,6 +2,7 @@
 
 from collections import deque
 from collections.abc import Mapping
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -13,11 +14,11 @@ from skyless.arguments import (
     existing_file,
     wrong,
 )
-from skyless.core.air.masterless_packets import Point
+from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.geometry import GUESSED_STD_M, plane_height_m
 from skyless.core.site import Site
-from skyless.research.foreign.formats import format_of
+from skyless.research.foreign.formats import Format, format_of, open_recording
 from skyless.research.replays.options import BAROMETER, RECORDED, RecordingOptions, ReplayOptions
 from skyless.run.masterless.smoothing import Height
 from skyless.sim.evaluation.figures import FLIGHT_M, antenna_truth, flies, shifted
@@ -53,6 +54,19 @@ def known_anchors(anchors: "Anchors | None", site: Site | str | Path | None) -> 
         x_m, y_m, z_m = check_point(f"--anchors[{identifier}]", position_m, (3,))
         anchors_m[identifier] = (x_m, y_m, z_m)
     return anchors_m, None
+
+
+_MAX_TO_FIND_ANCHORS: Final = 2_000
+"""Every anchor of a DL-TDoA recording is heard within this many records."""
+
+
+def stated_anchors(file: str | Path, kind: Format) -> dict[int, Point]:
+    """Positions stated by the anchors of a DL-TDoA recording."""
+    if not kind.is_dl_tdoa:
+        return {}
+    with open_recording(file, kind.name) as recording:
+        packets = [record for record in islice(recording, _MAX_TO_FIND_ANCHORS) if isinstance(record, Packet)]
+    return {packet.anchor: packet.position_m for packet in packets if packet.position_m is not None}
 
 
 def _read_yaml(path: Path) -> dict[int, Point]:

@@ -326,16 +326,18 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     """Anchors of the site are offline, only cut off from the broker, or not synchronised."""
     if evidence.table.site is None:
         return
-    names = evidence.table.site_anchors
+    names, spelled = evidence.table.site_anchors, evidence.table.spelled
     offline, cut_off, idle = _anchors(evidence, now_s)
     if offline:
         which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
-        which = which or f"{listed('anchor', offline)} of {len(names)} {verb(offline, 'is', 'are')}"
+        which = (
+            which or f"{listed('anchor', evidence.table.spelled(offline))} of {len(names)} {verb(offline, 'is', 'are')}"
+        )
         advice = "See whether power and program run there; positions are less accurate without them."
         too_few = len(names) - len(offline) < _MIN_ANCHORS
         yield _of("anchor", "anchors", "bad" if too_few else "warning", f"{which} offline", advice, offline)
     if cut_off:
-        text = f"{listed('anchor', cut_off)} {verb(cut_off, 'does', 'do')} not report, though on the air"
+        text = f"{listed('anchor', spelled(cut_off))} {verb(cut_off, 'does', 'do')} not report, though on the air"
         advice = "The program has lost the broker, or the page lost its messages: see its log."
         yield _of("anchor", "silent-anchors", "warning", text, advice, cut_off)
     if idle:

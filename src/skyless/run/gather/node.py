@@ -122,7 +122,7 @@ class SiteCondition:
     def _on_site(self, message: SiteMessage | None) -> None:
         if message is not None:
             self.site = message
-            self._table.set_site(message.site, self._now_s)
+            self._table.set_site(message.site, self._now_s, addresses=message.system == "dl-tdoa")
 
     def _on_health(self, health: Health, channel: Channel) -> None:
         self._table.add_health(channel.who, channel.name, health, self._now_s)

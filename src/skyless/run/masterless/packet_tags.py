@@ -1,6 +1,6 @@
-"""Tags on sniffers and FiRa boards, which receive the packets of a system without a master.
+"""Tags on sniffers, FiRa boards and phones, which receive the packets of a system without a master.
 
-The anchors' positions are configured, or stated in a FiRa board's messages.
+The anchors' positions are configured, or stated in the messages of a FiRa board or a phone.
 """
 
 import time
@@ -18,7 +18,8 @@ from skyless.core.site import AnchorSite, GeoreferenceSite, Site, TagsSite
 from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign.bitcraze import STAMP_BITS
 from skyless.radio.foreign.foreign_radios import SnifferRadio, UciRadio
-from skyless.radio.interface import Gone, Restarted
+from skyless.radio.foreign.phone_radio import PhoneRadio
+from skyless.radio.interface import Gone, Hint, Restarted
 from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog
 from skyless.run.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, MASTERLESS, PacketTracking
 from skyless.run.mqtt.address import MqttAddress
@@ -36,7 +37,7 @@ _METHOD: Final = "joint"
 
 _NEW_HEIGHT_M: Final = 0.05  # change of the anchors' mean height that restarts tracking
 
-PacketRadio = SnifferRadio | UciRadio
+PacketRadio = SnifferRadio | UciRadio | PhoneRadio
 
 
 class PacketTagSettings(Struct, frozen=True):
@@ -101,7 +102,7 @@ class PacketTagNode:
     def _new_tracking(self) -> PacketTracking:
         asked = self.settings
         known = {"qa": asked.qa, "height_m": self._height_m, "height_std_m": self._height_std_m}
-        is_dl_tdoa = isinstance(self.radio, UciRadio)
+        is_dl_tdoa = isinstance(self.radio, UciRadio | PhoneRadio)
         return PacketTracking(
             (DL_TDOA if is_dl_tdoa else MASTERLESS).changed(**known),
             asked.anchors_m,
@@ -123,13 +124,14 @@ class PacketTagNode:
         """Listen until cancelled."""
         await self.radio.run(self.on_event)
 
-    def on_event(self, event: Packet | Restarted | Gone) -> None:
+    def on_event(self, event: Packet | Restarted | Gone | Hint) -> None:
         """Process an event of the radio."""
         if isinstance(event, Packet):
             self._receive(event)
             return
         self.monitor.on_event(event)
-        if isinstance(event, Restarted) and self.packets:
+        # A phone that connects again goes on; whether its time has begun again, its stamps say, as in a file.
+        if isinstance(event, Restarted) and self.packets and not isinstance(self.radio, PhoneRadio):
             self._height_m, self._height_std_m = self.settings.height_m, self.settings.height_std_m
             self._anchors_seen = 0  # the anchors may have been moved
             self._begin_again()
@@ -152,14 +154,15 @@ class PacketTagNode:
 
     def _receive(self, packet: Packet) -> None:
         self.packets += 1
-        if packet.host_s is not None and not self.fix_log.lateness.admits(packet.host_s, self._clock()):
+        host_s = None if isinstance(self.radio, PhoneRadio) else packet.host_s  # a phone's packets have its own time
+        if host_s is not None and not self.fix_log.lateness.admits(host_s, self._clock()):
             return
         fix = self.tracking.on_packet(packet)
         self._known += packet.anchor in self.tracking.anchors_m
         self._update_height()
         if fix is not None:
             done_s = self._clock()
-            self.fix_log.add(fix, done_s if packet.host_s is None else packet.host_s, done_s)
+            self.fix_log.add(fix, done_s if host_s is None else host_s, done_s)
 
 
 class PacketTags:
@@ -191,7 +194,7 @@ class PacketTags:
         self._simulated, self._on_anchors = simulated, on_anchors
         self._heard_m: dict[int, Point] = {}
         site = site_of(settings)
-        self._site_publisher = None if site is None else SitePublisher(site, simulated)
+        self._site_publisher = None if site is None else self._new_publisher(site)
 
     async def run(self) -> None:
         """Serve until cancelled."""
@@ -245,7 +248,7 @@ class PacketTags:
             return
         self._heard_m = heard_m
         radio = self.nodes[0].radio
-        known = radio.frame.origin if isinstance(radio, UciRadio) else None
+        known = radio.frame.origin if isinstance(radio, UciRadio | PhoneRadio) else None
         origin = None if known is None else GeoreferenceSite(*structs.astuple(known))
         if self._on_anchors is not None:
             self._on_anchors(heard_m, origin)
@@ -253,4 +256,9 @@ class PacketTags:
         if site is not None and self._site_publisher is not None:
             self._site_publisher.place(site)
         elif site is not None:
-            self._site_publisher = SitePublisher(site, self._simulated)
+            self._site_publisher = self._new_publisher(site)
+
+    def _new_publisher(self, site: Site) -> SitePublisher:
+        publisher = SitePublisher(site, self._simulated)
+        publisher.system = "dl-tdoa" if isinstance(self.nodes[0].radio, UciRadio | PhoneRadio) else "tdoa"
+        return publisher

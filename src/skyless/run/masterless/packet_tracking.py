@@ -6,6 +6,7 @@ unusable data are counted. The filter decides which measurements are used.
 
 from collections import Counter
 from collections.abc import Mapping
+from functools import partial
 from math import dist, log, sqrt
 from typing import Final
 
@@ -30,6 +31,7 @@ from skyless.core.ticks import (
 from skyless.run.masterless.difference_tracking import DIFFERENCES, Corners, is_within, neighbourhood_m
 from skyless.run.masterless.pair_engine import MAX_ANCHORS, remember
 from skyless.run.masterless.stamp_watch import StampWatch
+from skyless.site.anchor_names import anchor_name
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
 
 MASTERLESS_RANDOM_WALK_FM: Final = 5e-9
@@ -76,10 +78,6 @@ NOT_CALIBRATED: Final = (
 
 BACK_IN_ROW: Final = 8
 """Consecutive packets from before the newest that mean that the tag's counter has restarted."""
-
-
-def spelled(anchor: int) -> str:
-    return f"{anchor:04X}"
 
 
 class _Anchor:
@@ -149,7 +147,8 @@ class PacketTracking:
         self._pairs: set[tuple[int, int]] | None = None if one_way is None else set()
         """Pairs of listener and sender in relays, until two anchors have relayed each other."""
         self._watch, self._faults = StampWatch(), 0
-        self._is_calibrated = calibration is not None or one_way is None
+        self._has_addresses = one_way is not None  # those of FiRa
+        self._is_calibrated = calibration is not None or not self._has_addresses
         self._tracking = self._new_tracking()
         self._area_m: Corners = ((), ())
         self._drops: Counter[str] = Counter()
@@ -184,12 +183,13 @@ class PacketTracking:
     @property
     def notes(self) -> tuple[str, ...]:
         """What is wrong with the anchors, in sentences."""
+        names = partial(anchor_name, addresses=self._has_addresses)
         own = [
-            f"Anchor {spelled(anchor)} runs on its own clock ({ppm:+.1f} ppm): its time base is lost."
+            f"Anchor {names(anchor)} runs on its own clock ({ppm:+.1f} ppm): its time base is lost."
             for anchor, ppm in sorted(self._watch.own_clocks_ppm.items())
         ]
         flips = [
-            f"Stamps of anchor {spelled(anchor)} flip between two values {gap_m:.1f} m apart: no protection level."
+            f"Stamps of anchor {names(anchor)} flip between two values {gap_m:.1f} m apart: no protection level."
             for anchor, gap_m in sorted(self._watch.flips_m.items())
         ]
         return (*own, *flips, *(() if self._is_calibrated else (NOT_CALIBRATED,)))

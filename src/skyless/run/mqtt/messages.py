@@ -22,6 +22,9 @@ Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 """3 × 3, row by row."""
 
+System = Literal["tdoa", "dl-tdoa"]
+"""Other systems, none with a master; in dl-tdoa, FiRa's, anchors are called by their MAC addresses."""
+
 MAX_LEASES: Final = 64
 MAX_LEASE_S: Final = 60.0
 
@@ -40,6 +43,8 @@ class SiteMessage(Struct, frozen=True):
     """The storeys, where the site's file has them."""
     alarms: tuple[AlarmRule, ...] = ()
     """The alarm rules in the site's file."""
+    system: System | UnsetType = UNSET
+    """Whose anchors they are; omitted for Skyless's own."""
 
     @property
     def whole_site(self) -> Site:

@@ -1,7 +1,7 @@
 /** Anchors: their health as a colour and a shape, and their marks on the map. */
 
 import { s } from "../dom.js";
-import { on, state } from "../store.js";
+import { anchorName, on, state } from "../store.js";
 import { surveyShown } from "../survey/model.js";
 import { palette } from "../theme.js";
 import { groundHeight, otherFloor } from "./floors.js";
@@ -41,9 +41,9 @@ export function condition(id) {
   return state.health.conditions.get(id) ?? "unknown";
 }
 
-/** How the site's anchors share the air: master or free. */
+/** How the site's anchors share the air: master, or free as in all systems but the paper's. */
 export function siteMode() {
-  return state.site?.schedule?.mode ?? "master";
+  return state.site?.system ? "free" : (state.site?.schedule?.mode ?? "master");
 }
 
 /** Words for a condition; anchors that send at random instants are synchronised to nothing. */
@@ -112,7 +112,7 @@ export function drawAnchors(context) {
       context.strokeRect(x - MARK - 4.5, y - MARK - 4.5, 2 * MARK + 9, 2 * MARK + 9);
     }
     if (anchor.id === state.selection.anchor) ring(context, x, y, MARK + 9);
-    const words = leading ? `${anchor.id} ${leading}` : String(anchor.id);
+    const words = leading ? `${anchorName(anchor.id)} ${leading}` : anchorName(anchor.id);
     const height = view.spatial ? ` · ${Number(anchor.z_m.toFixed(2))} m` : "";
     const chosen = anchor.id === state.selection.anchor;
     names.push({ words: words + height, x, y, alpha, below: chosen ? 12 : 7, leading: chosen || leading !== "" });

@@ -3,7 +3,7 @@
  * of it is a sheet for those who mount the anchors, or a table of positions.
  */
 
-import { on, select, state } from "../store.js";
+import { anchorName, on, select, state } from "../store.js";
 import { installersSheet } from "../api.js";
 import { byId, h, text, toast } from "../dom.js";
 import { csvOf } from "../files.js";
@@ -74,7 +74,7 @@ function show() {
   const anchor = state.site?.anchors.find((one) => one.id === state.selection.anchor);
   const moved = places.size === 1 ? "1 anchor elsewhere" : `${places.size} anchors elsewhere`;
   const nothing = places.size ? `${moved}; nothing` : "Nothing";
-  const what = anchor ? `Anchor ${anchor.id}:` : "Drag an anchor, or select one.";
+  const what = anchor ? `Anchor ${anchorName(anchor.id)}:` : "Drag an anchor, or select one.";
   text(byId("placing-help"), `${nothing} is sent to the site. ${what}`);
   byId("placing-fields").hidden = !anchor;
   byId("placing-reset").disabled = !places.size;

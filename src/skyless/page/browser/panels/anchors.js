@@ -1,6 +1,6 @@
 /** Anchors and their clocks as a list; the selected one in detail; and the other programs of the site. */
 
-import { healthAge_s, state } from "../store.js";
+import { anchorName, healthAge_s, state } from "../store.js";
 import { Chart } from "../chart.js";
 import { Rows, h, text } from "../dom.js";
 import { DASH, duration, length, number } from "../format.js";
@@ -91,7 +91,7 @@ function describe(id) {
     words: [words, noCodes].filter(Boolean).join("; "),
     key: words + leading + noCodes,
     mark: () => anchorMark(noCodes ? "warn" : kind, leading !== ""),
-    name: [id, leading, finding && markWords(finding), noCodes].filter(Boolean).join(" "),
+    name: [anchorName(id), leading, finding && markWords(finding), noCodes].filter(Boolean).join(" "),
     figures: [
       leading ? "reference" : known ? number(health.offset_s, 4, "s") : DASH,
       leading || !known ? DASH : number(health.rate_ppm, 3, "ppm"),
@@ -124,7 +124,7 @@ function makeDetail() {
     const health = healthOf(id);
     element.hidden = !health;
     if (!health) return;
-    text(heading, `Anchor ${id}`);
+    text(heading, `Anchor ${anchorName(id)}`);
     const [codes, chain] = [codesOf(health)?.grade, chainWords(health)?.grade];
     const grade = condition(id) === "good" ? "" : condition(id);
     list.show(anchorFacts(id, health), { State: grade, "Last report": "bad", Codes: codes, "Key chain": chain, "Not accepted": "bad" });

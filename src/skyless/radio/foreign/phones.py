@@ -14,6 +14,9 @@ lowest first: an array of numbers, hexadecimal, or a whole number of ticks), ``i
 message: Android's documentation names either unit); and ``address``, which the app adds from the peer.
 
 An address is a number or hexadecimal text, with or without colons. Further keys are of no interest.
+
+A line may also be an array of records, as of one call of the system. Records of one message may stand in any order;
+between messages, those that are not newer than the newest are dropped.
 """
 
 from collections.abc import Iterator, Mapping
@@ -25,7 +28,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import Packet, Point
-from skyless.core.ticks import TICK_BITS, TICK_RATE_HZ, wrap
+from skyless.core.ticks import TICK_BITS, TICK_MASK, TICK_RATE_HZ, difference, wrap
 from skyless.files import Drops, lines
 from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.uci import DtMessage, DtMessageType, DtRounds, GeodeticPoint, host_time_s
@@ -39,6 +42,9 @@ _FARTHEST_M: Final = 1e6
 _COMMON_TIME: Final = 1
 _MAX_CLUSTERS: Final = 256
 _MAX_REPLY_TICKS: Final = (1 << 32) - 1
+
+LATE_S: Final = 1.0
+"""How far before the newest a record is late or a double; one from farther back means that time has begun again."""
 
 
 class _Wgs84(Struct):
@@ -82,50 +88,73 @@ class _Record(Struct, rename="camel"):
     anchor_location: _AnchorLocation | None = None
 
 
-_decode: Final = msgspec.json.Decoder(_Record).decode
+_decode: Final = msgspec.json.Decoder(_Record | list[_Record]).decode
+_BOM: Final = b"\xef\xbb\xbf"
 
 
 def recognise(head: bytes) -> bool:
-    """Whether the first line is a record of either system."""
-    first = head.removeprefix(b"\xef\xbb\xbf").partition(b"\n")[0]
+    """Whether the first line has records of either system."""
+    found = _records(head.partition(b"\n")[0])
+    return any(one.measurement_type is not None or one.message_type is not None for one in found or ())
+
+
+def _records(line: bytes) -> list[_Record] | None:
+    """The records of a line; None if it is malformed."""
     try:
-        record = _decode(first)
+        found = _decode(line.removeprefix(_BOM))
     except (msgspec.MsgspecError, ValueError, RecursionError):
-        return False
-    return record.measurement_type is not None or record.message_type is not None
+        return None
+    return found if isinstance(found, list) else [found]
 
 
 def read(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
     """Yield the packets of a file of records; ``anchors_m``: positions that replace all that anchors state."""
-    phone = _Phone(anchors_m)
+    phone = Phone(drops, anchors_m)
     for line in lines(stream, drops):
-        if not line.strip():
-            continue
-        packet = phone.on_line(line)
-        if isinstance(packet, Packet):
-            yield packet
-        else:
-            drops[packet] += 1
+        yield from phone.on_message(line)
 
 
-class _Phone:
-    """One phone's records, in their order."""
+class Phone:
+    """Converts one phone's records to packets, and counts unusable ones."""
 
-    def __init__(self, anchors_m: Mapping[int, Point] | None) -> None:
+    def __init__(
+        self, drops: Drops, anchors_m: Mapping[int, Point] | None = None, frame: AnchorFrame | None = None
+    ) -> None:
+        """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these."""
+        self._drops = drops
         self._rounds = DtRounds(anchors_m)
-        self._frame = None if anchors_m else AnchorFrame()
+        self._frame = None if anchors_m else frame or AnchorFrame()
         self._polls: dict[int, int] = {}
         """How many each cluster has sent, by its initiator."""
         self._newest_initiator: int | None = None
+        self._newest_rx_ticks: int | None = None
 
-    def on_line(self, line: bytes) -> Packet | str:
-        """The packet of a record, or the reason why it is of no use."""
-        try:
-            record = _decode(line.removeprefix(b"\xef\xbb\xbf"))
-        except (msgspec.MsgspecError, ValueError, RecursionError):
-            return "malformed-record"
-        message = self._android(record) if record.measurement_type is None else self._ios(record)
-        return message if isinstance(message, str) else self._rounds.on_message(message)
+    def on_message(self, message: bytes) -> list[Packet]:
+        """Packets of the lines of a message, in order of reception."""
+        records: list[_Record] = []
+        for line in message.split(b"\n"):
+            found = _records(line) if line.strip() else []
+            if found is None:
+                self._drops["malformed-record"] += 1
+            else:
+                records += found
+        packets = []
+        for record in _in_order(records):
+            stated = self._android(record) if record.measurement_type is None else self._ios(record)
+            packet = stated if isinstance(stated, str) else self._rounds.on_message(stated)
+            if isinstance(packet, Packet):
+                packets.append(packet)
+            else:
+                self._drops[packet] += 1
+        return packets
+
+    def _is_late(self, rx_ticks: int) -> bool:
+        """Whether a record is not newer than the newest, which it otherwise becomes."""
+        ahead = 1 if self._newest_rx_ticks is None else _ahead(rx_ticks, self._newest_rx_ticks)
+        if -LATE_S * TICK_RATE_HZ < ahead <= 0:
+            return True
+        self._newest_rx_ticks = rx_ticks
+        return False
 
     def _ios(self, record: _Record) -> DtMessage | str:
         kind, address = _kind(record.measurement_type), _address(record.address)
@@ -138,6 +167,8 @@ class _Phone:
             return "stamp-missing"
         if initiator is None:
             return "message-without-poll"
+        if self._is_late(rx_ticks):
+            return "late-or-double-record"
         if kind is DtMessageType.POLL:
             if initiator not in self._polls and len(self._polls) >= _MAX_CLUSTERS:
                 return "too-many-clusters"
@@ -171,6 +202,8 @@ class _Phone:
         indices = record.block_index, record.round_index
         if not all(0 <= value <= _MAX_REPLY_TICKS for value in (*replies, *indices)):
             return "impossible-number"
+        if self._is_late(rx_ticks):
+            return "late-or-double-record"
         return DtMessage(
             host_time_s(rx_ticks),
             address,
@@ -187,6 +220,27 @@ class _Phone:
 
     def _position_m(self, location: Point | GeodeticPoint | None) -> Point | None:
         return None if self._frame is None else self._frame.position_m(location)
+
+
+def _in_order(records: list[_Record]) -> list[_Record]:
+    """Records of one message by their RX stamps; those without one come first, to be counted."""
+    if len(records) < 2:
+        return records
+    stamps = [_rx_ticks(one) for one in records]
+    first = next((stamp for stamp in stamps if stamp is not None), 0)
+    ahead = [-TICK_MASK if stamp is None else _ahead(stamp, first) for stamp in stamps]
+    return [records[number] for number in sorted(range(len(records)), key=ahead.__getitem__)]
+
+
+def _rx_ticks(record: _Record) -> int | None:
+    if record.measurement_type is None:
+        return _android_ticks(record.rx_timestamp)
+    return _ios_ticks(record.raw_receive_time, record.receive_time)
+
+
+def _ahead(rx_ticks: int, other: int) -> int:
+    """How much later a stamp is than another; stamps of more than 40 bits do not wrap."""
+    return rx_ticks - other if max(rx_ticks, other) > TICK_MASK else difference(rx_ticks, other)
 
 
 def _kind(stated: int | str | None) -> DtMessageType | None:
