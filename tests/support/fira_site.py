@@ -52,13 +52,13 @@ class Measured(NamedTuple):
 
 def planned_m(site):
     """RMSE over the points by ``skyless plan``."""
-    table = Predictor(site, PlanSettings(qa=QA)).at(PLACES_M)
+    table = Predictor(site, PlanSettings()).at(PLACES_M)
     return math.sqrt(float(np.mean(table[:, RMSE] ** 2)))
 
 
 def round_planned_m(site, settings):
     """The same where tags receive a round's messages only, which relay the poll, or the responses in the final one."""
-    planner = Predictor(site, PlanSettings(qa=QA))
+    planner = Predictor(site, PlanSettings())
     superframe, relays, master = planner.superframe, planner.relays, planner.master
     messages = len(site.anchors) + site.schedule.frames_per_node - 1
     begins, ends, kept = [0, *relays.ends[:-1].tolist()], [], []

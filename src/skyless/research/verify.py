@@ -90,7 +90,7 @@ def verify(
         room = None if worlds == 1 else stated_room(site, slope_m=slope_m, at_rest=True)
         request = Request(site=site, seed=seed + world, room=room)
         impairments = replace(impairments_of(request, site), channel=settings.channel)
-        fleet = Fleet(site, still, impairments, request.seed, FleetSettings(qa=settings.qa, warmup_s=warm_up_s))
+        fleet = Fleet(site, still, impairments, request.seed, FleetSettings(warmup_s=warm_up_s))
         now_s = 0.0
         while now_s < end_s:
             now_s = min(now_s + 0.25, end_s)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 
-from skyless.arguments import check_choice, check_whole, process_noise, python_function
+from skyless.arguments import check_choice, check_whole, python_function
 from skyless.cli.api.fixes import Result, data_frame
 from skyless.cli.api.options import PlanOptions
 from skyless.cli.common import cm
@@ -289,7 +289,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
     site, file = site_of(asked.site)
     if not site.schedule.needs_master and len(site.anchors) > MAX_PREDICTED:
         asked.leave_out(
-            *("noise_ps", "qa", "dynamics", "target_m", "optimise", "anchor_heights_m", "mounts_m"),
+            *("noise_ps", "target_m", "optimise", "anchor_heights_m", "mounts_m"),
             *("search_s", "verify_points", "verify_rounds", "seed"),
             why=f"errors are predicted for sites of at most {MAX_PREDICTED} anchors; this one has {len(site.anchors)}",
         )
@@ -300,7 +300,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
         return rates
     asked.leave_out("exponent", why=f"it is for sites of more than {MAX_PREDICTED} anchors")
     channel = ChannelModel() if asked.range_m is None else with_range(ChannelModel(), asked.range_m)
-    settings = PlanSettings(asked.noise_ps, process_noise(asked.qa, asked.dynamics) or 0.3, channel)
+    settings = PlanSettings(asked.noise_ps, channel)
     if asked.optimise is None:
         check_anchor_count(site, file)
     else:

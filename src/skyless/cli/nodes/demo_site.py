@@ -470,7 +470,6 @@ class WholeSite:
             method=asked.method,
             integrity_risk=asked.integrity_risk,
             alert_limit_m=asked.alert_limit_m,
-            max_acceleration=asked.max_acceleration_mps2,
         )
         anchors = [str(anchor.id) for anchor in self.site.anchors]
         known = site if self._has_story else ()

@@ -11,7 +11,6 @@ from typing import Any, Final
 import numpy as np
 from msgspec import Struct, field, structs
 
-from skyless.arguments import process_noise
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.estimator.settings import EstimatorSettings
@@ -345,7 +344,7 @@ class CaptureReplay:
     def __init__(self, asked: ReplayOptions, calibration: DifferenceCalibration | None = None) -> None:
         """Open the recording; ``calibration`` is used instead of that of the table of anchors. Raises SkylessError."""
         asked.leave_out(
-            *("tag", "method", "integrity_risk", "alert_limit_m", "max_acceleration_mps2"),
+            *("tag", "method", "integrity_risk", "alert_limit_m"),
             why="it is for recordings of skyless record",
         )
         self._asked, kind = asked, format_of(asked.file, asked.format)
@@ -373,7 +372,6 @@ class CaptureReplay:
         if self._channel is None and self.measurements == PACKETS and kind.channels:
             self._channel = kind.channels[0]  # stamps of two channels have other constants
         self.recording: Recording = open_recording(path, asked.format, asked.listener, anchors_m, self._channel)
-        self._qa = process_noise(asked.qa, asked.dynamics)
         self._calibration = calibration
         table = asked.anchors if isinstance(asked.anchors, str | Path) and not asked.uncalibrated else None
         if calibration is None and table is not None and Path(table).suffix not in YAML_SUFFIXES:
@@ -414,7 +412,7 @@ class CaptureReplay:
         engine = None if bits is None else PairEngine(bits, anchors_m=self.known_m)
         if self._asked.estimator is not None:
             return ByOwnEstimator(self._asked.estimator(), self.known_m, engine, self._noise)
-        asked = {"qa": self._qa, "difference_std_m": self._asked.tdoa_std_m, "height_m": self.height_m}
+        asked = {"difference_std_m": self._asked.tdoa_std_m, "height_m": self.height_m}
         asked["height_std_m"] = self._height_std_m
         known = {key: value for key, value in asked.items() if value is not None}
         settings = PROFILES.get(self.recording.format.name, DIFFERENCES).changed(**known)
@@ -424,8 +422,7 @@ class CaptureReplay:
     def _by_packets(self) -> ByPackets:
         bits = self.recording.format.tx_bits
         assert bits is not None
-        qa = MASTERLESS.qa if self._qa is None else self._qa
-        known = {"qa": qa, "height_m": self.height_m, "height_std_m": self._height_std_m}
+        known = {"height_m": self.height_m, "height_std_m": self._height_std_m}
         known["carrier_cycles"] = CARRIER_CYCLES[self._channel or 5] if self._has_phases else 0
         is_dl_tdoa = self.recording.format.is_dl_tdoa
         tracking = PacketTracking(

@@ -122,7 +122,6 @@ def room_results(run: RoomRun) -> tuple[RunResult, ...]:
                 impairments=air_of(room, site),
                 seed=room.seed,
                 method=plan.method,
-                qa=plan.qa,
                 warmup_s=_WARMUP_S,
                 until_s=_WARMUP_S + plan.seconds,
             )

@@ -153,14 +153,14 @@ MAX_PREDICTED: Final = 60
 _GEOMETRY_CHUNK: Final = 2000
 _FILTER_CHUNK: Final = 100
 
+_QA_M2PS3: Final = 0.3  # what a receiver assumes of a tag at rest
+
 
 class PlanSettings(Struct, frozen=True):
     """Assumptions beyond the site file."""
 
     noise_ps: float | None = None
     """Noise of every TX and RX stamp; None for the site's own figures."""
-    qa: float = 0.3
-    """Process noise of the filter: spectral density of the acceleration, m²/s³."""
     channel: ChannelModel = ChannelModel()
 
 
@@ -185,7 +185,7 @@ class Predictor:
         self.relays = relays_of(self.anchors_m, self.master, self.superframe, self.budget, self.barriers)
         self.scene = Scene(self.anchors_m, self.superframe.sent, self.budget, self.barriers)
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
-        self._estimator = EstimatorSettings(qa=settings.qa, height_m=site.tags.height_m)
+        self._estimator = EstimatorSettings(qa=_QA_M2PS3, height_m=site.tags.height_m)
         read_accuracy(self._estimator, *map(encode_page, filter_pages_of(self.site)))
         fill_ages(self._estimator, superframe_s(site))
 

@@ -81,7 +81,6 @@ def plan_report(
         "method": DEFAULT_METHOD,
         "tx_stamp_ps": site.noise.tx_stamp_ps,
         "rx_stamp_ps": site.noise.rx_stamp_ps,
-        "qa": settings.qa,
         "range_m": range_of(settings.channel),
         "superframe_s": superframe_s(site),
         "master": site.master if site.schedule.needs_master else None,
@@ -155,7 +154,7 @@ def described(result: dict[str, Any]) -> str:
     tx_ps, rx_ps = result["tx_stamp_ps"], result["rx_stamp_ps"]
     noise = f"{tx_ps:g} ps" if tx_ps == rx_ps else f"{tx_ps:g} ps (TX) and {rx_ps:g} ps (RX)"
     return (
-        f"predicted for {result['method']} with qa {result['qa']:g} m²/s³, stamps of {noise}, "
+        f"predicted for {result['method']} with stamps of {noise}, "
         f"{'periods' if result['master'] is None else 'superframes'} of {1e3 * result['superframe_s']:.1f} ms, "
         "tags at rest"
     )
