@@ -22,7 +22,7 @@ from skyless.site.planning.links import (
     SIGMA_Z,
     with_range,
 )
-from skyless.site.planning.predict import PlanSettings, Predictor
+from skyless.site.planning.maps import PlanSettings, Predictor
 from skyless.site.planning.superframe import stamp_variances
 
 pytestmark = pytest.mark.statistical

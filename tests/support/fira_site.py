@@ -24,7 +24,7 @@ from skyless.sim.impairments import RangeErrorModel
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
 from skyless.site.planning.links import PLAN_COLUMNS, RMSE
-from skyless.site.planning.predict import PlanSettings, Predictor, fill_joint_sigma
+from skyless.site.planning.maps import PlanSettings, Predictor, fill_joint_sigma
 from skyless.site.planning.superframe import Relays, Superframe
 
 POINTS_M = np.array([(2.0, 3.0), (1.0, 1.0), (4.5, 6.0), (3.0, 4.0), (5.0, 2.0), (0.7, 7.0)])

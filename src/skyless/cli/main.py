@@ -33,7 +33,7 @@ _GROUPS: Final = {
         ("site", "site", "Write and check site files."),
         ("plan", "plan", "Predict a site's errors before it is mounted, and place its anchors."),
         ("survey", "survey", "Find where anchors hang, and their antenna delays."),
-        ("calibrate", "calibrate", "Correct antenna delays by a tag at known positions."),
+        ("calibrate", "survey:calibrate_app", "Correct antenna delays by a tag at known positions."),
         ("flash-config", "nodes.boards:flash_app", "Set up a board that computes its own position."),
         ("doctor", "nodes.doctor", "Check a computer, its boards and a running site in two minutes."),
     ),

@@ -16,8 +16,7 @@ from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of, stated_room
 from skyless.sim.trajectory import Static
 from skyless.site.planning.links import CLAIMED, FIX_SHARE, RMSE, SIGMA
-from skyless.site.planning.maps import PlanMap
-from skyless.site.planning.predict import Predictor
+from skyless.site.planning.maps import PlanMap, Predictor
 from skyless.site.planning.report import PointCheck, Verification
 
 _WARM_UP_S: Final = 3.0

@@ -28,9 +28,9 @@ from msgspec.structs import replace
 from skyless.core.errors import SkylessError, writing
 from skyless.files import replace_files
 from skyless.machine import how_to_install
-from skyless.run.gather.leaf import PING_INTERVAL, Leaf
 from skyless.run.gather.subjects import DOMAIN, MAX_PAYLOAD, NAME_REQUESTS, PAGE_INBOX, NatsAddress, at
 from skyless.run.gather.subjects import FIRST_PORT as FIRST_NATS_PORT
+from skyless.run.hub_files import PING_INTERVAL, Leaf
 from skyless.run.mqtt.address import ACCESS, PASSWORD_VARIABLE, MqttAddress, Role, mqtt_address
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.process import data_folder, end, end_with_parent, is_free, locked, reserve, reserve_next

@@ -31,9 +31,17 @@ from skyless.site.planning.links import (
     usual_tag_heights,
     with_range,
 )
-from skyless.site.planning.maps import PlanMap, grid_of, plan_map, rows_of, summary_of
+from skyless.site.planning.maps import (
+    MAX_PREDICTED,
+    PlanMap,
+    PlanSettings,
+    Predictor,
+    grid_of,
+    plan_map,
+    rows_of,
+    summary_of,
+)
 from skyless.site.planning.optimise import OneMore, Optimised, Search
-from skyless.site.planning.predict import MAX_PREDICTED, PlanSettings, Predictor
 from skyless.site.planning.rates import RateMap, described_rates, rate_map, rate_report
 from skyless.site.planning.report import AfterMetre, Verification, described, plan_report
 

@@ -15,9 +15,8 @@ from skyless.core.protocol1.snapshots import literal_covariance
 from skyless.core.tag.position import NoSolution, locate
 from skyless.site.file.advice import warnings_of
 from skyless.site.planning.links import BIAS, FIX_SHARE, IN_VIEW, SIGMA, Floor, Mounts, range_of, sample_points
-from skyless.site.planning.maps import MapSummary, PlanMap
+from skyless.site.planning.maps import MapSummary, PlanMap, Predictor
 from skyless.site.planning.optimise import Optimised, Scored, one_more
-from skyless.site.planning.predict import Predictor
 from skyless.site.planning.superframe import master_warnings, stamp_variances
 
 
