@@ -43,7 +43,7 @@ from skyless.site.planning.maps import (
 )
 from skyless.site.planning.optimise import OneMore, Optimised, Search
 from skyless.site.planning.rates import RateMap, described_rates, rate_map, rate_report
-from skyless.site.planning.report import AfterMetre, Verification, described, plan_report
+from skyless.site.planning.report import Verification, described, plan_report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -213,7 +213,10 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
         where = "" if worst_at is None else " at ({:.2f}, {:.2f}, {:.2f}) m".format(*worst_at)
         master = "no master" if found["master"] is None else f"master {found['master']}"
         yield "anchors", f"{len(found['anchors'])}, {master}, range {found['range_m']:.0f} m in the open"
-        yield "map", _map_line(found)
+        line = f"{found['points']} points, {found['step_m']:g} m apart"
+        if found["computed_every_m"] > found["step_m"]:
+            line += f"; {found['method']} computed every {found['computed_every_m']:g} m and interpolated by the PDOP"
+        yield "map", line
         yield (
             "covered",
             f"{found['covered_share']:.1%} of the region; fewest anchors in view: {found['fewest_anchors']}",
@@ -228,8 +231,13 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
         if found["walls_bias"]:
             rmse = f"RMSE mean {cm(found['mean_rmse_m'])}, worst {cm(found['worst_rmse_m'])}"
             yield "with the walls' delays", rmse
-        if found["after_metre"] is not None:
-            yield "after 1 m of walking", _after_metre(found["after_metre"])
+        if (after := found["after_metre"]) is not None:
+            yield (
+                "after 1 m of walking",
+                f"median {cm(after.median_sigma_m)}, worst {cm(after.worst_sigma_m)} with phases of the carrier; by "
+                f"stamps alone {cm(after.stamps_median_sigma_m)} and {cm(after.stamps_worst_sigma_m)} "
+                f"({after.walks} walks)",
+            )
         if found["target_share"] is not None:
             yield "target met", f"in {found['target_share']:.1%} of the region"
         if found["one_more"] is not None:
@@ -238,20 +246,6 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
             yield "optimised", _against_even(found["optimised"])
         if found["verification"] is not None:
             yield "simulated", _verified(found["verification"])
-
-
-def _map_line(result: dict[str, Any]) -> str:
-    line = f"{result['points']} points, {result['step_m']:g} m apart"
-    if result["computed_every_m"] > result["step_m"]:
-        line += f"; {result['method']} computed every {result['computed_every_m']:g} m and interpolated by the PDOP"
-    return line
-
-
-def _after_metre(found: AfterMetre) -> str:
-    return (
-        f"median {cm(found.median_sigma_m)}, worst {cm(found.worst_sigma_m)} with phases of the carrier; by stamps "
-        f"alone {cm(found.stamps_median_sigma_m)} and {cm(found.stamps_worst_sigma_m)} ({found.walks} walks)"
-    )
 
 
 def _one_more(more: OneMore) -> str:

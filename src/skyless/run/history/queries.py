@@ -572,16 +572,12 @@ def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
 
 def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of a result, with few of them in memory at once."""
-    parameters = _parameters(files, span) | more
+    parameters = {"files": list(map(str, files)), "begin": span.from_unix_s, "end": span.to_unix_s} | more
     if parameters["files"]:
         with _connection() as duck:
             found = duck.execute(sql, parameters)
             while rows := found.fetchmany(_FETCHED):
                 yield from rows
-
-
-def _parameters(files: Iterable[Path], span: Span) -> dict[str, Any]:
-    return {"files": list(map(str, files)), "begin": span.from_unix_s, "end": span.to_unix_s}
 
 
 def _quoted(path: Path) -> str:

@@ -199,7 +199,10 @@ class LiveSurvey:
         """Return the state of the survey as a message."""
         newest, state = self._results.get(self.serial), self.state(now_s)
         present = {anchor for anchor, heard_s in self._heard_s.items() if now_s - heard_s <= PRESENT_S}
-        ranges = self._shown_ranges(now_s)
+        # Ranges of 1225 pairs take half a second, so they are renewed only every six seconds.
+        if self._shown is None or not 0.0 <= now_s - self._shown[1] < len(self._shown[0].pairs) / _SHOWN_PAIRS_PER_S:
+            self._shown = self._ranger.ranges(), now_s
+        ranges = self._shown[0]
         error = self.error
         if error is None and state == "no data":
             ago = "yet" if self._newest_s is None else f"for {now_s - self._newest_s:.0f} s"
@@ -251,12 +254,6 @@ class LiveSurvey:
         self._results.clear()
 
     # Helpers
-
-    def _shown_ranges(self, now_s: float) -> PairRanges:
-        """Ranges for a message. Those of 1225 pairs take half a second, so they are renewed only every six seconds."""
-        if self._shown is None or not 0.0 <= now_s - self._shown[1] < len(self._shown[0].pairs) / _SHOWN_PAIRS_PER_S:
-            self._shown = self._ranger.ranges(), now_s
-        return self._shown[0]
 
     def _add(self, leg: AnchorLeg, now_s: float) -> None:
         self._newest_s = self._heard_s[leg.sender] = self._heard_s[leg.receiver] = now_s
