@@ -384,7 +384,10 @@ class History:
         A visit across an end of the range counts with its part inside. An unfinished one lasts until the end of the
         range, or of the known data.
         """
-        names, asked, until = self._zone_names(zone), [*self._tags(tags)], self.known_until_unix_s()
+        names = {one: name for one, (name, _) in self.zones().items()}
+        if zone is not None and zone not in names:
+            raise SkylessError(f"the history of site {self.site} has no zone {zone!r}; {_some(names, 'zones')}")
+        asked, until = [*self._tags(tags)], self.known_until_unix_s()
         if until is None or until <= span.from_unix_s:
             return ()
         known = Span(span.from_unix_s, min(until, span.to_unix_s))
@@ -507,13 +510,6 @@ class History:
                 raise SkylessError(f"the history of site {self.site} has no tag {one!r}; {_some(numbers, 'tags')}")
             found[tags[0]] = numbers[tags[0]]
         return found
-
-    def _zone_names(self, zone: str | None) -> dict[str, str]:
-        """Zone names by identifier. Raises SkylessError if ``zone`` is not among them."""
-        names = {one: name for one, (name, _) in self.zones().items()}
-        if zone is not None and zone not in names:
-            raise SkylessError(f"the history of site {self.site} has no zone {zone!r}; {_some(names, 'zones')}")
-        return names
 
 
 # The way of a tag
