@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skyless.arguments import check_number, check_point, check_whole, named_as_arguments, process_noise
+from skyless.arguments import check_number, check_point, check_whole, named_as_arguments
 from skyless.core.errors import SkylessError
 from skyless.research.replays.options import ReplayOptions
 
@@ -33,16 +33,6 @@ def test_what_is_no_number_is_refused(value):
 def test_what_is_no_point_is_refused(value):
     with pytest.raises(SkylessError, match=r"^x is .*; it should be 2 or 3 finite numbers in metres$"):
         check_point("x", value, (2, 3))
-
-
-def test_process_noise_is_given_as_a_number_or_by_a_name():
-    assert process_noise(None, None) is None
-    assert process_noise(0.7, None) == 0.7
-    assert [process_noise(None, name) for name in ("walk", "robot", "drone")] == [0.3, 1.0, 3.0]
-    with pytest.raises(SkylessError, match="--qa and --dynamics both set the process noise; give either"):
-        process_noise(0.3, "walk")
-    with pytest.raises(SkylessError, match="--dynamics is 'car'; it should be one of walk, robot, drone"):
-        process_noise(None, "car")
 
 
 @pytest.mark.parametrize(

@@ -493,7 +493,7 @@ void tag_begin(struct tag *tag)
     tag->host_us = tag->awake_since_us;
     skyless_begin_tag(&tag->core, (settings->site == FIX_NO_SITE) ? NO_SITE : (int32_t)settings->site,
                       settings->qa_m2ps3, has_bounds ? metres(settings->low_mm) : -__builtin_inff(),
-                      has_bounds ? metres(settings->high_mm) : __builtin_inff(), 0.0f, 0.0f, settings->integrity_risk,
+                      has_bounds ? metres(settings->high_mm) : __builtin_inff(), 0.0f, settings->integrity_risk,
                       limit_m);
     listen_all_the_time(tag);
 }

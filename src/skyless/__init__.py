@@ -9,8 +9,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
-    from skyless.cli.api.calibrate import BiasResult as BiasResult
-    from skyless.cli.api.calibrate import calibrate as calibrate
     from skyless.cli.api.plan import PlanResult as PlanResult
     from skyless.cli.api.plan import RatePlanResult as RatePlanResult
     from skyless.cli.api.plan import plan as plan
@@ -21,7 +19,9 @@ if TYPE_CHECKING:
     from skyless.cli.api.simulate import simulate as simulate
     from skyless.cli.api.study import StudyResult as StudyResult
     from skyless.cli.api.study import study as study
+    from skyless.cli.api.survey import BiasResult as BiasResult
     from skyless.cli.api.survey import SurveyResult as SurveyResult
+    from skyless.cli.api.survey import calibrate as calibrate
     from skyless.cli.api.survey import survey_site as survey_site
     from skyless.core.air.frame import Reception as Reception
     from skyless.core.air.frame import Transmission as Transmission
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 _MODULES: Final = {
     "METHODS": "skyless.core.method_names",
     "Anchor": "skyless.core.anchor",
-    "BiasResult": "skyless.cli.api.calibrate",
+    "BiasResult": "skyless.cli.api.survey",
     "Fix": "skyless.core.fix",
     "Fleet": "skyless.sim.evaluation.fleet",
     "NoFixReason": "skyless.core.fix",
@@ -68,7 +68,7 @@ _MODULES: Final = {
     "Transmission": "skyless.core.air.frame",
     "Trust": "skyless.core.trusted_receiver",
     "TrustedReceiver": "skyless.core.trusted_receiver",
-    "calibrate": "skyless.cli.api.calibrate",
+    "calibrate": "skyless.cli.api.survey",
     "fleet_of": "skyless.sim.evaluation.scenarios",
     "lab_site": "skyless.sim.lab",
     "load_site": "skyless.site.file.load",

@@ -25,7 +25,7 @@ from msgspec import NODEFAULT, Struct
 from msgspec.structs import force_setattr
 
 from skyless.core.errors import SkylessError
-from skyless.core.method_names import DYNAMICS_QA_M2PS3, METHODS
+from skyless.core.method_names import METHODS
 
 _LONGEST_VALUE: Final = 60
 _OPTION: Final = re.compile(r"(?<![\w./-])--([a-z][a-z0-9-]*)")
@@ -383,15 +383,6 @@ def folder_to_write(name: str, value: object) -> Path:
     if not os.access(parent, os.W_OK):
         raise SkylessError(f"{name} is {str(path)!r}, where no folder can be written")
     return path
-
-
-def process_noise(qa: float | None, dynamics: str | None) -> float | None:
-    """What filters assume, by either option; None where neither is given. Raises SkylessError."""
-    if dynamics is None:
-        return qa
-    if qa is not None:
-        raise SkylessError("--qa and --dynamics both set the process noise; give either")
-    return DYNAMICS_QA_M2PS3[check_choice("--dynamics", dynamics, tuple(DYNAMICS_QA_M2PS3))]
 
 
 def _is_number(value: object) -> bool:

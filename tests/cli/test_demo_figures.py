@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from node_stage import FakeLink
 
-from skyless.cli.nodes.demo_site import DemoFigures, sentence
+from skyless.cli.nodes.demo import DemoFigures, sentence
 from skyless.cli.nodes.site_view import SiteView
 from skyless.run.mqtt.messages import Counters, FixMessage, TagHealth, TrueMotion, TruthMessage
 

@@ -371,9 +371,6 @@ SIMULATE = [
     ({"loss": 1}, "loss is 1; it should be a number, at least 0, below 1"),
     ({"seed": -1}, "seed is -1; it should be a whole number, at least 0"),
     ({"fixes": "3"}, "fixes is '3'; it should be a whole number, at least 1"),
-    ({"qa": float("inf")}, "qa is inf; it should be a number, above 0"),
-    ({"qa": 1.0, "dynamics": "robot"}, "^qa and dynamics both set the process noise; give either"),
-    ({"dynamics": "car"}, "^dynamics is 'car'; it should be one of walk, robot, drone"),
     ({"biases": ((1, 2),)}, r"biases\[0\] is \(1, 2\); it should be a skyless.sim.impairments.AnchorBias"),
     ({"biases": (AnchorBias(99, 1.0),)}, "99"),
     ({"site": "no.toml"}, "site is 'no.toml'; it should be a file"),
@@ -456,8 +453,7 @@ PLAN = [
 @pytest.mark.parametrize(
     "arguments",
     [
-        {"qa": 1.0},
-        {"dynamics": "robot"},
+        {"noise_ps": 50.0},
         {"search_s": 3.0},
         {"verify_rounds": 200},
         {"seed": 2},

@@ -10,8 +10,7 @@ from rich.console import Console
 
 from skyless.cli.common import plain
 from skyless.cli.nodes.site_view import AnchorRow, Picture, SiteView, TagRow, drawn
-from skyless.run.condition._reasons import Reason
-from skyless.run.condition.monitor import Condition
+from skyless.run.condition.monitor import Condition, Reason
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import AlarmMessage, Asset, AssetsMessage
 from support.site_messages import anchor_health, tag_health

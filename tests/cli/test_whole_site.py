@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from skyless.cli.nodes import demo_site
-from skyless.cli.nodes.demo_site import DemoOptions, WholeSite
+from skyless.cli.nodes import demo
+from skyless.cli.nodes.demo import DemoOptions, WholeSite
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.address import MqttAddress
 
@@ -36,8 +36,8 @@ class Lasting:
 @pytest.fixture
 def link(monkeypatch):
     link = Lasting()
-    monkeypatch.setattr(demo_site, "Link", lambda *_arguments, **_options: link)
-    monkeypatch.setattr(demo_site, "Child", Lasting)
+    monkeypatch.setattr(demo, "Link", lambda *_arguments, **_options: link)
+    monkeypatch.setattr(demo, "Child", Lasting)
     return link
 
 
@@ -49,7 +49,7 @@ def test_the_demo_s_own_broker_keeps_nothing_after_its_end(link, monkeypatch):
         settings.append(asked)
         raise SkylessError("enough is known")
 
-    monkeypatch.setattr(demo_site, "start_broker", start)
+    monkeypatch.setattr(demo, "start_broker", start)
     with pytest.raises(SkylessError, match="enough"):
         asyncio.run(WholeSite(DemoOptions(record="none"), print).run())
     assert [asked.temporary for asked in settings] == [True]

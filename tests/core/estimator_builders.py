@@ -211,7 +211,7 @@ def seen(state):
     return SimpleNamespace(
         x=view(state.x)[:n],
         P=covariances(state)[:n, :n],
-        V=view(state.V)[:n, : faults + state.dim].T,
+        V=view(state.V)[:n, :faults].T,
         information=view(state.information)[:faults, :faults],
         evidence=view(state.evidence)[:faults],
         lasting_covariance=view(state.lasting_covariance)[:count, :count],

@@ -91,7 +91,7 @@ int main(int count, char **words) {
             memcpy(s, first_state, sizeof(State));
             memset(q, 0, sizeof(Acquisition));
             switch (draw() % 3) {
-                case 0: skyless_begin_tag(t, NO_SITE, (real)0.3, -INFINITY, INFINITY, 0, 0, (real)1e-4, NAN); break;
+                case 0: skyless_begin_tag(t, NO_SITE, (real)0.3, -INFINITY, INFINITY, 0, (real)1e-4, NAN); break;
                 case 1: skyless_wake(t, s, q, heard[0].rx_ticks, (real)(draw() % 100));
             }
         }

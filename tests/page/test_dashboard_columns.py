@@ -13,13 +13,11 @@ from msgspec.structs import replace
 from starlette.testclient import TestClient
 from starlette.websockets import WebSocketDisconnect
 
-from skyless.page import live2
-from skyless.page import live2 as columns_module
+from skyless.page import gathered as columns_module
 from skyless.page.app import Services, make_app
 from skyless.page.connections import AccessRules
-from skyless.page.gathered import Gathered
+from skyless.page.gathered import Columns, Gathered, View, anchors_message, conditions_message, tags_message
 from skyless.page.live import LiveSite
-from skyless.page.live2 import Columns, View, anchors_message, conditions_message, tags_message
 from skyless.page.sites import LiveSites
 from skyless.run.fix_batch import RECORD
 from skyless.run.gather.subjects import NatsAddress
@@ -123,7 +121,7 @@ def test_many_tags_are_counts_of_cells_that_add_up(width, height, random):
     columns = Columns()
     columns.update(records_of([(n + 1, 10**15, x, y) for n, (x, y) in enumerate(positions)]), 1.0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(live2, "MAX_POINTS", 200)
+        patch.setattr(columns_module, "MAX_POINTS", 200)
         message = tags_message(columns, replace(VIEW, px=(width, height)), 1.0, 9)
     kind, cell, across, along, zero, unix_us = struct.unpack_from("<BBHHHQ", message)
     assert (chr(kind), zero, unix_us) == ("B", 0, 9)

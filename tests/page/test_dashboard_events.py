@@ -9,8 +9,7 @@ from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 
 from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, TAKEOVER_S, EventLog, EventQueue, Kept, publisher_rank
-from skyless.run.condition._reasons import Reason
-from skyless.run.condition.monitor import Condition
+from skyless.run.condition.monitor import Condition, Reason
 from skyless.run.mqtt.messages import (
     SurveyMessage,
     WatchFinding,

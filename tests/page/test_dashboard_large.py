@@ -8,7 +8,7 @@ from dashboard_builders import SITE, SITE_ID, drained, fix, of, status
 from msgspec.structs import replace
 from test_dashboard_condition import anchor_health
 
-from skyless.page.live2 import View
+from skyless.page.gathered import View
 from skyless.page.state import MAX_ROWS, PageRequest, read_request
 from skyless.run import site_table
 from skyless.run.mqtt import topics

@@ -16,7 +16,7 @@ from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, TaskProcess
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.planning.colours import COLOUR_STOPS
 from skyless.site.planning.links import HDOP, PDOP, SIGMA
-from skyless.site.planning.predict import PlanSettings, Predictor
+from skyless.site.planning.maps import PlanSettings, Predictor
 
 pytestmark = pytest.mark.site
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import skyless
 from skyless.radio.foreign import fira
 from skyless.research.foreign.formats import format_of, open_recording
-from skyless.research.replays.inputs import known_anchors
+from skyless.research.replays.captures import known_anchors
 from support import synthetic_recordings as synthetic
 
 ROWS = 3000

@@ -15,7 +15,7 @@ from skyless.research.studies import runner
 from skyless.research.studies.run import Parts, run_study
 from skyless.research.studies.runner import Cell, Plan, Study
 
-NUMBERS, DEADLY, PLAN = range(5), 3, Plan(qa=0.1)
+NUMBERS, DEADLY, PLAN = range(5), 3, Plan(noise_ps=50.0)
 ROWS = [number / 3 for number in NUMBERS]
 
 
@@ -73,7 +73,7 @@ def test_another_study_is_refused_and_what_differs_is_named(log, folder, monkeyp
     ran(log, folder)
     for other, said in (
         (lambda: ran(log, folder, name="halves"), "study is 'thirds' there, 'halves' here"),
-        (lambda: ran(log, folder, replace(PLAN, qa=0.3)), "qa is 0.1 there, 0.3 here"),
+        (lambda: ran(log, folder, replace(PLAN, noise_ps=100.0)), "noise_ps is 50.0 there, 100.0 here"),
         (lambda: ran(log, folder, replace(PLAN, quick=True)), "quick is False there, True here"),
     ):
         with pytest.raises(SkylessError, match=f"^--resume is .*parts', of another study: {said}; give another folder"):

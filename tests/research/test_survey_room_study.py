@@ -4,16 +4,20 @@ import numpy as np
 import pytest
 
 from skyless.core.ticks import TICK_M
-from skyless.research.studies import survey_room as study
+from skyless.research.studies import surveyed_rooms as study
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import Plan
-from skyless.research.studies.survey_room import SURVEYED, TRUTH, Group, groups, limits_of
 from skyless.research.studies.surveyed_rooms import (
     ROOM_RANGES,
+    SURVEYED,
+    TRUTH,
+    Group,
     RoomErrors,
     air_of,
     drawn_room,
+    groups,
     hand_site,
+    limits_of,
     ranges_of,
     survey_layouts,
     surveyed_room,

@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.keys.fault import Fault
-from skyless.run.condition._reasons import authentication_reasons
 from skyless.run.condition.evidence import Evidence
+from skyless.run.condition.monitor import authentication_reasons
 from skyless.run.site_table import SiteTable
 from support.site_messages import anchor_health, tag_health
 

@@ -7,9 +7,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.site import UnplacedAnchor
-from skyless.run.condition._reasons import START_S, alert_reasons
 from skyless.run.condition.evidence import Evidence
-from skyless.run.condition.monitor import EVALUATION_S, HOLD_S, ConditionMonitor
+from skyless.run.condition.monitor import EVALUATION_S, HOLD_S, START_S, ConditionMonitor, alert_reasons
 from skyless.run.mqtt.messages import EtherHealth, WatchFinding, WatchMessage
 from skyless.run.site_table import THRESHOLDS, SiteTable
 from support import site_messages

@@ -32,8 +32,7 @@ from skyless.run.mqtt.messages import (
     WatchMessage,
 )
 from skyless.run.survey import program as program_module
-from skyless.run.survey.live_survey import ADOPTION_S, NO_DATA_S, LiveSurvey
-from skyless.run.survey.program import FindingsLog, SurveyNode, SurveySettings
+from skyless.run.survey.program import ADOPTION_S, NO_DATA_S, FindingsLog, LiveSurvey, SurveyNode, SurveySettings
 from skyless.sim.impairments import AnchorDisplacement, CarrierModel, DelayError, lab_impairments
 from skyless.sim.lab import lab_site
 from skyless.sim.world import World

@@ -64,7 +64,7 @@ async def test_fixes_states_and_alerts_of_a_board_are_published_and_written_as_l
     ("words", "right"),
     [
         (["--radio", "listener:/dev/a"], "with --from-board it should be a board, serial:PATH"),
-        (["--radio", "serial:/dev/a", "--qa", "0.5"], "--qa is 0.5; it should be left out: the board computes"),
+        (["--radio", "serial:/dev/a", "--site-id", "5"], "--site-id is 5; it should be left out: the board computes"),
         (["--radio", "serial:/dev/a", "--site-id", "4"], "with the settings of skyless flash-config"),
     ],
 )

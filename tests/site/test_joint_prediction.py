@@ -22,7 +22,7 @@ from skyless.site.planning.links import (
     SIGMA_Z,
     with_range,
 )
-from skyless.site.planning.predict import PlanSettings, Predictor
+from skyless.site.planning.maps import PlanSettings, Predictor
 from skyless.site.planning.superframe import stamp_variances
 
 pytestmark = pytest.mark.statistical
@@ -65,7 +65,7 @@ def test_the_filter_claims_the_bound_of_what_has_come_in(site, point):
     for first in range(len(anchors)):
         order = np.roll(anchors, -first, axis=0)
         turns.append(np.trace(tracking_bound(order, path, settings)[-1]))
-    row = Predictor(site, PlanSettings(qa=QA)).at(np.array([point]))[0]
+    row = Predictor(site, PlanSettings()).at(np.array([point]))[0]
     assert row[CLAIMED] == pytest.approx(np.sqrt(np.mean(turns)), rel=0.006)
 
 
@@ -140,7 +140,7 @@ def dense(site, point, superframes, shift_m=0.0):
     ids=("lab", "3-D", "range errors"),
 )
 def test_the_true_error_is_that_of_a_dense_recursion(site, point, motion):
-    row = Predictor(site, PlanSettings(qa=QA)).at(np.array([point]))[0]
+    row = Predictor(site, PlanSettings()).at(np.array([point]))[0]
     said, true, _ = dense(site, np.array(point), 100)
     assert row[CLAIMED] == pytest.approx(said, rel=4e-3)
     assert row[SIGMA] == pytest.approx(true, rel=4e-3)
@@ -169,7 +169,7 @@ def test_a_late_anchor_shifts_positions_as_in_a_dense_recursion():
     site = replace(LAB, walls=(wall,))
     _, relays = superframe_and_relays(site)
     assert (relays.delay_m == 0.0).all()
-    row = Predictor(site, PlanSettings(qa=QA)).at(np.array([point]))[0]
+    row = Predictor(site, PlanSettings()).at(np.array([point]))[0]
     expected = dense(LAB, np.array(point), 150, 0.05)[2]
     assert row[BIAS] == pytest.approx(expected, rel=0.01)
     assert row[RMSE] ** 2 == pytest.approx(row[SIGMA] ** 2 + row[BIAS] ** 2)

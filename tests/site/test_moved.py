@@ -10,8 +10,7 @@ import pytest
 from skyless.cli.main import main
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.survey.live_survey import LiveSurvey
-from skyless.run.survey.program import SurveyNode, SurveySettings
+from skyless.run.survey.program import LiveSurvey, SurveyNode, SurveySettings
 from skyless.sim.lab import lab_site
 from skyless.site.survey.facts import Facts, Gauge, PairBlock
 from skyless.site.survey.legs import AnchorLeg

@@ -21,7 +21,7 @@ from skyless.site.planning.links import (
     sides,
     with_range,
 )
-from skyless.site.planning.maps import grid_of, plan_map, summary_of
+from skyless.site.planning.maps import PlanSettings, Predictor, grid_of, plan_map, summary_of
 from skyless.site.planning.optimise import (
     Search,
     even_layout,
@@ -32,7 +32,6 @@ from skyless.site.planning.optimise import (
     site_with,
     site_with_one_more,
 )
-from skyless.site.planning.predict import PlanSettings, Predictor
 from skyless.site.planning.report import plan_warnings
 
 pytestmark = pytest.mark.statistical

@@ -27,8 +27,16 @@ from skyless.site.planning.links import (
     points_along,
     sides,
 )
-from skyless.site.planning.maps import csv_lines, geojson_lines, grid_of, plan_map, summary_of, to_wgs84
-from skyless.site.planning.predict import PlanSettings, Predictor
+from skyless.site.planning.maps import (
+    PlanSettings,
+    Predictor,
+    csv_lines,
+    geojson_lines,
+    grid_of,
+    plan_map,
+    summary_of,
+    to_wgs84,
+)
 
 pytestmark = pytest.mark.statistical
 

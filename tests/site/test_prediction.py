@@ -25,7 +25,7 @@ from skyless.site.planning.links import (
     range_of,
     with_range,
 )
-from skyless.site.planning.predict import PlanSettings, Predictor
+from skyless.site.planning.maps import PlanSettings, Predictor
 from skyless.site.planning.superframe import stamp_variances, steady_clock
 
 pytestmark = pytest.mark.statistical

@@ -13,7 +13,7 @@ from skyless.core.site import ScheduleSite
 from skyless.core.ticks import TICK_S
 from skyless.research.uncertainty import BoundSettings, tracking_bound
 from skyless.sim.lab import lab_site, paper_lab_site
-from skyless.site.planning.predict import PlanSettings, Predictor
+from skyless.site.planning.maps import PlanSettings, Predictor
 
 pytestmark = pytest.mark.site
 

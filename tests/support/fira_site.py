@@ -24,7 +24,7 @@ from skyless.sim.impairments import RangeErrorModel
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
 from skyless.site.planning.links import PLAN_COLUMNS, RMSE
-from skyless.site.planning.predict import PlanSettings, Predictor, fill_joint_sigma
+from skyless.site.planning.maps import PlanSettings, Predictor, fill_joint_sigma
 from skyless.site.planning.superframe import Relays, Superframe
 
 POINTS_M = np.array([(2.0, 3.0), (1.0, 1.0), (4.5, 6.0), (3.0, 4.0), (5.0, 2.0), (0.7, 7.0)])
@@ -52,13 +52,13 @@ class Measured(NamedTuple):
 
 def planned_m(site):
     """RMSE over the points by ``skyless plan``."""
-    table = Predictor(site, PlanSettings(qa=QA)).at(PLACES_M)
+    table = Predictor(site, PlanSettings()).at(PLACES_M)
     return math.sqrt(float(np.mean(table[:, RMSE] ** 2)))
 
 
 def round_planned_m(site, settings):
     """The same where tags receive a round's messages only, which relay the poll, or the responses in the final one."""
-    planner = Predictor(site, PlanSettings(qa=QA))
+    planner = Predictor(site, PlanSettings())
     superframe, relays, master = planner.superframe, planner.relays, planner.master
     messages = len(site.anchors) + site.schedule.frames_per_node - 1
     begins, ends, kept = [0, *relays.ends[:-1].tolist()], [], []

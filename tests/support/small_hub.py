@@ -7,10 +7,9 @@ import nats
 
 from skyless.cli.main import main
 from skyless.run.broker import BrokerSettings, _program, start_broker
-from skyless.run.gather.leaf import read_json
 from skyless.run.gather.node import Gather
 from skyless.run.gather.subjects import EVENT_STREAM, at
-from skyless.run.hub_files import Hub
+from skyless.run.hub_files import Hub, read_json
 from support.processes import free_node_port, free_port, started
 from support.waiting import running
 

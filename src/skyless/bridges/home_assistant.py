@@ -49,16 +49,6 @@ def device_id(site: int, tag: str) -> str:
     return f"skyless_{site}_{tag}"
 
 
-def config_topic(prefix: str, site: int, tag: str) -> str:
-    """Topic of a tag's retained document; an empty one removes the tag."""
-    return f"{prefix}/device/{device_id(site, tag)}/config"
-
-
-def birth_topic(prefix: str) -> str:
-    """Carries ``online`` when Home Assistant has started."""
-    return f"{prefix}/status"
-
-
 def document(site: BridgedSite, tag: str, status_topic: str, removed: Mapping[str, str]) -> bytes:
     """The discovery document of a tag.
 
@@ -126,12 +116,8 @@ def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
             "state_topic": zones_topic,
             "value_template": _ROOM,
         }
-    return components | {zone_key(zone): _occupancy(zone, zones_topic) for zone in site.zones}
-
-
-def zone_key(zone: Zone) -> str:
-    """Key of a zone's component, from its id, so that renaming changes nothing."""
-    return f"zone_{zone.id}"
+    # By identifiers, so that renaming changes nothing.
+    return components | {f"zone_{zone.id}": _occupancy(zone, zones_topic) for zone in site.zones}
 
 
 def _occupancy(zone: Zone, topic: str) -> Component:
@@ -202,7 +188,7 @@ class Announcer:
         self._monitor.set_zones(site.zones, 0.0)
         self._kept: dict[str, int] = {}
         """Tags that this bridge had before, from retained messages, and the seconds left to wait for them."""
-        link.subscribe(birth_topic(prefix), self._on_birth)
+        link.subscribe(f"{prefix}/status", self._on_birth)  # ``online`` when Home Assistant has started
         link.subscribe(tag_zones_topic(site.id, "+"), self._on_kept_zones, 1)
 
     def on_site(self, site: BridgedSite) -> None:
@@ -261,7 +247,8 @@ class Announcer:
         return tag
 
     def _config_topic(self, name: str) -> str:
-        return config_topic(self._prefix, self._site.id, name)
+        """Topic of a tag's retained document; an empty one removes the tag."""
+        return f"{self._prefix}/device/{device_id(self._site.id, name)}/config"
 
     def _announce(self, tag: _Tag) -> None:
         status = status_topic(self._site.id, NODE_KIND, self._name)

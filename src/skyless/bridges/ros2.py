@@ -120,7 +120,10 @@ class RosEncoder:
             data = _nav_sat_fix(self._name(fix.tag), fix.unix_s, geodetic(fix.position_m, origin), covariance_enu_m2)
             found.append(RosMessage(self._topic(fix.tag, "fix"), NAV_SAT_FIX, data))
         if self._settings.transforms:
-            found.append(RosMessage("/tf", TRANSFORMS, _transform(fix, frame, self._name(fix.tag))))
+            moved = _made("geometry_msgs/msg/Transform", _vector(*fix.position_m), _no_turn())
+            header, child = _header(fix.unix_s, frame), self._name(fix.tag)
+            stamped = _made("geometry_msgs/msg/TransformStamped", header, child, moved)
+            found.append(RosMessage("/tf", TRANSFORMS, _cdr(TRANSFORMS, [stamped])))
         return found
 
     def on_no_fix(self, tag: str, unix_s: float) -> list[RosMessage]:
@@ -238,13 +241,6 @@ def _nav_sat_fix(frame: str, unix_s: float, earth: Vector | None, covariance_m2:
     covariance = np.zeros(9) if covariance_m2 is None else np.array(covariance_m2)
     kind = _COVARIANCE_UNKNOWN if covariance_m2 is None else _COVARIANCE_KNOWN
     return _cdr(NAV_SAT_FIX, _header(unix_s, frame), status, *place, covariance, kind)
-
-
-def _transform(fix: FixMessage, frame: str, child: str) -> bytes:
-    """``tf2_msgs/TFMessage`` with one transform."""
-    transform = _made("geometry_msgs/msg/Transform", _vector(*fix.position_m), _no_turn())
-    stamped = _made("geometry_msgs/msg/TransformStamped", _header(fix.unix_s, frame), child, transform)
-    return _cdr(TRANSFORMS, [stamped])
 
 
 def _diagnostics(health: TagHealth | AnchorHealth) -> bytes:

@@ -81,6 +81,8 @@ def dashboard(
         Write one JSON object with the page's address instead of a table.
     """
     import asyncio
+    import re
+    import socket
 
     from skyless.page.api.questions import Past
     from skyless.page.app import Services, bind, serve
@@ -98,7 +100,9 @@ def dashboard(
     sock = bind(listening)
     port = sock.getsockname()[1]
     rules = _rules(sock.getsockname()[0], listening.host, port, token, reader_token, read_only=hub is not None)
-    make = partial(LiveSite, _client_name(port), used_share=ProcessorUse().share, has_history=history is not None)
+    # The same name on MQTT after a restart, so that old sessions do not accumulate.
+    client = f"{re.sub(r'[^A-Za-z0-9_.-]', '-', socket.gethostname())}-{port}"
+    make = partial(LiveSite, client, used_share=ProcessorUse().share, has_history=history is not None)
     serves = partial(Services, playback=Playback(recordings), past=Past(history))
     if hub is None:
         address, services, work = _at_broker(make, serves, broker, site, site_id, assets, nats)
@@ -165,14 +169,6 @@ def _gathered(nats: str | None, broker: "MqttAddress") -> "Gathered | None":
     from skyless.page.gathered import Gathered
 
     return Gathered(address)
-
-
-def _client_name(port: int) -> str:
-    """The dashboard's MQTT client name, the same after a restart so that old sessions do not accumulate."""
-    import re
-    import socket
-
-    return f"{re.sub(r'[^A-Za-z0-9_.-]', '-', socket.gethostname())}-{port}"
 
 
 def _load(name: str) -> "tuple[SiteMessage, dict[int | None, bytes]]":

@@ -33,7 +33,7 @@ _GROUPS: Final = {
         ("site", "site", "Write and check site files."),
         ("plan", "plan", "Predict a site's errors before it is mounted, and place its anchors."),
         ("survey", "survey", "Find where anchors hang, and their antenna delays."),
-        ("calibrate", "calibrate", "Correct antenna delays by a tag at known positions."),
+        ("calibrate", "survey:calibrate_app", "Correct antenna delays by a tag at known positions."),
         ("flash-config", "nodes.boards:flash_app", "Set up a board that computes its own position."),
         ("doctor", "nodes.doctor", "Check a computer, its boards and a running site in two minutes."),
     ),
@@ -131,7 +131,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     A command returns its own exit code, or None for 0.
     """
-    _write_any_character()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # which may be unable to show a character
+            stream.reconfigure(errors="backslashreplace")
     interrupted = [_INTERRUPTED]
     try:
         with _interrupts_where_they_are_kept(), _ended_by_sigterm(lambda: interrupted.append(_TERMINATED)):
@@ -232,13 +234,6 @@ def _trouble(error: OSError) -> str:
         raise error
     _drop_output()
     return f"standard output cannot be written: {error.strerror}"
-
-
-def _write_any_character() -> None:
-    """Let terminals and pipes that cannot show a character print its code instead of failing."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
 
 
 def _drop_output() -> None:

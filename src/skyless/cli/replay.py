@@ -72,7 +72,7 @@ def replay(asked: ReplayOptions, *more: Path, output: _Output) -> int:
     Avalue receptions, and recordings of MULoc and STARLOC; the format is recognised by the content.
 
     A recording of skyless record knows its site and truth and gives the very fixes that the tags gave; of the options
-    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --max-acceleration, --tag-height-std,
+    below it takes --site, --tag, --method, --integrity-risk, --alert-limit-m, --tag-height-std,
     --settle, --above, --fixes-csv, --plot and --json.
 
     Of several recordings each has its own report, and --json writes one line with all of them, under recordings; one

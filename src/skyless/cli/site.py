@@ -108,7 +108,11 @@ def _new_site(asked: NewOptions) -> Site:
     if asked.paper and (unplaced is not None or spacing is not None):
         raise SkylessError("--paper is for one room; its anchors need positions, and all receive one master")
     sizes = asked.given("width", "depth", "anchor_count", "height")
-    height_m = _tag_height(asked.tag_height, spacing)
+    if asked.tag_height is None:
+        height_m = None if spacing is None else _TAGS_BELOW_A_GRID_M
+    else:
+        wish = read_height("--tag-height", asked.tag_height, ("free",))
+        height_m = None if isinstance(wish, str) else wish
     if unplaced is not None:
         if sizes or spacing is not None:
             raise SkylessError(f"--unplaced is {unplaced}; it takes no sizes: anchors without positions fill no room")
@@ -140,14 +144,6 @@ def _check_free(file: Path, *, force: bool) -> None:
     if file.is_dir():
         raise SkylessError(f"{file} is a folder; it should be the name of a file to write")
     check_new(file, force=force)
-
-
-def _tag_height(text: str | None, spacing_m: float | None) -> float | None:
-    """The tags' height in metres, None if it is estimated. Raises SkylessError."""
-    if text is None:
-        return None if spacing_m is None else _TAGS_BELOW_A_GRID_M
-    height_m = read_height("--tag-height", text, ("free",))
-    return None if isinstance(height_m, str) else height_m
 
 
 @app.command(help_epilogue="Example: skyless site check site.toml --json")

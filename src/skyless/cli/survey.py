@@ -1,4 +1,4 @@
-"""``skyless survey``: positions and antenna delays of anchors from their receptions of one another."""
+"""``skyless survey`` and ``skyless calibrate``: anchors from their receptions, delays from a tag at known positions."""
 
 import asyncio
 import contextlib
@@ -21,17 +21,19 @@ from skyless.cli.common import (
     command,
     console,
     number,
+    print_facts,
     print_json,
     print_table,
     print_warnings,
     progress_bar,
     with_status,
+    write_file,
     write_picture,
 )
 from skyless.cli.nodes.options import MqttCa, SiteId, log, run_until_stopped
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site
-from skyless.research.calibration.options import SurveyOptions
+from skyless.research.calibration.options import CalibrateOptions, SurveyOptions
 from skyless.run.find_site import find_site
 from skyless.run.mqtt.address import mqtt_address
 from skyless.run.process import run
@@ -339,3 +341,48 @@ def _line(node: "SurveyNode", seconds: float | None) -> str:
     n = len(live.site.all_anchors)
     what = f"{len(now.anchors)} of {n} anchors, {len(now.pairs)} of {n * (n - 1) // 2} pairs, {now.duration_s:.0f} s"
     return f"survey: {what}{'' if seconds is None else f' of {seconds:.0f} s'}; {now.error or now.state}"
+
+
+calibrate_app = App(
+    name="calibrate",
+    help_epilogue="Example: skyless calibrate stay.mcap --at 3,4,1.2 --site site.toml --out calibrated.toml",
+)
+
+_ONLY_A_TABLE: Final = (
+    "it should be a table, .csv: a site file holds antenna delays, which only a recording of skyless record can correct"
+)
+
+
+@calibrate_app.default
+@command
+def calibrate(asked: CalibrateOptions, *, output: Output) -> int:
+    """Find the errors of antenna delays from a tag at known positions (--at, --truth); the anchors' positions are kept.
+
+    In a recording of skyless record the ranges between the anchors take part. In a recording of another system the tag
+    shows by how much each anchor seems late, which skyless replay then takes off.
+
+    Ends with exit code 1 if no delay is determined.
+    """
+    output.check_files(asked.site, asked.file, asked.truth)
+    from skyless.cli.api.survey import SurveyResult, biases_of_other, delays_of_site
+    from skyless.run.recordings.recording import is_mcap
+
+    is_of_site = is_mcap(asked.file)
+    if output.out is not None and output.out.suffix.lower() != ".csv" and not is_of_site:
+        raise SkylessError(f"--out is {str(output.out)!r}; {_ONLY_A_TABLE}")
+    with progress_bar("calibrating") as reach:
+        asked = replace(asked, progress=reach)
+        found = delays_of_site(asked, output.on_count) if is_of_site else biases_of_other(asked)
+    if isinstance(found, SurveyResult):
+        return report(found, output)
+    if output.out is not None:
+        write_file(output.out, found.corrected_file().encode())
+    if output.plot is not None:
+        write_picture(output.plot, found.plot())
+    if output.json:
+        print_json({**found.summary, "written": output.out})
+        return 0
+    print_facts(found.title(), found.facts())
+    if output.out is not None:
+        console().print(f"wrote {output.out}", markup=False)
+    return 0

@@ -48,8 +48,6 @@ class IntegrityRequirement(Struct, frozen=True):
     """Probability, for each fix, that an error exceeds its protection level."""
     alert_limit_m: float | None = None
     """Fixes with a higher horizontal protection level have an alert."""
-    max_acceleration_mps2: float = 0.0
-    """The tag's largest acceleration, covered by the levels beyond the process noise; 0 if unknown."""
     height_std_m: float = 0.0
     """Standard deviation of the tag's true height from the given one, which fixes then include."""
 
@@ -57,9 +55,8 @@ class IntegrityRequirement(Struct, frozen=True):
         limits_of(self.risk)
         if self.alert_limit_m is not None and not 0.0 < self.alert_limit_m < np.inf:
             raise ValueError(f"alert_limit_m is {self.alert_limit_m!r}; it should be more than 0 m")
-        for name in ("max_acceleration_mps2", "height_std_m"):
-            if not 0.0 <= (value := getattr(self, name)) < np.inf:
-                raise ValueError(f"{name} is {value!r}; it should be a finite number from 0 on")
+        if not 0.0 <= self.height_std_m < np.inf:
+            raise ValueError(f"height_std_m is {self.height_std_m!r}; it should be a finite number from 0 on")
 
 
 def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert_limit_m: float | None) -> Integrity:

@@ -168,8 +168,11 @@ class SiteAlarms:
             first = min(((one.unix_s, one.name) for one in dashboards if one.online), default=(0.0, ""))[1]
             if first != self._name:
                 self._rest()
-                if first:
-                    self._drop_cleared()
+                if first:  # drop alarms that the broker does not have, as another dashboard leads
+                    kept = self.engine.messages
+                    for key in kept.keys() - self._received.keys():
+                        del kept[key]
+                        self._changed = True
             elif not self.engine.leading:
                 self._lead(now_s, unix_s)
         for what, message in self.engine.tick(now_s, unix_s, blind=blind):
@@ -180,13 +183,6 @@ class SiteAlarms:
         if self._changed and now_s - self._sent_s >= _BROADCAST_S:
             self._changed, self._sent_s = False, now_s
             self._broadcast("alarms", self.encoded()["alarms"])
-
-    def _drop_cleared(self) -> None:
-        """Drop alarms that the broker does not have, as another dashboard leads."""
-        kept = self.engine.messages
-        for key in kept.keys() - self._received.keys():
-            del kept[key]
-            self._changed = True
 
     def _apply_rules(self) -> None:
         ids, kept = {rule.id for rule in self.file_rules}, self._kept_rules.message

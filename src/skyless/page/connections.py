@@ -229,7 +229,9 @@ class Guard:
 
     def _carries(self, request: HTTPConnection, secret: str) -> bool:
         """Whether a request carries the token with this digest, or the digest as a cookie."""
-        digests = [*map(_digest, _tokens(request)), request.cookies.get(self._rules.cookie, "")]
+        kind, _, bearer = request.headers.get("authorization", "").partition(" ")
+        tokens = request.query_params.getlist("token")[:1] + ([bearer.strip()] if kind.lower() == "bearer" else [])
+        digests = [*map(_digest, tokens), request.cookies.get(self._rules.cookie, "")]
         return any(hmac.compare_digest(digest.encode(), secret.encode()) for digest in digests)
 
     def _with_headers(self, request: HTTPConnection, send: Send) -> Send:
@@ -251,9 +253,3 @@ class Guard:
 
 def _digest(token: str) -> str:
     return sha256(token.encode()).hexdigest()
-
-
-def _tokens(request: HTTPConnection) -> list[str]:
-    """Tokens in the query or in the Authorization header."""
-    kind, _, bearer = request.headers.get("authorization", "").partition(" ")
-    return request.query_params.getlist("token")[:1] + ([bearer.strip()] if kind.lower() == "bearer" else [])

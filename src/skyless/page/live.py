@@ -361,12 +361,6 @@ class LiveSite:
             self.alarms.engine.on_zone_events(events, self._clock())
             self.events.schedule(events, publisher_rank(self.name, self._dashboards), self._clock())
 
-    def _publish_events(self, now_s: float) -> None:
-        for event in self.events.pop_due(now_s):
-            self.event_list.add_zone_event(event)
-            if self._link is not None and self._site_id is not None:
-                self._link.publish(topics.zone_event_topic(self._site_id, event.zone), event, qos=1)
-
     # Alarms
 
     def acknowledge(self, rule: str, subject: str, occurrence: str, by: str) -> None:
@@ -477,7 +471,10 @@ class LiveSite:
                 page.request_state(health=True)
             for page in [page for page in self.pages if now_s - page.active_s > GONE_S]:
                 self._close_idle(page)
-        self._publish_events(now_s)
+        for event in self.events.pop_due(now_s):
+            self.event_list.add_zone_event(event)
+            if self._link is not None and self._site_id is not None:
+                self._link.publish(topics.zone_event_topic(self._site_id, event.zone), event, qos=1)
         self.alarms.tick(now_s, unix_s, self._dashboards, blind=self._condition_monitor.is_blind(now_s))
         self.assets.tick(now_s)
         if now_s >= self._condition_due_s:

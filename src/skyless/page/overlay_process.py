@@ -15,8 +15,7 @@ from skyless.core.site import Site
 from skyless.page.tasks import OverlayTask, serve_tasks
 from skyless.site.planning.colours import COLOUR_STOPS, scale_of
 from skyless.site.planning.links import FIX_SHARE, HDOP, PDOP, SIGMA
-from skyless.site.planning.maps import Grid, plan_map
-from skyless.site.planning.predict import MAX_PREDICTED, PlanSettings, Predictor
+from skyless.site.planning.maps import MAX_PREDICTED, Grid, PlanSettings, Predictor, plan_map
 
 MAX_CELLS: Final = 40_000
 _STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)

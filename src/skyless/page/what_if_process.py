@@ -87,7 +87,9 @@ class _Tables:
                         break  # after a gap the clock is another one
                     receiver = receiver_of(start.settings) or AnyReceiver()
                 if receiver is not None and unix_s <= task.begin_unix_s + self._begin_s + task.seconds:
-                    self._hear(receiver, _reception_of(raw), unix_s)
+                    known = Diagnostics(raw.rx_power_dbm, raw.first_path_power_dbm, raw.carrier_offset_ppm)
+                    heard = Reception(raw.frame, raw.rx_ticks, raw.host_s, known, raw.carrier_phase_cycles)
+                    self._hear(receiver, heard, unix_s)
         if self._state is None:
             raise SkylessError(
                 f"tag {task.tag} has no fix from there on that can be recomputed: it takes raw receptions at a site "
@@ -151,11 +153,6 @@ def _receptions(recording: McapRecording, tag: str) -> Iterator[tuple[SegmentSta
             if raw.host_s is not None:
                 yield start, raw, raw.host_s + message.unix_less_host_s
                 start = None
-
-
-def _reception_of(raw: RawReception) -> Reception:
-    diagnostics = Diagnostics(raw.rx_power_dbm, raw.first_path_power_dbm, raw.carrier_offset_ppm)
-    return Reception(raw.frame, raw.rx_ticks, raw.host_s, diagnostics, raw.carrier_phase_cycles)
 
 
 def _state_at(estimator: Estimator, rx_ticks: int) -> State:

@@ -236,14 +236,19 @@ class EtherConnection:
                 endpoint = _connect(self._host, self._port)
                 transport, protocol = await loop.create_connection(lambda: _Stream(self), sock=await endpoint)
             except OSError as error:
-                reason = f"no ether at {self._host}:{self._port} ({_why(error)})"
+                # asyncio's message repeats the address and omits the cause
+                known = error.errno is not None and error.errno > 0
+                why = os.strerror(error.errno) if known else error.strerror or str(error)  # type: ignore[arg-type]
+                reason = f"no ether at {self._host}:{self._port} ({why})"
             else:
                 transport.write(pack(self._join))
                 try:
                     reason = await protocol.ended
                 finally:
                     transport.abort()
-                    self._on_lost()
+                    self._transport = None
+                    for radio in self.radios:
+                        radio.set_clock(None, 0.0)
             if reason != reported:
                 reported = reason
                 self._notify_all(Gone(reason))
@@ -254,11 +259,6 @@ class EtherConnection:
         self._transport = transport
         self._set_clocks(message.host_s + shift_s, message.ticks)
         self._notify_all(Restarted())
-
-    def _on_lost(self) -> None:
-        self._transport = None
-        for radio in self.radios:
-            radio.set_clock(None, 0.0)
 
     def _notify_all(self, event: RadioEvent) -> None:
         for radio in self.radios:
@@ -351,12 +351,6 @@ class _Stream(asyncio.Protocol):
             self.ended.set_result(reason)
         if self._transport is not None:
             self._transport.abort()
-
-
-def _why(error: OSError) -> str:
-    """The cause in words; asyncio's message repeats the address and omits the cause."""
-    known = error.errno is not None and error.errno > 0
-    return os.strerror(error.errno) if known else error.strerror or str(error)  # type: ignore[arg-type]
 
 
 async def _connect(host: str, port: int) -> socket.socket:

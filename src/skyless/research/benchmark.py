@@ -31,8 +31,7 @@ from skyless.files import replace_files, write_whole
 from skyless.research.calibration.biases import biases_of, tdoas_of
 from skyless.research.calibration.options import CalibrateOptions
 from skyless.research.foreign.formats import format_of, open_recording
-from skyless.research.replays.captures import CaptureReplay
-from skyless.research.replays.inputs import known_anchors, known_truth
+from skyless.research.replays.captures import CaptureReplay, known_anchors, known_truth
 from skyless.research.replays.options import ReplayOptions
 from skyless.research.replays.site import SITE_FORMAT, SiteReplay
 from skyless.run.masterless.smoothing import OwnEstimator

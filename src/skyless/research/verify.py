@@ -16,8 +16,7 @@ from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of, stated_room
 from skyless.sim.trajectory import Static
 from skyless.site.planning.links import CLAIMED, FIX_SHARE, RMSE, SIGMA
-from skyless.site.planning.maps import PlanMap
-from skyless.site.planning.predict import Predictor
+from skyless.site.planning.maps import PlanMap, Predictor
 from skyless.site.planning.report import PointCheck, Verification
 
 _WARM_UP_S: Final = 3.0
@@ -90,7 +89,7 @@ def verify(
         room = None if worlds == 1 else stated_room(site, slope_m=slope_m, at_rest=True)
         request = Request(site=site, seed=seed + world, room=room)
         impairments = replace(impairments_of(request, site), channel=settings.channel)
-        fleet = Fleet(site, still, impairments, request.seed, FleetSettings(qa=settings.qa, warmup_s=warm_up_s))
+        fleet = Fleet(site, still, impairments, request.seed, FleetSettings(warmup_s=warm_up_s))
         now_s = 0.0
         while now_s < end_s:
             now_s = min(now_s + 0.25, end_s)

@@ -28,9 +28,9 @@ from msgspec.structs import replace
 from skyless.core.errors import SkylessError, writing
 from skyless.files import replace_files
 from skyless.machine import how_to_install
-from skyless.run.gather.leaf import PING_INTERVAL, Leaf
 from skyless.run.gather.subjects import DOMAIN, MAX_PAYLOAD, NAME_REQUESTS, PAGE_INBOX, NatsAddress, at
 from skyless.run.gather.subjects import FIRST_PORT as FIRST_NATS_PORT
+from skyless.run.hub_files import PING_INTERVAL, Leaf
 from skyless.run.mqtt.address import ACCESS, PASSWORD_VARIABLE, MqttAddress, Role, mqtt_address
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.process import data_folder, end, end_with_parent, is_free, locked, reserve, reserve_next
@@ -389,7 +389,9 @@ async def _spawn(
 
 async def _until_ready(process: asyncio.subprocess.Process, address: MqttAddress, data: Path) -> None:
     loop = asyncio.get_running_loop()
-    tls = _unverified() if address.tls else None
+    tls = ssl.create_default_context() if address.tls else None
+    if tls is not None:  # the child's certificate is for its network names, not for loopback
+        tls.check_hostname, tls.verify_mode = False, ssl.CERT_NONE
     deadline_s = loop.time() + _START_S
     trouble: SkylessError | None = None
     while loop.time() < deadline_s:
@@ -431,14 +433,6 @@ def _program() -> Path:
     if found is None:
         raise SkylessError(f"nats-server is missing at {here}: {how_to_install('site')}")
     return Path(found)
-
-
-def _unverified() -> ssl.SSLContext:
-    """TLS settings without certificate checks: the child's certificate is for its network names, not for loopback."""
-    context = ssl.create_default_context()
-    context.check_hostname = False
-    context.verify_mode = ssl.CERT_NONE
-    return context
 
 
 # The address for other programs

@@ -20,11 +20,10 @@ from skyless.core.errors import SkylessError
 from skyless.run.broker import Broker
 from skyless.run.find_site import KnownSites
 from skyless.run.gather import subjects
-from skyless.run.gather.leaf import Leaf, StuckLineError
 from skyless.run.gather.node import Summary
 from skyless.run.gather.streams import EVENT_BYTES, KEEP_EVENTS_S, KEEP_S, NEWEST_OF_EACH, follow, make_stream
 from skyless.run.gather.subjects import NatsAddress, connect, rarely
-from skyless.run.hub_files import Hub
+from skyless.run.hub_files import Hub, Leaf, StuckLineError
 from skyless.run.mqtt.link import Handler, Subscriptions
 from skyless.run.process import Log, together
 

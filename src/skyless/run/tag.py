@@ -42,7 +42,6 @@ class TagSettings(Struct, frozen=True):
     """How a tag computes and what it publishes."""
 
     method: str = DEFAULT_METHOD
-    qa: float = 0.3
     site: int | None = None
     """The only site to listen to; None for the first that is heard."""
     integrity: IntegrityRequirement = IntegrityRequirement()
@@ -90,12 +89,12 @@ class TagNode:
     def new_receiver(self) -> AnyReceiver:
         """Create a receiver that has heard nothing yet."""
         asked = self.settings
-        return AnyReceiver(asked.method, site=asked.site, qa=asked.qa, integrity=asked.integrity)
+        return AnyReceiver(asked.method, site=asked.site, integrity=asked.integrity)
 
     def _new_verified_receiver(self) -> Receiver:
         """Create a receiver for verified beacons, which only protocol 2 has."""
         asked = self.settings
-        return Receiver(site=asked.site, qa=asked.qa, integrity=asked.integrity)
+        return Receiver(site=asked.site, integrity=asked.integrity)
 
     def _new_trusted(self) -> TrustedReceiver | None:
         """Create the receiver that verifies beacons, with the site's remembered keys; None without a public key."""
@@ -239,7 +238,7 @@ class Tag:
         self._late_before = 0  # fixes that became too old in links to other sites
         self._link_tasks: list[asyncio.Task[None]] = []
         self._fix_topic = self._health_topic = self._receptions_topic = ""
-        asked = receiver_settings(settings.method, settings.site, settings.qa, integrity=settings.integrity)
+        asked = receiver_settings(settings.method, settings.site, integrity=settings.integrity)
         self.reception_log = ReceptionLog(radio.name, asked, secrets.token_hex(4))
         memory = None if settings.trust is None else TagMemory(settings.trust, data_folder())
         self.node = TagNode(settings, radio, self._publish, log, self.reception_log.add, memory=memory)

@@ -215,7 +215,10 @@ class Medium(Generic[Result]):
         self._setups = [stream(seed, *key, purpose=1) for key in keys]
         self._streams = Streams([stream(seed, *key) for key in keys])
         self.clocks = make_clocks(impairments.oscillator, self._setups)
-        self._warm_up()
+        every_tag = range(len(self._anchors), self._nodes)
+        for one in self._impairments.warm_ups:
+            for node in every_tag if one.anchor is None else (self.node_of[one.anchor],):
+                warm_up(self.clocks[node], one.ppm, one.start_s, one.tau_s)
         self.range_errors = RangeErrors(impairments.range_errors, len(tags), len(site.anchors), seed)
         for error in impairments.anchor_pair_errors:
             a, b = self.node_of[error.a], self.node_of[error.b]
@@ -270,13 +273,6 @@ class Medium(Generic[Result]):
                 self._carriers.restart(node)
 
     # Clocks
-
-    def _warm_up(self) -> None:
-        """Set the crystals' warm-ups, for all tags if no anchor is named."""
-        every_tag = range(len(self._anchors), self._nodes)
-        for one in self._impairments.warm_ups:
-            for node in every_tag if one.anchor is None else (self.node_of[one.anchor],):
-                warm_up(self.clocks[node], one.ppm, one.start_s, one.tau_s)
 
     def read_counter(self, node: int) -> int:
         """Advance a node to the present and return its unwrapped counter."""

@@ -81,7 +81,10 @@ class Waypoints(Trajectory):
         start_s: float = 0.0,
     ) -> None:
         """``points_m`` has shape (n, 2) or (n, 3), n ≥ 2. Raises ValueError for paths that cannot be walked."""
-        self._points_m = _as_points(points_m)
+        points = np.asarray(points_m, dtype=np.float64)
+        if points.ndim != 2 or points.shape[0] < 2 or points.shape[1] not in {2, 3}:
+            raise ValueError(f"waypoints should have shape (n, 2) or (n, 3) with n of 2 or more, not {points.shape}")
+        self._points_m = np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
         self._loop = loop
         targets = np.roll(self._points_m, -1, axis=0) if loop else self._points_m[1:]
         steps = targets - self._points_m[: len(targets)]
@@ -147,13 +150,6 @@ class Waypoints(Trajectory):
         before, after = self._leg(corner - 1), self._leg(corner)
         turning = (after - before) / (2.0 * self._half_s)
         return Piece(begin_s, end_s, begin_s, self._corner(corner) - before * self._half_s, before, turning)
-
-
-def _as_points(points_m: ArrayLike) -> Array:
-    points = np.asarray(points_m, dtype=np.float64)
-    if points.ndim != 2 or points.shape[0] < 2 or points.shape[1] not in {2, 3}:
-        raise ValueError(f"waypoints should have shape (n, 2) or (n, 3) with n of 2 or more, not {points.shape}")
-    return np.pad(points, ((0, 0), (0, 3 - points.shape[1])))
 
 
 class Roaming(Trajectory):

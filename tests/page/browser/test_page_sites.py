@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from page_browser import PHONE, came
 
-from skyless.page import live2
+from skyless.page import gathered
 from skyless.run.fix_batch import RECORD
 from skyless.sim.lab import lab_site
 
@@ -96,18 +96,22 @@ class Crowd:
         records["position_mm"][:, :2] = (
             np.column_stack([np.where(is_right, RIGHT_M, LEFT_M), np.full(count, Y_M)]) * 1000
         )
-        self.columns = live2.Columns()
+        self.columns = gathered.Columns()
         self.columns.update(records[is_right], 1.0)
         self.columns.update(records[~is_right], 5.0)
         self.columns.names = {number: f"t{number}" for number in range(count)}
 
     def __call__(self, asked):
         self.asked.append(asked)
-        view = msgspec.convert({key: asked[key] for key in ("view", "px", "named")}, live2.View)
+        view = msgspec.convert({key: asked[key] for key in ("view", "px", "named")}, gathered.View)
         unix_us = round(1e6 * (time.time() + 1.0))  # later than any delay that the page reckons with
-        found = live2.tags_message(self.columns, view, 5.0, unix_us)
-        named = [live2.names_message(self.columns, view.named, unix_us)] if view.named else []
-        return [*named, live2.anchors_message(lab_site(100.0).anchors, unix_us), found[:-1] if self.spoilt else found]
+        found = gathered.tags_message(self.columns, view, 5.0, unix_us)
+        named = [gathered.names_message(self.columns, view.named, unix_us)] if view.named else []
+        return [
+            *named,
+            gathered.anchors_message(lab_site(100.0).anchors, unix_us),
+            found[:-1] if self.spoilt else found,
+        ]
 
 
 PIXEL = """

@@ -21,7 +21,6 @@ from skyless.arguments import (
     number,
     numbers,
     points,
-    process_noise,
     read_list,
     read_numbers,
     read_points,
@@ -30,7 +29,7 @@ from skyless.arguments import (
     wrong,
 )
 from skyless.core.errors import SkylessError
-from skyless.core.method_names import DEFAULT_METHOD, Dynamics
+from skyless.core.method_names import DEFAULT_METHOD
 from skyless.research.replays.options import check_estimator, read_estimator
 from skyless.sim.evaluation.request import Conditions, IntegrityRisk, ProtectionOptions
 
@@ -71,7 +70,7 @@ class SimulateOptions(Conditions, frozen=True, kw_only=True):
         """Check that the options are compatible. Raises SkylessError."""
         Conditions.check(self)
         if self.estimator is not None:
-            names = "method", "qa", "dynamics", "silences", *ProtectionOptions.__struct_fields__
+            names = "method", "silences", *ProtectionOptions.__struct_fields__
             self.leave_out(*(name for name in names if name != "progress"), why="the estimator is your own")
         if self.site is not None and self.scenario is not None:
             raise SkylessError("give either --scenario or --site, not both")
@@ -130,10 +129,6 @@ class PlanOptions(_Planned, frozen=True, kw_only=True):
 
     noise_ps: Picoseconds | None = None
     """Noise of every TX and RX stamp in picoseconds; by default the site's own figures."""
-    qa: Positive | None = None
-    """Process noise that joint assumes: spectral density of the acceleration, m²/s³; by default 0.3."""
-    dynamics: Dynamics | None = None
-    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     range_m: Annotated[Positive | None, Option("range")] = None
     """How far a frame carries in the open, metres: half arrive there; by default what the link budget gives (31 m)."""
     step_m: Annotated[Positive | None, Option("step")] = None
@@ -182,10 +177,6 @@ class PlanOptions(_Planned, frozen=True, kw_only=True):
     seed: Seed = 1
     """Same seed, same random points and search."""
 
-    def check(self) -> None:
-        """Check that the options are compatible. Raises SkylessError."""
-        process_noise(self.qa, self.dynamics)
-
 
 def _check_study(name: str, value: str) -> Any:  # noqa: ANN401 - the name
     from skyless.research.studies.run import STUDIES
@@ -225,10 +216,6 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
     """Simulated seconds for which each world is judged."""
     noise_ps: Picoseconds | None = None
     """Noise of every TX and RX stamp in picoseconds, known to the filters; by default 100."""
-    qa: Positive | None = None
-    """Process noise that the filters assume at rest: spectral density of the acceleration, m²/s³; by default 0.3."""
-    dynamics: Dynamics | None = None
-    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     integrity_risk: IntegrityRisk | None = None
     """Probability, for each fix, that the error exceeds its protection level (integrity); 1e-4 by default."""
     alert_limit_m: Positive | None = None
@@ -246,7 +233,6 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
         """Check that the options are compatible. Raises SkylessError."""
         from skyless.research.studies.run import OF_EPISODES
 
-        process_noise(self.qa, self.dynamics)
         if self.scheduler is not None and self.processes is not None:
             raise SkylessError("--processes are on this machine, --scheduler is for others; give either")
         if self.name != "integrity":
@@ -260,4 +246,4 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
             self.leave_out("worlds", "seconds", why="the study integrity takes --episodes")
         else:
             why = "the study efficiency has cases of its own, and takes --episodes"
-            self.leave_out("worlds", "seconds", "noise_ps", "qa", "dynamics", why=why)
+            self.leave_out("worlds", "seconds", "noise_ps", why=why)

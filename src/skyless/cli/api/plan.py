@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
 
 import numpy as np
 
-from skyless.arguments import check_choice, check_whole, process_noise, python_function
+from skyless.arguments import check_choice, check_whole, python_function
 from skyless.cli.api.fixes import Result, data_frame
 from skyless.cli.api.options import PlanOptions
 from skyless.cli.common import cm
@@ -31,11 +31,19 @@ from skyless.site.planning.links import (
     usual_tag_heights,
     with_range,
 )
-from skyless.site.planning.maps import PlanMap, grid_of, plan_map, rows_of, summary_of
+from skyless.site.planning.maps import (
+    MAX_PREDICTED,
+    PlanMap,
+    PlanSettings,
+    Predictor,
+    grid_of,
+    plan_map,
+    rows_of,
+    summary_of,
+)
 from skyless.site.planning.optimise import OneMore, Optimised, Search
-from skyless.site.planning.predict import MAX_PREDICTED, PlanSettings, Predictor
 from skyless.site.planning.rates import RateMap, described_rates, rate_map, rate_report
-from skyless.site.planning.report import AfterMetre, Verification, described, plan_report
+from skyless.site.planning.report import Verification, described, plan_report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -205,7 +213,10 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
         where = "" if worst_at is None else " at ({:.2f}, {:.2f}, {:.2f}) m".format(*worst_at)
         master = "no master" if found["master"] is None else f"master {found['master']}"
         yield "anchors", f"{len(found['anchors'])}, {master}, range {found['range_m']:.0f} m in the open"
-        yield "map", _map_line(found)
+        line = f"{found['points']} points, {found['step_m']:g} m apart"
+        if found["computed_every_m"] > found["step_m"]:
+            line += f"; {found['method']} computed every {found['computed_every_m']:g} m and interpolated by the PDOP"
+        yield "map", line
         yield (
             "covered",
             f"{found['covered_share']:.1%} of the region; fewest anchors in view: {found['fewest_anchors']}",
@@ -220,8 +231,13 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
         if found["walls_bias"]:
             rmse = f"RMSE mean {cm(found['mean_rmse_m'])}, worst {cm(found['worst_rmse_m'])}"
             yield "with the walls' delays", rmse
-        if found["after_metre"] is not None:
-            yield "after 1 m of walking", _after_metre(found["after_metre"])
+        if (after := found["after_metre"]) is not None:
+            yield (
+                "after 1 m of walking",
+                f"median {cm(after.median_sigma_m)}, worst {cm(after.worst_sigma_m)} with phases of the carrier; by "
+                f"stamps alone {cm(after.stamps_median_sigma_m)} and {cm(after.stamps_worst_sigma_m)} "
+                f"({after.walks} walks)",
+            )
         if found["target_share"] is not None:
             yield "target met", f"in {found['target_share']:.1%} of the region"
         if found["one_more"] is not None:
@@ -230,20 +246,6 @@ class PlanResult(FloorResult[PlanMap], frozen=True, eq=False):
             yield "optimised", _against_even(found["optimised"])
         if found["verification"] is not None:
             yield "simulated", _verified(found["verification"])
-
-
-def _map_line(result: dict[str, Any]) -> str:
-    line = f"{result['points']} points, {result['step_m']:g} m apart"
-    if result["computed_every_m"] > result["step_m"]:
-        line += f"; {result['method']} computed every {result['computed_every_m']:g} m and interpolated by the PDOP"
-    return line
-
-
-def _after_metre(found: AfterMetre) -> str:
-    return (
-        f"median {cm(found.median_sigma_m)}, worst {cm(found.worst_sigma_m)} with phases of the carrier; by stamps "
-        f"alone {cm(found.stamps_median_sigma_m)} and {cm(found.stamps_worst_sigma_m)} ({found.walks} walks)"
-    )
 
 
 def _one_more(more: OneMore) -> str:
@@ -289,7 +291,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
     site, file = site_of(asked.site)
     if not site.schedule.needs_master and len(site.anchors) > MAX_PREDICTED:
         asked.leave_out(
-            *("noise_ps", "qa", "dynamics", "target_m", "optimise", "anchor_heights_m", "mounts_m"),
+            *("noise_ps", "target_m", "optimise", "anchor_heights_m", "mounts_m"),
             *("search_s", "verify_points", "verify_rounds", "seed"),
             why=f"errors are predicted for sites of at most {MAX_PREDICTED} anchors; this one has {len(site.anchors)}",
         )
@@ -300,7 +302,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
         return rates
     asked.leave_out("exponent", why=f"it is for sites of more than {MAX_PREDICTED} anchors")
     channel = ChannelModel() if asked.range_m is None else with_range(ChannelModel(), asked.range_m)
-    settings = PlanSettings(asked.noise_ps, process_noise(asked.qa, asked.dynamics) or 0.3, channel)
+    settings = PlanSettings(asked.noise_ps, channel)
     if asked.optimise is None:
         check_anchor_count(site, file)
     else:

@@ -207,7 +207,7 @@ def _replay_capture(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured 
 def _replay_site(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | None) -> ReplayResult:
     why, path = "a recording of skyless record brings its own", Path(asked.file)
     asked.leave_out(
-        *("anchors", "truth", "truth_offset_s", "lever_arm_m", "format", "listener", "qa", "dynamics", "tdoa_std_m"),
+        *("anchors", "truth", "truth_offset_s", "lever_arm_m", "format", "listener", "tdoa_std_m"),
         *("measurements", "uncalibrated", "tag_height_m", "z_bounds_m", "heights", "first_s"),
         why=why,
     )
@@ -251,8 +251,8 @@ def run_replay(asked: ReplayOptions) -> ReplayResult:
     """Turn a recording into fixes, as ``skyless replay`` does, and judge them where the truth is known.
 
     A recording of ``skyless record`` contains its site and truth; of the arguments below it takes ``site``, ``tag``,
-    ``method``, ``integrity_risk``, ``alert_limit_m``, ``max_acceleration_mps2``, ``tag_height_std_m``, ``settle_s`` and
-    ``above_m``. A recording of another system needs ``anchors`` or ``site``, unless it contains the positions.
+    ``method``, ``integrity_risk``, ``alert_limit_m``, ``tag_height_std_m``, ``settle_s`` and ``above_m``. A recording
+    of another system needs ``anchors`` or ``site``, unless it contains the positions.
     """
     recorders: list[tuple[FixRecorder, MeasurementRecorder]] = []
 

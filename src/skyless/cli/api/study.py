@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
-from skyless.arguments import check_choice, process_noise, python_function
+from skyless.arguments import check_choice, python_function
 from skyless.cli.api.fixes import Result, data_frame, figures
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.common import cm
@@ -108,7 +108,6 @@ def run_study(asked: StudyOptions) -> StudyResult:
         quick=asked.quick,
         conditions=asked.conditions,
         noise_ps=asked.noise_ps or 100.0,
-        qa=process_noise(asked.qa, asked.dynamics) or 0.3,
         worlds=asked.worlds,
         seconds=asked.seconds,
         episodes=asked.episodes,

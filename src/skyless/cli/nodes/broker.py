@@ -18,9 +18,8 @@ from skyless.core.errors import SkylessError
 from skyless.machine import extra_module
 from skyless.run.broker import FIRST_PORT, Broker, BrokerSettings, start_broker
 from skyless.run.find_site import SiteOnBroker, watch_sites
-from skyless.run.gather.leaf import Leaf, StuckLineError, read_json
 from skyless.run.gather.subjects import NatsAddress, nats_address
-from skyless.run.hub_files import PLAN, Hub, Node, read_node, with_sites, write_files
+from skyless.run.hub_files import PLAN, Hub, Leaf, Node, StuckLineError, read_json, read_node, with_sites, write_files
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, Role, create_access, mqtt_address, read_access
 from skyless.run.process import Child, Program, together
 

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TextIO
 from cyclopts import App, Parameter
 from msgspec.structs import replace
 
-from skyless.arguments import Method, NotNegative, Options, Positive, Text, number, process_noise, read_height
+from skyless.arguments import Method, NotNegative, Options, Text, number, read_height
 from skyless.bridges.program import TagBridge, heard_site
 from skyless.cli.common import cm, command, to_json
 from skyless.cli.nodes.bridge import hub_of
 from skyless.cli.nodes.options import MqttOptions, SiteId, log, run_until_stopped
 from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
-from skyless.core.method_names import DEFAULT_METHOD, Dynamics
+from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import GeoreferenceSite
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.run.fix_log import FixListener
@@ -184,8 +184,7 @@ def _standard_output() -> TextIO:
 _TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
 
 _OF_BOARDS: Final = (
-    *("method", "qa", "dynamics", "tag_height_std", "site_id", "site_key", "trust", "clock_bound_ms"),
-    *("integrity_risk", "alert_limit_m", "max_acceleration_mps2"),
+    *("method", "tag_height_std", "site_id", "site_key", "trust", "clock_bound_ms", "integrity_risk", "alert_limit_m"),
 )
 """Options of the filter, for which a computing board uses its own settings."""
 
@@ -205,10 +204,6 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     Several tags have several paths, with commas; PATH@BAUD gives another rate."""
     method: Method = DEFAULT_METHOD
     """How positions are computed (sniffers, FiRa boards, phones: always joint)."""
-    qa: Positive | None = None
-    """Process noise for the tags' motion: spectral density of the acceleration in m²/s³ (joint); by default 0.3."""
-    dynamics: Dynamics | None = None
-    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     tag_height_std: NotNegative | None = None
     """Standard deviation of the tags' height from the one that is given, in metres, which fixes and levels then
     count (joint); 0 by default, for sniffers, FiRa boards and phones 0.5 where the height is only taken for the
@@ -266,7 +261,7 @@ def tag(
         )
     if receives_packets(asked.radio):
         asked.leave_out(
-            *("site_key", "trust", "clock_bound_ms", "integrity_risk", "alert_limit_m", "max_acceleration_mps2"),
+            *("site_key", "trust", "clock_bound_ms", "integrity_risk", "alert_limit_m"),
             why="it is not for sniffers, FiRa boards and phones",
         )
         tags = _on_sniffers
@@ -309,7 +304,6 @@ def _on_radios(
     trust = _site_trust(asked)
     settings = TagSettings(
         asked.method,
-        process_noise(asked.qa, asked.dynamics) or 0.3,
         asked.site_id if trust is None else trust.site,
         integrity=required,
         publish_hz=asked.publish_hz,
@@ -392,7 +386,7 @@ def _system(asked: TagOptions) -> "PacketTagSettings":
     return PacketTagSettings(
         anchors_m,
         site=TDOA_SITE if asked.site_id is None else asked.site_id,
-        qa=process_noise(asked.qa, asked.dynamics) or 0.3,
+        qa=0.3,
         height_m=height_m,
         height_std_m=std_m if asked.tag_height_std is None else asked.tag_height_std,
         auto_height=asked.anchors is None and asked.tag_height in (None, "auto"),

@@ -45,9 +45,6 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     square_s, cube_s = dt * dt / 2.0, dt * dt * dt / 3.0
     for axis in range(s.dim):
         _add_noise(s, axis, axis, motion * cube_s, motion * square_s, motion * dt)
-        unknown = FAULT_KINDS * s.count + axis  # acceleration unknown to the filter
-        s.V[axis][unknown] -= 0.5 * dt * dt
-        s.V[where.velocity + axis][unknown] -= dt
     for anchor in range(s.count):
         offset = where.offset + anchor
         walk = settings.walk * s.anchors[anchor].walk_scale

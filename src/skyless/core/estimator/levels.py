@@ -29,7 +29,7 @@ _SWEEPS: Final = 8
 
 def protect(s: State) -> None:
     """Compute the levels in metres and the tests of faults."""
-    settings, levels, scale = s.settings, s.levels, covariance_scale(s)
+    levels, scale = s.levels, covariance_scale(s)
     levels[HPL] = levels[VPL] = 0.0
     for kind in range(FAULT_KINDS):
         levels[FIRST_TEST + kind] = fault_chi2(s, kind, s.dim)
@@ -51,13 +51,6 @@ def protect(s: State) -> None:
         levels[HPL] = max(levels[HPL], hypot(shift_x, shift_y) + s.horizontal_k * sqrt(largest))
         if s.dim == 3:
             levels[VPL] = max(levels[VPL], abs(shift_z) + s.vertical_k * sqrt(scale * s.P[at(2, 2)] + zz))
-    squared, up = 0.0, 0.0
-    for row in range(FAULT_KINDS * s.count, FAULT_KINDS * s.count + s.dim):
-        squared += square(s.V[0][row]) + square(s.V[1][row])
-        if s.dim == 3:
-            up += square(s.V[2][row])
-    levels[HPL] += settings.max_acceleration_mps2 * sqrt(squared)
-    levels[VPL] += settings.max_acceleration_mps2 * sqrt(up)
 
 
 def largest_test(s: State) -> float:

@@ -320,8 +320,6 @@ class EstimatorSettings(Record):
     """Standard deviation of each ready-made time difference."""
     stationary_s: float = 0.0
     """A tag without motion for this time counts as stationary; 0: never."""
-    max_acceleration_mps2: float = 0.0
-    """The tag's largest acceleration that levels cover beyond ``qa``."""
     integrity_risk: float = RISK
     alert_limit_m: float = nan
     """Fixes with a higher horizontal protection level have an alert; NaN for none."""

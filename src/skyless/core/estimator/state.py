@@ -67,7 +67,7 @@ LASTING, RECENT, CREEPING = range(3)
 """Kinds of faults: since the anchor joined, since its last few packets, or growing for seconds."""
 FAULT_KINDS: Final = 3
 FAULTS: Final = FAULT_KINDS * MAX_ANCHORS
-SENSITIVITIES: Final = FAULTS + AXES + PLANNED_FAULTS
+SENSITIVITIES: Final = FAULTS + PLANNED_FAULTS
 """Capacity for columns of V."""
 WORK_ROWS: Final = MAX_ANCHORS + 1 + 2 * AXES
 
@@ -307,8 +307,8 @@ class State(Record):
     P: Annotated[Reals, COVARIANCES]
     """Row by row, symmetric to the bit; see ``at``."""
     V: Annotated[Matrix, STATES, SENSITIVITIES]
-    """Sensitivity of x to faults: for each kind to each metre by which an anchor is received late, then to each m/s² of
-    acceleration along an axis, then to faults added by planning."""
+    """Sensitivity of x to faults: for each kind to each metre by which an anchor is received late, then to faults added
+    by planning."""
     settings: EstimatorSettings
     tuning: Tuning
     horizontal_k: float
@@ -480,7 +480,7 @@ def set_layout(s: State) -> None:
     where.zero = where.slope if dim == 2 else where.slope + 1
     where.survey = where.slope + 2
     where.end = where.survey + dim * count
-    s.rows = FAULT_KINDS * count + dim
+    s.rows = FAULT_KINDS * count
     make_uncertain(s, s.status.range_errors)
 
 

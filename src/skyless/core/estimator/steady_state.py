@@ -154,7 +154,7 @@ def find_walked(
 
 def _walls(s: State) -> int:
     """The row of V for the walls' delays; the rows of the impulses follow."""
-    return FAULT_KINDS * s.count + s.dim
+    return FAULT_KINDS * s.count
 
 
 def _process_superframe(

@@ -1686,7 +1686,7 @@ INTERNAL void set_layout(State *s) {
     where->zero = dim == 2 ? where->slope : where->slope + 1;
     where->survey = where->slope + 2;
     where->end = where->survey + dim * count;
-    s->rows = FAULT_KINDS * count + dim;
+    s->rows = FAULT_KINDS * count;
     make_uncertain(s, s->status.range_errors);
 }
 
@@ -2052,9 +2052,6 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     real cube_s = dt * dt * dt / REAL(3.0);
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         add_noise(s, axis, axis, motion * cube_s, motion * square_s, motion * dt);
-        int32_t unknown = FAULT_KINDS * s->count + axis;  /* acceleration unknown to the filter */
-        s->V[axis][unknown] -= REAL(0.5) * dt * dt;
-        s->V[where->velocity + axis][unknown] -= dt;
     }
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         int32_t offset = where->offset + anchor;
@@ -3147,7 +3144,6 @@ INTERNAL real covariance_scale(State *s) {
 
 /* Compute the levels in metres and the tests of faults. */
 INTERNAL void protect(State *s) {
-    EstimatorSettings *settings = &s->settings;
     real *levels = s->levels;
     real scale = covariance_scale(s);
     levels[VPL] = REAL(0.0);
@@ -3186,16 +3182,6 @@ INTERNAL void protect(State *s) {
             levels[VPL] = max_real(levels[VPL], abs_real(shift_z) + s->vertical_k * SQRT(scale * s->P[at(2, 2)] + zz));
         }
     }
-    real squared = REAL(0.0);
-    real up = REAL(0.0);
-    for (int32_t row = FAULT_KINDS * s->count, row_end = FAULT_KINDS * s->count + s->dim; row < row_end; row++) {
-        squared += square(s->V[0][row]) + square(s->V[1][row]);
-        if (s->dim == 3) {
-            up += square(s->V[2][row]);
-        }
-    }
-    levels[HPL] += settings->max_acceleration_mps2 * SQRT(squared);
-    levels[VPL] += settings->max_acceleration_mps2 * SQRT(up);
 }
 
 /* The largest test of faults; without faults χ² with one degree of freedom for each anchor. */
@@ -4864,7 +4850,7 @@ SKYLESS_EXPORT void skyless_find_walked(State *s, PlannedMessage *messages, Plan
 
 /* The row of V for the walls' delays; the rows of the impulses follow. */
 INTERNAL int32_t walls(State *s) {
-    return FAULT_KINDS * s->count + s->dim;
+    return FAULT_KINDS * s->count;
 }
 
 /* Process a superframe from ``now`` on; impulses act in the one that begins at ``impulses_ticks``. */
@@ -6795,7 +6781,7 @@ INTERNAL real float_at(uint8_t *data, int32_t at) {
  *
  * The other arguments are fields of ``EstimatorSettings``. */
 SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest_m, real highest_m, real height_std_m,
-        real max_acceleration_mps2, real integrity_risk, real alert_limit_m) {
+        real integrity_risk, real alert_limit_m) {
     t->owner = (EstimatorSettings){.qa = REAL(0.5), .start_speed_std_mps = REAL(2.0), .white = REAL(3.6e-05), .walk =
             REAL(0.09), .tx_variance_m2 = REAL(0.0009), .rx_variance_m2 = REAL(0.0009), .gate = REAL(4.0), .height_m =
             (real)__builtin_nan(""), .height_std_m = REAL(0.0), .lowest_m = (real)-__builtin_inf(), .highest_m =
@@ -6804,8 +6790,7 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .pair_std_m = REAL(0.02), .slope_std_m = REAL(0.05), .place_std_m = REAL(0.005), .place_distance_m =
             REAL(1.0), .place_time_s = REAL(100.0), .change_memory_s = REAL(0.0), .barometer_walk = REAL(0.00025),
             .least_change_std_m = REAL(0.05), .earliest_m = (real)-__builtin_inf(), .difference_std_m = REAL(0.12),
-            .stationary_s = REAL(0.0), .max_acceleration_mps2 = REAL(0.0), .integrity_risk = REAL(0.0001),
-            .alert_limit_m = (real)__builtin_nan("")};
+            .stationary_s = REAL(0.0), .integrity_risk = REAL(0.0001), .alert_limit_m = (real)__builtin_nan("")};
     t->admission = (Admission){.own = {.bits = 40, .last_host_s = (real)__builtin_nan("")}, .former = {.bits = 40,
             .last_host_s = (real)__builtin_nan("")}, .choice = {.only_site = -1, .site = -1}};
     t->pages = (SitePages){.issue = -1};
@@ -6817,15 +6802,14 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .pair_std_m = REAL(0.02), .slope_std_m = REAL(0.05), .place_std_m = REAL(0.005), .place_distance_m =
             REAL(1.0), .place_time_s = REAL(100.0), .change_memory_s = REAL(0.0), .barometer_walk = REAL(0.00025),
             .least_change_std_m = REAL(0.05), .earliest_m = (real)-__builtin_inf(), .difference_std_m = REAL(0.12),
-            .stationary_s = REAL(0.0), .max_acceleration_mps2 = REAL(0.0), .integrity_risk = REAL(0.0001),
-            .alert_limit_m = (real)__builtin_nan("")}, .tuning = {.restart_m = REAL(300.0), .start_walk_scale =
-            REAL(100.0), .mean_gain = REAL(0.05), .noise_growth = REAL(1.2), .max_walk_scale = REAL(10000.0),
-            .noise_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row = REAL(8.0), .steady_walk_scale = REAL(4.0),
-            .max_scale = REAL(100.0), .lag_limit = REAL(3.5), .sudden_lag = REAL(9.0), .walking_mps = REAL(4.0),
-            .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07), .stationary_std_mps = REAL(0.01),
-            .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share = REAL(0.01), .slope_from_m =
-            REAL(4.0), .forgetting = REAL(0.02), .wrong_nis = REAL(2.0), .slow_forgetting = REAL(0.005),
-            .late_often_share = REAL(0.02), .reception_huber = REAL(1.5), .difference_huber = REAL(1.0),
+            .stationary_s = REAL(0.0), .integrity_risk = REAL(0.0001), .alert_limit_m = (real)__builtin_nan("")},
+            .tuning = {.restart_m = REAL(300.0), .start_walk_scale = REAL(100.0), .mean_gain = REAL(0.05), .noise_growth
+            = REAL(1.2), .max_walk_scale = REAL(10000.0), .noise_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row
+            = REAL(8.0), .steady_walk_scale = REAL(4.0), .max_scale = REAL(100.0), .lag_limit = REAL(3.5), .sudden_lag =
+            REAL(9.0), .walking_mps = REAL(4.0), .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07),
+            .stationary_std_mps = REAL(0.01), .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share =
+            REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02), .wrong_nis = REAL(2.0), .slow_forgetting =
+            REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5), .difference_huber = REAL(1.0),
             .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share = REAL(0.5), .suspect = REAL(3.0),
             .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0), .first_change_scale =
             REAL(10.0), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk = REAL(0.004),
@@ -6853,7 +6837,6 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;
     t->owner.height_std_m = height_std_m;
-    t->owner.max_acceleration_mps2 = max_acceleration_mps2;
     t->owner.integrity_risk = integrity_risk;
     t->owner.alert_limit_m = alert_limit_m;
     t->admission.choice.only_site = site;

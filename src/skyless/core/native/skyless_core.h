@@ -375,7 +375,7 @@ typedef double real;
 #define SCHEDULE_PAGE 2
 #define SEARCHING 26
 /* Capacity for columns of V. */
-#define SENSITIVITIES (FAULTS + AXES + PLANNED_FAULTS)
+#define SENSITIVITIES (FAULTS + PLANNED_FAULTS)
 /* Whether the search for a start uses the memory of the state, which is unused meanwhile. */
 #ifndef SHARES_MEMORY
 #define SHARES_MEMORY false
@@ -623,7 +623,6 @@ typedef struct EstimatorSettings {
     real earliest_m;  /* Lower bound of the changing part: obstacles only lengthen ranges. */
     real difference_std_m;  /* Standard deviation of each ready-made time difference. */
     real stationary_s;  /* A tag without motion for this time counts as stationary; 0: never. */
-    real max_acceleration_mps2;  /* The tag's largest acceleration that levels cover beyond ``qa``. */
     real integrity_risk;
     real alert_limit_m;  /* Fixes with a higher horizontal protection level have an alert; NaN for none. */
 } EstimatorSettings;
@@ -679,8 +678,7 @@ typedef struct Tuning {
     /* Mean square of the innovations along the axes (1 if the filter is right) beyond which that noise grows … */
     real lag_limit;
     real sudden_lag;  /* … and the square of their running mean beyond which it doubles with each innovation. */
-    /* Speed above which that noise is at least its setting × (speed over this)², as turns then accelerate more [m/s]. */
-    real walking_mps;
+    real walking_mps;  /* Speed above which that noise is at least its setting × (speed over this)², for turns [m/s]. */
     real better_known;  /* The position of a tag at rest is updated once its variance has shrunk to this fraction. */
     real stationary_noise_share;  /* Fraction of the process noise of motion kept at rest: 5 cm within half a minute. */
     real stationary_std_mps;  /* Standard deviation of the velocity of a tag at rest [m/s]. */
@@ -1060,8 +1058,8 @@ typedef struct Link {
 typedef struct State {
     real x[STATES];
     real P[COVARIANCES];  /* Row by row, symmetric to the bit; see ``at``. */
-    /* Sensitivity of x to faults: for each kind to each metre by which an anchor is received late, then to each m/s² of
-     * acceleration along an axis, then to faults added by planning. */
+    /* Sensitivity of x to faults: for each kind to each metre by which an anchor is received late, then to faults added
+     * by planning. */
     real V[STATES][SENSITIVITIES];
     EstimatorSettings settings;
     Tuning tuning;
@@ -1350,7 +1348,7 @@ SKYLESS_EXPORT int32_t skyless_admit_sender(Admission *a, int32_t site, int32_t 
 SKYLESS_EXPORT int32_t skyless_admit_stamp(Admission *a, int32_t anchor, int32_t sequence, int64_t tx_counter, int64_t
         period_ticks);
 SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest_m, real highest_m, real height_std_m,
-        real max_acceleration_mps2, real integrity_risk, real alert_limit_m);
+        real integrity_risk, real alert_limit_m);
 SKYLESS_EXPORT void skyless_wake(Tag *t, State *s, Acquisition *q, int64_t rx_counter, real slept_s);
 SKYLESS_EXPORT int32_t skyless_hear_frame(Tag *t, State *s, Acquisition *q, uint8_t *frame, int32_t length, int64_t
         rx_counter, real host_s, real rx_power_dbm, real first_path_power_dbm, real phase_cycles);

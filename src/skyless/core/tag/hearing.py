@@ -77,7 +77,6 @@ def begin_tag(
     lowest_m: float,
     highest_m: float,
     height_std_m: float,
-    max_acceleration_mps2: float,
     integrity_risk: float,
     alert_limit_m: float,
 ) -> None:
@@ -90,8 +89,7 @@ def begin_tag(
     t.pages = SitePages()
     t.course = Course()
     t.owner.qa, t.owner.lowest_m, t.owner.highest_m = qa, lowest_m, highest_m
-    t.owner.height_std_m, t.owner.max_acceleration_mps2 = height_std_m, max_acceleration_mps2
-    t.owner.integrity_risk, t.owner.alert_limit_m = integrity_risk, alert_limit_m
+    t.owner.height_std_m, t.owner.integrity_risk, t.owner.alert_limit_m = height_std_m, integrity_risk, alert_limit_m
     t.admission.choice.only_site = site
     t.course.most_anchors = MAX_ANCHORS_IN_USE
     t.course.horizontal_k, t.course.vertical_k = horizontal_limit(integrity_risk), vertical_limit(integrity_risk)

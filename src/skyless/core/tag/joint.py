@@ -82,9 +82,7 @@ class Estimation:
         self._anchors: tuple[int, ...] = ()
         self._anchors_m: Array = np.empty((0, 3))
         self._height_known = False
-        self._requirement = IntegrityRequirement(
-            settings.integrity_risk, settings.alert_limit, settings.max_acceleration_mps2, settings.height_std_m
-        )
+        self._requirement = IntegrityRequirement(settings.integrity_risk, settings.alert_limit, settings.height_std_m)
         if course is None:
             course = Course(settings=settings, tuning=TUNING, dim=settings.dim, superframe_s=superframe_s)
             course.horizontal_k, course.vertical_k = limits_of(settings.integrity_risk)

@@ -204,7 +204,7 @@ class Receiver(BeaconReceiver):
         super().__init__()
         required = integrity or IntegrityRequirement()
         limit_m = nan if required.alert_limit_m is None else required.alert_limit_m
-        levels = required.height_std_m, required.max_acceleration_mps2, required.risk, limit_m
+        levels = required.height_std_m, required.risk, limit_m
         self._tag = Tag()
         _begin_tag(self._tag, NO_SITE if site is None else site, qa, *(z_bounds_m or (-inf, inf)), *levels)
         self._tag.course.tuning = TUNING

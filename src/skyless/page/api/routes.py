@@ -16,19 +16,20 @@ from starlette.websockets import WebSocket
 
 from skyless.core.version import installed_version
 from skyless.page.api import questions
-from skyless.page.api.answers import (
+from skyless.page.api.questions import (
     CSV,
     GEOJSON,
     RENAMED,
     ROOT,
     MapQuery,
+    Past,
     SiteQuery,
     TagNames,
     document,
     names,
     read_query,
+    usable,
 )
-from skyless.page.api.questions import Past, usable
 from skyless.page.connections import JSON, POLICY_VIOLATION, TRY_LATER, json_answer, send, serve_socket
 from skyless.page.live import LiveSite
 from skyless.page.sites import Sites

@@ -246,7 +246,10 @@ class Pty:
         """Write, at once or soon. Returns False if this and all waiting bytes were dropped because nobody reads."""
         if self._waiting:
             if len(self._waiting) + len(data) > self._held_bytes:
-                self._drop()
+                self.overruns += 1
+                self._waiting.clear()
+                termios.tcflush(self._port, termios.TCIFLUSH)
+                asyncio.get_running_loop().remove_writer(self._board)
                 return False
             self._waiting += data
             return True
@@ -261,12 +264,6 @@ class Pty:
             del self._waiting[: os.write(self._board, self._waiting)]
         if not self._waiting:
             asyncio.get_running_loop().remove_writer(self._board)
-
-    def _drop(self) -> None:
-        self.overruns += 1
-        self._waiting.clear()
-        termios.tcflush(self._port, termios.TCIFLUSH)
-        asyncio.get_running_loop().remove_writer(self._board)
 
     def close(self) -> None:
         """Remove the port, as when a board is unplugged."""

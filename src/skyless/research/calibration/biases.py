@@ -23,7 +23,7 @@ from skyless.files import Drops, open_source
 from skyless.research.calibration.options import CalibrateOptions, First, Stay
 from skyless.research.foreign import datasets
 from skyless.research.foreign.formats import FORMATS, Recording, format_of, open_recording
-from skyless.research.replays.inputs import flight_height, known_anchors, known_truth, stated_anchors
+from skyless.research.replays.captures import flight_height, known_anchors, known_truth, stated_anchors
 from skyless.research.replays.site import SITE_FORMAT, reception_of, recorded_site, recorded_truth
 from skyless.run.masterless.pair_engine import PairEngine
 from skyless.run.mqtt.messages import ReceptionsMessage, StampsMessage

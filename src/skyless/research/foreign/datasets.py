@@ -103,7 +103,8 @@ def read_muloc(stream: BufferedIOBase, drops: Drops, channel: int | None = None)
     for number, (one, rx_ticks) in enumerate(zip(index, rounds, strict=False)):
         follows = bool(before) and (one - index[number - 1]) % 256 == 1
         last, before = before if follows else [[-1] * (_SENDERS + 1)] * _SENDERS, rx_ticks
-        if _is_stale([stamps[_TAG] for stamps in rx_ticks]):
+        gaps = (difference(b[_TAG], a[_TAG], TICK_BITS) for a, b in pairwise(rx_ticks))
+        if any(abs(gap - _DELAY - _TX_ANTENNA_TICKS) > _MAX_STALE_TICKS for gap in gaps):
             drops["stale-registers"] += 1
             continue
         retuned = follows and channels[number] != channels[number - 1]
@@ -137,12 +138,6 @@ def phases_cycles(iq: NDArray[Any], rcphase: NDArray[Any]) -> Array:
     """Carrier phases in [0, 1), from accumulator samples, shape (…, 2), and RCPHASE in 1/128 cycles, shape (…)."""
     angles = np.arctan2(iq[..., 1].astype(np.float64), iq[..., 0].astype(np.float64))
     return np.asarray((angles / (2.0 * np.pi) - rcphase / 128.0) % 1.0, np.float64)
-
-
-def _is_stale(stamps: list[int]) -> bool:
-    """Whether the tag's stamps of a round are not of consecutive packets."""
-    gaps = (difference(b, a, TICK_BITS) for a, b in pairwise(stamps))
-    return any(abs(gap - _DELAY - _TX_ANTENNA_TICKS) > _MAX_STALE_TICKS for gap in gaps)
 
 
 def muloc_anchors(path: str | PathLike[str]) -> dict[int, Point]:

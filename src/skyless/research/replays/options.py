@@ -19,14 +19,12 @@ from skyless.arguments import (
     existing_file,
     numbers,
     point,
-    process_noise,
     read_height,
     read_numbers,
     wrong,
 )
 from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import SkylessError
-from skyless.core.method_names import Dynamics
 from skyless.core.site import Site
 from skyless.sim.evaluation.request import IntegrityRisk, ProtectionOptions
 
@@ -168,10 +166,6 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     """Replay only this number of seconds from the first record on."""
     settle_s: Annotated[NotNegative | None, Option("settle")] = None
     """Seconds from the start that are not judged; by default 3 with a truth table, 2 without."""
-    qa: Positive | None = None
-    """Process noise that the filter assumes: spectral density of the acceleration, m²/s³."""
-    dynamics: Dynamics | None = None
-    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     tdoa_std_m: Annotated[Positive | None, Option("tdoa-std")] = None
     """Noise of what is new in a time difference, metres."""
     uncalibrated: bool = False
@@ -187,11 +181,9 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     """Probability, for each fix, that the error exceeds its protection level, in recordings of skyless record (joint);
     by default the tag's own."""
     alert_limit_m: Positive | None = None
-    """Fixes whose protection level exceeds this, in metres, carry an alert; by default the tag's own limit holds."""
-    max_acceleration_mps2: Annotated[NotNegative | None, Option("max-acceleration")] = None
-    """The largest acceleration of the tags in m/s²; by default what the tag assumed. With any of these, or
-    --tag-height-std, tags start from the beginning, as with another method, and those that are not given are as of
-    a tag of which nothing was asked."""
+    """Fixes whose protection level exceeds this, in metres, carry an alert; by default the tag's own limit holds.
+    With either, or --tag-height-std, tags start from the beginning, as with another method, and those that are not
+    given are as of a tag of which nothing was asked."""
 
     @property
     def needs_differences(self) -> str:
@@ -206,10 +198,9 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     def check(self) -> None:
         """Check that the options are compatible. Raises SkylessError."""
         if self.estimator is not None:
-            self.leave_out("smooth", "heights", "qa", "dynamics", "tdoa_std_m", why="the estimator is your own")
+            self.leave_out("smooth", "heights", "tdoa_std_m", why="the estimator is your own")
         if self.heights is None:
             self.leave_out("height_kind", why="--heights gives none")
-        process_noise(self.qa, self.dynamics)
         _ = self.requirement
 
     @property
@@ -218,7 +209,6 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
         asked = ProtectionOptions(
             integrity_risk=self.integrity_risk,
             alert_limit_m=self.alert_limit_m,
-            max_acceleration_mps2=self.max_acceleration_mps2,
         )
         if not asked.protection_given and self.tag_height_std_m is None:
             return None

@@ -27,7 +27,10 @@ def _fill(figure: Figure, rows: Matrix) -> None:
     _over_time(axes[0, 1], time_s, errors[:, :2], std_m[:, :2], known=known)
     _over_time(axes[0, 2], time_s, errors[:, 2:], std_m[:, 2:], known=known)
     _histogram(axes[1, 0], errors, known=known)
-    _distribution(axes[1, 1], np.linalg.norm(errors[:, :2], axis=1), known=known)
+    label, radial_m = f"horizontal {_label(known=known)}", np.linalg.norm(errors[:, :2], axis=1)
+    axes[1, 1].plot(np.sort(radial_m), np.linspace(0.0, 100.0, len(radial_m)))
+    axes[1, 1].set(xlabel=label, ylabel="per cent of the fixes below", title="distribution")
+    axes[1, 1].grid(visible=True, linewidth=0.3)
     _height(axes[1, 2], rows, judged)
 
 
@@ -66,12 +69,6 @@ def _histogram(axes: Axes, errors: Matrix, *, known: bool) -> None:
         axes.hist(errors[:, axis], bins=80, range=(-span, span), histtype="step", label=name)
     axes.set(xlabel=_label(known=known), ylabel="fixes", title="histogram")
     axes.legend()
-
-
-def _distribution(axes: Axes, radial_m: Matrix, *, known: bool) -> None:
-    axes.plot(np.sort(radial_m), np.linspace(0.0, 100.0, len(radial_m)))
-    axes.set(xlabel=f"horizontal {_label(known=known)}", ylabel="per cent of the fixes below", title="distribution")
-    axes.grid(visible=True, linewidth=0.3)
 
 
 def _label(*, known: bool) -> str:

@@ -32,6 +32,7 @@ from skyless.research.studies.efficiency import (
 )
 from skyless.research.studies.picture import clustered_interval
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, with_limits
+from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3
 from skyless.sim.lab import paper_lab_site
 
 _ONSETS: Final = (40, 67)
@@ -182,7 +183,7 @@ def cells(plan: Plan) -> list[Cell]:
     """
     if plan.method != "joint":
         raise SkylessError(f"--method is {plan.method!r}; protection levels are given by joint")
-    case = Case(plan.noise_ps, qa=plan.qa, mesh=True)
+    case = Case(plan.noise_ps, qa=ROOM_QA_M2PS3, mesh=True)
     seeds = SeedSequence(plan.seed).spawn(len(FAULTS))
     found = []
     for fault, seed in zip(FAULTS, seeds, strict=True):

@@ -206,7 +206,7 @@ def _judge_tag(run: LargeRun, site: Site, tape: Tape, tag: int) -> LargeResult:
     case, plan = run.case, run.plan
     seconds = 1.0 if case.starts else _BOUND_S if case.bounded else case.seconds or plan.seconds
     begin_s = float(np.random.default_rng(seed_of(plan.seed, run.number, tag)).uniform(1.0, 20.0))
-    log = _TagLog(Receiver(qa=plan.qa))
+    log = _TagLog(Receiver())
     beacons: list[Heard] = []
     at_s = begin_s
     while at_s < begin_s + seconds and not (case.starts and log.first_fix_s is not None):

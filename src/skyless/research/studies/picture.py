@@ -71,12 +71,6 @@ def shade_sides(axes: Axes, sides: Sides, limit: float, *, along: Literal["x", "
     set_limits(low, high)
 
 
-def _name_sides(axes: Axes, sides: Sides, *, along: Literal["x", "y"]) -> None:
-    """Name both directions of an axis without a common limit."""
-    for side, words in (("below", sides.below), ("above", sides.above)):
-        _name(axes, words, GREEN if side == sides.safe else RED, side, along)
-
-
 def _name(axes: Axes, words: str, colour: str, side: str, along: Literal["x", "y"]) -> None:
     """Words for a side: below the label of the axis x, at the upper or lower edge of the panel for y."""
     if along == "x":
@@ -202,7 +196,8 @@ def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
     if panel.sides is not None:
         limit = panel.target
         if limit is None:
-            _name_sides(axes, panel.sides, along="y" if curve else "x")
+            for side, words in (("below", panel.sides.below), ("above", panel.sides.above)):
+                _name(axes, words, GREEN if side == panel.sides.safe else RED, side, "y" if curve else "x")
         else:
             shade_sides(axes, panel.sides, limit, along="y" if curve else "x")
 

@@ -17,7 +17,6 @@ from typing import Any, Final
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import AnchorSite, Site, TagsSite, WallSite
 from skyless.research.studies import lab
 from skyless.research.studies.picture import Case, world_cells, world_rows
@@ -94,8 +93,7 @@ _WALK_SPANS: Final = 4
 
 TURNS_MPS2: Final = (3.0, 6.0, 10.0, 30.0)
 _TURNING_MPS: Final = 3.0
-_STATED_MPS2: Final = 10.0
-"""Turns that are also driven with the tag's largest acceleration stated."""
+_JUDGED_TURN_MPS2: Final = 10.0
 
 _PHASE_WARMUP_S: Final = 2.5
 _PHASE_RATIO: Final = 1.05
@@ -340,13 +338,12 @@ def warming_anchors(plan: Plan, low_ppm: float, high_ppm: float, tau_s: float, n
 
 
 def _turns(plan: Plan) -> list[Case]:
-    """Cases of tags that turn, with and without a stated largest acceleration."""
+    """Cases of tags that turn."""
     found = []
-    for turn, stated in (*((turn, False) for turn in TURNS_MPS2), (_STATED_MPS2, True)):
-        name = f"turns of {turn:g} m/s² at {_TURNING_MPS:g} m/s" + (", stated" if stated else "")
-        limits = (_exceeded(1e-3),) if turn == _STATED_MPS2 else ()
-        asked = IntegrityRequirement(max_acceleration_mps2=turn if stated else 0.0)
-        found.append(_case(plan, name, "turns", *limits, paths=partial(turning, plan, turn), integrity=asked))
+    for turn in TURNS_MPS2:
+        name = f"turns of {turn:g} m/s² at {_TURNING_MPS:g} m/s"
+        limits = (_exceeded(1e-3),) if turn == _JUDGED_TURN_MPS2 else ()
+        found.append(_case(plan, name, "turns", *limits, paths=partial(turning, plan, turn)))
     return found
 
 
@@ -405,13 +402,11 @@ def _with_carrier(carrier: CarrierModel | None, impairments: Impairments) -> Imp
 
 
 def _hands(plan: Plan, rate_hz: float, random_walk_fm: float, **options: Any) -> tuple[Run, ...]:  # noqa: ANN401 - of ``worlds``
-    """Tags in hands, with filters set to that motion, at this rate of beacons of each anchor."""
+    """Tags in hands at this rate of beacons of each anchor."""
     site = lab_site(plan.noise_ps)
     noise, schedule = replace(site.noise, random_walk_fm=random_walk_fm), replace(site.schedule, rate_hz=rate_hz)
     site = replace(site, noise=noise, schedule=schedule)
-    return worlds(
-        replace(plan, qa=_HANDS_QA_M2PS3), site, partial(_hand_paths, site, plan.tags), room=Room(), **options
-    )
+    return worlds(plan, site, partial(_hand_paths, site, plan.tags), room=Room(), **options)
 
 
 def _hand_paths(site: Site, tags: int, seed: int) -> list[Trajectory]:

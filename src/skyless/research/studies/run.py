@@ -8,7 +8,7 @@ from typing import Any, Final
 from msgspec import Struct
 
 from skyless.core.errors import SkylessError
-from skyless.research.studies import efficiency, integrity, large, room, survey, survey_room, watch
+from skyless.research.studies import efficiency, integrity, large, room, survey, surveyed_rooms, watch
 from skyless.research.studies.picture import Look, draw
 from skyless.research.studies.runner import (
     KeptResults,
@@ -103,7 +103,7 @@ STUDIES: Final = {
         _study("room", "the room", room, "rmse", "nees", "level", "exceeded"),
         _study("large", "a site of 1,024 anchors without a master", large, "rmse", "nees"),
         _study("survey", "anchors that survey themselves", survey, "rmse", "nees"),
-        _study("survey-room", "tags by surveyed anchors", survey_room, "rmse", "nees"),
+        _study("survey-room", "tags by surveyed anchors", surveyed_rooms, "rmse", "nees"),
         _study("watch", "the watch of the anchors", watch, "found", "found_s"),
     )
 }

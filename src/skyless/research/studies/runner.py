@@ -46,8 +46,6 @@ class Plan(Struct, frozen=True):
     """Cases of the study ``room``, a key of ``CONDITIONS``."""
     noise_ps: float = 100.0
     """Noise of every TX and RX stamp, which filters know."""
-    qa: float = 0.3
-    """Process noise that filters assume at rest, m²/s³."""
     worlds: int = 12
     """Independent worlds of a case; what scatters between them gives the standard errors."""
     seconds: float = 20.0

@@ -272,7 +272,7 @@ def _row(plan: Plan, layout: str, variant: str, outcomes: Sequence[Outcome]) -> 
         p95_m=float(np.quantile(errors_m, 0.95)) if whole else None,
         max_m=float(errors_m.max()) if whole else None,
         said_m=_root_mean([one.said_m for one in whole]),
-        nees=_mean([one.nees for one in whole]),
+        nees=float(np.mean(known)) if (known := [one.nees for one in whole if one.nees is not None]) else None,
         bound_m=_root_mean([one.bound_m for one in outcomes]),
         ratio=ratio,
         ratio_error=None if ratio is None or error is None or not rmse_m else ratio * error / rmse_m,
@@ -294,11 +294,6 @@ def _row(plan: Plan, layout: str, variant: str, outcomes: Sequence[Outcome]) -> 
 def _is_wrong(one: Outcome) -> bool:
     """Whether a result is far off, and farther than it says."""
     return one.error_m is not None and one.error_m > max(NEAR_M, _WRONG_SIGMAS * (one.said_m or 0.0))
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
 
 
 def _root_mean(values: Sequence[float | None]) -> float | None:

@@ -57,7 +57,6 @@ class Run(Struct, frozen=True):
     impairments: Impairments
     seed: int
     method: str
-    qa: float
     warmup_s: float
     """True time before which no fix is judged."""
     until_s: float
@@ -165,7 +164,7 @@ def beacons_of(run: Run) -> Iterator[Heard]:
 
 def judged(run: Run, beacons: Iterable[Heard]) -> RunResult:
     """Let the tags of a world compute their positions from what they received, and judge them."""
-    receivers = [AnyReceiver(run.method, qa=run.qa, integrity=run.integrity) for _ in run.trajectories]
+    receivers = [AnyReceiver(run.method, integrity=run.integrity) for _ in run.trajectories]
     tally, messages, cpu_s = _Tally(run), 0, 0.0
     for beacon in beacons:
         begun_s = time.thread_time()
@@ -273,7 +272,6 @@ def worlds(
                 impairments=impairments if change is None else change(impairments),
                 seed=seed,
                 method=plan.method,
-                qa=plan.qa,
                 warmup_s=warmup_s,
                 until_s=warmup_s + (seconds or plan.seconds),
                 lost_at_tags=lost_at_tags,

@@ -384,7 +384,10 @@ class History:
         A visit across an end of the range counts with its part inside. An unfinished one lasts until the end of the
         range, or of the known data.
         """
-        names, asked, until = self._zone_names(zone), [*self._tags(tags)], self.known_until_unix_s()
+        names = {one: name for one, (name, _) in self.zones().items()}
+        if zone is not None and zone not in names:
+            raise SkylessError(f"the history of site {self.site} has no zone {zone!r}; {_some(names, 'zones')}")
+        asked, until = [*self._tags(tags)], self.known_until_unix_s()
         if until is None or until <= span.from_unix_s:
             return ()
         known = Span(span.from_unix_s, min(until, span.to_unix_s))
@@ -508,13 +511,6 @@ class History:
             found[tags[0]] = numbers[tags[0]]
         return found
 
-    def _zone_names(self, zone: str | None) -> dict[str, str]:
-        """Zone names by identifier. Raises SkylessError if ``zone`` is not among them."""
-        names = {one: name for one, (name, _) in self.zones().items()}
-        if zone is not None and zone not in names:
-            raise SkylessError(f"the history of site {self.site} has no zone {zone!r}; {_some(names, 'zones')}")
-        return names
-
 
 # The way of a tag
 
@@ -572,16 +568,12 @@ def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
 
 def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of a result, with few of them in memory at once."""
-    parameters = _parameters(files, span) | more
+    parameters = {"files": list(map(str, files)), "begin": span.from_unix_s, "end": span.to_unix_s} | more
     if parameters["files"]:
         with _connection() as duck:
             found = duck.execute(sql, parameters)
             while rows := found.fetchmany(_FETCHED):
                 yield from rows
-
-
-def _parameters(files: Iterable[Path], span: Span) -> dict[str, Any]:
-    return {"files": list(map(str, files)), "begin": span.from_unix_s, "end": span.to_unix_s}
 
 
 def _quoted(path: Path) -> str:

@@ -5,7 +5,7 @@ times are passed in, by any monotonic clock.
 """
 
 from collections import Counter, deque
-from typing import Annotated, Final
+from typing import Final
 
 import msgspec
 from msgspec import Struct
@@ -124,7 +124,6 @@ class ReceptionLog:
 def receiver_settings(
     method: str,
     site: int | None = None,
-    qa: float = 0.3,
     z_bounds_m: tuple[float, float] | None = None,
     integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
 ) -> Settings:
@@ -133,27 +132,23 @@ def receiver_settings(
     return {
         "method": method,
         "site": site,
-        "qa": qa,
         "z_low_m": low_m,
         "z_high_m": high_m,
         "integrity_risk": integrity.risk,
         "alert_limit_m": integrity.alert_limit_m,
-        "max_acceleration_mps2": integrity.max_acceleration_mps2,
         "height_std_m": integrity.height_std_m,
     }
 
 
 class _TagSettings(Struct, frozen=True):
-    """Settings of a tag's program, with defaults for those that a recording lacks."""
+    """Settings of a tag's program, with defaults for those that a recording lacks; older ones hold more, of no use."""
 
     method: str | None = None
     site: int | None = None
-    qa: Annotated[float, msgspec.Meta(gt=0.0, lt=1e6)] = 0.3
     z_low_m: float | None = None
     z_high_m: float | None = None
     integrity_risk: float = RISK
     alert_limit_m: float | None = None
-    max_acceleration_mps2: float = 0.0
     height_std_m: float = 0.0
 
 
@@ -163,16 +158,14 @@ def receiver_of(
     """A receiver with the settings of a segment, or this method and requirement; None if they are invalid."""
     try:
         known = msgspec.convert(settings, _TagSettings)
-        integrity = integrity or IntegrityRequirement(
-            known.integrity_risk, known.alert_limit_m, known.max_acceleration_mps2, known.height_std_m
-        )
+        integrity = integrity or IntegrityRequirement(known.integrity_risk, known.alert_limit_m, known.height_std_m)
     except (msgspec.ValidationError, ValueError, TypeError):
         return None
     name = method or known.method
     if name not in METHODS:
         return None
     bounds_m = None if known.z_low_m is None or known.z_high_m is None else (known.z_low_m, known.z_high_m)
-    return AnyReceiver(name, site=known.site, qa=known.qa, z_bounds_m=bounds_m, integrity=integrity)
+    return AnyReceiver(name, site=known.site, z_bounds_m=bounds_m, integrity=integrity)
 
 
 def raw(reception: Reception) -> RawReception:

@@ -140,7 +140,9 @@ class McapScan:
             channel, entries = _INDEX_HEAD.unpack(self._file.read(_INDEX_HEAD.size))
             self.chunks[-1].counts[channel] = entries // _INDEX_ENTRY_BYTES
         elif kind == _ATTACHMENT:
-            self._index_attachment(content, length)
+            head = self._file.read(min(length, 1 << 12))
+            (name_bytes,) = struct.unpack_from("<I", head.ljust(20, b"\0"), 16)
+            self.attachments[head[20 : 20 + name_bytes].decode("utf-8", "replace")] = (content, length)
         elif kind == _MESSAGE:
             self.drops["message-outside-chunks"] += 1
         elif kind == _DATA_END:
@@ -153,11 +155,6 @@ class McapScan:
             if not chunk.counts.keys() <= self.topics.keys():
                 for _ in self.messages(chunk):
                     pass
-
-    def _index_attachment(self, content: int, length: int) -> None:
-        head = self._file.read(min(length, 1 << 12))
-        (name_bytes,) = struct.unpack_from("<I", head.ljust(20, b"\0"), 16)
-        self.attachments[head[20 : 20 + name_bytes].decode("utf-8", "replace")] = (content, length)
 
     def attachment(self, name: str) -> bytes | None:
         """Content of the last attachment of that name; None if it is missing or damaged."""
@@ -192,14 +189,10 @@ class McapScan:
             if kind == _MESSAGE and length >= _MESSAGE_HEAD.size:
                 channel, _, log_ns, _ = _MESSAGE_HEAD.unpack_from(data, at)
                 yield channel, log_ns, data[at + _MESSAGE_HEAD.size : at + length]
-            elif kind == _CHANNEL:
-                self._index_channel(data[at : at + length])
+            elif kind == _CHANNEL and length >= 8:
+                channel, _, size = struct.unpack_from("<HHI", data, at)
+                self.topics[channel] = data[at + 8 : at + min(8 + size, length)].decode("utf-8", "replace")
             at += length
-
-    def _index_channel(self, record: bytes) -> None:
-        if len(record) >= 8:
-            channel, _, size = struct.unpack_from("<HHI", record)
-            self.topics[channel] = record[8 : 8 + size].decode("utf-8", "replace")
 
     def _content(self, chunk: ChunkIndex) -> bytes | None:
         self._file.seek(chunk.offset)

@@ -66,7 +66,6 @@ class FleetSettings(Struct, frozen=True):
     """How the tags compute, and which fixes are judged."""
 
     method: str = DEFAULT_METHOD
-    qa: float = 0.3
     warmup_s: float = 2.0
     """Fixes before this true time are not judged; ``first_fix_s`` reports cold starts."""
     most_fixes: int | None = None
@@ -81,15 +80,13 @@ class FleetSettings(Struct, frozen=True):
 class ReceiverWithOutages(AnyReceiver):
     """A receiver that drops and counts frames while its radio is off; its counter keeps running."""
 
-    def __init__(
-        self, method: str, *, qa: float, integrity: IntegrityRequirement, silences: tuple[Outage, ...]
-    ) -> None:
+    def __init__(self, method: str, *, integrity: IntegrityRequirement, silences: tuple[Outage, ...]) -> None:
         """``silences`` are in host time, which in the simulated world is true time.
 
         Raises:
             ValueError: there is no such method.
         """
-        super().__init__(method, qa=qa, integrity=integrity)
+        super().__init__(method, integrity=integrity)
         self._silences = silences
 
     def hear(self, reception: Reception) -> Fix | None:
@@ -152,8 +149,8 @@ class TagFleet:
         if asked.new_receiver is not None:
             return asked.new_receiver()
         if asked.silences:
-            return ReceiverWithOutages(asked.method, qa=asked.qa, integrity=asked.integrity, silences=asked.silences)
-        return AnyReceiver(asked.method, qa=asked.qa, integrity=asked.integrity)
+            return ReceiverWithOutages(asked.method, integrity=asked.integrity, silences=asked.silences)
+        return AnyReceiver(asked.method, integrity=asked.integrity)
 
     def add(self, tag: int, fix: Fix | None, truth_m: Array, at_s: float) -> JudgedFix | None:
         """Count a processed frame that ended at ``at_s``, and judge its fix if there is one."""

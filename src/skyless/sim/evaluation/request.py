@@ -20,7 +20,6 @@ from skyless.arguments import (
     check_number,
     check_point,
     number,
-    process_noise,
     read_numbers,
     read_points,
     sequence,
@@ -30,7 +29,7 @@ from skyless.arguments import (
 )
 from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import SkylessError
-from skyless.core.method_names import DEFAULT_METHOD, METHODS, PROTECTED, Dynamics
+from skyless.core.method_names import DEFAULT_METHOD, METHODS, PROTECTED
 
 if TYPE_CHECKING:
     from skyless.core.integrity import IntegrityRequirement
@@ -56,13 +55,11 @@ class ProtectionOptions(ComputedOptions, frozen=True, kw_only=True):
     """Probability, for each fix, that the error exceeds its protection level (joint); 1e-4 by default."""
     alert_limit_m: Positive | None = None
     """Fixes whose protection level exceeds this, in metres, carry an alert (joint)."""
-    max_acceleration_mps2: Annotated[NotNegative | None, Option("max-acceleration")] = None
-    """The largest acceleration of the tags in m/s², for protection levels that cover their hardest turns (joint)."""
 
     @property
     def protection_given(self) -> bool:
         """Whether any of them is given."""
-        return bool(self.given("integrity_risk", "alert_limit_m", "max_acceleration_mps2"))
+        return bool(self.given("integrity_risk", "alert_limit_m"))
 
     def requirement(self, method: str | None = None, height_std_m: float | None = None) -> "IntegrityRequirement":
         """Them and --tag-height-std as the filter takes them.
@@ -74,12 +71,10 @@ class ProtectionOptions(ComputedOptions, frozen=True, kw_only=True):
 
         if method in METHODS and method != PROTECTED:
             why = f"{method} gives no protection levels"
-            self.leave_out("integrity_risk", "alert_limit_m", "max_acceleration_mps2", why=why)
+            self.leave_out("integrity_risk", "alert_limit_m", why=why)
             if height_std_m is not None:
                 raise SkylessError(f"--tag-height-std is {height_std_m:g}; it should be left out: {why}")
-        return IntegrityRequirement(
-            self.integrity_risk or RISK, self.alert_limit_m, self.max_acceleration_mps2 or 0.0, height_std_m or 0.0
-        )
+        return IntegrityRequirement(self.integrity_risk or RISK, self.alert_limit_m, height_std_m or 0.0)
 
 
 # From texts to faults, and which faults can be simulated
@@ -197,10 +192,6 @@ class Conditions(ProtectionOptions, frozen=True, kw_only=True):
     """How many tags walk about where neither --position nor --waypoints is given; 1 by default."""
     speed_mps: Annotated[float | None, Option("speed"), number(above=0.0, most=1000.0)] = None
     """How fast tags walk, in m/s; 1 by default. In the room only for --waypoints."""
-    qa: Positive | None = None
-    """Process noise that joint assumes: spectral density of the acceleration, m²/s³; by default 0.3."""
-    dynamics: Dynamics | None = None
-    """How tags move: walk (as people), robot or drone, which sets the process noise instead of --qa."""
     noise_ps: Picoseconds | None = None
     """Noise of every TX and RX stamp in picoseconds, known to the filters; by default the site's own figures."""
     fixes: Annotated[int | None, whole(1)] = None
@@ -250,14 +241,8 @@ class Conditions(ProtectionOptions, frozen=True, kw_only=True):
 
     def check(self) -> None:
         """See that the options fit one another. Raises SkylessError."""
-        process_noise(self.qa, self.dynamics)
         self.requirement(self.method)
         anchors = [(error.anchor, error.from_s) for error in self.delay_errors]
         for anchor, from_s in anchors:
             if anchors.count((anchor, from_s)) > 1:
                 raise SkylessError(f"--delay-error is given twice for anchor {anchor}; it should be given once")
-
-    @property
-    def assumed_qa(self) -> float:
-        """Process noise of the filters."""
-        return process_noise(self.qa, self.dynamics) or 0.3

@@ -200,7 +200,6 @@ def fleet_of_any_size(request: Request) -> TagFleet:
 def _settings(request: Request) -> FleetSettings:
     return FleetSettings(
         request.method,
-        request.assumed_qa,
         request.settle_s,
         request.fixes,
         request.requirement(request.method),

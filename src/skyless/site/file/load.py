@@ -66,7 +66,10 @@ def load_site(path: Path | str) -> Site:
     _refuse_unknown_keys(path, document)
     rows = _separate_unplaced(path, document)
     try:
-        site = _converted(path, document)
+        try:
+            site = msgspec.convert(document, Site)
+        except msgspec.ValidationError as error:
+            raise _wrong_type(path, document, str(error)) from None
         check_site(site, path)
     except ConfigurationError as error:
         key, right = _in_file(error.key, rows), _in_file(error.expected, rows)
@@ -84,13 +87,6 @@ def _refuse_mode_slots(path: Path, document: dict[str, Any]) -> None:
             "leave out slot_s, guard_s, slots, reuse_m, site_time and the anchors' slot"
         )
         raise ConfigurationError(path, "schedule.mode", "slots", right)
-
-
-def _converted(path: Path, document: dict[str, Any]) -> Site:
-    try:
-        return msgspec.convert(document, Site)
-    except msgspec.ValidationError as error:
-        raise _wrong_type(path, document, str(error)) from None
 
 
 class _Rows(Struct):
@@ -269,9 +265,13 @@ def with_values(text: str, of_anchors: OfAnchors, of_sections: OfSections, path:
             table = _with_all(table, of_sections.get(section[1], {}))
         changed += [lines[start], *table]
     result = "".join(changed)
+    line_end = "\r\n" if "\r\n" in result else "\n"
     for name, values in of_sections.items():
         if name not in present:
-            result += _new_section(result, name, values)
+            rows = [f"{key} = {_toml(value)}" for key, value in values.items()]
+            result += ("" if result.endswith("\n") or not result else line_end) + line_end.join(
+                ["", f"[{name}]", *rows, ""]
+            )
     if not _parses_to(result, _expected(text, of_anchors, of_sections)):
         expected = f"in [[anchors]] tables, one line for each key, so that {what} can be written into them"
         raise ConfigurationError(path, "anchors", "written otherwise", expected)
@@ -303,12 +303,6 @@ def _with_value(lines: list[str], key: str, new: float | str) -> list[str]:
 
 def _toml(value: float | str) -> str:
     return json.dumps(value, ensure_ascii=False) if isinstance(value, str) else str(value)
-
-
-def _new_section(text: str, name: str, values: Mapping[str, float | str]) -> str:
-    end = "\r\n" if "\r\n" in text else "\n"
-    rows = [f"{key} = {_toml(value)}" for key, value in values.items()]
-    return ("" if text.endswith("\n") or not text else end) + end.join(["", f"[{name}]", *rows, ""])
 
 
 def _expected(text: str, of_anchors: OfAnchors, of_sections: OfSections) -> dict[str, Any]:

@@ -227,7 +227,10 @@ def floor_of(site: Site, file: Path, outline_m: Matrix | None, region_m: Box | N
     """
     floor_m = outline_of(site) if outline_m is None else outline_m
     if floor_m is None:
-        floor_m = _guessed(site, file)
+        anchors = anchor_positions(site)[:, :2]
+        low, high = anchors.min(axis=0), anchors.max(axis=0)
+        x1, y1, x2, y2 = floor_plan_box(site, file) or (*low.tolist(), *high.tolist())
+        floor_m = np.array([(x1, y1), (x2, y1), (x2, y2), (x1, y2)])
     if abs(area(floor_m)) < 1e-6:
         right = "anchors that are not all in one line, or a floor plan; outline_m or --outline gives the room else"
         raise ConfigurationError(file, "anchors", f"{len(site.anchors)} in one line", right)
@@ -235,14 +238,6 @@ def floor_of(site: Site, file: Path, outline_m: Matrix | None, region_m: Box | N
         _check_inside(site, file, floor_m)
     low, high = floor_m.min(axis=0), floor_m.max(axis=0)
     return Floor(floor_m, region_m or (*low.tolist(), *high.tolist()))
-
-
-def _guessed(site: Site, file: Path) -> Matrix:
-    """The floor plan, or the box around the anchors."""
-    anchors = anchor_positions(site)[:, :2]
-    low, high = anchors.min(axis=0), anchors.max(axis=0)
-    x1, y1, x2, y2 = floor_plan_box(site, file) or (*low.tolist(), *high.tolist())
-    return np.array([(x1, y1), (x2, y1), (x2, y2), (x1, y2)])
 
 
 def _check_inside(site: Site, file: Path, outline_m: Matrix) -> None:

@@ -31,7 +31,7 @@ from skyless.site.planning.links import (
     masters_by_links,
     sample_points,
 )
-from skyless.site.planning.predict import PlanSettings, Predictor, with_noise
+from skyless.site.planning.maps import PlanSettings, Predictor, with_noise
 from skyless.site.planning.superframe import stamp_variances
 
 _SEARCH_POINTS: Final = 140

@@ -15,9 +15,8 @@ from skyless.core.protocol1.snapshots import literal_covariance
 from skyless.core.tag.position import NoSolution, locate
 from skyless.site.file.advice import warnings_of
 from skyless.site.planning.links import BIAS, FIX_SHARE, IN_VIEW, SIGMA, Floor, Mounts, range_of, sample_points
-from skyless.site.planning.maps import MapSummary, PlanMap
+from skyless.site.planning.maps import MapSummary, PlanMap, Predictor
 from skyless.site.planning.optimise import Optimised, Scored, one_more
-from skyless.site.planning.predict import Predictor
 from skyless.site.planning.superframe import master_warnings, stamp_variances
 
 
@@ -81,7 +80,6 @@ def plan_report(
         "method": DEFAULT_METHOD,
         "tx_stamp_ps": site.noise.tx_stamp_ps,
         "rx_stamp_ps": site.noise.rx_stamp_ps,
-        "qa": settings.qa,
         "range_m": range_of(settings.channel),
         "superframe_s": superframe_s(site),
         "master": site.master if site.schedule.needs_master else None,
@@ -155,7 +153,7 @@ def described(result: dict[str, Any]) -> str:
     tx_ps, rx_ps = result["tx_stamp_ps"], result["rx_stamp_ps"]
     noise = f"{tx_ps:g} ps" if tx_ps == rx_ps else f"{tx_ps:g} ps (TX) and {rx_ps:g} ps (RX)"
     return (
-        f"predicted for {result['method']} with qa {result['qa']:g} m²/s³, stamps of {noise}, "
+        f"predicted for {result['method']} with stamps of {noise}, "
         f"{'periods' if result['master'] is None else 'superframes'} of {1e3 * result['superframe_s']:.1f} ms, "
         "tags at rest"
     )

@@ -238,7 +238,8 @@ class RelayDelays:
             direction.unranged += 1
             if direction.unranged < UNRANGED:
                 return
-            excess_m = self._usual_excess_m()
+            known = sorted(value for median in self._excess_m.values() if (value := median.value) is not None)
+            excess_m = known[len(known) // 2] if known else 0.0
         else:
             excess_m = (flight - distance) * TICK_M
             pair = (listener, sender) if listener < sender else (sender, listener)
@@ -247,10 +248,6 @@ class RelayDelays:
         direction.skip = REFRESH - 1 if direction.heard > ALWAYS_REFRESHED else 0
         own_m = self.own_m.get(listener, 0.0) - self.own_m.get(sender, 0.0)
         direction.delay_ticks = round((excess_m + own_m) / TICK_M)
-
-    def _usual_excess_m(self) -> float:
-        known = sorted(value for median in self._excess_m.values() if (value := median.value) is not None)
-        return known[len(known) // 2] if known else 0.0
 
     def _estimate(self) -> None:
         """Estimate the anchors' own delays; pairs use them from their next flights."""

@@ -249,7 +249,9 @@ def _estimate(
 ) -> CalibrationEstimate:
     count = len(found.anchors)
     good = np.array([anchor not in reasons for anchor in found.anchors.tolist()])
-    bias_m, std_m = _in_gauge(found, good)
+    shift = np.eye(count) - good / max(int(good.sum()), 1)
+    covariance = shift @ found.covariance_m2[:count, :count] @ shift.T
+    bias_m, std_m = shift @ found.bias_m, np.sqrt(np.maximum(np.diag(covariance), 0.0))
     for row in np.flatnonzero(good & (std_m > _MAX_STD_M)):
         reasons[int(found.anchors[row])] = f"its standard error would be {std_m[row]:.2f} m"
     rows = {anchor: row for row, anchor in enumerate(found.anchors.tolist())}
@@ -283,11 +285,3 @@ def _estimate(
 def _spent(differences: int, anchors: int) -> float:
     """Factor from residuals to noise, for the degrees of freedom that the constants use up."""
     return float(np.sqrt(differences / max(differences - anchors + 1, 1)))
-
-
-def _in_gauge(found: Fit, good: Mask) -> tuple[Vector, Vector]:
-    """Constants less the mean of the good ones, and their standard errors, each of shape (m,)."""
-    count = len(found.anchors)
-    shift = np.eye(count) - good / max(int(good.sum()), 1)
-    covariance = shift @ found.covariance_m2[:count, :count] @ shift.T
-    return shift @ found.bias_m, np.sqrt(np.maximum(np.diag(covariance), 0.0))

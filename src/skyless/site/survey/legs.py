@@ -280,7 +280,11 @@ def earliest_cluster(value: Array, weight: Array, std: float, total: float | Non
     """
     order = np.argsort(value, kind="stable")
     ordered, until = value[order], np.cumsum(weight[order])
-    width = 2.0 * _SIGMAS * max(std, _densest(ordered, until) / _DENSE_WIDTH)
+    before = np.concatenate([[0.0], until[:-1]])
+    ends = np.searchsorted(until, before + _DENSE_SHARE * until[-1] * (1.0 - 1e-9))
+    whole = ends < len(ordered)
+    densest = float(np.min(ordered[ends[whole]] - ordered[whole]))  # the shortest interval that holds that share
+    width = 2.0 * _SIGMAS * max(std, densest / _DENSE_WIDTH)
     ends = np.searchsorted(ordered, ordered + width, side="right") - 1
     held = until[ends] - until + weight[order]
     enough = np.flatnonzero(held >= MIN_CLUSTER_SHARE * max(until[-1], total or 0.0))
@@ -301,14 +305,6 @@ def half_sample_mode(ordered: Array) -> float:
     if len(ordered) == 3:
         ordered = ordered[:2] if ordered[1] - ordered[0] <= ordered[2] - ordered[1] else ordered[1:]
     return float(np.mean(ordered))
-
-
-def _densest(ordered: Array, until: Array) -> float:
-    """Length of the shortest interval that holds ``_DENSE_SHARE`` of the weight."""
-    before = np.concatenate([[0.0], until[:-1]])
-    ends = np.searchsorted(until, before + _DENSE_SHARE * until[-1] * (1.0 - 1e-9))
-    whole = ends < len(ordered)
-    return float(np.min(ordered[ends[whole]] - ordered[whole]))
 
 
 _ENOUGH: Final = 5  # ranges of a pair needed to look for clusters; of fewer the median is used

@@ -206,7 +206,9 @@ def _sentence(
     fitted: Fitted, framed: Framed, other: OtherFit, position_m: Array, distance_m: Array, elsewhere: Integers
 ) -> str:
     """Say which anchors are elsewhere, where, by how much the others differ, and which distance decides."""
-    case, here_m = _case(fitted, other.used), framed.position_m
+    here_m, unused = framed.position_m, np.flatnonzero(fitted.used & ~other.used)
+    late = [f"{fitted.pairs[index].a}–{fitted.pairs[index].b}" for index in unused]
+    case = f"if {joined(late)} came late" if late else "in a mirror image that fits as well"
     if len(elsewhere) > _MAX_NAMED:
         anchors = anchors_named([fitted.anchors[index] for index in elsewhere])
         sentence = f"{case}, {anchors} are elsewhere, by up to {distance_m.max():.2f} m"
@@ -234,11 +236,6 @@ def _sentence(
 
 def _place(position_m: Array) -> str:
     return f"({', '.join(f'{round(value, 2) + 0.0:.2f}' for value in position_m.tolist())})"
-
-
-def _case(fitted: Fitted, used: Mask) -> str:
-    late = [f"{fitted.pairs[index].a}–{fitted.pairs[index].b}" for index in np.flatnonzero(fitted.used & ~used)]
-    return f"if {joined(late)} came late" if late else "in a mirror image that fits as well"
 
 
 def _xyz(position_m: Array) -> tuple[float, float, float]:

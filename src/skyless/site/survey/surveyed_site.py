@@ -53,7 +53,9 @@ def surveyed_site(site: Site, survey: Survey) -> Site:
     accuracy = _accuracy(site, found, survey.range_std_m)
     delays = {anchor.id: anchor.tx_antenna_delay_ticks for anchor in site.all_anchors}
     if accuracy == site.accuracy and any(anchor.tx_antenna_delay_ticks != delays[anchor.id] for anchor in known):
-        accuracy = replace(accuracy, range_std_m=_another_std(accuracy.range_std_m))
+        more_m = _up(accuracy.range_std_m, _STD_STEPS_PER_M) + 1.0 / _STD_STEPS_PER_M
+        std_m = more_m if _RANGE_STD.contains(more_m) else more_m - 2.0 / _STD_STEPS_PER_M
+        accuracy = replace(accuracy, range_std_m=round(std_m, 4))
     return replace(
         site,
         anchors=tuple(anchor for anchor in known if isinstance(anchor, AnchorSite)),
@@ -158,12 +160,6 @@ def _accuracy(site: Site, found: dict[int, SurveyedAnchor], range_std_m: float) 
         survey_std_m=survey_std_m,
         range_std_m=_up(range_std_m, _STD_STEPS_PER_M) if range_std_m > old.range_std_m else old.range_std_m,
     )
-
-
-def _another_std(std_m: float) -> float:
-    """The next larger value that the air format can state, or the next smaller one at the upper limit."""
-    more_m = _up(std_m, _STD_STEPS_PER_M) + 1.0 / _STD_STEPS_PER_M
-    return round(more_m if _RANGE_STD.contains(more_m) else more_m - 2.0 / _STD_STEPS_PER_M, 4)
 
 
 def _changes(before: AnchorSite | UnplacedAnchor, after: AnchorSite) -> dict[str, float]:

@@ -404,7 +404,10 @@ class AnchorWatch:
                         break
             if len(same) < _NEEDED:
                 return None
-            part = _compromise(part, common, kinds)
+            if len(common) == 1 and kinds == {"moved", "delay"}:
+                part = replace(part, or_else="delay" if part.kind == "moved" else "moved")
+            else:
+                part = Part("check", tuple(sorted(common)), part.size_m, None)
         since_s = min(window.start_s for window in same)
         sentence = sentence_of(part.kind, part.anchors, part.size_m, or_else=part.or_else)
         finding = Finding(part.kind, part.anchors, part.size_m, part.std_m, since_s, sentence)
@@ -468,13 +471,6 @@ class AnchorWatch:
 
 def _key(one: Part | Finding) -> tuple[str, tuple[int, ...]]:
     return one.kind, one.anchors
-
-
-def _compromise(part: Part, anchors: set[int], kinds: set[str]) -> Part:
-    """The part that windows with different changes at the same anchors support."""
-    if len(anchors) == 1 and kinds == {"moved", "delay"}:
-        return replace(part, or_else="delay" if part.kind == "moved" else "moved")
-    return Part("check", tuple(sorted(anchors)), part.size_m, None)
 
 
 # Detection of an anchor that was moved while its ranges were gathered: those from before and after do not fit together.
