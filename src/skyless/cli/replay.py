@@ -196,7 +196,7 @@ def _likely_reason(report: "ReplayReport", asked: ReplayOptions) -> str:
         found = "no message of the recording says where its anchors are"
         found += how_to_find_anchors(asked.file, format_of(asked.file, asked.format))
     else:
-        found = _REASONS.get(report.reason or "", report.reason or "unknown")
+        found = "; ".join((_REASONS.get(report.reason or "", report.reason or "unknown"), *report.notes))
     return found + (f" ({dropped(report.drops)})" if report.drops else "")
 
 

@@ -89,6 +89,7 @@ class FixLog:
         memory_bytes: int,
         phases: tuple[Phase, ...] = (),
         late_in_link: int = 0,
+        notes: tuple[str, ...] = (),
     ) -> TagHealth:
         """Return the tag's state; some figures cover the time since the last call.
 
@@ -120,6 +121,7 @@ class FixLog:
             late=self.lateness.dropped + late_fixes,
             lateness_s=self.lateness.drain(),
             interval_s=self._interval_s,
+            notes=notes,
         )
 
 

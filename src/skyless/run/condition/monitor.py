@@ -408,6 +408,20 @@ def multipath_reason(evidence: Evidence, now_s: float) -> Reason | None:
     return _of("tag", "multipath", "warning", text, advice, more)
 
 
+def notes_reason(evidence: Evidence, now_s: float) -> Reason | None:
+    """What tags state of another system's anchors."""
+    found = {
+        name: tag.health.notes
+        for name, tag in evidence.table.senders("tag")
+        if tag.reports(now_s) and isinstance(tag.health, TagHealth) and tag.health.notes
+    }
+    if not found:
+        return None
+    text = "; ".join(dict.fromkeys(note for notes in found.values() for note in notes))
+    advice = "Restart the anchors that are named, and calibrate those that are not calibrated."
+    return _of("tag", "notes", "warning", f"{text[0].lower()}{text[1:]}", advice, found)
+
+
 def master_reason(evidence: Evidence, now_s: float) -> Reason | None:
     """The master changes often (protocol 1)."""
     count = sum(now_s - time_s < OFTEN_S for time_s in evidence.leader.changes_s)
@@ -649,7 +663,7 @@ _ORDER: Final = (
     *("broker", "refused", "behind", "slow", "busy", "late", "not-shown", "forged", "clock", "chain-ended", "codes"),
     *("not-verified", "no-fixes", "limit"),
     *("moved", "anchors", "master", "no-fix", "alert", "keys", "not-synchronised", "silent-anchors", "silent", "watch"),
-    *("multipath", "chain"),
+    *("notes", "multipath", "chain"),
 )
 """Kinds of reasons, causes before their effects."""
 
@@ -750,6 +764,7 @@ class ConditionMonitor:
             left_out_reason(evidence, now_s),
             master_reason(evidence, now_s),
             multipath_reason(evidence, now_s),
+            notes_reason(evidence, now_s),
             *alert_reasons(evidence),
             *authentication_reasons(evidence, now_s),
             *watch_reasons(watch, watch_age_s),

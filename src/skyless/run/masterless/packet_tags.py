@@ -97,6 +97,7 @@ class PacketTagNode:
         self.fix_log = FixLog(radio.name, publish, settings.publish_hz, clock)
         self.monitor = RadioMonitor(f"tag {radio.name}", "listening", log, radio.advice)
         self._drops: Counter[str] = Counter()
+        self._notes: tuple[str, ...] = ()
         self._known = 0  # packets of anchors with known positions
 
     def _new_tracking(self) -> PacketTracking:
@@ -119,6 +120,14 @@ class PacketTagNode:
     def check_reception(self, now_s: float) -> None:
         """Log advice if the radio receives nothing usable. ``now_s``: the host's monotonic clock."""
         self.monitor.check(now_s, self.packets, self._known, self.drops)
+
+    def new_notes(self, log: Log) -> tuple[str, ...]:
+        """What is wrong with the anchors; what was not before is logged."""
+        notes, before, self._notes = self.tracking.notes, self._notes, self.tracking.notes
+        for note in notes:
+            if note not in before:
+                log(f"tag {self.radio.name}: {note}")
+        return notes
 
     async def run(self) -> None:
         """Listen until cancelled."""
@@ -230,6 +239,7 @@ class PacketTags:
                 cpu=share / len(self.nodes),
                 memory_bytes=memory_bytes,
                 late_in_link=0 if link is None else link.late,
+                notes=node.new_notes(self._log),
             )
             if self._on_health is not None:
                 self._on_health(health)

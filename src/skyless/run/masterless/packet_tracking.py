@@ -72,8 +72,8 @@ RESTART_IN_ROW: Final = 3
 """Consecutive impossible stamps of an anchor that mean that its counter has restarted."""
 
 NOT_CALIBRATED: Final = (
-    "The anchors are not calibrated: no protection level. Record the tag at a known place, and use skyless calibrate "
-    "--at, or state each anchor's bias_m in their table, 0 where it is known to be."
+    "Not calibrated: no protection level. skyless calibrate --at X,Y,Z finds the anchors' constants from a recording "
+    "at a known place; bias_m in the table of anchors states them (0: known to be none)"
 )
 
 BACK_IN_ROW: Final = 8
@@ -148,7 +148,6 @@ class PacketTracking:
         """Pairs of listener and sender in relays, until two anchors have relayed each other."""
         self._watch, self._faults = StampWatch(), 0
         self._has_addresses = one_way is not None  # those of FiRa
-        self._is_calibrated = calibration is not None or not self._has_addresses
         self._tracking = self._new_tracking()
         self._area_m: Corners = ((), ())
         self._drops: Counter[str] = Counter()
@@ -181,15 +180,21 @@ class PacketTracking:
         return self._delays.contradictions_m
 
     @property
+    def _is_calibrated(self) -> bool:
+        """Whether the constants of all anchors are known, or small as those of Bitcraze's."""
+        known = {} if self._calibration is None else self._calibration.anchors
+        return not self._has_addresses or self._anchors.keys() <= known.keys()
+
+    @property
     def notes(self) -> tuple[str, ...]:
         """What is wrong with the anchors, in sentences."""
         names = partial(anchor_name, addresses=self._has_addresses)
         own = [
-            f"Anchor {names(anchor)} runs on its own clock ({ppm:+.1f} ppm): its time base is lost."
+            f"Anchor {names(anchor)} runs on its own clock ({ppm:+.1f} ppm): its time base is lost"
             for anchor, ppm in sorted(self._watch.own_clocks_ppm.items())
         ]
         flips = [
-            f"Stamps of anchor {names(anchor)} flip between two values {gap_m:.1f} m apart: no protection level."
+            f"Stamps of anchor {names(anchor)} flip between two values {gap_m:.1f} m apart: no protection level"
             for anchor, gap_m in sorted(self._watch.flips_m.items())
         ]
         return (*own, *flips, *(() if self._is_calibrated else (NOT_CALIBRATED,)))

@@ -190,6 +190,8 @@ class TagHealth(Struct, frozen=True):
     """Usual time between its fixes, where it knows that it is longer than a second."""
     sleeps_s: float | None = None
     """For how long from now it sends no fixes, as it is going to sleep; None while it is awake."""
+    notes: tuple[str, ...] = ()
+    """What is wrong with another system's anchors, in sentences."""
 
 
 NOT_DROPS: Final = frozenset({"heard", "sent", "takeover"})
