@@ -9,6 +9,7 @@ import os
 import pytest
 from msgspec.structs import replace
 
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.ticks import WRAP_TICKS
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
@@ -40,7 +41,7 @@ def test_no_jump_in_hours():
     impairments = replace(
         impairments_of(Request(SLOW), SLOW), oscillator=OscillatorModel(white_fm=1e-11, random_walk_fm=1e-10)
     )
-    fleet = Fleet(SLOW, [Static(3.0, 4.0)], impairments, 1, FleetSettings("joint", 1e-3))
+    fleet = Fleet(SLOW, [Static(3.0, 4.0)], impairments, 1, FleetSettings(new_receiver=lambda: AnyReceiver(qa=1e-3)))
     restarts, largest_sigmas, squares, fixes, last_s = 0, 0.0, 0.0, 0, -1.0
     for judged in fleet.run(HOURS * 3600.0):
         if judged.time_s < 10.0:

@@ -19,7 +19,7 @@ def heard(seed, seconds=4.0, tags=1, carrier=USUAL):
     request = Request(SITE, seed=seed, tags=tags, room=Room())
     impairments = replace(impairments_of(request, SITE), carrier=carrier)
     paths = tuple(trajectories_of(request))
-    return list(beacons_of(Run(SITE, paths, impairments, seed, "joint", 0.3, 0.0, seconds)))
+    return list(beacons_of(Run(SITE, paths, impairments, seed, "joint", 0.0, seconds)))
 
 
 @pytest.fixture(scope="module")
