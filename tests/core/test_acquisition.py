@@ -67,7 +67,7 @@ def relayed_by(anchor, turn, others):
 def search(count=0, *, turns=2, height_m=1.0, late=0, late_m=0.0):
     """A search after this number of turns of the anchors' packets; those of one may be late."""
     q = Acquisition(
-        knows_height=height_m is not None, height_m=height_m or 0.0, variance_m2=0.0008, max_age_s=0.5,
+        knows_height=height_m is not None, height_m=height_m or 0.0, variance_m2=0.0008, max_age_s=0.5, start_age_s=0.5,
         speed_std_mps=2.0, error_variance_m2=0.0001, tuning=TUNING,
     )  # fmt: skip
     for turn in range(turns):
@@ -88,7 +88,7 @@ def packet_of(anchor, rx_ticks=0, *, tx_ticks=0, sequence=0, position_m=(0.0, 0.
 
 def with_packets(*rx_ticks, **fields):
     """A search in which anchors 1, 2 ... have sent twice, the second time at these times."""
-    q = Acquisition(tuning=TUNING, **fields)
+    q = Acquisition(tuning=TUNING, start_age_s=TUNING.start_age_s, **fields)
     for anchor, ticks in enumerate(rx_ticks, start=1):
         for before, sequence in ((10 * MS, 4), (0, 5)):
             gather_packet(q, packet_of(anchor, ticks - before, sequence=sequence), Relays())
@@ -178,7 +178,7 @@ def test_links_are_kept_for_twice_that_age():
 def test_pairs_are_the_anchors_with_two_packets_of_which_the_newer_is_recent():
     age = 7 * MS
     q = with_packets(0, 1, 2, 1, 9)
-    q.heard[3].count, q.pair_count, q.tuning.start_age_s = 1, 4, age * TICK_S
+    q.heard[3].count, q.pair_count, q.start_age_s = 1, 4, age * TICK_S
     acquisition._choose_pairs(q, age)
     assert pairs_of(q) == [2, 3, 5]
 

@@ -189,6 +189,17 @@ def test_the_noise_of_motion_grows_while_innovations_along_the_axes_stay_on_one_
     assert s.status.q_scale == near(10.0 * (TUNING.noise_growth if is_beyond else TUNING.noise_loss))
 
 
+@beyond
+def test_the_noise_of_motion_doubles_at_once_while_innovations_are_far_off(factor, is_beyond):
+    s, gain = state(), TUNING.mean_gain
+    lag = math.sqrt(TUNING.sudden_lag * factor * gain / (2.0 - gain))
+    for scale, most in ((10.0, 20.0), (0.7 * TUNING.max_scale, TUNING.max_scale)):
+        s.h[0], s.h[1], s.status.q_scale, s.status.lag_square = 0.6, -0.8, scale, 0.0
+        s.status.lag[0], s.status.lag[1] = 0.6 * lag / (1.0 - gain), -0.8 * lag / (1.0 - gain)
+        monitor.adapt_process_noise(s, 0.0)
+        assert s.status.q_scale == near(most if is_beyond else scale * TUNING.noise_loss)
+
+
 # The gate
 
 
