@@ -5732,7 +5732,7 @@ INTERNAL int32_t try_start(Acquisition *q, Packet *packet, Relays *relays) {
     drop_impossible(q, now);
     int32_t needed = q->knows_height ? 3 : 4;
     if (q->pair_count < needed) {
-        return TOO_FEW_ANCHORS;
+        return q->count < needed ? TOO_FEW_ANCHORS : ACQUIRING;
     }
     bool is_first = anchor_of(q, 0) == anchor;
     if (!came_around || (q->pair_count == q->rival_count && !is_first)) {

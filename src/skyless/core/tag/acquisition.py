@@ -169,7 +169,7 @@ def try_start(q: Acquisition, packet: Packet, relays: Relays) -> int:
     _drop_impossible(q, now)
     needed = 3 if q.knows_height else 4
     if q.pair_count < needed:
-        return TOO_FEW_ANCHORS
+        return TOO_FEW_ANCHORS if q.count < needed else ACQUIRING
     is_first = _anchor_of(q, 0) == anchor
     if not came_around or (q.pair_count == q.rival_count and not is_first):
         return MIRROR if q.rival_count > 0 else ACQUIRING
