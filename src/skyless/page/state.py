@@ -136,7 +136,8 @@ class SiteState:
             presence = table.fresh_for_s(tag), slept_s, slept_s + table.gone_after_s(tag)
             if tag.is_gone:  # its program has ended
                 presence = 0.0, 0.0, 0.0
-            tag.row = [*_row(fix, self._truths.at(fix.tag, fix.unix_s), tag.ended_unix_s), *map(_tenths, presence)]
+            truth = self._truths.at(fix.tag, fix.unix_s)
+            tag.row = [*_row(fix, truth, tag.ended_unix_s), *(round(one_s, 1) for one_s in presence)]
         return tag.row
 
     def new_state(self, sent: Sent) -> bytes | None:
@@ -257,10 +258,6 @@ class SiteState:
                 "ages": ages,
             },
         )
-
-
-def _tenths(seconds: float) -> float:
-    return round(seconds, 1)
 
 
 def encode(kind: str, fields: dict[str, Any]) -> bytes:

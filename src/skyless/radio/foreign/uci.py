@@ -622,7 +622,9 @@ class DtRounds:
             return "response-of-the-initiator"
         flight = message.flight_ticks
         if message.common_time:
-            flight = self._distance_ticks(poll.address, message.address) if flight is None else flight
+            poll_m, own_m = self._position_m(poll.address), self._position_m(message.address)
+            if flight is None and poll_m is not None and own_m is not None:
+                flight = dist(poll_m, own_m) / TICK_M
             if flight is None:
                 return "flight-unknown"
             rx_ticks = poll.tx_ticks + round(flight)
@@ -633,10 +635,6 @@ class DtRounds:
         if message.initiator_reply_ticks > 0 and len(going_on.responses) < MAX_ANCHORS_KEPT:
             going_on.responses[message.address] = message
         return _packet(message, (Relay(poll.address, _sequence(poll), wrap(rx_ticks), flight),))
-
-    def _distance_ticks(self, one: int, other: int) -> float | None:
-        one_m, other_m = self._position_m(one), self._position_m(other)
-        return None if one_m is None or other_m is None else dist(one_m, other_m) / TICK_M
 
     def _position_m(self, address: int) -> Point | None:
         return self._known_m.get(address, self._stated_m.get(address))

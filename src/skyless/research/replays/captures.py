@@ -12,11 +12,7 @@ import numpy as np
 from msgspec import Struct, field, structs
 from numpy.typing import ArrayLike
 
-from skyless.arguments import (
-    check_point,
-    existing_file,
-    wrong,
-)
+from skyless.arguments import check_point, existing_file, wrong
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.estimator.settings import EstimatorSettings
@@ -59,10 +55,8 @@ from skyless.site.tables import HEIGHT_STD_M, Truth, read_anchors, read_calibrat
 if TYPE_CHECKING:
     from skyless.research.replays.options import Anchors
 
-
 TOO_FLAT = "the anchors' mean: they lie too flat to determine the height"
 """Source of a height that nobody gave."""
-
 
 YAML_SUFFIXES: Final = frozenset({".yaml", ".yml"})
 
@@ -448,7 +442,6 @@ READING_SHARE: Final = 0.1
 
 FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
 """Formats whose packets are used by default, as that is better on real captures; on Avalue's it is not."""
-
 
 _MAX_WITHOUT_ANCHORS: Final = 20_000
 """A recording that carries anchor positions has one within this many records."""

@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     AnyTruth = ArrayLike | str | Path
     """Rows of time and position, shape (n, 4), or the path of a table."""
 
-
 PACKETS, DIFFERENCES_MADE = "packets", "differences"
 MEASUREMENTS: Final = (PACKETS, DIFFERENCES_MADE)
 """Input of the filter: anchors' packets as they are, or time differences derived from them."""
@@ -52,7 +51,6 @@ HEIGHT_SENSOR, BAROMETER, RECORDED = "sensor", "barometer", "recording"
 
 HEIGHT_WORDS: Final = ("truth", "free", "auto")
 """Alternatives to a tag's height in metres: the truth's median, estimated, or automatic."""
-
 
 _read_height = partial(read_height, words=HEIGHT_WORDS)
 

@@ -282,7 +282,6 @@ _BOUND_TAG_S: Final = 0.03
 RAW_METHODS: Final = ("joint",)
 """Methods that use anchors' receptions of each other."""
 
-
 _ALPHA: Final = 0.01
 CLUSTER_FIXES: Final = 25.0
 """Assumed size of a cluster of misleading fixes where none larger is observed: neighbours share their errors."""

@@ -441,11 +441,6 @@ def true_site(room: DrawnRoom) -> Site:
     return replace(site, anchors=anchors, accuracy=replace(site.accuracy, survey_std_m=0.0))
 
 
-def exact_site(room: DrawnRoom) -> Site:
-    """The true site, which also states exact ranges."""
-    return replace(true_site(room), accuracy=EXACT)
-
-
 def hand_site(room: DrawnRoom) -> Site:
     """A site file with positions measured by hand and the usual delays."""
     return _aligned(room, site_at(room.layout, room.layout.position_m + room.hand_m, room.noise_ps))
@@ -602,7 +597,10 @@ def room_results(run: RoomRun) -> tuple[RunResult, ...]:
     """Results of the tags with each file of a room."""
     plan, seed = run.plan, seed_of(run.plan.seed, run.world)
     room = drawn_room(survey_layouts()[run.group.layout], run.group.errors, plan.noise_ps, seed)
-    paths = _paths(run, room)
+    if run.group.at_rest:
+        paths: tuple[Trajectory, ...] = (Static(*_AT_REST_M),) * plan.tags
+    else:
+        paths = tuple(wanderers(site_at(room.layout, room.layout.position_m, plan.noise_ps), plan.tags, room.seed))
     return tuple(
         run_world(
             Run(
@@ -619,16 +617,10 @@ def room_results(run: RoomRun) -> tuple[RunResult, ...]:
     )
 
 
-def _paths(run: RoomRun, room: DrawnRoom) -> tuple[Trajectory, ...]:
-    if run.group.at_rest:
-        return (Static(*_AT_REST_M),) * run.plan.tags
-    return tuple(wanderers(site_at(room.layout, room.layout.position_m, run.plan.noise_ps), run.plan.tags, room.seed))
-
-
 def _files(run: RoomRun, room: DrawnRoom) -> list[Site]:
     ranges = ranges_of(room, run.survey_s)
     if run.group.at_rest:
-        return [exact_site(room), surveyed_room(room, ranges, is_exact=True)]
+        return [replace(true_site(room), accuracy=EXACT), surveyed_room(room, ranges, is_exact=True)]
     made = {
         TRUTH: lambda: true_site(room),
         SURVEYED: lambda: surveyed_room(room, ranges),

@@ -28,16 +28,7 @@ from skyless.arguments import check_number
 from skyless.core.errors import SkylessError
 from skyless.files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
-from skyless.run.history.answers import (
-    GAP_S,
-    THINNED_GAP_S,
-    Contact,
-    Dwell,
-    Heatmap,
-    Span,
-    Track,
-    TrackPoint,
-)
+from skyless.run.history.answers import GAP_S, THINNED_GAP_S, Contact, Dwell, Heatmap, Span, Track, TrackPoint
 from skyless.run.history.layout import (
     ASSET_COLUMNS,
     EVENT_COLUMNS,

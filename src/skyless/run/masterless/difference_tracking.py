@@ -250,7 +250,6 @@ class DifferenceTracking:
 
 JOINING_STEPS: Final = 4  # iterations of reweighted least squares
 
-
 Corners = tuple[tuple[float, ...], tuple[float, ...]]
 """Opposite corners of a space, x, y and z each."""
 

@@ -410,7 +410,7 @@ def _slice_progress(progress: Callable[[float], None] | None, k: int, grid: Grid
 def _slice(
     predictor: Predictor, grid: Grid, height_m: float, progress: Callable[[float], None] | None
 ) -> tuple[Array, float]:
-    points = points_of(grid, height_m)
+    points = np.stack([*np.meshgrid(grid.x_m, grid.y_m), np.full(grid.within.shape, height_m)], axis=-1)
     table = np.full((*grid.within.shape, len(PLAN_COLUMNS)), np.nan)
     stride = _stride(predictor, grid, points[grid.within])
     if stride == 1:
@@ -424,12 +424,6 @@ def _slice(
     _interpolate(coarse, carrier, rows, columns, grid.within, fine)
     table[grid.within] = fine
     return table, stride * grid.step_m
-
-
-def points_of(grid: Grid, height_m: float) -> Array:
-    """Points of one slice, shape (ny, nx, 3)."""
-    x, y = np.meshgrid(grid.x_m, grid.y_m)
-    return np.stack([x, y, np.full_like(x, height_m)], axis=-1)
 
 
 def _stride(predictor: Predictor, grid: Grid, points: Matrix) -> int:
