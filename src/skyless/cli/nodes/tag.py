@@ -237,10 +237,7 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
 @app.default
 @command
 def tag(
-    *names: Annotated[str, Parameter(name="NAMES")],
-    asked: TagOptions,
-    broker: MqttOptions,
-    shown: LineOptions,
+    *names: Annotated[str, Parameter(name="NAMES")], asked: TagOptions, broker: MqttOptions, shown: LineOptions
 ) -> None:
     """Run listening tags until Ctrl-C.
 

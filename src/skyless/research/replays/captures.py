@@ -430,7 +430,7 @@ class ByOwnEstimator(Pipeline):
 
 
 PROFILES: Final[Mapping[str, EstimatorSettings]] = {
-    "miluv": DIFFERENCES.changed(qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),
+    "miluv": DIFFERENCES.changed(qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15)
 }
 """Settings for formats that need others: MILUV's exchanges come once or twice a second, among obstacles."""
 
@@ -498,8 +498,7 @@ class CaptureReplay:
     def __init__(self, asked: ReplayOptions, calibration: DifferenceCalibration | None = None) -> None:
         """Open the recording; ``calibration`` is used instead of that of the table of anchors. Raises SkylessError."""
         asked.leave_out(
-            *("tag", "method", "integrity_risk", "alert_limit_m"),
-            why="it is for recordings of skyless record",
+            *("tag", "method", "integrity_risk", "alert_limit_m"), why="it is for recordings of skyless record"
         )
         self._asked, kind = asked, format_of(asked.file, asked.format)
         self._anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)

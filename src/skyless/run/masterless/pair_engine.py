@@ -75,17 +75,7 @@ class BroadcastClock:
     received ``phase`` ticks later than stamped; ``rate`` is the gain of the listener's clock on the anchor's.
     """
 
-    __slots__ = (
-        "_covariance",
-        "_rejected",
-        "_streak",
-        "_tx_bits",
-        "phase",
-        "rate",
-        "restarts",
-        "rx_ticks",
-        "tx_ticks",
-    )
+    __slots__ = ("_covariance", "_rejected", "_streak", "_tx_bits", "phase", "rate", "restarts", "rx_ticks", "tx_ticks")
 
     def __init__(self, tx_bits: int, tx_ticks: int, rx_ticks: int) -> None:
         self._tx_bits = tx_bits

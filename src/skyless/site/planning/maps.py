@@ -438,14 +438,7 @@ def _every(stride: int, count: int) -> Integers:
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
-def _interpolate(
-    coarse: Array,
-    carrier: Matrix,
-    rows: Integers,
-    columns: Integers,
-    within: Mask,
-    fine: Matrix,
-) -> None:
+def _interpolate(coarse: Array, carrier: Matrix, rows: Integers, columns: Integers, within: Mask, fine: Matrix) -> None:
     """Fill the filter's columns of ``fine`` from a coarse table of these rows and columns of the grid.
 
     ``carrier``: weighted PDOP at the coarse points; at the fine points it is in the column ``sigma_m``.
