@@ -614,7 +614,11 @@ class DtRounds:
             return self._response(going_on, message)
         if message.address != going_on.poll.address:
             return "final-of-another-anchor"
-        return _packet(message, tuple(_relay_of_response(one, message) for one in going_on.responses.values()))
+        relays = []
+        for one in going_on.responses.values():
+            rx_ticks = wrap(message.tx_ticks - one.initiator_reply_ticks)
+            relays.append(Relay(one.address, _sequence(one), rx_ticks, one.flight_ticks))
+        return _packet(message, tuple(relays))
 
     def _response(self, going_on: _Round, message: DtMessage) -> Packet | str:
         poll = going_on.poll
@@ -638,11 +642,6 @@ class DtRounds:
 
     def _position_m(self, address: int) -> Point | None:
         return self._known_m.get(address, self._stated_m.get(address))
-
-
-def _relay_of_response(response: DtMessage, final: DtMessage) -> Relay:
-    rx_ticks = wrap(final.tx_ticks - response.initiator_reply_ticks)
-    return Relay(response.address, _sequence(response), rx_ticks, response.flight_ticks)
 
 
 def _packet(message: DtMessage, relays: tuple[Relay, ...]) -> Packet:
