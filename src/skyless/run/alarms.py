@@ -341,7 +341,9 @@ class AlarmEngine:
         if subject not in own.concerned:
             return False
         is_there = tag is not None and self._table.is_there(tag, now_s)
-        is_settled = tag is not None and self._is_settled(tag, now_s)
+        since_s = math.inf if tag is None else max(tag.first_s, self._zones_s)
+        # Whether it is known which zones the tag is outside.
+        is_settled = tag is not None and tag.fix_s > since_s and now_s - since_s >= SETTLE_S
         match rule.kind:
             case "inside":
                 is_unknown = self._is_missed(subject, now_s) or (is_there and not is_settled)
@@ -365,11 +367,6 @@ class AlarmEngine:
         """For how long a tag has had no fix and has not been asleep; infinite before its first one."""
         tag = self._table.get("tag", name)
         return math.inf if tag is None else now_s - max(tag.fix_s, tag.asleep_until_s)
-
-    def _is_settled(self, tag: Node, now_s: float) -> bool:
-        """Whether it is known which zones a tag is outside."""
-        since_s = max(tag.first_s, self._zones_s)
-        return tag.fix_s > since_s and now_s - since_s >= SETTLE_S
 
     @staticmethod
     def _battery(tag: Node | None) -> float | None:

@@ -138,15 +138,8 @@ class Phone:
                 self._drops["malformed-record"] += 1
             else:
                 records += found
-        packets = []
-        for record in _in_order(records):
-            stated = self._android(record) if record.measurement_type is None else self._ios(record)
-            packet = stated if isinstance(stated, str) else self._rounds.on_message(stated)
-            if isinstance(packet, Packet):
-                packets.append(packet)
-            else:
-                self._drops[packet] += 1
-        return packets
+        stated = (self._android(one) if one.measurement_type is None else self._ios(one) for one in _in_order(records))
+        return self._rounds.packets(stated, self._drops)
 
     def _is_late(self, rx_ticks: int) -> bool:
         """Whether a record is not newer than the newest, which it otherwise becomes."""

@@ -37,7 +37,7 @@ bytes serve our tests, and Qorvo's client for QM35. The specification itself is 
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
 from math import dist
 from struct import Struct as Layout
@@ -593,6 +593,12 @@ class DtRounds:
         self._known_m = anchors_m or {}
         self._stated_m: dict[int, Point] = {}
         self._rounds: dict[int, _Round] = {}
+
+    def packets(self, messages: Iterable[DtMessage | str], drops: Counter[str]) -> list[Packet]:
+        """The packets of messages. Reasons, those in the place of messages too, are counted in ``drops``."""
+        found = [one if isinstance(one, str) else self.on_message(one) for one in messages]
+        drops.update(one for one in found if isinstance(one, str))
+        return [one for one in found if isinstance(one, Packet)]
 
     def on_message(self, message: DtMessage) -> Packet | str:
         """The packet of a message, or the reason why it is unusable."""
