@@ -328,22 +328,19 @@ class AlarmEngine:
         limit, hysteresis = own.limit, rule.hysteresis if held else 0.0
         if rule.zone is not None and rule.zone not in self._zones:
             return False
-        was_blind = now_s - self._blind_s < THRESHOLDS.grace_s
         match rule.kind:
             case "near":
                 if subject in own.distances_m:
                     return own.distances_m[subject] < limit + hysteresis
                 return None if any(self._is_missed(name, now_s) for name in subject.split("~")) else False
             case "crowded":
-                return len(self._crowd(own)) > limit - hysteresis or (None if was_blind else False)
+                return len(self._crowd(own)) > limit - hysteresis or (None if self._was_blind(now_s) else False)
             case "anchor-offline" | "anchor-moved" as kind:
                 return subject in self._anchors[kind] if kind in self._anchors else None
         if subject not in own.concerned:
             return False
         is_there = tag is not None and self._table.is_there(tag, now_s)
-        since_s = math.inf if tag is None else max(tag.first_s, self._zones_s)
-        # Whether it is known which zones the tag is outside.
-        is_settled = tag is not None and tag.fix_s > since_s and now_s - since_s >= SETTLE_S
+        is_settled = tag is not None and self._is_settled(tag, now_s)
         match rule.kind:
             case "inside":
                 is_unknown = self._is_missed(subject, now_s) or (is_there and not is_settled)
@@ -368,10 +365,18 @@ class AlarmEngine:
         tag = self._table.get("tag", name)
         return math.inf if tag is None else now_s - max(tag.fix_s, tag.asleep_until_s)
 
+    def _is_settled(self, tag: Node, now_s: float) -> bool:
+        """Whether it is known which zones a tag is outside."""
+        since_s = max(tag.first_s, self._zones_s)
+        return tag.fix_s > since_s and now_s - since_s >= SETTLE_S
+
     @staticmethod
     def _battery(tag: Node | None) -> float | None:
         health = None if tag is None else tag.health
         return health.battery_share if isinstance(health, TagHealth) else None
+
+    def _was_blind(self, now_s: float) -> bool:
+        return now_s - self._blind_s < THRESHOLDS.grace_s
 
     def _is_missed(self, name: str, now_s: float) -> bool:
         """Whether a tag may be present although nothing has been received from it since messages were missed."""

@@ -110,7 +110,6 @@ def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *
     ``settle_s``: time before the first leg. The last block is closed.
     """
     whole = PairRanger()
-    until_s = settle_s + seconds
 
     def on_leg(sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float) -> None:
         if t_s >= settle_s:
@@ -119,7 +118,7 @@ def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *
     def new_recorded(anchor: int) -> RecordedAnchor:
         return RecordedAnchor(new_anchor(site, anchor), site.id, on_leg)
 
-    for _ in World(site, new_recorded, (), impairments, seed).run(until_s):
+    for _ in World(site, new_recorded, (), impairments, seed).run(settle_s + seconds):
         pass
     whole.finish()
     return whole
@@ -585,12 +584,11 @@ def limits_of(group: Group, file: str) -> tuple[Limit, ...]:
 
 def cells(plan: Plan) -> list[Cell]:
     """One cell for each world."""
-    runs = [RoomRun(group, plan, world) for group in groups() for world in range(plan.worlds)]
-    return [Cell(run.group.name, partial(room_results, run), _weight_s(run)) for run in runs]
-
-
-def _weight_s(run: RoomRun) -> float:
-    return run.survey_s * 0.06 + len(run.group.files) * run.plan.tags * (run.plan.seconds + _WARMUP_S) * _RUN_S
+    found = []
+    for run in (RoomRun(group, plan, world) for group in groups() for world in range(plan.worlds)):
+        weight_s = run.survey_s * 0.06 + len(run.group.files) * plan.tags * (plan.seconds + _WARMUP_S) * _RUN_S
+        found.append(Cell(run.group.name, partial(room_results, run), weight_s))
+    return found
 
 
 def room_results(run: RoomRun) -> tuple[RunResult, ...]:
