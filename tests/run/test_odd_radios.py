@@ -1,8 +1,5 @@
 """Phones and boards with anchors that people reported: lost time bases, unknown constants, slow rounds, two values."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -63,13 +60,9 @@ def test_constants_have_to_be_calibrated_before_there_is_a_level(seed, anchors_m
     _, levels_m, _, report = replayed(phone, tmp_path, bare)
     assert not np.isfinite(levels_m).any()
     assert [note[:14] for note in report.notes] == ["Not calibrated"]
-    still = Phone(anchors_m, seed=seed, constants_m=late_m, place_m=(14.0, 13.0, HEIGHT_M)).write(
-        tmp_path / "still.jsonl"
-    )
-    options = "--anchors", str(bare), "--at", f"14,13,{HEIGHT_M}", "--out", str(calibrated)
-    subprocess.run(
-        [sys.executable, "-m", "skyless", "calibrate", str(still), *options], check=True, capture_output=True
-    )
+    still = Phone(anchors_m, seed=seed, constants_m=late_m, place_m=(14.0, 13.0, HEIGHT_M))
+    found = skyless.calibrate(still.write(tmp_path / "still.jsonl"), anchors=bare, stays=[(14.0, 13.0, HEIGHT_M)])
+    calibrated.write_text(found.corrected_file())
     errors_m, levels_m, time_s, report = replayed(phone, tmp_path, calibrated)
     assert report.notes == ()
     assert np.isfinite(levels_m[time_s > 1.0]).all()

@@ -78,5 +78,5 @@ class Phone(Struct, frozen=True):
 
     def errors_m(self, time_s: np.ndarray, position_m: np.ndarray) -> np.ndarray:
         """Horizontal errors of fixes, whose times count from the first record."""
-        truth_m = np.array([self.position_m(3.0 + when_s) for when_s in time_s])
+        truth_m = np.array([self.position_m(3.0 + when_s) for when_s in time_s]).reshape(-1, 3)
         return np.hypot(*(position_m - truth_m)[:, :2].T)

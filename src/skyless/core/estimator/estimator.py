@@ -152,9 +152,9 @@ class Estimator:
         s.P[at(constant, constant)] += (TUNING.staying_share * staying_m) ** 2
         make_uncertain(s, ALL_RANGE_ERRORS)
 
-    def withhold_levels(self, are_withheld: bool = True) -> None:
-        """Withhold the levels, because the position is not certain yet or anchors are known to be misplaced."""
-        self._state.status.withholds_levels = are_withheld
+    def withhold_levels(self, state: int) -> None:
+        """State the levels as ``CONTRADICTED`` or ``UNAVAILABLE`` from now on; ``SOUND``: as the filter finds them."""
+        self._state.status.withheld = state
 
     def start(
         self,

@@ -204,7 +204,7 @@ def integrity_state(s: State) -> int:
     share = sqrt(s.P[at(0, 0)] + s.P[at(1, 1)]) / max(
         range_m, 1e-6
     )  # levels are a first-order approximation in this share
-    if status.withholds_levels or largest_test(s) > limit:
+    if largest_test(s) > limit:
         state = CONTRADICTED
     if was_contradicted and (status.epoch_ticks - status.start_ticks) * TICK_S < tuning.contradicted_start_s:
         state = CONTRADICTED
@@ -213,4 +213,4 @@ def integrity_state(s: State) -> int:
     is_new = s.count <= s.dim or not is_warm(s)
     if is_new or share > tuning.curved_std or is_side_open(s):
         state = UNAVAILABLE
-    return state
+    return max(state, status.withheld)

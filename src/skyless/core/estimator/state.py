@@ -240,8 +240,8 @@ class Status(Record):
     """Its position then …"""
     stationary_m2: Annotated[Reals, AXES]
     """… and the variance along each axis."""
-    withholds_levels: bool
-    """Whether the anchors' positions are known to be wrong."""
+    withheld: int
+    """``CONTRADICTED`` or ``UNAVAILABLE`` if levels are withheld from outside the filter, otherwise ``SOUND``."""
     height_ticks: Ticks
     """Tag time of the last height used from a sensor."""
     plane_m: Annotated[Reals, AXES]

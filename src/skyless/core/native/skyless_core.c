@@ -3377,7 +3377,7 @@ INTERNAL int32_t integrity_state(State *s) {
     bool was_contradicted = status->fault_std_m[LASTING] > tuning->lasting_std_m;  /* then no anchor is selected */
     real limit = was_contradicted ? tuning->sure_chi2 : tuning->uncovered_chi2;
     real share = SQRT(s->P[at(0, 0)] + s->P[at(1, 1)]) / max_real(range_m, REAL(1e-06));  /* levels are a first-order approximation in this share */
-    if (status->withholds_levels || largest_test(s) > limit) {
+    if (largest_test(s) > limit) {
         state = CONTRADICTED;
     }
     if (was_contradicted && (real)(status->epoch_ticks - status->start_ticks) * TICK_S < tuning->contradicted_start_s) {
@@ -3390,7 +3390,7 @@ INTERNAL int32_t integrity_state(State *s) {
     if (is_new || share > tuning->curved_std || is_side_open(s)) {
         state = UNAVAILABLE;
     }
-    return state;
+    return max_32(state, status->withheld);
 }
 
 /* The kinds of measurements. Each is linearised at the state, gated, and processed by one scalar update.

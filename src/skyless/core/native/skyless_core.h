@@ -974,7 +974,8 @@ typedef struct Status {
     real stationary_s;  /* Time since the tag last showed motion. */
     real stationary_m[3];  /* Its position then … */
     real stationary_m2[3];  /* … and the variance along each axis. */
-    bool withholds_levels;  /* Whether the anchors' positions are known to be wrong. */
+    /* ``CONTRADICTED`` or ``UNAVAILABLE`` if levels are withheld from outside the filter, otherwise ``SOUND``. */
+    int32_t withheld;
     int64_t height_ticks;  /* Tag time of the last height used from a sensor. */
     real plane_m[3];  /* A point of the plane that fits the anchors best. */
     real plane_normal[3];  /* Normal of that plane. */

@@ -17,7 +17,7 @@ from skyless.core.estimator.process import ACCEPTED
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import at
 from skyless.core.fix import Fix, NoFixReason
-from skyless.core.integrity import IntegrityRequirement
+from skyless.core.integrity import CONTRADICTED, SOUND, IntegrityRequirement
 from skyless.core.native.records import MAX_ANCHORS
 from skyless.core.tag.position import NoSolution, locate
 from skyless.core.ticks import TICK_RATE_HZ
@@ -221,7 +221,7 @@ class DifferenceTracking:
             if start.is_ambiguous or gap_m @ np.linalg.solve(both_m2, gap_m) < TUNING.apart_chi2:
                 has_moved = bool(np.linalg.norm(position_m - self._start.position_m[:dim]) > TUNING.rival_m)
                 self._is_confirmed = has_moved or not start.is_ambiguous
-                self.estimator.withhold_levels(not self._is_confirmed)
+                self.estimator.withhold_levels(SOUND if self._is_confirmed else CONTRADICTED)
                 window.clear()
                 return False
             self.counters["restart"] += 1
@@ -229,7 +229,7 @@ class DifferenceTracking:
         self.estimator.start(
             0, start.position_m[:dim], start.covariance_m2[:dim, :dim], self._settings.start_speed_std_mps**2
         )
-        self.estimator.withhold_levels(True)
+        self.estimator.withhold_levels(CONTRADICTED)
         self._start = start
         for anchor, (late_m, variance_m2) in start.late.items():
             may_stay = anchor not in self._calibration.anchors  # a calibrated anchor has no constant lateness

@@ -15,6 +15,7 @@ import numpy as np
 from skyless.core.air.masterless_packets import Packet, Point, Relay
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
+from skyless.core.integrity import CONTRADICTED, SOUND, UNAVAILABLE
 from skyless.core.tag.joint import Estimation, Observation
 from skyless.core.ticks import (
     LAST_TICKS,
@@ -239,8 +240,9 @@ class PacketTracking:
             _phase_of(packet),
             tuple(phases),
         )
-        is_sure = self._is_calibrated and self._watch.is_ready and not self._watch.flips_m
-        self.tracking.estimator.withhold_levels(not is_sure or bool(self._delays.contradictions_m))
+        is_wrong = self._watch.flips_m or self._delays.contradictions_m
+        is_known = self._is_calibrated and self._watch.is_ready
+        self.tracking.estimator.withhold_levels(CONTRADICTED if is_wrong else SOUND if is_known else UNAVAILABLE)
         fix = self.tracking.update(observation)
         self.used = isinstance(fix, Fix)
         if not isinstance(fix, Fix):
