@@ -140,7 +140,6 @@ LEAST_CHANGE = 0.02
 FEW_WORLDS_CHANGE = 0.1
 """A change that rests on few worlds is shown from here on, in brackets."""
 
-
 FACTORS = ("× 2", "÷ 2")
 
 

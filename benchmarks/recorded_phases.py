@@ -90,10 +90,8 @@ def main() -> None:
     for channel in muloc.CHANNELS:
         for has_phases in (False, True):
             name = "with phases " if has_phases else "stamps alone"
-            print(
-                f"channel {channel}, {name}: {figures(tracked(path, channel, has_phases=has_phases), stops)}",
-                flush=True,
-            )
+            found = figures(tracked(path, channel, has_phases=has_phases), stops)
+            print(f"channel {channel}, {name}: {found}", flush=True)
 
 
 if __name__ == "__main__":

@@ -146,7 +146,7 @@ def test_a_blocked_anchor_does_not_pull_the_tag_away(system):
     excluded = {}
     for t_s, packet in timed:
         again.on_packet(packet)
-        excluded[t_s] = again._tracking.excluded
+        excluded[t_s] = again.tracking.excluded
     assert {told for t_s, told in excluded.items() if 3.3 < t_s < 4.9} == {(3,)}
     assert {told for t_s, told in excluded.items() if t_s > 5.3} == {()}
     assert len(rows) > 0.98 * sum(t_s >= 1.0 for t_s, _ in timed)  # the others carry the fixes on

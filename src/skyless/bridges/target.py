@@ -440,7 +440,9 @@ class Hub:
         for name, reason in tuple(self._reasons.items()):
             tag = self.table.get("tag", name)
             if tag is None:
-                self._forget(name)
+                del self._reasons[name], self._due_s[name]
+                for route in self.routes:
+                    route.rates.pop(name, None)
             elif self.table.presence(tag, now_s) in ("fresh", "asleep"):
                 continue
             elif now_s >= self._due_s[name] and self.site is not None:
@@ -455,11 +457,6 @@ class Hub:
         for route in self.routes:
             if route.tag in (None, tag):
                 self._guard(route, lambda target: target.on_gone(tag, unix_s))
-
-    def _forget(self, tag: str) -> None:
-        del self._reasons[tag], self._due_s[tag]
-        for route in self.routes:
-            route.rates.pop(tag, None)
 
     def _give_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
         for route in self.routes:

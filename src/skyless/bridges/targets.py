@@ -239,7 +239,6 @@ class SerialSender:
 
 MAX_HZ: Final = 1000.0
 
-
 Sender = TcpServer | UdpSender | PtySender | SerialSender
 
 

@@ -141,10 +141,7 @@ def _heatmap_rows(found: _Row) -> list[_Row]:
     return [*rows, whole] if found["tags"] else []
 
 
-_ROWS: Mapping[str, Callable[[Any], list[_Row]]] = {
-    "track": _track_rows,
-    "heatmap": _heatmap_rows,
-}
+_ROWS: Mapping[str, Callable[[Any], list[_Row]]] = {"track": _track_rows, "heatmap": _heatmap_rows}
 """Functions that convert an answer to table rows, for commands that do not show the answer itself."""
 
 

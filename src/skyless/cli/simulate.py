@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from skyless.cli.api.simulate import Simulation
     from skyless.sim.evaluation.fleet import FleetReport, JudgedFix
 
-
 FIXES_CSV_COLUMNS: Final = (
     *("t_s", "tag"),
     *("x_m", "y_m", "z_m", "var_x_m2", "var_y_m2", "var_z_m2", "truth_x_m", "truth_y_m", "truth_z_m", "anchors"),

@@ -305,12 +305,7 @@ _FEW: Final = 128
 
 
 def new_chain(
-    site: int,
-    serial: int,
-    starts_s: float,
-    ends_s: float,
-    private: bytes,
-    reached: Callable[[float], None],
+    site: int, serial: int, starts_s: float, ends_s: float, private: bytes, reached: Callable[[float], None]
 ) -> Chain:
     """Make a chain with a new seed between two Unix times, the end rounded up to whole sections (14 minutes).
 

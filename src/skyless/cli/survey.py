@@ -47,7 +47,6 @@ if TYPE_CHECKING:
     from skyless.site.survey.facts import Count, Facts, PairRanges, Survey, SurveyedPair, TapeAdvice
     from skyless.site.survey.pair_ranger import PairRanger
 
-
 NOTHING_DETERMINED: Final = 1
 """Exit code of a survey without a position or a delay."""
 
@@ -212,7 +211,11 @@ def _show(found: "SurveyResult", written: tuple[str, ...]) -> None:
     checked = [pair for pair in survey.pairs if pair.residual_m is not None]
     if checked:
         _print_pairs(checked)
-    excluded = ", ".join(f"{pair.a}–{pair.b}{_late(pair)}" for pair in survey.pairs if pair.excluded)
+    excluded = ", ".join(
+        f"{pair.a}–{pair.b}" + ("" if pair.residual_m is None else f" ({pair.residual_m:+.2f} m)")
+        for pair in survey.pairs
+        if pair.excluded
+    )
     lines = [
         f"left out as late: {excluded or 'no pair'}",
         f"constant error of a pair: {cm(survey.range_std_m)}; {_checks(survey.redundancy)}",
@@ -247,10 +250,6 @@ def _print_pairs(checked: Sequence["SurveyedPair"]) -> None:
         figures = [number(pair.residual_m, "{:+.2f}", 100.0), number(pair.std_m, "{:.2f}", 100.0)]
         rows.append((f"{pair.a}–{pair.b}", number(pair.range_m), *figures, "left out" if pair.excluded else ""))
     print_table(shown, ("pair", "range / m", "range − result / cm", "± / cm", ""), rows, figures=True)
-
-
-def _late(pair: "SurveyedPair") -> str:
-    return "" if pair.residual_m is None else f" ({pair.residual_m:+.2f} m)"
 
 
 def _checks(redundancy: int) -> str:

@@ -42,7 +42,6 @@ ALERT_INTERVAL_S: Final = 10.0
 
 _KEPT_S: Final = 5.0  # an older first status is a retained one, and no event
 
-
 MAX_EVENTS: Final = 50
 """Most zone events kept for pages."""
 

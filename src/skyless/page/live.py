@@ -51,7 +51,6 @@ _STATE_PERIOD_S: Final = 0.05
 _HEALTH_PERIOD_S: Final = 1.0
 _EVALUATION_SHARE: Final = 5.0  # evaluations take at most a sixth of the time
 
-
 IDLE_S: Final = 12.0
 """A page that has sent nothing for this long may be closed for another one. A visible page sends a ping every 2 s."""
 
@@ -193,7 +192,7 @@ class LiveSite:
         feed = self.feed
         feed.on(SiteMessage, self._on_site)
         feed.on_bytes("floor_plan", self._on_floor_plan)
-        feed.on(FixMessage, lambda fix, _: self._on_fix(fix))
+        feed.on(FixMessage, lambda fix, _: self._add_fix(fix, self._clock()))
         feed.on(StatusMessage, lambda status, _: self._on_status(status))
         for kind in (TagHealth, AnchorHealth, EtherHealth):
             feed.on(kind, self._on_health)
@@ -267,9 +266,6 @@ class LiveSite:
         """Message with digests, so that pages reload images that have changed."""
         digests = {floor: f"{zlib.crc32(image):08x}" for floor, image in self.plans.items()}
         return encode("floor_plan", {"digest": digests.pop(None, None), "floors": digests})
-
-    def _on_fix(self, fix: FixMessage) -> None:
-        self._add_fix(fix, self._clock())
 
     def on_batched_fix(self, fix: FixMessage, now_s: float) -> None:
         """Process a fix that arrived in a batch at this time."""

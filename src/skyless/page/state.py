@@ -96,7 +96,8 @@ class SiteState:
         """Times of the next messages, by the table's clock and by Unix time; set by the owner."""
         self._truths = TruthBuffer()
         self._leaders: set[str] = set()  # anchors that lead the site's time
-        self._conditions: dict[str, str] = {}  # of anchors
+        self.conditions: dict[str, str] = {}
+        """The condition of each anchor, by name, as of the last ``judge``."""
         self._waiting: list[str] = []  # tags that report and have no position yet
         self._encoded: dict[tuple[int, int], bytes] = {}
 
@@ -136,7 +137,8 @@ class SiteState:
             presence = table.fresh_for_s(tag), slept_s, slept_s + table.gone_after_s(tag)
             if tag.is_gone:  # its program has ended
                 presence = 0.0, 0.0, 0.0
-            tag.row = [*_row(fix, self._truths.at(fix.tag, fix.unix_s), tag.ended_unix_s), *map(_tenths, presence)]
+            truth = self._truths.at(fix.tag, fix.unix_s)
+            tag.row = [*_row(fix, truth, tag.ended_unix_s), *(round(one_s, 1) for one_s in presence)]
         return tag.row
 
     def new_state(self, sent: Sent) -> bytes | None:
@@ -184,11 +186,6 @@ class SiteState:
 
     # Healths and statuses
 
-    @property
-    def conditions(self) -> dict[str, str]:
-        """The condition of each anchor, by name, as of the last ``judge``."""
-        return self._conditions
-
     def judge(self, now_s: float, *, blind: bool) -> None:
         """Update the condition of each anchor: ``good``, ``warn`` (not synchronised) or ``bad`` (offline).
 
@@ -205,11 +202,11 @@ class SiteState:
                     self._leaders.add(name)
                 found[name] = "good" if health.synchronised or health.role == "master" else "warn"
                 is_silent = now_s - anchor.health_s > THRESHOLDS.report_s
-                if is_silent and not (blind and self._conditions.get(name) != "bad"):
+                if is_silent and not (blind and self.conditions.get(name) != "bad"):
                     found[name] = "bad"
             if anchor.online is False:
                 found[name] = "bad"
-        self._conditions = found
+        self.conditions = found
 
     def new_health(self, sent: Sent) -> bytes:
         """The ``health`` message with what is new to a page. The first one is ``whole``.
@@ -239,10 +236,10 @@ class SiteState:
             nodes = [node.status for node in sorted(newer, key=lambda node: node.status_serial) if node.status]
             if sum(map(len, there.values())) > MAX_HEALTHS:  # then pages list only the other programs
                 nodes = [status for status in nodes if status.kind not in {"tag", "anchor"}]
-        changed = {name: kind for name, kind in self._conditions.items() if sent.conditions.get(name) != kind}
-        changed |= dict.fromkeys(sent.conditions.keys() - self._conditions.keys(), "unknown")
+        changed = {name: kind for name, kind in self.conditions.items() if sent.conditions.get(name) != kind}
+        changed |= dict.fromkeys(sent.conditions.keys() - self.conditions.keys(), "unknown")
         sent.healths, sent.named = table.healths_serial, named | {"ether": set()}
-        sent.statuses, sent.conditions = table.statuses_serial, self._conditions
+        sent.statuses, sent.conditions = table.statuses_serial, self.conditions
         return encode(
             "health",
             {
@@ -257,10 +254,6 @@ class SiteState:
                 "ages": ages,
             },
         )
-
-
-def _tenths(seconds: float) -> float:
-    return round(seconds, 1)
 
 
 def encode(kind: str, fields: dict[str, Any]) -> bytes:

@@ -389,17 +389,15 @@ def results_of(
 def with_best(results: Sequence[Result]) -> Iterator[Result]:
     """The results, plus for each recording the one of ``PLAIN`` and ``SIMPLE`` with the smallest error."""
     yield from results
-    simple = [(_error_m(one), one) for one in results if one.method in {PLAIN, *SIMPLE} and one.figures]
+    simple = [
+        (figures.rmse_3d_m or figures.rmse_2d_m or np.inf, one)  # in 3-D if the recording has heights
+        for one in results
+        if one.method in {PLAIN, *SIMPLE} and (figures := one.figures)
+    ]
     for recording in dict.fromkeys(one.recording for _, one in simple):
         errors = [(m, one) for m, one in simple if one.recording == recording and np.isfinite(m)]
         if errors:
             yield structs.replace(min(errors, key=lambda error: error[0])[1], method=BEST, drawn=())
-
-
-def _error_m(result: Result) -> float:
-    """The RMSE, in 3-D if the recording has heights; infinite without figures."""
-    figures = result.figures
-    return np.inf if figures is None else figures.rmse_3d_m or figures.rmse_2d_m or np.inf
 
 
 def _kept(file: Path) -> tuple[Result, ...] | None:

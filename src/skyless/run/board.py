@@ -34,13 +34,7 @@ from skyless.radio.interface import Gone, Hint, Late, Radio, RadioEvent, Restart
 from skyless.radio.serial import link
 from skyless.radio.serial.link import ANY_SITE, MODES, OUTPUTS, BoardSettings, pack, to_steps, unpack
 from skyless.radio.serial.serial_port import Pty
-from skyless.radio.tag_reports import (
-    BODY_AT,
-    fix_body,
-    georeference_body,
-    place_body,
-    status_body,
-)
+from skyless.radio.tag_reports import BODY_AT, fix_body, georeference_body, place_body, status_body
 from skyless.run.fix_log import Lateness
 from skyless.run.process import HEALTH_S, Log, RateLimit, every, together
 

@@ -186,26 +186,22 @@ async def keep(link: Link, log: Log) -> None:
 
 
 def reader(
-    kind: type[Struct] | Callable[[bytes], Struct],
-    act: Callable[[Any], None],
-    on_wrong: Callable[[], None],
-    withdrawn: Struct | None = None,
+    kind: type[Struct] | Callable[[bytes], Struct], act: Callable[[Any], None], on_wrong: Callable[[], None]
 ) -> Handler:
     """Make a handler that decodes messages of a kind, or with a function. ``on_wrong`` is called if that fails.
 
-    An empty payload, a withdrawn retained message, is skipped or replaced by the message ``withdrawn``.
+    An empty payload, a withdrawn retained message, is skipped.
     """
 
     def read(_topic: str, payload: bytes) -> None:
-        message = withdrawn
+        if not payload:
+            return
         try:
-            if payload:
-                message = read_message(payload, kind) if isinstance(kind, type) else kind(payload)
+            message = read_message(payload, kind) if isinstance(kind, type) else kind(payload)
         except WrongMessageError:
             on_wrong()
         else:
-            if message is not None:
-                act(message)
+            act(message)
 
     return read
 

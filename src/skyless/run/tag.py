@@ -91,19 +91,16 @@ class TagNode:
         asked = self.settings
         return AnyReceiver(asked.method, site=asked.site, integrity=asked.integrity)
 
-    def _new_verified_receiver(self) -> Receiver:
-        """Create a receiver for verified beacons, which only protocol 2 has."""
-        asked = self.settings
-        return Receiver(site=asked.site, integrity=asked.integrity)
-
     def _new_trusted(self) -> TrustedReceiver | None:
         """Create the receiver that verifies beacons, with the site's remembered keys; None without a public key."""
-        trust = self.settings.trust
+        asked = self.settings
+        trust = asked.trust
         if trust is None:
             return None
         known = Remembered() if self._memory is None else self._memory.remembered
         newest = replace(trust, least_serial=max(trust.least_serial, known.serial))
-        return TrustedReceiver(newest, self._new_verified_receiver, known.certificates)
+        # Only protocol 2 has beacons that can be verified.
+        return TrustedReceiver(newest, lambda: Receiver(site=asked.site, integrity=asked.integrity), known.certificates)
 
     @property
     def receiver(self) -> SiteListener:

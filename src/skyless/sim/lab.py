@@ -8,7 +8,6 @@ from skyless.core.site import EXACT, AccuracySite, AnchorSite, NoiseSite, Schedu
 
 _TYPICAL: Final = AccuracySite()
 
-
 _POSITIONS_M: Final = ((0.0, 0.0), (6.0, 0.0), (6.0, 4.0), (6.0, 8.0), (0.0, 8.0), (0.0, 4.0))
 
 

@@ -65,7 +65,7 @@ class Timeline(Generic[Result]):
 
     def __init__(self) -> None:
         self.now_ticks = 0
-        self._serial = self._until_ticks = 0
+        self._serial = 0
         self._events: list[tuple[int, int, Callable[[], Result | None]]] = []
 
     @property
@@ -73,26 +73,13 @@ class Timeline(Generic[Result]):
         """Time of the next event; None if nothing is planned."""
         return self._events[0][0] if self._events else None
 
-    @property
-    def until_ticks(self) -> int:
-        """End of the present ``run``."""
-        return self._until_ticks
-
     def at(self, ticks: int, happen: Callable[[], Result | None]) -> None:
         """Plan an event; one in the past happens now."""
         self._serial += 1
         heapq.heappush(self._events, (max(ticks, self.now_ticks), self._serial, happen))
 
-    def pass_to(self, ticks: int) -> bool:
-        """Advance to ``ticks`` at once if no event and no end of ``run`` comes first. Returns True if advanced."""
-        if ticks > self._until_ticks or (self._events and self._events[0][0] <= ticks):
-            return False
-        self.now_ticks = max(self.now_ticks, ticks)
-        return True
-
     def run(self, until_ticks: int) -> Iterator[Result]:
         """Run all events up to a time, and yield their results."""
-        self._until_ticks = until_ticks
         while self._events and self._events[0][0] <= until_ticks:
             self.now_ticks, _, happen = heapq.heappop(self._events)
             result = happen()
@@ -189,11 +176,8 @@ class Medium(Generic[Result]):
         impairments: Impairments,
         seed: int,
         deliver: Callable[[Delivery], Result | None],
-        turnaround_s: float = TURNAROUND_S,
     ) -> None:
         """``deliver`` is called with every frame at its end; ``run`` yields its results.
-
-        ``turnaround_s``: how long before its preamble a frame must be passed in.
 
         Raises ValueError if an impairment names an anchor that is not the site's.
         """
@@ -209,7 +193,7 @@ class Medium(Generic[Result]):
         self._transmissions = self._late = 0
         self._deliver = deliver
         self.timeline: Timeline[Result] = Timeline()
-        self._least_ahead_ticks = _PREAMBLE_TICKS + from_seconds(turnaround_s)
+        self._least_ahead_ticks = _PREAMBLE_TICKS + from_seconds(TURNAROUND_S)
         _check_names(impairments, self.node_of)
         keys = [(ANCHOR_KEY, anchor.id) for anchor in site.anchors] + [(TAG_KEY, tag) for tag in range(len(tags))]
         self._setups = [stream(seed, *key, purpose=1) for key in keys]

@@ -21,6 +21,7 @@ from skyless.sim.impairments import Impairments
 from skyless.sim.listening import TagSpec
 from skyless.sim.medium import Delivery, Medium, Tally
 
+_LEAD_TICKS: Final = from_seconds(1e-3)  # how long before its RMARKER a frame is fetched
 _RETRY_TICKS: Final = from_seconds(5e-3)
 
 
@@ -77,12 +78,8 @@ class World:
         tags: Sequence[TagSpec],
         impairments: Impairments,
         seed: int,
-        *,
-        lead_s: float = 1e-3,
     ) -> None:
         """``anchor_factory`` creates the machine of an anchor by identifier, again when that anchor restarts.
-
-        ``lead_s``: how long before its RMARKER a frame is fetched.
 
         Raises ValueError if an impairment names an anchor that is not the site's.
         """
@@ -90,7 +87,6 @@ class World:
         self._factory = anchor_factory
         self.medium: Medium[Broadcast] = Medium(site, self._tags, impairments, seed, self._deliver)
         self._timeline = self.medium.timeline
-        self._lead_ticks = from_seconds(lead_s)
         nodes = len(self._anchors) + len(self._tags)
         self._machines: list[BeaconSender | None] = [None] * nodes
         self._reasons_off = [1] * nodes
@@ -152,7 +148,7 @@ class World:
             self._timeline.at(self._timeline.now_ticks + _RETRY_TICKS, partial(self._ask, node, boot))
             return
         ahead = difference(tx_ticks, wrap(local_ticks))
-        fetch_ticks = medium.foresee(node, local_ticks + ahead - self._lead_ticks)
+        fetch_ticks = medium.foresee(node, local_ticks + ahead - _LEAD_TICKS)
         self._timeline.at(fetch_ticks, partial(self._fetch, node, boot, tx_ticks))
 
     def _fetch(self, node: int, boot: int, tx_ticks: int) -> None:

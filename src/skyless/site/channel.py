@@ -116,14 +116,7 @@ def cross_wall(b: Barrier, x1_m: float, y1_m: float, z1_m: float, x2_m: float, y
 
 
 def cross_walls(
-    barriers: Array[Barrier],
-    count: int,
-    x1_m: float,
-    y1_m: float,
-    z1_m: float,
-    x2_m: float,
-    y2_m: float,
-    z2_m: float,
+    barriers: Array[Barrier], count: int, x1_m: float, y1_m: float, z1_m: float, x2_m: float, y2_m: float, z2_m: float
 ) -> tuple[float, float]:
     """Total loss in dB and delay in metres of the barriers that the straight line from one point to another crosses."""
     loss_db, delay_m = 0.0, 0.0

@@ -49,7 +49,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-
 FloorMap = TypeVar("FloorMap", PlanMap, RateMap)
 
 

@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
-
 _WORTH_SHIFTING_S: Final = 0.05
 """Offsets of the truth's times up to this are due to the filter itself."""
 

@@ -473,9 +473,7 @@ class WholeSite:
         ether = ("ether", *site, *mqtt, "--listen", f"{_HOST}:{self.ether_port}", *walks)
         ether += ("--move", MOVED) * self._has_story + ("--carrier",) * asked.carrier
         computing = _options(
-            method=asked.method,
-            integrity_risk=asked.integrity_risk,
-            alert_limit_m=asked.alert_limit_m,
+            method=asked.method, integrity_risk=asked.integrity_risk, alert_limit_m=asked.alert_limit_m
         )
         anchors = [str(anchor.id) for anchor in self.site.anchors]
         known = site if self._has_story else ()

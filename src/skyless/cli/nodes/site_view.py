@@ -54,7 +54,6 @@ GONE: Final = ("silent", "offline")
 LINK_NAME: Final = f"{platform.node()}-{os.getpid()}"
 _WAIT_SHARE: Final = 3.0
 
-
 TagState = Literal["fix", "asleep", "no fix", "offline"]
 
 

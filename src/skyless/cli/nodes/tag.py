@@ -237,10 +237,7 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
 @app.default
 @command
 def tag(
-    *names: Annotated[str, Parameter(name="NAMES")],
-    asked: TagOptions,
-    broker: MqttOptions,
-    shown: LineOptions,
+    *names: Annotated[str, Parameter(name="NAMES")], asked: TagOptions, broker: MqttOptions, shown: LineOptions
 ) -> None:
     """Run listening tags until Ctrl-C.
 
@@ -386,7 +383,6 @@ def _system(asked: TagOptions) -> "PacketTagSettings":
     return PacketTagSettings(
         anchors_m,
         site=TDOA_SITE if asked.site_id is None else asked.site_id,
-        qa=0.3,
         height_m=height_m,
         height_std_m=std_m if asked.tag_height_std is None else asked.tag_height_std,
         auto_height=asked.anchors is None and asked.tag_height in (None, "auto"),

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from skyless.page.api.routes import ApiRoute
     from skyless.run.history.queries import History
 
-
 _Text = Annotated[str, Meta(max_length=200)]
 
 

@@ -160,7 +160,7 @@ class ApiRoute:
         is_map: bool = False,
     ) -> None:
         """``path``: below ``ROOT``; ``media_type``: of an answer that is bytes."""
-        self.method, self.path, self.is_map, self.function = method, path, is_map, answer
+        self.method, self.path, self.function = method, path, answer
         self.is_past = path.startswith("/history/")
         self.key = path.rsplit("/", 1)[-1]
         self.summary = (answer.__doc__ or "").rstrip(".")

@@ -27,10 +27,11 @@ const MASTER = "master: its clock is the site's time";
 
 /** Fill the legend. */
 export function start() {
+  const overlays = h("label", { class: "choice" }, "Overlay", options({ id: "overlay" }, Object.entries(KINDS), choose));
   const sections = [
     ["Tags", tags(), groups()],
     ["Anchors", marks()],
-    ["Layers", ...Object.entries(SWITCHES).map(switchFor), trails(), overlays()],
+    ["Layers", ...Object.entries(SWITCHES).map(switchFor), trails(), overlays],
     ["Floors", ...floorChoice()],
     ["Save", saving()],
   ];
@@ -118,10 +119,6 @@ function trails() {
   });
   list.value = String(state.options.trails);
   return h("label", { class: "choice" }, "Trails", list);
-}
-
-function overlays() {
-  return h("label", { class: "choice" }, "Overlay", options({ id: "overlay" }, Object.entries(KINDS), choose));
 }
 
 /** The chosen floor, where the site has several, and the heights that the user gives. */

@@ -343,13 +343,7 @@ class ChipSession:
     """One chip from start to loss. Its only I/O is the driver's bus; no clock."""
 
     def __init__(
-        self,
-        bus: Bus,
-        delays: AntennaDelays,
-        listener: Listener,
-        counters: Counter[str],
-        *,
-        phases: bool = False,
+        self, bus: Bus, delays: AntennaDelays, listener: Listener, counters: Counter[str], *, phases: bool = False
     ) -> None:
         """``phases``: receptions include carrier phases."""
         self.driver = DW1000(bus)

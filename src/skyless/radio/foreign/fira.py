@@ -85,14 +85,7 @@ class DtTag:
         if len(usable) > 1:
             first = usable[0].rx_ticks_tag
             usable.sort(key=lambda one: difference(one.rx_ticks_tag, first))
-        packets = []
-        for one in usable:
-            packet = self._rounds.on_message(self._message(one, info.session, host_s))
-            if isinstance(packet, Packet):
-                packets.append(packet)
-            else:
-                self._drops[packet] += 1
-        return packets
+        return self._rounds.packets((self._message(one, info.session, host_s) for one in usable), self._drops)
 
     def _message(self, one: DtMeasurement, session: int, host_s: float | None) -> DtMessage:
         return DtMessage(

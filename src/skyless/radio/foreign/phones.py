@@ -138,15 +138,8 @@ class Phone:
                 self._drops["malformed-record"] += 1
             else:
                 records += found
-        packets = []
-        for record in _in_order(records):
-            stated = self._android(record) if record.measurement_type is None else self._ios(record)
-            packet = stated if isinstance(stated, str) else self._rounds.on_message(stated)
-            if isinstance(packet, Packet):
-                packets.append(packet)
-            else:
-                self._drops[packet] += 1
-        return packets
+        stated = (self._android(one) if one.measurement_type is None else self._ios(one) for one in _in_order(records))
+        return self._rounds.packets(stated, self._drops)
 
     def _is_late(self, rx_ticks: int) -> bool:
         """Whether a record is not newer than the newest, which it otherwise becomes."""
@@ -160,7 +153,10 @@ class Phone:
         kind, address = _kind(record.measurement_type), _address(record.address)
         if kind is None or address is None:
             return "unknown-message" if kind is None else "impossible-address"
-        initiator = address if kind is not DtMessageType.RESPONSE else self._initiator(record)
+        initiator: int | None = address
+        if kind is DtMessageType.RESPONSE:
+            stated = record.cluster_initiator_address
+            initiator = self._newest_initiator if stated is None else _address(stated)
         tx_ticks = _ios_ticks(record.raw_transmit_time, record.transmit_time)
         rx_ticks = _ios_ticks(record.raw_receive_time, record.receive_time)
         if tx_ticks is None or rx_ticks is None:
@@ -185,11 +181,6 @@ class Phone:
             common_time=True,
             position_m=self._position_m(_ios_location(record)),
         )
-
-    def _initiator(self, record: _Record) -> int | None:
-        """Whose poll a response answers: that of its cluster, or the newest."""
-        stated = record.cluster_initiator_address
-        return self._newest_initiator if stated is None else _address(stated)
 
     def _android(self, record: _Record) -> DtMessage | str:
         kind, address = _kind(record.message_type), _address(record.address)

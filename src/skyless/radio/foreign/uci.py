@@ -37,7 +37,7 @@ bytes serve our tests, and Qorvo's client for QM35. The specification itself is 
 """
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
 from math import dist
 from struct import Struct as Layout
@@ -594,6 +594,12 @@ class DtRounds:
         self._stated_m: dict[int, Point] = {}
         self._rounds: dict[int, _Round] = {}
 
+    def packets(self, messages: Iterable[DtMessage | str], drops: Counter[str]) -> list[Packet]:
+        """The packets of messages. Reasons, those in the place of messages too, are counted in ``drops``."""
+        found = [one if isinstance(one, str) else self.on_message(one) for one in messages]
+        drops.update(one for one in found if isinstance(one, str))
+        return [one for one in found if isinstance(one, Packet)]
+
     def on_message(self, message: DtMessage) -> Packet | str:
         """The packet of a message, or the reason why it is unusable."""
         if message.position_m is not None:
@@ -614,7 +620,11 @@ class DtRounds:
             return self._response(going_on, message)
         if message.address != going_on.poll.address:
             return "final-of-another-anchor"
-        return _packet(message, tuple(_relay_of_response(one, message) for one in going_on.responses.values()))
+        relays = []
+        for one in going_on.responses.values():
+            rx_ticks = wrap(message.tx_ticks - one.initiator_reply_ticks)
+            relays.append(Relay(one.address, _sequence(one), rx_ticks, one.flight_ticks))
+        return _packet(message, tuple(relays))
 
     def _response(self, going_on: _Round, message: DtMessage) -> Packet | str:
         poll = going_on.poll
@@ -622,7 +632,9 @@ class DtRounds:
             return "response-of-the-initiator"
         flight = message.flight_ticks
         if message.common_time:
-            flight = self._distance_ticks(poll.address, message.address) if flight is None else flight
+            poll_m, own_m = self._position_m(poll.address), self._position_m(message.address)
+            if flight is None and poll_m is not None and own_m is not None:
+                flight = dist(poll_m, own_m) / TICK_M
             if flight is None:
                 return "flight-unknown"
             rx_ticks = poll.tx_ticks + round(flight)
@@ -634,17 +646,8 @@ class DtRounds:
             going_on.responses[message.address] = message
         return _packet(message, (Relay(poll.address, _sequence(poll), wrap(rx_ticks), flight),))
 
-    def _distance_ticks(self, one: int, other: int) -> float | None:
-        one_m, other_m = self._position_m(one), self._position_m(other)
-        return None if one_m is None or other_m is None else dist(one_m, other_m) / TICK_M
-
     def _position_m(self, address: int) -> Point | None:
         return self._known_m.get(address, self._stated_m.get(address))
-
-
-def _relay_of_response(response: DtMessage, final: DtMessage) -> Relay:
-    rx_ticks = wrap(final.tx_ticks - response.initiator_reply_ticks)
-    return Relay(response.address, _sequence(response), rx_ticks, response.flight_ticks)
 
 
 def _packet(message: DtMessage, relays: tuple[Relay, ...]) -> Packet:

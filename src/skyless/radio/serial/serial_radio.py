@@ -135,16 +135,12 @@ class LinkSession:
             self._send(self._writer.record(link.ASK_STATUS))
         else:
             self._configure()
-            self._count_idle_poll()
+            self._idle_polls += 1
+            if self._idle_polls * STATUS_S >= _IDLE_S and not self._reported_idle:
+                self._reported_idle = True
+                text = f"the board at {self._port} answers, but does not start to receive: does its radio work?"
+                self._listener(Hint(text))
         return None
-
-    def _count_idle_poll(self) -> None:
-        """Report once that a board answers but does not receive."""
-        self._idle_polls += 1
-        if self._idle_polls * STATUS_S >= _IDLE_S and not self._reported_idle:
-            self._reported_idle = True
-            text = f"the board at {self._port} answers, but does not start to receive: does its radio work?"
-            self._listener(Hint(text))
 
     def _ask_hello(self, host_s: float) -> None:
         self._asked_s = host_s

@@ -65,7 +65,6 @@ class Format:
 _bitcraze: Final = partial(Format, tx_bits=bitcraze.STAMP_BITS, delays_ticks=bitcraze.ANTENNA_DELAYS_TICKS)
 _dl_tdoa: Final = partial(Format, tx_bits=TICK_BITS, is_dl_tdoa=True)
 
-
 FORMATS: Final = (
     _bitcraze(
         "bitcraze-yaml",

@@ -508,11 +508,7 @@ def _density(one: LambdaDistribution) -> Panel:
 # 4: errors at two static positions, and what biased stamps leave.
 
 _POSITIONS: Final = {"P1": P1, "P2": P2}
-_WORLDS: Final = {
-    "noise": "stamp noise only",
-    "power": "power-dependent bias",
-    "delay": "antenna-delay errors",
-}
+_WORLDS: Final = {"noise": "stamp noise only", "power": "power-dependent bias", "delay": "antenna-delay errors"}
 _METHODS: Final = ("literal", "joint")
 _BATCHES: Final = 30
 _DELAY_STD_M: Final = 0.05

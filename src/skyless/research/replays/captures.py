@@ -12,11 +12,7 @@ import numpy as np
 from msgspec import Struct, field, structs
 from numpy.typing import ArrayLike
 
-from skyless.arguments import (
-    check_point,
-    existing_file,
-    wrong,
-)
+from skyless.arguments import check_point, existing_file, wrong
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.estimator.settings import EstimatorSettings
@@ -59,10 +55,8 @@ from skyless.site.tables import HEIGHT_STD_M, Truth, read_anchors, read_calibrat
 if TYPE_CHECKING:
     from skyless.research.replays.options import Anchors
 
-
 TOO_FLAT = "the anchors' mean: they lie too flat to determine the height"
 """Source of a height that nobody gave."""
-
 
 YAML_SUFFIXES: Final = frozenset({".yaml", ".yml"})
 
@@ -436,7 +430,7 @@ class ByOwnEstimator(Pipeline):
 
 
 PROFILES: Final[Mapping[str, EstimatorSettings]] = {
-    "miluv": DIFFERENCES.changed(qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15),
+    "miluv": DIFFERENCES.changed(qa=0.1, difference_std_m=0.5, range_std_m=0.15, place_std_m=0.15)
 }
 """Settings for formats that need others: MILUV's exchanges come once or twice a second, among obstacles."""
 
@@ -448,7 +442,6 @@ READING_SHARE: Final = 0.1
 
 FORMATS_BY_PACKETS: Final = frozenset({"bitcraze-yaml", "bitcraze-text", "bitcraze-binary"})
 """Formats whose packets are used by default, as that is better on real captures; on Avalue's it is not."""
-
 
 _MAX_WITHOUT_ANCHORS: Final = 20_000
 """A recording that carries anchor positions has one within this many records."""
@@ -505,8 +498,7 @@ class CaptureReplay:
     def __init__(self, asked: ReplayOptions, calibration: DifferenceCalibration | None = None) -> None:
         """Open the recording; ``calibration`` is used instead of that of the table of anchors. Raises SkylessError."""
         asked.leave_out(
-            *("tag", "method", "integrity_risk", "alert_limit_m"),
-            why="it is for recordings of skyless record",
+            *("tag", "method", "integrity_risk", "alert_limit_m"), why="it is for recordings of skyless record"
         )
         self._asked, kind = asked, format_of(asked.file, asked.format)
         self._anchors_m, site_height_m = known_anchors(asked.anchors, asked.site)

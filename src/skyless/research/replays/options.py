@@ -41,7 +41,6 @@ if TYPE_CHECKING:
     AnyTruth = ArrayLike | str | Path
     """Rows of time and position, shape (n, 4), or the path of a table."""
 
-
 PACKETS, DIFFERENCES_MADE = "packets", "differences"
 MEASUREMENTS: Final = (PACKETS, DIFFERENCES_MADE)
 """Input of the filter: anchors' packets as they are, or time differences derived from them."""
@@ -52,7 +51,6 @@ HEIGHT_SENSOR, BAROMETER, RECORDED = "sensor", "barometer", "recording"
 
 HEIGHT_WORDS: Final = ("truth", "free", "auto")
 """Alternatives to a tag's height in metres: the truth's median, estimated, or automatic."""
-
 
 _read_height = partial(read_height, words=HEIGHT_WORDS)
 
@@ -206,10 +204,7 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     @property
     def requirement(self) -> "IntegrityRequirement | None":
         """Requirements for the levels that replace the tag's own; None without any."""
-        asked = ProtectionOptions(
-            integrity_risk=self.integrity_risk,
-            alert_limit_m=self.alert_limit_m,
-        )
+        asked = ProtectionOptions(integrity_risk=self.integrity_risk, alert_limit_m=self.alert_limit_m)
         if not asked.protection_given and self.tag_height_std_m is None:
             return None
         return asked.requirement(self.method, self.tag_height_std_m)

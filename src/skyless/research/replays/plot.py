@@ -20,37 +20,32 @@ def _fill(figure: Figure, rows: Matrix) -> None:
     axes = figure.subplots(2, 3)
     judged = rows[np.isfinite(rows[:, 4])]
     known = len(judged) > 0
+    label = "error in m" if known else "deviation from the median in m"
     drawn = judged if known else rows
     errors = judged[:, 1:4] - judged[:, 4:7] if known else rows[:, 1:4] - np.median(rows[:, 1:4], axis=0)
     time_s, std_m = drawn[:, 0] - drawn[:1, 0], drawn[:, 7:10]
-    _track(axes[0, 0], rows, judged)
-    _over_time(axes[0, 1], time_s, errors[:, :2], std_m[:, :2], known=known)
-    _over_time(axes[0, 2], time_s, errors[:, 2:], std_m[:, 2:], known=known)
-    _histogram(axes[1, 0], errors, known=known)
-    label, radial_m = f"horizontal {_label(known=known)}", np.linalg.norm(errors[:, :2], axis=1)
+    _track(axes[0, 0], rows[:, [1, 2]], judged[:, [4, 5]])
+    axes[0, 0].set(xlabel="x in m", ylabel="y in m", title="track", aspect="equal")
+    _over_time(axes[0, 1], time_s, errors[:, :2], std_m[:, :2], label)
+    _over_time(axes[0, 2], time_s, errors[:, 2:], std_m[:, 2:], label)
+    _histogram(axes[1, 0], errors, label)
+    radial_m = np.linalg.norm(errors[:, :2], axis=1)
     axes[1, 1].plot(np.sort(radial_m), np.linspace(0.0, 100.0, len(radial_m)))
-    axes[1, 1].set(xlabel=label, ylabel="per cent of the fixes below", title="distribution")
+    axes[1, 1].set(xlabel=f"horizontal {label}", ylabel="per cent of the fixes below", title="distribution")
     axes[1, 1].grid(visible=True, linewidth=0.3)
-    _height(axes[1, 2], rows, judged)
+    begin = np.array([rows[0, 0], 0.0])
+    _track(axes[1, 2], rows[:, [0, 3]] - begin, judged[:, [0, 6]] - begin)
+    axes[1, 2].set(xlabel="time in s", ylabel="z in m", title="height")
 
 
-def _track(axes: Axes, rows: Matrix, judged: Matrix) -> None:
-    if len(judged):
-        axes.plot(judged[:, 4], judged[:, 5], color="black", linewidth=0.8, label="truth")
-    axes.plot(rows[:, 1], rows[:, 2], ".", markersize=2, label="fixes")
-    axes.set(xlabel="x in m", ylabel="y in m", title="track", aspect="equal")
+def _track(axes: Axes, fixes: Matrix, truth: Matrix) -> None:
+    if len(truth):
+        axes.plot(*truth.T, color="black", linewidth=0.8, label="truth")
+    axes.plot(*fixes.T, ".", markersize=2, label="fixes")
     axes.legend()
 
 
-def _height(axes: Axes, rows: Matrix, judged: Matrix) -> None:
-    if len(judged):
-        axes.plot(judged[:, 0] - rows[0, 0], judged[:, 6], color="black", linewidth=0.8, label="truth")
-    axes.plot(rows[:, 0] - rows[0, 0], rows[:, 3], ".", markersize=2, label="fixes")
-    axes.set(xlabel="time in s", ylabel="z in m", title="height")
-    axes.legend()
-
-
-def _over_time(axes: Axes, time_s: Vector, errors: Matrix, std_m: Matrix, *, known: bool) -> None:
+def _over_time(axes: Axes, time_s: Vector, errors: Matrix, std_m: Matrix, label: str) -> None:
     """Errors of x and y, or of z, and their largest σ."""
     names = "xy" if errors.shape[1] == 2 else "z"
     for axis, name in enumerate(names):
@@ -59,17 +54,13 @@ def _over_time(axes: Axes, time_s: Vector, errors: Matrix, std_m: Matrix, *, kno
         axes.plot(
             time_s, sign * std_m.max(axis=1), color="black", linewidth=0.8, label="± stated σ" if sign > 0 else None
         )
-    axes.set(xlabel="time in s", ylabel=_label(known=known), title=f"{' and '.join(names)} over time")
+    axes.set(xlabel="time in s", ylabel=label, title=f"{' and '.join(names)} over time")
     axes.legend()
 
 
-def _histogram(axes: Axes, errors: Matrix, *, known: bool) -> None:
+def _histogram(axes: Axes, errors: Matrix, label: str) -> None:
     span = np.percentile(np.abs(errors), 99.5) if len(errors) else 1.0
     for axis, name in enumerate("xyz"):
         axes.hist(errors[:, axis], bins=80, range=(-span, span), histtype="step", label=name)
-    axes.set(xlabel=_label(known=known), ylabel="fixes", title="histogram")
+    axes.set(xlabel=label, ylabel="fixes", title="histogram")
     axes.legend()
-
-
-def _label(*, known: bool) -> str:
-    return "error in m" if known else "deviation from the median in m"

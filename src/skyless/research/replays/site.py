@@ -171,16 +171,12 @@ class TagReplay:
         for made, unix_s in found:
             self.begun_s = unix_s if self.begun_s is None else self.begun_s
             if self.on_measured is not None:
-                self._tell(self.on_measured, made, unix_s)
+                beacon, rx_ticks = decode_any(made.reception.frame), made.reception.rx_ticks
+                if not isinstance(beacon, Malformed):
+                    packet = Packet(None, beacon.anchor, beacon.sequence, beacon.tx_ticks, rx_ticks, ())
+                    self.on_measured(unix_s, packet, made.fix is not None)
             if made.fix is not None:
                 yield Replayed(made.fix, unix_s)
-
-    @staticmethod
-    def _tell(on_measured: Callable[[float, Packet, bool], None], made: _Heard, unix_s: float) -> None:
-        beacon, rx_ticks = decode_any(made.reception.frame), made.reception.rx_ticks
-        if not isinstance(beacon, Malformed):
-            packet = Packet(None, beacon.anchor, beacon.sequence, beacon.tx_ticks, rx_ticks, ())
-            on_measured(unix_s, packet, made.fix is not None)
 
     def all_drops(self) -> dict[str, int]:
         """What could not be used, by reason, including the receiver's own."""

@@ -45,7 +45,6 @@ _EPISODE_COST_S: Final = 0.008
 _MIN_LARGEST: Final = 100
 """A chunk returns at least this number of its largest errors, and ten times its epochs times the risk."""
 
-
 MAX_LEVEL_RATIO: Final = 1.5
 ALL_FAULTS: Final = "all faults"
 

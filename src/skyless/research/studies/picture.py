@@ -282,7 +282,6 @@ _BOUND_TAG_S: Final = 0.03
 RAW_METHODS: Final = ("joint",)
 """Methods that use anchors' receptions of each other."""
 
-
 _ALPHA: Final = 0.01
 CLUSTER_FIXES: Final = 25.0
 """Assumed size of a cluster of misleading fixes where none larger is observed: neighbours share their errors."""
@@ -385,7 +384,7 @@ def case_row(
 def _with_errors(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
     sums = np.array([(world.fixes, world.squared_m2, world.nees) for world in worlds])
     rmse_m, rmse_error_m = jackknife(sums, _rmse)
-    nees, nees_error = jackknife(sums, _nees)
+    nees, nees_error = jackknife(sums, lambda rows: _per_fix(rows, 2))
     return replace(
         row,
         rmse_m=rmse_m,
@@ -437,25 +436,18 @@ def _with_bound(row: WorldRow, worlds: Sequence[RunResult], variances_m2: Sequen
     if row.fixes == 0:
         return row
     sums = np.array([(a.fixes, a.squared_m2, variance) for a, variance in zip(worlds, variances_m2, strict=True)])
-    ratio, ratio_error = jackknife(sums, _over_bound)
+    ratio, ratio_error = jackknife(sums, lambda rows: float(np.sqrt(_per_fix(rows, 1) / rows[:, 2].mean())))
     return replace(row, ratio=ratio, ratio_error=ratio_error)
 
 
 def _rmse(sums: Array) -> float:
     """From columns of counts and sums of squares."""
-    fixes, squared = sums[:, 0].sum(), sums[:, 1].sum()
-    return float(np.sqrt(squared / fixes)) if fixes else np.nan
+    return float(np.sqrt(_per_fix(sums, 1)))
 
 
-def _over_bound(sums: Array) -> float:
-    """From columns of counts, sums of squares and variances of the bound."""
+def _per_fix(sums: Array, column: int) -> float:
     fixes = sums[:, 0].sum()
-    return float(np.sqrt(sums[:, 1].sum() / fixes / sums[:, 2].mean())) if fixes else np.nan
-
-
-def _nees(sums: Array) -> float:
-    fixes = sums[:, 0].sum()
-    return float(sums[:, 2].sum() / fixes) if fixes else np.nan
+    return float(sums[:, column].sum() / fixes) if fixes else np.nan
 
 
 def jackknife(rows: Array, figure: Callable[[Array], float]) -> tuple[float, float | None]:

@@ -148,6 +148,7 @@ def _exceeded(most: float) -> Limit:
 
 def _rooms(plan: Plan) -> list[Case]:
     hall = (Limit("level", 0.97), Limit("nees", 0.5, 1.5))
+    stairwell = _site_3d(plan.noise_ps, "stairwell", _STAIRWELL_M, _STAIRWELL_HEIGHTS_M)
     usual = (
         Limit("rmse_m", most=0.030),
         Limit("nees", 0.7, 1.3),
@@ -163,7 +164,7 @@ def _rooms(plan: Plan) -> list[Case]:
             _case(plan, name, "rooms", Limit("rmse_m", most=most_m), site=site, bounded=True)
             for name, most_m, site in (
                 ("3-D room, 8 anchors", 0.050, room_3d_site(plan.noise_ps)),
-                ("stairwell in 3-D, 8 anchors", 0.038, stairwell_site(plan.noise_ps)),
+                ("stairwell in 3-D, 8 anchors", 0.038, stairwell),
             )
         ),
         _case(
@@ -441,11 +442,6 @@ def hall_site(noise_ps: float) -> Site:
 def room_3d_site(noise_ps: float) -> Site:
     """Eight anchors on the walls of 8 m × 6 m, high and low by turns; the height of tags is not given."""
     return _site_3d(noise_ps, "3-D room", _ROOM_3D_M, tuple(_HEIGHTS_M[k % 2] for k in range(1, 9)))
-
-
-def stairwell_site(noise_ps: float) -> Site:
-    """Eight anchors on the walls of 4 m × 6 m, over 5 m of height; the height of tags is not given."""
-    return _site_3d(noise_ps, "stairwell", _STAIRWELL_M, _STAIRWELL_HEIGHTS_M)
 
 
 def _site_3d(noise_ps: float, name: str, floor_m: tuple[float, float], heights_m: Sequence[float]) -> Site:

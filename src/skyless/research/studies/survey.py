@@ -177,10 +177,11 @@ class SurveyRuns(Struct, frozen=True):
 
 def cells(plan: Plan) -> list[Cell]:
     """Some runs of one group on one layout each."""
-    return [
-        Cell(f"{runs.layout}, {runs.group.name}", partial(survey_runs, runs), _weight_s(runs))
-        for runs in _all_runs(plan)
-    ]
+    found = []
+    for runs in _all_runs(plan):
+        weight_s = len(runs.seeds) * (0.06 * runs.seconds + 0.3 * len(runs.group.variants))
+        found.append(Cell(f"{runs.layout}, {runs.group.name}", partial(survey_runs, runs), weight_s))
+    return found
 
 
 def _all_runs(plan: Plan) -> list[SurveyRuns]:
@@ -194,10 +195,6 @@ def _all_runs(plan: Plan) -> list[SurveyRuns]:
                 for first in range(0, plan.worlds, _RUNS_IN_A_CELL)
             ]
     return found
-
-
-def _weight_s(runs: SurveyRuns) -> float:
-    return len(runs.seeds) * (0.06 * runs.seconds + 0.3 * len(runs.group.variants))
 
 
 def survey_runs(runs: SurveyRuns) -> tuple[tuple[Outcome, ...], ...]:

@@ -110,7 +110,6 @@ def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *
     ``settle_s``: time before the first leg. The last block is closed.
     """
     whole = PairRanger()
-    until_s = settle_s + seconds
 
     def on_leg(sender: int, receiver: int, tx_ticks: int, rx_ticks: int, t_s: float) -> None:
         if t_s >= settle_s:
@@ -119,7 +118,7 @@ def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *
     def new_recorded(anchor: int) -> RecordedAnchor:
         return RecordedAnchor(new_anchor(site, anchor), site.id, on_leg)
 
-    for _ in World(site, new_recorded, (), impairments, seed).run(until_s):
+    for _ in World(site, new_recorded, (), impairments, seed).run(settle_s + seconds):
         pass
     whole.finish()
     return whole
@@ -441,11 +440,6 @@ def true_site(room: DrawnRoom) -> Site:
     return replace(site, anchors=anchors, accuracy=replace(site.accuracy, survey_std_m=0.0))
 
 
-def exact_site(room: DrawnRoom) -> Site:
-    """The true site, which also states exact ranges."""
-    return replace(true_site(room), accuracy=EXACT)
-
-
 def hand_site(room: DrawnRoom) -> Site:
     """A site file with positions measured by hand and the usual delays."""
     return _aligned(room, site_at(room.layout, room.layout.position_m + room.hand_m, room.noise_ps))
@@ -590,19 +584,21 @@ def limits_of(group: Group, file: str) -> tuple[Limit, ...]:
 
 def cells(plan: Plan) -> list[Cell]:
     """One cell for each world."""
-    runs = [RoomRun(group, plan, world) for group in groups() for world in range(plan.worlds)]
-    return [Cell(run.group.name, partial(room_results, run), _weight_s(run)) for run in runs]
-
-
-def _weight_s(run: RoomRun) -> float:
-    return run.survey_s * 0.06 + len(run.group.files) * run.plan.tags * (run.plan.seconds + _WARMUP_S) * _RUN_S
+    found = []
+    for run in (RoomRun(group, plan, world) for group in groups() for world in range(plan.worlds)):
+        weight_s = run.survey_s * 0.06 + len(run.group.files) * plan.tags * (plan.seconds + _WARMUP_S) * _RUN_S
+        found.append(Cell(run.group.name, partial(room_results, run), weight_s))
+    return found
 
 
 def room_results(run: RoomRun) -> tuple[RunResult, ...]:
     """Results of the tags with each file of a room."""
     plan, seed = run.plan, seed_of(run.plan.seed, run.world)
     room = drawn_room(survey_layouts()[run.group.layout], run.group.errors, plan.noise_ps, seed)
-    paths = _paths(run, room)
+    if run.group.at_rest:
+        paths: tuple[Trajectory, ...] = (Static(*_AT_REST_M),) * plan.tags
+    else:
+        paths = tuple(wanderers(site_at(room.layout, room.layout.position_m, plan.noise_ps), plan.tags, room.seed))
     return tuple(
         run_world(
             Run(
@@ -619,16 +615,10 @@ def room_results(run: RoomRun) -> tuple[RunResult, ...]:
     )
 
 
-def _paths(run: RoomRun, room: DrawnRoom) -> tuple[Trajectory, ...]:
-    if run.group.at_rest:
-        return (Static(*_AT_REST_M),) * run.plan.tags
-    return tuple(wanderers(site_at(room.layout, room.layout.position_m, run.plan.noise_ps), run.plan.tags, room.seed))
-
-
 def _files(run: RoomRun, room: DrawnRoom) -> list[Site]:
     ranges = ranges_of(room, run.survey_s)
     if run.group.at_rest:
-        return [exact_site(room), surveyed_room(room, ranges, is_exact=True)]
+        return [replace(true_site(room), accuracy=EXACT), surveyed_room(room, ranges, is_exact=True)]
     made = {
         TRUTH: lambda: true_site(room),
         SURVEYED: lambda: surveyed_room(room, ranges),

@@ -40,7 +40,6 @@ _DOOR_LATE_M: Final = (0.1, 0.5)
 
 _CHUNK: Final = 20_000
 
-
 _Truth = set[tuple[Kind, tuple[int, ...]]]
 """Kinds and anchors of true findings."""
 

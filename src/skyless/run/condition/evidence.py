@@ -55,7 +55,7 @@ class Evidence:
         self.table.add_health(kind, name, health, now_s)
         if isinstance(health, AnchorHealth):
             self.leader.update(health, now_s)
-        elif isinstance(health, TagHealth) and self._is_here(name):
+        elif isinstance(health, TagHealth) and (node := self.table.get("tag", name)) and node.host == self.table.host:
             self.ages.add_health(name, unix_s - health.unix_s, now_s)
 
     def add_fix(self, fix: FixMessage, now_s: float, unix_s: float, *, batched: bool = False) -> Node | None:
@@ -84,10 +84,6 @@ class Evidence:
     def computer(self, host: str) -> str:
         """Name a computer in words. An unknown one counts as this one."""
         return "this computer" if host in {"", self.table.host} else f"computer {host}"
-
-    def _is_here(self, tag: str) -> bool:
-        node = self.table.get("tag", tag)
-        return node is not None and node.host == self.table.host
 
 
 # Ages of fixes

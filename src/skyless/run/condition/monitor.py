@@ -463,17 +463,17 @@ def authentication_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]
         for name, node in evidence.table.senders("anchor")
         if node.reports(now_s) and isinstance(node.health, AnchorHealth)
     }
-    keyed = {name: health for name, health in anchors.items() if _has_keys(health)}
+    keyed = {
+        name: health
+        for name, health in anchors.items()
+        if health.chain is not None or health.chain_ends_unix_s is not None or health.code_fault is not None
+    }
     yield from _clock(tags)
     yield from _not_verified(evidence, tags, now_s)
     yield from _chains(keyed)
     yield from _codes(evidence, keyed, now_s)
     yield from _keys(evidence, keyed, anchors, now_s)
     yield from _forged(evidence, tags, anchors, now_s)
-
-
-def _has_keys(health: AnchorHealth) -> bool:
-    return health.chain is not None or health.chain_ends_unix_s is not None or health.code_fault is not None
 
 
 def _left_s(health: AnchorHealth) -> float:

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
     from nats.aio.msg import Msg
     from nats.js import JetStreamContext
 
-
 KEEP_S: Final = 24 * 3600.0
 """How long the stream keeps fixes."""
 KEEP_EVENTS_S: Final = 365 * 24 * 3600.0

@@ -23,7 +23,6 @@ from skyless.run.process import Log
 if TYPE_CHECKING:
     from nats.aio.client import Client
 
-
 JSON_FIXES: Final = "skyless.v1.{}.tag.*.fix"
 STATUSES: Final = "skyless.v1.{}.*.*.status"
 HEALTHS: Final = "skyless.v1.{}.*.*.health"

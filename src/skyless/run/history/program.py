@@ -35,14 +35,7 @@ from skyless.run.history.writer import FILE_ROWS, Intake, Keep, Writer, tidy
 from skyless.run.hub import LIST_S, sites_at
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import (
-    AlarmMessage,
-    AssetsMessage,
-    FixMessage,
-    StatusMessage,
-    ZoneEvent,
-    ZonesMessage,
-)
+from skyless.run.mqtt.messages import AlarmMessage, AssetsMessage, FixMessage, StatusMessage, ZoneEvent, ZonesMessage
 from skyless.run.process import Log, keep, together
 from skyless.run.recordings.recording import McapRecording
 from skyless.run.site_feed import Channel, SiteFeed

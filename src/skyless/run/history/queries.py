@@ -28,16 +28,7 @@ from skyless.arguments import check_number
 from skyless.core.errors import SkylessError
 from skyless.files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
-from skyless.run.history.answers import (
-    GAP_S,
-    THINNED_GAP_S,
-    Contact,
-    Dwell,
-    Heatmap,
-    Span,
-    Track,
-    TrackPoint,
-)
+from skyless.run.history.answers import GAP_S, THINNED_GAP_S, Contact, Dwell, Heatmap, Span, Track, TrackPoint
 from skyless.run.history.layout import (
     ASSET_COLUMNS,
     EVENT_COLUMNS,
@@ -267,7 +258,6 @@ VIEWS: Final = f"""
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-_Floats = NDArray[np.float64]
 
 
 def sites_in(folder: Path) -> tuple[int, ...]:
@@ -356,7 +346,7 @@ class History:
         """
         ((tag, numbers),) = self._tags((tag,)).items()
         check_number("the number of points", most_points, least=2, most=LIMITS.points)
-        files, own = self._files(span), f"{_FIXES} AND tag IN ({_listed(numbers)})"
+        files, own = self._files(span), f"{_FIXES} AND tag IN ({', '.join(map(str, numbers))})"
         gap_ms = round(1000 * (THINNED_GAP_S if _are_thinned(files) else GAP_S))
         ((count,),) = _stream(f"SELECT count(*) FROM ({own})", files, span) if files else ((0,),)
         if not count:
@@ -604,10 +594,6 @@ def _of_days(files: Iterable[Path], span: Span) -> list[Path]:
 def _are_thinned(files: Iterable[Path]) -> bool:
     """Whether any of the files is thinned."""
     return any(THINNED in (parquet.read_schema(file).metadata or {}) for file in files)
-
-
-def _listed(numbers: Iterable[int]) -> str:
-    return ", ".join(map(str, numbers))
 
 
 def _some(known: Iterable[str], kind: str) -> str:

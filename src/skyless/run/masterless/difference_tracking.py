@@ -73,7 +73,8 @@ class DifferenceTracking:
         self._asked = IntegrityRequirement(settings.integrity_risk, settings.alert_limit)
         self._positions_m = {anchor: np.array(point) for anchor, point in anchors_m.items()}
         self._z_bounds_m = z_bounds_m
-        self._estimator = Estimator(self._settings)
+        self.estimator = Estimator(self._settings)
+        """The filter with all its states."""
         self._window: deque[PairTdoa] = deque(maxlen=int(TUNING.window))
         self._begin_s = self._newest_s = 0.0
         self._received_s: dict[int, float] = {}
@@ -84,18 +85,13 @@ class DifferenceTracking:
         self._is_confirmed = False
 
     @property
-    def estimator(self) -> Estimator:
-        """The filter with all its states."""
-        return self._estimator
-
-    @property
     def has_started(self) -> bool:
         """Whether the filter has a state."""
         return self._start is not None
 
     def update_height(self, height_m: float, std_m: float, is_barometer: bool = False) -> None:
         """Process a reading of the tag's height sensor at the time of the newest difference."""
-        if self.has_started and self._estimator.process_height(height_m, std_m, is_barometer) != ACCEPTED:
+        if self.has_started and self.estimator.process_height(height_m, std_m, is_barometer) != ACCEPTED:
             self.counters["outlier-height"] += 1
 
     def update(self, pairs: Sequence[PairTdoa]) -> bool:
@@ -134,7 +130,7 @@ class DifferenceTracking:
         else:
             self.counters["outlier"] += 1
             self.reason = NoFixReason.RESIDUALS
-        if self._estimator.rejects_most:
+        if self.estimator.rejects_most:
             self._stop()
         return used
 
@@ -144,8 +140,8 @@ class DifferenceTracking:
         error_m = self._calibration.error_m(pair.anchor_b, dist(position_m, self._positions_m[pair.anchor_b]))
         error_m -= self._calibration.error_m(pair.anchor_a, dist(position_m, self._positions_m[pair.anchor_a]))
         for anchor in (pair.anchor_a, pair.anchor_b):
-            self._estimator.know_anchor(anchor, self._positions_m[anchor])
-        found = self._estimator.process_difference(
+            self.estimator.know_anchor(anchor, self._positions_m[anchor])
+        found = self.estimator.process_difference(
             pair.anchor_a, pair.anchor_b, self.ticks(pair.time_s), pair.tdoa_m - error_m
         )
         return found == ACCEPTED
@@ -159,11 +155,11 @@ class DifferenceTracking:
         if not 0.0 <= silent_s <= TUNING.longest_silence_s:
             return True
         is_short = silent_s <= TUNING.short_silence_s
-        return not is_short and self._estimator.horizontal_variance_m2(silent_s) > TUNING.most_horizontal_std_m**2
+        return not is_short and self.estimator.horizontal_variance_m2(silent_s) > TUNING.most_horizontal_std_m**2
 
     def _is_plausible(self) -> bool:
         """Whether the state is near the anchors, where differences have information, and accurate enough."""
-        start, state, dim = self._start, self._estimator.state, self._estimator.dim
+        start, state, dim = self._start, self.estimator.state, self.estimator.dim
         if start is None or not is_within(start.corners_m, self.position_m[:dim]):
             self.reason = NoFixReason.NOT_CONVERGED
             self._stop()
@@ -179,8 +175,8 @@ class DifferenceTracking:
     @property
     def position_m(self) -> tuple[float, float, float]:
         """The newest position."""
-        x = self._estimator.state.x
-        return x[0], x[1], x[2] if self._estimator.dim == 3 else self._settings.height_m
+        x = self.estimator.state.x
+        return x[0], x[1], x[2] if self.estimator.dim == 3 else self._settings.height_m
 
     def fix(self) -> Fix:
         """The newest fix; only after an ``update`` that gave one."""
@@ -188,7 +184,7 @@ class DifferenceTracking:
         used = tuple([anchor for anchor, when_s in self._received_s.items() if now_s - when_s <= age_s])
         if used != self._in_use[0]:
             self._in_use = used, np.array([self._positions_m[anchor] for anchor in used]).reshape(-1, 3)
-        rows, known = self._estimator.rows, self._settings.known_height_m is not None
+        rows, known = self.estimator.rows, self._settings.known_height_m is not None
         return Fix(self._newest_s, rows, used, self._in_use[1], "joint", known, 1, self._asked)
 
     def _stop(self) -> None:
@@ -210,7 +206,7 @@ class DifferenceTracking:
 
     def _try_start(self) -> bool:
         """Search for a start, or for one that confirms or contradicts the current one. Returns True if it is used."""
-        window, dim = self._window, self._estimator.dim
+        window, dim = self._window, self.estimator.dim
         self._tried_s = self._newest_s
         start = find_start(
             window, self._positions_m, self._calibration, self._settings.known_height_m, self._z_bounds_m
@@ -219,26 +215,26 @@ class DifferenceTracking:
             self.reason = start.reason
             return False
         if self._start is not None:
-            position_m, covariance_m2 = (array[..., :dim] for array in self._estimator.motion())
+            position_m, covariance_m2 = (array[..., :dim] for array in self.estimator.motion())
             gap_m = position_m - start.position_m[:dim]
             both_m2 = covariance_m2[:dim] + start.covariance_m2[:dim, :dim]
             if start.is_ambiguous or gap_m @ np.linalg.solve(both_m2, gap_m) < TUNING.apart_chi2:
                 has_moved = bool(np.linalg.norm(position_m - self._start.position_m[:dim]) > TUNING.rival_m)
                 self._is_confirmed = has_moved or not start.is_ambiguous
-                self._estimator.withhold_levels(SOUND if self._is_confirmed else CONTRADICTED)
+                self.estimator.withhold_levels(SOUND if self._is_confirmed else CONTRADICTED)
                 window.clear()
                 return False
             self.counters["restart"] += 1
         self._begin_s, newest = self._newest_s, window[-1]
-        self._estimator.start(
+        self.estimator.start(
             0, start.position_m[:dim], start.covariance_m2[:dim, :dim], self._settings.start_speed_std_mps**2
         )
-        self._estimator.withhold_levels(CONTRADICTED)
+        self.estimator.withhold_levels(CONTRADICTED)
         self._start = start
         for anchor, (late_m, variance_m2) in start.late.items():
             may_stay = anchor not in self._calibration.anchors  # a calibrated anchor has no constant lateness
-            self._estimator.know_anchor(anchor, self._positions_m[anchor])
-            self._estimator.expect_late(anchor, late_m, variance_m2, may_stay)
+            self.estimator.know_anchor(anchor, self._positions_m[anchor])
+            self.estimator.expect_late(anchor, late_m, variance_m2, may_stay)
         self._received_s = {anchor: self._newest_s for kept in window for anchor in (kept.anchor_a, kept.anchor_b)}
         self.counters["start"] += 1
         window.clear()
@@ -249,7 +245,6 @@ class DifferenceTracking:
 
 
 JOINING_STEPS: Final = 4  # iterations of reweighted least squares
-
 
 Corners = tuple[tuple[float, ...], tuple[float, ...]]
 """Opposite corners of a space, x, y and z each."""

@@ -46,7 +46,6 @@ class PacketTagSettings(Struct, frozen=True):
     anchors_m: Mapping[int, Point]
     """Positions of the anchors; empty if messages state them."""
     site: int = TDOA_SITE
-    qa: float = MASTERLESS.qa
     height_m: float | None = None
     """Known height of the tags, or None to estimate it."""
     height_std_m: float = 0.0
@@ -102,7 +101,7 @@ class PacketTagNode:
 
     def _new_tracking(self) -> PacketTracking:
         asked = self.settings
-        known = {"qa": asked.qa, "height_m": self._height_m, "height_std_m": self._height_std_m}
+        known = {"qa": 0.3, "height_m": self._height_m, "height_std_m": self._height_std_m}
         is_dl_tdoa = isinstance(self.radio, UciRadio | PhoneRadio)
         return PacketTracking(
             (DL_TDOA if is_dl_tdoa else MASTERLESS).changed(**known),

@@ -149,15 +149,11 @@ class PacketTracking:
         """Pairs of listener and sender in relays, until two anchors have relayed each other."""
         self._watch, self._faults = StampWatch(), 0
         self._has_addresses = one_way is not None  # those of FiRa
-        self._tracking = self._new_tracking()
+        self.tracking = self._new_tracking()
+        """The filter."""
         self._area_m: Corners = ((), ())
         self._drops: Counter[str] = Counter()
         self._rejected_before = self._rejected_now = 0
-
-    @property
-    def tracking(self) -> Estimation:
-        """The filter."""
-        return self._tracking
 
     @property
     def anchors_m(self) -> Mapping[int, Point]:
@@ -219,10 +215,10 @@ class PacketTracking:
             self._drops[fault] += 1
             self.reason = NoFixReason.RESIDUALS
             return None
-        if self._tracking.is_starting:
+        if self.tracking.is_starting:
             periods = sorted([one.period_ticks for one in self._anchors.values() if one.period_ticks < LAST_TICKS])
             if periods:
-                self._tracking.expect_period(max(periods[len(periods) // 2] * TICK_S, PERIOD_S))
+                self.tracking.expect_period(max(periods[len(periods) // 2] * TICK_S, PERIOD_S))
         relays, phases = [], []
         for relay in packet.relays:
             rx_ticks = self._relayed(packet.anchor, anchor, relay)
@@ -246,15 +242,15 @@ class PacketTracking:
         )
         is_wrong = self._watch.flips_m or self._delays.contradictions_m
         is_known = self._is_calibrated and self._watch.is_ready
-        self._tracking.estimator.withhold_levels(CONTRADICTED if is_wrong else SOUND if is_known else UNAVAILABLE)
-        fix = self._tracking.update(observation)
+        self.tracking.estimator.withhold_levels(CONTRADICTED if is_wrong else SOUND if is_known else UNAVAILABLE)
+        fix = self.tracking.update(observation)
         self.used = isinstance(fix, Fix)
         if not isinstance(fix, Fix):
             self._count_relays()
             if fix is NoFixReason.RESIDUALS:
                 self._drops["outlier"] += 1
-                if packet.anchor in self._tracking.excluded:
-                    fix = self._tracking.coast(observation)
+                if packet.anchor in self.tracking.excluded:
+                    fix = self.tracking.coast(observation)
         return self._checked(fix)
 
     def _look_both_ways(self, listener: int, sender: int) -> None:
@@ -269,7 +265,7 @@ class PacketTracking:
     def _begin_again(self) -> None:
         """Search for a new start."""
         self._count_relays()
-        self._tracking = self._new_tracking()
+        self.tracking = self._new_tracking()
 
     def _new_tracking(self) -> Estimation:
         return Estimation(self._settings, self._z_bounds_m, self._time, PERIOD_S)
@@ -282,7 +278,7 @@ class PacketTracking:
             covariance = fix.covariance_m2
             if not is_within(self._area_m, fix.position_m[:2].tolist()):
                 fix = NoFixReason.NOT_CONVERGED
-                self._tracking = self._new_tracking()
+                self.tracking = self._new_tracking()
             elif covariance.item(0) + covariance.item(4) > TUNING.most_horizontal_std_m**2:
                 fix = NoFixReason.ACQUIRING
             else:
@@ -382,7 +378,7 @@ class PacketTracking:
 
     def _count_relays(self) -> None:
         """Update the sum of relays rejected by filters, whose counter starts from zero with each start."""
-        rejected = self._tracking.estimator.state.status.relays_rejected
+        rejected = self.tracking.estimator.state.status.relays_rejected
         if rejected < self._rejected_now:
             self._rejected_before += self._rejected_now
         self._rejected_now = rejected

@@ -75,17 +75,7 @@ class BroadcastClock:
     received ``phase`` ticks later than stamped; ``rate`` is the gain of the listener's clock on the anchor's.
     """
 
-    __slots__ = (
-        "_covariance",
-        "_rejected",
-        "_streak",
-        "_tx_bits",
-        "phase",
-        "rate",
-        "restarts",
-        "rx_ticks",
-        "tx_ticks",
-    )
+    __slots__ = ("_covariance", "_rejected", "_streak", "_tx_bits", "phase", "rate", "restarts", "rx_ticks", "tx_ticks")
 
     def __init__(self, tx_bits: int, tx_ticks: int, rx_ticks: int) -> None:
         self._tx_bits = tx_bits
@@ -255,7 +245,9 @@ class PairEngine:
         if not 0 < between < PAIR_RELAY_MAX_AGE_S * TICK_RATE_HZ:
             return "relay-too-old"
         relayed = clock.unwrap(relay.rx_ticks, rx_a)
-        flight = self._flight_ticks(a, b, tx_a, relayed, relay.tof_ticks)
+        flight = self._flights.update(a, b, tx_a, relayed, relay.tof_ticks)
+        if flight is None:
+            flight = distance_ticks(self._anchors_m, a, b)
         if flight is None:
             return "time-of-flight-unknown"
         reply = clock.tx_ticks - relayed
@@ -265,11 +257,6 @@ class PairEngine:
         if abs(tdoa_m) > self._limit_m(a, b):
             return "beyond-anchors"
         return tdoa_m
-
-    def _flight_ticks(self, a: int, b: int, tx_a: int, rx_b: int, carried: float | None) -> float | None:
-        """Time of flight of a pair: as stated by anchors, else from two-way ranging, else from the known distance."""
-        flight = self._flights.update(a, b, tx_a, rx_b, carried)
-        return distance_ticks(self._anchors_m, a, b) if flight is None else flight
 
     def _limit_m(self, a: int, b: int) -> float:
         limit = self._limits_m.get((a, b))

@@ -40,7 +40,6 @@ FORGETTING: Final = 0.02
 OFTEN: Final = 0.2
 """Share of late packets from which on an anchor's stamps are said to flip. Fewer are single late packets."""
 
-
 _ALL: Final = (1 << WINDOW) - 1
 
 

@@ -138,13 +138,7 @@ class Link:
         return self._outbox.unacknowledged
 
     def publish(
-        self,
-        topic: str,
-        message: Struct | bytes,
-        *,
-        qos: int = 0,
-        retain: bool = False,
-        until_s: float = math.inf,
+        self, topic: str, message: Struct | bytes, *, qos: int = 0, retain: bool = False, until_s: float = math.inf
     ) -> None:
         """Queue a message, and return at once. A struct becomes JSON.
 

@@ -124,16 +124,14 @@ class ReceptionLog:
 def receiver_settings(
     method: str,
     site: int | None = None,
-    z_bounds_m: tuple[float, float] | None = None,
     integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
 ) -> Settings:
     """The receiver's arguments as a segment states them."""
-    low_m, high_m = (None, None) if z_bounds_m is None else z_bounds_m
     return {
         "method": method,
         "site": site,
-        "z_low_m": low_m,
-        "z_high_m": high_m,
+        "z_low_m": None,
+        "z_high_m": None,
         "integrity_risk": integrity.risk,
         "alert_limit_m": integrity.alert_limit_m,
         "height_std_m": integrity.height_std_m,

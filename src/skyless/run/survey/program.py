@@ -367,12 +367,7 @@ class SurveyNode:
     """The survey program of one site, with stamps from MQTT."""
 
     def __init__(
-        self,
-        settings: SurveySettings,
-        facts_of: FactsOf,
-        solve: Solve,
-        address: MqttAddress,
-        log: Log,
+        self, settings: SurveySettings, facts_of: FactsOf, solve: Solve, address: MqttAddress, log: Log
     ) -> None:
         """``facts_of``: facts about a site known without a user's help. ``solve``: ``survey.solve.run_survey``."""
         self.live: LiveSurvey | None = None  # None before the site is known

@@ -158,15 +158,12 @@ class Transceiver:
 
     def off(self) -> None:
         """TRXOFF: abort everything; HPDWARN is cleared with its cause (UM p. 91)."""
-        self._withdraw()
-        self.stop_listening()
-        self.sending = None
-        self.drop_bits(r.HPDWARN)
-
-    def _withdraw(self) -> None:
         if self.sending is not None and not self.sending.missed:
             self._air.withdraw()
             self.counts["withdrawn"] += 1
+        self.stop_listening()
+        self.sending = None
+        self.drop_bits(r.HPDWARN)
 
     def _start(self) -> None:
         """TXSTRT and TXDLYS: send at DX_TIME, whose low nine bits are ignored (UM p. 26)."""
@@ -251,11 +248,6 @@ class Transceiver:
             self.suspect = True
             self.raise_bits(r.RXRFTO)
         self._count_receiving(now)
-
-    @property
-    def window_left_ticks(self) -> int | None:
-        """Time left in the receiver's window, if it has one."""
-        return None if self._window_end_ticks is None else difference(self._window_end_ticks, self._air.now_ticks())
 
     def finish(self) -> None:
         """The air reports that the frame has been sent."""

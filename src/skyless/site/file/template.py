@@ -181,7 +181,6 @@ _EXAMPLE_PLAN = FloorPlanSite(image="floor.png", width_m=6.0)
 _EXAMPLE_FLOOR = FloorSite(number=1, low_m=3.2, name="Upper floor", image="upper.png", width_m=6.0)
 _EXAMPLE_GEOREFERENCE = GeoreferenceSite(latitude_deg=47.3769, longitude_deg=8.5417, height_m=408.0)
 
-
 _FROM_FLOOR_AND_CEILING_M: Final = 0.5
 _FARTHEST_M: Final = 8388.0  # largest coordinate that an anchor can state
 

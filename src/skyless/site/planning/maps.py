@@ -410,7 +410,7 @@ def _slice_progress(progress: Callable[[float], None] | None, k: int, grid: Grid
 def _slice(
     predictor: Predictor, grid: Grid, height_m: float, progress: Callable[[float], None] | None
 ) -> tuple[Array, float]:
-    points = points_of(grid, height_m)
+    points = np.stack([*np.meshgrid(grid.x_m, grid.y_m), np.full(grid.within.shape, height_m)], axis=-1)
     table = np.full((*grid.within.shape, len(PLAN_COLUMNS)), np.nan)
     stride = _stride(predictor, grid, points[grid.within])
     if stride == 1:
@@ -426,12 +426,6 @@ def _slice(
     return table, stride * grid.step_m
 
 
-def points_of(grid: Grid, height_m: float) -> Array:
-    """Points of one slice, shape (ny, nx, 3)."""
-    x, y = np.meshgrid(grid.x_m, grid.y_m)
-    return np.stack([x, y, np.full_like(x, height_m)], axis=-1)
-
-
 def _stride(predictor: Predictor, grid: Grid, points: Matrix) -> int:
     """Stride of the rows and columns to compute in full; ``points``: a slice's points inside the outline, (n, 3)."""
     some = points[:: math.ceil(len(points) / _SAMPLE_POINTS)]
@@ -444,14 +438,7 @@ def _every(stride: int, count: int) -> Integers:
     return np.unique(np.append(np.arange(0, count, stride), count - 1))
 
 
-def _interpolate(
-    coarse: Array,
-    carrier: Matrix,
-    rows: Integers,
-    columns: Integers,
-    within: Mask,
-    fine: Matrix,
-) -> None:
+def _interpolate(coarse: Array, carrier: Matrix, rows: Integers, columns: Integers, within: Mask, fine: Matrix) -> None:
     """Fill the filter's columns of ``fine`` from a coarse table of these rows and columns of the grid.
 
     ``carrier``: weighted PDOP at the coarse points; at the fine points it is in the column ``sigma_m``.

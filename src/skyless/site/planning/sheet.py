@@ -52,11 +52,7 @@ def _cable_m(anchor: AnchorSite, start: Point) -> tuple[float, float]:
 
 
 def sheet(
-    site: Site,
-    file: Path | None,
-    kind: Literal["pdf", "png"],
-    date: str,
-    cables_from: Point | None = None,
+    site: Site, file: Path | None, kind: Literal["pdf", "png"], date: str, cables_from: Point | None = None
 ) -> bytes:
     """The sheet as a file: one or more A4 pages per floor; in a PNG one below the other.
 

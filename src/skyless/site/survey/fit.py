@@ -917,7 +917,6 @@ TAPE_STD_M: Final = 0.005
 
 _MIN_TAPE_GAIN: Final = 0.02  # share of the standard deviation that a tape must remove to be advised
 
-
 _AS_GOOD: Final = 0.98
 _AS_LITTLE: Final = 1.2
 """A tape is as good as the best with this share of the best gain and this multiple of the least remaining variance.

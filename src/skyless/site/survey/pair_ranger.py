@@ -226,10 +226,7 @@ class PairRanger:
     """
 
     def __init__(
-        self,
-        bits: int = TICK_BITS,
-        block_s: float = 1.0,
-        on_block: Callable[[PairBlock], None] | None = None,
+        self, bits: int = TICK_BITS, block_s: float = 1.0, on_block: Callable[[PairBlock], None] | None = None
     ) -> None:
         """``bits``: width of the counters; ``block_s``: length of a block.
 

@@ -190,7 +190,7 @@ def _ambiguities(fitted: Fitted, framed: Framed, others: tuple[OtherFit, ...]) -
         if distance_m.max() <= _MOVED_M:
             continue
         elsewhere = np.flatnonzero(distance_m > max(_MOVED_M, _ELSEWHERE * distance_m.max()))
-        positions = {fitted.anchors[index]: _xyz(position_m[index]) for index in elsewhere.tolist()}
+        positions = {fitted.anchors[index]: tuple(position_m[index].tolist()) for index in elsewhere.tolist()}
         if any(_is_same(positions, known.positions_m) for known in found):
             continue
         sentence = _sentence(fitted, framed, other, position_m, distance_m, elsewhere)
@@ -236,11 +236,6 @@ def _sentence(
 
 def _place(position_m: Array) -> str:
     return f"({', '.join(f'{round(value, 2) + 0.0:.2f}' for value in position_m.tolist())})"
-
-
-def _xyz(position_m: Array) -> tuple[float, float, float]:
-    x, y, z = position_m.tolist()
-    return x, y, z
 
 
 def _nothing(measured: Measured, links: Links, fitted: Fitted | None) -> Survey:

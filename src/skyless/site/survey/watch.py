@@ -149,7 +149,6 @@ _MEDIAN_BLOCKS: Final = 3  # blocks needed to use their median, which short obst
 
 _JUMP_WINDOWS: Final = 1000  # a block older than this many windows means that the clock was set back
 
-
 GRACE_S: Final = 3.0
 """How long a window waits for blocks after its end."""
 _NEEDED: Final = 2

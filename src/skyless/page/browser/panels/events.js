@@ -44,7 +44,7 @@ export function start(panel) {
 
 /** Bring the tab up to date; what it shows counts as read. */
 export function show() {
-  const all = shownLog();
+  const all = state.mode === "live" ? state.log : (state.player?.events ?? []);
   const events = all.filter((event) => isIn(group, event)).reverse();
   parts.rows.show(events.map((event) => [`${event.serial} ${event.unix_s}`, event]));
   text(parts.count, events.length ? `${events.length} of ${all.length}, the newest first` : "");
@@ -73,11 +73,6 @@ function markRead() {
   readUnix_s = newest;
   saveSetting(READ, String(newest));
   changed("read");
-}
-
-/** The live site's events, or the recording's. */
-function shownLog() {
-  return state.mode === "live" ? state.log : (state.player?.events ?? []);
 }
 
 function isIn(name, { kind, level }) {
