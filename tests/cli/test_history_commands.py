@@ -159,15 +159,14 @@ def test_a_slip_is_one_line(folder, words, said, capsys):
     assert (err.count("\n"), said in err) == (1, True), err
 
 
-def test_where_there_is_no_history_or_no_such_time(tmp_path, folder, capsys):
-    assert main(["history", "heatmap"]) == 2
-    assert "it should be the folder of a site's history, and it holds none" in capsys.readouterr().err
+def test_where_there_is_no_history_or_no_such_time(tmp_path, folder, complaint):
+    assert "it should be the folder of a site's history, and it holds none" in complaint("history", "heatmap")
     (folder / "site=9").mkdir()
-    assert main(["history", "heatmap", "--history", str(folder)]) == 2
-    assert "the sites 5, 9; --site-id chooses one" in capsys.readouterr().err
+    assert "the sites 5, 9; --site-id chooses one" in complaint("history", "heatmap", "--history", folder)
     (folder / "site=9").rmdir()
-    assert main(["history", "heatmap", "--history", str(folder), "--from", "soonish"]) == 2
-    assert "--from is 'soonish'; it should be a time such as" in capsys.readouterr().err
+    assert "--from is 'soonish'; it should be a time such as" in complaint(
+        "history", "heatmap", "--history", folder, "--from", "soonish"
+    )
 
 
 def test_a_range_without_fixes_ends_with_1(folder, tmp_path, capsys):
