@@ -174,10 +174,7 @@ def test_a_wrong_place_is_noticed(stay, capsys):
         (("--at", "1,2,x@0:9"), "--at is '1,2,x@0:9'; '1,2,x' should be 2 or 3 numbers"),
         (("--at", "1,2,1e300"), "metres, at most 1e+06"),
         (("--truth", "{folder}/far.csv"), 'line 2, column x_m is "1e300"; it should be metres, at most'),
-        (
-            ("--truth", "{folder}/near.csv", "--lever-arm", "1e300,0,0"),
-            "--lever-arm is (1e+300, 0.0, 0.0); it should be",
-        ),
+        (("--truth", "{folder}/near.csv", "--lever-arm", "1e300,0,0"), "--lever-arm is (1e+300, 0.0, 0.0); it should"),
         (("--truth", "{folder}/pipe"), "a pipe"),
         (("--at", "1,2,3@9:4"), "later one last"),
         (("--at", "1,2,3", "--at", "4,5,6@0:9"), "--at is '1,2'; before another --at it should have its times"),

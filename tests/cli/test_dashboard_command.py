@@ -108,10 +108,7 @@ def test_the_address_that_is_printed_is_one_that_others_can_open():
     [
         (["--token", "short"], "--token has 5 characters"),
         (["--reader-token", "short"], "--reader-token has 5 characters"),
-        (
-            ["--token", "one-and-the-same", "--reader-token", "one-and-the-same"],
-            "--reader-token is the same as --token",
-        ),
+        (["--token", "one-and-the-same", "--reader-token", "one-and-the-same"], "--reader-token is the same as --tok"),
         (["--history", "/no/such/folder"], "--history is '/no/such/folder'; it should be a folder"),
         (["--assets", "/no/such/folder/a.csv"], "--assets is '/no/such/folder/a.csv'"),
         (["--mqtt", "http://x"], "--mqtt is"),

@@ -60,10 +60,7 @@ def test_anchors_of_a_site_that_relays_phases_ask_their_radios_for_them(key, pha
         ("history run --to /dev/null --mqtt mqtt://127.0.0.1:1", "--to is '/dev/null', which is no folder"),
         ("demo --paper --method weighted --integrity-risk 1e-5", "--integrity-risk is 1e-05; it should be left out"),
         ("tag t --alert-limit-m -1", "--alert-limit-m"),
-        (
-            "tag t --radio sniffer:/dev/x --integrity-risk 1e-5",
-            "--integrity-risk is 1e-05; it should be left out: it is not for sniffers",
-        ),
+        ("tag t --radio sniffer:/dev/x --integrity-risk 1e-5", "1e-05; it should be left out: it is not for sniffers"),
         ("demo --integrity-risk high", "--integrity-risk"),
         ("demo --alert-limit-m inf", "--alert-limit-m"),
         ("ether --site lab:loud", "--site is 'lab:loud'; it should be a site file, lab, paper, or lab:PICOSECONDS"),

@@ -86,13 +86,6 @@ def test_a_slip_is_told_on_standard_error(arguments, said):
     assert said in done.stderr
 
 
-def test_a_configuration_error_is_one_line(tmp_path):
-    done = skyless("site", "check", tmp_path / "none.toml", "--json")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("skyless: ")
-    assert done.stderr.count("\n") == 1
-
-
 def test_a_site_file_is_a_file(tmp_path, complaint):
     """What never ends, or waits for a writer, is refused at once."""
     pipe = tmp_path / "pipe"

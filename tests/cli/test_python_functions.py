@@ -413,10 +413,7 @@ REPLAY = [
     ({"site": paper_lab_site(accuracy=AccuracySite())}, "give either anchors or site"),
     ({"truth": [[0, 1, 2]]}, r"truth is an array of shape \(1, 3\); it should be an array of shape \(n, 4\)"),
     ({"truth": [[0, 1, 2, float("nan")]]}, "all finite"),
-    (
-        {"truth": [[900.0, 1, 2, 1], [901.0, 1, 2, 1]]},
-        "truth: column t_s is .900.000 to 901.000.; it should be in the time of the recording",
-    ),
+    ({"truth": [[900, 1, 2, 1], [901, 1, 2, 1]]}, "truth: column t_s is .900.000 to 901.000.; it should be in the"),
     ({"lever_arm_m": (1, 2)}, r"lever_arm_m is \(1, 2\); it should be 3 finite numbers"),
     ({"lever_arm_m": (1, 2, 3)}, "lever_arm_m is .*; it should be left out: it moves the truth, which truth must give"),
     ({"tag_height_m": "high"}, "tag_height_m is 'high'; it should be metres, truth, free or auto"),
@@ -451,19 +448,11 @@ PLAN = [
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        {"noise_ps": 50.0},
-        {"search_s": 3.0},
-        {"verify_rounds": 200},
-        {"seed": 2},
-        {"optimise": 4},
-    ],
-    ids=str,
+    ("name", "value"), [("noise_ps", 50.0), ("search_s", 3.0), ("verify_rounds", 200), ("seed", 2), ("optimise", 4)]
 )
-def test_what_has_no_effect_on_a_plan_of_beacons_is_refused(arguments):
-    with pytest.raises(skyless.SkylessError, match=f"{next(iter(arguments))} is .*; it should be left out: errors are"):
-        skyless.plan(grid_site(100.0, 90.0, 10.0, 4.0, 1.2), **arguments)
+def test_what_has_no_effect_on_a_plan_of_beacons_is_refused(name, value):
+    with pytest.raises(skyless.SkylessError, match=f"{name} is .*; it should be left out: errors are"):
+        skyless.plan(grid_site(100.0, 90.0, 10.0, 4.0, 1.2), **{name: value})
 
 
 @pytest.mark.parametrize(("arguments", "right"), PLAN, ids=[str(sorted(given)) for given, _ in PLAN])

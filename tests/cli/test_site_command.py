@@ -73,33 +73,24 @@ def test_new_overwrites_only_by_force(tmp_path, complaint):
     assert load_site(path).name == "mine"
 
 
+OUT_OF_RANGE = ("--width 0", "--width nan", "--anchor-count 0", "--anchor-count 256")
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         (["--width", "3"], "both --width and --depth"),
         (["--anchor-count", "8"], "both --width and --depth"),
         (["--tag-height", "0"], "both --width and --depth"),
-        (
-            ["--width", "3", "--depth", "3", "--tag-height", "nan"],
-            "--tag-height is 'nan'; it should be metres or free",
-        ),
-        (
-            ["--width", "0.001", "--depth", "0.001", "--anchor-count", "20"],
-            "--width is 0.001; it should be a number, at least 0.1",
-        ),
+        (["--width", "3", "--depth", "3", "--tag-height", "nan"], "--tag-height is 'nan'; it should be metres or free"),
+        (["--width", "0.001", "--depth", "0.001"], "--width is 0.001; it should be a number, at least 0.1"),
         (["--width", "3", "--depth", "0.09"], "--depth is 0.09; it should be a number, at least 0.1"),
+        *(([*["--width", "3", "--depth", "3"], *two.split()], two.split()[0]) for two in OUT_OF_RANGE),
     ],
 )
 def test_new_refuses(tmp_path, complaint, options, said):
     assert said in complaint("site", "new", tmp_path / "x.toml", *options)
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    "option", [["--width", "0"], ["--width", "nan"], ["--anchor-count", "0"], ["--anchor-count", "256"]]
-)
-def test_new_refuses_numbers_out_of_range(tmp_path, option):
-    assert main(["site", "new", str(tmp_path / "x.toml"), "--width", "3", "--depth", "3", *option]) == 2
 
 
 def test_new_where_nothing_can_be_written(tmp_path, complaint):
