@@ -16,17 +16,7 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.geometry import area, distance_outside, inside
 from skyless.core.site import AnchorSite, GeoreferenceSite, WallSite
 from skyless.sim.lab import paper_lab_site
-from skyless.site.planning import maps
-from skyless.site.planning.links import (
-    ANCHORS_IN_VIEW,
-    PDOP,
-    PLAN_COLUMNS,
-    SIGMA,
-    Mounts,
-    floor_of,
-    points_along,
-    sides,
-)
+from skyless.site.planning import links, maps
 from skyless.site.planning.maps import (
     PlanSettings,
     Predictor,
@@ -45,7 +35,7 @@ LAB = paper_lab_site()
 
 
 def lab_map(step=0.5, site=LAB):
-    floor = floor_of(site, Path("lab.toml"), None, None)
+    floor = links.floor_of(site, Path("lab.toml"), None, None)
     return plan_map(Predictor(site, PlanSettings()), grid_of(floor, (0.0,), step))
 
 
@@ -58,9 +48,9 @@ def test_inside_agrees_with_matplotlib(x, y):
 def test_areas_and_ways_around():
     assert area(L_SHAPE) == pytest.approx(12 * 4 + 5 * 5)
     assert area(L_SHAPE[::-1]) == pytest.approx(-73)
-    mounts = Mounts(sides(L_SHAPE), (0.0,))
+    mounts = links.Mounts(links.sides(L_SHAPE), (0.0,))
     assert mounts.length_m == pytest.approx(42)
-    around = points_along(mounts.segments_m, np.array([0.0, 12.0, 14.0, 23.0, 42.0, 43.0]))
+    around = links.points_along(mounts.segments_m, np.array([0.0, 12.0, 14.0, 23.0, 42.0, 43.0]))
     assert around.tolist() == [[0, 0], [12, 0], [12, 2], [5, 4], [0, 0], [1, 0]]
     assert distance_outside(np.array([8.0, 6.0]), L_SHAPE) == pytest.approx(2.0)
     assert distance_outside(np.array([2.0, 6.0]), L_SHAPE) == 0.0
@@ -68,19 +58,19 @@ def test_areas_and_ways_around():
 
 def test_an_anchor_off_the_floor_is_a_mistake_of_the_file():
     with pytest.raises(ConfigurationError, match=r"anchors\[3\] \(anchor 4\) is .*\(6, 8\).*should be on the floor"):
-        floor_of(LAB, Path("lab.toml"), np.array([(0.0, 0.0), (6.0, 0.0), (6.0, 5.0)]), None)
+        links.floor_of(LAB, Path("lab.toml"), np.array([(0.0, 0.0), (6.0, 0.0), (6.0, 5.0)]), None)
 
 
 def test_anchors_in_one_line_need_an_outline():
     site = replace(LAB, anchors=tuple(AnchorSite(k, float(k), 0.0) for k in range(1, 5)))
     with pytest.raises(ConfigurationError, match="--outline"):
-        floor_of(site, Path("x.toml"), None, None)
-    assert floor_of(site, Path("x.toml"), L_SHAPE, None).region_m == (0.0, 0.0, 12.0, 9.0)
+        links.floor_of(site, Path("x.toml"), None, None)
+    assert links.floor_of(site, Path("x.toml"), L_SHAPE, None).region_m == (0.0, 0.0, 12.0, 9.0)
 
 
 def test_only_what_lies_inside_the_outline_counts():
     site = replace(LAB, anchors=LAB.anchors[:1])
-    floor = floor_of(site, Path("x.toml"), L_SHAPE, None)
+    floor = links.floor_of(site, Path("x.toml"), L_SHAPE, None)
     grid = grid_of(floor, (0.0, 1.0), 0.5)
     assert grid.points == 2 * 4 * 73
     with pytest.raises(ValueError, match="inside the outline"):
@@ -89,7 +79,7 @@ def test_only_what_lies_inside_the_outline_counts():
 
 def test_a_summary_is_that_of_the_table():
     plan = lab_map()
-    sigma = plan.column(SIGMA)
+    sigma = plan.column(links.SIGMA)
     summary = summary_of(plan, 0.034)
     assert summary.points == 12 * 16
     assert summary.mean_sigma_m == pytest.approx(sigma.mean())
@@ -108,9 +98,9 @@ def test_interpolation_of_the_filter_is_close_and_keeps_walls_sharp(monkeypatch)
     rough = lab_map(0.2, site)
     assert full.computed_every_m == 0.2
     assert rough.computed_every_m == pytest.approx(0.8)
-    assert (rough.column(ANCHORS_IN_VIEW) == full.column(ANCHORS_IN_VIEW)).all()
-    assert (rough.column(PDOP) == full.column(PDOP)).all()
-    errors = rough.column(SIGMA) / full.column(SIGMA) - 1.0
+    assert (rough.column(links.ANCHORS_IN_VIEW) == full.column(links.ANCHORS_IN_VIEW)).all()
+    assert (rough.column(links.PDOP) == full.column(links.PDOP)).all()
+    errors = rough.column(links.SIGMA) / full.column(links.SIGMA) - 1.0
     assert np.quantile(abs(errors), 0.95) < 0.1
     assert abs(errors.mean()) < 0.02
 
@@ -119,8 +109,8 @@ def test_csv_holds_the_map():
     plan = lab_map(1.0)
     rows = list(csv.DictReader("".join(csv_lines(plan)).splitlines()))
     assert len(rows) == 48
-    assert list(rows[0]) == ["x_m", "y_m", "z_m", *PLAN_COLUMNS]
-    assert [float(row["sigma_m"]) for row in rows] == pytest.approx(plan.column(SIGMA).ravel(), rel=1e-3)
+    assert list(rows[0]) == ["x_m", "y_m", "z_m", *links.PLAN_COLUMNS]
+    assert [float(row["sigma_m"]) for row in rows] == pytest.approx(plan.column(links.SIGMA).ravel(), rel=1e-3)
     assert (float(rows[1]["x_m"]), float(rows[1]["y_m"])) == (1.5, 0.5)
 
 
