@@ -71,12 +71,7 @@ ANSWERS = {
         == [("bob", "Forklift 3", "[red]ann", 1.0)]
     ),
 }
-SHOWN = {
-    "track": "length",
-    "heatmap": "1 h 59 min",
-    "dwell": "10 min 00 s",
-    "contacts": "Forklift 3",
-}
+SHOWN = {"track": "length", "heatmap": "1 h 59 min", "dwell": "10 min 00 s", "contacts": "Forklift 3"}
 
 
 @pytest.mark.parametrize("question", QUESTIONS)

@@ -249,10 +249,7 @@ def test_arrays_and_files_of_surveys(results, folder, tmp_path, capsys):
     assert delays.anchors.tolist() == [1, 2, 3, 4, 5, 6]
     out = tmp_path / "out.csv"
     recording, table, truth = (str(folder / name) for name in ("tdoa-table", "anchors.csv", "truth.csv"))
-    assert main(["calibrate", recording, "--anchors", table, "--truth", truth, "--out", str(out)]) in {
-        None,
-        0,
-    }
+    assert main(["calibrate", recording, "--anchors", table, "--truth", truth, "--out", str(out)]) in {None, 0}
     assert found.corrected_file() == out.read_text()
     assert "tx_antenna_delay_ticks" in delays.corrected_file()
 

@@ -28,8 +28,7 @@ POSITIVE = [
 ]
 REAL = ["master_offset_s", "tag_offset_s", "anchor_offset_s", "sync_s", "reference_s", "delay_s"]
 CHAIN = Chain(
-    **{name: sp.Symbol(name, positive=True) for name in POSITIVE},
-    **{name: sp.Symbol(name, real=True) for name in REAL},
+    **{name: sp.Symbol(name, positive=True) for name in POSITIVE}, **{name: sp.Symbol(name, real=True) for name in REAL}
 )
 MASTER, ANCHOR, TAG = CHAIN.sigma_master_s, CHAIN.sigma_anchor_s, CHAIN.sigma_tag_s
 M1, M2, REF, S1, S2, A1, A2, R1, R2, RM = STAMPS = sp.symbols("m1 m2 tm s1 s2 a1 a2 r1 r2 rm", real=True)

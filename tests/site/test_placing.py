@@ -12,17 +12,8 @@ from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.channel import ChannelModel, barriers_of
 from skyless.site.file.template import rectangular_site
 from skyless.site.planning import links, optimise
+from skyless.site.planning import optimise as optimiser
 from skyless.site.planning.maps import PlanSettings, Predictor, grid_of, plan_map, summary_of
-from skyless.site.planning.optimise import (
-    Search,
-    even_layout,
-    exchange,
-    lattice_of,
-    mean_and_worst,
-    one_more,
-    site_with,
-    site_with_one_more,
-)
 from skyless.site.planning.report import plan_warnings
 
 pytestmark = pytest.mark.statistical
@@ -46,7 +37,7 @@ def small_search(monkeypatch):
 def searched(site, outline, anchors, heights, tag_heights, settings=SETTINGS, seed=1):
     floor = links.floor_of(site, FILE, outline, None)
     mounts = links.Mounts(links.sides(floor.outline_m), heights)
-    return floor, Search(site, settings, floor, mounts, tag_heights, anchors, seed, 300.0).run()
+    return floor, optimiser.Search(site, settings, floor, mounts, tag_heights, anchors, seed, 300.0).run()
 
 
 @pytest.mark.usefixtures("small_search")
@@ -85,7 +76,7 @@ def test_same_seed_same_places():
     assert places[0] == places[1]
 
 
-class SlowSearch(Search):
+class SlowSearch(optimiser.Search):
     """Each point of a prediction takes 10 ms on a clock of its own; Ctrl-C at an evaluation."""
 
     now_s, interrupt_at = 0.0, None
@@ -136,24 +127,24 @@ def test_exchange_finds_what_trying_all_finds():
     places = mounts.at(np.arange(12) * mounts.length_m / 12, np.zeros(12, np.int64))
     floor = links.floor_of(paper_lab_site(), FILE, None, None)
     points, weights = links.sample_points(floor, (0.0,), 60)
-    lattice = lattice_of(places, points, weights, links.link_budget(ChannelModel()), barriers_of(()), 2, 0.04)
+    lattice = optimiser.lattice_of(places, points, weights, links.link_budget(ChannelModel()), barriers_of(()), 2, 0.04)
 
     def score(chosen):
-        return sum(mean_and_worst(np.array(chosen), lattice))
+        return sum(optimiser.mean_and_worst(np.array(chosen), lattice))
 
     best = min(map(score, combinations(range(12), 4)))
     reference = (1e9, 1e9)  # far from any: then the score is the sum of both to a factor
     found = []
     for start in ([0, 1, 2, 3], [0, 3, 6, 9], [2, 5, 7, 11]):
         chosen = np.array(start)
-        exchange(chosen, 0, lattice, reference, 20)
+        optimiser.exchange(chosen, 0, lattice, reference, 20)
         found.append(score(chosen))
     assert min(found) == pytest.approx(best, rel=1e-9)
 
 
 def test_the_even_layout_goes_around_with_heights_in_turn():
     mounts = links.Mounts(links.sides(np.array([(0, 0), (4, 0), (4, 2), (0, 2)], float)), (0.5, 2.5))
-    layout = even_layout(mounts, 4)
+    layout = optimiser.even_layout(mounts, 4)
     assert mounts.at(layout.along_m, layout.levels).tolist() == [[0, 0, 0.5], [3, 0, 2.5], [4, 2, 0.5], [1, 2, 2.5]]
 
 
@@ -162,21 +153,23 @@ def test_one_more_anchor_helps_where_one_is_missing():
     anchors = tuple(a for a in paper_lab_site().anchors if a.id not in {3, 4})
     site = replace(paper_lab_site(), anchors=anchors)
     floor = links.floor_of(site, FILE, np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float), None)
-    more = one_more(site, SETTINGS, floor, links.Mounts(links.sides(floor.outline_m), (0.0,)), (0.0,))
+    more = optimiser.one_more(site, SETTINGS, floor, links.Mounts(links.sides(floor.outline_m), (0.0,)), (0.0,))
     assert more.position_m[0] == pytest.approx(6.0, abs=0.5)
     assert more.position_m[1] > 6.0
     assert more.mean_after_m < 0.9 * more.mean_before_m
     assert more.worst_after_m < 0.7 * more.worst_before_m
     assert more.helps
-    grown = site_with_one_more(site, np.array(more.position_m))
+    grown = optimiser.site_with_one_more(site, np.array(more.position_m))
     assert [a.id for a in grown.anchors] == [1, 2, 5, 6, 7]
 
 
 def test_one_more_anchor_helps_nobody_where_it_only_lengthens_the_superframe():
     ring = links.Mounts(links.sides(np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float)), (0.0,))
-    site = site_with(paper_lab_site(), ring.at(even_layout(ring, 16).along_m, np.zeros(16, np.int64)), 1)
+    site = optimiser.site_with(
+        paper_lab_site(), ring.at(optimiser.even_layout(ring, 16).along_m, np.zeros(16, np.int64)), 1
+    )
     floor = links.floor_of(site, FILE, None, (2.0, 2.0, 4.0, 6.0))
-    more = one_more(site, SETTINGS, floor, ring, (0.0,))
+    more = optimiser.one_more(site, SETTINGS, floor, ring, (0.0,))
     assert not more.helps
     assert more.mean_after_m > 0.95 * more.mean_before_m
 
@@ -251,7 +244,7 @@ def test_a_site_from_places_keeps_the_rest():
     site = replace(
         paper_lab_site(), walls=(WallSite(0.0, 0.0, 1.0, 1.0),), schedule=replace(paper_lab_site().schedule, slots=9)
     )
-    made = site_with(site, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]), 2)
+    made = optimiser.site_with(site, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]), 2)
     assert made.master == 3
     assert made.walls == site.walls
     assert made.schedule.slots is None
