@@ -6,6 +6,7 @@ import inspect
 import math
 import os
 import signal
+import socket
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -121,6 +122,13 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
         return err
 
     return said_by
+
+
+@pytest.fixture
+def taken() -> Iterator[int]:
+    """A port where another program listens."""
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        yield other.getsockname()[1]
 
 
 @pytest.fixture(scope="session")

@@ -5,7 +5,6 @@ The commands run in this process, up to where they notice.
 
 import errno
 import os
-import socket
 from pathlib import Path
 
 import pytest
@@ -77,7 +76,6 @@ MISTAKES = {
     "a recording over another": (["record", "nothing.mcap", "--duration", "1"], "nothing.mcap"),
     "a port that is none": (["broker", "--port", "70000"], "--port"),
     "two ports": (["broker", "--port", "2000", "--listen", "127.0.0.1:2001"], "give the port once"),
-    "two kinds of lines": (["tag", "one", "--csv", "--json", "--mqtt", "none"], "exclude each other"),
 }
 
 
@@ -151,14 +149,6 @@ def test_an_old_table_outlives_a_full_disk(room, capsys, full_disk):
         file.write("precious")
     assert main(["replay", *F, "--fixes-csv", "out.csv"]) == 2
     assert Path("out.csv").read_text() == "precious"
-
-
-@pytest.fixture
-def taken():
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        yield other.getsockname()[1]
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,6 @@ import json
 import os
 import re
 import signal
-import socket
 import time
 from pathlib import Path
 
@@ -31,15 +30,6 @@ pytestmark = pytest.mark.site
 @pytest.fixture
 def port():
     return free_port()
-
-
-@pytest.fixture
-def taken():
-    """A port where another program listens."""
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        yield other.getsockname()[1]
 
 
 @contextlib.contextmanager
