@@ -145,6 +145,7 @@ def test_live_records_give_the_packets_drops_and_fixes_of_their_file(lines, send
     assert stage.of_kind() == of_file.events
     stage.counters["malformed-record"] += stage.counters.pop("overlong-line", 0)  # files have no such limit
     assert (stage.counters, stage.node.drops) == (of_file.counters, of_file.node.drops)
+    assert stage.counters["late-or-double-record"] == (60 if len(lines) > 900 else 0)  # of the spoiled ones
     assert [fix.position_m for fix in stage.fixes] == [fix.position_m for fix in of_file.fixes]
     assert len(stage.fixes) > 800
     assert dist(stage.fixes[-1].position_m, TRACK_M[-1]) < 0.15
