@@ -22,15 +22,25 @@ pytestmark = pytest.mark.site
 TAG = ["tag", "one", "--mqtt", "none", "--publish-hz", "1000"]
 
 
-class PlayedRadio(FakeRadio):
-    """Receives half a second of the lab as fast as it is processed, and then asks the program to end."""
+class Endless(FakeRadio):
+    """Receives half a second of the lab as fast as it is processed, and never ends by itself."""
 
     async def run(self, listener):
         for reception in receptions(0.5):
             listener(msgspec.structs.replace(reception, host_s=None))
+        await self.end()
+
+    async def end(self):
+        await asyncio.Event().wait()
+
+
+class PlayedRadio(Endless):
+    """Asks the program to end."""
+
+    async def end(self):
         await asyncio.sleep(0.05)
         signal.raise_signal(signal.SIGTERM)
-        await asyncio.Event().wait()
+        await super().end()
 
 
 @pytest.fixture
@@ -89,19 +99,9 @@ def test_a_reader_that_goes_away_ends_the_program(capfd, monkeypatch, error, cod
     assert "Traceback" not in err
 
 
-class Endless(FakeRadio):
-    """Receives and never ends by itself."""
-
-    async def run(self, listener):
-        for reception in receptions(0.5):
-            listener(msgspec.structs.replace(reception, host_s=None))
-        await asyncio.Event().wait()
-
-
 @pytest.mark.parametrize("options", [["--csv", "--json"], ["--print", "--csv", "--json"]])
-def test_one_kind_of_lines_at_a_time(capfd, options):
-    assert main([*TAG, *options]) == 2
-    assert f"{' and '.join(options)} exclude each other" in capfd.readouterr().err
+def test_one_kind_of_lines_at_a_time(complaint, options):
+    assert f"{' and '.join(options)} exclude each other" in complaint(*TAG, *options)
 
 
 async def test_a_reader_that_takes_nothing_delays_no_fix(monkeypatch):

@@ -11,15 +11,7 @@ import pytest
 from pyarrow import parquet
 
 from skyless.cli.main import main
-from skyless.run.history.layout import (
-    ASSET_COLUMNS,
-    EVENT_COLUMNS,
-    FIX_COLUMNS,
-    NAME_COLUMNS,
-    ZONE_COLUMNS,
-    file_name,
-    site_folder,
-)
+from skyless.run.history import layout
 
 pytestmark = pytest.mark.site
 
@@ -41,20 +33,20 @@ def write(file, columns, rows):
 def folder(tmp_path_factory):
     """An hour of two tags that walk side by side."""
     folder = tmp_path_factory.mktemp("history")
-    site, s = site_folder(folder, 5), np.arange(0, 3600)
+    site, s = layout.site_folder(folder, 5), np.arange(0, 3600)
     x_mm = np.rint(3000.0 + 2000.0 * np.sin(s / 60.0)).astype(int).tolist()
     ms = [round(1000.0 * (BEGIN + one)) for one in s.tolist()]
     fixes = [(tag, t, x, 1000 * tag, 1200, 50, 65535, 8) for tag in (1, 2) for t, x in zip(ms, x_mm, strict=True)]
-    write(site / "day=2026-11-20" / file_name(1, 7200), FIX_COLUMNS, fixes)
-    write(site / "names.parquet", NAME_COLUMNS, [(1, "[red]ann", 0), (2, "bob", 0)])
-    write(site / "assets.parquet", ASSET_COLUMNS, [("bob", "Forklift 3")])
-    write(site / "zones.parquet", ZONE_COLUMNS, [("dock", "Dock", "[[1, 0], [3, 0], [3, 3], [1, 3]]")])
+    write(site / "day=2026-11-20" / layout.file_name(1, 7200), layout.FIX_COLUMNS, fixes)
+    write(site / "names.parquet", layout.NAME_COLUMNS, [(1, "[red]ann", 0), (2, "bob", 0)])
+    write(site / "assets.parquet", layout.ASSET_COLUMNS, [("bob", "Forklift 3")])
+    write(site / "zones.parquet", layout.ZONE_COLUMNS, [("dock", "Dock", "[[1, 0], [3, 0], [3, 3], [1, 3]]")])
     events = [
         (ms[60], "enter", "[red]ann", "dock", None, None, ""),
         (ms[90], "alarm-raised", None, "dock", "[red]ann", "late/ann/1", "ann is late"),
         (ms[660], "leave", "[red]ann", "dock", None, None, ""),
     ]
-    write(site / "events" / "day=2026-11-20" / file_name(1, 3), EVENT_COLUMNS, events)
+    write(site / "events" / "day=2026-11-20" / layout.file_name(1, 3), layout.EVENT_COLUMNS, events)
     return folder
 
 
@@ -79,12 +71,7 @@ ANSWERS = {
         == [("bob", "Forklift 3", "[red]ann", 1.0)]
     ),
 }
-SHOWN = {
-    "track": "length",
-    "heatmap": "1 h 59 min",
-    "dwell": "10 min 00 s",
-    "contacts": "Forklift 3",
-}
+SHOWN = {"track": "length", "heatmap": "1 h 59 min", "dwell": "10 min 00 s", "contacts": "Forklift 3"}
 
 
 @pytest.mark.parametrize("question", QUESTIONS)
@@ -159,15 +146,14 @@ def test_a_slip_is_one_line(folder, words, said, capsys):
     assert (err.count("\n"), said in err) == (1, True), err
 
 
-def test_where_there_is_no_history_or_no_such_time(tmp_path, folder, capsys):
-    assert main(["history", "heatmap"]) == 2
-    assert "it should be the folder of a site's history, and it holds none" in capsys.readouterr().err
+def test_where_there_is_no_history_or_no_such_time(tmp_path, folder, complaint):
+    assert "it should be the folder of a site's history, and it holds none" in complaint("history", "heatmap")
     (folder / "site=9").mkdir()
-    assert main(["history", "heatmap", "--history", str(folder)]) == 2
-    assert "the sites 5, 9; --site-id chooses one" in capsys.readouterr().err
+    assert "the sites 5, 9; --site-id chooses one" in complaint("history", "heatmap", "--history", folder)
     (folder / "site=9").rmdir()
-    assert main(["history", "heatmap", "--history", str(folder), "--from", "soonish"]) == 2
-    assert "--from is 'soonish'; it should be a time such as" in capsys.readouterr().err
+    assert "--from is 'soonish'; it should be a time such as" in complaint(
+        "history", "heatmap", "--history", folder, "--from", "soonish"
+    )
 
 
 def test_a_range_without_fixes_ends_with_1(folder, tmp_path, capsys):

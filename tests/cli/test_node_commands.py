@@ -60,10 +60,7 @@ def test_anchors_of_a_site_that_relays_phases_ask_their_radios_for_them(key, pha
         ("history run --to /dev/null --mqtt mqtt://127.0.0.1:1", "--to is '/dev/null', which is no folder"),
         ("demo --paper --method weighted --integrity-risk 1e-5", "--integrity-risk is 1e-05; it should be left out"),
         ("tag t --alert-limit-m -1", "--alert-limit-m"),
-        (
-            "tag t --radio sniffer:/dev/x --integrity-risk 1e-5",
-            "--integrity-risk is 1e-05; it should be left out: it is not for sniffers",
-        ),
+        ("tag t --radio sniffer:/dev/x --integrity-risk 1e-5", "1e-05; it should be left out: it is not for sniffers"),
         ("demo --integrity-risk high", "--integrity-risk"),
         ("demo --alert-limit-m inf", "--alert-limit-m"),
         ("ether --site lab:loud", "--site is 'lab:loud'; it should be a site file, lab, paper, or lab:PICOSECONDS"),
@@ -84,18 +81,16 @@ def test_anchors_of_a_site_that_relays_phases_ask_their_radios_for_them(key, pha
         ("watch --mqtt none", "it should be the broker of the site to watch"),
     ],
 )
-def test_wrong_input_is_told_with_what_would_be_right(command, right, capsys):
-    assert main(command.split()) == 2
-    assert right in capsys.readouterr().err
+def test_wrong_input_is_told_with_what_would_be_right(command, right, complaint):
+    assert right in complaint(*command.split())
 
 
 @pytest.mark.parametrize("height", ["high", "nan"])
-def test_a_sniffer_s_height_is_metres_or_a_word(height, tmp_path, capsys):
+def test_a_sniffer_s_height_is_metres_or_a_word(height, tmp_path, complaint):
     table = tmp_path / "anchors.csv"
     table.write_text("id,x_m,y_m,z_m\n1,0,0,0\n2,5,0,0\n3,0,5,0\n")
     command = ["tag", "t", "--radio", "sniffer:/dev/x", "--anchors", str(table), "--tag-height", height]
-    assert main(command) == 2
-    assert f"--tag-height is '{height}'; it should be metres, free or auto" in capsys.readouterr().err
+    assert f"--tag-height is '{height}'; it should be metres, free or auto" in complaint(*command)
 
 
 @pytest.mark.parametrize(
@@ -130,9 +125,8 @@ def test_a_program_that_is_asked_to_end_does_so_as_planned(number):
 
 
 @pytest.mark.parametrize("speaks", ["listener", "sniffer", "sniffer-text", "uci", "uci-2"])
-def test_an_anchor_has_no_board_that_only_listens(speaks, capsys):
-    assert main(["board", "6", "--wire", speaks]) == 2
-    assert "it should be link for an anchor" in capsys.readouterr().err
+def test_an_anchor_has_no_board_that_only_listens(speaks, complaint):
+    assert "it should be link for an anchor" in complaint("board", "6", "--wire", speaks)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -46,12 +46,6 @@ def planned(capsys, *arguments):
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
-def refused(capsys, *arguments):
-    assert main(["plan", *map(str, arguments)]) == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    return line
-
-
 @pytest.mark.statistical
 def test_all_files_at_once(lab, tmp_path, capsys):
     png, page, table = tmp_path / "map.png", tmp_path / "plan.html", tmp_path / "grid.geojson"
@@ -77,7 +71,7 @@ def test_people_get_a_table(lab, capsys):
     assert not re.search(r"one more anchor.* cm", out), "a second mean and worst, of other points than the map's"
 
 
-def test_an_optimised_site_is_a_site(lab, tmp_path, capsys):
+def test_an_optimised_site_is_a_site(lab, tmp_path, capsys, complaint):
     out = tmp_path / "better" / "site.toml"
     out.parent.mkdir()
     options = ["--optimise", "4", "--out", out, "--heights", "0,1", "--step", "1", "--search-seconds", "10"]
@@ -89,7 +83,7 @@ def test_an_optimised_site_is_a_site(lab, tmp_path, capsys):
     assert {anchor.z_m for anchor in site.anchors} <= {0.0, 1.0}
     assert result["optimised"]["mean_ratio"] < 1.0
     assert result["optimised"]["worst_ratio"] < 1.0
-    assert "exists" in refused(capsys, lab, *options)
+    assert "exists" in complaint("plan", lab, *options)
 
 
 def test_verification_tells_its_points(lab, capsys):
@@ -100,35 +94,35 @@ def test_verification_tells_its_points(lab, capsys):
         assert point["ratio"] == pytest.approx(1.0, abs=0.03 + 4 * point["ratio_error"])
 
 
-def test_one_anchor(lab, capsys):
+def test_one_anchor(lab, complaint):
     first = lab.read_text().split("[[anchors]]")[:2]
     lab.write_text("[[anchors]]".join(first))
-    assert "lab.toml: anchors is" in (line := refused(capsys, lab))
+    assert "lab.toml: anchors is" in (line := complaint("plan", lab))
     assert "at least 3" in line
 
 
-def test_all_anchors_in_one_point(lab, capsys):
+def test_all_anchors_in_one_point(lab, complaint):
     lab.write_text(re.sub(r"(x|y)_m = \d+\.\d+\n", r"\1_m = 1.0\n", lab.read_text()))
-    assert "anchors[1] (anchor 2)" in (line := refused(capsys, lab))
+    assert "anchors[1] (anchor 2)" in (line := complaint("plan", lab))
     assert "same point" in line
 
 
-def test_not_a_number(lab, capsys):
+def test_not_a_number(lab, complaint):
     lab.write_text(lab.read_text().replace("x_m = 6.0", "x_m = nan", 1))
-    assert "anchors[1].x_m (anchor 2) is nan; it should be a number of metres" in refused(capsys, lab)
+    assert "anchors[1].x_m (anchor 2) is nan; it should be a number of metres" in complaint("plan", lab)
 
 
-def test_anchors_outside_the_plan(lab, capsys):
+def test_anchors_outside_the_plan(lab, complaint):
     lab.write_text(lab.read_text().replace("width_m = 6.0", "width_m = 3.0"))
-    assert "(anchor 2)" in (line := refused(capsys, lab))
+    assert "(anchor 2)" in (line := complaint("plan", lab))
     assert "on the floor, which reaches from (0, 0) to (3, 4) m" in line
 
 
 @pytest.mark.parametrize("keep", [0, 10, 200])
-def test_an_image_that_cannot_be_read(lab, tmp_path, capsys, keep):
+def test_an_image_that_cannot_be_read(lab, tmp_path, complaint, keep):
     image = tmp_path / "floor.png"
     image.write_bytes(image.read_bytes()[:keep])
-    assert 'floor_plan.image is "floor.png"; it should be' in refused(capsys, lab)
+    assert 'floor_plan.image is "floor.png"; it should be' in complaint("plan", lab)
 
 
 @pytest.mark.parametrize(
@@ -149,17 +143,17 @@ def test_an_image_that_cannot_be_read(lab, tmp_path, capsys, keep):
         (["--html", "missing/plan.html", "--step", "1"], "cannot be written"),
     ],
 )
-def test_slips_are_told(lab, tmp_path, capsys, monkeypatch, options, told):
+def test_slips_are_told(lab, tmp_path, complaint, monkeypatch, options, told):
     monkeypatch.chdir(tmp_path)
-    assert told in refused(capsys, lab, *options)
+    assert told in complaint("plan", lab, *options)
 
 
 @pytest.mark.parametrize(
     ("option", "words"),
     [("--plot", "its ending should be one of"), ("--grid", "would destroy it"), ("--html", "would destroy it")],
 )
-def test_inputs_are_spared(lab, tmp_path, capsys, option, words):
+def test_inputs_are_spared(lab, tmp_path, complaint, option, words):
     before = lab.read_text()
-    assert words in refused(capsys, lab, option, lab)
-    assert "would destroy it" in refused(capsys, lab, option, tmp_path / "floor.png")
+    assert words in complaint("plan", lab, option, lab)
+    assert "would destroy it" in complaint("plan", lab, option, tmp_path / "floor.png")
     assert lab.read_text() == before

@@ -249,10 +249,7 @@ def test_arrays_and_files_of_surveys(results, folder, tmp_path, capsys):
     assert delays.anchors.tolist() == [1, 2, 3, 4, 5, 6]
     out = tmp_path / "out.csv"
     recording, table, truth = (str(folder / name) for name in ("tdoa-table", "anchors.csv", "truth.csv"))
-    assert main(["calibrate", recording, "--anchors", table, "--truth", truth, "--out", str(out)]) in {
-        None,
-        0,
-    }
+    assert main(["calibrate", recording, "--anchors", table, "--truth", truth, "--out", str(out)]) in {None, 0}
     assert found.corrected_file() == out.read_text()
     assert "tx_antenna_delay_ticks" in delays.corrected_file()
 
@@ -413,10 +410,7 @@ REPLAY = [
     ({"site": paper_lab_site(accuracy=AccuracySite())}, "give either anchors or site"),
     ({"truth": [[0, 1, 2]]}, r"truth is an array of shape \(1, 3\); it should be an array of shape \(n, 4\)"),
     ({"truth": [[0, 1, 2, float("nan")]]}, "all finite"),
-    (
-        {"truth": [[900.0, 1, 2, 1], [901.0, 1, 2, 1]]},
-        "truth: column t_s is .900.000 to 901.000.; it should be in the time of the recording",
-    ),
+    ({"truth": [[900, 1, 2, 1], [901, 1, 2, 1]]}, "truth: column t_s is .900.000 to 901.000.; it should be in the"),
     ({"lever_arm_m": (1, 2)}, r"lever_arm_m is \(1, 2\); it should be 3 finite numbers"),
     ({"lever_arm_m": (1, 2, 3)}, "lever_arm_m is .*; it should be left out: it moves the truth, which truth must give"),
     ({"tag_height_m": "high"}, "tag_height_m is 'high'; it should be metres, truth, free or auto"),
@@ -451,19 +445,11 @@ PLAN = [
 
 
 @pytest.mark.parametrize(
-    "arguments",
-    [
-        {"noise_ps": 50.0},
-        {"search_s": 3.0},
-        {"verify_rounds": 200},
-        {"seed": 2},
-        {"optimise": 4},
-    ],
-    ids=str,
+    ("name", "value"), [("noise_ps", 50.0), ("search_s", 3.0), ("verify_rounds", 200), ("seed", 2), ("optimise", 4)]
 )
-def test_what_has_no_effect_on_a_plan_of_beacons_is_refused(arguments):
-    with pytest.raises(skyless.SkylessError, match=f"{next(iter(arguments))} is .*; it should be left out: errors are"):
-        skyless.plan(grid_site(100.0, 90.0, 10.0, 4.0, 1.2), **arguments)
+def test_what_has_no_effect_on_a_plan_of_beacons_is_refused(name, value):
+    with pytest.raises(skyless.SkylessError, match=f"{name} is .*; it should be left out: errors are"):
+        skyless.plan(grid_site(100.0, 90.0, 10.0, 4.0, 1.2), **{name: value})
 
 
 @pytest.mark.parametrize(("arguments", "right"), PLAN, ids=[str(sorted(given)) for given, _ in PLAN])
@@ -500,11 +486,12 @@ def test_mistakes_of_a_survey_are_named(folder, arguments, right):
     refused(right, skyless.survey_site, {"recording": folder / "tdoa-table"} | arguments)
 
 
-def test_a_lever_arm_without_a_truth_to_move_is_refused(folder, capsys):
+def test_a_lever_arm_without_a_truth_to_move_is_refused(folder, complaint):
     with pytest.raises(skyless.SkylessError, match=r"lever_arm_m is .*; it should be left out: it moves the truth"):
         skyless.calibrate(folder / "stay.mcap", recorded_truth=True, lever_arm_m=(0.0, 0.0, 0.1))
-    assert main(["calibrate", str(folder / "stay.mcap"), "--recorded-truth", "--lever-arm", "0,0,0.1"]) == 2
-    assert "--lever-arm is (0.0, 0.0, 0.1); it should be left out" in capsys.readouterr().err
+    assert "--lever-arm is (0.0, 0.0, 0.1); it should be left out" in complaint(
+        "calibrate", folder / "stay.mcap", "--recorded-truth", "--lever-arm", "0,0,0.1"
+    )
 
 
 STUDY = [

@@ -39,19 +39,11 @@ def shown(site, capsys):
     return json.loads(capsys.readouterr().out)
 
 
-def refused(arguments, capsys, words):
-    capsys.readouterr()
-    assert main(["site", "keys", *map(str, arguments)]) == 2
-    error = capsys.readouterr().err
-    assert words in error
-    assert error.count("\n") == 1, error
-
-
 def contents(folder):
     return {file.name: file.read_bytes() for file in folder.iterdir()}
 
 
-def test_new_makes_everything_and_overwrites_nothing(site, keys, capsys):
+def test_new_makes_everything_and_overwrites_nothing(site, keys, complaint):
     assert sorted(contents(keys)) == ["chain-1.public", "chain-1.seed", "site.private", "site.public"]
     modes = {file.name: file.stat().st_mode & 0o777 for file in (keys, *keys.iterdir())}
     assert modes["site.private"] == modes["chain-1.seed"] == 0o600
@@ -62,10 +54,10 @@ def test_new_makes_everything_and_overwrites_nothing(site, keys, capsys):
     now = chain.timing.interval_at(time.time())
     assert chain.holds(now)
     before = contents(keys)
-    refused(["new", site, *SHORT], capsys, "holds keys already")
+    assert "holds keys already" in complaint("site", "keys", "new", site, *SHORT)
     (keys / "site.private").unlink()
     (keys / "site.public").unlink()
-    refused(["new", site, *SHORT], capsys, "holds keys already")
+    assert "holds keys already" in complaint("site", "keys", "new", site, *SHORT)
     assert before.items() >= contents(keys).items()
 
 
@@ -126,29 +118,31 @@ def test_new_may_begin_later(site, tmp_path, capsys):
         ("0001-01-01T00:00+14:00", "--starts is"),
     ],
 )
-def test_a_wrong_time_is_refused_before_anything_is_made(site, keys, capsys, starts, words):
+def test_a_wrong_time_is_refused_before_anything_is_made(site, keys, complaint, starts, words):
     before = contents(keys)
-    refused(["rotate", site, "--starts", starts], capsys, words)
+    assert words in complaint("site", "keys", "rotate", site, "--starts", starts)
     assert contents(keys) == before
 
 
-def test_wrong_input_is_one_line(site, keys, tmp_path, capsys):
+def test_wrong_input_is_one_line(site, keys, tmp_path, complaint):
     lab = tmp_path / "lab.toml"
     assert main(["site", "new", str(lab), "--paper"]) == 0
-    refused(["new", lab], capsys, 'schedule.mode is "master", whose beacons carry no codes; it should be free')
-    refused(["show", site, "--keys", tmp_path / "none"], capsys, "none is no folder")
-    refused(["new", site, "--keys", lab], capsys, "is no folder; --keys should name a folder to make")
-    refused(["new", tmp_path / "missing.toml"], capsys, "missing.toml")
-    refused(["new", site, "--years", "0"], capsys, "--years")
+    assert 'schedule.mode is "master", whose beacons carry no codes; it should be free' in complaint(
+        "site", "keys", "new", lab
+    )
+    assert "none is no folder" in complaint("site", "keys", "show", site, "--keys", tmp_path / "none")
+    assert "is no folder; --keys should name a folder to make" in complaint("site", "keys", "new", site, "--keys", lab)
+    assert "missing.toml" in complaint("site", "keys", "new", tmp_path / "missing.toml")
+    assert "--years" in complaint("site", "keys", "new", site, "--years", "0")
     other = tmp_path / "other.toml"
     other.write_text((tmp_path / "hall.toml").read_text().replace("id = 300", "id = 301"))
     for command in ("rotate", "revoke", "show"):
-        refused([command, other], capsys, "is of site 300; it should be of site 301")
+        assert "is of site 300; it should be of site 301" in complaint("site", "keys", command, other)
     (keys / "site.private").rename(tmp_path / "elsewhere")
     for command in ("rotate", "revoke"):
-        refused([command, site], capsys, "site.private is missing")
+        assert "site.private is missing" in complaint("site", "keys", command, site)
     (keys / "chain-1.public").unlink()
-    refused(["show", site], capsys, "holds no chain-N.public")
+    assert "holds no chain-N.public" in complaint("site", "keys", "show", site)
 
 
 @pytest.mark.statistical

@@ -20,23 +20,12 @@ from skyless.core.keys.fault import Fault
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, from_seconds, wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.sim.evaluation.scenarios import Request
+from support import keyed_air
 from support.adversary import FORGERIES, Adversary, any_forgery
-from support.keyed_air import (
-    START_UNIX_S,
-    Attack,
-    AttackedAir,
-    Received,
-    compare,
-    delayed,
-    errors_m,
-    key_of,
-    made_keys,
-    run_tag,
-)
 
 pytestmark = pytest.mark.statistical
 
-KEYS = made_keys(FREE.id, -60.0)
+KEYS = keyed_air.made_keys(FREE.id, -60.0)
 VERIFIED = SiteTrust(FREE.id, KEYS.public, trust=Trust.VERIFIED)
 OPEN = replace(VERIFIED, trust=Trust.OPEN)
 ATTACK_FROM_S = 0.7
@@ -71,8 +60,8 @@ RIGHT_REASONS = {
 @lru_cache(maxsize=64)
 def air_of(forgery=None, rate_hz=477.0, is_noise=False, until_s=SECONDS):
     """What the tag receives, and the anchors, after an attack."""
-    attack = None if forgery is None else Attack(forgery, rate_hz, ATTACK_FROM_S, is_noise)
-    air = AttackedAir(Request(FREE), KEYS, attack)
+    attack = None if forgery is None else keyed_air.Attack(forgery, rate_hz, ATTACK_FROM_S, is_noise)
+    air = keyed_air.AttackedAir(Request(FREE), KEYS, attack)
     return tuple(air.run(until_s)), air
 
 
@@ -84,8 +73,8 @@ def genuine_of(tape):
 def test_no_forged_frame_moves_a_verified_fix_or_an_anchor(name):
     tape, air = air_of(FORGERIES[name])
     noise, _ = air_of(FORGERIES[name], is_noise=True)
-    run, expected = run_tag(tape, VERIFIED), run_tag(noise, VERIFIED)
-    found = compare(run, tape, FREE.id)
+    run, expected = keyed_air.run_tag(tape, VERIFIED), keyed_air.run_tag(noise, VERIFIED)
+    found = keyed_air.compare(run, tape, FREE.id)
     in_time = [one for one in expected.given if one.given_s < SECONDS - AHEAD_S]
     assert len(in_time) > 200
     assert (found.moved, found.most_moved_m, found.refused) == (0, 0.0, 0)
@@ -106,8 +95,8 @@ def test_a_tag_that_is_switched_on_in_an_attack(name):
     forgery = FORGERIES.get(name, any_forgery)
     tape, air = air_of(forgery)
     later = [one for one in tape if one.reception.host_s > SWITCHED_ON_S]
-    run = run_tag(later, VERIFIED)
-    found = compare(run, later, FREE.id)
+    run = keyed_air.run_tag(later, VERIFIED)
+    found = keyed_air.compare(run, later, FREE.id)
     assert found.fixes > 40
     assert run.given[0].given_s < SWITCHED_ON_S + 0.7 + AHEAD_S  # two intervals and the lag
     assert (found.moved, found.forged) == (0, 0)
@@ -120,7 +109,10 @@ def test_an_open_tag_is_soon_back(rate_hz):
     """Up to a key, which comes at most 0.6 s later, forged frames count; then few do, or verified ones only."""
     tape, _ = air_of(FORGERIES["false-measurement"], rate_hz, False, OPEN_SECONDS)
     noise, _ = air_of(FORGERIES["false-measurement"], rate_hz, True, OPEN_SECONDS)
-    found, expected = errors_m(run_tag(tape, OPEN), tape), errors_m(run_tag(noise, OPEN), noise)
+    found, expected = (
+        keyed_air.errors_m(keyed_air.run_tag(tape, OPEN), tape),
+        keyed_air.errors_m(keyed_air.run_tag(noise, OPEN), noise),
+    )
     after = found[found[:, 0] > ATTACK_FROM_S + 0.8]
     assert len(after) > 50
     assert after[:, 1].max() < expected[expected[:, 0] > 0.4][:, 1].max() + 0.2
@@ -134,8 +126,8 @@ def test_forged_frames_cost_an_open_tag_hardly_more_fixes_than_noise(name, rate_
     fixes = []
     for attack in ((None, 0.0, False), (FORGERIES[name], rate_hz, True), (FORGERIES[name], rate_hz, False)):
         tape, _ = air_of(*attack, OPEN_SECONDS)
-        received_s = {key_of(one.reception): one.reception.host_s for one in tape}
-        given_s = [received_s[one.key] for one in run_tag(tape, OPEN).given]
+        received_s = {keyed_air.key_of(one.reception): one.reception.host_s for one in tape}
+        given_s = [received_s[one.key] for one in keyed_air.run_tag(tape, OPEN).given]
         assert given_s == sorted(set(given_s))
         fixes.append(sum(ATTACK_FROM_S < each_s < OPEN_SECONDS - 0.6 for each_s in given_s))
     clean, noise, forged = fixes
@@ -151,7 +143,7 @@ def genuine_tape():
 @lru_cache(maxsize=1)
 def forged_frames():
     """Forged frames of all kinds, with the time for which each was made, and all genuine ones that were on the air."""
-    air = AttackedAir(Request(FREE), KEYS)
+    air = keyed_air.AttackedAir(Request(FREE), KEYS)
     adversary, made, genuine = air.adversary, [], set()
     for one in air.run(SECONDS):
         now_s = one.reception.host_s
@@ -163,7 +155,7 @@ def forged_frames():
     return tuple(made), frozenset(genuine)
 
 
-def received_at(frame, near: Received, host_s):
+def received_at(frame, near: keyed_air.Received, host_s):
     """A frame that a tag receives some time after another one."""
     later = from_seconds(host_s - near.reception.host_s)
     return replace(near, is_genuine=False, reception=Reception(frame, wrap(near.reception.rx_ticks + later), host_s))
@@ -193,7 +185,7 @@ def test_any_mix_gives_the_fixes_of_the_genuine_frames(seed, losses, additions):
                 frame = bytes(altered)
         mixed.append(received_at(frame, kept[at], host_s))
     mixed.sort(key=lambda one: one.reception.host_s)
-    found = compare(run_tag(mixed, VERIFIED), mixed, FREE.id)
+    found = keyed_air.compare(keyed_air.run_tag(mixed, VERIFIED), mixed, FREE.id)
     assert (found.moved, found.forged) == (0, 0)
     assert found.fixes > 100
 
@@ -203,8 +195,8 @@ def test_any_mix_gives_the_fixes_of_the_genuine_frames(seed, losses, additions):
 def test_frames_that_come_when_their_key_is_known_are_refused(later_s, every):
     tape = genuine_tape()
     chosen = {one.reception.frame for one in tape[::every]}
-    mixed = delayed(tape, lambda one: later_s if one.reception.frame in chosen else 0.0)
-    run = run_tag([replace(one, is_genuine=one.reception.frame not in chosen) for one in mixed], VERIFIED)
+    mixed = keyed_air.delayed(tape, lambda one: later_s if one.reception.frame in chosen else 0.0)
+    run = keyed_air.run_tag([replace(one, is_genuine=one.reception.frame not in chosen) for one in mixed], VERIFIED)
     assert not chosen & {frame for _, frame in run.accepted}
     assert run.counters[Fault.LATE] > 0
     if every > 1:
@@ -214,8 +206,8 @@ def test_frames_that_come_when_their_key_is_known_are_refused(later_s, every):
 def test_a_delay_that_grows_slowly_is_not_found_by_codes():
     """It is what codes cannot show; the protection level or an alert may."""
     tape = genuine_tape()
-    slowly = delayed(tape, lambda one: 0.25 * one.reception.host_s / SPEED_OF_LIGHT_MPS)
-    run = run_tag(slowly, VERIFIED)
+    slowly = keyed_air.delayed(tape, lambda one: 0.25 * one.reception.host_s / SPEED_OF_LIGHT_MPS)
+    run = keyed_air.run_tag(slowly, VERIFIED)
     assert len(run.accepted) > 0.7 * len(tape)
     assert not run.counters
 
@@ -238,7 +230,7 @@ def test_anchors_admit_no_forged_frame():
     admitted = 0
     for one in tape:
         host_s = one.reception.host_s
-        authentication.set_time(one.reception.rx_ticks, START_UNIX_S + host_s)
+        authentication.set_time(one.reception.rx_ticks, keyed_air.START_UNIX_S + host_s)
         anchor.hear(one.reception)
         while next_s is not None and next_s <= host_s:
             heard = counters["heard"]
@@ -254,7 +246,7 @@ def test_anchors_admit_no_forged_frame():
 def test_the_attacker_knows_only_what_was_disclosed():
     """Else the attacks would be none: it learns keys from the air alone, each when its lag has passed."""
     tape, air = genuine_tape(), air_of()[1]
-    adversary = Adversary(START_UNIX_S, 1, np.zeros(3))
+    adversary = Adversary(keyed_air.START_UNIX_S, 1, np.zeros(3))
     for one in tape:
         adversary.overhear(one.reception.frame, one.reception.host_s)
         present = adversary.interval_at(one.reception.host_s)

@@ -7,40 +7,35 @@ from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from skyless.core.keys import chain as chains
 from skyless.core.keys import known_keys
-from skyless.core.keys.chain import (
-    SECTION_BITS,
-    SECTION_INTERVALS,
-    Chain,
-    ChainKeys,
-    ChainTiming,
-    earlier_key,
-    public_key,
-    read_certificate,
-    section_signatures,
-)
 from skyless.core.keys.fault import Fault
 from skyless.core.keys.known_keys import SILENCE_TICKS, Arrivals, KeyUse, KnownKeys, Stamps
 from skyless.core.ticks import MAX_DRIFT, from_seconds, wrap
 
 SITE = 42
-TIMING = ChainTiming()
+TIMING = chains.ChainTiming()
 SECTION = 2_197_265
-FIRST = SECTION << SECTION_BITS
+FIRST = SECTION << chains.SECTION_BITS
 PRIVATE = Ed25519PrivateKey.from_private_bytes(bytes(range(32)))
-PUBLIC = public_key(PRIVATE.public_key().public_bytes_raw())
+PUBLIC = chains.public_key(PRIVATE.public_key().public_bytes_raw())
 
 
 def chain(serial=1, first=FIRST, sections=2, site=SITE, private=PRIVATE):
-    covered = range(first >> SECTION_BITS, (first >> SECTION_BITS) + sections)
+    covered = range(first >> chains.SECTION_BITS, (first >> chains.SECTION_BITS) + sections)
     seed = bytes((serial,)) * 32
-    return Chain(
-        site, serial, TIMING, first, section_signatures(seed, site, serial, TIMING, first, covered, private), seed
+    return chains.Chain(
+        site,
+        serial,
+        TIMING,
+        first,
+        chains.section_signatures(seed, site, serial, TIMING, first, covered, private),
+        seed,
     )
 
 
 CHAIN = chain()
-KEYS = ChainKeys(CHAIN)
+KEYS = chains.ChainKeys(CHAIN)
 SENT = KEYS.certificate(FIRST)
 
 
@@ -71,7 +66,7 @@ def test_any_bytes_are_a_forged_certificate(sent):
 
 def test_certificates_of_other_sites_and_owners_are_forged():
     for other in (chain(site=43), chain(private=Ed25519PrivateKey.generate())):
-        sent = ChainKeys(other).certificate(FIRST)
+        sent = chains.ChainKeys(other).certificate(FIRST)
         assert KnownKeys(SITE, PUBLIC).on_certificate(sent, at_s(FIRST)) is KeyUse.FORGED
 
 
@@ -109,7 +104,7 @@ def count_steps(monkeypatch, module):
 
     def counted(key, name, number=1):
         steps.append(number)
-        return earlier_key(key, name, number)
+        return chains.earlier_key(key, name, number)
 
     monkeypatch.setattr(module, "earlier_key", counted)
     return steps
@@ -117,7 +112,7 @@ def count_steps(monkeypatch, module):
 
 def test_forged_keys_far_ahead_cost_a_bounded_number_of_steps(monkeypatch):
     steps = count_steps(monkeypatch, known_keys)
-    made, interval = known(), FIRST + SECTION_INTERVALS - 1
+    made, interval = known(), FIRST + chains.SECTION_INTERVALS - 1
     for number in range(1000):  # within a second
         made.on_key(secrets.token_bytes(16), interval, at_s(FIRST) + 1e-3 * number, 1)
     assert sum(steps) <= known_keys.MAX_STEPS + known_keys.STEPS_PER_S
@@ -143,12 +138,12 @@ def test_forged_certificates_cost_a_bounded_number_of_checks():
 
 
 def test_the_next_section_and_the_next_chain_go_on():
-    made, last = known(), FIRST + SECTION_INTERVALS - 1
+    made, last = known(), FIRST + chains.SECTION_INTERVALS - 1
     assert made.on_certificate(KEYS.certificate(last + 1), at_s(last)) is KeyUse.NEW
     for interval in (last, last + 1, last + 5):
         assert made.on_key(KEYS.key(interval), interval, at_s(last), 1) is KeyUse.NEW
         assert made.mac_key(interval) == KEYS.mac_key(interval)
-    second = ChainKeys(chain(serial=2, first=last + 100, sections=2))
+    second = chains.ChainKeys(chain(serial=2, first=last + 100, sections=2))
     assert made.on_certificate(second.certificate(last + 100), at_s(last)) is KeyUse.NEW
     assert made.serial == 1  # it does not count yet
     assert made.on_key(KEYS.key(last + 99), last + 99, at_s(last), 1) is KeyUse.NEW
@@ -162,12 +157,12 @@ def test_the_next_section_and_the_next_chain_go_on():
 
 def test_old_certificates_make_way():
     made = KnownKeys(SITE, PUBLIC)
-    long = ChainKeys(chain(sections=12))
+    long = chains.ChainKeys(chain(sections=12))
     for section in range(12):
-        interval = FIRST + section * SECTION_INTERVALS
+        interval = FIRST + section * chains.SECTION_INTERVALS
         assert made.on_certificate(long.certificate(interval), at_s(interval)) is KeyUse.NEW
         assert len(made.certificates) <= known_keys.MAX_CERTIFICATES
-        assert read_certificate(SITE, made.certificates[-1])[0].name.section == SECTION + section
+        assert chains.read_certificate(SITE, made.certificates[-1])[0].name.section == SECTION + section
         assert made.on_key(long.key(interval), interval, at_s(interval), 1) is KeyUse.NEW
 
 

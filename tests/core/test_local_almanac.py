@@ -5,19 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import asdict, replace
 
+from skyless.core.air import site_pages
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SitePage
 from skyless.core.air.beacon import Beacon, StatedPosition, fields_of
 from skyless.core.air.neighbours import PRESENT_TICKS, Neighbours, find_neighbour, neighbour_of
-from skyless.core.air.site_pages import (
-    MAX_NOISE,
-    SAME_PAGES,
-    LocalAlmanac,
-    SitePages,
-    decode_page,
-    encode_page,
-    note_page,
-    site_issue,
-)
 from skyless.core.anchor import site_page_for, site_pages_of
 from skyless.core.clock_filter import clock_noise, stamp_variances_m2
 from skyless.core.estimator.settings import EstimatorSettings
@@ -29,8 +20,8 @@ from skyless.core.ticks import from_seconds
 from skyless.sim.lab import lab_site
 
 SITE = replace(lab_site(), schedule=replace(lab_site().schedule, mode="free"))
-PAGES = tuple(decode_page(encode_page(one)) for one in site_pages_of(SITE))
-ISSUE = site_issue(PAGES)
+PAGES = tuple(site_pages.decode_page(site_pages.encode_page(one)) for one in site_pages_of(SITE))
+ISSUE = site_pages.site_issue(PAGES)
 STEP = from_seconds(0.005)
 
 
@@ -43,7 +34,7 @@ def beacon(anchor, page=None, issue=ISSUE, position=HERE):
 
 def rotation(count, anchors=(1, 2, 3), pages=PAGES):
     """Beacons of some anchors, one after the other, with the pages of their turns."""
-    issue = site_issue(pages)
+    issue = site_pages.site_issue(pages)
     for n in range(count):
         anchor = anchors[n % len(anchors)]
         yield beacon(anchor, site_page_for(pages, n // len(anchors), anchor), issue)
@@ -54,8 +45,8 @@ class Tag:
 
     def __init__(self):
         self.neighbours = Neighbours()
-        self.pages = SitePages()
-        self.almanac = LocalAlmanac(self.pages, self.neighbours)
+        self.pages = site_pages.SitePages()
+        self.almanac = site_pages.LocalAlmanac(self.pages, self.neighbours)
 
     def hear(self, one, rx_ticks, is_confirmed=True):
         t, fields = self.neighbours, fields_of(one)
@@ -67,8 +58,8 @@ class Tag:
             n.relayed_ticks = rx_ticks
         if fields.has_place:
             keep_place(n, fields.place)
-        frame = b"" if one.page is None else b"\0" + encode_page(one.page)
-        return note_page(self.pages, t, frame, 1 if frame else 0, rx_ticks) != SAME_PAGES
+        frame = b"" if one.page is None else b"\0" + site_pages.encode_page(one.page)
+        return site_pages.note_page(self.pages, t, frame, 1 if frame else 0, rx_ticks) != site_pages.SAME_PAGES
 
     def run(self, beacons, is_confirmed=True, start=0):
         return [self.hear(one, start + n * STEP, is_confirmed) for n, one in enumerate(beacons)]
@@ -158,8 +149,8 @@ def test_memory_is_bounded_whatever_comes(rows):
 
 
 def test_the_issue_does_not_depend_on_the_order_of_the_pages():
-    assert site_issue(reversed(PAGES)) == ISSUE
-    assert site_issue((*PAGES[:-1], replace(PAGES[-1], tag_height_m=0.5))) != ISSUE
+    assert site_pages.site_issue(reversed(PAGES)) == ISSUE
+    assert site_pages.site_issue((*PAGES[:-1], replace(PAGES[-1], tag_height_m=0.5))) != ISSUE
 
 
 @pytest.mark.site
@@ -181,11 +172,12 @@ def test_strangers_do_not_displace_anchors_that_others_have_received(tag):
 
 
 @given(
-    st.lists(st.floats(0.0, MAX_NOISE), min_size=4, max_size=4), st.lists(st.integers(1, 65535), min_size=6, max_size=6)
+    st.lists(st.floats(0.0, site_pages.MAX_NOISE), min_size=4, max_size=4),
+    st.lists(st.integers(1, 65535), min_size=6, max_size=6),
 )
 def test_settings_from_the_bytes_of_pages_are_those_from_their_figures(figures, steps):
-    pages = encode_page(NoisePage(*figures)), struct.pack("<B6H4x", 5, *steps)
-    noise, accuracy = map(decode_page, pages)
+    pages = site_pages.encode_page(NoisePage(*figures)), struct.pack("<B6H4x", 5, *steps)
+    noise, accuracy = map(site_pages.decode_page, pages)
     expected = EstimatorSettings(**asdict(accuracy))
     expected.tx_variance_m2, expected.rx_variance_m2 = stamp_variances_m2(noise.tx_stamp_s, noise.rx_stamp_s)
     oscillator = clock_noise(noise.white_fm, noise.random_walk_fm)

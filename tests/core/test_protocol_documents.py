@@ -7,19 +7,8 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from skyless.core.air import beacon
 from skyless.core.air.almanac import LONGEST_PERIOD_CODE, OFFERED_HZ, SHORTEST_PERIOD_S, AnchorPage, period_ticks
-from skyless.core.air.beacon import (
-    HAS_AUTHENTICATION,
-    HAS_CERTIFICATE,
-    HAS_PAGE,
-    HAS_PHASES,
-    HAS_POSITION,
-    RESERVED_FLAGS,
-    Beacon,
-    decode,
-    encode,
-    heard_capacity,
-)
 from skyless.core.air.frame import Heard, Malformed, PackedHeard, air_time_s
 from skyless.core.air.site_pages import MIN_ANCHORS
 from skyless.core.native.records import MAX_ANCHORS_IN_USE, MAX_NEIGHBOURS, MAX_PAGES, MAX_SENDERS
@@ -46,7 +35,7 @@ class Document:
 
 
 FIRST = Document("protocol.md", protocol1.Beacon, (protocol1.decode, protocol1.encode), 24)
-SECOND = Document("protocol2.md", Beacon, (decode, encode), 20)
+SECOND = Document("protocol2.md", beacon.Beacon, (beacon.decode, beacon.encode), 20)
 each_document = pytest.mark.parametrize("document", [FIRST, SECOND], ids=["protocol 1", "protocol 2"])
 
 
@@ -109,16 +98,16 @@ def test_rotation_formula_of_the_document():
 
 
 def test_length_and_air_time_of_the_table():
-    entries = heard_capacity(position=True)
+    entries = beacon.heard_capacity(position=True)
     longest = 53 + 8 * entries
     assert f"| 53 | {entries} | {longest} | {1e6 * air_time_s(longest):.0f} µs |" in SECOND.text
 
 
 def test_flags_of_the_document():
     stated = {int(flag, 16) for flag in re.findall(r"\*flag (0x[0-9A-F]+)\*", SECOND.text)}
-    flags = {HAS_POSITION, HAS_PAGE, HAS_AUTHENTICATION, HAS_CERTIFICATE, HAS_PHASES}
+    flags = {beacon.HAS_POSITION, beacon.HAS_PAGE, beacon.HAS_AUTHENTICATION, beacon.HAS_CERTIFICATE, beacon.HAS_PHASES}
     assert stated == flags
-    assert sum(flags) == 0xFF & ~RESERVED_FLAGS
+    assert sum(flags) == 0xFF & ~beacon.RESERVED_FLAGS
 
 
 def test_the_entry_with_a_phase_of_the_document():

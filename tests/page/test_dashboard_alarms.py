@@ -8,15 +8,7 @@ from msgspec.structs import replace
 from skyless.core.site import AlarmRule
 from skyless.page._alarms import KEPT_WAIT_S, MAX_SENT, NoAlarmError
 from skyless.page.live import LiveSite
-from skyless.run.mqtt import topics
-from skyless.run.mqtt.messages import (
-    AcknowledgeMessage,
-    AlarmMessage,
-    AlarmRulesMessage,
-    Asset,
-    WrongMessageError,
-    ZonesMessage,
-)
+from skyless.run.mqtt import messages, topics
 from skyless.site.alarm_rules import BadAlarmRulesError
 
 RULE = AlarmRule("r", "inside", zone=SQUARE.id, clear_after_s=0.0)
@@ -33,7 +25,7 @@ class Broker:
         self.happened = []
         self.dashboards = {}
         self.publish(topics.site_topic(SITE_ID), replace(SITE, alarms=(FILE_RULE,)), retain=True)
-        self.publish(topics.zones_topic(SITE_ID), ZonesMessage((SQUARE,), SITE.site.name), retain=True)
+        self.publish(topics.zones_topic(SITE_ID), messages.ZonesMessage((SQUARE,), SITE.site.name), retain=True)
 
     def publish(self, topic, message, *, retain=False):
         payload = message if isinstance(message, bytes) else msgspec.json.encode(message)
@@ -42,7 +34,7 @@ class Broker:
             if payload:
                 self.kept[topic] = payload
         if "/alarm/" in topic and topic.endswith("/state") and payload:
-            self.happened.append(msgspec.json.decode(payload, type=AlarmMessage))
+            self.happened.append(msgspec.json.decode(payload, type=messages.AlarmMessage))
         for live, wire in list(self.dashboards.values()):
             if live.connected:
                 wire.deliver(topic, payload)
@@ -89,7 +81,7 @@ class Broker:
 
     def alarm(self, subject="t1"):
         payload = self.kept.get(topics.alarm_topic(SITE_ID, "r", subject))
-        return None if payload is None else msgspec.json.decode(payload, type=AlarmMessage)
+        return None if payload is None else msgspec.json.decode(payload, type=messages.AlarmMessage)
 
     @property
     def raised(self):
@@ -102,7 +94,7 @@ IN, OUT = (2.0, 2.0), (8.0, 8.0)
 @pytest.fixture
 def broker():
     broker = Broker()
-    rules = AlarmRulesMessage((RULE,), SITE.site.name)
+    rules = messages.AlarmRulesMessage((RULE,), SITE.site.name)
     broker.publish(topics.alarm_rules_topic(SITE_ID), rules, retain=True)
     return broker
 
@@ -220,7 +212,7 @@ def test_an_acknowledgement_that_the_first_did_not_publish_is_published_by_the_n
     alarm = broker.alarm()
     broker.dashboards["a"][0].connected = False  # it hears nothing any more
     broker.publish(
-        topics.acknowledge_topic(SITE_ID, "r", "t1"), AcknowledgeMessage(alarm.id, "Ada", broker.times.unix_s)
+        topics.acknowledge_topic(SITE_ID, "r", "t1"), messages.AcknowledgeMessage(alarm.id, "Ada", broker.times.unix_s)
     )
     broker.end("a")
     broker.run(3.0, place)
@@ -237,17 +229,17 @@ def test_rules_of_the_page_are_stored_checked_and_sent(broker):
     new = AlarmRule("quiet", "silent", after_s=5.0)
     live.alarms.store_rules([RULE, new], SITE.site.name)
     broker.run(0.2)
-    kept = msgspec.json.decode(broker.kept[topics.alarm_rules_topic(SITE_ID)], type=AlarmRulesMessage)
-    assert kept == AlarmRulesMessage((RULE, new), SITE.site.name)
+    kept = msgspec.json.decode(broker.kept[topics.alarm_rules_topic(SITE_ID)], type=messages.AlarmRulesMessage)
+    assert kept == messages.AlarmRulesMessage((RULE, new), SITE.site.name)
     assert live.alarms.engine.rules == (FILE_RULE, RULE, new)
     for rules, site, words in (
         ([AlarmRule("file", "anchor-moved")], "", "no other rule"),
         ([AlarmRule("x", "silent")], "", "after_s"),
         ([], "elsewhere", "which is shown now"),
     ):
-        with pytest.raises((BadAlarmRulesError, WrongMessageError), match=words):
+        with pytest.raises((BadAlarmRulesError, messages.WrongMessageError), match=words):
             live.alarms.store_rules(rules, site)
-    broker.publish(topics.alarm_rules_topic(SITE_ID), AlarmRulesMessage((new,), "another site"), retain=True)
+    broker.publish(topics.alarm_rules_topic(SITE_ID), messages.AlarmRulesMessage((new,), "another site"), retain=True)
     broker.run(0.2)
     assert live.alarms.rules == ()
 
@@ -255,7 +247,9 @@ def test_rules_of_the_page_are_stored_checked_and_sent(broker):
 def test_pages_are_sent_the_newest_and_those_that_nobody_has_seen_first(live, wire):
     for k in range(MAX_SENT + 7):
         seen = 5.0 if k % 2 else None
-        one = AlarmMessage(f"r/t{k}/{k}", "r", "r", "inside", "info", f"t{k}", k, k, "", acknowledged_unix_s=seen)
+        one = messages.AlarmMessage(
+            f"r/t{k}/{k}", "r", "r", "inside", "info", f"t{k}", k, k, "", acknowledged_unix_s=seen
+        )
         wire.deliver(topics.alarm_topic(SITE_ID, "r", f"t{k}"), one)
     message = of("alarms", drained(live))[0]
     assert (len(message["alarms"]), message["more"]) == (MAX_SENT, 7)
@@ -267,6 +261,6 @@ def test_pages_are_sent_the_newest_and_those_that_nobody_has_seen_first(live, wi
 
 def test_alarms_name_assets(broker):
     live = broker.start("a")
-    live.assets.store((Asset("t1", name="Ada"),))
+    live.assets.store((messages.Asset("t1", name="Ada"),))
     broker.run(4.0, IN)
     assert broker.alarm().sentence.startswith("Ada (t1) has been in Desk for ")

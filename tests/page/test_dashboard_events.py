@@ -10,14 +10,7 @@ from test_dashboard_condition import anchor_health
 
 from skyless.page.events import ALERT_INTERVAL_S, MAX_LOGGED, TAKEOVER_S, EventLog, EventQueue, Kept, publisher_rank
 from skyless.run.condition.monitor import Condition, Reason
-from skyless.run.mqtt.messages import (
-    SurveyMessage,
-    WatchFinding,
-    WatchMessage,
-    WrongMessageError,
-    ZoneEvent,
-    ZonesMessage,
-)
+from skyless.run.mqtt import messages
 from skyless.run.site_table import THRESHOLDS, SiteTable
 from skyless.run.zones import read_zones
 from skyless.site.survey.facts import Facts
@@ -167,15 +160,15 @@ def test_alerts_begin_and_end_and_are_not_repeated_often():
 
 def test_findings_of_the_watch_begin_and_end():
     log = Log()
-    moved = WatchFinding("moved", (4,), 0.11, 0.01, 1.0, "anchor 4 has moved by about 11 cm.")
+    moved = messages.WatchFinding("moved", (4,), 0.11, 0.01, 1.0, "anchor 4 has moved by about 11 cm.")
     for k, findings in enumerate(((), (moved,), (replace(moved, size_m=0.12),), ())):
-        log.on_watch(WatchMessage(1.0, "watching", findings, 15), NOW + k)
+        log.on_watch(messages.WatchMessage(1.0, "watching", findings, 15), NOW + k)
     assert texts(log) == ["anchor 4 has moved by about 11 cm", "no longer found: anchor 4 has moved by about 11 cm"]
 
 
 def test_a_saved_survey_is_an_event_once():
     log = Log()
-    survey = SurveyMessage(1.0, 12, (1,), (), 1.0, (), Facts(), None, by="x")
+    survey = messages.SurveyMessage(1.0, 12, (1,), (), 1.0, (), Facts(), None, by="x")
     for saved in (None, 11, 11, 12):
         log.on_survey(replace(survey, saved_serial=saved, file="hall.toml"), NOW)
     log.on_survey(replace(survey, saved_serial=3, by="another"), NOW)
@@ -218,11 +211,11 @@ def test_the_newest_are_kept():
     assert log.events[-1].serial == log.serial
 
 
-MINE, THEIRS = (ZonesMessage((replace(SQUARE, id=name),)) for name in ("mine", "theirs"))
+MINE, THEIRS = (messages.ZonesMessage((replace(SQUARE, id=name),)) for name in ("mine", "theirs"))
 
 
 def test_a_kept_list_is_what_was_stored_here_until_another_is_stored_after_it():
-    wire, kept = Wire(), Kept(ZonesMessage(()), read_zones)
+    wire, kept = Wire(), Kept(messages.ZonesMessage(()), read_zones)
     kept.store(MINE)
     kept.attach(wire, "zones")
     assert [(topic, qos, retain) for topic, _, qos, retain in wire.published] == [("zones", 1, True)]
@@ -233,19 +226,19 @@ def test_a_kept_list_is_what_was_stored_here_until_another_is_stored_after_it():
 
 
 def test_a_kept_list_that_cannot_be_read_or_is_not_that_of_the_site_shown_is_not_overwritten():
-    kept = Kept(ZonesMessage(()), read_zones)
-    with pytest.raises(WrongMessageError, match="'Lab'; it should be 'Hall'"):
+    kept = Kept(messages.ZonesMessage(()), read_zones)
+    with pytest.raises(messages.WrongMessageError, match="'Lab'; it should be 'Hall'"):
         kept.check_store("Lab", "Hall")
     for payload in (b"{", b'{"zones": [{"id": "/"}]}'):
-        with pytest.raises(WrongMessageError):
+        with pytest.raises(messages.WrongMessageError):
             kept.receive(payload)
-        with pytest.raises(WrongMessageError, match="nothing was overwritten"):
+        with pytest.raises(messages.WrongMessageError, match="nothing was overwritten"):
             kept.check_store("Hall", "Hall")
     kept.receive(b"")
     kept.check_store("Hall", "Hall")
 
 
-EVENT = ZoneEvent("desk", "Desk", "t1", "enter", 1000.0, (1.0, 2.0, 3.0))
+EVENT = messages.ZoneEvent("desk", "Desk", "t1", "enter", 1000.0, (1.0, 2.0, 3.0))
 
 
 def test_the_dashboard_that_is_online_longest_publishes_first():

@@ -23,9 +23,8 @@ def quantised(diagnostics):
 class PlayedRadio:
     """The radio on the board."""
 
-    def __init__(self, name="tag1"):
-        self.name, self.counters, self.ticks = name, Counter(), 5
-        self.transmissions = []
+    def __init__(self, name="tag1", ticks=5):
+        self.name, self.counters, self.ticks, self.transmissions = name, Counter(), ticks, []
 
     def now_ticks(self):
         return self.ticks

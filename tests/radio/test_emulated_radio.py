@@ -61,11 +61,7 @@ async def nodes(port, kind, *names):
 @contextlib.asynccontextmanager
 async def anchor_and_tag(name):
     """An ether, and an anchor and a tag on the air."""
-    async with (
-        OpenAir() as air,
-        nodes(air.port, "anchor", name) as (anchor,),
-        nodes(air.port, "tag", "tag1") as (tag,),
-    ):
+    async with OpenAir() as air, nodes(air.port, "anchor", name) as (anchor,), nodes(air.port, "tag", "tag1") as (tag,):
         await anchor.until(Restarted)
         await tag.until(Restarted)
         yield air, anchor, tag
@@ -89,11 +85,7 @@ async def speak(node, listener):
 
 
 async def test_frames_go_from_radio_to_radio_with_stamps_diagnostics_and_the_time_of_the_host():
-    async with (
-        OpenAir() as air,
-        nodes(air.port, "anchor", "1") as (anchor,),
-        nodes(air.port, "tag", "tag1") as (tag,),
-    ):
+    async with OpenAir() as air, nodes(air.port, "anchor", "1") as (anchor,), nodes(air.port, "tag", "tag1") as (tag,):
         assert anchor.radio.now_ticks() is None
         await anchor.until(Restarted)
         await tag.until(Restarted)

@@ -23,15 +23,7 @@ TABLE = [
 ]
 
 
-def lab_tracking_bound_m(
-    stamp_s,
-    *,
-    random_walk_fm=1e-9,
-    qa=0.5,
-    mesh=False,
-    paths=400,
-    seed=1,
-):
+def lab_tracking_bound_m(stamp_s, *, random_walk_fm=1e-9, qa=0.5, mesh=False, paths=400, seed=1):
     """Root mean square of the posterior bound of the position in the lab at the end of two seconds, in metres.
 
     Tags start in the middle half of the room, each component of their velocity normal with 0.4 m/s, and accelerate

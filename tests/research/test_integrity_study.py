@@ -6,19 +6,8 @@ from scipy.stats import chi2
 
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import TICK_M
+from skyless.research.studies import integrity
 from skyless.research.studies.efficiency import Case, draw_episode
-from skyless.research.studies.integrity import (
-    ALL_FAULTS,
-    FAULT_BURST_S,
-    FAULTS,
-    MAX_LEVEL_RATIO,
-    Chunk,
-    Fault,
-    anchors_of,
-    cells,
-    faulty,
-    rows,
-)
 from skyless.research.studies.picture import CLUSTER_FIXES, clustered_interval
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import plan_of
@@ -32,13 +21,13 @@ PLAN = plan_of("joint", 1, episodes=100)
 
 
 def episode_of(superframes=120):
-    return draw_episode(np.random.default_rng(1), anchors_of("lab"), SLOT_S, Case(mesh=True), superframes)
+    return draw_episode(np.random.default_rng(1), integrity.anchors_of("lab"), SLOT_S, Case(mesh=True), superframes)
 
 
 @pytest.mark.parametrize(("kind", "sign"), [("step", 1.0), ("early", -1.0), ("delay", 1.0)])
 def test_a_fault_changes_what_is_heard_of_its_anchor_from_the_onset_on(kind, sign):
     episode, anchor, onset = episode_of(), 3, 240
-    packets = faulty(episode, Fault("lab", 1.0, kind), anchor, onset, SLOT_S)
+    packets = integrity.faulty(episode, integrity.Fault("lab", 1.0, kind), anchor, onset, SLOT_S)
     late_m = (packets.rx_ticks - episode.packets.rx_ticks) * TICK_M
     touched = (packets.anchors == anchor) & (np.arange(len(late_m)) >= onset)
     assert late_m[touched] == pytest.approx(sign, abs=TICK_M)
@@ -56,12 +45,15 @@ def test_ramps_grow_for_a_second_and_bursts_come_and_go():
 
     def late_m(kind):
         return (
-            (faulty(episode, Fault("lab", 2.0, kind), anchor, onset, SLOT_S).rx_ticks - episode.packets.rx_ticks)
+            (
+                integrity.faulty(episode, integrity.Fault("lab", 2.0, kind), anchor, onset, SLOT_S).rx_ticks
+                - episode.packets.rx_ticks
+            )
             * TICK_M
         )[own]
 
     assert late_m("ramp") == pytest.approx(2.0 * np.clip(since_s, 0.0, 1.0), abs=TICK_M)
-    on = (since_s >= 0.0) & (since_s % (2.0 * FAULT_BURST_S) < FAULT_BURST_S)
+    on = (since_s >= 0.0) & (since_s % (2.0 * integrity.FAULT_BURST_S) < integrity.FAULT_BURST_S)
     assert late_m("bursts") == pytest.approx(np.where(on, 2.0, 0.0), abs=TICK_M)
 
 
@@ -93,21 +85,21 @@ def chunk(misleading, levels_m=(0.1, 0.2)):
     """What 50 episodes of 100 fixes would have found."""
     counts = np.tile([100.0, 90.0, 0.0, 0.0], (50, 1))
     counts[0, 2] = misleading
-    return Chunk(counts, 1.0, levels_m, np.linspace(0.1, 0.8, 100), np.linspace(0.01, 0.1, 100))
+    return integrity.Chunk(counts, 1.0, levels_m, np.linspace(0.1, 0.8, 100), np.linspace(0.01, 0.1, 100))
 
 
 def test_rows_are_what_chunks_tell():
-    results = [chunk(0)] * 2 * len(FAULTS)
+    results = [chunk(0)] * 2 * len(integrity.FAULTS)
     results[2] = chunk(100)  # of the second row
-    found = {row.case: row for row in rows(PLAN, results)}
-    assert len(found) == len(FAULTS) + 1
+    found = {row.case: row for row in integrity.rows(PLAN, results)}
+    assert len(found) == len(integrity.FAULTS) + 1
     clean, step = found["lab, clean"], found["lab, step 0.05 m"]
     assert (clean.runs, clean.fixes, clean.available, clean.hmi, clean.limits[0].most) == (
         100,
         10_000,
         0.9,
         0.0,
-        MAX_LEVEL_RATIO,
+        integrity.MAX_LEVEL_RATIO,
     )
     assert clean.ratio == pytest.approx(1.0 / 0.8, rel=0.01)
     assert clean.passed
@@ -115,15 +107,15 @@ def test_rows_are_what_chunks_tell():
     assert step.hmi_interval[0] < 1e-4 < 0.01 < step.hmi_interval[1]  # one cluster proves little
     assert step.passed
     assert (step.hpl_m, step.vpl_m, found["room, clean"].vpl_m) == (pytest.approx(0.1), None, pytest.approx(0.2))
-    assert found[ALL_FAULTS].hmi == pytest.approx(100 / found[ALL_FAULTS].fixes)
-    assert found[ALL_FAULTS].fixes == 10_000 * (len(FAULTS) - 2)
+    assert found[integrity.ALL_FAULTS].hmi == pytest.approx(100 / found[integrity.ALL_FAULTS].fixes)
+    assert found[integrity.ALL_FAULTS].fixes == 10_000 * (len(integrity.FAULTS) - 2)
 
 
 def test_levels_that_mislead_often_fail():
-    results = [chunk(0)] * 2 * len(FAULTS)
+    results = [chunk(0)] * 2 * len(integrity.FAULTS)
     counts = np.tile([100.0, 90.0, 1.0, 0.0], (50, 1))
-    results[2] = Chunk(counts, 1.0, (0.1, 0.2), results[0].top, results[0].errors_m)
-    failed = [row.case for row in rows(PLAN, results) if not row.passed]
+    results[2] = integrity.Chunk(counts, 1.0, (0.1, 0.2), results[0].top, results[0].errors_m)
+    failed = [row.case for row in integrity.rows(PLAN, results) if not row.passed]
     assert failed == ["lab, step 0.05 m"]
 
 
@@ -131,14 +123,14 @@ def test_levels_that_mislead_often_fail():
 @pytest.mark.statistical
 def test_it_can_be_drawn(levels_m):
     study = STUDIES["integrity"]
-    found = study.rows(PLAN, [chunk(3, levels_m)] * 2 * len(FAULTS))
+    found = study.rows(PLAN, [chunk(3, levels_m)] * 2 * len(integrity.FAULTS))
     assert picture(study.draw(found), "png", 50.0).startswith(b"\x89PNG")
 
 
 def test_cells_carry_what_is_asked():
     asked = plan_of("joint", 1, episodes=60, integrity_risk=1e-3, alert_limit_m=0.5)
-    found = cells(asked)
-    assert len(found) == 2 * len(FAULTS)
+    found = integrity.cells(asked)
+    assert len(found) == 2 * len(integrity.FAULTS)
     asked_of = [cell.function.args for cell in found]
     assert {(setting.risk, setting.alert_limit_m) for setting, _ in asked_of} == {(1e-3, 0.5)}
     assert [len(seeds) for _, seeds in asked_of[:2]] == [50, 10]
@@ -146,7 +138,7 @@ def test_cells_carry_what_is_asked():
 
 @pytest.mark.parametrize("place", ["lab", "room"])
 def test_levels_hold_in_clean_episodes(place):
-    cell = next(cell for cell in cells(plan_of("joint", 1, episodes=3)) if cell.name == f"{place}, clean")
+    cell = next(cell for cell in integrity.cells(plan_of("joint", 1, episodes=3)) if cell.name == f"{place}, clean")
     found = cell.function()
     fixes, promised, across, above = found.counts.T
     assert (fixes > 350).all()
@@ -158,4 +150,4 @@ def test_levels_hold_in_clean_episodes(place):
 
 def test_other_methods_have_no_levels():
     with pytest.raises(SkylessError, match="--method is 'literal'"):
-        cells(plan_of("literal", 1))
+        integrity.cells(plan_of("literal", 1))

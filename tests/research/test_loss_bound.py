@@ -54,11 +54,7 @@ def test_sendings_in_any_order_are_those_of_another_numbering():
     expected = received_bound(LAB_M, PATH_M, settings(True), rows, Sendings(np.tile(np.arange(6), 100), times_s))
     renamed = np.argsort(order)
     found = received_bound(
-        LAB_M[order],
-        PATH_M,
-        settings(True),
-        rows[:, [*order, 6]],
-        Sendings(np.tile(renamed, 100), times_s),
+        LAB_M[order], PATH_M, settings(True), rows[:, [*order, 6]], Sendings(np.tile(renamed, 100), times_s)
     )
     np.testing.assert_allclose(found[-1], expected[-1], rtol=1e-3)
 

@@ -10,7 +10,6 @@ from msgspec.structs import replace
 
 from skyless.cli.main import main
 from skyless.core.alert import Alert
-from skyless.core.errors import SkylessError
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import METHODS
 from skyless.research.replays.site import SiteReplay
@@ -80,23 +79,14 @@ def test_a_replay_from_the_middle_agrees_with_that_of_the_whole(tmp_path, method
         assert np.all(np.abs(cold.position_m - warm.position_m)[:2] < 5.0 * std_m[:2])
 
 
-def test_receivers_states_in_recordings_of_older_versions_are_ignored(tmp_path):
-    path, old = tmp_path / "live.mcap", tmp_path / "old.mcap"
-    said = messages(2.0)
-    record(path, said)
-    start = b'"start":{"serial":812,"state":"gASVBg==",'
-    older = [(s, topic, payload.replace(b'"start":{', start)) for s, topic, payload in said]
-    assert older != said
-    record(old, older)
-    assert [fix.rows for _, fix in replayed_fixes(old)] == [fix.rows for _, fix in replayed_fixes(path)]
-
-
-def test_settings_that_only_older_programs_had_are_ignored(tmp_path):
+@pytest.mark.parametrize(
+    "had", [b'"start":{"serial":812,"state":"gASVBg==",', b'"settings":{"qa":3.0,"max_acceleration_mps2":10.0,']
+)
+def test_states_and_settings_that_only_older_programs_had_are_ignored(tmp_path, had):
     path, old = tmp_path / "new.mcap", tmp_path / "old.mcap"
     said = messages(2.0)
     record(path, said)
-    had = b'"settings":{"qa":3.0,"max_acceleration_mps2":10.0,'
-    older = [(s, topic, payload.replace(b'"settings":{', had)) for s, topic, payload in said]
+    older = [(s, topic, payload.replace(had[: had.index(b"{") + 1], had)) for s, topic, payload in said]
     assert older != said
     record(old, older)
     assert [fix.rows for _, fix in replayed_fixes(old)] == [fix.rows for _, fix in replayed_fixes(path)]
@@ -123,12 +113,9 @@ def test_levels_of_another_risk_are_larger(tmp_path):
 @pytest.mark.parametrize(
     "forged",
     [
-        {"integrity_risk": 0.0},
-        {"integrity_risk": "high"},
-        {"alert_limit_m": -1.0},
-        {"alert_limit_m": "far"},
-        {"method": "rm -rf"},
-        {"method": "tracker"},
+        *({"integrity_risk": risk} for risk in (0.0, "high")),
+        *({"alert_limit_m": limit_m} for limit_m in (-1.0, "far")),
+        *({"method": method} for method in ("rm -rf", "tracker")),
         {"method": 3.5, "site": "x"},
     ],
 )
@@ -136,9 +123,7 @@ def test_settings_that_nobody_can_ask_for_are_counted(tmp_path, forged):
     path = tmp_path / "forged.mcap"
 
     def forge(_, m):
-        if m.start is None:
-            return [m]
-        return [replace(m, start=SegmentStart({**m.start.settings, **forged}))]
+        return [m if m.start is None else replace(m, start=SegmentStart({**m.start.settings, **forged}))]
 
     record(path, changed(messages(1.5, ("a",), "joint", 0.0), forge))
     (report,) = replayed(path)
@@ -242,7 +227,7 @@ def test_the_command_tells_one_tag_as_other_replays_and_all_in_sums(tmp_path, ca
     assert "has no end: it was cut off" in " ".join(capsys.readouterr().out.split())
 
 
-def test_mistakes_are_told_in_one_line(tmp_path, capsys):
+def test_mistakes_are_told_in_one_line(tmp_path, complaint):
     path = tmp_path / "live.mcap"
     record(path, messages(1.0, ("a", "b")))
     bare = tmp_path / "bare.mcap"
@@ -259,10 +244,7 @@ def test_mistakes_are_told_in_one_line(tmp_path, capsys):
         ([str(bare)], "raw receptions is missing"),
         ([str(at_once)], 'the recording is "empty'),
     ):
-        assert main(["replay", *arguments]) == 2
-        told = capsys.readouterr().err
-        assert words in told
-        assert told.count("\n") == 1
+        assert words in complaint("replay", *arguments)
 
 
 @pytest.mark.parametrize(
@@ -275,9 +257,3 @@ def test_snapshots_of_few_members_are_warned_of(tmp_path, capsys, loss, method, 
     told = capsys.readouterr()
     assert ("a: weighted had " in told.err) is warned
     assert "50, 75, 95, 100 % 2-D" in told.out
-
-
-def test_a_recording_without_receptions_says_so(tmp_path):
-    record(tmp_path / "empty.mcap", messages(1.0, join_s=9.0))
-    with pytest.raises(SkylessError, match="raw receptions"):
-        replayed(tmp_path / "empty.mcap")

@@ -5,14 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from skyless.research.paper.claims import (
-    CHECKED_ANCHORS,
-    NOISES,
-    QUANTITIES,
-    lambda_distributions,
-    paper_chain,
-    paper_checks,
-)
+from skyless.research.paper import claims
 
 pytestmark = pytest.mark.statistical
 
@@ -32,16 +25,16 @@ PRINTED_PCT = {
 
 @pytest.fixture(scope="module")
 def checks():
-    return paper_checks(1, DRAWS)
+    return claims.paper_checks(1, DRAWS)
 
 
 @pytest.mark.statistical
 def test_every_quantity_of_ten_anchors_is_checked_for_both_noises(checks):
     assert {(c.noise, c.quantity, c.anchor) for c in checks} == {
         (noise, quantity, anchor)
-        for noise in NOISES
-        for quantity in QUANTITIES
-        for anchor in range(1, CHECKED_ANCHORS + 1)
+        for noise in claims.NOISES
+        for quantity in claims.QUANTITIES
+        for anchor in range(1, claims.CHECKED_ANCHORS + 1)
     }
     assert {c.draws for c in checks} == {DRAWS}
 
@@ -60,7 +53,7 @@ def test_the_standard_error_is_that_of_so_many_draws(checks):
     assert all(0.7 * gaussian < c.standard_error_pct < gaussian for c in checks if c.noise == "uniform")
 
 
-@pytest.mark.parametrize("quantity", QUANTITIES)
+@pytest.mark.parametrize("quantity", claims.QUANTITIES)
 def test_printed_standard_deviations_are_off(checks, quantity):
     low, high = PRINTED_PCT[quantity]
     errors = [c.printed_error_pct for c in checks if c.quantity == quantity]
@@ -68,7 +61,7 @@ def test_printed_standard_deviations_are_off(checks, quantity):
 
 
 def test_far_from_the_origin_the_printed_form_is_off_by_hundreds_of_per_cent():
-    far = [c for c in paper_checks(1, 50_000, origin_s=1.0) if c.quantity == "lambda"]
+    far = [c for c in claims.paper_checks(1, 50_000, origin_s=1.0) if c.quantity == "lambda"]
     assert min(c.printed_error_pct for c in far) > 300.0
     assert max(c.corrected_error_pct for c in far) < 4.5 * 100.0 / math.sqrt(2 * 50_000)
 
@@ -76,7 +69,7 @@ def test_far_from_the_origin_the_printed_form_is_off_by_hundreds_of_per_cent():
 def test_distributions_have_the_shape_of_their_noise():
     """E10: uniform noise changes the shape a little and the variance not at all, once σ is that of the noise."""
     draws = 300_000
-    gaussian, uniform = lambda_distributions(2, draws)
+    gaussian, uniform = claims.lambda_distributions(2, draws)
     middles = (gaussian.edges_m[1:] + gaussian.edges_m[:-1]) / 2.0
     assert gaussian.counts.sum() == pytest.approx(draws, abs=10)
     assert uniform.std_m / gaussian.std_m == pytest.approx(math.sqrt(3.0), rel=5.0 / math.sqrt(draws))
@@ -94,6 +87,8 @@ def test_distributions_have_the_shape_of_their_noise():
 
 
 def test_random_chains_differ_by_seed_and_anchor_and_not_by_noise():
-    rates = {(seed, anchor): paper_chain(seed, anchor, "gaussian").master_rate for seed in (1, 2) for anchor in (1, 2)}
+    rates = {
+        (seed, anchor): claims.paper_chain(seed, anchor, "gaussian").master_rate for seed in (1, 2) for anchor in (1, 2)
+    }
     assert len(set(rates.values())) == 4
-    assert paper_chain(1, 1, "uniform").master_rate == rates[1, 1]
+    assert claims.paper_chain(1, 1, "uniform").master_rate == rates[1, 1]

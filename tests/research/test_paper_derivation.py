@@ -7,14 +7,7 @@ plus noise. Nothing of ``CORRECTED`` or of the errata enters before the comparis
 import pytest
 import sympy as sp
 
-from skyless.core.protocol1.snapshots import (
-    averaged_offset,
-    protocol_interval,
-    relative_offset,
-    relative_rate,
-    tag_rate,
-    to_master,
-)
+from skyless.core.protocol1 import snapshots
 from skyless.research import uncertainty
 from skyless.research.uncertainty import CORRECTED, PRINTED, Chain
 
@@ -35,8 +28,7 @@ POSITIVE = [
 ]
 REAL = ["master_offset_s", "tag_offset_s", "anchor_offset_s", "sync_s", "reference_s", "delay_s"]
 CHAIN = Chain(
-    **{name: sp.Symbol(name, positive=True) for name in POSITIVE},
-    **{name: sp.Symbol(name, real=True) for name in REAL},
+    **{name: sp.Symbol(name, positive=True) for name in POSITIVE}, **{name: sp.Symbol(name, real=True) for name in REAL}
 )
 MASTER, ANCHOR, TAG = CHAIN.sigma_master_s, CHAIN.sigma_anchor_s, CHAIN.sigma_tag_s
 M1, M2, REF, S1, S2, A1, A2, R1, R2, RM = STAMPS = sp.symbols("m1 m2 tm s1 s2 a1 a2 r1 r2 rm", real=True)
@@ -87,13 +79,13 @@ def algorithm(same_as=None):
     s1, s2 = anchor(t1 + c.anchor_tof_s, S1), anchor(t2 + c.anchor_tof_s, S2)
     a1, a2 = anchor(t_i, A1), anchor(t_i + c.spacing_s, A2)
     r1, r2 = tag(t_i + c.tag_tof_s, R1), tag(t_i + c.spacing_s + c.tag_tof_s, R2)
-    rate = plain(relative_rate)(s2 - s1, m2 - m1)
-    first = plain(relative_offset)(s1, m1, rate, c.anchor_tof_s)
-    delayed = plain(relative_offset)(s2, m2, rate, c.anchor_tof_s)
-    offset = plain(averaged_offset)(first, delayed)
-    x1, x2 = plain(to_master)(a1, rate, offset), plain(to_master)(a2, rate, offset)
-    tags_rate = plain(tag_rate)(r2 - r1, x2 - x1)
-    interval = plain(protocol_interval)(tags_rate, x1, master(t_m, reference))
+    rate = plain(snapshots.relative_rate)(s2 - s1, m2 - m1)
+    first = plain(snapshots.relative_offset)(s1, m1, rate, c.anchor_tof_s)
+    delayed = plain(snapshots.relative_offset)(s2, m2, rate, c.anchor_tof_s)
+    offset = plain(snapshots.averaged_offset)(first, delayed)
+    x1, x2 = plain(snapshots.to_master)(a1, rate, offset), plain(snapshots.to_master)(a2, rate, offset)
+    tags_rate = plain(snapshots.tag_rate)(r2 - r1, x2 - x1)
+    interval = plain(snapshots.protocol_interval)(tags_rate, x1, master(t_m, reference))
     tdoa = (r1 - tag(t_m + c.tag_master_tof_s, RM)) - interval
     return {
         "beta": rate,

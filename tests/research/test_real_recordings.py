@@ -13,10 +13,7 @@ from skyless.site.tables import read_anchors, read_truth
 
 pytestmark = pytest.mark.site
 
-KUIPMAN = {
-    "6af847e_testoutput2": (3309, 3295),
-    "b34daf0_output20240415": (2753, 7813),
-}
+KUIPMAN = {"6af847e_testoutput2": (3309, 3295), "b34daf0_output20240415": (2753, 7813)}
 LEVER_ARM_M = np.array([-0.01245, 0.00127, 0.0908])
 
 

@@ -79,7 +79,9 @@ def test_each_case_is_wrong_in_what_its_name_says():
         ]
         assert sorted(moved)[-count:] == pytest.approx([off_m] * count)
         assert sorted(moved)[:-count] == [0.0] * (6 - count)
-    axes = np.array([(d.x_m, d.y_m) for run in CASES["each axis N(5 cm)"].runs for d in _moved(run)])
+    axes = np.array(
+        [(d.x_m, d.y_m) for run in CASES["each axis N(5 cm)"].runs for d in run.impairments.anchor_displacements]
+    )
     assert np.std(axes) == pytest.approx(0.05, rel=0.4)
     (slow,) = faults("tags' crystals +5 ppm").warm_ups
     assert (slow.ppm, slow.tau_s, slow.start_s, slow.anchor) == (5.0, 60.0, 1.5, None)
@@ -133,14 +135,9 @@ def test_all_anchors_crystals_change_each_by_its_own_rate_and_sign():
             assert len({abs(gain) for gain in gains}) == 6
             assert all(0.999 * low_hz <= abs(gain) <= high_hz for gain in gains)
             assert {one.start_s for one in warm_ups} == {0.0}
-    signs = {
-        math.copysign(1.0, one.ppm) for run in CASES["all anchors' crystals ±0.5–3 ppm"].runs for one in _warm(run)
-    }
+    crystals = CASES["all anchors' crystals ±0.5–3 ppm"].runs
+    signs = {math.copysign(1.0, one.ppm) for run in crystals for one in run.impairments.warm_ups}
     assert signs == {-1.0, 1.0}
-
-
-def _warm(run):
-    return run.impairments.warm_ups
 
 
 def test_the_line_and_the_stairwell_are_what_they_are_called():
@@ -149,10 +146,6 @@ def test_the_line_and_the_stairwell_are_what_they_are_called():
     assert min(path.position(t_s)[1] for path in line.trajectories for t_s in range(16)) > 0.3
     heights_m = [anchor.z_m for anchor in stairs.site.anchors]
     assert (len(set(heights_m)), max(heights_m) - min(heights_m), stairs.site.tags.height_m) == (8, 5.0, None)
-
-
-def _moved(run):
-    return run.impairments.anchor_displacements
 
 
 def test_anchors_are_late_by_amounts_of_their_own_from_the_start_or_for_six_seconds():
@@ -325,15 +318,8 @@ def test_the_table_shows_levels_and_what_is_missed(capsys, monkeypatch):
     rows = room.rows(plan, _results(plan, counts))
     print_rows(StudyResult("room", plan, tuple(rows), 1.0, Parts(1, 0, ())))
     out = capsys.readouterr().out
-    for words in (
-        "past a wall",
-        "3 of 6 late, 0.5–2 m, 6 s",
-        "missed: RMSE, level, exceeded, ratio",
-        "held",
-        "66.7 %",
-        "5000",
-        "±",
-    ):
+    notes = ("3 of 6 late, 0.5–2 m, 6 s", "missed: RMSE, level, exceeded, ratio")
+    for words in ("past a wall", *notes, "held", "66.7 %", "5000", "±"):
         assert words in out
 
 

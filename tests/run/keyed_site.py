@@ -6,15 +6,7 @@ from msgspec.structs import replace
 from node_stage import LAB, PLACE_M
 
 from skyless.core.site import ScheduleSite
-from skyless.run.keys import (
-    SITE_PUBLIC,
-    SitePublic,
-    chain_public_bytes,
-    chain_public_file,
-    chain_seed_file,
-    seed_bytes,
-    site_public_bytes,
-)
+from skyless.run import keys
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
@@ -31,13 +23,13 @@ OTHER_KEYS = made_keys(FREE.id, 0.0, number=2)
 
 def put(folder, *chains, least_serial=1, seeds=True):
     """Write files of keys as an operator copies them."""
-    (folder / SITE_PUBLIC).write_bytes(site_public_bytes(SitePublic(FREE.id, KEYS.public, least_serial)))
+    (folder / keys.SITE_PUBLIC).write_bytes(keys.site_public_bytes(keys.SitePublic(FREE.id, KEYS.public, least_serial)))
     for chain in chains:
-        chain_public_file(folder, chain.serial).write_bytes(chain_public_bytes(chain))
+        keys.chain_public_file(folder, chain.serial).write_bytes(keys.chain_public_bytes(chain))
         if seeds:
-            seed = chain_seed_file(folder, chain.serial)
+            seed = keys.chain_seed_file(folder, chain.serial)
             seed.touch(0o600)
-            seed.write_bytes(seed_bytes(chain))
+            seed.write_bytes(keys.seed_bytes(chain))
 
 
 @lru_cache(maxsize=4)

@@ -90,6 +90,18 @@ class Program:
             return await self.process.wait()
 
 
+@contextlib.asynccontextmanager
+async def together(programs):
+    """Programs that run; what they said, when they have ended."""
+    lines = []
+    try:
+        await asyncio.gather(*(program.start() for program in programs))
+        yield lines
+    finally:
+        await asyncio.gather(*(program.stop() for program in programs))
+    lines += (line for program in programs for _, line in program.said)
+
+
 class SevenAnchors:
     """Ether, seven anchors and three tags, each a process, at Debian's mosquitto."""
 

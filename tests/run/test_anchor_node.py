@@ -16,17 +16,7 @@ from skyless.core.site import ScheduleSite, site_digest
 from skyless.core.ticks import TICK_RATE_HZ, difference, wrap
 from skyless.radio.interface import Gone, Late, Restarted, Sent
 from skyless.run import anchor, process
-from skyless.run.anchor import (
-    ASK_AGAIN_S,
-    LOST_ANSWER_S,
-    MAX_PENDING_STAMPS,
-    STAMPS_INTERVAL_S,
-    AnchorNode,
-    StampLog,
-    TransmissionCount,
-    health_of,
-    leads,
-)
+from skyless.run import anchor as anchor_node
 from skyless.run.mqtt.messages import MAX_LEASE_S, MAX_LEASES, Counters, Leases, PlacementMessage, RequestMessage, Stamp
 from skyless.run.process import SitePublisher
 
@@ -80,7 +70,7 @@ async def test_a_late_frame_is_skipped_and_counted_and_the_next_slot_is_taken():
         _, first = radio.transmissions[-1]
         node.on_event(Late(first.tx_ticks))
         assert node.late == 1
-        await asyncio.sleep(ASK_AGAIN_S + SUPERFRAME_S)
+        await asyncio.sleep(anchor_node.ASK_AGAIN_S + SUPERFRAME_S)
         _, second = radio.transmissions[-1]
         superframes = difference(second.tx_ticks, first.tx_ticks) / TICK_RATE_HZ / SUPERFRAME_S
         assert superframes == pytest.approx(1.0, abs=1e-3)
@@ -93,12 +83,12 @@ async def test_a_late_frame_is_skipped_and_counted_and_the_next_slot_is_taken():
 async def test_an_answer_that_never_comes_is_waited_for_and_then_asked_for_again():
     async with running() as (node, radio, _):
         begin_s, first = radio.transmissions[-1]
-        await asyncio.sleep(LOST_ANSWER_S - 2e-3)
+        await asyncio.sleep(anchor_node.LOST_ANSWER_S - 2e-3)
         assert len(radio.transmissions) == 1
         await asyncio.sleep((1 + SILENT_SUPERFRAMES) * SUPERFRAME_S + 9e-3)  # so long silent, it listens first
         assert len(radio.transmissions) == 2
         when_s, second = radio.transmissions[-1]
-        assert when_s - begin_s >= LOST_ANSWER_S
+        assert when_s - begin_s >= anchor_node.LOST_ANSWER_S
         slots = difference(second.tx_ticks, first.tx_ticks) / TICK_RATE_HZ / SUPERFRAME_S
         assert slots == pytest.approx(round(slots), abs=1e-3)  # still its own slot
         assert node.late == 0
@@ -158,7 +148,7 @@ async def test_nothing_goes_on_after_it_was_stopped():
 
 def test_transmissions_that_were_passed_over_are_missed_too():
     step = schedule_of(LAB).superframe_ticks
-    count = TransmissionCount(step)
+    count = anchor_node.TransmissionCount(step)
     assert count.drain() == 0.0
     slots = [0, 1, 2, 5, 6, 7]  # two were passed over
     for before, after in itertools.pairwise(slots):
@@ -180,10 +170,10 @@ def test_transmissions_that_were_passed_over_are_missed_too():
 async def test_a_free_anchor_sends_at_once_and_has_no_time_but_its_own():
     async with running_anchor(FREE, seconds=2.0) as (node, radio, _):
         assert len(radio.transmissions) == pytest.approx(98, abs=10)
-        health = health_of(node, NONE, 0.0, 0.0)
+        health = anchor_node.health_of(node, NONE, 0.0, 0.0)
         assert (health.mode, health.role, health.synchronised) == ("free", "anchor", True)
         assert {health.master, health.term, health.offset_s, health.rate_ppm} == {None}
-        assert [leads(node.machine, is_first=first) for first in (True, False)] == [True, False]
+        assert [anchor_node.leads(node.machine, is_first=first) for first in (True, False)] == [True, False]
 
 
 # Positions and delays of a survey
@@ -249,7 +239,7 @@ async def test_the_delay_of_receptions_counts_as_one_of_transmissions():
 
 def test_placements_for_other_sites_are_ignored_and_logged():
     said = []
-    node = AnchorNode(LAB, 1, FakeRadio("1"), said.append)
+    node = anchor_node.AnchorNode(LAB, 1, FakeRadio("1"), said.append)
     assert not node.place(PlacementMessage(0.0, "0123456789abcdef", surveyed()))
     assert not node.place(PlacementMessage(0.0, BEFORE, replace(surveyed(), anchors=surveyed().anchors[1:])))
     far = replace(LAB, anchors=(replace(LAB.anchors[0], x_m=1e9), *LAB.anchors[1:]))
@@ -262,15 +252,15 @@ def test_placements_for_other_sites_are_ignored_and_logged():
 
 def test_an_anchor_with_an_older_file_adopts_the_newest_placement():
     twice = surveyed(50, 0.3)
-    node = AnchorNode(LAB, 1, FakeRadio("1"), lambda _: None)
+    node = anchor_node.AnchorNode(LAB, 1, FakeRadio("1"), lambda _: None)
     assert node.place(PlacementMessage(0.0, site_digest(surveyed()), twice, (BEFORE,)))
     assert node.site == twice
-    started_with_the_new_file = AnchorNode(twice, 1, FakeRadio("1"), pytest.fail)
+    started_with_the_new_file = anchor_node.AnchorNode(twice, 1, FakeRadio("1"), pytest.fail)
     assert not started_with_the_new_file.place(PlacementMessage(0.0, site_digest(surveyed()), twice, (BEFORE,)))
 
 
 def test_stamps_are_what_was_received_of_the_sites_anchors():
-    node = AnchorNode(LAB, 2, FakeRadio("2"), lambda _: None)
+    node = anchor_node.AnchorNode(LAB, 2, FakeRadio("2"), lambda _: None)
     heard = [one for one in receptions(1.0) if decode(one.frame).anchor != 2]
     node.on_event(heard[0])
     node.on_request(RequestMessage("me", (), 10.0, True))
@@ -319,13 +309,13 @@ def request(by, lease_s=10.0, stamps=True):
 @pytest.fixture
 def log():
     """Of an anchor that is asked at 100 s, for 10 s."""
-    log = StampLog(2, "a")
+    log = anchor_node.StampLog(2, "a")
     log.request(request("me"), 100.0)
     return log
 
 
 def test_nothing_is_kept_until_somebody_asks():
-    log = StampLog(2, "a")
+    log = anchor_node.StampLog(2, "a")
     log.add(1, 10, 20)
     assert log.collect(100.0, 0.0) is None
     log.request(request("me"), 100.0)
@@ -340,16 +330,16 @@ def test_nothing_is_kept_until_somebody_asks():
 
 def test_messages_come_at_an_interval_also_when_nobody_is_received(log):
     assert log.collect(100.0, 0.0).stamps == ()
-    assert log.collect(100.0 + 0.9 * STAMPS_INTERVAL_S, 0.0) is None
+    assert log.collect(100.0 + 0.9 * anchor_node.STAMPS_INTERVAL_S, 0.0) is None
     log.add(1, 10, 20)
-    assert log.collect(100.0 + STAMPS_INTERVAL_S, 0.0).stamps == (Stamp(1, 10, 20),)
+    assert log.collect(100.0 + anchor_node.STAMPS_INTERVAL_S, 0.0).stamps == (Stamp(1, 10, 20),)
 
 
 def test_what_is_not_collected_takes_no_memory_and_is_counted(log):
-    for number in range(MAX_PENDING_STAMPS + 7):
+    for number in range(anchor_node.MAX_PENDING_STAMPS + 7):
         log.add(1, number, number)
     message = log.collect(101.0, 0.0)
-    assert len(message.stamps) == MAX_PENDING_STAMPS
+    assert len(message.stamps) == anchor_node.MAX_PENDING_STAMPS
     assert message.missed == 7
     assert message.stamps[0].tx_ticks == 7
     log.add(1, 1, 1)

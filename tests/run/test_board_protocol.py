@@ -5,6 +5,7 @@ from collections import Counter
 
 import pytest
 from msgspec.structs import replace
+from serial_stage import PlayedRadio
 
 from skyless.core.air.almanac import GeoreferencePage
 from skyless.core.air.frame import Heard, Reception, Transmission, fcs
@@ -37,24 +38,11 @@ def frame_of(body):
     return body + fcs(body)
 
 
-class Radio:
-    name = "a board with a long name"
-
-    def __init__(self):
-        self.counters, self.ticks, self.transmissions = Counter(), 77, []
-
-    def now_ticks(self):
-        return self.ticks
-
-    def transmit(self, transmission):
-        self.transmissions.append(transmission)
-
-
 class Host:
     """Talks with a board."""
 
     def __init__(self, can_transmit=True):
-        self.radio, self.said, self.full, self.now_s = Radio(), [], False, 0.0
+        self.radio, self.said, self.full, self.now_s = PlayedRadio("a board with a long name", 77), [], False, 0.0
         self._reader, self.writer = link.Reader(), link.Writer()
         self.board = LinkProtocol(self.radio, self._take, can_transmit=can_transmit, clock_s=lambda: self.now_s)
 

@@ -7,7 +7,6 @@ import json
 import os
 import re
 import signal
-import socket
 import time
 from pathlib import Path
 
@@ -31,15 +30,6 @@ pytestmark = pytest.mark.site
 @pytest.fixture
 def port():
     return free_port()
-
-
-@pytest.fixture
-def taken():
-    """A port where another program listens."""
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        yield other.getsockname()[1]
 
 
 @contextlib.contextmanager
@@ -128,9 +118,10 @@ async def test_retained_messages_survive_its_death(port, tmp_path):
         assert await retained_by(broker, "skyless/v1/7/zones", "t3") == b"kept"
 
 
-def test_a_taken_port_is_an_error_when_it_was_asked_for(taken, tmp_path, capsys):
-    assert main(["broker", "--port", str(taken), "--data", str(tmp_path)]) == 2
-    assert f"--port is {taken}, where another program listens" in capsys.readouterr().err
+def test_a_taken_port_is_an_error_when_it_was_asked_for(taken, tmp_path, complaint):
+    assert f"--port is {taken}, where another program listens" in complaint(
+        "broker", "--port", taken, "--data", tmp_path
+    )
 
 
 async def test_without_a_port_the_next_free_one_is_taken(taken, tmp_path, monkeypatch):
@@ -218,11 +209,12 @@ def test_wrong_options_are_reported_with_what_would_be_right(options, right, tmp
     assert re.search(right, capsys.readouterr().err)
 
 
-def test_an_address_of_another_machine_is_reported(tmp_path, monkeypatch, capsys):
+def test_an_address_of_another_machine_is_reported(tmp_path, monkeypatch, complaint):
     monkeypatch.setenv("SKYLESS_MQTT_PASSWORD", "word")
     for listen in ("192.0.2.1", "nowhere.invalid"):
-        assert main(["broker", "--listen", listen, "--user", "ann", "--data", str(tmp_path)]) == 2
-        assert f"--listen is '{listen}'; it should be an address of this machine" in capsys.readouterr().err
+        assert f"--listen is '{listen}'; it should be an address of this machine" in complaint(
+            "broker", "--listen", listen, "--user", "ann", "--data", tmp_path
+        )
 
 
 # Its address for programs without ``--mqtt``

@@ -17,13 +17,7 @@ from skyless.core.estimator.kalman import is_stationary
 from skyless.core.estimator.settings import TUNING
 from skyless.core.fix import NoFixReason
 from skyless.core.tag.position import Solution, locate
-from skyless.run.masterless.difference_tracking import (
-    DIFFERENCES,
-    DifferenceTracking,
-    Start,
-    find_start,
-    joined_tdoas,
-)
+from skyless.run.masterless.difference_tracking import DIFFERENCES, DifferenceTracking, Start, find_start, joined_tdoas
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
 
 pytestmark = pytest.mark.site

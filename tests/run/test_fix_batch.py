@@ -11,24 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.alert import Alert
-from skyless.run.fix_batch import (
-    ALERT_BITS,
-    ALERTS,
-    FIELDS,
-    HEADER_BYTES,
-    HEIGHT_GIVEN,
-    NONE_U16,
-    RECORD,
-    SIMULATED,
-    VELOCITY_KNOWN,
-    VERIFIED,
-    BadBatchError,
-    Batch,
-    decode_batch,
-    encode_batch,
-    fix_of,
-    records_of,
-)
+from skyless.run import fix_batch
 
 pytestmark = pytest.mark.site
 
@@ -38,8 +21,10 @@ u32 = st.integers(0, 2**32 - 1)
 u64 = st.integers(0, 2**64 - 1)
 numbers = st.floats(allow_nan=False, allow_infinity=False)
 vectors = st.tuples(numbers, numbers, numbers)
-raw_records = st.binary(max_size=20 * 48).map(lambda data: np.frombuffer(data[: len(data) // 48 * 48], RECORD))
-batches = st.builds(Batch, u32, u32, u64, u32, raw_records)
+raw_records = st.binary(max_size=20 * 48).map(
+    lambda data: np.frombuffer(data[: len(data) // 48 * 48], fix_batch.RECORD)
+)
+batches = st.builds(fix_batch.Batch, u32, u32, u64, u32, raw_records)
 fixes = st.builds(
     lambda **fields: replace(FIX, **fields),
     tag=st.text(max_size=5),
@@ -57,7 +42,7 @@ fixes = st.builds(
 
 @given(batches)
 def test_a_batch_has_the_stated_layout(batch):
-    data = encode_batch(batch)
+    data = fix_batch.encode_batch(batch)
     magic, header, size, run, sequence, sent, issue, count = struct.unpack_from(HEADER, data)
     assert (magic, header, size, count) == (b"SKB2", 32, 48, len(batch.records))
     assert (run, sequence, sent, issue) == (batch.run, batch.sequence, batch.sent_unix_us, batch.names_issue)
@@ -71,32 +56,32 @@ def test_a_batch_has_the_stated_layout(batch):
 
 @given(batches, st.integers(0, 9), st.integers(0, 9))
 def test_readers_skip_what_longer_headers_and_records_have(batch, more_header, more_record):
-    plain = encode_batch(batch)
-    head = bytearray(plain[:HEADER_BYTES])
-    struct.pack_into("<HH", head, 4, HEADER_BYTES + more_header, RECORD.itemsize + more_record)
-    rows = [plain[at : at + 48] + b"\xaa" * more_record for at in range(HEADER_BYTES, len(plain), 48)]
-    found = decode_batch(bytes(head) + b"\xbb" * more_header + b"".join(rows))
+    plain = fix_batch.encode_batch(batch)
+    head = bytearray(plain[: fix_batch.HEADER_BYTES])
+    struct.pack_into("<HH", head, 4, fix_batch.HEADER_BYTES + more_header, fix_batch.RECORD.itemsize + more_record)
+    rows = [plain[at : at + 48] + b"\xaa" * more_record for at in range(fix_batch.HEADER_BYTES, len(plain), 48)]
+    found = fix_batch.decode_batch(bytes(head) + b"\xbb" * more_header + b"".join(rows))
     assert found.records.tobytes() == batch.records.tobytes()
     assert (found.run, found.sequence, found.sent_unix_us) == (batch.run, batch.sequence, batch.sent_unix_us)
 
 
 @given(batches, st.data())
 def test_damaged_bytes_are_refused_or_a_batch_and_raise_nothing_else(batch, data):
-    plain = bytearray(encode_batch(batch))
+    plain = bytearray(fix_batch.encode_batch(batch))
     for at in data.draw(st.lists(st.integers(0, len(plain) - 1), max_size=4)):
         plain[at] ^= data.draw(st.integers(1, 255))
     damaged = bytes(plain[: data.draw(st.integers(0, len(plain)))])
     try:
-        found = decode_batch(damaged)
-    except BadBatchError:
+        found = fix_batch.decode_batch(damaged)
+    except fix_batch.BadBatchError:
         return
-    assert found.records.dtype == RECORD
+    assert found.records.dtype == fix_batch.RECORD
 
 
 @given(st.binary(max_size=200))
 def test_other_bytes_are_refused(data):
-    with pytest.raises(BadBatchError):
-        decode_batch(data)
+    with pytest.raises(fix_batch.BadBatchError):
+        fix_batch.decode_batch(data)
 
 
 def near(found, value, scale, most):
@@ -109,19 +94,19 @@ def near(found, value, scale, most):
 @settings(max_examples=30)
 @given(st.lists(st.tuples(u32, fixes), max_size=5), st.booleans())
 def test_records_hold_what_fixes_state(numbered, simulated):
-    records = records_of(numbered, simulated=simulated)
+    records = fix_batch.records_of(numbered, simulated=simulated)
     for record, (number, fix) in zip(records, numbered, strict=True):
         flags = int(record["flags"])
         assert (record["tag"], record["anchors"]) == (number, min(len(fix.anchors), 255))
-        assert bool(flags & HEIGHT_GIVEN) == fix.height_known
-        assert bool(flags & VELOCITY_KNOWN) == (fix.velocity_mps is not None)
-        assert bool(flags & VERIFIED) == (fix.verified_until_s is not None)
-        stated = fix.alert if fix.alert in (None, *ALERTS) else Alert.UNAVAILABLE
-        assert (flags & ALERT_BITS) == (0 if stated is None else 1 + ALERTS.index(stated))
+        assert bool(flags & fix_batch.HEIGHT_GIVEN) == fix.height_known
+        assert bool(flags & fix_batch.VELOCITY_KNOWN) == (fix.velocity_mps is not None)
+        assert bool(flags & fix_batch.VERIFIED) == (fix.verified_until_s is not None)
+        stated = fix.alert if fix.alert in (None, *fix_batch.ALERTS) else Alert.UNAVAILABLE
+        assert (flags & fix_batch.ALERT_BITS) == (0 if stated is None else 1 + fix_batch.ALERTS.index(stated))
         assert all(near(*pair, 1000.0, 2**31 - 1) for pair in zip(record["position_mm"], fix.position_m, strict=True))
         assert record["unix_us"] == 0 or near(record["unix_us"], fix.unix_s, 1e6, 2**63 - 1)
-        assert (record["hpl_cm"] == NONE_U16) >= (fix.hpl_m is None)
-        assert not fix.height_known or record["std_z_mm"] == NONE_U16
+        assert (record["hpl_cm"] == fix_batch.NONE_U16) >= (fix.hpl_m is None)
+        assert not fix.height_known or record["std_z_mm"] == fix_batch.NONE_U16
 
 
 @given(raw_records, st.booleans())
@@ -131,13 +116,15 @@ def test_the_fix_of_a_record_gives_the_same_record_again(records, simulated):
     records = records[finite & (records["unix_us"] < 2**50)].copy()
     records["covariance_m2"] = np.abs(records["covariance_m2"])
     flags = records["flags"]
-    flags[:] = (flags & (VERIFIED | VELOCITY_KNOWN | HEIGHT_GIVEN)) | (flags & ALERT_BITS) % (1 + len(ALERTS))
-    flags[:] |= SIMULATED * simulated
-    flags[records["std_z_mm"] == NONE_U16] |= HEIGHT_GIVEN
-    records["std_z_mm"][flags & HEIGHT_GIVEN > 0] = NONE_U16
-    records["velocity_cmps"][flags & VELOCITY_KNOWN == 0] = 0
+    flags[:] = (flags & (fix_batch.VERIFIED | fix_batch.VELOCITY_KNOWN | fix_batch.HEIGHT_GIVEN)) | (
+        flags & fix_batch.ALERT_BITS
+    ) % (1 + len(fix_batch.ALERTS))
+    flags[:] |= fix_batch.SIMULATED * simulated
+    flags[records["std_z_mm"] == fix_batch.NONE_U16] |= fix_batch.HEIGHT_GIVEN
+    records["std_z_mm"][flags & fix_batch.HEIGHT_GIVEN > 0] = fix_batch.NONE_U16
+    records["velocity_cmps"][flags & fix_batch.VELOCITY_KNOWN == 0] = 0
     for field in ("position_mm", "velocity_cmps"):
         records[field] = np.maximum(records[field], -np.iinfo(records[field].dtype).max)
     records["anchors"], records["method"] = 0, 0
-    numbered = [(row[0], fix_of("a", row)) for row in FIELDS.iter_unpack(records.tobytes())]
-    np.testing.assert_array_equal(records_of(numbered, simulated=simulated), records)
+    numbered = [(row[0], fix_batch.fix_of("a", row)) for row in fix_batch.FIELDS.iter_unpack(records.tobytes())]
+    np.testing.assert_array_equal(fix_batch.records_of(numbered, simulated=simulated), records)

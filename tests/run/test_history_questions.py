@@ -425,10 +425,7 @@ def test_sql_answers_what_the_questions_do_not(history):
         ORDER BY raised
     """
     found = history.sql(alarms, Span(0.0, SPAN.to_unix_s))
-    assert [(one["alarm"], one["ended"]) for one in found] == [
-        ("r/tag1/2", BEGIN + 600.0),
-        ("s/tag1+tag2/3", None),
-    ]
+    assert [(one["alarm"], one["ended"]) for one in found] == [("r/tag1/2", BEGIN + 600.0), ("s/tag1+tag2/3", None)]
     inside = """
         SELECT zone, sum(CASE kind WHEN 'enter' THEN 1 ELSE -1 END) OVER (PARTITION BY zone ORDER BY unix_s) AS tags
         FROM events JOIN zones USING (zone) WHERE kind IN ('enter', 'leave') AND tag = 'tag4' ORDER BY unix_s

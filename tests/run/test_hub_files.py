@@ -69,11 +69,8 @@ def test_sites_and_tenants_are_added_and_passwords_stay(tmp_path, capsys):
         (("--node", "a", "--tenant", "A.b"), "--tenant is 'A.b'"),
     ],
 )
-def test_mistakes_are_named(words, named, tmp_path, capsys):
-    assert main(["hub", "init", str(tmp_path / "hub"), *words]) == 2
-    err = capsys.readouterr().err
-    assert named in err
-    assert err.count("\n") == 1
+def test_mistakes_are_named(words, named, tmp_path, complaint):
+    assert named in complaint("hub", "init", tmp_path / "hub", *words)
     assert not (tmp_path / "hub").exists()
 
 

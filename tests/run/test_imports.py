@@ -89,16 +89,16 @@ def test_a_longer_recording_and_one_beside_the_running_history_add_what_is_new(t
     assert numbers == list(range(1, 201))
 
 
-def test_a_recording_of_no_site_needs_one(tmp_path, capsys):
+def test_a_recording_of_no_site_needs_one(tmp_path, capsys, complaint):
     path = tmp_path / "empty.mcap"
     McapFile(path).close()
-    assert main(["history", "import", str(path), "--to", str(tmp_path / "history")]) == 2
-    assert "does not say of which site it is; --site-id should" in capsys.readouterr().err
+    assert "does not say of which site it is; --site-id should" in complaint(
+        "history", "import", path, "--to", tmp_path / "history"
+    )
     assert not (tmp_path / "history").exists()
     assert imported(capsys, path, tmp_path / "history", "--site-id", "3")["fixes"] == 0
 
 
-def test_a_file_that_is_no_recording_is_named(tmp_path, capsys):
-    assert main(["history", "import", __file__, "--to", str(tmp_path / "history")]) == 2
-    assert "it should be that of an MCAP" in capsys.readouterr().err
+def test_a_file_that_is_no_recording_is_named(tmp_path, complaint):
+    assert "it should be that of an MCAP" in complaint("history", "import", __file__, "--to", tmp_path / "history")
     assert not (tmp_path / "history").exists()

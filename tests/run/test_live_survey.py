@@ -12,18 +12,8 @@ import numpy as np
 import pytest
 from site_programs import Program
 
-from skyless.run.mqtt import topics
+from skyless.run.mqtt import messages, topics
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import (
-    FixMessage,
-    SiteMessage,
-    StatusMessage,
-    SurveyFactsMessage,
-    SurveyMessage,
-    SurveySaveMessage,
-    TruthMessage,
-    WatchMessage,
-)
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge
 from support.mqtt_brokers import MOSQUITTO, Mosquitto
@@ -77,13 +67,13 @@ class Fresh:
         self.link = Link(self.broker.address, "trial", site=SITE, kind="watch")
         self.newest, self.fixes, self.truths = {}, [], []
         for topic, kind in (
-            (topics.survey_topic(SITE), SurveyMessage),
-            (topics.watch_topic(SITE), WatchMessage),
-            (topics.site_topic(SITE), SiteMessage),
-            (topics.status_topic(SITE, "survey", "survey"), StatusMessage),
+            (topics.survey_topic(SITE), messages.SurveyMessage),
+            (topics.watch_topic(SITE), messages.WatchMessage),
+            (topics.site_topic(SITE), messages.SiteMessage),
+            (topics.status_topic(SITE, "survey", "survey"), messages.StatusMessage),
         ):
             self.link.subscribe(topic, self._keep(msgspec.json.Decoder(kind), kind))
-        fixes, truths = msgspec.json.Decoder(FixMessage), msgspec.json.Decoder(TruthMessage)
+        fixes, truths = msgspec.json.Decoder(messages.FixMessage), msgspec.json.Decoder(messages.TruthMessage)
         self.link.subscribe(topics.fix_topic(SITE, "+"), lambda _, payload: self.fixes.append(fixes.decode(payload)))
         self.link.subscribe(topics.truth_topic(SITE), lambda _, payload: self.truths.append(truths.decode(payload)))
 
@@ -98,7 +88,7 @@ class Fresh:
         return [self.ether, *self.anchors, self.tag, self.survey]
 
     def survey_message(self):
-        return self.newest.get(SurveyMessage)
+        return self.newest.get(messages.SurveyMessage)
 
     async def errors_m(self, count):
         """Errors of that many fixes from now on, by the nearest truths."""
@@ -122,7 +112,7 @@ async def surveyed_live(fresh, facts):
     await asyncio.gather(*(program.heard("on the air") for program in fresh.anchors))
     await fresh.tag.heard("listening")
     await fresh.survey.heard("stamps come")
-    fresh.link.publish(topics.survey_facts_topic(SITE), SurveyFactsMessage(facts, by="trial"), qos=1)
+    fresh.link.publish(topics.survey_facts_topic(SITE), messages.SurveyFactsMessage(facts, by="trial"), qos=1)
 
     def is_ready():
         message = fresh.survey_message()
@@ -135,7 +125,7 @@ async def surveyed_live(fresh, facts):
     assert message.state == "surveyed"
     assert message.missing == ()
     assert len(message.pairs) == 15
-    fresh.link.publish(topics.survey_save_topic(SITE), SurveySaveMessage("trial", message.serial), qos=1)
+    fresh.link.publish(topics.survey_save_topic(SITE), messages.SurveySaveMessage("trial", message.serial), qos=1)
     await until(lambda: fresh.survey_message().saved_serial == message.serial, PATIENCE_S)
     assert fresh.survey_message().error is None
     for program in fresh.anchors:
@@ -160,8 +150,8 @@ async def run(folder, positions, protocol, facts, judge):
         link, survey = await surveyed_live(fresh, facts)
         await judge(fresh, survey)
         assert await ended(fresh, link) == [0] * len(fresh.programs)
-        assert fresh.newest[SurveyMessage] is None  # what is retained was withdrawn
-        assert fresh.newest[StatusMessage].online is False
+        assert fresh.newest[messages.SurveyMessage] is None  # what is retained was withdrawn
+        assert fresh.newest[messages.StatusMessage].online is False
     except BaseException:
         for program in fresh.programs:
             _log.warning("%s: %s", program.arguments, program.said[-20:])
@@ -182,9 +172,9 @@ async def judge_saved(fresh, survey):
         assert math.dist((anchor.x_m, anchor.y_m), (found[anchor.id].x_m, found[anchor.id].y_m)) < 2e-4
     assert fresh.file.with_name("fresh.before-survey-1.toml").read_text(encoding="utf-8") == fresh.before
     assert fresh.file.with_name("fresh.survey.json").exists()
-    await until(lambda: fresh.newest[SiteMessage].site == site, PATIENCE_S)
-    await until(lambda: fresh.newest.get(WatchMessage) is not None, PATIENCE_S)
-    assert fresh.newest[WatchMessage].findings == ()
+    await until(lambda: fresh.newest[messages.SiteMessage].site == site, PATIENCE_S)
+    await until(lambda: fresh.newest.get(messages.WatchMessage) is not None, PATIENCE_S)
+    assert fresh.newest[messages.WatchMessage].findings == ()
 
 
 async def judge_fresh(fresh, survey):

@@ -4,20 +4,19 @@ Anchors, a tag and a recorder run as processes at a broker; the chain is replace
 lines, all payloads on MQTT, the recording and what the tag remembers.
 """
 
-import asyncio
 import base64
 import os
 import time
 
 import pytest
 from mcap.reader import make_reader
-from site_programs import START_S, Program
+from site_programs import START_S, Program, together
 
 from skyless.cli.main import main
 from skyless.core.keys.chain import ChainKeys
 from skyless.run.keys import read_keys
 from skyless.run.mqtt.link import Link
-from support.mqtt_brokers import Embedded
+from support.mqtt_brokers import Embedded, running
 from support.processes import free_port
 from support.waiting import until
 
@@ -88,25 +87,15 @@ async def test_no_key_leaves_the_programs(site, tmp_path):
         tag,
         Program("record", tmp_path / "walk.mcap", *mqtt),
     ]
-    await broker.start()
     observer = Link(broker.address, "observer", site=SITE, kind="watch")
     observer.subscribe(f"{TOPICS}#", lambda topic, payload: seen.append((topic, bytes(payload))))
-    watching = asyncio.ensure_future(observer.run())
-    await until(lambda: observer.connected)
-    try:
-        await asyncio.gather(*(program.start() for program in programs))
+    async with running(broker, observer), together(programs) as lines:
         await tag.heard("are verified (key chain 1)")
         await until(lambda: sum(topic.endswith("receptions") for topic, _ in seen) > 10, START_S)
         assert main(["site", "keys", "revoke", str(site), "--years", "0.0001"]) == 0
         await tag.heard("are verified (key chain 2)")
         count = len(seen)
         await until(lambda: sum(topic.endswith("fix") for topic, _ in seen[count:]) > 50, START_S)
-    finally:
-        await asyncio.gather(*(program.stop() for program in programs))
-        watching.cancel()
-        await asyncio.wait([watching])
-        await broker.stop()
-    lines = [line for program in programs for _, line in program.said]
     ended_s = time.time()
     written = {
         "lines": "\n".join(lines).encode(),

@@ -15,21 +15,9 @@ from node_stage import receptions
 
 from skyless.core.errors import SkylessError
 from skyless.core.protocol1.beacon import decode
+from skyless.run import process as parts
 from skyless.run.fix_log import Latencies, PhaseLog
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.process import (
-    Usage,
-    data_folder,
-    every,
-    hold_any,
-    is_free,
-    new_recording,
-    recordings_folder,
-    reserve,
-    reserve_next,
-    resident_bytes,
-    together,
-)
 from skyless.run.record import RecorderNode, _client_key, _own_name
 from skyless.run.recordings.recorder import McapFile
 from support.processes import started
@@ -104,7 +92,7 @@ def test_a_busy_process_uses_a_core_and_a_sleeping_one_none():
     def clocks():
         return np.array([time.monotonic(), time.process_time()])
 
-    usage = Usage()
+    usage = parts.Usage()
     time.sleep(0.3)
     before = clocks()
     asleep, _ = usage.sample()
@@ -116,14 +104,14 @@ def test_a_busy_process_uses_a_core_and_a_sleeping_one_none():
     (longest_s, most_s), (shortest_s, least_s) = clocks() - before, end - begin
     assert asleep < 0.2
     assert least_s / longest_s <= busy <= most_s / shortest_s
-    assert memory_bytes == pytest.approx(resident_bytes(), rel=0.05)
+    assert memory_bytes == pytest.approx(parts.resident_bytes(), rel=0.05)
 
 
 def test_memory_that_is_taken_shows():
-    before = resident_bytes()
+    before = parts.resident_bytes()
     with mmap.mmap(-1, 50_000_000) as block:  # of its own: what the process has freed before is not used for it
         block[:] = bytes(len(block))
-        assert resident_bytes() - before >= 0.9 * len(block)
+        assert parts.resident_bytes() - before >= 0.9 * len(block)
 
 
 # Places
@@ -131,12 +119,12 @@ def test_memory_that_is_taken_shows():
 
 def test_recordings_stand_in_the_user_s_data_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    assert recordings_folder() == tmp_path / "data" / "skyless" / "recordings"
-    assert recordings_folder().is_dir()
+    assert parts.recordings_folder() == tmp_path / "data" / "skyless" / "recordings"
+    assert parts.recordings_folder().is_dir()
     monkeypatch.setenv("XDG_DATA_HOME", "not/absolute")
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    assert data_folder() == tmp_path / "home" / ".local" / "share" / "skyless"
-    name = new_recording(tmp_path, "demo")
+    assert parts.data_folder() == tmp_path / "home" / ".local" / "share" / "skyless"
+    name = parts.new_recording(tmp_path, "demo")
     assert name.parent == tmp_path
     assert name.name.startswith("demo-")
     assert name.suffix == ".mcap"
@@ -150,7 +138,7 @@ def test_a_home_that_cannot_be_written_is_replaced_by_a_temporary_folder(tmp_pat
     monkeypatch.setenv("TMPDIR", str(tmp_path))
     monkeypatch.setattr("tempfile.tempdir", None)
     monkeypatch.chdir(tmp_path)
-    folder = recordings_folder()
+    folder = parts.recordings_folder()
     assert folder.is_relative_to(tmp_path)
     assert folder.is_dir()
     (folder / "x").write_bytes(b"x")
@@ -161,11 +149,11 @@ def test_a_user_without_a_home_and_a_folder_that_is_read_only_are_replaced_too(t
     (tmp_path / "temporary").mkdir()
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "mine"))
     monkeypatch.setattr("os.access", lambda folder, mode: not folder.is_relative_to(tmp_path / "mine"))
-    assert data_folder().is_relative_to(tmp_path / "temporary")
+    assert parts.data_folder().is_relative_to(tmp_path / "temporary")
     monkeypatch.delenv("XDG_DATA_HOME")
     monkeypatch.delenv("HOME")
     monkeypatch.setattr("os.getuid", lambda: 4_000_000_000)
-    assert data_folder() == tmp_path / "temporary" / "skyless-4000000000"
+    assert parts.data_folder() == tmp_path / "temporary" / "skyless-4000000000"
 
 
 def test_a_recorder_passes_over_names_that_others_have(tmp_path, monkeypatch):
@@ -188,7 +176,7 @@ HOST = "127.0.0.1"
 
 def any_port(host):
     """A port that is free at this moment."""
-    port, held = hold_any(host)
+    port, held = parts.hold_any(host)
     held.close()
     return port
 
@@ -198,8 +186,8 @@ def test_a_port_that_is_taken_is_passed_over():
         one.bind((HOST, 0))
         port = one.getsockname()[1]
         one.listen()
-        assert not is_free(HOST, port)
-        found, held = reserve_next(HOST, port)
+        assert not parts.is_free(HOST, port)
+        found, held = parts.reserve_next(HOST, port)
         with held:
             assert found > port
         assert any_port(HOST) != port
@@ -211,31 +199,31 @@ def test_a_port_that_was_just_left_is_free():
         with socket.create_connection((HOST, port)):
             served, _ = server.accept()
             served.close()  # the server's side closes first and waits in TIME_WAIT
-    assert is_free(HOST, port)
+    assert parts.is_free(HOST, port)
 
 
 def test_two_that_look_at_once_get_two_ports_and_a_reservation_that_ends_frees_its_own():
     port = any_port(HOST)
-    first, held = reserve_next(HOST, port)
-    second, other = reserve_next(HOST, port)
+    first, held = parts.reserve_next(HOST, port)
+    second, other = parts.reserve_next(HOST, port)
     assert second > first
-    assert reserve(HOST, first) is None
+    assert parts.reserve(HOST, first) is None
     held.close()
     other.close()
-    again = reserve(HOST, first)
+    again = parts.reserve(HOST, first)
     assert again is not None
     again.close()
 
 
 def test_a_held_port_is_given_to_nobody_but_to_who_asks_for_it():
-    port, held = hold_any(HOST)
+    port, held = parts.hold_any(HOST)
     with held, socket.create_server((HOST, port)) as server, socket.create_connection((HOST, port)) as caller:
         assert server.accept()[1] == caller.getsockname()
 
 
 def test_an_address_of_another_machine_is_never_free():
     with pytest.raises(OSError, match="assign"):
-        is_free("192.0.2.200", 4711)
+        parts.is_free("192.0.2.200", 4711)
 
 
 # Running together
@@ -255,9 +243,9 @@ async def test_parts_stand_and_fall_together():
         raise ValueError("broken")
 
     with pytest.raises(ValueError, match="broken"):
-        await together(lasting("a"), failing(), lasting("b"))
+        await parts.together(lasting("a"), failing(), lasting("b"))
     assert sorted(ended) == ["a", "b"]
-    task = asyncio.ensure_future(together(lasting("c")))
+    task = asyncio.ensure_future(parts.together(lasting("c")))
     await asyncio.sleep(0)
     await asyncio.sleep(0)
     task.cancel()
@@ -268,7 +256,7 @@ async def test_parts_stand_and_fall_together():
 
 async def test_something_is_done_again_and_again():
     done = []
-    task = asyncio.ensure_future(every(0.01, lambda: done.append(1)))
+    task = asyncio.ensure_future(parts.every(0.01, lambda: done.append(1)))
     while len(done) < 3:
         await asyncio.sleep(0.001)
     task.cancel()

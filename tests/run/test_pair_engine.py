@@ -12,16 +12,7 @@ from scipy.linalg import solve_discrete_are
 
 from skyless.core.air.masterless_packets import Packet, Relay
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ, TICK_S
-from skyless.run.masterless.pair_engine import (
-    ACCELERATION_M2PS3,
-    BROADCAST_WALK_FM,
-    MAX_ANCHORS,
-    RESTART_AFTER,
-    STAMP_TICKS,
-    WHITE_FM,
-    BroadcastClock,
-    PairEngine,
-)
+from skyless.run.masterless import pair_engine
 
 SECOND = 63_897_600_000
 PERIOD = SECOND // 50
@@ -37,7 +28,7 @@ def stamps(times, rate, offset_tx, bits=32):
 def test_32_bit_counters_are_followed_across_gaps_of_seconds(rate, offset, first_gap, second_gap):
     times = [0, 1, 2, 3, 4, 4 + first_gap, 5 + first_gap, 5 + first_gap + second_gap]
     heard = stamps([time * PERIOD for time in times], rate, offset)
-    clock = BroadcastClock(32, *heard[0])
+    clock = pair_engine.BroadcastClock(32, *heard[0])
     assert all(clock.update(*packet) for packet in heard[1:])
     assert clock.tx_ticks - heard[0][0] == pytest.approx(times[-1] * PERIOD * (1 - rate), abs=2)
     assert clock.rate == pytest.approx(rate / (1 - rate), abs=1e-9)
@@ -47,22 +38,24 @@ def test_32_bit_counters_are_followed_across_gaps_of_seconds(rate, offset, first
 @pytest.mark.site
 def test_the_phase_is_as_good_as_an_optimal_filter_of_that_noise():
     rng = np.random.default_rng(4)
-    walk = (2 * BROADCAST_WALK_FM**2 + ACCELERATION_M2PS3 / SPEED_OF_LIGHT_MPS**2) * TICK_S
-    white = 2 * WHITE_FM**2 / TICK_S
+    walk = (2 * pair_engine.BROADCAST_WALK_FM**2 + pair_engine.ACCELERATION_M2PS3 / SPEED_OF_LIGHT_MPS**2) * TICK_S
+    white = 2 * pair_engine.WHITE_FM**2 / TICK_S
     step = np.array([[1.0, PERIOD], [0.0, 1.0]])
     noise = np.array(
         [[white * PERIOD + walk * PERIOD**3 / 3, walk * PERIOD**2 / 2], [walk * PERIOD**2 / 2, walk * PERIOD]]
     )
     phase = np.array([[1.0], [0.0]])
-    prior = solve_discrete_are(step.T, phase, noise, [[STAMP_TICKS**2]])[0, 0]  # SciPy's word on the steady state
-    posterior = prior * STAMP_TICKS**2 / (prior + STAMP_TICKS**2)
+    prior = solve_discrete_are(step.T, phase, noise, [[pair_engine.STAMP_TICKS**2]])[
+        0, 0
+    ]  # SciPy's word on the steady state
+    posterior = prior * pair_engine.STAMP_TICKS**2 / (prior + pair_engine.STAMP_TICKS**2)
     state = np.zeros(2)
-    clock = BroadcastClock(32, 0, 0)
+    clock = pair_engine.BroadcastClock(32, 0, 0)
     errors = []
     for number in range(1, 20_000):
         state = step @ state + rng.multivariate_normal([0.0, 0.0], noise)
         sent = number * PERIOD
-        rx_ticks = sent + round(state[0] + rng.normal(0.0, STAMP_TICKS))
+        rx_ticks = sent + round(state[0] + rng.normal(0.0, pair_engine.STAMP_TICKS))
         clock.update(sent % 2**32, rx_ticks)
         errors.append(rx_ticks + clock.phase - sent - state[0])
     # 20 000 errors that are alike over some 6 packets: standard error of the deviation 1.2 %, of the mean 1.7 %.
@@ -73,8 +66,8 @@ def test_the_phase_is_as_good_as_an_optimal_filter_of_that_noise():
 @pytest.mark.site
 def test_single_wild_stamps_are_left_out_and_change_nothing():
     times = [number * PERIOD for number in range(200)]
-    clean = BroadcastClock(32, 0, 0)
-    wild = BroadcastClock(32, 0, 0)
+    clean = pair_engine.BroadcastClock(32, 0, 0)
+    wild = pair_engine.BroadcastClock(32, 0, 0)
     for number, (tx, rx) in enumerate(stamps(times, 5e-6, 0)[1:]):
         if number % 10 == 9:
             assert not wild.update(tx, rx + 20_000)
@@ -88,10 +81,10 @@ def test_single_wild_stamps_are_left_out_and_change_nothing():
 def test_a_restarted_anchor_is_followed_after_three_packets():
     before = stamps([number * PERIOD for number in range(50)], 5e-6, 123)
     after = stamps([number * PERIOD for number in range(50, 100)], 5e-6, 3_000_000_000)
-    clock = BroadcastClock(32, *before[0])
+    clock = pair_engine.BroadcastClock(32, *before[0])
     assert all(clock.update(*packet) for packet in before[1:])
     taken = [clock.update(*packet) for packet in after]
-    assert taken == [False] * RESTART_AFTER + [True] * (50 - RESTART_AFTER)
+    assert taken == [False] * pair_engine.RESTART_AFTER + [True] * (50 - pair_engine.RESTART_AFTER)
     assert clock.restarts == 1
     assert clock.rate == pytest.approx(5e-6, abs=2e-9)
 
@@ -99,7 +92,7 @@ def test_a_restarted_anchor_is_followed_after_three_packets():
 @pytest.mark.site
 def test_packets_out_of_order_are_refused():
     heard = stamps([number * PERIOD for number in range(20)], 0.0, 0)
-    clock = BroadcastClock(32, *heard[0])
+    clock = pair_engine.BroadcastClock(32, *heard[0])
     for packet in heard[1:]:
         assert clock.update(*packet)
     assert not clock.update(*heard[10])
@@ -181,7 +174,7 @@ ROUNDING_M = 0.03  # a few stamps of a tick (4.7 mm) each, and the rate that two
 @settings(max_examples=25)
 def test_exact_stamps_give_the_geometry_whatever_the_clocks(seed, tx_bits):
     world = World(seed, tx_bits=tx_bits)
-    tdoas = hear(PairEngine(tx_bits), world.packets(400))
+    tdoas = hear(pair_engine.PairEngine(tx_bits), world.packets(400))
     assert len(tdoas) > 1100
     assert worst_m(world, tdoas[30:]) < ROUNDING_M
     assert {(tdoa.anchor_a, tdoa.anchor_b) for tdoa in tdoas} == {
@@ -192,7 +185,7 @@ def test_exact_stamps_give_the_geometry_whatever_the_clocks(seed, tx_bits):
 def test_time_runs_in_seconds_of_the_tag_since_its_first_packet():
     world = World(1)
     times_s = world.times_s(4000)  # 20 s: the tag's counter wraps
-    engine = PairEngine()
+    engine = pair_engine.PairEngine()
     found = [(engine.on_packet(world.packet(1 + i % 4, time_s)), time_s) for i, time_s in enumerate(times_s)]
     stamps = [(tdoas[0].time_s, time_s - times_s[0]) for tdoas, time_s in found if tdoas]
     assert stamps[-1][1] > 18
@@ -203,7 +196,7 @@ def test_time_runs_in_seconds_of_the_tag_since_its_first_packet():
 @pytest.mark.parametrize("gap_s", [0.07, 0.5, 8.0, 30.0, 7200.0])
 def test_gaps_beyond_the_wraps_do_no_harm(gap_s):
     world = World(2)
-    engine = PairEngine()
+    engine = pair_engine.PairEngine()
     hear(engine, world.packets(400, host=True))
     tdoas = hear(engine, world.packets(400, start_s=3.0 + gap_s, host=True))
     assert len(tdoas) > 1000
@@ -214,7 +207,7 @@ def test_gaps_beyond_the_wraps_do_no_harm(gap_s):
 
 def test_without_told_times_of_flight_two_way_ranging_finds_them():
     world = World(3)
-    engine = PairEngine()
+    engine = pair_engine.PairEngine()
     tdoas = hear(engine, world.packets(800, tof=False))
     assert len(tdoas) > 2000
     assert worst_m(world, tdoas[200:]) < ROUNDING_M
@@ -222,7 +215,7 @@ def test_without_told_times_of_flight_two_way_ranging_finds_them():
 
 def test_wild_stamps_cost_their_own_packets_only():
     world = World(4)
-    engine = PairEngine(anchors_m=ANCHORS_M)
+    engine = pair_engine.PairEngine(anchors_m=ANCHORS_M)
     packets = world.packets(1000)
     for index in range(100, 1000, 37):
         packet = packets[index]
@@ -238,7 +231,7 @@ def late_by(ticks, relay):
 
 def test_a_wild_relay_is_caught_by_the_distance_of_the_anchors():
     world = World(5)
-    engine = PairEngine(anchors_m=ANCHORS_M)
+    engine = pair_engine.PairEngine(anchors_m=ANCHORS_M)
     hear(engine, world.packets(200))
     packet = world.packet(1, 1.1)
     spoilt, *sound = packet.relays
@@ -249,7 +242,7 @@ def test_a_wild_relay_is_caught_by_the_distance_of_the_anchors():
 
 def test_positions_that_packets_carry_arm_the_gate():
     world = World(6)
-    silent, telling = PairEngine(), PairEngine()
+    silent, telling = pair_engine.PairEngine(), pair_engine.PairEngine()
     for packet in world.packets(200):
         silent.on_packet(packet)
         telling.on_packet(structs.replace(packet, position_m=ANCHORS_M[packet.anchor]))
@@ -262,7 +255,7 @@ def test_positions_that_packets_carry_arm_the_gate():
 
 def test_a_restarted_anchor_comes_back():
     world = World(7)
-    engine = PairEngine()
+    engine = pair_engine.PairEngine()
     hear(engine, world.packets(400))
     world.offsets[2] += 987_654_321_012
     for heard in world.heard.values():
@@ -278,11 +271,11 @@ def test_a_restarted_anchor_comes_back():
 
 def test_duplicates_and_stale_relays_are_counted():
     world = World(8)
-    engine = PairEngine()
+    engine = pair_engine.PairEngine()
     packets = world.packets(100)
     tdoas = hear(engine, [packet for packet in packets for _ in range(2)])
     assert engine.drops["duplicate"] == 100
-    assert len(tdoas) == len(hear(PairEngine(), packets))
+    assert len(tdoas) == len(hear(pair_engine.PairEngine(), packets))
     before = engine.drops["relay-of-unheard-packet"]
     strange = (Relay(9, 1, 5, None), Relay(2, 99, 5, None))
     assert engine.on_packet(structs.replace(world.packet(1, 0.8), relays=strange)) == []
@@ -293,8 +286,8 @@ def test_duplicates_and_stale_relays_are_counted():
 
 
 def test_the_engine_holds_a_bounded_number_of_anchors():
-    engine = PairEngine()
-    for anchor in range(MAX_ANCHORS + 50):
+    engine = pair_engine.PairEngine()
+    for anchor in range(pair_engine.MAX_ANCHORS + 50):
         engine.on_packet(Packet(None, anchor, 1, 1, anchor * 1000, ()))
     assert engine.drops == {"too-many-anchors": 50}
 
@@ -315,4 +308,4 @@ packets = st.builds(
 @pytest.mark.site
 @given(st.lists(packets, max_size=40))
 def test_arbitrary_packets_never_raise(heard):
-    assert all(math.isfinite(tdoa.tdoa_m) for tdoa in hear(PairEngine(), heard))
+    assert all(math.isfinite(tdoa.tdoa_m) for tdoa in hear(pair_engine.PairEngine(), heard))

@@ -1,6 +1,5 @@
 """A site whose programs have roles and TLS, as ``docs/howto/secure_a_site.md`` makes them: nothing is refused."""
 
-import asyncio
 import os
 import re
 import shlex
@@ -10,13 +9,13 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from site_programs import START_S, Program, site_file
+from site_programs import START_S, Program, site_file, together
 
 from skyless.core.errors import SkylessError
 from skyless.run.mqtt.address import MqttAddress, Role, create_access, read_access
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
-from support.mqtt_brokers import Embedded
+from support.mqtt_brokers import Embedded, running
 from support.processes import free_port
 from support.waiting import until
 
@@ -89,21 +88,11 @@ async def test_the_programs_of_a_site_may_do_all_that_they_do(broker, tmp_path):
         program(Role.SURVEY, "survey", "--serve", *mqtts, "--mqtt-ca", tmp_path / "certificate.pem"),
         program(Role.PAGE, "bridge", f"jsonl+tcp://127.0.0.1:{free_port()}"),
     ]
-    await broker.start()
     seen = set()
     observer = Link(address_of(broker, Role.OPERATOR, tmp_path / "certificate.pem"), "observer", site=77, kind="watch")
     observer.subscribe(f"{SITE}#", lambda topic, _: seen.add(topic.removeprefix(SITE)))
-    watching = asyncio.ensure_future(observer.run())
-    await until(lambda: observer.connected)
-    try:
-        await asyncio.gather(*(program.start() for program in programs))
+    async with running(broker, observer), together(programs) as lines:
         await until(lambda: kinds(seen) >= EXPECTED, START_S)
-    finally:
-        await asyncio.gather(*(program.stop() for program in programs))
-        watching.cancel()
-        await asyncio.wait([watching])
-        await broker.stop()
-    lines = [line for program in programs for _, line in program.said]
     assert not [line for line in lines if "does not let" in line or "refuses" in line]
     assert "Violation" not in (tmp_path / "store" / "nats-server.log").read_text(encoding="utf-8")
 

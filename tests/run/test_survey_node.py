@@ -18,19 +18,9 @@ from skyless.core.any_receiver import new_anchor
 from skyless.core.errors import SkylessError
 from skyless.core.site import FloorPlanSite, ScheduleSite, UnplacedAnchor, site_digest
 from skyless.run.anchor import StampLog
+from skyless.run.mqtt import messages as mqtt
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.messages import (
-    PlacementMessage,
-    RequestMessage,
-    SiteMessage,
-    StampsMessage,
-    SurveyFactsMessage,
-    SurveyMessage,
-    SurveySaveMessage,
-    WatchFinding,
-    WatchMessage,
-)
 from skyless.run.survey import program as program_module
 from skyless.run.survey.program import ADOPTION_S, NO_DATA_S, FindingsLog, LiveSurvey, SurveyNode, SurveySettings
 from skyless.sim.impairments import AnchorDisplacement, CarrierModel, DelayError, lab_impairments
@@ -53,14 +43,7 @@ SITE = replace(
 )
 FRESH = replace(SITE, anchors=(), unplaced=tuple(UnplacedAnchor(one.id) for one in SITE.anchors))
 TEXT = "\n".join(
-    [
-        'name = "lab"',
-        "id = 1",
-        "[tags]",
-        "height_m = 0.0",
-        "[schedule]",
-        'mode = "free"',
-    ]
+    ['name = "lab"', "id = 1", "[tags]", "height_m = 0.0", "[schedule]", 'mode = "free"']
     + [line for one in SITE.anchors for line in ("[[anchors]]", f"id = {one.id}")]
 )
 DELAY_TICKS = {anchor: 20 * anchor - 60 for anchor in POSITIONS_M}
@@ -75,7 +58,7 @@ class Collecting:
         self.machine, self.log = new_anchor(site or FRESH, anchor), StampLog(anchor, "run1")
         self.id, self.next_transmission_ticks = anchor, self.machine.next_transmission_ticks
         self.transmission = self.machine.transmission
-        self.log.request(RequestMessage("test", (), 60.0, True), 0.0)
+        self.log.request(mqtt.RequestMessage("test", (), 60.0, True), 0.0)
 
     def hear(self, reception):
         self.machine.hear(reception)
@@ -162,7 +145,7 @@ def test_what_does_not_come_any_more_is_visible():
 
 def test_stamps_of_strangers_are_dropped_and_a_restarted_counter_harms_no_range():
     live = LiveSurvey(FRESH, Facts())
-    stranger = StampsMessage(99, "x", 0.0, ((1, 5, 5),))
+    stranger = mqtt.StampsMessage(99, "x", 0.0, ((1, 5, 5),))
     for t_s, message in messages():
         shifted = tuple(replace(one, rx_ticks=(one.rx_ticks + 2**38) % 2**40) for one in message.stamps)
         restarted = message.anchor == 2 and t_s > 3.0
@@ -229,20 +212,20 @@ async def test_results_are_published_and_saved_and_anchors_get_their_placement(m
     stage = Stage(monkeypatch, site=site, file=file)
     facts = Facts(gauge=Gauge(1, 2, 4))
     plan = FloorPlanSite("", 12.0, -1.0, -2.0)
-    stage.link.receive(topics.survey_facts_topic(1), SurveyFactsMessage(facts, plan, "page"))
+    stage.link.receive(topics.survey_facts_topic(1), mqtt.SurveyFactsMessage(facts, plan, "page"))
     stage.link.handlers[topics.floor_plan_topic(1)]("", PNG)
     await stage.play()
-    message = stage.link.newest(SurveyMessage)
+    message = stage.link.newest(mqtt.SurveyMessage)
     assert message.survey == true_survey()
     assert message.facts == facts
     assert message.file == str(file)
-    assert stage.link.newest(WatchMessage) is None  # anchors have no positions yet
-    stage.link.receive(topics.site_topic(1), SiteMessage(site, True, 0.0))
-    stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", message.serial))
-    assert stage.link.newest(SurveyMessage).error is None
-    assert stage.link.newest(SurveyMessage).saved_serial == message.serial
+    assert stage.link.newest(mqtt.WatchMessage) is None  # anchors have no positions yet
+    stage.link.receive(topics.site_topic(1), mqtt.SiteMessage(site, True, 0.0))
+    stage.link.receive(topics.survey_save_topic(1), mqtt.SurveySaveMessage("page", message.serial))
+    assert stage.link.newest(mqtt.SurveyMessage).error is None
+    assert stage.link.newest(mqtt.SurveyMessage).saved_serial == message.serial
 
-    saved, placement = load_site(file), stage.link.newest(PlacementMessage)
+    saved, placement = load_site(file), stage.link.newest(mqtt.PlacementMessage)
     assert placement.site == saved
     assert placement.before == site_digest(site)
     assert [(one.x_m, one.y_m) for one in saved.anchors] == list(POSITIONS_M.values())
@@ -263,16 +246,16 @@ async def test_results_are_published_and_saved_and_anchors_get_their_placement(m
     assert stage.node.live.ranges().pairs == ()
     await stage.play(6.0, 8.0)
     assert len(stage.asked) > count
-    assert stage.link.newest(WatchMessage).findings == ()
+    assert stage.link.newest(mqtt.WatchMessage).findings == ()
 
 
 async def test_a_second_survey_names_the_sites_before_it(monkeypatch):
     stage = Stage(monkeypatch, site=SITE)
     first = replace(SITE, anchors=(replace(SITE.anchors[0], x_m=0.5), *SITE.anchors[1:]))
-    stage.link.receive(topics.placement_topic(1), PlacementMessage(0.0, site_digest(first), SITE, ("ab",)))
+    stage.link.receive(topics.placement_topic(1), mqtt.PlacementMessage(0.0, site_digest(first), SITE, ("ab",)))
     await stage.play()
     stage.node.save()
-    placement = stage.link.newest(PlacementMessage)
+    placement = stage.link.newest(mqtt.PlacementMessage)
     assert placement.before == site_digest(SITE)
     assert placement.earlier == (site_digest(first), "ab")
     assert stage.node.saved.written == ()  # there is no file
@@ -282,9 +265,9 @@ async def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, fil
     stage = Stage(monkeypatch, site=load_site(file), file=file)
 
     def refused(serial):
-        stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", serial))
-        assert stage.link.newest(PlacementMessage) is None
-        return stage.link.newest(SurveyMessage).error
+        stage.link.receive(topics.survey_save_topic(1), mqtt.SurveySaveMessage("page", serial))
+        assert stage.link.newest(mqtt.PlacementMessage) is None
+        return stage.link.newest(mqtt.SurveyMessage).error
 
     assert "result 1 is not there" in refused(1)
     stage.found = true_survey(())
@@ -292,9 +275,9 @@ async def test_what_cannot_be_saved_is_said_and_changes_nothing(monkeypatch, fil
     assert "determines no anchor" in refused(stage.node.live.serial)
     stage.found = true_survey()
     await stage.play(3.0, 6.0)
-    stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
+    stage.link.receive(topics.site_topic(1), mqtt.SiteMessage(SITE, True, 0.0))
     assert "another site" in refused(stage.node.live.serial)
-    stage.link.receive(topics.site_topic(1), SiteMessage(load_site(file), True, 0.0))
+    stage.link.receive(topics.site_topic(1), mqtt.SiteMessage(load_site(file), True, 0.0))
     file.write_text(TEXT.replace('mode = "free"', 'mode = "free"\nrate_hz = 20.0'), encoding="utf-8")
     changed = file.read_text(encoding="utf-8")
     assert "has been changed" in refused(stage.node.live.serial)
@@ -310,11 +293,11 @@ async def test_a_solver_that_fails_is_reported_and_asked_again(monkeypatch):
         await stage.play(until_s - 3.0, until_s)
         stage.now_s += 1.0
         await stage.step()
-        assert str(error.args[0]) in stage.link.newest(SurveyMessage).error
+        assert str(error.args[0]) in stage.link.newest(mqtt.SurveyMessage).error
         assert stage.node.live.serial == 0
     stage.found = true_survey()
     await stage.play(7.0, 10.0)
-    assert stage.link.newest(SurveyMessage).error is None
+    assert stage.link.newest(mqtt.SurveyMessage).error is None
 
 
 async def test_the_site_on_mqtt_does_where_there_is_no_file_and_bad_messages_are_counted(monkeypatch):
@@ -323,11 +306,11 @@ async def test_the_site_on_mqtt_does_where_there_is_no_file_and_bad_messages_are
     assert stage.node.live is None
     with pytest.raises(SkylessError, match="not known"):
         stage.node.save()
-    stage.link.receive(topics.site_topic(1), SiteMessage(SITE, True, 0.0))
+    stage.link.receive(topics.site_topic(1), mqtt.SiteMessage(SITE, True, 0.0))
     await stage.play(0.0, 2.0)
     assert stage.node.live.serial > 0
     other = replace(SITE, anchors=(replace(SITE.anchors[0], x_m=0.5), *SITE.anchors[1:]))
-    stage.link.receive(topics.site_topic(1), SiteMessage(other, True, 0.0))
+    stage.link.receive(topics.site_topic(1), mqtt.SiteMessage(other, True, 0.0))
     assert stage.node.live.site == other
     assert stage.node.live.serial == 0
     for topic in (topics.survey_facts_topic(1), topics.survey_save_topic(1), topics.site_topic(1)):
@@ -340,11 +323,11 @@ async def test_what_is_retained_and_the_lease_end_with_the_program(monkeypatch):
     async with running(stage.node.run()):
         for callback in stage.link.on_state:
             callback(True)
-        assert stage.link.newest(RequestMessage).stamps
+        assert stage.link.newest(mqtt.RequestMessage).stamps
         await asyncio.sleep(0.01)
     cleared = {topic for topic, message, options in stage.link.published if message == b"" and options["retain"]}
     assert cleared == {topics.survey_topic(1), topics.watch_topic(1)}
-    assert not stage.link.newest(RequestMessage).stamps
+    assert not stage.link.newest(mqtt.RequestMessage).stamps
 
 
 async def test_one_that_gathers_computes_and_publishes_nothing_but_its_request(monkeypatch):
@@ -352,7 +335,7 @@ async def test_one_that_gathers_computes_and_publishes_nothing_but_its_request(m
     await stage.play(0.0, 3.0)
     assert not stage.asked
     assert len(stage.node.live.ranges().pairs) == 15
-    assert {type(message) for _, message, _ in stage.link.published} <= {RequestMessage}
+    assert {type(message) for _, message, _ in stage.link.published} <= {mqtt.RequestMessage}
 
 
 async def test_a_result_that_was_begun_before_it_was_saved_is_dropped(monkeypatch):
@@ -397,10 +380,10 @@ def test_ranges_go_on_when_the_clock_of_an_anchors_host_is_set(step_s):
 )
 async def test_facts_that_cannot_be_computed_with_are_counted_and_ignored(monkeypatch, facts):
     stage = Stage(monkeypatch, site=SITE)
-    stage.link.receive(topics.survey_facts_topic(1), SurveyFactsMessage(facts))
+    stage.link.receive(topics.survey_facts_topic(1), mqtt.SurveyFactsMessage(facts))
     await stage.play(0.0, 2.0)
     assert stage.node.problems == 1
-    assert stage.link.newest(SurveyMessage).facts == Facts()
+    assert stage.link.newest(mqtt.SurveyMessage).facts == Facts()
 
 
 async def test_numbers_that_are_no_stamps_spoil_nothing(monkeypatch):
@@ -417,7 +400,7 @@ async def test_numbers_that_are_no_stamps_spoil_nothing(monkeypatch):
 async def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_has_ended(monkeypatch):
     stage = Stage(monkeypatch, site=SITE)
     await stage.play(0.0, 2.0)
-    own = stage.link.newest(SurveyMessage)
+    own = stage.link.newest(mqtt.SurveyMessage)
     for unix_s in (1.0, 2.0):  # a later one, which waits itself
         stage.link.receive(topics.survey_topic(1), replace(own, by=own.by + "0", unix_s=unix_s))
     stage.link.receive(topics.survey_topic(1), replace(own, by="0", unix_s=1.0))  # one that the broker has kept
@@ -426,11 +409,11 @@ async def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_h
     stage.link.receive(topics.survey_topic(1), replace(own, by="0", unix_s=2.0))
     count = len(stage.link.published)
     await stage.play(3.0, 5.0)
-    stage.link.receive(topics.survey_save_topic(1), SurveySaveMessage("page", stage.node.live.serial))
+    stage.link.receive(topics.survey_save_topic(1), mqtt.SurveySaveMessage("page", stage.node.live.serial))
     assert len(stage.link.published) == count
     stage.now_s += 31.0
     await stage.step()
-    assert isinstance(stage.link.published[-1][1], SurveyMessage | WatchMessage)
+    assert isinstance(stage.link.published[-1][1], mqtt.SurveyMessage | mqtt.WatchMessage)
     assert sum("another survey program" in line for line in stage.said) == 1
 
 
@@ -462,13 +445,13 @@ async def test_a_finding_is_logged_once_although_its_size_wavers():
     found = []
     node.live = SimpleNamespace(
         state=lambda _: "no data",
-        watch_message=lambda *_: WatchMessage(0.0, "watching", tuple(found), 15),
+        watch_message=lambda *_: mqtt.WatchMessage(0.0, "watching", tuple(found), 15),
         restart_ranges=lambda: again.append(None),
         advance_watch=lambda _: None,
     )
 
     for size_m in (0.31, 0.32, 0.31, 0.32, 0.9):
-        found[:] = [WatchFinding("moved", (4,), size_m, 0.01, 0.0, f"anchor 4 has moved by about {size_m:g} m")]
+        found[:] = [mqtt.WatchFinding("moved", (4,), size_m, 0.01, 0.0, f"anchor 4 has moved by about {size_m:g} m")]
         node.update()
     found.clear()
     node.update()
@@ -495,7 +478,7 @@ def test_what_phases_show_is_found_beside_what_stamps_show():
         for machine in machines.values():
             message = machine.log.collect(world.now_s, 1e9 + 1000.0 * machine.id + world.now_s)
             if message is not None:
-                live.add_stamps(msgspec.json.decode(msgspec.json.encode(message), type=StampsMessage), now_s)
+                live.add_stamps(msgspec.json.decode(msgspec.json.encode(message), type=mqtt.StampsMessage), now_s)
                 live.advance_watch(now_s)
                 shown.append(live.watch_message(now_s, 1e9 + world.now_s))
     (finding,) = shown[-1].findings
@@ -515,6 +498,6 @@ def test_ranges_count_from_the_delays_of_the_file_although_the_anchors_run_with_
     node.live = live_after(3.0)
     before = {(pair.a, pair.b): pair.range_m for pair in node.final_ranges().pairs}
     more = replace(FRESH, unplaced=tuple(replace(one, tx_antenna_delay_ticks=16536) for one in FRESH.unplaced))
-    node._on_site(SiteMessage(more, simulated=True, unix_s=0.0))
+    node._on_site(mqtt.SiteMessage(more, simulated=True, unix_s=0.0))
     for pair in node.final_ranges().pairs:  # with smaller delays they are longer, by 50 ticks of each anchor
         assert pair.range_m - before[pair.a, pair.b] == pytest.approx(100 * 0.00469176, abs=1e-5)

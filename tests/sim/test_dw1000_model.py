@@ -334,8 +334,7 @@ def test_with_another_setting_it_hears_nothing_and_is_not_heard(bench, register,
 
 
 @pytest.mark.parametrize(
-    ("fault", "event"),
-    [("header", r.RXPHE), ("parity", r.RXRFSL), ("delimiter", r.RXSFDTO), ("first-path", r.LDEERR)],
+    ("fault", "event"), [("header", r.RXPHE), ("parity", r.RXRFSL), ("delimiter", r.RXSFDTO), ("first-path", r.LDEERR)]
 )
 def test_errors_show_and_want_a_reset_of_the_receiver(bench, fault, event):
     bench.listen()

@@ -24,14 +24,7 @@ def test_the_sample_is_every_kth_row_in_order(count, rows):
         assert count - kept[-1] <= max(stride, count / rows * 2)
 
 
-@given(
-    st.lists(
-        st.tuples(*[st.floats(-1e3, 1e3)] * 3),
-        min_size=1,
-        max_size=60,
-    ),
-    st.booleans(),
-)
+@given(st.lists(st.tuples(*[st.floats(-1e3, 1e3)] * 3), min_size=1, max_size=60), st.booleans())
 def test_sums_equal_those_of_all_errors(errors, planar):
     statistics = ErrorStatistics(planar=planar)
     for error in errors:

@@ -57,12 +57,7 @@ def theory(delayed, weighted):
 
 @pytest.mark.parametrize(
     ("method", "delayed", "weighted"),
-    [
-        ("literal", False, False),
-        ("literal-delayed", True, False),
-        ("weighted", False, True),
-        ("bracketed", True, True),
-    ],
+    [("literal", False, False), ("literal-delayed", True, False), ("weighted", False, True), ("bracketed", True, True)],
 )
 @pytest.mark.statistical
 def test_snapshots_err_as_the_propagated_covariance_says(method, delayed, weighted):

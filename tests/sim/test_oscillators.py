@@ -12,24 +12,15 @@ from scipy.stats import chi2
 from skyless.core.native.library import KERNELS, compiled
 from skyless.core.native.views import view
 from skyless.core.ticks import TICK_RATE_HZ, TICK_S
-from skyless.sim.oscillator import (
-    OscillatorModel,
-    Temperature,
-    advance,
-    clock_rate,
-    emit,
-    foresee,
-    make_clocks,
-    temperature_phase_s,
-)
+from skyless.sim import oscillator
 from skyless.sim.streams import Streams, draw_normal, draw_uniform, stream
 
-_advance_clock = compiled(advance, KERNELS)
+_advance_clock = compiled(oscillator.advance, KERNELS)
 
 
 def _nodes(model, count, seed=1):
     generators = [stream(seed, 0, node, 1) for node in range(count)]
-    return make_clocks(model, generators), Streams([stream(seed, 0, node) for node in range(count)])
+    return oscillator.make_clocks(model, generators), Streams([stream(seed, 0, node) for node in range(count)])
 
 
 def _advance(clocks, streams, node, ticks):
@@ -53,7 +44,7 @@ def _phase_record_s(model, steps, tau_s):
     ("white_fm", "random_walk_fm", "tau_s", "alpha"), [(2e-11, 0.0, 0.01, 0), (0.0, 1e-9, 0.1, -2)]
 )
 def test_allan_deviation_follows_the_theory(white_fm, random_walk_fm, tau_s, alpha):
-    model = OscillatorModel(offset_ppm=0.0, white_fm=white_fm, random_walk_fm=random_walk_fm)
+    model = oscillator.OscillatorModel(offset_ppm=0.0, white_fm=white_fm, random_walk_fm=random_walk_fm)
     phase = _phase_record_s(model, 8192, tau_s)
     for m in (1, 4, 16, 64, 256):
         _, (deviation,), _, _ = allantools.oadev(phase, rate=1.0 / tau_s, data_type="phase", taus=[m * tau_s])
@@ -66,7 +57,7 @@ def test_allan_deviation_follows_the_theory(white_fm, random_walk_fm, tau_s, alp
 
 def test_noise_does_not_depend_on_how_an_interval_is_split():
     count, white, walk = 1500, 2e-9, 5e-9
-    model = OscillatorModel(offset_ppm=0.0, white_fm=white, random_walk_fm=walk)
+    model = oscillator.OscillatorModel(offset_ppm=0.0, white_fm=white, random_walk_fm=walk)
     end = round(TICK_RATE_HZ)
     theory = np.array([[white**2 + walk**2 / 3.0, walk**2 / 2.0], [walk**2 / 2.0, walk**2]])
     whiten = np.linalg.inv(np.linalg.cholesky(theory))
@@ -86,7 +77,7 @@ def test_noise_does_not_depend_on_how_an_interval_is_split():
 
 
 def test_offsets_are_uniform_and_counters_start_anywhere():
-    clocks = view(_nodes(OscillatorModel(offset_ppm=10.0), 400)[0])
+    clocks = view(_nodes(oscillator.OscillatorModel(offset_ppm=10.0), 400)[0])
     assert np.abs(clocks["rate"]).max() < 10e-6
     assert np.std(clocks["rate"]) == pytest.approx(10e-6 / math.sqrt(3.0), rel=0.12)  # 4 standard errors
     assert clocks["local_ticks"].min() < 2**40 * 0.05
@@ -94,18 +85,20 @@ def test_offsets_are_uniform_and_counters_start_anywhere():
 
 
 def test_temperature_phase_is_the_integral_of_the_rate():
-    warm = Temperature(coefficient_ppm_per_k=0.2, warm_up_k=12.0, warm_up_s=40.0, swing_k=3.0, swing_period_s=200.0)
-    model = OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0, temperature=warm)
+    warm = oscillator.Temperature(
+        coefficient_ppm_per_k=0.2, warm_up_k=12.0, warm_up_s=40.0, swing_k=3.0, swing_period_s=200.0
+    )
+    model = oscillator.OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0, temperature=warm)
     clocks, streams = _nodes(model, 1)
 
     def rate(t_s):
         clocks[0].true_ticks = round(t_s * TICK_RATE_HZ)
-        return clock_rate(clocks[0])
+        return oscillator.clock_rate(clocks[0])
 
     assert rate(0.0) == pytest.approx(0.2e-6 * 3.0 * math.sin(clocks[0].swing_phase_rad))
     for from_s, to_s in ((0.0, 1.0), (7.0, 300.0), (1000.0, 1000.0025)):
         integral, _ = quad(rate, from_s, to_s, epsabs=1e-18, limit=200)
-        assert temperature_phase_s(clocks[0], from_s, to_s) == pytest.approx(integral, rel=1e-7, abs=1e-18)
+        assert oscillator.temperature_phase_s(clocks[0], from_s, to_s) == pytest.approx(integral, rel=1e-7, abs=1e-18)
     clocks[0].true_ticks, start = 0, int(clocks[0].local_ticks)
     for second in range(1, 101):
         _advance(clocks, streams, 0, round(second * TICK_RATE_HZ))
@@ -114,7 +107,7 @@ def test_temperature_phase_is_the_integral_of_the_rate():
 
 
 def test_counter_stays_exact_over_months():
-    clocks, streams = _nodes(OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0), 1)
+    clocks, streams = _nodes(oscillator.OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0), 1)
     rate = 2.0**-20 + 2.0**-30
     clocks[0].rate, clocks[0].local_fraction = rate, 0.25
     start = int(clocks[0].local_ticks)
@@ -127,12 +120,12 @@ def test_counter_stays_exact_over_months():
 
 
 def test_emission_is_where_the_counter_shows_the_time():
-    clocks, streams = _nodes(OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0), 1)
+    clocks, streams = _nodes(oscillator.OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0), 1)
     clocks[0].rate, clocks[0].local_fraction = -7.25e-6, 0.75
     start = int(clocks[0].local_ticks) + Fraction(3, 4)
     target = int(clocks[0].local_ticks) + 63_897_601
-    foreseen = foresee(clocks[0], target)
-    fraction = emit(clocks[0], streams.noise[0], target, 0.0, 0.0)
+    foreseen = oscillator.foresee(clocks[0], target)
+    fraction = oscillator.emit(clocks[0], streams.noise[0], target, 0.0, 0.0)
     exact = (target - start) / (1 + Fraction(-7.25e-6))
     assert abs(clocks[0].true_ticks + Fraction(fraction) - exact) < Fraction(1, 10**5)
     assert abs(foreseen - exact) <= 2
@@ -142,13 +135,13 @@ def test_emission_is_where_the_counter_shows_the_time():
 def test_emission_noise_is_that_of_the_interval():
     """Variance of the true time that a counter needs to a mark: q_w dt + q_rw dt³/3, as for the counter itself."""
     count, white, walk = 2000, 1e-9, 1e-6
-    clocks, streams = _nodes(OscillatorModel(offset_ppm=0.0, white_fm=white, random_walk_fm=walk), count)
+    clocks, streams = _nodes(oscillator.OscillatorModel(offset_ppm=0.0, white_fm=white, random_walk_fm=walk), count)
     dt = 63_897_600
     late = np.empty(count)
     for node in range(count):
         clocks[node].local_fraction = 0.0
         target = int(clocks[node].local_ticks) + dt
-        fraction = emit(clocks[node], streams.noise[node], target, 0.0, 0.0)
+        fraction = oscillator.emit(clocks[node], streams.noise[node], target, 0.0, 0.0)
         late[node] = (clocks[node].true_ticks - dt + fraction) * TICK_S
     dt_s = dt * TICK_S
     low, high = chi2.ppf([1e-4, 1 - 1e-4], count) / count

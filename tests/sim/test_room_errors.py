@@ -14,17 +14,7 @@ from skyless.core.native.views import view
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import WallSite
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S, difference
-from skyless.sim.impairments import (
-    AnchorBias,
-    AnchorDisplacement,
-    Body,
-    Impairments,
-    RangeErrorModel,
-    RangeErrors,
-    WarmUp,
-    lab_impairments,
-    slope_error_m,
-)
+from skyless.sim import impairments as faults
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.oscillator import OscillatorModel, clock_rate, drift_phase_s, make_clocks, warm_up
@@ -82,7 +72,7 @@ def _late_at_anchors_m(changed, sites=(LAB, LAB)):
 def test_displaced_anchors_are_heard_from_where_they_truly_are():
     """By tags and by other anchors; and they themselves hear there."""
     shift = np.array([0.3, -0.2])
-    changed = faulty(anchor_displacements=(AnchorDisplacement(3, *shift),))
+    changed = faulty(anchor_displacements=(faults.AnchorDisplacement(3, *shift),))
     for anchor, rows in _late_m(changed, 0.2).items():
         moved = PLACES_M[anchor] + (shift if anchor == 3 else 0.0)
         longer_m = math.dist(moved, (3.0, 4.0)) - math.dist(PLACES_M[anchor], (3.0, 4.0))
@@ -94,14 +84,14 @@ def test_displaced_anchors_are_heard_from_where_they_truly_are():
 
 
 def test_machines_are_told_the_places_of_the_site_file():
-    world = World(LAB, staggered(), [], faulty(anchor_displacements=(AnchorDisplacement(3, 1.0),)), 1)
+    world = World(LAB, staggered(), [], faulty(anchor_displacements=(faults.AnchorDisplacement(3, 1.0),)), 1)
     assert tuple(world.medium.stations[2].position_m) == (7.0, 4.0, 0.0)
     assert (LAB.anchors[2].x_m, LAB.anchors[2].y_m) == (6.0, 4.0)
 
 
 def test_drawn_constants_are_uniform_stay_and_belong_to_their_pair():
     tags = [TagSpec(Static(2.0 + 0.01 * k, 3.0)) for k in range(120)]
-    worlds = [World(LAB, staggered(), tags, i, 3) for i in (IDEAL, faulty(range_errors=RangeErrorModel(0.05)))]
+    worlds = [World(LAB, staggered(), tags, i, 3) for i in (IDEAL, faulty(range_errors=faults.RangeErrorModel(0.05)))]
     late = {}
     for plain, changed in zip(*(world.run(0.1) for world in worlds), strict=True):
         late.setdefault(plain.anchor, []).append((changed.rx_ticks - plain.rx_ticks) * TICK_M)
@@ -109,17 +99,17 @@ def test_drawn_constants_are_uniform_stay_and_belong_to_their_pair():
     drawn = worlds[1].medium.range_errors.present_m[6:]
     assert np.abs(found - drawn.T[:, None]).max() <= 1.01 * TICK_M
     assert kstest(drawn.ravel(), uniform(-0.05, 0.1).cdf).pvalue > 1e-4
-    few = World(LAB, staggered(), tags[:3], faulty(range_errors=RangeErrorModel(0.05)), 3)
+    few = World(LAB, staggered(), tags[:3], faulty(range_errors=faults.RangeErrorModel(0.05)), 3)
     assert (few.medium.range_errors.present_m[6:] == drawn[:3]).all()
-    other = World(LAB, staggered(), tags[:3], faulty(range_errors=RangeErrorModel(0.05)), 4)
+    other = World(LAB, staggered(), tags[:3], faulty(range_errors=faults.RangeErrorModel(0.05)), 4)
     assert not (other.medium.range_errors.present_m[6:] == drawn[:3]).any()
     assert not worlds[1].medium.range_errors.present_m[:6].any()
 
 
 def test_the_slope_grows_with_the_distance_at_tags_alone():
     for distance_m, share in ((0.0, -1.0), (2.0, -0.5), (4.0, 0.0), (7.0, 0.75), (8.0, 1.0), (30.0, 1.0)):
-        assert slope_error_m(0.05, distance_m) == pytest.approx(0.05 * share)
-    model = faulty(range_errors=RangeErrorModel(slope_m=0.08))
+        assert faults.slope_error_m(0.05, distance_m) == pytest.approx(0.05 * share)
+    model = faulty(range_errors=faults.RangeErrorModel(slope_m=0.08))
     place = Static(0.5, 1.5)
     for anchor, rows in _late_m(model, 0.2, tag=TagSpec(place)).items():
         expected_m = 0.08 * np.clip((math.dist(PLACES_M[anchor], (0.5, 1.5)) - 4.0) / 4.0, -1.0, 1.0)
@@ -140,7 +130,7 @@ def test_changing_errors_forget_with_their_correlation_length(along):
     paths = [Waypoints([(0, k), (500, k)], 0.5) for k in range(300)] + [Static(0.0, 0.0)]
     length = {"correlation_s": 10.0} if along == "time" else {"correlation_m": 5.0}
     world = World(site_of((0, 0), (1, 0)), staggered(), [TagSpec(p) for p in paths], IDEAL, 5)
-    errors = RangeErrors(RangeErrorModel(changing_m=0.029, **length), len(paths), 2, 5)
+    errors = faults.RangeErrors(faults.RangeErrorModel(changing_m=0.029, **length), len(paths), 2, 5)
     history = []
     for step in range(301):
         world.medium._move_tags(0.5 * step)
@@ -158,7 +148,7 @@ def test_changing_errors_forget_with_their_correlation_length(along):
 
 
 def test_changing_errors_reach_the_stamps():
-    model = faulty(range_errors=RangeErrorModel(changing_m=0.1, correlation_s=0.2))
+    model = faulty(range_errors=faults.RangeErrorModel(changing_m=0.1, correlation_s=0.2))
     world = World(LAB, staggered(), [TagSpec(MIDDLE)], model, 7)
     plain = World(LAB, staggered(), [TagSpec(MIDDLE)], IDEAL, 7)
     seen = set()
@@ -198,7 +188,7 @@ def test_a_wall_delays_while_it_stands_between(between_anchors):
 
 
 def test_a_body_shadows_its_sector_behind_the_tag_and_turns_with_it():
-    body = Body(delay_m=0.2, sector_rad=math.radians(100.0))
+    body = faults.Body(delay_m=0.2, sector_rad=math.radians(100.0))
     path = Waypoints([(2.0, 3.0), (4.0, 3.0), (4.0, 5.0)], 1.0)
     late = _late_m(faulty(body=body), 4.0, tag=TagSpec(path))
     shadowed = 0
@@ -214,13 +204,13 @@ def test_a_body_shadows_its_sector_behind_the_tag_and_turns_with_it():
 
 
 def test_a_body_in_front_of_a_tag_at_rest_looks_along_x():
-    late = _late_m(faulty(body=Body(0.2, math.radians(20.0), 0.0)), 0.2)
+    late = _late_m(faulty(body=faults.Body(0.2, math.radians(20.0), 0.0)), 0.2)
     assert {anchor for anchor, rows in late.items() if rows[:, 1].mean() > 0.1} == {3}  # at (6, 4), seen from (3, 4)
 
 
 def test_a_bias_lasts_from_one_time_to_another():
     """Within it bursts come and go as always."""
-    biases = (AnchorBias(2, 0.3, from_s=0.5, to_s=1.25), AnchorBias(4, 1.0, 0.2, 0.3, from_s=1.0))
+    biases = (faults.AnchorBias(2, 0.3, from_s=0.5, to_s=1.25), faults.AnchorBias(4, 1.0, 0.2, 0.3, from_s=1.0))
     late = _late_m(faulty(anchor_biases=biases), 2.0)
     t_s, late_m = late[2].T
     assert late_m == pytest.approx(np.where((t_s >= 0.5) & (t_s < 1.25), 0.3, 0.0), abs=1.01 * TICK_M)
@@ -229,7 +219,7 @@ def test_a_bias_lasts_from_one_time_to_another():
 
 
 def test_a_bias_that_creeps_grows_from_its_beginning_and_ends_at_once():
-    late = _late_m(faulty(anchor_biases=(AnchorBias(2, 0.1, from_s=0.5, to_s=1.5, creep_mps=0.4),)), 2.0)
+    late = _late_m(faulty(anchor_biases=(faults.AnchorBias(2, 0.1, from_s=0.5, to_s=1.5, creep_mps=0.4),)), 2.0)
     t_s, late_m = late[2].T
     grown_m = np.where((t_s >= 0.5) & (t_s < 1.5), 0.1 + 0.4 * (t_s - 0.5), 0.0)
     assert late_m == pytest.approx(grown_m, abs=1.01 * TICK_M)
@@ -239,7 +229,7 @@ def test_a_bias_that_creeps_grows_from_its_beginning_and_ends_at_once():
 @pytest.mark.statistical
 def test_a_warming_crystal_gains_what_its_curve_says(ppm):
     """The tag's stamps run ahead by ppm·(t − τ(1 − e^(−t/τ))), t from the start of the warm-up."""
-    rows = np.vstack(list(_late_m(faulty(warm_ups=(WarmUp(ppm, 20.0, 1.0),)), 10.0).values()))
+    rows = np.vstack(list(_late_m(faulty(warm_ups=(faults.WarmUp(ppm, 20.0, 1.0),)), 10.0).values()))
     since_s = np.maximum(rows[:, 0] - 1.0, 0.0)
     ahead_s = ppm * 1e-6 * (since_s - 20.0 * (1.0 - np.exp(-since_s / 20.0)))
     assert rows[:, 1] == pytest.approx(ahead_s * SPEED_OF_LIGHT_MPS, abs=1.01 * TICK_M + 1e-5)
@@ -263,7 +253,7 @@ def test_the_phase_of_a_warm_up_is_the_integral_of_its_rate():
 
 def test_an_anchors_crystal_warms_alone():
     """It speaks too early, as its counter runs ahead; the others speak as before."""
-    changed = faulty(warm_ups=(WarmUp(2.0, 20.0, anchor=3),))
+    changed = faulty(warm_ups=(faults.WarmUp(2.0, 20.0, anchor=3),))
     worlds = [World(LAB, staggered(), [TagSpec(MIDDLE)], impairments, 7) for impairments in (IDEAL, changed)]
     for plain, warm in zip(*(world.run(2.0) for world in worlds), strict=True):
         t_s = plain.emission_s
@@ -272,12 +262,12 @@ def test_an_anchors_crystal_warms_alone():
 
 
 def _room(seed, tags=2, **changes):
-    impairments = Impairments(
-        anchor_displacements=(AnchorDisplacement(2, 0.1, 0.1),),
-        range_errors=RangeErrorModel(0.05, 0.05, 0.029, correlation_m=1.0),
-        body=Body(),
-        warm_ups=(WarmUp(1.0, 20.0), WarmUp(1.0, 20.0, anchor=2)),
-        anchor_biases=(AnchorBias(5, 0.3, from_s=0.1, to_s=0.2),),
+    impairments = faults.Impairments(
+        anchor_displacements=(faults.AnchorDisplacement(2, 0.1, 0.1),),
+        range_errors=faults.RangeErrorModel(0.05, 0.05, 0.029, correlation_m=1.0),
+        body=faults.Body(),
+        warm_ups=(faults.WarmUp(1.0, 20.0), faults.WarmUp(1.0, 20.0, anchor=2)),
+        anchor_biases=(faults.AnchorBias(5, 0.3, from_s=0.1, to_s=0.2),),
     )
     specs = [TagSpec(Roaming((3, 4, 0), (1, 1.3, 0), seed=k)) for k in range(tags)]
     return World(LAB, lambda a: Anchor(LAB, a), specs, msgspec.structs.replace(impairments, **changes), seed)
@@ -297,7 +287,7 @@ def test_the_lab_is_what_it_was():
     """Its ticks, whatever anchors send, as at commit 12610a1, before worlds knew of the errors of rooms."""
     tags = [TagSpec(MIDDLE), TagSpec(Waypoints([(1, 1), (5, 1), (5, 7)], 1.0))]
     digest = hashlib.sha256()
-    for broadcast in World(LAB, staggered(), tags, lab_impairments(100.0), 1).run(0.5):
+    for broadcast in World(LAB, staggered(), tags, faults.lab_impairments(100.0), 1).run(0.5):
         digest.update(broadcast.frame + broadcast.rx_ticks.tobytes())
     assert digest.hexdigest() == "acd622382a8ffca57eefffb93c2fe663f1b0244226aeac5dedfb5626a2c2bc89"
 
@@ -305,15 +295,15 @@ def test_the_lab_is_what_it_was():
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: RangeErrorModel(changing_m=0.03), "either correlation_s or correlation_m"),
-        (lambda: RangeErrorModel(correlation_s=1.0, correlation_m=1.0), "either correlation_s or correlation_m"),
-        (lambda: RangeErrorModel(changing_m=0.03, correlation_m=0.0), "more than 0"),
+        (lambda: faults.RangeErrorModel(changing_m=0.03), "either correlation_s or correlation_m"),
+        (lambda: faults.RangeErrorModel(correlation_s=1.0, correlation_m=1.0), "either correlation_s or correlation_m"),
+        (lambda: faults.RangeErrorModel(changing_m=0.03, correlation_m=0.0), "more than 0"),
         (
-            lambda: World(LAB, Metronome, [], faulty(warm_ups=(WarmUp(1.0, 1.0, anchor=9),)), 1),
+            lambda: World(LAB, Metronome, [], faulty(warm_ups=(faults.WarmUp(1.0, 1.0, anchor=9),)), 1),
             "warm_ups names anchor 9",
         ),
         (
-            lambda: World(LAB, Metronome, [], faulty(anchor_displacements=(AnchorDisplacement(9),)), 1),
+            lambda: World(LAB, Metronome, [], faulty(anchor_displacements=(faults.AnchorDisplacement(9),)), 1),
             "anchor_displacements names anchor 9",
         ),
     ],

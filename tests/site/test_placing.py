@@ -11,27 +11,9 @@ from skyless.research.verify import random_points, verify
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.channel import ChannelModel, barriers_of
 from skyless.site.file.template import rectangular_site
-from skyless.site.planning import optimise
-from skyless.site.planning.links import (
-    FIX_SHARE,
-    Mounts,
-    floor_of,
-    link_budget,
-    sample_points,
-    sides,
-    with_range,
-)
+from skyless.site.planning import links, optimise
+from skyless.site.planning import optimise as optimiser
 from skyless.site.planning.maps import PlanSettings, Predictor, grid_of, plan_map, summary_of
-from skyless.site.planning.optimise import (
-    Search,
-    even_layout,
-    exchange,
-    lattice_of,
-    mean_and_worst,
-    one_more,
-    site_with,
-    site_with_one_more,
-)
 from skyless.site.planning.report import plan_warnings
 
 pytestmark = pytest.mark.statistical
@@ -53,9 +35,9 @@ def small_search(monkeypatch):
 
 
 def searched(site, outline, anchors, heights, tag_heights, settings=SETTINGS, seed=1):
-    floor = floor_of(site, FILE, outline, None)
-    mounts = Mounts(sides(floor.outline_m), heights)
-    return floor, Search(site, settings, floor, mounts, tag_heights, anchors, seed, 300.0).run()
+    floor = links.floor_of(site, FILE, outline, None)
+    mounts = links.Mounts(links.sides(floor.outline_m), heights)
+    return floor, optimiser.Search(site, settings, floor, mounts, tag_heights, anchors, seed, 300.0).run()
 
 
 @pytest.mark.usefixtures("small_search")
@@ -94,7 +76,7 @@ def test_same_seed_same_places():
     assert places[0] == places[1]
 
 
-class SlowSearch(Search):
+class SlowSearch(optimiser.Search):
     """Each point of a prediction takes 10 ms on a clock of its own; Ctrl-C at an evaluation."""
 
     now_s, interrupt_at = 0.0, None
@@ -111,8 +93,8 @@ class SlowSearch(Search):
 def slow_search(monkeypatch):
     monkeypatch.setattr("skyless.site.planning.optimise.time.monotonic", lambda: SlowSearch.now_s)
     site = with_master(10.0, 6.0, 4, 3.0, 1.2)
-    floor = floor_of(site, FILE, None, None)
-    mounts = Mounts(sides(floor.outline_m), (2.5,))
+    floor = links.floor_of(site, FILE, None, None)
+    mounts = links.Mounts(links.sides(floor.outline_m), (2.5,))
     return lambda seconds: SlowSearch(site, SETTINGS, floor, mounts, (1.2,), 4, 1, seconds)
 
 
@@ -139,30 +121,30 @@ def test_exchange_finds_what_trying_all_finds():
     """Four anchors on twelve places: the exchange against all 495 choices."""
     from itertools import combinations
 
-    mounts = Mounts(
+    mounts = links.Mounts(
         np.array([[0.0, 0.0, 6.0, 0.0], [6.0, 0.0, 6.0, 8.0], [6.0, 8.0, 0.0, 8.0], [0.0, 8.0, 0.0, 0.0]]), (2.0,)
     )
     places = mounts.at(np.arange(12) * mounts.length_m / 12, np.zeros(12, np.int64))
-    floor = floor_of(paper_lab_site(), FILE, None, None)
-    points, weights = sample_points(floor, (0.0,), 60)
-    lattice = lattice_of(places, points, weights, link_budget(ChannelModel()), barriers_of(()), 2, 0.04)
+    floor = links.floor_of(paper_lab_site(), FILE, None, None)
+    points, weights = links.sample_points(floor, (0.0,), 60)
+    lattice = optimiser.lattice_of(places, points, weights, links.link_budget(ChannelModel()), barriers_of(()), 2, 0.04)
 
     def score(chosen):
-        return sum(mean_and_worst(np.array(chosen), lattice))
+        return sum(optimiser.mean_and_worst(np.array(chosen), lattice))
 
     best = min(map(score, combinations(range(12), 4)))
     reference = (1e9, 1e9)  # far from any: then the score is the sum of both to a factor
     found = []
     for start in ([0, 1, 2, 3], [0, 3, 6, 9], [2, 5, 7, 11]):
         chosen = np.array(start)
-        exchange(chosen, 0, lattice, reference, 20)
+        optimiser.exchange(chosen, 0, lattice, reference, 20)
         found.append(score(chosen))
     assert min(found) == pytest.approx(best, rel=1e-9)
 
 
 def test_the_even_layout_goes_around_with_heights_in_turn():
-    mounts = Mounts(sides(np.array([(0, 0), (4, 0), (4, 2), (0, 2)], float)), (0.5, 2.5))
-    layout = even_layout(mounts, 4)
+    mounts = links.Mounts(links.sides(np.array([(0, 0), (4, 0), (4, 2), (0, 2)], float)), (0.5, 2.5))
+    layout = optimiser.even_layout(mounts, 4)
     assert mounts.at(layout.along_m, layout.levels).tolist() == [[0, 0, 0.5], [3, 0, 2.5], [4, 2, 0.5], [1, 2, 2.5]]
 
 
@@ -170,22 +152,24 @@ def test_one_more_anchor_helps_where_one_is_missing():
     """The lab without its two anchors on the right: the new one belongs there."""
     anchors = tuple(a for a in paper_lab_site().anchors if a.id not in {3, 4})
     site = replace(paper_lab_site(), anchors=anchors)
-    floor = floor_of(site, FILE, np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float), None)
-    more = one_more(site, SETTINGS, floor, Mounts(sides(floor.outline_m), (0.0,)), (0.0,))
+    floor = links.floor_of(site, FILE, np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float), None)
+    more = optimiser.one_more(site, SETTINGS, floor, links.Mounts(links.sides(floor.outline_m), (0.0,)), (0.0,))
     assert more.position_m[0] == pytest.approx(6.0, abs=0.5)
     assert more.position_m[1] > 6.0
     assert more.mean_after_m < 0.9 * more.mean_before_m
     assert more.worst_after_m < 0.7 * more.worst_before_m
     assert more.helps
-    grown = site_with_one_more(site, np.array(more.position_m))
+    grown = optimiser.site_with_one_more(site, np.array(more.position_m))
     assert [a.id for a in grown.anchors] == [1, 2, 5, 6, 7]
 
 
 def test_one_more_anchor_helps_nobody_where_it_only_lengthens_the_superframe():
-    ring = Mounts(sides(np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float)), (0.0,))
-    site = site_with(paper_lab_site(), ring.at(even_layout(ring, 16).along_m, np.zeros(16, np.int64)), 1)
-    floor = floor_of(site, FILE, None, (2.0, 2.0, 4.0, 6.0))
-    more = one_more(site, SETTINGS, floor, ring, (0.0,))
+    ring = links.Mounts(links.sides(np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float)), (0.0,))
+    site = optimiser.site_with(
+        paper_lab_site(), ring.at(optimiser.even_layout(ring, 16).along_m, np.zeros(16, np.int64)), 1
+    )
+    floor = links.floor_of(site, FILE, None, (2.0, 2.0, 4.0, 6.0))
+    more = optimiser.one_more(site, SETTINGS, floor, ring, (0.0,))
     assert not more.helps
     assert more.mean_after_m > 0.95 * more.mean_before_m
 
@@ -193,7 +177,7 @@ def test_one_more_anchor_helps_nobody_where_it_only_lengthens_the_superframe():
 def test_warnings_name_what_is_wrong():
     wall = WallSite(3.0, -1.0, 3.0, 9.0, loss_db=25.0, delay_m=0.3)
     site = replace(paper_lab_site(), walls=(wall,))
-    floor = floor_of(site, FILE, None, None)
+    floor = links.floor_of(site, FILE, None, None)
     predictor = Predictor(site, SETTINGS)
     text = "\n".join(plan_warnings(predictor, floor, plan_map(predictor, grid_of(floor, (0.0,), 0.5))))
     assert (
@@ -205,7 +189,7 @@ def test_warnings_name_what_is_wrong():
 
 def test_mirrors_are_told_by_the_solver():
     flat = Site("flat", 1, 1, tuple(replace(a, z_m=2.5) for a in paper_lab_site().anchors), tags=TagsSite())
-    floor = floor_of(flat, FILE, None, None)
+    floor = links.floor_of(flat, FILE, None, None)
     predictor = Predictor(flat, SETTINGS)
     warnings = plan_warnings(predictor, floor, plan_map(predictor, grid_of(floor, (1.0,), 1.0)))
     assert any("of the region has a mirror image" in warning for warning in warnings)
@@ -243,12 +227,12 @@ def test_prediction_and_simulation_agree(monkeypatch, name, rounds):
     """
     monkeypatch.setattr("skyless.research.verify._WORLDS", 8)
     site = paper_lab_site(accuracy=AccuracySite()) if name == "range errors" else SITES[name]
-    floor = floor_of(site, FILE, None, None)
+    floor = links.floor_of(site, FILE, None, None)
     predictor = Predictor(site, SETTINGS)
     heights = (1.0, 2.0) if name == "3-D" else (0.0,)
     grid = grid_of(floor, heights, 0.5)
     plan = plan_map(predictor, grid)
-    grid.within[:] &= (plan.column(FIX_SHARE) > 0.85).all(axis=0)
+    grid.within[:] &= (plan.column(links.FIX_SHARE) > 0.85).all(axis=0)
     checked = verify(predictor, random_points(plan, 3, 5), rounds, 9)
     for check in checked.points:
         assert check.ratio == pytest.approx(1.0, abs=0.05 + 4.0 * check.ratio_error)
@@ -260,7 +244,7 @@ def test_a_site_from_places_keeps_the_rest():
     site = replace(
         paper_lab_site(), walls=(WallSite(0.0, 0.0, 1.0, 1.0),), schedule=replace(paper_lab_site().schedule, slots=9)
     )
-    made = site_with(site, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]), 2)
+    made = optimiser.site_with(site, np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 1.0], [0.0, 1.0, 1.0]]), 2)
     assert made.master == 3
     assert made.walls == site.walls
     assert made.schedule.slots is None
@@ -268,8 +252,8 @@ def test_a_site_from_places_keeps_the_rest():
 
 
 def test_range_decides_coverage():
-    floor = floor_of(lab_site(), FILE, None, None)
-    near = PlanSettings(channel=with_range(ChannelModel(), 4.0))
+    floor = links.floor_of(lab_site(), FILE, None, None)
+    near = PlanSettings(channel=links.with_range(ChannelModel(), 4.0))
     summary = summary_of(plan_map(Predictor(lab_site(), near), grid_of(floor, (0.0,), 0.5)))
     assert summary.covered_share < 1.0
     assert summary.fewest_anchors < 3

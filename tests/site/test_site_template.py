@@ -78,13 +78,7 @@ def test_every_key_of_its_mode_stands_in_the_template(lab, others):
 
 
 @pytest.mark.site
-@given(
-    st.floats(1, 500),
-    st.floats(1, 500),
-    st.integers(1, 60),
-    st.floats(0.5, 30),
-    st.none() | st.floats(-5, 30),
-)
+@given(st.floats(1, 500), st.floats(1, 500), st.integers(1, 60), st.floats(0.5, 30), st.none() | st.floats(-5, 30))
 def test_rooms_load_and_their_anchors_hang_on_the_walls(tmp_path_factory, width, depth, anchors, height, tag_height):
     site = rectangular_site(width, depth, anchors, height, tag_height)
     assert reload(tmp_path_factory.getbasetemp(), site) == site

@@ -18,18 +18,8 @@ from skyless.sim.lab import paper_lab_site
 from skyless.site.file.check import check_site
 from skyless.site.file.load import load_site
 from skyless.site.file.template import site_template
+from skyless.site.survey import surveyed_site as surveyed
 from skyless.site.survey.facts import PairRange, PairRanges, Survey, SurveyedAnchor
-from skyless.site.survey.surveyed_site import (
-    SurveyRecord,
-    baseline,
-    delay_changes_ticks,
-    encode_record,
-    read_record,
-    record_path,
-    surveyed_site,
-    surveyed_text,
-    unchanged_anchors,
-)
 
 pytestmark = pytest.mark.site
 
@@ -80,12 +70,12 @@ def test_the_written_text_is_the_surveyed_site(tmp_path_factory, site, anchors, 
     assert load_site(path) == site
     before = path.read_text()
     try:
-        after = surveyed_text(before, survey, site, path)
+        after = surveyed.surveyed_text(before, survey, site, path)
     except ConfigurationError as error:  # two anchors at one point, as hypothesis likes them
         assert "anchors" in error.key
         return
     path.write_text(after)
-    written, expected = load_site(path), surveyed_site(site, survey)
+    written, expected = load_site(path), surveyed.surveyed_site(site, survey)
     order = lambda anchors: sorted(anchors, key=lambda anchor: anchor.id)  # noqa: E731
     assert order(written.anchors) == order(expected.anchors)
     assert written.unplaced == expected.unplaced
@@ -97,7 +87,7 @@ def test_comments_and_layout_stay_and_only_what_has_changed_is_written(tmp_path)
     text = site_template(LAB).replace("[[anchors]]\n", "[[anchors]]   # by the door\n", 1)
     first = LAB.anchors[0]
     survey = survey_of(found(first.id, first.x_m, 1.25, first.z_m, delay_m=0.0))
-    after = surveyed_text(text, survey, LAB, tmp_path / "lab.toml")
+    after = surveyed.surveyed_text(text, survey, LAB, tmp_path / "lab.toml")
     changed = [(old, new) for old, new in zip(text.splitlines(), after.splitlines(), strict=True) if old != new]
     assert [new.split("#")[0].strip() for _, new in changed] == ["survey_std_m = 0.019", "y_m = 1.25"]
 
@@ -113,7 +103,7 @@ def test_delays_accuracy_and_anchors_that_are_not_determined():
         found(999),
         range_std_m=0.05432,
     )
-    new = surveyed_site(site, survey)
+    new = surveyed.surveyed_site(site, survey)
     assert new.anchors[0].tx_antenna_delay_ticks - a.tx_antenna_delay_ticks == round(-0.4 / TICK_M)
     assert new.anchors[0].std_m == 0.005
     assert new.anchors[1] == b
@@ -121,8 +111,8 @@ def test_delays_accuracy_and_anchors_that_are_not_determined():
     assert (new.anchors[2].id, new.anchors[2].std_m) == (site.unplaced[0].id, 0.255)
     assert new.unplaced == (kept,)
     assert new.accuracy == replace(site.accuracy, range_std_m=0.0544)
-    assert unchanged_anchors(site, survey) == (b.id, kept.id)
-    assert delay_changes_ticks(site, survey) == {a.id: round(-0.4 / TICK_M), 100: round(0.4 / TICK_M)}
+    assert surveyed.unchanged_anchors(site, survey) == (b.id, kept.id)
+    assert surveyed.delay_changes_ticks(site, survey) == {a.id: round(-0.4 / TICK_M), 100: round(0.4 / TICK_M)}
 
 
 @pytest.mark.parametrize("range_std_m", [0.0, 0.03, 0.50003, 6.5])
@@ -130,8 +120,8 @@ def test_tags_see_from_the_accuracy_that_delays_have_changed(range_std_m):
     """Positions that are kept do not change the almanac, and delays are not in it."""
     site = replace(free_site(6, 0), accuracy=replace(LAB.accuracy, range_std_m=range_std_m))
     kept = [found(one.id, one.x_m, one.y_m, one.z_m, one.std_m, 0.0) for one in site.anchors]
-    assert surveyed_site(site, survey_of(*kept, range_std_m=0.0)).accuracy == site.accuracy
-    changed = surveyed_site(site, survey_of(*kept[1:], replace(kept[0], delay_m=0.1), range_std_m=0.0))
+    assert surveyed.surveyed_site(site, survey_of(*kept, range_std_m=0.0)).accuracy == site.accuracy
+    changed = surveyed.surveyed_site(site, survey_of(*kept[1:], replace(kept[0], delay_m=0.1), range_std_m=0.0))
     assert 0.5e-4 < abs(changed.accuracy.range_std_m - range_std_m) < 2e-4
     assert site_issue(site_pages_of(changed)) != site_issue(site_pages_of(site))
     check_site(changed, "the site")
@@ -140,14 +130,16 @@ def test_tags_see_from_the_accuracy_that_delays_have_changed(range_std_m):
 def test_one_accuracy_for_all_anchors_in_protocol_1():
     site = replace(LAB, accuracy=replace(LAB.accuracy, survey_std_m=0.02, range_std_m=0.1))
     first, second = LAB.anchors[:2]
-    new = surveyed_site(site, survey_of(found(first.id, std_m=0.01), found(second.id, std_m=0.0)))
+    new = surveyed.surveyed_site(site, survey_of(found(first.id, std_m=0.01), found(second.id, std_m=0.0)))
     assert new.accuracy == replace(site.accuracy, survey_std_m=0.0169)  # sqrt((0.01² + 4 · 0.02²) / 6), rounded up
-    assert surveyed_site(site, survey_of()) == site
+    assert surveyed.surveyed_site(site, survey_of()) == site
 
 
 def test_an_antenna_delay_that_no_radio_has(tmp_path):
     with pytest.raises(SkylessError, match="antenna delay of -"):
-        surveyed_text(site_template(LAB), survey_of(found(LAB.anchors[0].id, delay_m=-50.0)), LAB, tmp_path / "a.toml")
+        surveyed.surveyed_text(
+            site_template(LAB), survey_of(found(LAB.anchors[0].id, delay_m=-50.0)), LAB, tmp_path / "a.toml"
+        )
 
 
 def test_sections_that_the_file_lacks_are_added(tmp_path):
@@ -158,20 +150,22 @@ def test_sections_that_the_file_lacks_are_added(tmp_path):
     path.write_text(text.removesuffix("\n"))
     site = load_site(path)
     survey = survey_of(*(found(k, 2.0 * k, std_m=0.001) for k in (1, 2, 3)), range_std_m=0.5)
-    path.write_text(surveyed_text(path.read_text(), survey, site, path))
-    assert load_site(path) == surveyed_site(site, survey)
+    path.write_text(surveyed.surveyed_text(path.read_text(), survey, site, path))
+    assert load_site(path) == surveyed.surveyed_site(site, survey)
 
 
 RANGES = PairRanges((PairRange(1, 2, 5.0, 0.001, 9), PairRange(1, 3, 4.0, 0.001, 9)), (1, 2, 3), {1: 0.001}, 4.0)
 
 
 def test_the_record_comes_back_and_its_baseline_has_the_new_delays(tmp_path):
-    path = record_path(tmp_path / "hall.toml")
+    path = surveyed.record_path(tmp_path / "hall.toml")
     assert path.name == "hall.survey.json"
-    record = SurveyRecord("hall", 7, 1.75e9, RANGES, survey_of(found(1), found(2)), {1: 20, 2: -4})
-    path.write_bytes(encode_record(record))
-    assert read_record(path) == record
-    assert [pair.range_m for pair in baseline(record).pairs] == pytest.approx([5.0 - 8 * TICK_M, 4.0 - 10 * TICK_M])
+    record = surveyed.SurveyRecord("hall", 7, 1.75e9, RANGES, survey_of(found(1), found(2)), {1: 20, 2: -4})
+    path.write_bytes(surveyed.encode_record(record))
+    assert surveyed.read_record(path) == record
+    assert [pair.range_m for pair in surveyed.baseline(record).pairs] == pytest.approx(
+        [5.0 - 8 * TICK_M, 4.0 - 10 * TICK_M]
+    )
 
 
 @pytest.mark.parametrize(
@@ -181,9 +175,9 @@ def test_a_bad_record_is_refused(tmp_path, data):
     path = tmp_path / "x.survey.json"
     path.write_bytes(data)
     with pytest.raises(ConfigurationError, match=r"x\.survey\.json"):
-        read_record(path)
+        surveyed.read_record(path)
     with pytest.raises(ConfigurationError, match="can be read"):
-        read_record(tmp_path / "none.json")
+        surveyed.read_record(tmp_path / "none.json")
 
 
 def test_json_has_no_infinity():

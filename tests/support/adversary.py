@@ -28,18 +28,7 @@ from skyless.core.air.beacon import (
 )
 from skyless.core.air.frame import HEARD, Heard, PackedHeard, fcs
 from skyless.core.arrays import Array
-from skyless.core.keys.chain import (
-    KEY_BYTES,
-    SECTION_BITS,
-    USUAL_TIMING,
-    Certificate,
-    ChainTiming,
-    SectionName,
-    mac_key,
-    mac_of,
-    read_certificate,
-    sign,
-)
+from skyless.core.keys import chain
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ, difference, nearest, wrap
 
 DRAG_MPS: Final = 0.5
@@ -77,7 +66,7 @@ class Adversary:
         self.recent: deque[Overheard] = deque(maxlen=_RECENT)
         self.keys: dict[int, bytes] = {}
         """Disclosed keys by their intervals."""
-        self.certificates: list[tuple[bytes, Certificate]] = []
+        self.certificates: list[tuple[bytes, chain.Certificate]] = []
         self.private: Ed25519PrivateKey | None = None
         """Its own key, to sign certificates with."""
         self._begins_unix_s = begins_unix_s
@@ -99,7 +88,7 @@ class Adversary:
         self.newest[beacon.anchor] = one
         self.recent.append(one)
         if beacon.certificate is not None and all(beacon.certificate != sent for sent, _ in self.certificates):
-            read = read_certificate(beacon.site, beacon.certificate)
+            read = chain.read_certificate(beacon.site, beacon.certificate)
             if read is not None:
                 self.certificates.append((beacon.certificate, read[0]))
         if isinstance(beacon.page, KeyPage) and beacon.authentication is not None:
@@ -107,9 +96,9 @@ class Adversary:
             self.keys[interval - self.timing.lag] = beacon.page.key
 
     @property
-    def timing(self) -> ChainTiming:
+    def timing(self) -> chain.ChainTiming:
         """That of the site's chain."""
-        return self.certificates[-1][1].timing if self.certificates else USUAL_TIMING
+        return self.certificates[-1][1].timing if self.certificates else chain.USUAL_TIMING
 
     def interval_at(self, true_s: float) -> int:
         """Number of the interval at a true time."""
@@ -242,7 +231,7 @@ def false_key(adversary: Adversary) -> bytes:
     """A key page with a random key, or a genuine key of another interval."""
     draw, beacon = adversary.random, _measurement(adversary)
     keys = list(adversary.keys.values())
-    key = draw.choice(keys[-8:]) if keys and draw.random() < 0.5 else draw.randbytes(KEY_BYTES)
+    key = draw.choice(keys[-8:]) if keys and draw.random() < 0.5 else draw.randbytes(chain.KEY_BYTES)
     return _shifted(adversary, replace(_with_space(beacon), page=KeyPage(key)))
 
 
@@ -267,10 +256,10 @@ def false_certificate(adversary: Adversary) -> bytes:
     sent = draw.choice(adversary.certificates)[0] if adversary.certificates else None
     kind = draw.randrange(4)
     if sent is None or kind == 0:
-        section = adversary.interval_at(adversary.now_s) >> SECTION_BITS
-        name = SectionName(beacon.site, draw.randrange(1, 1 << 16), section)
-        made = Certificate(name, adversary.timing, name.first_interval, draw.randbytes(KEY_BYTES))
-        sent = made.sent_bytes(sign(made, adversary.private))
+        section = adversary.interval_at(adversary.now_s) >> chain.SECTION_BITS
+        name = chain.SectionName(beacon.site, draw.randrange(1, 1 << 16), section)
+        made = chain.Certificate(name, adversary.timing, name.first_interval, draw.randbytes(chain.KEY_BYTES))
+        sent = made.sent_bytes(chain.sign(made, adversary.private))
     elif kind == 1:
         altered = bytearray(sent)
         altered[draw.randrange(len(sent))] ^= 1 << draw.randrange(8)
@@ -288,9 +277,11 @@ def disclosed_key(adversary: Adversary) -> bytes:
         return encode(beacon)
     interval = max(adversary.keys) - adversary.random.choice((0, 0, 0, 1, 2))
     key = adversary.keys.get(interval, adversary.keys[max(adversary.keys)])
-    name = SectionName(beacon.site, adversary.certificates[-1][1].name.serial, interval >> SECTION_BITS)
+    name = chain.SectionName(beacon.site, adversary.certificates[-1][1].name.serial, interval >> chain.SECTION_BITS)
     lowest_bits = interval & (1 << INTERVAL_BITS) - 1
-    return with_authentication(encode(beacon), lowest_bits, lambda signed: mac_of(signed, mac_key(key, name)))
+    return with_authentication(
+        encode(beacon), lowest_bits, lambda signed: chain.mac_of(signed, chain.mac_key(key, name))
+    )
 
 
 def other_name(adversary: Adversary) -> bytes:

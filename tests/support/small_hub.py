@@ -39,10 +39,7 @@ async def site(folder, leaf, keep_bytes=10**8):
     """The broker of a site with its gather, whose streams are there."""
     place = folder / f"{leaf.tenant}{leaf.site}"
     settings = BrokerSettings(port=free_port(), data=place, gathered_bytes=keep_bytes, hub=leaf)
-    async with (
-        await start_broker(settings) as broker,
-        running(Gather(broker.nats, leaf.site, keep_bytes, print).run()),
-    ):
+    async with await start_broker(settings) as broker, running(Gather(broker.nats, leaf.site, keep_bytes, print).run()):
         client = await client_of(broker.nats)
         async with asyncio.timeout(30):
             while not await has_stream(client, at(EVENT_STREAM, leaf.site)):
