@@ -40,7 +40,7 @@ def test_one_beacon_a_second_is_enough_for_fixes_with_levels(seed):
     assert report.first_fix_s < 5.0
     assert report.levels.misleading == 0
     assert report.levels.available > 0.7
-    assert report.rmse_m < 0.45
+    assert report.rmse_m < 0.5
 
 
 def test_anchors_at_one_height_give_no_level_without_a_known_height():
