@@ -76,6 +76,14 @@ def test_neither_an_obstacle_nor_single_late_packets_are_two_values():
     assert not watch.flips_m
 
 
+def test_an_anchor_that_is_silent_is_not_named_any_more():
+    watch = StampWatch()
+    heard(watch, (0.0, 0.0, 5.0), rounds=8)
+    assert list(watch.own_clocks_ppm) == [2]
+    heard(watch, (0.0, 0.0), begin_s=8.0, rounds=2)
+    assert not watch.own_clocks_ppm
+
+
 def test_faults_show_within_a_second():
     watch = StampWatch()
     heard(watch, rounds=int(READY_S / EVERY_S))

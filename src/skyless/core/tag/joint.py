@@ -56,6 +56,10 @@ class Observation(Struct, frozen=True, gc=False):
     """Phases of ``relays``, as anchors received each other."""
 
 
+_PERIOD_SHARE: Final = 0.1
+"""Smaller changes of a period do not begin the search again."""
+
+
 class Estimation:
     """One tag's estimator, from its first beacon on."""
 
@@ -101,7 +105,7 @@ class Estimation:
 
     def expect_period(self, period_s: float) -> None:
         """Let a search for a start expect anchors that send once in this time."""
-        if period_s != self.course.superframe_s:
+        if abs(period_s - self.course.superframe_s) > _PERIOD_SHARE * self.course.superframe_s:
             self.course.superframe_s = period_s
             fill_ages(self.course.settings, period_s)
             _begin_course(self.course, self.search)

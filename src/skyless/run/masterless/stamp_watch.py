@@ -40,6 +40,9 @@ FORGETTING: Final = 0.02
 OFTEN: Final = 0.2
 """Share of late packets from which on an anchor's stamps are said to flip. Fewer are single late packets."""
 
+NAMED_S: Final = 5.0
+"""Anchors are not named after this silence."""
+
 _ALL: Final = (1 << WINDOW) - 1
 
 
@@ -108,12 +111,16 @@ class StampWatch:
     @property
     def own_clocks_ppm(self) -> dict[int, float]:
         """Anchors whose time base is lost, and how much faster their clocks run than the common time."""
-        return {anchor: 1e6 * one.own_rate for anchor, one in self._stamps.items() if one.own_rate}
+        return {anchor: 1e6 * one.own_rate for anchor, one in self._heard_lately() if one.own_rate}
 
     @property
     def flips_m(self) -> dict[int, float]:
         """Anchors whose stamps flip between two values, and the distance of these."""
-        return {anchor: one.gap_m for anchor, one in self._stamps.items() if one.late_share > OFTEN}
+        return {anchor: one.gap_m for anchor, one in self._heard_lately() if one.late_share > OFTEN}
+
+    def _heard_lately(self) -> list[tuple[int, _Stamps]]:
+        after = from_seconds(self._newest_s - NAMED_S)
+        return [(anchor, one) for anchor, one in self._stamps.items() if one.rx_ticks > after]
 
     def _note_change(self) -> None:
         self.changes += 1
