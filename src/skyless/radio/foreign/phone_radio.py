@@ -102,6 +102,8 @@ class PhoneRadio:
             data = await reader.read(CHUNK_BYTES)
         if isinstance(messages, LineCutter):
             messages.finish()
+        for packet in self._records.finish() if self._phone is writer else ():
+            self._listener(packet)
 
     def _take(self, writer: StreamWriter) -> None:
         """Let this connection be the phone's."""

@@ -47,6 +47,11 @@ LATE_S: Final = 1.0
 """How far before the newest a record is late or a double; one from farther back means that time has begun again."""
 
 
+WAIT_S: Final = 0.05
+"""How much newer a record has to be for those before it not to wait any longer, in an unordered stream."""
+_MOST_WAITING: Final = 1024
+
+
 class _Wgs84(Struct):
     latitude: float
     longitude: float
@@ -112,6 +117,7 @@ def read(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | 
     phone = Phone(drops, anchors_m)
     for line in lines(stream, drops):
         yield from phone.on_message(line)
+    yield from phone.finish()
 
 
 class Phone:
@@ -128,9 +134,12 @@ class Phone:
         """How many each cluster has sent, by its initiator."""
         self._newest_initiator: int | None = None
         self._newest_rx_ticks: int | None = None
+        self._is_unordered = False
+        """Whether a record has been older than one before: from then on they wait for each other."""
+        self._waiting: list[_Record] = []
 
     def on_message(self, message: bytes) -> list[Packet]:
-        """Packets of the lines of a message, in order of reception."""
+        """Packets of the lines of a message, and of records that have waited, in order of reception."""
         records: list[_Record] = []
         for line in message.split(b"\n"):
             found = _records(line) if line.strip() else []
@@ -138,13 +147,38 @@ class Phone:
                 self._drops["malformed-record"] += 1
             else:
                 records += found
-        stated = (self._android(one) if one.measurement_type is None else self._ios(one) for one in _in_order(records))
+        if not self._is_unordered:
+            return self._packets(_in_order(records))
+        packets = self.finish() if self._begin_again(records) else []
+        waiting = _in_order(self._waiting + records)
+        newest = _rx_ticks(waiting[-1]) if waiting else None
+        ready = len(waiting)
+        if newest is not None and ready <= _MOST_WAITING:
+            stamps = [_rx_ticks(one) for one in waiting]
+            ready = sum(stamp is None or _ahead(newest, stamp) > WAIT_S * TICK_RATE_HZ for stamp in stamps)
+        self._waiting = waiting[ready:]
+        return packets + self._packets(waiting[:ready])
+
+    def _begin_again(self, records: list[_Record]) -> bool:
+        """Whether the time of some records has begun again since those that wait."""
+        newest = _rx_ticks(self._waiting[-1]) if self._waiting else None
+        stamps = [stamp for one in records if (stamp := _rx_ticks(one)) is not None]
+        return newest is not None and any(_ahead(stamp, newest) < -LATE_S * TICK_RATE_HZ for stamp in stamps)
+
+    def finish(self) -> list[Packet]:
+        """Packets of the records that still wait."""
+        waiting, self._waiting = self._waiting, []
+        return self._packets(waiting)
+
+    def _packets(self, records: list[_Record]) -> list[Packet]:
+        stated = (self._android(one) if one.measurement_type is None else self._ios(one) for one in records)
         return self._rounds.packets(stated, self._drops)
 
     def _is_late(self, rx_ticks: int) -> bool:
         """Whether a record is not newer than the newest, which it otherwise becomes."""
         ahead = 1 if self._newest_rx_ticks is None else _ahead(rx_ticks, self._newest_rx_ticks)
         if -LATE_S * TICK_RATE_HZ < ahead <= 0:
+            self._is_unordered |= ahead < 0
             return True
         self._newest_rx_ticks = rx_ticks
         return False
