@@ -100,11 +100,11 @@ def test_a_key_of_another_interval_is_forged():
 
 def count_steps(monkeypatch, module):
     """The steps of each hash from now on."""
-    steps = []
+    steps, earlier_key = [], chains.earlier_key
 
     def counted(key, name, number=1):
         steps.append(number)
-        return chains.earlier_key(key, name, number)
+        return earlier_key(key, name, number)
 
     monkeypatch.setattr(module, "earlier_key", counted)
     return steps

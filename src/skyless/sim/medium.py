@@ -66,6 +66,8 @@ class Timeline(Generic[Result]):
     def __init__(self) -> None:
         self.now_ticks = 0
         self._serial = 0
+        self.until_ticks = 0
+        """End of the present ``run``."""
         self._events: list[tuple[int, int, Callable[[], Result | None]]] = []
 
     @property
@@ -78,8 +80,16 @@ class Timeline(Generic[Result]):
         self._serial += 1
         heapq.heappush(self._events, (max(ticks, self.now_ticks), self._serial, happen))
 
+    def pass_to(self, ticks: int) -> bool:
+        """Advance to ``ticks`` at once if no event and no end of ``run`` comes first. Returns True if advanced."""
+        if ticks > self.until_ticks or (self._events and self._events[0][0] <= ticks):
+            return False
+        self.now_ticks = max(self.now_ticks, ticks)
+        return True
+
     def run(self, until_ticks: int) -> Iterator[Result]:
         """Run all events up to a time, and yield their results."""
+        self.until_ticks = until_ticks
         while self._events and self._events[0][0] <= until_ticks:
             self.now_ticks, _, happen = heapq.heappop(self._events)
             result = happen()

@@ -249,6 +249,11 @@ class Transceiver:
             self.raise_bits(r.RXRFTO)
         self._count_receiving(now)
 
+    @property
+    def window_left_ticks(self) -> int | None:
+        """Time left in the receiver's window, if it has one."""
+        return None if self._window_end_ticks is None else difference(self._window_end_ticks, self._air.now_ticks())
+
     def finish(self) -> None:
         """The air reports that the frame has been sent."""
         if self.sending is not None and not self.sending.missed:
