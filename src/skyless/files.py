@@ -123,7 +123,10 @@ class LineCutter:
             self._overlong = True
             self._rest = b""
         for line in parts:
-            yield line[:-1] if line.endswith(b"\r") else line
+            if len(line) > MAX_LINE_BYTES:
+                self._drops["overlong-line"] += 1
+            else:
+                yield line[:-1] if line.endswith(b"\r") else line
 
     def finish(self) -> None:
         """Count what has no end."""

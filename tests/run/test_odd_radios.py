@@ -43,7 +43,7 @@ def test_the_anchor_that_lost_its_time_base_is_named_within_its_first_records(se
     assert replayed(phone, tmp_path)[3].notes == named
     errors_m, levels_m, time_s, report = replayed(Phone(anchors_m, seed=seed, own_clocks=own_clocks), tmp_path)
     assert report.notes == named
-    assert report.drops["time-base-lost"] > 0.95 * 20 * 60
+    assert report.drops["time-base-lost"] > 0.9 * 20 * 60
     assert rmse_m(errors_m[time_s > 2.0]) < (0.2 if anchors_m is FOUR else 0.05)
     assert (errors_m > levels_m).mean() <= RISK
 
@@ -77,8 +77,28 @@ def test_slow_rounds_give_fixes(seed, rounds_per_s, most_m, tmp_path):
     assert time_s[0] < 3.0 / rounds_per_s
     assert report.fixes > 0.9 * 60 * 4 * rounds_per_s
     assert rmse_m(errors_m) < most_m
-    assert np.isfinite(levels_m).mean() > 0.8
+    assert np.isfinite(levels_m[time_s > 20.0]).mean() > 0.9
     assert (errors_m > levels_m).mean() <= RISK
+
+
+def test_rounds_may_become_slow(tmp_path):
+    phone = Phone()
+    lines = [line for index, line in enumerate(phone.records()) if index // 4 < 200 or index // 4 % 20 == 0]
+    file, table = tmp_path / "slower.jsonl", tmp_path / "anchors.csv"
+    file.write_text("\n".join(lines) + "\n")
+    replayed(Phone(seconds=1.0), tmp_path)  # writes the table
+    fixes = skyless.replay(file, anchors=table, tag_height_m=HEIGHT_M).fixes
+    slow = phone.errors_m(fixes.time_s, fixes.position_m)[fixes.time_s > 11.0]
+    assert len(slow) > 0.9 * 49 * 4
+    assert rmse_m(slow) < 0.25
+
+
+@pytest.mark.parametrize("anchors_m", [FOUR, SIX], ids=["four", "six"])
+@pytest.mark.parametrize("rounds_per_s", [2.0, 4.0, 5.0])
+def test_slow_rounds_whose_stamps_flip_have_no_level(rounds_per_s, anchors_m, tmp_path):
+    errors_m, levels_m, _, report = replayed(Phone(anchors_m, rounds_per_s, flip_share=0.5), tmp_path)
+    assert (errors_m > levels_m).mean() <= RISK
+    assert report.notes == ("Receptions are often late: no protection level",)
 
 
 @pytest.mark.parametrize("anchors_m", [FOUR, SIX], ids=["four", "six"])

@@ -179,7 +179,7 @@ class Tuning(Record):
     """… up to this fraction of the mean range …"""
     slow_start_std: float = 2.0
     """… and a start, which goes back to the packets before, up to this multiple of it; otherwise up to 1."""
-    longest_superframe_s: float = 2.0
+    longest_superframe_s: float = 1.3
     """In longer superframes a tag may move by metres: each round of packets is a start of its own [s]."""
     heights_in_row: float = 20
     """Consecutive heights that do not fit at which the position is wrong."""

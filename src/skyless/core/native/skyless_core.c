@@ -6822,7 +6822,7 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s = REAL(0.5), .curved_std = REAL(0.1),
             .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s = REAL(1.0), .start_margin =
             REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0), .slow_superframe_s = REAL(0.2),
-            .slow_curved_std = REAL(0.7), .slow_start_std = REAL(2.0), .longest_superframe_s = REAL(2.0),
+            .slow_curved_std = REAL(0.7), .slow_start_std = REAL(2.0), .longest_superframe_s = REAL(1.3),
             .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late =
             REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s =
             REAL(1.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),

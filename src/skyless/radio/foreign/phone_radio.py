@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 MAX_CONNECTIONS: Final = 16
 """Connections at once; for a further one the oldest that is not the phone's is ended."""
 
+FLUSH_S = 0.2
+"""Longest time for which records of an unordered stream wait for others."""
+
 _REQUEST: Final = re.compile(rb"[A-Z]+ \S+ HTTP/\d")
 
 
@@ -49,8 +52,9 @@ class PhoneRadio:
         self._listener = listener
         try:
             server = await asyncio.start_server(self._serve, self._host, self.port)
-        except OSError as error:
-            reason = os.strerror(error.errno) if error.errno is not None and error.errno > 0 else error
+        except (OSError, UnicodeError) as error:  # a name that no host can have
+            number = getattr(error, "errno", None) or 0
+            reason = os.strerror(number) if number > 0 else error
             raise SkylessError(f"--radio cannot listen on {self._host}:{self.port}: {reason}") from None
         self.port = server.sockets[0].getsockname()[1]
         listener(Hint(f"waits for a phone at {self._host}:{self.port}"))
@@ -68,14 +72,16 @@ class PhoneRadio:
         """Serve one connection until it ends or is replaced."""
         if len(self._connections) >= MAX_CONNECTIONS:
             self.counters["too-many-connections"] += 1
-            next(one for one in self._connections if one is not self._phone).transport.abort()
+            oldest = next(one for one in self._connections if one is not self._phone)
+            del self._connections[oldest]
+            oldest.transport.abort()
         self._connections[writer] = None
         try:
             await self._receive(reader, writer)
         except OSError:
             pass  # it broke
         finally:
-            del self._connections[writer]
+            self._connections.pop(writer, None)
             writer.close()
             if self._phone is writer:
                 self._phone = None
@@ -99,9 +105,17 @@ class PhoneRadio:
                 for packet in self._records.on_message(message):
                     self._listener(packet)
             await writer.drain()
-            data = await reader.read(CHUNK_BYTES)
+            reading = asyncio.ensure_future(reader.read(CHUNK_BYTES))
+            await asyncio.wait([reading], timeout=FLUSH_S if self._records.is_waiting else None)
+            if not reading.done():
+                self._flush(writer)
+            data = await reading
         if isinstance(messages, LineCutter):
             messages.finish()
+        self._flush(writer)
+
+    def _flush(self, writer: StreamWriter) -> None:
+        """Let the phone's records not wait any longer."""
         for packet in self._records.finish() if self._phone is writer else ():
             self._listener(packet)
 

@@ -19,6 +19,7 @@ A line may also be an array of records, as of one call of the system. Records of
 between messages, those that are not newer than the newest are dropped.
 """
 
+import re
 from collections.abc import Iterator, Mapping
 from io import BufferedIOBase
 from math import isfinite
@@ -37,6 +38,7 @@ _KINDS: Final = {"poll": DtMessageType.POLL, "response": DtMessageType.RESPONSE,
 _STAMP_BYTES: Final = TICK_BITS // 8
 _MAX_STAMP_BYTES: Final = 8
 _LAST_ADDRESS: Final = (1 << 64) - 1
+_HEXADECIMAL: Final = re.compile(r"(?a:[0-9A-Fa-f]{1,2}(:?[0-9A-Fa-f]{1,2}){0,7})")
 _LAST_S: Final = 1e9
 _FARTHEST_M: Final = 1e6
 _COMMON_TIME: Final = 1
@@ -50,6 +52,8 @@ LATE_S: Final = 1.0
 WAIT_S: Final = 0.05
 """How much newer a record has to be for those before it not to wait any longer, in an unordered stream."""
 _MOST_WAITING: Final = 1024
+_ORDERED: Final = 512
+"""Messages in order after which records do not wait any longer."""
 
 
 class _Wgs84(Struct):
@@ -136,6 +140,8 @@ class Phone:
         self._newest_rx_ticks: int | None = None
         self._is_unordered = False
         """Whether a record has been older than one before: from then on they wait for each other."""
+        self._ordered = 0
+        """Messages in a row that were newer than those before."""
         self._waiting: list[_Record] = []
 
     def on_message(self, message: bytes) -> list[Packet]:
@@ -151,6 +157,11 @@ class Phone:
             return self._packets(_in_order(records))
         packets = self.finish() if self._begin_again(records) else []
         waiting = _in_order(self._waiting + records)
+        self._ordered = self._ordered + 1 if waiting[: len(self._waiting)] == self._waiting else 0
+        self._is_unordered = self._ordered < _ORDERED
+        if not self._is_unordered:
+            self._waiting = []
+            return packets + self._packets(waiting)
         newest = _rx_ticks(waiting[-1]) if waiting else None
         ready = len(waiting)
         if newest is not None and ready <= _MOST_WAITING:
@@ -164,6 +175,11 @@ class Phone:
         newest = _rx_ticks(self._waiting[-1]) if self._waiting else None
         stamps = [stamp for one in records if (stamp := _rx_ticks(one)) is not None]
         return newest is not None and any(_ahead(stamp, newest) < -LATE_S * TICK_RATE_HZ for stamp in stamps)
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether records wait for newer ones."""
+        return bool(self._waiting)
 
     def finish(self) -> list[Packet]:
         """Packets of the records that still wait."""
@@ -200,9 +216,9 @@ class Phone:
         if self._is_late(rx_ticks):
             return "late-or-double-record"
         if kind is DtMessageType.POLL:
-            if initiator not in self._polls and len(self._polls) >= _MAX_CLUSTERS:
-                return "too-many-clusters"
-            self._polls[initiator] = self._polls.get(initiator, 0) + 1
+            self._polls[initiator] = self._polls.pop(initiator, 0) + 1
+            if len(self._polls) > _MAX_CLUSTERS:
+                del self._polls[next(iter(self._polls))]
             self._newest_initiator = initiator
         return DtMessage(
             host_s=host_time_s(rx_ticks),
@@ -275,11 +291,9 @@ def _kind(stated: int | str | None) -> DtMessageType | None:
 
 
 def _address(stated: int | str) -> int | None:
-    try:
-        value = int(stated.replace(":", ""), 16) if isinstance(stated, str) else stated
-    except ValueError:
-        return None
-    return value if 0 <= value <= _LAST_ADDRESS else None
+    if isinstance(stated, str):
+        return int(stated.replace(":", ""), 16) if _HEXADECIMAL.fullmatch(stated) else None
+    return stated if 0 <= stated <= _LAST_ADDRESS else None
 
 
 def _ios_ticks(raw: int | None, seconds: float | None) -> int | None:

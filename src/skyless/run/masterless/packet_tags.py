@@ -101,7 +101,7 @@ class PacketTagNode:
 
     def _new_tracking(self) -> PacketTracking:
         asked = self.settings
-        known = {"qa": 0.3, "height_m": self._height_m, "height_std_m": self._height_std_m}
+        known = {"height_m": self._height_m, "height_std_m": self._height_std_m}
         is_dl_tdoa = isinstance(self.radio, UciRadio | PhoneRadio)
         return PacketTracking(
             (DL_TDOA if is_dl_tdoa else MASTERLESS).changed(**known),

@@ -4,7 +4,7 @@ Stamps are unwrapped along the tag's clock, antenna delays are subtracted from r
 unusable data are counted. The filter decides which measurements are used.
 """
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping
 from functools import partial
 from math import dist, log, sqrt
@@ -31,7 +31,7 @@ from skyless.core.ticks import (
 )
 from skyless.run.masterless.difference_tracking import DIFFERENCES, Corners, is_within, neighbourhood_m
 from skyless.run.masterless.pair_engine import MAX_ANCHORS, remember
-from skyless.run.masterless.stamp_watch import StampWatch
+from skyless.run.masterless.stamp_watch import OFTEN, StampWatch
 from skyless.site.anchor_names import anchor_name
 from skyless.site.survey.anchor_errors import NO_BIAS, SLOPE_NEAREST_M, DifferenceCalibration, RelayDelays
 
@@ -73,7 +73,7 @@ RESTART_IN_ROW: Final = 3
 """Consecutive impossible stamps of an anchor that mean that its counter has restarted."""
 
 NOT_CALIBRATED: Final = (
-    "Not calibrated: no protection level. skyless calibrate --at X,Y,Z finds the anchors' constants from a recording "
+    "Not calibrated{}: no protection level. skyless calibrate --at X,Y,Z finds the anchors' constants from a recording "
     "at a known place; bias_m in the table of anchors states them (0: known to be none)"
 )
 
@@ -81,18 +81,23 @@ BACK_IN_ROW: Final = 8
 """Consecutive packets from before the newest that mean that the tag's counter has restarted."""
 
 
+_LATELY_TICKS: Final = 10 * TICK_RATE_HZ
+_SLOWER: Final = 2.5
+"""Factor on the period at which a filter for faster anchors would lose them."""
+
+
 class _Anchor:
     """One anchor at the tag: its position, its newest stamps, and the stamps of its latest packets."""
 
-    __slots__ = ("anchor_m", "heard", "impossible", "period_ticks", "position_m", "rx_ticks", "tx_ticks")
+    __slots__ = ("anchor_m", "heard", "impossible", "intervals", "position_m", "rx_ticks", "tx_ticks")
 
     def __init__(self, position_m: Point, tx_ticks: int, rx_ticks: int) -> None:
         self.position_m = position_m
         self.anchor_m = np.array(position_m)
         self.tx_ticks, self.rx_ticks = tx_ticks, rx_ticks
         self.impossible = 0
-        self.period_ticks = LAST_TICKS
-        """Shortest time between two packets."""
+        self.intervals: deque[int] = deque(maxlen=4)
+        """Newest times between two packets."""
         self.heard: dict[int, tuple[int, int]] = {}
         """Sequence number → unwrapped (tx_ticks of the anchor, rx_ticks of the tag)."""
 
@@ -102,7 +107,7 @@ class _Anchor:
         if tx_ticks is None:
             self.impossible += 1
             return False
-        self.period_ticks = min(self.period_ticks, rx_ticks - self.rx_ticks)
+        self.intervals.append(rx_ticks - self.rx_ticks)
         self.tx_ticks, self.rx_ticks, self.impossible = tx_ticks, rx_ticks, 0
         return True
 
@@ -147,7 +152,8 @@ class PacketTracking:
         self._both_ways = settings
         self._pairs: set[tuple[int, int]] | None = None if one_way is None else set()
         """Pairs of listener and sender in relays, until two anchors have relayed each other."""
-        self._watch, self._faults = StampWatch(), 0
+        self._watch, self._faults, self._has_new_faults = StampWatch(), 0, False
+        self._is_often_late = False
         self._has_addresses = one_way is not None  # those of FiRa
         self.tracking = self._new_tracking()
         """The filter."""
@@ -177,10 +183,12 @@ class PacketTracking:
         return self._delays.contradictions_m
 
     @property
-    def _is_calibrated(self) -> bool:
-        """Whether the constants of all anchors are known, or small as those of Bitcraze's."""
+    def _uncalibrated(self) -> list[int]:
+        """Anchors heard lately whose constants are neither known nor small as those of Bitcraze's."""
         known = {} if self._calibration is None else self._calibration.anchors
-        return not self._has_addresses or self._anchors.keys() <= known.keys()
+        after = (self._newest_rx_ticks or 0) - _LATELY_TICKS
+        heard = [anchor for anchor, one in self._anchors.items() if anchor not in known and one.rx_ticks > after]
+        return heard if self._has_addresses else []
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -194,7 +202,10 @@ class PacketTracking:
             f"Stamps of anchor {names(anchor)} flip between two values {gap_m:.1f} m apart: no protection level"
             for anchor, gap_m in sorted(self._watch.flips_m.items())
         ]
-        return (*own, *flips, *(() if self._is_calibrated else (NOT_CALIBRATED,)))
+        late = () if flips or not self._is_often_late else ("Receptions are often late: no protection level",)
+        without = sorted(self._uncalibrated)
+        which = "" if self._calibration is None else f" ({', '.join(map(names, without))})"
+        return (*own, *flips, *late, *((NOT_CALIBRATED.format(which),) if without else ()))
 
     def on_packet(self, packet: Packet) -> Fix | None:
         """Process one packet. Returns a fix, or None with the ``reason``.
@@ -208,17 +219,14 @@ class PacketTracking:
         fault = self._watch.check(
             packet.anchor, anchor.rx_ticks, anchor.tx_ticks, claims_common_time=packet.claims_common_time
         )
-        if self._watch.changes > self._faults:
-            self._faults = self._watch.changes
-            self._begin_again()
+        if self._watch.changes > self._faults or (self._has_new_faults and self._watch.is_ready):
+            self._has_new_faults, self._faults = self._watch.changes > self._faults, self._watch.changes
+            self._begin_again()  # at once, and when all faults of that kind have shown
         if fault is not None:
             self._drops[fault] += 1
             self.reason = NoFixReason.RESIDUALS
             return None
-        if self.tracking.is_starting:
-            periods = sorted([one.period_ticks for one in self._anchors.values() if one.period_ticks < LAST_TICKS])
-            if periods:
-                self.tracking.expect_period(max(periods[len(periods) // 2] * TICK_S, PERIOD_S))
+        self._expect_period()
         relays, phases = [], []
         for relay in packet.relays:
             rx_ticks = self._relayed(packet.anchor, anchor, relay)
@@ -240,8 +248,10 @@ class PacketTracking:
             _phase_of(packet),
             tuple(phases),
         )
-        is_wrong = self._watch.flips_m or self._delays.contradictions_m
-        is_known = self._is_calibrated and self._watch.is_ready
+        status = self.tracking.estimator.state.status
+        self._is_often_late = max(status.late_share, status.rejected_share) > OFTEN  # as of flips in slow rounds
+        is_wrong = self._watch.flips_m or self._delays.contradictions_m or self._is_often_late
+        is_known = self._watch.is_ready and not self._uncalibrated
         self.tracking.estimator.withhold_levels(CONTRADICTED if is_wrong else SOUND if is_known else UNAVAILABLE)
         fix = self.tracking.update(observation)
         self.used = isinstance(fix, Fix)
@@ -261,6 +271,19 @@ class PacketTracking:
             self._begin_again()
         else:
             self._pairs.add((listener, sender))
+
+    def _expect_period(self) -> None:
+        """Let the filter expect the anchors' present period; if they have become much slower, begin again with it."""
+        periods = sorted([min(one.intervals) for one in self._heard_lately() if one.intervals])
+        period_s = max(periods[len(periods) // 2] * TICK_S if periods else 0.0, PERIOD_S)
+        if period_s > _SLOWER * self.tracking.course.superframe_s and not self.tracking.is_starting:
+            self._begin_again()
+        if self.tracking.is_starting:
+            self.tracking.expect_period(period_s)
+
+    def _heard_lately(self) -> list[_Anchor]:
+        after = (self._newest_rx_ticks or 0) - _LATELY_TICKS
+        return [one for one in self._anchors.values() if one.rx_ticks > after]
 
     def _begin_again(self) -> None:
         """Search for a new start."""

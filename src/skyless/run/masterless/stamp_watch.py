@@ -11,8 +11,10 @@ import numpy as np
 
 from skyless.core.ticks import TICK_M, TICK_S, from_seconds
 
-OWN_RATE: Final = 2e-7
-"""Difference of rates that no motion explains: 60 m/s."""
+RATE_TICKS: Final = from_seconds(0.5)
+"""Least time over which the rate of an anchor's clock is measured; at most about twice that, or two packets."""
+OWN_RATE: Final = 7e-8
+"""Difference of rates over that time that neither motion nor stamps that flip explain: 20 m/s."""
 OWN_IN_ROW: Final = 3
 """Consecutive packets with such a rate that show that a time base is lost, or without one that it is back."""
 
@@ -32,7 +34,9 @@ BEND_M: Final = 0.4
 WITHIN_M: Final = 0.2
 """Distance from a line within which a packet is on it."""
 FEWEST: Final = 3
-"""Packets of the rarer value, and changes from one to the other, that show a flip."""
+"""Packets of the rarer value that show a flip …"""
+CHANGES: Final = 5
+"""… and changes from one value to the other: obstacles come and go more slowly."""
 MOST_OTHERS: Final = 0.2
 """Largest share of packets with neither value."""
 FORGETTING: Final = 0.02
@@ -49,15 +53,12 @@ _ALL: Final = (1 << WINDOW) - 1
 class _Stamps:
     """An anchor's newest stamps."""
 
-    __slots__ = (
-        "bends", "gap_m", "late_m", "late_share", "off_in_row", "own_rate", "packets", "rate", "rx_ticks", "time_s",
-        "tx_ticks",
-    )  # fmt: skip
-
     def __init__(self, rx_ticks: int, tx_ticks: int) -> None:
         self.rx_ticks, self.tx_ticks = rx_ticks, tx_ticks
+        self.before = self.between = rx_ticks, tx_ticks
+        """Stamps from which on the rate is measured, and those that will follow them."""
         self.rate = 0.0
-        """Of the anchor's clock against the tag's, as a fraction, over its two newest packets; 0 before the second."""
+        """Of the anchor's clock against the tag's, as a fraction; 0 before it is known."""
         self.own_rate = 0.0
         """Rate against the common time, once that is lost; otherwise 0."""
         self.off_in_row = 0
@@ -67,7 +68,18 @@ class _Stamps:
         self.bends = 0
         """Bits of the packets in the window, the newest lowest: whether each is off the line through the two before."""
         self.gap_m = self.late_share = 0.0
+        self.flipped_s = 0.0
+        """When a window last had two values."""
+        self.has_flipped = False
         self.packets = 1
+
+    def measure_rate(self) -> None:
+        """Update the rate to the newest stamps."""
+        if self.rx_ticks - self.between[0] >= RATE_TICKS:
+            self.before, self.between = self.between, (self.rx_ticks, self.tx_ticks)
+        elapsed = self.rx_ticks - self.before[0]
+        if elapsed >= RATE_TICKS:
+            self.rate = (self.tx_ticks - self.before[1] - elapsed) / elapsed
 
 
 class StampWatch:
@@ -88,15 +100,13 @@ class StampWatch:
             self._stamps[anchor] = _Stamps(rx_ticks, tx_ticks)
             return None
         elapsed, sent = rx_ticks - one.rx_ticks, tx_ticks - one.tx_ticks
-        one.rx_ticks, one.tx_ticks, one.rate = rx_ticks, tx_ticks, (sent - elapsed) / elapsed
+        one.rx_ticks, one.tx_ticks = rx_ticks, tx_ticks
+        one.measure_rate()
         if claims_common_time and self._runs_on_its_own(one):
             return "time-base-lost"
-        did_flip = one.gap_m > 0.0
-        is_late = _is_late(one, elapsed * TICK_S, (elapsed - sent) * TICK_M)
+        is_late = self._is_late(one, elapsed * TICK_S, (elapsed - sent) * TICK_M)
         one.packets += 1
         one.late_share += max(FORGETTING, 1.0 / one.packets) * (is_late - one.late_share)
-        if one.gap_m > 0.0 and not did_flip:
-            self._note_change()
         return "late-of-two-values" if is_late else None
 
     def forget(self) -> None:
@@ -106,7 +116,8 @@ class StampWatch:
     @property
     def is_ready(self) -> bool:
         """Whether enough has been received for faults to show."""
-        return self._newest_s - self._first_s >= READY_S
+        has_many = any(one.packets > WINDOW for one in self._stamps.values())
+        return has_many and self._newest_s - self._first_s >= READY_S
 
     @property
     def own_clocks_ppm(self) -> dict[int, float]:
@@ -127,11 +138,15 @@ class StampWatch:
         self._first_s = self._newest_s
 
     def _runs_on_its_own(self, one: _Stamps) -> bool:
-        """Whether an anchor's clock has another rate than those of most others, of which there are two at least."""
+        """Whether an anchor's clock has another rate than those of most anchors, which agree."""
         after = one.rx_ticks - COMPARED_TICKS
-        rates = sorted([other.rate for other in self._stamps.values() if other.rate and other.rx_ticks > after])
-        off = one.rate - rates[len(rates) // 2]
-        is_off = len(rates) > 2 and abs(off) > OWN_RATE
+        rates = [other.rate for other in self._stamps.values() if other.rate and other.rx_ticks > after]
+        agreeing = [sum([abs(rate - other) <= OWN_RATE for other in rates]) for rate in rates]
+        most = max(agreeing, default=0)
+        common = [rate for rate, agree in zip(rates, agreeing, strict=True) if agree == most]
+        off = one.rate - (common[0] if common else 0.0)
+        is_known = most > 1 and len(rates) > 2 and max(common) - min(common) <= OWN_RATE
+        is_off = is_known and abs(off) > OWN_RATE
         one.off_in_row = one.off_in_row + 1 if is_off != (one.own_rate != 0.0) else 0
         if one.off_in_row >= OWN_IN_ROW:
             if is_off:
@@ -139,32 +154,38 @@ class StampWatch:
             one.own_rate, one.off_in_row = off if is_off else 0.0, 0
         return one.own_rate != 0.0
 
+    def _is_late(self, one: _Stamps, elapsed_s: float, change_m: float) -> bool:
+        """Whether an anchor's newest packet, ``change_m`` later than the one before, has the later of two values."""
+        times_s, late_m = one.time_s, one.late_m
+        if elapsed_s > LONGEST_GAP_S:
+            times_s.clear()
+            late_m.clear()
+            one.bends = 0
+        times_s.append(times_s[-1] + elapsed_s if times_s else 0.0)
+        late_m.append(late_m[-1] + change_m if late_m else 0.0)
+        if len(times_s) > 2:
+            before_mps = (late_m[-2] - late_m[-3]) / (times_s[-2] - times_s[-3])
+            one.bends = (one.bends << 1 | (abs(late_m[-1] - late_m[-2] - before_mps * elapsed_s) > BEND_M)) & _ALL
+        if one.gap_m and self._newest_s - one.flipped_s > NAMED_S:
+            one.gap_m = 0.0
+        if one.bends.bit_count() < (1 if one.gap_m else FEWEST) or len(times_s) < FIRST:
+            return False
+        above_m, gap_m, evidence = two_values(np.array(times_s), np.array(late_m))
+        if evidence >= 1.0:
+            if not one.has_flipped:
+                self._note_change()
+            one.gap_m, one.flipped_s, one.has_flipped = gap_m, self._newest_s, True
+        elif abs(gap_m - one.gap_m) > 2.0 * WITHIN_M:
+            return one.gap_m > 0.0  # which of the two it is remains open
+        return above_m > 0.5 * gap_m > 0.0
 
-def _is_late(one: _Stamps, elapsed_s: float, change_m: float) -> bool:
-    """Whether an anchor's newest packet, later than the one before by ``change_m``, has the later one of two values."""
-    times_s, late_m = one.time_s, one.late_m
-    if elapsed_s > LONGEST_GAP_S:
-        times_s.clear()
-        late_m.clear()
-        one.bends = 0
-    times_s.append(times_s[-1] + elapsed_s if times_s else 0.0)
-    late_m.append(late_m[-1] + change_m if late_m else 0.0)
-    if len(times_s) > 2:
-        before_mps = (late_m[-2] - late_m[-3]) / (times_s[-2] - times_s[-3])
-        one.bends = (one.bends << 1 | (abs(late_m[-1] - late_m[-2] - before_mps * elapsed_s) > BEND_M)) & _ALL
-    fewest = 1 if one.gap_m > 0.0 else FEWEST
-    if one.bends.bit_count() < fewest or len(times_s) < FIRST:
-        return False
-    above_m, gap_m = two_values(np.array(times_s), np.array(late_m), fewest)
-    one.gap_m = gap_m or one.gap_m
-    return above_m > 0.5 * gap_m > 0.0
 
+def two_values(time_s: np.ndarray, late_m: np.ndarray) -> tuple[float, float, float]:
+    """Distance of the newest value from the lower of two parallel lines over time, that of the lines, and the evidence.
 
-def two_values(time_s: np.ndarray, late_m: np.ndarray, fewest: int) -> tuple[float, float]:
-    """Distance of the newest value from the lower of two parallel lines over time, and that of the lines; 0, 0 if none.
-
-    The slope is that of the pair of values whose line most values are on. ``fewest``: values on the upper line, and
-    changes between the two; a rare lower one needs ``FEWEST``, as it may be a single early packet.
+    The slope is that of the pair of values whose line most values are on. The evidence is 1 where ``FEWEST`` values are
+    on either line, with ``CHANGES`` between them, and less in proportion. Zeros if there are no two lines, or if the
+    lower one has less evidence, as of single early packets.
     """
     one, other = np.triu_indices(len(time_s), 1)
     slopes = (late_m[other] - late_m[one]) / (time_s[other] - time_s[one])
@@ -174,8 +195,9 @@ def two_values(time_s: np.ndarray, late_m: np.ndarray, fewest: int) -> tuple[flo
     gap_m = float(np.median(off_m[~is_first])) if not is_first.all() else 0.0
     is_second = np.abs(off_m - gap_m) < WITHIN_M
     known = (is_second & ~is_first)[is_first | is_second]
-    fewest = fewest if gap_m > 0.0 else FEWEST
-    is_flip = abs(gap_m) > BEND_M and min(known.sum(), (~known).sum(), (known[1:] != known[:-1]).sum()) >= fewest
+    rarer = min(known.sum(), (~known).sum()) / FEWEST
+    evidence = float(min(rarer, (known[1:] != known[:-1]).sum() / CHANGES))
+    is_flip = abs(gap_m) > BEND_M and (gap_m > 0.0 or evidence >= 1.0)
     if not is_flip or len(known) < (1.0 - MOST_OTHERS) * len(off_m):
-        return 0.0, 0.0
-    return float(off_m[-1]) - min(gap_m, 0.0), abs(gap_m)
+        return 0.0, 0.0, 0.0
+    return float(off_m[-1]) - min(gap_m, 0.0), abs(gap_m), evidence
