@@ -45,6 +45,12 @@ def test_a_table_that_is_written_is_read_again(tmp_path_factory, anchors, addres
     assert read_anchors(table) == places
 
 
+def test_a_spreadsheet_may_leave_out_zeros(tmp_path):
+    table = tmp_path / "anchors.csv"
+    table.write_text("id,x_m,y_m,z_m\nC974,0,0,1\n364,1,0,1\n")
+    assert list(read_anchors(table)) == [0xC974, 0x364]
+
+
 def test_offline_anchors_are_named_as_they_are_called():
     site = Site("hall", 1, 7, tuple(AnchorSite(anchor, x, 0.0) for x, anchor in enumerate((0xC974, 7))))
     for addresses, names in ((False, ["51572", "7"]), (True, ["C974", "0007"])):

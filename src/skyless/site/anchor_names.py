@@ -17,8 +17,11 @@ def is_address(text: str) -> bool:
 
 
 def read_anchor(text: str, *, addresses: bool = False) -> int:
-    """The anchor of a name; ``addresses``: whether 4 or 16 decimal digits are a MAC address, too. Raises ValueError."""
-    if is_address(text) or (addresses and _ADDRESS.fullmatch(text)):
+    """The anchor of a name; ``addresses``: whether digits alone are a MAC address, too. Raises ValueError.
+
+    A spreadsheet leaves out the zeros before a short one.
+    """
+    if is_address(text) or (addresses and _ADDRESS.fullmatch(text.zfill(4))):
         return int(text, 16)
     anchor = int(text, 0) if text.lower().startswith("0x") else int(text)
     if anchor < 0:

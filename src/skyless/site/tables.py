@@ -53,7 +53,7 @@ class _Row(Struct, frozen=True, gc=False):
     fields: dict[str, str]
     """By column."""
     addresses: bool = False
-    """Whether identifiers of 4 or 16 digits are MAC addresses, without a letter too."""
+    """Whether identifiers are MAC addresses, without a letter too."""
 
     def number(self, column: str, limit_m: float = inf) -> float:
         """A finite number, within ± ``limit_m``."""
