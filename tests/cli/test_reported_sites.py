@@ -4,23 +4,13 @@ import pytest
 from msgspec.structs import replace
 
 import skyless
-from skyless.core.site import AccuracySite, AnchorSite, ScheduleSite, Site
+from skyless.core.site import ScheduleSite, TagsSite
 from skyless.site.file.template import rectangular_site
 
 pytestmark = pytest.mark.statistical
 
 RINK = replace(rectangular_site(60.0, 30.0, 8, 5.0, 1.0), schedule=ScheduleSite(mode="free"))
-AT_ONE_HEIGHT = Site(
-    name="beacons",
-    id=1,
-    master=1,
-    anchors=tuple(
-        AnchorSite(number, x, y, 2.1)
-        for number, (x, y) in enumerate(((0.0, 0.0), (3.0, 0.2), (2.7, 4.35), (0.3, 4.35)), start=1)
-    ),
-    schedule=ScheduleSite(mode="free"),
-    accuracy=AccuracySite(0.03, 0.05),
-)
+AT_ONE_HEIGHT = replace(rectangular_site(3.0, 4.35, 4, 2.6, 1.0), schedule=ScheduleSite(mode="free"), tags=TagsSite())
 
 
 @pytest.mark.parametrize(("speed_mps", "most_m"), [(1.0, 0.045), (3.0, 0.04), (5.0, 0.04), (8.0, 0.042)])
