@@ -98,7 +98,7 @@ def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
             "entity_category": "diagnostic",
             "state_topic": position_topic,
             "value_template": "{{ value_json.std_m }}",
-        },
+        }
     }
     if site.georeference is not None:
         components["position"] = {

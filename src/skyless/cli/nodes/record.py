@@ -78,11 +78,7 @@ def record(
 
 
 async def _record(
-    file: "McapFile",
-    address: MqttAddress,
-    site_id: int | None,
-    duration_s: float | None,
-    found: "list[RecorderNode]",
+    file: "McapFile", address: MqttAddress, site_id: int | None, duration_s: float | None, found: "list[RecorderNode]"
 ) -> None:
     from skyless.run.record import RecorderNode
 

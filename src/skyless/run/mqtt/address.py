@@ -246,8 +246,7 @@ ACCESS: Final = {
     ),
     Role.OPERATOR: Access(publish=(EVERYTHING,), subscribe=(EVERYTHING,)),
     Role.STRANGER: Access(
-        publish=(),
-        subscribe=(topics.site_topic(EVERY_SITE), topics.fix_topic(EVERY_SITE, EVERY_NODE)),
+        publish=(), subscribe=(topics.site_topic(EVERY_SITE), topics.fix_topic(EVERY_SITE, EVERY_NODE))
     ),
 }
 
