@@ -200,8 +200,7 @@ def survey_runs(runs: SurveyRuns) -> tuple[tuple[Outcome, ...], ...]:
 
 def _run(runs: SurveyRuns, room: DrawnRoom) -> tuple[Outcome, ...]:
     layout, ranges = room.layout, ranges_in_air(room, runs.seconds)
-    no_delay_m = np.zeros(len(layout.anchors))
-    hand_tag_m = tag_error_m(layout, layout.position_m + room.hand_m, no_delay_m, room.tx_delay_m)
+    hand_tag_m = tag_error_m(layout, layout.position_m + room.hand_m, np.zeros(len(layout.anchors)), room.tx_delay_m)
     outcomes, asked_for = [], tuple[TapeAdvice, ...]()
     for variant in runs.group.variants:
         facts = _facts(room, runs.group, variant, asked_for[: variant.tapes])
