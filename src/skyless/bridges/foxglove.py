@@ -238,12 +238,7 @@ class FoxgloveTarget(Target):
     """Serves one site to any number of clients. A channel costs nothing without subscribers."""
 
     def __init__(
-        self,
-        text: str,
-        host: str,
-        port: int,
-        origins: Collection[str] = (),
-        unix_time: Callable[[], float] = time.time,
+        self, text: str, host: str, port: int, origins: Collection[str] = (), unix_time: Callable[[], float] = time.time
     ) -> None:
         """``origins``: web applications that may connect, besides Foxglove's and those of this computer."""
         super().__init__(text)

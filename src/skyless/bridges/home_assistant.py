@@ -98,7 +98,7 @@ def _components(site: BridgedSite, tag: str) -> dict[str, Component]:
             "entity_category": "diagnostic",
             "state_topic": position_topic,
             "value_template": "{{ value_json.std_m }}",
-        },
+        }
     }
     if site.georeference is not None:
         components["position"] = {
@@ -251,8 +251,7 @@ class Announcer:
         return f"{self._prefix}/device/{device_id(self._site.id, name)}/config"
 
     def _announce(self, tag: _Tag) -> None:
-        status = status_topic(self._site.id, NODE_KIND, self._name)
-        tag.document = document(self._site, tag.name, status, tag.removed)
+        tag.document = document(self._site, tag.name, status_topic(self._site.id, NODE_KIND, self._name), tag.removed)
         self._publish(self._config_topic(tag.name), tag.document)
 
     def _remove(self, tag: _Tag, before: dict[str, str]) -> None:
@@ -443,8 +442,7 @@ class HomeAssistant(Target):
 def make_target(url: TargetUrl, context: BridgeContext) -> HomeAssistant:
     """``homeassistant:`` or ``homeassistant://[USER[:PASSWORD]@]HOST[:PORT]``.
 
-    Keys: ``tls=yes|no`` of a broker that the address names, ``prefix`` of discovery, ``move_m``.
-    Raises SkylessError.
+    Keys: ``tls=yes|no`` of a broker that the address names, ``prefix`` of discovery, ``move_m``. Raises SkylessError.
     """
     tls = url.choice("tls", ("no", "yes"), "no") == "yes"
     prefix = url.text_option("prefix", "homeassistant")

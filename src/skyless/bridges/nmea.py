@@ -85,8 +85,7 @@ class NmeaEncoder(Encoder):
 def make_encoder(url: TargetUrl, _context: BridgeContext) -> Encoder:
     """The encoder of ``nmea+tcp``, ``nmea+udp``, ``nmea+pty``, ``nmea+serial``; keys ``quality`` and ``geoid_m``."""
     return NmeaEncoder(
-        quality=url.choice("quality", ("auto", *_QUALITIES), "auto"),
-        geoid_m=url.number("geoid_m", 0.0, -120.0, 100.0),
+        quality=url.choice("quality", ("auto", *_QUALITIES), "auto"), geoid_m=url.number("geoid_m", 0.0, -120.0, 100.0)
     )
 
 

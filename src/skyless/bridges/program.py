@@ -194,8 +194,7 @@ class TagBridge:
         """Process a tag's state, once a second, and its knowledge of the site."""
         now_s = time.monotonic()
         self._receivers[health.tag] = receiver
-        heard = self._sites.setdefault(health.tag, _HeardSite())
-        site = heard.update(receiver, now_s, simulated=self._is_simulated())
+        site = self._sites.setdefault(health.tag, _HeardSite()).update(receiver, now_s, simulated=self._is_simulated())
         if site is not None and (self._is_here(health.tag) or not any(map(self._is_here, self._receivers))):
             self.on_site(site)
         self._hub.on_health(health, now_s)

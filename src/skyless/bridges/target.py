@@ -149,10 +149,7 @@ class Target:
 
 
 class Encoder:
-    """Base of encoders: each element of a result is one datagram or one write.
-
-    No I/O; reads no clock.
-    """
+    """Base of encoders: each element of a result is one datagram or one write. No I/O; reads no clock."""
 
     one_tag = False
     """See ``Target``."""

@@ -95,8 +95,7 @@ def _load(file: Path, output: _Output) -> "Site":
     check_picture(output.plot)
     outputs = {"plot": output.plot, "grid": output.grid, "html": output.html, "out": output.out}
     for name, path in outputs.items():
-        others = (other for key, other in outputs.items() if key != name)
-        check_output(name, path, file, image, *others)
+        check_output(name, path, file, image, *(other for key, other in outputs.items() if key != name))
     if output.grid is not None and output.grid.suffix.lower() not in {".csv", ".geojson", ".json"}:
         raise SkylessError(f"--grid is {str(output.grid)!r}; it should end with .csv or .geojson")
     if output.out is not None and output.out.exists():

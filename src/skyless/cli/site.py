@@ -275,8 +275,7 @@ def _show(file: Path, report: dict[str, Any]) -> None:
         print_facts(title, _summary(report))
     if report["floors"]:
         heads = ("floor", "name", "from / m", "slab / dB", "slab / m", "anchors")
-        rows = ([str(value) for value in floor.values()] for floor in report["floors"])
-        print_table("floors", heads, rows)
+        print_table("floors", heads, ([str(value) for value in floor.values()] for floor in report["floors"]))
     height = report["tag_height_m"]
     tags = "estimate their height (3-D)" if height is None else f"move at a height of {height:g} m (2-D)"
     out = console()

@@ -284,8 +284,7 @@ def _first(condition: Condition) -> tuple[str, str]:
 
 def publisher_rank(name: str, dashboards: list[StatusMessage]) -> int:
     """Number of online dashboards that came online before this one. The first publishes the events."""
-    online = sorted((status.unix_s, status.name) for status in dashboards if status.online)
-    names = [other for _, other in online]
+    names = [other for _, other in sorted((status.unix_s, status.name) for status in dashboards if status.online)]
     return names.index(name) if name in names else 0
 
 

@@ -54,8 +54,7 @@ class ShownSites:
             link, live = HubLink(self.known.address, number, self._name), self._make()
             live.attach(link, number)
             link.on_state.append(live.on_connection)
-            work = self._tasks.create_task(connected(link, live))
-            self._shown[number] = _Shown(live, work, 0.0)
+            self._shown[number] = _Shown(live, self._tasks.create_task(connected(link, live)), 0.0)
         self._shown[number].asked_s = time.monotonic()
         return self._shown[number].live
 

@@ -171,8 +171,7 @@ class Playback:
         """
         start_s = self.summary(name).start_unix_s
         with self._lock:
-            recording = self._recording(name)
-            return _states(recording, start_s + begin_s, start_s + end_s, 1.0 / rate_hz, self._stopped)
+            return _states(self._recording(name), start_s + begin_s, start_s + end_s, 1.0 / rate_hz, self._stopped)
 
     def _list(self, file: Path, known: dict[str, tuple[_Version, ListedRecording]]) -> None:
         """Add a file to the list, reading it only if it has changed since the last list."""
@@ -263,8 +262,7 @@ def _zones(recording: McapRecording) -> tuple[Zone, ...]:
     """Zones of the recorded site, without those of other sites with its number."""
     if recording.zones is None:
         return ()
-    name = "" if recording.site is None else recording.site.site.name
-    return zones_of(recording.zones, name).zones
+    return zones_of(recording.zones, "" if recording.site is None else recording.site.site.name).zones
 
 
 def _fix_spans(recording: McapRecording) -> tuple[tuple[float, float], ...]:

@@ -278,8 +278,7 @@ class EtherConnection:
                     Reception(message.frame, row.rx_ticks, host_s, measured, row.carrier_phase_cycles)
                 )
         elif isinstance(message, Done):
-            event = Late(message.tx_ticks) if message.late else Sent(message.tx_ticks)
-            self.radios[message.node].notify(event)
+            self.radios[message.node].notify(Late(message.tx_ticks) if message.late else Sent(message.tx_ticks))
         else:
             self._set_clocks(message.host_s + shift_s, message.ticks)
 

@@ -478,8 +478,7 @@ def _calibrations(found: Sequence[Found], asked: Asked) -> dict[Path, Difference
     calibrations: dict[Path, DifferenceCalibration] = {}
     for one in found:
         if asked.is_calibrated_on(one) and one.anchors is not None:
-            options = _options(one, asked)
-            truth = known_truth(one.path, options)
+            truth = known_truth(one.path, _options(one, asked))
             assert truth is not None
             rows = np.column_stack([truth.t_s, truth.position_m])
             known = CalibrateOptions(file=one.path, truth=rows, anchors=known_anchors(one.anchors, None)[0])

@@ -424,13 +424,7 @@ def relayed_receptions(
 
 
 def _frame_bound(
-    anchors: Array,
-    path: Array,
-    settings: BoundSettings,
-    known: Mask,
-    sendings: Sendings,
-    biases: Biases,
-    at_once: bool,
+    anchors: Array, path: Array, settings: BoundSettings, known: Mask, sendings: Sendings, biases: Biases, at_once: bool
 ) -> Array:
     """Bound after every frame; where receptions are not known at once it holds at the end of a superframe."""
     s = _prior(anchors, settings, biases)

@@ -69,11 +69,7 @@ def random_points(plan: PlanMap, count: int, seed: int) -> Matrix:
 
 
 def verify(
-    predictor: Predictor,
-    points_m: Matrix,
-    rounds: int,
-    seed: int,
-    progress: Callable[[float], None] | None = None,
+    predictor: Predictor, points_m: Matrix, rounds: int, seed: int, progress: Callable[[float], None] | None = None
 ) -> Verification:
     """Let a tag rest at each point, shape (m, 3), for ``rounds`` superframes, and compare."""
     site, settings = predictor.site, predictor.settings

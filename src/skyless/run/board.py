@@ -85,8 +85,7 @@ class BoardTag:
             if record[BODY_AT] & link.IN_FLASH:
                 self.flash = settings
         if record[0] != link.SET_TIME:
-            in_flash = link.IN_FLASH * (self.flash == self.settings)
-            self._report(link.TAG_CONFIG, bytes((in_flash,)) + pack(self.settings))
+            self._report(link.TAG_CONFIG, bytes((link.IN_FLASH * (self.flash == self.settings),)) + pack(self.settings))
 
     def hear(self, reception: Reception) -> None:
         """Process a frame, and report the position if due."""
@@ -216,8 +215,7 @@ class LinkProtocol:
             self._receiving = True
             self._status()
         elif kind == link.TX_AT and _is_frame(record[link.TX_FRAME_AT :]):
-            dx_ticks = int.from_bytes(record[BODY_AT : link.TX_FRAME_AT], "little")
-            self._transmit(dx_ticks, record[link.TX_FRAME_AT :])
+            self._transmit(int.from_bytes(record[BODY_AT : link.TX_FRAME_AT], "little"), record[link.TX_FRAME_AT :])
         elif kind in (link.RX_ON, link.TX_AT):
             self.report(link.REFUSED, bytes((kind, link.REFUSED_MALFORMED)))
         elif kind in (link.SET_TAG_CONFIG, link.ASK_TAG_CONFIG, link.SET_TIME) and self.tag is not None:

@@ -54,8 +54,7 @@ def residuals_check(name: str, words: str, fixes: Collection[FixMessage]) -> Che
     """Check that the residuals of fixes match the site's noise figures. ``words`` precede the finding."""
     ratio = sum(fix.chi2 for fix in fixes) / max(sum(fix.dof for fix in fixes), 1)
     finding = f"{words}; squared residuals are {ratio:.2f} of what the site's noise figures let expect."
-    advice = "Survey the anchors again, and look for what stands in the way."
-    return judged(name, ratio, 2.0, 10.0, finding, advice)
+    return judged(name, ratio, 2.0, 10.0, finding, "Survey the anchors again, and look for what stands in the way.")
 
 
 # Stability of counters, from two counters' stamps of the same frames: a check of the site's noise figures.

@@ -191,8 +191,7 @@ class Ether:
             self._timer.cancel()
         ticks = self.medium.timeline.next_ticks
         due_s = _CLOCKS_S / 2.0 if ticks is None else self._origin_s + ticks * TICK_S - self._clock()
-        loop = asyncio.get_running_loop()
-        self._timer = loop.call_later(min(max(due_s, 0.0), _CLOCKS_S / 2.0), self.advance)
+        self._timer = asyncio.get_running_loop().call_later(min(max(due_s, 0.0), _CLOCKS_S / 2.0), self.advance)
 
     async def send_clocks(self) -> None:
         """Send every process its nodes' counters, until cancelled."""

@@ -106,8 +106,7 @@ def decode_batch(data: bytes) -> Batch:
         raise BadBatchError(f"its header has {header_bytes} bytes and its records {record_bytes}")
     if count > MAX_RECORDS or len(data) != header_bytes + count * record_bytes:
         raise BadBatchError(f"{len(data)} bytes are not {count} records")
-    records = np.ndarray(count, RECORD, data, header_bytes, record_bytes)
-    return Batch(run, sequence, sent, issue, records)
+    return Batch(run, sequence, sent, issue, np.ndarray(count, RECORD, data, header_bytes, record_bytes))
 
 
 def records_of(fixes: Sequence[tuple[int, FixMessage]], *, simulated: bool) -> Records:
@@ -131,8 +130,7 @@ def _row(number: int, fix: FixMessage, *, simulated: bool) -> tuple[Any, ...]:
     hpl_cm = NONE_U16 if fix.hpl_m is None else _counted(fix.hpl_m, 100.0)
     position_mm = tuple(_scaled(value, 1000.0, _MAX_I32) for value in fix.position_m)
     unix_us = max(0, _scaled(fix.unix_s, 1e6, _MAX_I64))
-    anchors = min(len(fix.anchors), 255)
-    return number, flags, anchors, 0, unix_us, position_mm, (xx, xy, yy), std_z_mm, hpl_cm, velocity
+    return number, flags, min(len(fix.anchors), 255), 0, unix_us, position_mm, (xx, xy, yy), std_z_mm, hpl_cm, velocity
 
 
 def fix_of(name: str, record: tuple[Any, ...]) -> FixMessage:

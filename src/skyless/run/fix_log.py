@@ -74,8 +74,7 @@ class FixLog:
         if self.first_fix_s is None:
             self.first_fix_s = done_s - self.started_s
         if self.lateness.gives(self.due_s, done_s) and self._rate.is_due(ended_s):
-            unix_s = ended_s + self.unix_less_host_s
-            self._publish(fix_message(self.tag, self.serial, fix, unix_s, done_s - ended_s))
+            self._publish(fix_message(self.tag, self.serial, fix, ended_s + self.unix_less_host_s, done_s - ended_s))
 
     def health(
         self,

@@ -242,8 +242,7 @@ class Tape:
         arrives, arrivals = self._receive(np.full(len(span), _TAG_KEY + tag), points_m, span)
         span, points_m, times_s = span[arrives], points_m[arrives], times_s[arrives]
         sender, number = frames.sender[span], frames.number[span]
-        distances_m = _apart_m(points_m, self.true_positions_m[sender])
-        errors_m = self._errors[tag].at(times_s, points_m, sender, distances_m)
+        errors_m = self._errors[tag].at(times_s, points_m, sender, _apart_m(points_m, self.true_positions_m[sender]))
         stamps = self._stamps(_TAG_KEY + tag, len(self._ids) + tag, span, arrivals[arrives] + errors_m / TICK_M)
         relays = self._relays(span)
         rows = zip(
@@ -273,8 +272,7 @@ class Tape:
             own = start + int(true_ticks) + self._clocks.gains(rows, true_ticks).astype(np.int64) - self._first_ticks
             cycles, rest = np.divmod(np.maximum(own, 0), cycle)
             numbers.append(_CYCLE * cycles + (self._ahead_ticks[:, :-1] < rest[:, None]).sum(axis=1))
-        counts = np.where(self._dead, 0, numbers[1] - numbers[0])
-        sender, at = _spread(counts)
+        sender, at = _spread(np.where(self._dead, 0, numbers[1] - numbers[0]))
         number = numbers[0][sender] + at
         tx_ticks = (
             self._first_ticks[sender] + number // _CYCLE * cycle[sender] + self._ahead_ticks[sender, number % _CYCLE]

@@ -72,13 +72,7 @@ class Waypoints(Trajectory):
     """
 
     def __init__(
-        self,
-        points_m: ArrayLike,
-        speed_mps: float,
-        *,
-        loop: bool = False,
-        corner_s: float = 0.0,
-        start_s: float = 0.0,
+        self, points_m: ArrayLike, speed_mps: float, *, loop: bool = False, corner_s: float = 0.0, start_s: float = 0.0
     ) -> None:
         """``points_m`` has shape (n, 2) or (n, 3), n ≥ 2. Raises ValueError for paths that cannot be walked."""
         points = np.asarray(points_m, dtype=np.float64)

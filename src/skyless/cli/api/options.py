@@ -192,10 +192,9 @@ def _check_conditions(name: str, value: str) -> Any:  # noqa: ANN401 - the condi
 
 class _Studied(ComputedOptions, frozen=True):
     name: Annotated[str, Rule(_check_study)]
-    """efficiency: RMSE over the Cramér–Rao bound. integrity: protection levels with a faulty anchor.
-    room: the errors of real rooms, and what goes wrong in them. large: 1,024 anchors without a master.
-    survey: anchors that survey themselves. survey-room: tags in rooms whose site files a survey wrote.
-    watch: anchors that have moved."""
+    """efficiency: RMSE over the Cramér–Rao bound. integrity: protection levels with a faulty anchor. room: the errors
+    of real rooms, and what goes wrong in them. large: 1,024 anchors without a master. survey: anchors that survey
+    themselves. survey-room: tags in rooms whose site files a survey wrote. watch: anchors that have moved."""
 
 
 class StudyOptions(_Studied, frozen=True, kw_only=True):

@@ -308,8 +308,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
         check_whole("--optimise", asked.optimise, least=anchors_needed(site)[0], most=60)
     floor, heights_m = _floor(asked, site, file), _heights_m(asked, site)
     walls_m = None if asked.mounts_m is None else np.array(asked.mounts_m)
-    levels_m = None if asked.anchor_heights_m is None else tuple(asked.anchor_heights_m)
-    mounts = mounts_of(site, floor, walls_m, levels_m)
+    mounts = mounts_of(site, floor, walls_m, None if asked.anchor_heights_m is None else tuple(asked.anchor_heights_m))
     optimised: Optimised | None = None
     if asked.optimise is not None:
         search = Search(site, settings, floor, mounts, heights_m, asked.optimise, asked.seed, asked.search_s)

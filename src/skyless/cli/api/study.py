@@ -46,8 +46,7 @@ class StudyResult(Result, frozen=True, eq=False):
 
     def column(self, name: str) -> Vector:
         """One field of all rows, shape (n,); NaN where it does not apply. Raises SkylessError."""
-        numbers = tuple(one for one in self._fields if self._is_number(one))
-        check_choice("name", name, numbers)
+        check_choice("name", name, tuple(one for one in self._fields if self._is_number(one)))
         return figures(getattr(row, name) for row in self.rows)
 
     @property

@@ -119,8 +119,7 @@ def _boards(radio: str | None) -> tuple[SerialRadio, ...]:
     kind, _, ports = radio.partition(":")
     if kind != "serial":
         raise SkylessError(f"--radio is {radio!r}; it should be a board, serial:PATH[@BAUD], as serial:/dev/ttyACM0")
-    boards = open_radios(radio, "tag", tuple(ports.split(",")))
-    return tuple(one for one in boards if isinstance(one, SerialRadio))
+    return tuple(one for one in open_radios(radio, "tag", tuple(ports.split(","))) if isinstance(one, SerialRadio))
 
 
 async def _examine(

@@ -78,11 +78,7 @@ def record(
 
 
 async def _record(
-    file: "McapFile",
-    address: MqttAddress,
-    site_id: int | None,
-    duration_s: float | None,
-    found: "list[RecorderNode]",
+    file: "McapFile", address: MqttAddress, site_id: int | None, duration_s: float | None, found: "list[RecorderNode]"
 ) -> None:
     from skyless.run.record import RecorderNode
 
@@ -169,8 +165,7 @@ def export(
     check_output("to", to, file)
     if not FRAME_NAME.fullmatch(frame):
         raise SkylessError(f"--frame is {frame!r}; it should be {FRAME_RULE}")
-    settings = RosSettings(frame=frame, transforms=transforms)
-    bag = write_bag(file, to, settings, tag, 8 if bag_version == "8" else 9)
+    bag = write_bag(file, to, RosSettings(frame=frame, transforms=transforms), tag, 8 if bag_version == "8" else 9)
     if output.json:
         print_json(bag)
     else:

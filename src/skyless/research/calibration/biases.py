@@ -82,10 +82,7 @@ def positions_of(
 def known_tags(
     recording: McapRecording, site: Site, asked: CalibrateOptions, truth: Truth | None
 ) -> tuple[TagEpochs, ...]:
-    """Differences of tags while at known positions.
-
-    ``truth``: from a table, in Unix time. Raises SkylessError.
-    """
+    """Differences of tags while at known positions. ``truth``: from a table, in Unix time. Raises SkylessError."""
     raw = tags_to_replay(recording.summary())
     names, recorded = ", ".join(raw), recorded_truth(recording)
     if asked.tag is not None and asked.tag not in raw:

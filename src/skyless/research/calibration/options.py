@@ -257,10 +257,7 @@ class SurveyOptions(ComputedOptions, frozen=True, kw_only=True):
     anchor_height_std_m: Annotated[_Std | None, Option("anchor-height-std")] = None
     """Estimate heights, too; those given are known this well, metres. Without it they are exact."""
     distances: Annotated[
-        Sequence[Tape],
-        Option("distance"),
-        Text(_read_tape, "1-4=7.21 or 1-4=7.21±0.01", many=True),
-        Rule(_check_tapes),
+        Sequence[Tape], Option("distance"), Text(_read_tape, "1-4=7.21 or 1-4=7.21±0.01", many=True), Rule(_check_tapes)
     ] = ()
     """A distance between two anchors by tape or laser, metres; ±0.005 by default."""
     points_m: Annotated[

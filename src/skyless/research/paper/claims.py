@@ -915,8 +915,7 @@ _COUNTED_FROM_S: Final = 1.0
 def rate_sites() -> dict[str, Site]:
     """The lab with its six slots of 2.5 ms, and seven nodes in slots of 2²⁷ ticks (2.1 ms), as short as the paper's."""
     lab = paper_lab_site(RADIO_PS)
-    seventh = AnchorSite(id=7, x_m=3.0, y_m=8.0)
-    seven = replace(lab, anchors=(*lab.anchors, seventh), schedule=ScheduleSite())
+    seven = replace(lab, anchors=(*lab.anchors, AnchorSite(id=7, x_m=3.0, y_m=8.0)), schedule=ScheduleSite())
     return {"six nodes, 2.5 ms": lab, "seven nodes, 2.1 ms": seven}
 
 

@@ -219,8 +219,7 @@ def _run(setting: Setting, draw: Generator) -> tuple[NDArray[Any], ...]:
     packets = faulty(episode, setting.fault, int(draw.integers(len(anchors_m))), onset, slot_s)
     height_m = 0.0 if setting.fault.scene == "lab" else None
     settings, dim = settings_of(setting.case, height_m).changed(integrity_risk=setting.risk), 3 - (height_m is not None)
-    start_m = episode.path_m[0] + draw.normal(0.0, START_STD_M, 3)
-    rows = tracked(settings, anchors_m, packets, start_m, has_levels=True)
+    rows = tracked(settings, anchors_m, packets, episode.path_m[0] + draw.normal(0.0, START_STD_M, 3), has_levels=True)
     fixes = np.flatnonzero(np.isin(rows["outcome"][onset:], (ACCEPTED, JOINED))) + onset
     errors, given = np.zeros((len(fixes), 3)), rows["levels"][fixes]
     errors[:, :dim] = rows["position_m"][fixes, :dim] - episode.path_m[fixes, :dim]

@@ -172,8 +172,7 @@ def _path(case: LargeCase, draw: np.random.Generator, low_m: float, high_m: floa
         point = draw.uniform(low_m, high_m, 2)
         if _LEG_M[0] <= np.linalg.norm(point - points[-1]) <= longest_m:
             points.append(point)
-    points_m = [(x_m, y_m, _TAG_HEIGHT_M) for x_m, y_m in points]
-    return Waypoints(points_m, case.speed_mps, loop=True, corner_s=_CORNER_S)
+    return Waypoints([(x_m, y_m, _TAG_HEIGHT_M) for x_m, y_m in points], case.speed_mps, loop=True, corner_s=_CORNER_S)
 
 
 def tape_of(run: LargeRun) -> Tape:

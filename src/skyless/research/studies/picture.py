@@ -422,8 +422,7 @@ def _with_levels(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
 
 def _with_ratio(row: WorldRow, worlds: Sequence[RunResult], reference: Sequence[RunResult]) -> WorldRow:
     """Add the ratio of RMSEs. Worlds of the same number share their seed, so the jackknife leaves them out together."""
-    pairs = zip(worlds, reference, strict=True)
-    sums = np.array([(a.fixes, a.squared_m2, b.fixes, b.squared_m2) for a, b in pairs])
+    sums = np.array([(a.fixes, a.squared_m2, b.fixes, b.squared_m2) for a, b in zip(worlds, reference, strict=True)])
     if sums[:, 2].sum() == 0:
         return row
     ratio, ratio_error = jackknife(sums, lambda rows: _rmse(rows) / _rmse(rows[:, 2:]))

@@ -24,7 +24,7 @@ from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of
 from skyless.research.studies.worlds import Run, anchor_of, box, walking, worlds
 from skyless.research.uncertainty import Biases
 from skyless.sim.evaluation.scenarios import Room, wanderer, wanderers
-from skyless.sim.impairments import AnchorBias, Body, CarrierModel, Impairments, RangeErrorModel, WarmUp
+from skyless.sim.impairments import AnchorBias, Body, CarrierModel, RangeErrorModel, WarmUp
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.trajectory import Static, Trajectory, Waypoints
 
@@ -391,15 +391,11 @@ def _phases(plan: Plan) -> list[Case]:
     found, never_worse = [], Limit("ratio", most=_PHASE_RATIO)
     for name, carrier, runs_of, limits in scenes:
         stamps, phases = (
-            runs_of(warmup_s=_PHASE_WARMUP_S, change=partial(_with_carrier, one)) for one in (None, carrier)
+            runs_of(warmup_s=_PHASE_WARMUP_S, change=partial(replace, carrier=one)) for one in (None, carrier)
         )
         alone = f"{name}, stamps alone"
         found += [Case(alone, name, None, stamps), Case(name, name, None, phases, alone, (*limits, never_worse))]
     return found
-
-
-def _with_carrier(carrier: CarrierModel | None, impairments: Impairments) -> Impairments:
-    return replace(impairments, carrier=carrier)
 
 
 def _hands(plan: Plan, rate_hz: float, random_walk_fm: float, **options: Any) -> tuple[Run, ...]:  # noqa: ANN401 - of ``worlds``

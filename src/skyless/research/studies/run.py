@@ -85,8 +85,7 @@ def way_on(resume: str | Path | None) -> str:
 
 
 def _study(name: str, title: str, module: Any, *panels: str, x: str = "") -> Study:  # noqa: ANN401 - a module
-    look = Look(title[0].upper() + title[1:], panels, x)
-    return Study(name, title, module.cells, module.rows, partial(draw, look))
+    return Study(name, title, module.cells, module.rows, partial(draw, Look(title[0].upper() + title[1:], panels, x)))
 
 
 STUDIES: Final = {

@@ -65,10 +65,7 @@ class Group(Struct, frozen=True):
 
 
 _KNOWN: Final = Variant("delays known", 0.0)
-_EXACT: Final = (
-    Group("exact", (_KNOWN,)),
-    Group("1 s", (Variant("delays known, 1 s", 0.0),), seconds=1.0),
-)
+_EXACT: Final = (Group("exact", (_KNOWN,)), Group("1 s", (Variant("delays known, 1 s", 0.0),), seconds=1.0))
 _DELAYS: Final = Group(
     "delays",
     (
@@ -121,11 +118,7 @@ def limits_of(layout: str, case: str) -> tuple[Limit, ...]:
             Limit("delay_m", most=(0.016, 0.016, 0.014)[of]),
             Limit("tag_m", most=(0.016, 0.024, 0.013)[of]),
         ),
-        "pairs 2 cm, delays 7 cm": (
-            Limit("ratio", most=1.05),
-            honest,
-            Limit("tag_m", most=(0.020, 0.026, 0.012)[of]),
-        ),
+        "pairs 2 cm, delays 7 cm": (Limit("ratio", most=1.05), honest, Limit("tag_m", most=(0.020, 0.026, 0.012)[of])),
         "pairs 3 cm": (Limit("flagged", most=0.01),),
         "10 % late": (*((Limit("near", 0.8),) if layout == "lab" else ()), Limit("wrong_flagged", 0.9)),
         "30 % late": (Limit("wrong_flagged", 0.9),),
@@ -207,8 +200,7 @@ def survey_runs(runs: SurveyRuns) -> tuple[tuple[Outcome, ...], ...]:
 
 def _run(runs: SurveyRuns, room: DrawnRoom) -> tuple[Outcome, ...]:
     layout, ranges = room.layout, ranges_in_air(room, runs.seconds)
-    no_delay_m = np.zeros(len(layout.anchors))
-    hand_tag_m = tag_error_m(layout, layout.position_m + room.hand_m, no_delay_m, room.tx_delay_m)
+    hand_tag_m = tag_error_m(layout, layout.position_m + room.hand_m, np.zeros(len(layout.anchors)), room.tx_delay_m)
     outcomes, asked_for = [], tuple[TapeAdvice, ...]()
     for variant in runs.group.variants:
         facts = _facts(room, runs.group, variant, asked_for[: variant.tapes])

@@ -349,8 +349,7 @@ def judged(room: DrawnRoom, survey: Survey, outcome: Outcome) -> Outcome:
         return outcome
     found_m = np.array([(one.x_m, one.y_m, one.z_m) for one in survey.anchors], float)
     delay_m = np.array([one.delay_m or 0.0 for one in survey.anchors])
-    true_m = aligned(layout.position_m, found_m, layout.dimensions)
-    error_m = found_m - true_m
+    error_m = found_m - aligned(layout.position_m, found_m, layout.dimensions)
     k = layout.dimensions
     squares = [
         float(error @ np.linalg.pinv(np.array(one.covariance_m2)[:k, :k], rcond=1e-9, hermitian=True) @ error)
@@ -507,8 +506,7 @@ def _written(room: DrawnRoom, rough_m: Array, survey: Survey, accuracy: Accuracy
 
 def _aligned(room: DrawnRoom, site: Site) -> Site:
     """The site with its positions moved to the frame of the truth."""
-    stated_m = anchor_positions(site)
-    moved_m = aligned(stated_m, room.layout.position_m, room.layout.dimensions)
+    moved_m = aligned(anchor_positions(site), room.layout.position_m, room.layout.dimensions)
     anchors = tuple(
         replace(anchor, x_m=x_m, y_m=y_m, z_m=z_m)
         for anchor, (x_m, y_m, z_m) in zip(site.anchors, moved_m.tolist(), strict=True)

@@ -139,8 +139,7 @@ def _read(text: str, now: datetime, day: date) -> datetime:
 
     settings = {"RELATIVE_BASE": now, "PREFER_DATES_FROM": "past", "DATE_ORDER": "YMD"}
     settings |= {"RETURN_TIME_AS_PERIOD": True, "PARSERS": ["relative-time", "absolute-time"]}
-    parser = DateDataParser(languages=["en"], settings=settings)
-    found = parser.get_date_data(_AT_AN_HOUR.sub(r"\1:00", text))
+    found = DateDataParser(languages=["en"], settings=settings).get_date_data(_AT_AN_HOUR.sub(r"\1:00", text))
     when: datetime | None = found.date_obj
     if when is None or not (found.period in {"time", "day"} or text.endswith("ago")):
         raise ValueError  # a month or a year is not a time

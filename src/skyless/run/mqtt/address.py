@@ -113,8 +113,7 @@ def _broker(url: str, single: str, ca: Path | None) -> MqttAddress:
     if ca is not None and parts.scheme != "mqtts":
         raise _wrong(url, "mqtts://… together with --mqtt-ca")
     user, password = _credentials(url, parts)
-    host = parts.hostname or ""
-    return MqttAddress(host, port or _PORTS[parts.scheme], parts.scheme == "mqtts", user, password, ca)
+    return MqttAddress(parts.hostname or "", port or _PORTS[parts.scheme], parts.scheme == "mqtts", user, password, ca)
 
 
 def _credentials(url: str, parts: SplitResult) -> tuple[str | None, str | None]:
@@ -246,8 +245,7 @@ ACCESS: Final = {
     ),
     Role.OPERATOR: Access(publish=(EVERYTHING,), subscribe=(EVERYTHING,)),
     Role.STRANGER: Access(
-        publish=(),
-        subscribe=(topics.site_topic(EVERY_SITE), topics.fix_topic(EVERY_SITE, EVERY_NODE)),
+        publish=(), subscribe=(topics.site_topic(EVERY_SITE), topics.fix_topic(EVERY_SITE, EVERY_NODE))
     ),
 }
 

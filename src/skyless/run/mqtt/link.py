@@ -244,8 +244,7 @@ class Link:
 
     def _repeat_later(self, connection: Connection) -> None:
         """Schedule a repetition of the status, at a random time because many links connect at the same moment."""
-        wait_s = RESEND_S * random.uniform(0.5, 1.0)
-        asyncio.get_running_loop().call_later(wait_s, self._repeat_status, connection)
+        asyncio.get_running_loop().call_later(RESEND_S * random.uniform(0.5, 1.0), self._repeat_status, connection)
 
     def _repeat_status(self, connection: Connection) -> None:
         if self._connection is connection and not self._stopping:

@@ -229,8 +229,7 @@ class McapRecorder:
             self._georeference = message.site.georeference
             site = message.site
             anchors_m = {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors}
-            shown = scene(unix_s, anchors_m, site.master, site.walls)
-            self._add(SCENE_TOPIC, "foxglove.SceneUpdate", shown, log_ns)
+            self._add(SCENE_TOPIC, "foxglove.SceneUpdate", scene(unix_s, anchors_m, site.master, site.walls), log_ns)
 
     def _show(self, fix: FixMessage, log_ns: int) -> None:
         """Add Foxglove's messages for a fix, at most ``SHOWN_HZ`` a second for each tag."""

@@ -147,8 +147,7 @@ class LiveSurvey:
 
     def ranges(self) -> PairRanges:
         """Return all ranges so far, with all anchors of the site."""
-        found = self._ranger.ranges()
-        return replace(found, anchors=tuple(sorted(self._known)))
+        return replace(self._ranger.ranges(), anchors=tuple(sorted(self._known)))
 
     def finish(self) -> PairRanger:
         """Finish the ranges, including those since the last full second, and return their ranger."""
@@ -652,8 +651,7 @@ class SurveyNode:
             if site_digest(present) != site_digest(before) or not is_same_but_placed(before, present):
                 raise SkylessError(f"{file} is not the site that was surveyed: it has been changed meanwhile")
             plan = None if self._given is None else self._given.floor_plan
-            floor = None if plan is None else FloorImage(plan, self._image)
-            saved = save_survey(file, survey, ranges, unix_s, floor)
+            saved = save_survey(file, survey, ranges, unix_s, None if plan is None else FloorImage(plan, self._image))
         self._place(live, before, saved, number)
         return saved
 
@@ -730,5 +728,4 @@ class FindingsLog:
 
 def _content(message: WatchMessage) -> object:
     """Contents of a watch message that are compared: all but its times and sizes."""
-    findings = [(one.kind, one.anchors, one.sentence) for one in message.findings]
-    return message.state, message.pairs, findings
+    return message.state, message.pairs, [(one.kind, one.anchors, one.sentence) for one in message.findings]

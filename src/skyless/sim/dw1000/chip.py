@@ -125,8 +125,7 @@ class Clocking:
         """Apply OTP_CTRL: read a word, or load the microcode (UM 6.3.2, 2.5.5.10)."""
         control = self._memory.get(r.OTP_CTRL)
         if control & r.OTPREAD:
-            address = self._memory.get(r.OTP_ADDR) & 0x7FF
-            self._memory.set(r.OTP_RDAT, self._sensors.otp().get(address, 0))
+            self._memory.set(r.OTP_RDAT, self._sensors.otp().get(self._memory.get(r.OTP_ADDR) & 0x7FF, 0))
         if control & r.LDELOAD:
             if self._memory.get(r.PMSC_CTRL0) & 0xFFFF == r.PMSC_FOR_LDE:
                 self._loaded_s = self._seconds() + _LOAD_S

@@ -359,8 +359,7 @@ def patrols(site: Site, tags: int, speed_mps: float = 1.0) -> list[Trajectory]:
         x1, y1 = high[:2] - inset
         z = float((low[2] + high[2]) / 2.0)
         corners = [(x0, y0, z), (x1, y0, z), (x1, y1, z), (x0, y1, z)]
-        turned = corners[index % 4 :] + corners[: index % 4]
-        paths.append(_smooth_path(turned, speed_mps))
+        paths.append(_smooth_path(corners[index % 4 :] + corners[: index % 4], speed_mps))
     return paths
 
 

@@ -148,8 +148,7 @@ def masters_by_links(anchors_m: Matrix, budget: Vector, barriers: Barriers) -> I
     """Rows of anchors ordered by how well all others receive them, best first; equals by distance from the middle."""
     heard, _ = links(anchors_m, anchors_m, budget, barriers)
     total = np.round(np.minimum(heard, 0.99).sum(axis=0), 3)
-    middle = np.linalg.norm(anchors_m[:, :2] - anchors_m[:, :2].mean(axis=0), axis=1)
-    return np.lexsort((middle, -total))
+    return np.lexsort((np.linalg.norm(anchors_m[:, :2] - anchors_m[:, :2].mean(axis=0), axis=1), -total))
 
 
 class Scene(NamedTuple):

@@ -93,8 +93,7 @@ def fill_joint_sigma(
         rows = anchors_in_use(scene, point, share)
         if len(rows) <= settings.dim:
             continue
-        state = _state_at(settings, scene.anchors, rows, point)
-        found = _steady_state(state, superframe, relays, share, delay_m, rows)
+        found = _steady_state(_state_at(settings, scene.anchors, rows, point), superframe, relays, share, delay_m, rows)
         claimed_m2 = view(found.variance_m2) / found.fixes
         variance_m2 = np.maximum(claimed_m2 - view(found.motion_m2), 0.0)
         sigma_m = math.sqrt(variance_m2.sum())

@@ -217,8 +217,7 @@ def exchange(
             if late():
                 return score
             best = chosen[k]
-            others = np.delete(chosen, k)
-            free = (lattice.apart_m[:, others] >= _CLOSEST_M).all(axis=1)
+            free = (lattice.apart_m[:, np.delete(chosen, k)] >= _CLOSEST_M).all(axis=1)
             for candidate in np.flatnonzero(free):
                 chosen[k] = candidate
                 trial = relative_score(*mean_and_worst(chosen, lattice), *reference)
@@ -356,8 +355,7 @@ class Search:
 
     def _site_of(self, layout: Layout, rank: int = 0) -> Site:
         anchors_m = self._mounts.at(layout.along_m, layout.levels)
-        master = int(masters_by_links(anchors_m, self._budget, self._barriers)[rank])
-        return site_with(self._site, anchors_m, master)
+        return site_with(self._site, anchors_m, int(masters_by_links(anchors_m, self._budget, self._barriers)[rank]))
 
     def _sigma(self, site: Site, sample: tuple[Matrix, Vector]) -> tuple[float, float, float]:
         """Mean and worst standard deviation over the points, capped, as without a fix; and the share with a fix."""

@@ -249,8 +249,7 @@ def draw_image(axes: Axes, site: Site, file: Path) -> None:
         return
     from matplotlib.image import imread  # noqa: PLC0415 (only with a floor plan)
 
-    image = imread(file.parent / plan.image)
-    axes.imshow(image, extent=(box[0], box[2], box[1], box[3]), zorder=0, cmap="gray")
+    axes.imshow(imread(file.parent / plan.image), extent=(box[0], box[2], box[1], box[3]), zorder=0, cmap="gray")
 
 
 def draw_outline_and_walls(axes: Axes, site: Site, floor: Floor) -> None:

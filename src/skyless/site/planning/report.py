@@ -197,8 +197,7 @@ def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
 
 def _has_mirror(anchors: Array, point: Array, height_m: float | None, tx_var: float, rx_var: float) -> bool:
     """Whether the anchors in view, shape (n, 3), or the nearest of many, leave two possible positions."""
-    nearest = np.argsort(np.linalg.norm(anchors - point, axis=1))[:MAX_ANCHORS]
-    anchors = anchors[np.sort(nearest)]
+    anchors = anchors[np.sort(np.argsort(np.linalg.norm(anchors - point, axis=1))[:MAX_ANCHORS])]
     if len(anchors) < (4 if height_m is None else 3):
         return False
     ranges = np.linalg.norm(anchors - point, axis=1)
@@ -208,8 +207,7 @@ def _has_mirror(anchors: Array, point: Array, height_m: float | None, tx_var: fl
 
 
 def _holes(plan: PlanMap) -> list[str]:
-    share = np.where(plan.grid.within, plan.column(FIX_SHARE), np.nan)
-    missing = share < 0.5
+    missing = np.where(plan.grid.within, plan.column(FIX_SHARE), np.nan) < 0.5
     if not missing.any():
         return []
     part = missing.sum() / plan.grid.points

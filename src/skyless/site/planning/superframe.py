@@ -208,8 +208,7 @@ def reception_of(site: Site, channel: ChannelModel) -> MasterReception:
 
 def with_best_master(site: Site, channel: ChannelModel) -> Site:
     """The same site with the master that the others receive best; among equals the most central one."""
-    best = _masters(site, channel)[0]
-    return replace(site, master=site.anchors[best].id)
+    return replace(site, master=site.anchors[_masters(site, channel)[0]].id)
 
 
 def master_warnings(site: Site, channel: ChannelModel) -> list[str]:
@@ -229,8 +228,7 @@ def master_warnings(site: Site, channel: ChannelModel) -> list[str]:
     warnings = [text for text in both if text]
     if not warnings:
         return []
-    best = int(_masters(site, channel)[0])
-    other = replace(site, master=site.anchors[best].id)
+    other = replace(site, master=site.anchors[int(_masters(site, channel)[0])].id)
     left = int((reception_of(other, channel).share < _RELIABLE).sum())
     if left < int(poor.sum()):
         receive = f"all would receive {_RELIABLE:.0%} or more" if left == 0 else f"{left} would receive it that badly"

@@ -136,8 +136,7 @@ def antenna_delays_m(excess_m: Mapping[Pair, float]) -> dict[int, float]:
     H, excess = _design(kept, anchors), np.array(list(kept.values()))
     information = H.T @ H / EXCESS_STD_M**2
     information[range(len(anchors)), range(len(anchors))] += 1.0 / ANTENNA_DELAY_STD_M**2
-    delays = np.linalg.solve(information, H.T @ excess / EXCESS_STD_M**2)
-    return dict(zip(anchors, delays[:-1].tolist(), strict=True))
+    return dict(zip(anchors, np.linalg.solve(information, H.T @ excess / EXCESS_STD_M**2)[:-1].tolist(), strict=True))
 
 
 def contradictions_m(excess_m: Mapping[Pair, float], delays_m: Mapping[int, float]) -> dict[Pair, float]:

@@ -210,8 +210,7 @@ def estimate(differences: Differences) -> CalibrationEstimate:
 
     A slope over the range is also estimated, and used if it differs from zero and is plausible for the radio.
     """
-    found = np.unique(np.concatenate([differences.anchor_a, differences.anchor_b]))
-    kept, reasons = _connected(differences, found)
+    kept, reasons = _connected(differences, np.unique(np.concatenate([differences.anchor_a, differences.anchor_b])))
     data = differences.select(np.isin(differences.anchor_a, kept))
     plain = fit(data, kept, slope=False)
     steep = fit(data, plain.anchors, slope=True) if moves(data, plain) else None

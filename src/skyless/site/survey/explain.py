@@ -240,8 +240,7 @@ def _model(pairs: Pairs, causes: Sequence[int], ends: Integers, parameter: Array
         if cause < n:
             position_m[cause, :dim] += parameter[end - dim : end]
     apart_m = np.linalg.norm(position_m[pairs.first] - position_m[pairs.second], axis=1)
-    before_m = np.linalg.norm(pairs.position_m[pairs.first] - pairs.position_m[pairs.second], axis=1)
-    predicted = apart_m - before_m
+    predicted = apart_m - np.linalg.norm(pairs.position_m[pairs.first] - pairs.position_m[pairs.second], axis=1)
     columns = np.zeros((m, len(parameter)))
     moved, delayed = _moved_columns(pairs, position_m), incidence(n, pairs.first, pairs.second)
     for cause, end in zip(causes, ends.tolist(), strict=True):
@@ -322,8 +321,7 @@ def explain(pairs: Pairs, change_m: Array) -> Explanation:
     if not best.causes:
         return nothing(pairs, change_m)
     if best.is_complete:
-        rivals = [one for one in sets if one is not best and one.score > best.score - _MARGIN]
-        parts = _parts(pairs, best, rivals)
+        parts = _parts(pairs, best, [one for one in sets if one is not best and one.score > best.score - _MARGIN])
     else:
         parts = [_check(pairs, [best.causes], best)]
     return Explanation(tuple(parts), weight_without(pairs, best.fit), pairs.weight @ best.fit.residual_m)

@@ -237,8 +237,7 @@ def _near(problem: Problem, solution: Solution, used: Mask) -> Minima:
     elsewhere = graduated(problem, start_m, delay_m, np.full(len(start_m), 0.3))
     sets = without_ranges(problem, solution, used)
     position_m, delay_m = np.tile(solution.position_m, (len(sets), 1, 1)), np.tile(solution.delay_m, (len(sets), 1))
-    fewer = cut_off(problem, position_m, delay_m, sets)
-    return _joined(elsewhere, fewer)
+    return _joined(elsewhere, cut_off(problem, position_m, delay_m, sets))
 
 
 def _joined(some: Minima, more: Minima) -> Minima:
@@ -269,8 +268,7 @@ def _from_starts(problem: Problem, start_m: Array) -> Minima:
 
 
 def _plain(problem: Problem, start_m: Array) -> Solutions:
-    everything = np.ones((len(start_m), len(problem.range_m)))
-    return _distinct(solve_many(problem, start_m, everything, most_steps=15))
+    return _distinct(solve_many(problem, start_m, np.ones((len(start_m), len(problem.range_m))), most_steps=15))
 
 
 def _is_large(problem: Problem) -> bool:
@@ -281,8 +279,7 @@ def _huber(problem: Problem, start: Solutions) -> Solutions:
     """Least squares with nearly absolute values for late residuals (iteratively reweighted)."""
     fit = start
     for _ in range(_HUBER_ROUNDS):
-        weight = _bent_weight(problem, fit.residual_m)
-        fit = solve_many(problem, fit.position_m, weight, fit.delay_m, _STEPS_A_ROUND)
+        fit = solve_many(problem, fit.position_m, _bent_weight(problem, fit.residual_m), fit.delay_m, _STEPS_A_ROUND)
     return fit
 
 
@@ -324,8 +321,7 @@ def cut_off(problem: Problem, position_m: Array, delay_m: Array, used: Mask | No
     for _ in range(_MAX_CHANGES):
         weight = used[busy].astype(np.float64)
         fit = solve_many(problem, position_m[busy], weight, delay_m[busy])
-        scaled = _in_cutoffs(problem, fit.residual_m)
-        new = scaled < 1.0
+        new = _in_cutoffs(problem, fit.residual_m) < 1.0
         # Squares of all ranges; those left out cost the cut-off.
         squares = fit.residual_m**2 / problem.variance_m2
         limit = np.where(fit.residual_m > 0.0, LATE_CUTOFF**2, EARLY_CUTOFF**2)
@@ -613,8 +609,7 @@ def find_ambiguities(fit: RobustFit) -> tuple[OtherFit, ...]:
     """Results that fit nearly as well and have anchors elsewhere, the best first."""
     problem = fit.problem
     starts = mirrored(problem, fit.solution.position_m)
-    delay_m = np.tile(fit.solution.delay_m, (len(starts), 1))
-    by_mirror = cut_off(problem, starts, delay_m)
+    by_mirror = cut_off(problem, starts, np.tile(fit.solution.delay_m, (len(starts), 1)))
     std_m = aligned_std_m(fit)
     is_late = solve_least_squares(problem, fit.solution.position_m).cost > fit.cost + _LATE_GAIN
     others: list[tuple[float, OtherFit]] = []
@@ -784,8 +779,7 @@ def aligned_covariance(problem: Problem, position_m: Array, core: Mask, weight: 
     count, size = motion.shape[1], int(inside.sum())
     basis = np.zeros((len(used), len(used) - count))
     if count:
-        complete = np.linalg.qr(motion[inside], mode="complete")[0]
-        basis[inside, : size - count] = complete[:, count:]
+        basis[inside, : size - count] = np.linalg.qr(motion[inside], mode="complete")[0][:, count:]
     else:
         basis[inside, :size] = np.eye(size)
     basis[~inside, size - count :] = np.eye(len(used) - size)
@@ -946,8 +940,7 @@ def best_tapes(
     """
     n = len(position_m)
     first, second = np.triu_indices(n, 1)
-    has_tape = adjacency(n, problem.tape_first, problem.tape_second)
-    usable = core[first] & core[second] & ~has_tape[first, second]
+    usable = core[first] & core[second] & ~adjacency(n, problem.tape_first, problem.tape_second)[first, second]
     first, second = first[usable], second[usable]
     unit = unit_vectors(position_m, first, second)
     inside = np.repeat(core, 3)

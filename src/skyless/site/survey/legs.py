@@ -108,8 +108,7 @@ class TwoWayRanging:
             return None
         flight = bracketed_flight_ticks(before, back, leg, self._bits)
         if flight is not None:
-            pair = _pair(sender, receiver)
-            self._flights.setdefault(pair, RunningMedian(self._window)).add(flight)
+            self._flights.setdefault(_pair(sender, receiver), RunningMedian(self._window)).add(flight)
         return flight
 
     def forget(self, node: int) -> None:
@@ -280,8 +279,7 @@ def earliest_cluster(value: Array, weight: Array, std: float, total: float | Non
     """
     order = np.argsort(value, kind="stable")
     ordered, until = value[order], np.cumsum(weight[order])
-    before = np.concatenate([[0.0], until[:-1]])
-    ends = np.searchsorted(until, before + _DENSE_SHARE * until[-1] * (1.0 - 1e-9))
+    ends = np.searchsorted(until, np.concatenate([[0.0], until[:-1]]) + _DENSE_SHARE * until[-1] * (1.0 - 1e-9))
     whole = ends < len(ordered)
     densest = float(np.min(ordered[ends[whole]] - ordered[whole]))  # the shortest interval that holds that share
     width = 2.0 * _SIGMAS * max(std, densest / _DENSE_WIDTH)
@@ -352,8 +350,7 @@ def _mean(a: int, b: int, values_m: Array, noise_m: float) -> PairRange:
     total = max(float(count), _MIN_COUNT / MIN_CLUSTER_SHARE)
     cluster = values_m[earliest_cluster(values_m, np.ones(count), noise_m, total)]
     std_m = max(float(np.std(cluster, ddof=1)) if len(cluster) > 1 else 0.0, noise_m) / math.sqrt(len(cluster))
-    late_share = float(np.mean(values_m > cluster.max()))
-    return PairRange(a, b, float(cluster.mean()), std_m, len(cluster), late_share)
+    return PairRange(a, b, float(cluster.mean()), std_m, len(cluster), float(np.mean(values_m > cluster.max())))
 
 
 # Time differences of a tag without site time: one anchor relays when it received another, and the tag receives both.

@@ -77,8 +77,7 @@ def flights_of(legs: Legs, longest_ticks: int) -> tuple[Flights, Legs, int]:
     used[legs_a.seen] = True
     used[legs_b.seen] = True
     flights = Flights(*map(np.concatenate, zip(astuple(legs_a.flights), astuple(legs_b.flights), strict=True)))
-    needed = legs_a.is_needed | legs_b.is_needed
-    kept = replace(legs, is_used=used).part(needed)
+    kept = replace(legs, is_used=used).part(legs_a.is_needed | legs_b.is_needed)
     return flights, kept, legs_a.impossible + legs_b.impossible
 
 
@@ -348,8 +347,7 @@ class PairRanger:
     def _close_block(self) -> None:
         if not self._open or self._block is None:
             return
-        both = zip(astuple(self._kept), astuple(_legs_of(self._open)), strict=True)
-        legs = Legs(*map(np.concatenate, both))
+        legs = Legs(*map(np.concatenate, zip(astuple(self._kept), astuple(_legs_of(self._open)), strict=True)))
         self._open = []
         flights, kept, impossible = flights_of(legs, self._longest_ticks)
         self._kept = kept.part(kept.t_s > self._last_s - _KEPT_S)

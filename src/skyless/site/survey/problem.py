@@ -93,8 +93,7 @@ def solve_least_squares(problem: Problem, position_m: Array, weight: Array | Non
     """
     given = np.ones(len(problem.range_m)) if weight is None else weight
     many = solve_many(problem, position_m[None], given[None])
-    equations = _Equations(problem)
-    information = equations.normal(many.position_m, many.delay_m, given[None])[0][0]
+    information = _Equations(problem).normal(many.position_m, many.delay_m, given[None])[0][0]
     return Solution(many.position_m[0], many.delay_m[0], many.residual_m[0], float(many.cost[0]), information)
 
 
