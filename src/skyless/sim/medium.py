@@ -186,8 +186,11 @@ class Medium(Generic[Result]):
         impairments: Impairments,
         seed: int,
         deliver: Callable[[Delivery], Result | None],
+        turnaround_s: float = TURNAROUND_S,
     ) -> None:
         """``deliver`` is called with every frame at its end; ``run`` yields its results.
+
+        ``turnaround_s``: how long before its preamble a frame must be passed in (firmware/emulator).
 
         Raises ValueError if an impairment names an anchor that is not the site's.
         """
@@ -203,7 +206,7 @@ class Medium(Generic[Result]):
         self._transmissions = self._late = 0
         self._deliver = deliver
         self.timeline: Timeline[Result] = Timeline()
-        self._least_ahead_ticks = _PREAMBLE_TICKS + from_seconds(TURNAROUND_S)
+        self._least_ahead_ticks = _PREAMBLE_TICKS + from_seconds(turnaround_s)
         _check_names(impairments, self.node_of)
         keys = [(ANCHOR_KEY, anchor.id) for anchor in site.anchors] + [(TAG_KEY, tag) for tag in range(len(tags))]
         self._setups = [stream(seed, *key, purpose=1) for key in keys]
