@@ -125,7 +125,7 @@ def test_events_have_marks_with_words_and_keys_lead_anywhere(replay):
         page.keyboard.press(key)
         replay.until("!skyless.state.player.playing")
         assert at_s is None or replay.at_s == pytest.approx(at_s)
-    replay.until("Math.abs(document.getElementById('slider').value - 45.2) < 0.01")  # drawn, from where the key leads on
+    replay.until("Math.abs(document.getElementById('slider').value - 45.2) < 0.01")  # the key leads on from there
     page.focus("#slider")
     page.keyboard.press("ArrowLeft")
     replay.paused_at(45.1)
