@@ -24,7 +24,7 @@ HEIGHT_M = 1.2
 
 
 class Phone(Struct, frozen=True):
-    """A phone that walks an ellipse, or lies still, and what is wrong with its anchors."""
+    """A phone that walks an ellipse, or is at rest, and what is wrong with its anchors."""
 
     anchors_m: Mapping[int, Point] = field(default_factory=lambda: FOUR)
     rounds_per_s: float = 20.0
@@ -39,7 +39,7 @@ class Phone(Struct, frozen=True):
     flip_m: float = 1.2
     """Share of each anchor's stamps that are late, and by how much."""
     place_m: Point | None = None
-    """Where the phone lies still."""
+    """Where the phone is at rest."""
 
     def position_m(self, time_s: float) -> Point:
         """The true position."""

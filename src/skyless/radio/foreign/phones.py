@@ -155,7 +155,7 @@ class Phone:
                 records += found
         if not self._is_unordered:
             return self._packets(_in_order(records))
-        packets = self.finish() if self._begin_again(records) else []
+        packets = self.finish() if self._has_begun_again(records) else []
         waiting = _in_order(self._waiting + records)
         self._ordered = self._ordered + 1 if waiting[: len(self._waiting)] == self._waiting else 0
         self._is_unordered = self._ordered < _ORDERED
@@ -170,7 +170,7 @@ class Phone:
         self._waiting = waiting[ready:]
         return packets + self._packets(waiting[:ready])
 
-    def _begin_again(self, records: list[_Record]) -> bool:
+    def _has_begun_again(self, records: list[_Record]) -> bool:
         """Whether the time of some records has begun again since those that wait."""
         newest = _rx_ticks(self._waiting[-1]) if self._waiting else None
         stamps = [stamp for one in records if (stamp := _rx_ticks(one)) is not None]
@@ -194,7 +194,8 @@ class Phone:
         """Whether a record is not newer than the newest, which it otherwise becomes."""
         ahead = 1 if self._newest_rx_ticks is None else _ahead(rx_ticks, self._newest_rx_ticks)
         if -LATE_S * TICK_RATE_HZ < ahead <= 0:
-            self._is_unordered |= ahead < 0
+            if ahead < 0:
+                self._is_unordered, self._ordered = True, 0
             return True
         self._newest_rx_ticks = rx_ticks
         return False

@@ -186,8 +186,7 @@ class PacketTracking:
     def _uncalibrated(self) -> list[int]:
         """Anchors heard lately whose constants are neither known nor small as those of Bitcraze's."""
         known = {} if self._calibration is None else self._calibration.anchors
-        after = (self._newest_rx_ticks or 0) - _LATELY_TICKS
-        heard = [anchor for anchor, one in self._anchors.items() if anchor not in known and one.rx_ticks > after]
+        heard = [anchor for anchor in self._heard_lately() if anchor not in known]
         return heard if self._has_addresses else []
 
     @property
@@ -274,16 +273,16 @@ class PacketTracking:
 
     def _expect_period(self) -> None:
         """Let the filter expect the anchors' present period; if they have become much slower, begin again with it."""
-        periods = sorted([min(one.intervals) for one in self._heard_lately() if one.intervals])
+        periods = sorted([min(one.intervals) for one in self._heard_lately().values() if one.intervals])
         period_s = max(periods[len(periods) // 2] * TICK_S if periods else 0.0, PERIOD_S)
         if period_s > _SLOWER * self.tracking.course.superframe_s and not self.tracking.is_starting:
             self._begin_again()
         if self.tracking.is_starting:
             self.tracking.expect_period(period_s)
 
-    def _heard_lately(self) -> list[_Anchor]:
+    def _heard_lately(self) -> dict[int, _Anchor]:
         after = (self._newest_rx_ticks or 0) - _LATELY_TICKS
-        return [one for one in self._anchors.values() if one.rx_ticks > after]
+        return {anchor: one for anchor, one in self._anchors.items() if one.rx_ticks > after}
 
     def _begin_again(self) -> None:
         """Search for a new start."""
