@@ -111,3 +111,10 @@ def test_stamps_that_flip_between_two_values_are_named_and_the_earlier_is_used(s
     is_often = share > 0.2
     assert any(" flip between two values 1." in note for note in report.notes) is is_often
     assert bool(np.isfinite(levels_m).mean() < 0.1) is is_often
+
+
+@pytest.mark.unit
+def test_addresses_of_eight_bytes_are_whole_in_measurements(tmp_path):
+    anchors_m = {0xFEDC << 48 | anchor: place_m for anchor, place_m in FOUR.items()}
+    measured = skyless.replay(Phone(anchors_m, seconds=2.0).write(tmp_path / "phone.jsonl")).measurements
+    assert set(measured.anchor_b.view(np.uint64)) == set(anchors_m)

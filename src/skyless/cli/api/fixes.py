@@ -210,8 +210,8 @@ _WHOLE: Final = 7
 class Measurements(Struct, frozen=True, eq=False):
     """n measurements in the order in which the estimator got them: receptions of anchors, or time differences.
 
-    Missing values are -1, or NaN in ``tdoa_m``. Relays in packets are not included; ``skyless.open_recording`` gives
-    whole packets.
+    Missing values are -1, or NaN in ``tdoa_m``. Addresses from 2⁶³ on are negative: ``anchor_b.view(np.uint64)`` are all
+    addresses. Relays in packets are not included; ``skyless.open_recording`` gives whole packets.
     """
 
     tags: tuple[str, ...]
@@ -271,7 +271,7 @@ class MeasurementRecorder:
             self._numbers.extend((time_s, measured.tdoa_m))
         else:
             stamps = measured.sequence, measured.tx_ticks, measured.rx_ticks
-            self._whole.extend((number, _NONE, measured.anchor, *stamps, used))
+            self._whole.extend((number, _NONE, measured.anchor - (measured.anchor >> 63 << 64), *stamps, used))
             self._numbers.extend((time_s, np.nan))
 
     def measurements(self) -> Measurements:
