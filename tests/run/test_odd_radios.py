@@ -113,7 +113,6 @@ def test_stamps_that_flip_between_two_values_are_named_and_the_earlier_is_used(s
     assert bool(np.isfinite(levels_m).mean() < 0.1) is is_often
 
 
-@pytest.mark.unit
 def test_addresses_of_eight_bytes_are_whole_in_measurements(tmp_path):
     anchors_m = {0xFEDC << 48 | anchor: place_m for anchor, place_m in FOUR.items()}
     measured = skyless.replay(Phone(anchors_m, seconds=2.0).write(tmp_path / "phone.jsonl")).measurements
