@@ -36,9 +36,9 @@ def _rounding():
 
     One processor rounds in several ways: CI once ran with ``OPENBLAS_CORETYPE`` set, the hashes' machine without.
     """
-    A = np.random.default_rng(1).normal(size=(300, 12))
-    values = [function(x) for x in A[:, 0] for function in (math.sin, math.exp, math.atan)]
-    for A, b in ((A[:6, :3], A[:6, 3]), (A[:40, :4], A[:40, 4]), (A, A[:, 0])):
+    drawn = np.random.default_rng(1).normal(size=(300, 12))
+    values = [function(x) for x in drawn[:, 0] for function in (math.sin, math.exp, math.atan)]
+    for A, b in ((drawn[:6, :3], drawn[:6, 3]), (drawn[:40, :4], drawn[:40, 4]), (drawn, drawn[:, 0])):
         for part in (A.T @ A, A @ A.T, np.linalg.lstsq(A, b)[0], np.linalg.inv(A.T @ A), np.linalg.svd(A)[1]):
             values.extend(part.ravel())
     return hashlib.sha256(np.array(values).tobytes()).hexdigest()[:8]

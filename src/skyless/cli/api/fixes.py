@@ -210,8 +210,8 @@ _WHOLE: Final = 7
 class Measurements(Struct, frozen=True, eq=False):
     """n measurements in the order in which the estimator got them: receptions of anchors, or time differences.
 
-    Missing values are -1, or NaN in ``tdoa_m``. Addresses from 2⁶³ on are negative: ``anchor_b.view(np.uint64)`` are all
-    addresses. Relays in packets are not included; ``skyless.open_recording`` gives whole packets.
+    Missing values are -1, or NaN in ``tdoa_m``. Addresses from 2⁶³ on are negative: ``anchor_b.view(np.uint64)`` has
+    them all. Relays in packets are not included; ``skyless.open_recording`` gives whole packets.
     """
 
     tags: tuple[str, ...]
