@@ -126,7 +126,7 @@ def test_an_image_that_cannot_be_read(lab, tmp_path, complaint, keep):
 
 
 @pytest.mark.parametrize(
-    ("options", "told"),
+    ("options", "message"),
     [
         (["--region", "1,2,3"], "--region is '1,2,3'"),
         (["--region", "3,3,1,1"], "x1 < x2"),
@@ -143,9 +143,9 @@ def test_an_image_that_cannot_be_read(lab, tmp_path, complaint, keep):
         (["--html", "missing/plan.html", "--step", "1"], "cannot be written"),
     ],
 )
-def test_slips_are_told(lab, tmp_path, complaint, monkeypatch, options, told):
+def test_wrong_options_are_reported(lab, tmp_path, complaint, monkeypatch, options, message):
     monkeypatch.chdir(tmp_path)
-    assert told in complaint("plan", lab, *options)
+    assert message in complaint("plan", lab, *options)
 
 
 @pytest.mark.parametrize(

@@ -49,10 +49,10 @@ def test_a_final_message_without_responses_relays_nothing():
 def test_in_the_common_time_the_poll_arrives_one_flight_after_it_left(states_positions):
     rounds = uci.DtRounds(None if states_positions else PLACES_M)
     stated_m = PLACES_M if states_positions else dict.fromkeys(PLACES_M)
-    rounds.on_message(replace(POLL, common_time=True, position_m=stated_m[1]))
+    rounds.on_message(replace(POLL, common_time=True, location=stated_m[1]))
     flight = dist(PLACES_M[1], PLACES_M[3]) / TICK_M
     packet = rounds.on_message(
-        replace(RESPONSE, address=3, common_time=True, responder_reply_ticks=0, position_m=stated_m[3])
+        replace(RESPONSE, address=3, common_time=True, responder_reply_ticks=0, location=stated_m[3])
     )
     assert packet.relays == (Relay(1, packet.sequence, (2**40 - 500 + round(flight)) % 2**40, flight),)
     assert packet.position_m == stated_m[3]
@@ -80,8 +80,8 @@ def test_messages_of_no_use_have_a_reason(messages, reason):
 def test_addresses_that_change_for_ever_hide_no_newer_position():
     rounds = uci.DtRounds()
     for address in range(3 * uci.MAX_ANCHORS_KEPT):
-        rounds.on_message(replace(POLL, address=address, common_time=True, position_m=PLACES_M[1]))
-    response = replace(RESPONSE, address=2**16, common_time=True, position_m=PLACES_M[2])
+        rounds.on_message(replace(POLL, address=address, common_time=True, location=PLACES_M[1]))
+    response = replace(RESPONSE, address=2**16, common_time=True, location=PLACES_M[2])
     assert isinstance(rounds.on_message(response), Packet)
 
 

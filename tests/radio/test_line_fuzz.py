@@ -14,9 +14,8 @@ from collections import Counter
 
 import pytest
 
-from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.foreign_radios import ListenerRadio, SnifferStream, UciRadio
-from skyless.radio.foreign.uci import DtMeasurement, SessionInfo, encode_packet, encode_session_info
+from skyless.radio.foreign.uci import AnchorFrame, DtMeasurement, SessionInfo, encode_packet, encode_session_info
 from skyless.radio.interface import AntennaDelays
 from skyless.radio.serial import link
 from skyless.radio.serial.serial_radio import LinkSession

@@ -16,8 +16,7 @@ from skyless.core.air.masterless_packets import Packet
 from skyless.core.earth import geodetic
 from skyless.core.site import GeoreferenceSite
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
-from skyless.radio.foreign import fira, phones
-from skyless.radio.foreign.fira import AnchorFrame
+from skyless.radio.foreign import fira, phones, uci
 from skyless.radio.foreign.uci import DtMeasurement, DtMessageType, GeodeticPoint, SessionInfo, encode_wgs84
 from skyless.research.foreign.formats import open_recording
 from skyless.research.replays.captures import CaptureReplay
@@ -94,7 +93,7 @@ def test_positions_on_the_earth_are_in_the_frame_of_the_first():
     origin = GeoreferenceSite(latitude_deg=48.1, longitude_deg=11.5, height_m=500.0, heading_deg=0.0)
     latitude, longitude, height = geodetic((30.0, -40.0, 2.5), origin)
     here = GeodeticPoint(48.1, 11.5, 500.0)
-    frame = AnchorFrame()
+    frame = uci.AnchorFrame()
     assert frame.position_m(here) == (0.0, 0.0, 0.0)
     assert dist(frame.position_m(GeodeticPoint(latitude, longitude, height)), (30.0, -40.0, 2.5)) < 1e-3
     tag = fira.DtTag(Counter())
@@ -221,7 +220,7 @@ def test_two_sessions_that_take_turns_are_kept_apart(stated):
 
 def test_one_frame_has_one_kind_of_positions_and_several_tags_share_it():
     here, there = GeodeticPoint(48.1, 11.5, 500.0), GeodeticPoint(48.1, 11.6, 500.0)
-    frame = AnchorFrame()
+    frame = uci.AnchorFrame()
     assert frame.position_m(None) is None
     assert frame.position_m(here) == (0.0, 0.0, 0.0)
     assert frame.position_m((1.0, 2.0, 3.0)) is None
@@ -230,7 +229,7 @@ def test_one_frame_has_one_kind_of_positions_and_several_tags_share_it():
     first_m, second_m = (tag.on_info(SessionInfo(1, 1, 1, (one,)))[0].position_m for tag in (first, second))
     assert first_m == second_m
     assert first_m[0] > 7000.0
-    relative = AnchorFrame()
+    relative = uci.AnchorFrame()
     assert relative.position_m((1.0, 2.0, 3.0)) == (1.0, 2.0, 3.0)
     assert relative.position_m(here) is None
     assert relative.origin is None
@@ -269,7 +268,7 @@ def test_anchors_that_state_other_positions_later_are_where_they_state(tmp_path)
 def test_degrees_of_a_metre():
     """The frame's scale, from the Earth's radius."""
     metre_deg = degrees(1.0 / 6_371_000.0)
-    frame = AnchorFrame()
+    frame = uci.AnchorFrame()
     frame.position_m(GeodeticPoint(0.0, 0.0, 0.0))
     east_m, north_m, _ = frame.position_m(GeodeticPoint(metre_deg, metre_deg, 0.0))
     assert (east_m, north_m) == pytest.approx((1.0, 1.0), abs=0.007)

@@ -22,8 +22,8 @@ SETTINGS = PacketTagSettings(hall.ANCHORS_M, site=7, publish_hz=1e5)
 @pytest.fixture(scope="module")
 def packets():
     """Five seconds of a tag at rest; the host's clock begins at 100 s."""
-    told = hall.tdoa3_capture(hall.MasterlessWorld(3), 5.0)
-    return [decode_payload(payload, 100.0 + t_s, sender, rx_ticks) for t_s, sender, rx_ticks, payload in told]
+    frames = hall.tdoa3_capture(hall.MasterlessWorld(3), 5.0)
+    return [decode_payload(payload, 100.0 + t_s, sender, rx_ticks) for t_s, sender, rx_ticks, payload in frames]
 
 
 def test_packets_become_fixes_and_a_sniffer_that_comes_back_begins_again(packets):
@@ -68,11 +68,11 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
         one.on_event(msgspec.structs.replace(packet, host_s=None))
     tags._publish_health()
     assert [(link.name, link.site, link.kind) for link in links] == [("one", 7, "tag"), ("two", 7, "tag")]
-    (fix_topic, fix, _), *_, (site_topic, told, retained), (health_topic, health, _) = links[0].published
+    (fix_topic, fix, _), *_, (site_topic, site_message, retained), (health_topic, health, _) = links[0].published
     assert retained["retain"]
-    assert (site_topic, told.site.id, told.simulated) == ("skyless/v1/7/site", 7, False)
-    assert told.system == "tdoa"
-    assert {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in told.site.anchors} == hall.ANCHORS_M
+    assert (site_topic, site_message.site.id, site_message.simulated) == ("skyless/v1/7/site", 7, False)
+    assert site_message.system == "tdoa"
+    assert {anchor.id: (anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site_message.site.anchors} == hall.ANCHORS_M
     assert (fix_topic, health_topic) == ("skyless/v1/7/tag/one/fix", "skyless/v1/7/tag/one/health")
     assert isinstance(fix, FixMessage)
     again = msgspec.json.decode(msgspec.json.encode(health), type=TagHealth)
@@ -84,7 +84,7 @@ def test_fixes_and_health_go_out_under_the_site_that_was_given(packets, monkeypa
     assert again.reason is None
     assert again.counters["malformed-line"] == 3
     assert again.counters["unknown-anchor"] == 1
-    ((topic, silent, _),) = links[1].published  # the site is told once
+    ((topic, silent, _),) = links[1].published  # the site is published once
     assert (topic, silent.reason, silent.fixes) == ("skyless/v1/7/tag/two/health", "no-beacons", 0)
 
 
@@ -107,12 +107,12 @@ def test_a_sniffer_that_turns_out_to_be_emulated_when_it_comes_is_reported_as_su
     assert [site.simulated for site in sites] == [False, True, False]
 
 
-def test_a_phone_s_anchors_are_told_as_those_of_fira(monkeypatch, links):
+def test_a_phone_s_anchors_are_published_as_those_of_fira(monkeypatch, links):
     monkeypatch.setattr(packet_tags, "link_of", FakeLink)
     radios = open_sniffers("phone://127.0.0.1", ("one",), hall.ANCHORS_M)
     PacketTags(SETTINGS, radios, None, print, simulated=lambda: False)._publish_health()
-    (told,) = [message for _, message, _ in links[0].published if isinstance(message, SiteMessage)]
-    assert told.system == "dl-tdoa"
+    (site_message,) = [message for _, message, _ in links[0].published if isinstance(message, SiteMessage)]
+    assert site_message.system == "dl-tdoa"
 
 
 def test_a_table_that_no_site_can_have_is_not_reported():

@@ -15,8 +15,8 @@ from skyless.core.air.masterless_packets import Packet
 from skyless.core.errors import SkylessError
 from skyless.files import MAX_LINE_BYTES
 from skyless.radio.foreign import phone_radio, phones
-from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.phone_radio import PhoneRadio
+from skyless.radio.foreign.uci import AnchorFrame
 from skyless.radio.interface import Gone
 from skyless.run.masterless.packet_tags import PacketTagNode, PacketTagSettings
 from support import synthetic_recordings as synthetic

@@ -9,9 +9,8 @@ from skyless.core.air.masterless_packets import Packet
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import Beacon, encode
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ
-from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.foreign_radios import UciRadio
-from skyless.radio.foreign.uci import UciReader, decode_session_info, location_of
+from skyless.radio.foreign.uci import AnchorFrame, UciReader, decode_session_info, location_of
 from skyless.radio.interface import Restarted
 from skyless.run.board import UciProtocol
 from skyless.run.masterless.packet_tags import PacketTagNode, PacketTagSettings

@@ -122,8 +122,8 @@ def open_sniffers(
 
     ``anchors_m``: known positions of the system's anchors. Raises SkylessError.
     """
-    from skyless.radio.foreign.fira import AnchorFrame
     from skyless.radio.foreign.foreign_radios import SnifferRadio, UciRadio
+    from skyless.radio.foreign.uci import AnchorFrame
 
     driver, _, where = spec.partition(":")
     if driver == "phone":

@@ -7,18 +7,16 @@ from io import BufferedIOBase
 from typing import Final, Literal
 
 from skyless.core.air.masterless_packets import Packet, Point
-from skyless.core.earth import east_north_up_of
-from skyless.core.site import GeoreferenceSite
 from skyless.core.ticks import TICK_BITS, difference, wrap
 from skyless.files import Drops, chunks, lines
 from skyless.radio.foreign.uci import (
     CONTROL_HEADER_BYTES,
     STATUS_OK,
+    AnchorFrame,
     DtMeasurement,
     DtMessage,
     DtMessageType,
     DtRounds,
-    GeodeticPoint,
     SessionInfo,
     UciPacket,
     UciReader,
@@ -26,29 +24,6 @@ from skyless.radio.foreign.uci import (
     host_time_s,
     location_of,
 )
-
-
-class AnchorFrame:
-    """The coordinate frame of one recording, or of one process's boards."""
-
-    def __init__(self) -> None:
-        self.origin: GeodeticPoint | None = None
-        """The first geodetic position, if positions are geodetic."""
-        self._is_relative = False
-
-    def position_m(self, location: Point | GeodeticPoint | None) -> Point | None:
-        """A location in this frame; None for one of the other kind."""
-        if isinstance(location, GeodeticPoint):
-            if self._is_relative:
-                return None
-            self.origin = self.origin or location
-            origin = GeoreferenceSite(self.origin.latitude_deg, self.origin.longitude_deg, self.origin.height_m)
-            return east_north_up_of(location.latitude_deg, location.longitude_deg, location.height_m, origin)
-        if location is None or self.origin is not None:
-            return None
-        self._is_relative = True
-        return location
-
 
 _STAMP_BYTES: Final = TICK_BITS // 8
 _MESSAGES: Final = frozenset(map(int, DtMessageType))
@@ -62,8 +37,7 @@ class DtTag:
     ) -> None:
         """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these, if tags share it."""
         self._drops = drops
-        self._rounds = DtRounds(anchors_m)
-        self._frame = None if anchors_m else frame or AnchorFrame()
+        self._rounds = DtRounds(anchors_m, frame)
 
     def on_uci(self, packet: UciPacket, host_s: float | None = None) -> list[Packet]:
         """Packets of a notification in order of reception; ``host_s``: its arrival."""
@@ -100,7 +74,7 @@ class DtTag:
             one.responder_reply_ticks,
             one.initiator_reply_ticks,
             one.flight_ticks or None,
-            None if self._frame is None else self._frame.position_m(location_of(one)),
+            location_of(one),
         )
 
 

@@ -14,8 +14,8 @@ from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.ticks import wrap
 from skyless.files import Drops, LineCutter
 from skyless.radio.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
-from skyless.radio.foreign.fira import AnchorFrame, DtTag
-from skyless.radio.foreign.uci import UciReader
+from skyless.radio.foreign.fira import DtTag
+from skyless.radio.foreign.uci import AnchorFrame, UciReader
 from skyless.radio.interface import Gone, Late, RadioEvent, Restarted, ignore
 from skyless.radio.serial.serial_port import BoardClock, SerialPort, line_advice
 

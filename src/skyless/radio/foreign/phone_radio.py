@@ -1,7 +1,7 @@
 """A phone that sends its DL-TDoA records while it measures: a server for lines of JSON, by TCP or WebSocket.
 
 One port serves both: a connection whose first line is that of an HTTP request is a WebSocket's. There is one phone: the
-first message of a new connection ends the old one, as phones come back without having said goodbye.
+first message of a new connection ends the old one, as phones reconnect without having closed theirs.
 """
 
 import asyncio
@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final
 from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.errors import SkylessError
 from skyless.files import CHUNK_BYTES, MAX_LINE_BYTES, LineCutter
-from skyless.radio.foreign.fira import AnchorFrame
 from skyless.radio.foreign.phones import Phone
+from skyless.radio.foreign.uci import AnchorFrame
 from skyless.radio.interface import Gone, Hint, Restarted, ignore
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ lowest first: an array of numbers, hexadecimal, or a whole number of ticks), ``i
 ``z`` in millimetres) or ``wgs84Location`` (``latitude``, ``longitude``, ``altitude``, the last in kilometres as in the
 message: Android's documentation names either unit); and ``address``, which the app adds from the peer.
 
-An address is a number or hexadecimal text, with or without colons. Further keys are of no interest.
+An address is a number or hexadecimal text, with or without colons. Other keys are ignored.
 
 A line may also be an array of records, as of one call of the system. Records of one message may stand in any order;
 between messages, those that are not newer than the newest are dropped.
@@ -31,8 +31,7 @@ from msgspec import Struct
 from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.ticks import TICK_BITS, TICK_MASK, TICK_RATE_HZ, difference, wrap
 from skyless.files import Drops, lines
-from skyless.radio.foreign.fira import AnchorFrame
-from skyless.radio.foreign.uci import DtMessage, DtMessageType, DtRounds, GeodeticPoint, host_time_s
+from skyless.radio.foreign.uci import AnchorFrame, DtMessage, DtMessageType, DtRounds, GeodeticPoint, host_time_s
 
 _KINDS: Final = {"poll": DtMessageType.POLL, "response": DtMessageType.RESPONSE, "final": DtMessageType.FINAL}
 _STAMP_BYTES: Final = TICK_BITS // 8
@@ -132,8 +131,7 @@ class Phone:
     ) -> None:
         """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these."""
         self._drops = drops
-        self._rounds = DtRounds(anchors_m)
-        self._frame = None if anchors_m else frame or AnchorFrame()
+        self._rounds = DtRounds(anchors_m, frame)
         self._polls: dict[int, int] = {}
         """How many each cluster has sent, by its initiator."""
         self._newest_initiator: int | None = None
@@ -230,7 +228,7 @@ class Phone:
             tx_ticks=wrap(tx_ticks),
             rx_ticks_tag=wrap(rx_ticks),
             common_time=True,
-            position_m=self._position_m(_ios_location(record)),
+            location=_ios_location(record),
         )
 
     def _android(self, record: _Record) -> DtMessage | str:
@@ -257,11 +255,8 @@ class Phone:
             replies[0],
             replies[1],
             float(replies[2]) or None,
-            self._position_m(_android_location(record.anchor_location)),
+            _android_location(record.anchor_location),
         )
-
-    def _position_m(self, location: Point | GeodeticPoint | None) -> Point | None:
-        return None if self._frame is None else self._frame.position_m(location)
 
 
 def _in_order(records: list[_Record]) -> list[_Record]:

@@ -46,6 +46,8 @@ from typing import Final
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import Packet, Point, Relay
+from skyless.core.earth import east_north_up_of
+from skyless.core.site import GeoreferenceSite
 from skyless.core.ticks import TICK_M, TICK_MASK, TICK_S, wrap
 
 MAX_SEGMENT_BYTES: Final = 255
@@ -563,7 +565,8 @@ class DtMessage(Struct, frozen=True, gc=False):
     initiator_reply_ticks: int = 0
     flight_ticks: float | None = None
     """Between initiator and responder, as ranged by the responder."""
-    position_m: Point | None = None
+    location: Point | GeodeticPoint | None = None
+    """Where the sender states that it is."""
 
 
 def host_time_s(stamp_ticks: int) -> float | None:
@@ -585,12 +588,35 @@ class _Round:
         """By their senders, so that one that is reported twice counts once."""
 
 
+class AnchorFrame:
+    """The coordinate frame of one recording, or of one process's boards."""
+
+    def __init__(self) -> None:
+        self.origin: GeodeticPoint | None = None
+        """The first geodetic position, if positions are geodetic."""
+        self._is_relative = False
+
+    def position_m(self, location: Point | GeodeticPoint | None) -> Point | None:
+        """A location in this frame; None for one of the other kind."""
+        if isinstance(location, GeodeticPoint):
+            if self._is_relative:
+                return None
+            self.origin = self.origin or location
+            origin = GeoreferenceSite(self.origin.latitude_deg, self.origin.longitude_deg, self.origin.height_m)
+            return east_north_up_of(location.latitude_deg, location.longitude_deg, location.height_m, origin)
+        if location is None or self.origin is not None:
+            return None
+        self._is_relative = True
+        return location
+
+
 class DtRounds:
     """Converts the messages of one tag, in order, to packets with relays."""
 
-    def __init__(self, anchors_m: Mapping[int, Point] | None = None) -> None:
-        """``anchors_m``: known positions, if messages state none."""
+    def __init__(self, anchors_m: Mapping[int, Point] | None = None, frame: AnchorFrame | None = None) -> None:
+        """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these."""
         self._known_m = anchors_m or {}
+        self._frame = frame or AnchorFrame()
         self._stated_m: dict[int, Point] = {}
         self._rounds: dict[int, _Round] = {}
 
@@ -602,31 +628,32 @@ class DtRounds:
 
     def on_message(self, message: DtMessage) -> Packet | str:
         """The packet of a message, or the reason why it is unusable."""
-        if message.position_m is not None:
+        position_m = None if self._known_m else self._frame.position_m(message.location)
+        if position_m is not None:
             self._stated_m.pop(message.address, None)
             if len(self._stated_m) >= MAX_ANCHORS_KEPT:
                 del self._stated_m[next(iter(self._stated_m))]
-            self._stated_m[message.address] = message.position_m
+            self._stated_m[message.address] = position_m
         if message.kind is DtMessageType.POLL:
             self._rounds.pop(message.round, None)
             if len(self._rounds) >= MAX_ROUNDS_AT_ONCE:
                 del self._rounds[next(iter(self._rounds))]
             self._rounds[message.round] = _Round(message)
-            return _packet(message, ())
+            return _packet(message, position_m, ())
         going_on = self._rounds.get(message.round)
         if going_on is None or going_on.poll.block != message.block:
             return "message-without-poll"
         if message.kind is DtMessageType.RESPONSE:
-            return self._response(going_on, message)
+            return self._response(going_on, message, position_m)
         if message.address != going_on.poll.address:
             return "final-of-another-anchor"
         relays = []
         for one in going_on.responses.values():
             rx_ticks = wrap(message.tx_ticks - one.initiator_reply_ticks)
             relays.append(Relay(one.address, _sequence(one), rx_ticks, one.flight_ticks))
-        return _packet(message, tuple(relays))
+        return _packet(message, position_m, tuple(relays))
 
-    def _response(self, going_on: _Round, message: DtMessage) -> Packet | str:
+    def _response(self, going_on: _Round, message: DtMessage, position_m: Point | None) -> Packet | str:
         poll = going_on.poll
         if message.address == poll.address:
             return "response-of-the-initiator"
@@ -644,13 +671,13 @@ class DtRounds:
             return "reply-time-unknown"
         if message.initiator_reply_ticks > 0 and len(going_on.responses) < MAX_ANCHORS_KEPT:
             going_on.responses[message.address] = message
-        return _packet(message, (Relay(poll.address, _sequence(poll), wrap(rx_ticks), flight),))
+        return _packet(message, position_m, (Relay(poll.address, _sequence(poll), wrap(rx_ticks), flight),))
 
     def _position_m(self, address: int) -> Point | None:
         return self._known_m.get(address, self._stated_m.get(address))
 
 
-def _packet(message: DtMessage, relays: tuple[Relay, ...]) -> Packet:
+def _packet(message: DtMessage, position_m: Point | None, relays: tuple[Relay, ...]) -> Packet:
     return Packet(
         message.host_s,
         message.address,
@@ -658,7 +685,7 @@ def _packet(message: DtMessage, relays: tuple[Relay, ...]) -> Packet:
         message.tx_ticks,
         message.rx_ticks_tag,
         relays,
-        message.position_m,
+        position_m,
         claims_common_time=message.common_time,
     )
 

@@ -81,7 +81,8 @@ BACK_IN_ROW: Final = 8
 """Consecutive packets from before the newest that mean that the tag's counter has restarted."""
 
 
-_LATELY_TICKS: Final = 10 * TICK_RATE_HZ
+_RECENT_TICKS: Final = 10 * TICK_RATE_HZ
+"""Time after its last packet for which an anchor counts as heard."""
 _SLOWER: Final = 2.5
 """Factor on the period at which a filter for faster anchors would lose them."""
 
@@ -184,9 +185,9 @@ class PacketTracking:
 
     @property
     def _uncalibrated(self) -> list[int]:
-        """Anchors heard lately whose constants are neither known nor small as those of Bitcraze's."""
+        """Anchors heard recently whose constants are unknown; those of Bitcraze's systems are small."""
         known = {} if self._calibration is None else self._calibration.anchors
-        heard = [anchor for anchor in self._heard_lately() if anchor not in known]
+        heard = [anchor for anchor in self._heard_recently() if anchor not in known]
         return heard if self._has_addresses else []
 
     @property
@@ -273,15 +274,15 @@ class PacketTracking:
 
     def _expect_period(self) -> None:
         """Let the filter expect the anchors' present period; if they have become much slower, begin again with it."""
-        periods = sorted([min(one.intervals) for one in self._heard_lately().values() if one.intervals])
+        periods = sorted([min(one.intervals) for one in self._heard_recently().values() if one.intervals])
         period_s = max(periods[len(periods) // 2] * TICK_S if periods else 0.0, PERIOD_S)
         if period_s > _SLOWER * self.tracking.course.superframe_s and not self.tracking.is_starting:
             self._begin_again()
         if self.tracking.is_starting:
             self.tracking.expect_period(period_s)
 
-    def _heard_lately(self) -> dict[int, _Anchor]:
-        after = (self._newest_rx_ticks or 0) - _LATELY_TICKS
+    def _heard_recently(self) -> dict[int, _Anchor]:
+        after = (self._newest_rx_ticks or 0) - _RECENT_TICKS
         return {anchor: one for anchor, one in self._anchors.items() if one.rx_ticks > after}
 
     def _begin_again(self) -> None:

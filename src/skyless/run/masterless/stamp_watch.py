@@ -26,7 +26,7 @@ WINDOW: Final = 16
 FIRST: Final = 8
 """Packets of an anchor from which on they are compared."""
 READY_S: Final = 1.0
-"""Time since the first packet, or since an anchor began to be at fault, after which others have shown too."""
+"""Time since the first packet, or since a fault, within which faults of other anchors show as well."""
 LONGEST_GAP_S: Final = 0.2
 """Packets farther apart are not compared, as the tag may turn between them."""
 BEND_M: Final = 0.4
@@ -122,14 +122,14 @@ class StampWatch:
     @property
     def own_clocks_ppm(self) -> dict[int, float]:
         """Anchors whose time base is lost, and how much faster their clocks run than the common time."""
-        return {anchor: 1e6 * one.own_rate for anchor, one in self._heard_lately() if one.own_rate}
+        return {anchor: 1e6 * one.own_rate for anchor, one in self._heard_recently() if one.own_rate}
 
     @property
     def flips_m(self) -> dict[int, float]:
         """Anchors whose stamps flip between two values, and the distance of these."""
-        return {anchor: one.gap_m for anchor, one in self._heard_lately() if one.late_share > OFTEN}
+        return {anchor: one.gap_m for anchor, one in self._heard_recently() if one.late_share > OFTEN}
 
-    def _heard_lately(self) -> list[tuple[int, _Stamps]]:
+    def _heard_recently(self) -> list[tuple[int, _Stamps]]:
         after = from_seconds(self._newest_s - NAMED_S)
         return [(anchor, one) for anchor, one in self._stamps.items() if one.rx_ticks > after]
 
