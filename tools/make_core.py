@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from skyless.core.air import beacon, neighbours
-from skyless.core.estimator import kalman, levels, process, state, steady_state
+from skyless.core.estimator import kalman, levels, motion, process, state, steady_state
 from skyless.core.native.library import CORE, FOLDER, KERNELS
 from skyless.core.tag import admission, following, hearing, position
 from skyless.research import benchmark
@@ -32,6 +32,8 @@ EXPORTS: Final[tuple[Callable[..., Any], ...]] = (
     process.process_frame,
     process.process_difference,
     process.process_height,
+    motion.hear_motion,
+    motion.hear_wheels,
     process.track,
     steady_state.find_steady_state,
     steady_state.find_walked,

@@ -83,7 +83,7 @@ def test_a_record_and_a_line_of_json_hold_the_fix(fix):
     assert message.anchors == tuple(number for number, _ in ANCHORS)
     assert message.time_s == pytest.approx(fix.time_ticks / 63.8976e9)
     line, meant = written("json", fix), msgspec.structs.asdict(message)
-    assert list(json.loads(line)) == list(meant)
+    assert list(json.loads(line)) == [name for name in meant if name not in {"orientation", "heading_std_rad"}]
     assert line.endswith("}\n")
     found = msgspec.json.decode(line, type=FixMessage)
     for name, value in meant.items():

@@ -46,7 +46,9 @@ FRAME_RULE: Final = "a frame's name: letters, digits, _, - and /, not a / first"
 """In words, for messages."""
 
 UNKNOWN_VARIANCE: Final = 1e6
-"""Variance of each angle [rad²] and of its rate: a tag does not know its orientation."""
+"""Variance of each angle [rad²] and of its rate, where a tag does not know its orientation."""
+LEVEL_VARIANCE: Final = 0.002
+"""Variance of roll and pitch of a motion sensor whose heading is known: 2.5 degrees."""
 
 _STATUS_NO_FIX, _STATUS_FIX = -1, 0
 _SERVICE_UNKNOWN: Final = 0
@@ -120,7 +122,7 @@ class RosEncoder:
             data = _nav_sat_fix(self._name(fix.tag), fix.unix_s, geodetic(fix.position_m, origin), covariance_enu_m2)
             found.append(RosMessage(self._topic(fix.tag, "fix"), NAV_SAT_FIX, data))
         if self._settings.transforms:
-            moved = _made("geometry_msgs/msg/Transform", _vector(*fix.position_m), _no_turn())
+            moved = _made("geometry_msgs/msg/Transform", _vector(*fix.position_m), _turn(fix.orientation))
             header, child = _header(fix.unix_s, frame), self._name(fix.tag)
             stamped = _made("geometry_msgs/msg/TransformStamped", header, child, moved)
             found.append(RosMessage("/tf", TRANSFORMS, _cdr(TRANSFORMS, [stamped])))
@@ -199,17 +201,22 @@ def _header(unix_s: float, frame: str) -> object:
     return _made("std_msgs/msg/Header", _made("builtin_interfaces/msg/Time", *stamp_of(unix_s)), frame)
 
 
-def _no_turn() -> object:
-    return _made("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0)
+def _turn(orientation: tuple[float, float, float, float] | None = None) -> object:
+    """A quaternion given as w, x, y, z; the unit if it is unknown."""
+    w, x, y, z = orientation or (1.0, 0.0, 0.0, 0.0)
+    return _made("geometry_msgs/msg/Quaternion", x, y, z, w)
 
 
-def _pose_at(position_m: Vector) -> object:
-    return _made("geometry_msgs/msg/Pose", _point(*position_m), _no_turn())
+def _pose_at(position_m: Vector, orientation: tuple[float, float, float, float] | None = None) -> object:
+    return _made("geometry_msgs/msg/Pose", _point(*position_m), _turn(orientation))
 
 
 def _pose(fix: FixMessage, covariance_m2: Matrix, frame: str) -> bytes:
     """``geometry_msgs/PoseWithCovarianceStamped``: 36 entries in the order x, y, z and rotations about them."""
-    pose = _made("geometry_msgs/msg/PoseWithCovariance", _pose_at(fix.position_m), _with_angles(covariance_m2))
+    covariance = _with_angles(covariance_m2)
+    if fix.heading_std_rad is not None:
+        covariance[[21, 28, 35]] = LEVEL_VARIANCE, LEVEL_VARIANCE, fix.heading_std_rad**2
+    pose = _made("geometry_msgs/msg/PoseWithCovariance", _pose_at(fix.position_m, fix.orientation), covariance)
     return _cdr(POSE, _header(fix.unix_s, frame), pose)
 
 

@@ -15,6 +15,7 @@ from skyless.core.fix import Fix, NoFixReason
 from skyless.core.geometry import anchors_in_reach
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, METHODS
+from skyless.core.motion_sample import MotionSample
 from skyless.core.native.records import MAX_SITES
 from skyless.core.protocol1 import anchor as protocol1_anchor
 from skyless.core.protocol1 import beacon as protocol1_codec
@@ -182,6 +183,15 @@ class AnyReceiver:
     def hear_height(self, height_m: float, std_m: float) -> bool:
         """Process a reading of the tag's height sensor, as ``Receiver.hear_height`` does."""
         return self._receiver.hear_height(height_m, std_m)
+
+    def hear_motion(self, sample: MotionSample) -> bool:
+        """Process what a motion sensor or wheels show, as ``Receiver.hear_motion`` does."""
+        return self._receiver.hear_motion(sample)
+
+    @property
+    def motion_note(self) -> str | None:
+        """What keeps a motion sensor from being used fully, in a sentence; None if nothing does, or there is none."""
+        return self._receiver.motion_note
 
     def hear(self, reception: Reception) -> Fix | None:
         """Process a frame from the air. Returns a fix if it made one, otherwise sets ``reason``.

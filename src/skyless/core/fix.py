@@ -28,7 +28,11 @@ VELOCITY: Final = 5
 PROTECTION: Final = 9
 """The first three levels (``estimator/levels.py``); only of methods that compute them."""
 
-PROTECTED_ROWS: Final = 10
+ORIENTATION: Final = 10
+"""Quaternion w, x, y, z that turns the frame of a motion sensor into the site's, then the heading's standard deviation
+[rad], in two rows; zeros if unknown. Only of methods that use one."""
+
+PROTECTED_ROWS: Final = 12
 
 
 class NoFixReason(StrEnum):
@@ -120,6 +124,19 @@ class Fix(Struct, frozen=True, gc=False):
     def velocity_covariance(self) -> Array | None:
         """Shape (3, 3) in (m/s)²."""
         return _matrix(self.rows, VELOCITY + 1) if len(self.rows) > VELOCITY * ROW_BYTES else None
+
+    @property
+    def orientation(self) -> tuple[float, float, float, float] | None:
+        """Quaternion w, x, y, z that turns the motion sensor's frame into the site's; None if unknown."""
+        if len(self.rows) <= (ORIENTATION + 1) * ROW_BYTES:
+            return None
+        w, x, y, z = *_row(self.rows, ORIENTATION), _row(self.rows, ORIENTATION + 1)[0]
+        return (w, x, y, z) if any((w, x, y, z)) else None
+
+    @property
+    def heading_std_rad(self) -> float | None:
+        """Standard deviation of the orientation's heading; None if unknown."""
+        return None if self.orientation is None else _row(self.rows, ORIENTATION + 1)[1]
 
     @property
     def chi2(self) -> float:

@@ -134,7 +134,7 @@ def georeference(record: bytes) -> GeoreferencePage:
 
 def fix_body(fix: Fix, unix_s: float, rx_ticks: int, latency_s: float, serial: int, site: int, tag: int) -> bytes:
     """The body of FIX; ``serial`` is the number of the fix, ``tag`` that of the tag."""
-    rows, required = _ROWS.unpack(fix.rows), fix.requirement or IntegrityRequirement()
+    rows, required = _ROWS.unpack_from(fix.rows), fix.requirement or IntegrityRequirement()
     fixed = _FIX.pack(
         *(round(fix.time_s * TICK_RATE_HZ), round(1e6 * unix_s), rx_ticks, round(1e6 * latency_s), serial, 0),
         *(site, tag, fix.height_known, fix.verified_until_s is not None),
@@ -171,6 +171,7 @@ class BoardReceiver:
         self.reason = NoFixReason.NO_BEACONS
         self.site: int | None = None
         self.multipath_m: tuple[float, float] | None = None
+        self.motion_note: str | None = None
         self.phase_anchors: tuple[int, ...] = ()
         self._anchors_m: dict[int, tuple[float, float, float]] = {}
         self._georeference: GeoreferencePage | None = None

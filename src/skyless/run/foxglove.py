@@ -166,14 +166,14 @@ _LINE_LOOP: Final = 1
 
 
 def pose_in_frame(fix: FixMessage, *, facing: bool) -> bytes:
-    """``foxglove.PoseInFrame``: the tag's position; ``facing`` turns it to its direction of travel."""
+    """``foxglove.PoseInFrame``: the tag's pose; ``facing`` turns it to its direction of travel if that is unknown."""
     yaw = math.atan2(fix.velocity_mps[1], fix.velocity_mps[0]) if facing and fix.velocity_mps is not None else 0.0
-    return msgspec.json.encode({"timestamp": _time(fix.unix_s), "frame_id": FRAME, "pose": _pose(fix.position_m, yaw)})
+    return msgspec.json.encode({"timestamp": _time(fix.unix_s), "frame_id": FRAME, "pose": _pose_of(fix, yaw)})
 
 
 def frame_transform(fix: FixMessage) -> bytes:
-    """``foxglove.FrameTransform``: a frame named as the tag, at its position, with the site's axes."""
-    pose = _pose(fix.position_m, 0.0)
+    """``foxglove.FrameTransform``: a frame named as the tag, at its position, with its axes, or else the site's."""
+    pose = _pose_of(fix, 0.0)
     return msgspec.json.encode(
         {
             "timestamp": _time(fix.unix_s),
@@ -290,6 +290,14 @@ def _label(text: str, position_m: tuple[float, float, float]) -> Schema:
 def _time(unix_s: float) -> dict[str, int]:
     sec, nsec = divmod(max(round(unix_s * 1e9), 0), 1_000_000_000)
     return {"sec": sec, "nsec": nsec}
+
+
+def _pose_of(fix: FixMessage, yaw: float) -> Schema:
+    """The pose of a fix, turned by ``yaw`` if its orientation is unknown."""
+    pose = _pose(fix.position_m, yaw)
+    if fix.orientation is not None:
+        pose["orientation"] = dict(zip("wxyz", fix.orientation, strict=True))
+    return pose
 
 
 def _pose(position_m: tuple[float, float, float], yaw: float) -> Schema:

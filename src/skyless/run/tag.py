@@ -14,6 +14,7 @@ from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.motion_sample import MotionSample
 from skyless.core.tag.receiver import NOT_DROPS, Receiver, SiteListener, TagReceiver
 from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
 from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted
@@ -80,6 +81,9 @@ class TagNode:
         self._board = BoardReceiver() if settings.from_board else None
         self._report = None if settings.trust is None else TagReport(radio.name, settings.trust.site, log)
         self._log, self._has_logged_multipath = log, False
+        self._motion_note: str | None = None
+        self.motion_counters: Counter[str] = Counter()
+        """Unusable messages of the motion sensor, by reason."""
         self._heard_s = 0.0  # when the last reception was processed
         self.receptions = 0  # including those that were too old when their turn came
         self.fix_log = FixLog(self.name, publish, settings.publish_hz, self._clock)
@@ -117,7 +121,7 @@ class TagNode:
         counters = self.receiver.counters.items()
         dropped = Counter({reason: count for reason, count in counters if reason not in NOT_DROPS})
         refused = Counter[str]() if self._trusted is None else self._trusted.counters
-        return dropped + refused + self.radio.counters + self.fix_log.lateness.drops
+        return dropped + refused + self.radio.counters + self.fix_log.lateness.drops + self.motion_counters
 
     @property
     def reason(self) -> str:
@@ -130,6 +134,8 @@ class TagNode:
         """Add phases, multipath and verification to the health message."""
         trusted, phases = self._trusted, self.receiver.phase_anchors
         health = replace(health, carrier_phase_anchors=phases, on_board=self._board is not None)
+        if (note := self.receiver.motion_note) is not None:
+            health = replace(health, notes=(*health.notes, note))
         if (multipath := self.receiver.multipath_m) is not None:
             health = replace(health, multipath_std_m=multipath[0], multipath_distance_m=multipath[1])
         if trusted is None:
@@ -154,12 +160,19 @@ class TagNode:
     def _is_verified(self, trusted: TrustedReceiver) -> bool:
         return trusted.is_verified and self._clock() - self._heard_s < VERIFIED_S
 
+    def hear_motion(self, sample: MotionSample) -> None:
+        """Process what the tag's motion sensor shows, at a time of the host's monotonic clock."""
+        self._hearing.hear_motion(sample)
+
     def check_reception(self, now_s: float) -> None:
         """Log likely causes if nothing usable is received and, once, if ranges vary more than the site file states.
 
         ``now_s`` is the host's monotonic clock.
         """
         self.monitor.check(now_s, self.receptions, self.receiver.counters["heard"], self.drops)
+        if (note := self.receiver.motion_note) != self._motion_note:
+            self._motion_note = note
+            self._log(f"tag {self.name}: {note or 'the motion sensor is in use, and its heading is known'}")
         if not self._has_logged_multipath and (found := self.receiver.multipath_m) is not None:
             self._has_logged_multipath = True
             std_m, distance_m = found

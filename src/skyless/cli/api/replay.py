@@ -207,7 +207,7 @@ def _replay_site(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | N
     why, path = "a recording of skyless record brings its own", Path(asked.file)
     asked.leave_out(
         *("anchors", "truth", "truth_offset_s", "lever_arm_m", "format", "listener", "tdoa_std_m"),
-        *("measurements", "uncalibrated", "tag_height_m", "z_bounds_m", "heights", "first_s"),
+        *("measurements", "uncalibrated", "tag_height_m", "z_bounds_m", "heights", "imu", "first_s"),
         why=why,
     )
     asked.leave_out(

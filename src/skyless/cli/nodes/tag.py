@@ -16,6 +16,7 @@ from cyclopts import App, Parameter
 from msgspec.structs import replace
 
 from skyless.arguments import Method, NotNegative, Options, Text, number, read_height
+from skyless.bridges.motion_feed import MotionFeed
 from skyless.bridges.program import TagBridge, heard_site
 from skyless.cli.common import cm, command, to_json
 from skyless.cli.nodes.bridge import hub_of
@@ -44,7 +45,8 @@ from skyless.site.anchor_names import anchor_name
 
 if TYPE_CHECKING:
     from skyless.core.air.masterless_packets import Point
-    from skyless.run.masterless.packet_tags import PacketTagSettings
+    from skyless.run.masterless.packet_tags import PacketTagNode, PacketTagSettings
+    from skyless.run.tag import TagNode
 
 # Fixes as lines on standard output: for people, as CSV, or as JSON.
 #
@@ -229,6 +231,10 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     later, only those of verified beacons (with --site-key)."""
     clock_bound_ms: Annotated[float | None, number(above=0.0, most=10_000.0)] = None
     """How far this computer's clock may be from those of the anchors, in ms; 100 by default (with --site-key)."""
+    motion: str | None = None
+    """Where the tag's motion sensor or wheels are heard, which its filter uses (one NAME; joint): jsonl+tcp://HOST:PORT
+    for lines of JSON, as of the ROS 2 node, or mavlink+udp://HOST:PORT for HIGHRES_IMU and SCALED_IMU of a vehicle, on
+    which this computer waits; ?arm=x,y,z is the antenna seen from the sensor, forward, left and up in metres."""
     tag_height: str | None = None
     """The tags' height (sniffers, FiRa boards, phones): metres, free (estimated) or auto, the default: estimated unless
     the anchors lie too flat, then theirs."""
@@ -272,6 +278,8 @@ def tag(
                 f"--radio is {asked.radio!r}; with --from-board it should be a board, serial:PATH[@BAUD]"
             )
         asked.leave_out(*_OF_BOARDS, why="the board computes, with the settings of skyless flash-config")
+    if asked.motion is not None and (len(names) > 1 or asked.from_board):
+        raise SkylessError("--motion is of one tag that computes on this computer; give one name, without --from-board")
     bridge = TagBridge(hub_of(asked.to, address), lambda: is_simulated(asked.radio), log) if asked.to else None
     serve = tags(names, asked, address, _listener(lines, bridge), bridge)
     others = [part.run() for part in (lines, bridge) if part is not None]
@@ -308,7 +316,19 @@ def _on_radios(
         from_board=asked.from_board,
     )
     radios = open_radios(asked.radio, "tag", names, computes=asked.from_board)
-    return Tags(settings, radios, address, log, on_fix, None if bridge is None else bridge.on_health).run()
+    tags = Tags(settings, radios, address, log, on_fix, None if bridge is None else bridge.on_health)
+    return _with_motion(asked, tags.run(), tags.tags[0].node)
+
+
+def _with_motion(
+    asked: TagOptions, run: Coroutine[Any, Any, None], node: "TagNode | PacketTagNode"
+) -> Coroutine[Any, Any, None]:
+    """Run tags, and what receives the motion of the first."""
+    if asked.motion is None:
+        return run
+    feed = MotionFeed(asked.motion, node.hear_motion)
+    node.motion_counters = feed.counters
+    return together(run, feed.run())
 
 
 def _site_trust(asked: TagOptions) -> SiteTrust | None:
@@ -355,7 +375,7 @@ def _on_sniffers(
         on_health=None if bridge is None else bridge.on_system_health,
         on_anchors=on_anchors,
     )
-    return tags.run()
+    return _with_motion(asked, tags.run(), tags.nodes[0])
 
 
 def _system(asked: TagOptions) -> "PacketTagSettings":

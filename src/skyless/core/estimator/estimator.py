@@ -1,7 +1,8 @@
 """The estimator of one tag for Python: packet by packet, or many in one compiled loop, with the same bits."""
 
+import ctypes
 from collections.abc import Sequence
-from math import isfinite, sqrt
+from math import degrees, hypot, isfinite, sqrt
 from typing import Any, Final
 
 import numpy as np
@@ -12,6 +13,7 @@ from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.estimator import compiled
 from skyless.core.estimator.compiled import add_anchor, find_anchor, fit_plane, restart
 from skyless.core.estimator.faults import has_phase, horizontal_variance_m2, is_late_often, rejects_most
+from skyless.core.estimator.motion import GRAVITY_MPS2, heading_std_rad
 from skyless.core.estimator.process import (
     REJECTED,
     BatchPacket,
@@ -30,9 +32,15 @@ from skyless.core.estimator.state import (
     make_uncertain,
     new_state,
 )
+from skyless.core.motion_sample import MotionSample
 from skyless.core.native.records import MAX_RELAYS
 from skyless.core.native.views import records, view
-from skyless.core.ticks import NEVER
+from skyless.core.ticks import NEVER, TICK_S
+
+_WRONG_TILT: Final = 0.05
+"""Error of the level beyond which it is stated [rad]."""
+
+_THREE: Final = ctypes.c_double * 3
 
 MAX_ANCHORS_KNOWN: Final = 256
 """Beyond this number, each new anchor replaces one that is not in the state."""
@@ -78,6 +86,8 @@ class Estimator:
         """Each anchor's position as given, and its place for the filter."""
         self._packet, self._relays = Packet(), Relays()
         self._state = new_state(settings)
+        self._motion_late_s = 0.0
+        """How late the newest motion sample was."""
         for anchor, position_m in enumerate([] if anchors_m is None else anchors_m):
             self.know_anchor(anchor, position_m)
 
@@ -163,17 +173,37 @@ class Estimator:
         covariance_m2: Matrix,
         speed_variance: float,
     ) -> None:
-        """Start without anchors at a position, shapes (dim,) and (dim, dim); the share of late packets is kept."""
+        """Start without anchors at a position, shapes (dim,) and (dim, dim); the share of late packets is kept.
+
+        ``position_m`` may continue with a known velocity, ``covariance_m2`` with its covariance.
+        """
         s, dim = self._state, self.dim
         restart(s, rx_ticks, s.status.late_share, TUNING.lasting_std_m, False)
-        view(s.x)[:dim] = position_m
-        for one in range(dim):
-            for other in range(dim):
+        known = len(position_m)
+        view(s.x)[:known] = position_m
+        for one in range(known):
+            for other in range(known):
                 s.P[at(one, other)] = covariance_m2[one, other]
-        for axis in range(dim, 2 * dim):
+        for axis in range(known, 2 * dim):
             s.P[at(axis, axis)] = speed_variance
 
     # Measurements
+
+    def hear_motion(self, ticks: int, sample: MotionSample) -> bool:
+        """Process a motion sensor's sample at a tag time. Returns False if it is late."""
+        rate_rps, force_mps2, speed_mps = _THREE(*sample.rate_rps), sample.force_mps2, sample.speed_mps
+        lever = self._state.motion.lever_m
+        lever[0], lever[1], lever[2] = sample.arm_m
+        self._motion_late_s, is_used = (self._state.status.epoch_ticks - ticks) * TICK_S, False
+        if force_mps2 is not None:
+            is_used = bool(compiled.hear_motion(self._state, ticks, rate_rps, _THREE(*force_mps2)))
+        if speed_mps is not None:
+            is_used = bool(compiled.hear_wheels(self._state, ticks, rate_rps, speed_mps))
+        return is_used
+
+    def shift_motion(self, ticks: int) -> None:
+        """Let the time of motion samples continue on a scale on which the same time is ``ticks`` later."""
+        self._state.motion.ticks += ticks
 
     def process(
         self,
@@ -296,6 +326,28 @@ class Estimator:
         dim, velocity = self.dim, self._state.layout.velocity
         states = [*range(dim), *range(velocity, velocity + dim)]
         return view(self._state.x)[states], covariances(self._state)[np.ix_(states, states)]
+
+    @property
+    def motion_note(self) -> str | None:
+        """What keeps a motion sensor from being used fully, in a sentence; None if nothing does, or there is none."""
+        s, m = self._state, self._state.motion
+        silent_s = (s.status.epoch_ticks - max(m.ticks, m.speed_ticks)) * TICK_S
+        if m.samples == 0:
+            return None
+        if silent_s > TUNING.longest_gap_s:
+            is_late = self._motion_late_s > TUNING.longest_gap_s
+            why = f"come {self._motion_late_s:.1f} s late" if is_late else "have ended"
+            return f"The motion sensor's samples {why}: they are not used"
+        if not m.is_level:
+            return "The motion sensor's level is being found"
+        if not m.has_effect and m.ignored_ticks - s.status.epoch_ticks > 0:
+            return "The motion sensor contradicts the positions: it is ignored for a while (time, axes, mounting?)"
+        error = s.layout.acceleration
+        if heading_std_rad(s) < 0.0:
+            why = ", as the sensor has contradicted the positions" if m.contradictions else ""
+            return f"The motion sensor's heading is not known yet{why}: move by some 3 m, or turn"
+        tilt = hypot(s.x[error], s.x[error + 1]) / GRAVITY_MPS2
+        return f"The motion sensor's level is off by {degrees(tilt):.0f}°" if tilt > _WRONG_TILT else None
 
     def horizontal_variance_m2(self, ahead_s: float) -> float:
         """Sum of the variances of x and y after ``ahead_s`` without receptions."""

@@ -17,7 +17,7 @@ from skyless.core.estimator.state import (
     set_covariance,
 )
 from skyless.core.native.arithmetic import exp, sqrt, square
-from skyless.core.native.records import MOST_WAITING, PACKED, Reals, Ticks
+from skyless.core.native.records import MOST_WAITING, MOTION_STATES, PACKED, Reals, Ticks
 from skyless.core.ticks import TICK_S
 
 LONGEST_S: Final = 1000.0
@@ -33,7 +33,7 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     """
     status, settings, where = s.status, s.settings, s.layout
     dt = min((rx_ticks - status.epoch_ticks) * TICK_S, LONGEST_S)
-    status.walked_m += sqrt(_speed_squared(s)) * dt
+    status.walked_m += sqrt(speed_squared(s)) * dt
     if status.obstruction > 0.0:
         status.obstruction *= exp(-dt / s.tuning.obstruction_memory_s)
     for axis in range(s.dim):
@@ -56,7 +56,7 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     status.epoch_ticks = rx_ticks
 
 
-def _speed_squared(s: State) -> float:
+def speed_squared(s: State) -> float:
     """Square of the tag's speed."""
     total = 0.0
     for axis in range(s.dim):
@@ -65,8 +65,17 @@ def _speed_squared(s: State) -> float:
 
 
 def motion_noise(s: State) -> float:
-    """Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need."""
-    return s.settings.qa * max(s.status.q_scale, _speed_squared(s) / square(s.tuning.walking_mps))
+    """Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need.
+
+    With a motion sensor it is that of what the sensor does not show.
+    """
+    if MOTION_STATES > 0 and s.motion.is_used:
+        tuning = s.tuning
+        known = min(square(s.x[s.layout.heading]) + square(s.x[s.layout.heading + 1]), 1.0)
+        unknown = tuning.headless_noise + known * (tuning.sensor_noise - tuning.headless_noise)
+        doubted = s.settings.qa * square(s.status.rejected_share / tuning.lost_share)
+        return unknown * s.status.q_scale + doubted
+    return s.settings.qa * max(s.status.q_scale, speed_squared(s) / square(s.tuning.walking_mps))
 
 
 def is_stationary(s: State) -> bool:

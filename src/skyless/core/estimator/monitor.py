@@ -22,6 +22,7 @@ from skyless.core.estimator.faults import begin_obstruction, is_late_often
 from skyless.core.estimator.kalman import finish_updates
 from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, at, make_uncertain
 from skyless.core.native.arithmetic import log, sqrt, square
+from skyless.core.native.records import MOTION_STATES
 
 _PLACE_LIMIT: Final = 2.0
 """Squared differences of range errors are limited to this multiple of their mean, as jumps are not multipath."""
@@ -210,6 +211,8 @@ def update_stationary(s: State, dt: float) -> None:
         chi2 += square(s.x[axis] - status.stationary_m[axis]) / s.P[at(axis, axis)]
     status.stationary_s += dt
     moved = chi2 > s.dim or status.lag_square > tuning.lag_limit or status.rejected_in_row > 1
+    if MOTION_STATES > 0 and s.motion.is_used:
+        moved = moved or s.motion.rest_s < tuning.level_s
     if moved:
         status.stationary_s = 0.0
     for axis in range(s.dim):  # also if the position has become better known

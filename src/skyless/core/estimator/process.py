@@ -19,6 +19,7 @@ from skyless.core.estimator.measurements import (
     zero_velocity,
 )
 from skyless.core.estimator.monitor import covariance_scale, update_stationary
+from skyless.core.estimator.motion import fill_orientation, move
 from skyless.core.estimator.phases import close_phases, own_phase, relay_phase
 from skyless.core.estimator.state import (
     AXES,
@@ -34,6 +35,7 @@ from skyless.core.integrity import HPL, STATE, VPL
 from skyless.core.native.records import (
     MAX_ANCHORS,
     MAX_RELAYS,
+    MOTION_STATES,
     PACKETS_KEPT,
     PHASE_STATES,
     Array,
@@ -225,6 +227,8 @@ def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
         return outcome
     status.stale_in_row = 0
     predict(s, rx_ticks)
+    if MOTION_STATES > 0:
+        move(s, rx_ticks)
     fade_faults(s)
     if outcome == JOINED:
         first_reception(s, anchor, rx_ticks, tx_ticks, packet.variance_factor)
@@ -339,6 +343,8 @@ def fill_fix(s: State) -> None:
             s.fix[VELOCITY + 1 + one][other] = scale * s.P[at(velocity + one, velocity + other)]
     if s.dim == 2:
         s.fix[POSITION][2] = s.settings.height_m
+    if MOTION_STATES > 0:
+        fill_orientation(s)
     protect(s)
     s.fix[QUALITY][0] = s.status.mean_nis
     s.fix[QUALITY][1] = s.status.mean_square_m2
@@ -365,6 +371,8 @@ def process_difference(s: State, a: Place, b: Place, rx_ticks: Ticks, difference
     status.stale_in_row = 0
     elapsed_s = (rx_ticks - status.epoch_ticks) * TICK_S
     predict(s, rx_ticks)
+    if MOTION_STATES > 0:
+        move(s, rx_ticks)
     fade_faults(s)
     outcome = ACCEPTED if difference(s, near, far, rx_ticks, difference_m) == USED else REJECTED
     status.packets += 1

@@ -51,6 +51,57 @@ class Tuning(Record):
     stationary_std_mps: float = 0.01
     """Standard deviation of the velocity of a tag at rest [m/s]."""
 
+    # Motion sensors
+    longest_gap_s: float = 0.3
+    """Without samples for longer, the tag moves by its motion model again [s]."""
+    short_gap_s: float = 0.05
+    """Beyond this the newest sample does not stand for the present: process noise is that without a sensor [s]."""
+    wrong_scale: float = 60.0
+    """A factor on process noise beyond this shows that sensor and positions contradict each other, …"""
+    wrong_speed_nis: float = 5.0
+    """… or a mean NIS of wheels' speeds beyond this, …"""
+    wrong_s: float = 1.5
+    """… after this time [s]: the heading is looked for again, and from the second time on …"""
+    ignored_s: float = 20.0
+    """… the sensor is ignored for this time [s]; after as long without it counts as the first time."""
+    level_s: float = 0.5
+    """Time over which specific force is averaged to find the level [s]."""
+    rest_rps: float = 0.1
+    """A sensor's rate above this shows motion [rad/s] …"""
+    rest_mps2: float = 0.5
+    """… and a specific force that differs from its running mean by more [m/s²]."""
+    rest_mps: float = 0.2
+    """A tag that is faster is not at rest, whatever the sensor shows [m/s]."""
+    tilt_s: float = 2.0
+    """Time in which known errors of tilt and heading move into the attitude [s] …"""
+    bias_s: float = 20.0
+    """… and in which those that come back move into the gyroscope's bias [s]."""
+    heading_std: float = 0.7
+    """Standard deviation of cosine and sine of an unknown heading."""
+    heading_walk: float = 0.02
+    """Random walk of both [1/√s]: the gyroscope's drift."""
+    acceleration_std_mps2: float = 1.0
+    """Standard deviation of an acceleration's error: six degrees of tilt [m/s²] …"""
+    acceleration_walk: float = 0.08
+    """… and its random walk [m/s²/√s]."""
+    vertical_share: float = 0.02
+    """Share of both variances for the vertical, which does not depend on tilt."""
+    sensor_noise: float = 0.01
+    """Process noise of motion with a sensor whose heading is known [m²/s³] …"""
+    headless_noise: float = 0.1
+    """… and while it is not known."""
+    known_heading_variance: float = 0.1
+    """Variance of the heading's cosine and sine, together, below which it is roughly known …"""
+    sure_heading_variance: float = 0.007
+    """… below which it is well known, to five degrees: the gyroscope's bias is then learnt from its changes …"""
+    length_std: float = 0.2
+    """… and its length counts as 1, to this in each tenth of a second."""
+
+    speed_std_mps: float = 0.02
+    """Standard deviation of the speed that wheels show, over a second [m/s] …"""
+    speed_share: float = 0.02
+    """… and the part that is a fraction of it."""
+
     # Linearisation (docs/maths.md, section 6)
     held_step_m: float = 0.15
     """Distance of the estimate from the point of linearisation, of ranges or phases, that moves the point [m]."""
@@ -197,6 +248,14 @@ class Tuning(Record):
     """Ready-made time differences used to find a start …"""
     window_s: float = 1.0
     """… or those of this time [s]."""
+    moving_window: float = 20
+    """Differences that take longer than that find the start of a tag that may be moving; in them it is searched …"""
+    moving_std_m: float = 1.5
+    """… from places with this standard deviation [m] …"""
+    moving_nis: float = 1.5
+    """… and found where the mean NIS is below this …"""
+    moving_apart: float = 6.0
+    """… and that of no other place, summed, is within this."""
     median_difference_std_m: float = 0.08
     """Standard deviation of the median of a pair's differences [m]."""
     late_start_std_m: float = 0.14

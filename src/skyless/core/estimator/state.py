@@ -16,6 +16,11 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
     zero        barometer reading − true height of the tag, in 3-D
     surveys     for each anchor (dim) its true position − its position in the almanac
 
+Behind the tx noises, once a motion sensor is in use (``motion``):
+
+    heading       cosine and sine of the angle from the sensor's level frame to the site's
+    acceleration  (dim) what the sensor's accelerations lack in the site's frame: its bias, and its tilt times gravity
+
 Range errors and surveys are last because many sites state that they are exact. Exact states have no variance and no
 covariance and are left out of all arithmetic (``State.n``), until a jump or a fault proves otherwise. Everything
 behind the states in use is zero.
@@ -33,6 +38,7 @@ from skyless.core.native.arithmetic import square
 from skyless.core.native.records import (
     MAX_ANCHORS,
     MOST_WAITING,
+    MOTION_STATES,
     PACKED,
     PACKETS_KEPT,
     PHASE_STATES,
@@ -54,7 +60,12 @@ LANES: Final = 1 if PACKED else 4
 """Numbers in a 256-bit vector; rows of P start at vector boundaries."""
 
 AXES: Final = 3
-STATES: Final = 2 * (AXES + MAX_ANCHORS) + (3 + PHASE_STATES + AXES) * MAX_ANCHORS + 2
+HEADINGS: Final = 2
+STATES: Final = (
+    (2 * (AXES + MAX_ANCHORS) + (3 + PHASE_STATES + AXES) * MAX_ANCHORS + 2 + MOTION_STATES + LANES - 1)
+    // LANES
+    * LANES
+)
 """Capacity for states; a multiple of ``LANES``."""
 COVARIANCES: Final = STATES * (STATES + 1) // 2 if PACKED else STATES * STATES
 MOST_TERMS: Final = 2 * (AXES + 3) + 8
@@ -182,6 +193,79 @@ class Link(Record):
 
 
 @record
+class Motion(Record):
+    """A motion sensor's attitude and path since the newest packet, in a level frame with a heading of its own."""
+
+    lever_m: Annotated[Reals, AXES]
+    """Position of the antenna seen from the sensor, in the sensor's frame."""
+    has_states: bool
+    """Whether heading and acceleration are states."""
+    is_level: bool
+    """Whether the attitude is known but for the heading."""
+    has_force: bool
+    """Whether samples have a specific force; wheels have none."""
+    is_used: bool
+    """Whether the newest time update was one by a specific force."""
+    has_effect: bool
+    """Whether the newest time update was one by the sensor or its wheels."""
+    speed_nis: float
+    """Running mean of the NIS of speeds, over a second."""
+    wrong_s: float
+    """Time for which innovations have called for much process noise …"""
+    right_s: float
+    """… or for little."""
+    contradictions: int
+    """How often the former has lasted long, since the latter did."""
+    ignored_ticks: Ticks
+    """Tag time until which the sensor is ignored for that."""
+    ticks: Ticks
+    """Tag time of the newest sample that turned the attitude."""
+    speed_ticks: Ticks
+    """Tag time of the newest speed of wheels, …"""
+    speed_mps: float
+    """… along x of the sensor's frame."""
+    used_ticks: Ticks
+    """Tag time at which the path begins: that of the newest packet."""
+    attitude: Annotated[Reals, 4]
+    """Quaternion w, x, y, z that turns the sensor's frame into the level one."""
+    level: Annotated[Reals, 4]
+    """Quaternion that turned the first sample's frame into the level one; then that of the newest fix."""
+    bias_rps: Annotated[Reals, AXES]
+    """Bias of the gyroscope."""
+    position_m: Annotated[Reals, AXES]
+    """Path at the newest sample, against a uniform motion with the antenna's velocity where it begins."""
+    velocity_mps: Annotated[Reals, AXES]
+    rate_rps: Annotated[Reals, AXES]
+    """The newest sample's rate, in the sensor's frame."""
+    force_mps2: Annotated[Reals, AXES]
+    """Its specific force, in the level frame."""
+    arm_m: Annotated[Reals, AXES]
+    """Position of the antenna against the sensor in the level frame …"""
+    arm_mps: Annotated[Reals, AXES]
+    """… and its velocity."""
+    shown_m: Annotated[Reals, AXES]
+    """Path of the antenna since the newest packet …"""
+    shown_mps: Annotated[Reals, AXES]
+    """… and the change of its velocity."""
+    up_mps2: Annotated[Reals, AXES]
+    """What a sensor at rest would show, for wheels."""
+    mean_mps2: Annotated[Reals, AXES]
+    """Running mean of the specific force."""
+    rest_s: float
+    """Time since the newest sample that showed motion."""
+    level_s: float
+    """Time over which the specific force has been averaged to find the level."""
+    samples: Count
+    """Samples that turned the attitude …"""
+    speeds: Count
+    """… speeds of wheels …"""
+    late: Count
+    """… those not in order, or too old when they came …"""
+    gaps: Count
+    """… and gaps after which level and heading were looked for again."""
+
+
+@record
 class Status(Record):
     """Counters and running means of the estimator."""
 
@@ -283,6 +367,9 @@ class Layout(Record):
     velocity: int
     rate: int
     tx_noise: int
+    heading: int
+    acceleration: int
+    """These two exist only with a motion sensor; without, they equal ``ambiguity`` and are not used."""
     ambiguity: int
     mesh: int
     former: int
@@ -326,6 +413,7 @@ class State(Record):
     """Columns of V in use."""
     layout: Layout
     status: Status
+    motion: Motion
     information: Annotated[Matrix, FAULTS, FAULTS]
     """Information of the innovations on all faults, M; lower triangle."""
     evidence: Annotated[Reals, FAULTS]
@@ -457,6 +545,8 @@ def prepare(s: State) -> None:
     if status.has_open_ranges or stated > 0.0:
         status.range_errors = ALL_RANGE_ERRORS
     set_layout(s)
+    if MOTION_STATES > 0:
+        expect_motion(s)
     s.P[at(s.layout.slope, s.layout.slope)] = square(settings.slope_std_m)
     if s.dim == 2:
         s.P[at(s.layout.height, s.layout.height)] = square(settings.height_std_m)
@@ -469,7 +559,9 @@ def set_layout(s: State) -> None:
     where.velocity = dim + count
     where.rate = where.velocity + dim
     where.tx_noise = where.rate + count
-    where.ambiguity = where.tx_noise + count
+    where.heading = where.tx_noise + count
+    where.acceleration = where.heading + (HEADINGS if s.motion.has_states else 0)
+    where.ambiguity = where.acceleration + (dim if s.motion.has_states else 0)
     ambiguities = count if s.status.has_phases else 0
     where.mesh = where.ambiguity + ambiguities
     where.former = where.mesh + ambiguities
@@ -522,7 +614,7 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
         _insert_state(s, where.change)
         _insert_state(s, where.former)
         _insert_state(s, where.mesh)
-    _insert_state(s, where.ambiguity)
+    _insert_state(s, where.heading)
     _insert_state(s, where.tx_noise)
     _insert_state(s, where.velocity)
     for kind in range(FAULT_KINDS):
@@ -566,6 +658,30 @@ def use_phases(s: State) -> None:
             _insert_state(s, s.layout.change)
         s.status.has_phases = True
         set_layout(s)
+
+
+def use_motion(s: State) -> None:
+    """Add heading and acceleration of a motion sensor, both unknown."""
+    if not s.motion.has_states:
+        for _ in range(HEADINGS + s.dim):
+            _insert_state(s, s.layout.ambiguity)
+        s.motion.has_states = True
+        set_layout(s)
+        expect_motion(s)
+
+
+def expect_motion(s: State) -> None:
+    """Reset heading and acceleration of a motion sensor, if there is one, to what is known of any sensor."""
+    where, tuning = s.layout, s.tuning
+    s.motion.used_ticks = NEVER
+    for state in range(where.heading, where.ambiguity):
+        s.x[state] = 0.0
+        for other in range(s.used):
+            set_covariance(s, state, other, 0.0)
+        for row in range(s.rows):
+            s.V[state][row] = 0.0
+        std = tuning.heading_std if state < where.acceleration else tuning.acceleration_std_mps2
+        s.P[at(state, state)] = square(std) * (tuning.vertical_share if state == where.acceleration + 2 else 1.0)
 
 
 def _clear_link(link: Link, variance_m2: float) -> None:

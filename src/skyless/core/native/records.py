@@ -165,6 +165,8 @@ MAX_RELAYS: Final = 32
 """Most relays with a packet; 13 fit into a frame."""
 PHASE_STATES: Final = 3
 """States of each anchor for carrier phases; 0 if they are not used."""
+MOTION_STATES: Final = 5
+"""States for a motion sensor; 0 if none can be used."""
 PLANNED_FAULTS: Final = 13
 """Columns of V for planning: walls, and four impulses along each axis."""
 MOST_WAITING: Final = 8

@@ -11,6 +11,7 @@
  * skyless.core.estimator.levels
  * skyless.core.estimator.measurements
  * skyless.core.estimator.monitor
+ * skyless.core.estimator.motion
  * skyless.core.estimator.phases
  * skyless.core.estimator.process
  * skyless.core.estimator.state
@@ -157,6 +158,8 @@ INTERNAL void prepare(State *s);
 INTERNAL void set_layout(State *s);
 INTERNAL void make_uncertain(State *s, int32_t range_errors);
 INTERNAL void use_phases(State *s);
+INTERNAL void use_motion(State *s);
+INTERNAL void expect_motion(State *s);
 INTERNAL void clear_link(Link *link, real variance_m2);
 INTERNAL void remove_anchor(State *s, int32_t anchor);
 INTERNAL void insert_state(State *s, int32_t index_);
@@ -274,6 +277,29 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
 INTERNAL void bound_changes(State *s);
 INTERNAL int32_t height(State *s, real height_m, real std_m, bool is_barometer);
 INTERNAL void zero_velocity(State *s);
+INTERNAL void find_level(State *s, real dt);
+INTERNAL void step(Motion *m, real *rate_rps, real *force_mps2, real dt);
+INTERNAL void push(Motion *m, int32_t axis, real acceleration_mps2, real dt);
+INTERNAL void multiply(real *to, real a, real b, real c, real d, real w, real x, real y, real z);
+INTERNAL void rest(State *s, real *rate_rps, real dt);
+INTERNAL void tilt(State *s, real x, real y);
+INTERNAL void tilt_vector(real *vector, real x, real y);
+INTERNAL void turned_back(real *to, real *attitude, real *vector);
+INTERNAL void turned(real *to, real *attitude, real *vector);
+INTERNAL void move(State *s, int64_t rx_ticks);
+INTERNAL void doubt(State *s, real dt);
+INTERNAL void find_antenna(Motion *m);
+INTERNAL void add_path(State *s, real dt);
+INTERNAL void let_drift(State *s, real dt);
+INTERNAL void add_to(State *s, int32_t first, real *path, real of_acceleration);
+INTERNAL void add_state(State *s, int32_t target, int32_t source, real factor);
+INTERNAL bool is_heading_known(State *s);
+INTERNAL real heading_std_rad(State *s);
+INTERNAL void fill_orientation(State *s);
+INTERNAL void settle_heading(State *s, real dt);
+INTERNAL void turn_vector(real *vector, real cos, real sin);
+INTERNAL void turn_states(State *s, int32_t one, int32_t other, real cos, real sin);
+INTERNAL void measure_speed(State *s, real dt);
 INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles);
 INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks, real phase_cycles);
 INTERNAL real whole_cycles(State *s, int64_t ticks);
@@ -1546,6 +1572,11 @@ INTERNAL real vertical_limit(real risk) {
  *     zero        barometer reading − true height of the tag, in 3-D
  *     surveys     for each anchor (dim) its true position − its position in the almanac
  *
+ * Behind the tx noises, once a motion sensor is in use (``motion``):
+ *
+ *     heading       cosine and sine of the angle from the sensor's level frame to the site's
+ *     acceleration  (dim) what the sensor's accelerations lack in the site's frame: its bias, and its tilt times gravity
+ *
  * Range errors and surveys are last because many sites state that they are exact. Exact states have no variance and no
  * covariance and are left out of all arithmetic (``State.n``), until a jump or a fault proves otherwise. Everything
  * behind the states in use is zero. */
@@ -1660,6 +1691,9 @@ INTERNAL void prepare(State *s) {
         status->range_errors = ALL_RANGE_ERRORS;
     }
     set_layout(s);
+    if (MOTION_STATES > 0) {
+        expect_motion(s);
+    }
     s->P[at(s->layout.slope, s->layout.slope)] = square(settings->slope_std_m);
     if (s->dim == 2) {
         s->P[at(s->layout.height, s->layout.height)] = square(settings->height_std_m);
@@ -1675,7 +1709,9 @@ INTERNAL void set_layout(State *s) {
     where->velocity = dim + count;
     where->rate = where->velocity + dim;
     where->tx_noise = where->rate + count;
-    where->ambiguity = where->tx_noise + count;
+    where->heading = where->tx_noise + count;
+    where->acceleration = where->heading + (s->motion.has_states ? HEADINGS : 0);
+    where->ambiguity = where->acceleration + (s->motion.has_states ? dim : 0);
     int32_t ambiguities = s->status.has_phases ? count : 0;
     where->mesh = where->ambiguity + ambiguities;
     where->former = where->mesh + ambiguities;
@@ -1735,7 +1771,7 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
         insert_state(s, where->former);
         insert_state(s, where->mesh);
     }
-    insert_state(s, where->ambiguity);
+    insert_state(s, where->heading);
     insert_state(s, where->tx_noise);
     insert_state(s, where->velocity);
     for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
@@ -1791,6 +1827,36 @@ INTERNAL void use_phases(State *s) {
         }
         s->status.has_phases = true;
         set_layout(s);
+    }
+}
+
+/* Add heading and acceleration of a motion sensor, both unknown. */
+INTERNAL void use_motion(State *s) {
+    if (!s->motion.has_states) {
+        for (int32_t time_1 = 0, time_1_end = HEADINGS + s->dim; time_1 < time_1_end; time_1++) {
+            insert_state(s, s->layout.ambiguity);
+        }
+        s->motion.has_states = true;
+        set_layout(s);
+        expect_motion(s);
+    }
+}
+
+/* Reset heading and acceleration of a motion sensor, if there is one, to what is known of any sensor. */
+INTERNAL void expect_motion(State *s) {
+    Layout *where = &s->layout;
+    Tuning *tuning = &s->tuning;
+    s->motion.used_ticks = NEVER;
+    for (int32_t state = where->heading, state_end = where->ambiguity; state < state_end; state++) {
+        s->x[state] = REAL(0.0);
+        for (int32_t other = 0, other_end = s->used; other < other_end; other++) {
+            set_covariance(s, state, other, REAL(0.0));
+        }
+        for (int32_t row = 0, row_end = s->rows; row < row_end; row++) {
+            s->V[state][row] = REAL(0.0);
+        }
+        real std = state < where->acceleration ? tuning->heading_std : tuning->acceleration_std_mps2;
+        s->P[at(state, state)] = square(std) * (state == where->acceleration + 2 ? tuning->vertical_share : REAL(1.0));
     }
 }
 
@@ -2076,8 +2142,17 @@ INTERNAL real speed_squared(State *s) {
     return total;
 }
 
-/* Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need. */
+/* Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need.
+ *
+ * With a motion sensor it is that of what the sensor does not show. */
 INTERNAL real motion_noise(State *s) {
+    if (MOTION_STATES > 0 && s->motion.is_used) {
+        Tuning *tuning = &s->tuning;
+        real known = min_real(square(s->x[s->layout.heading]) + square(s->x[s->layout.heading + 1]), REAL(1.0));
+        real unknown = tuning->headless_noise + known * (tuning->sensor_noise - tuning->headless_noise);
+        real doubted = s->settings.qa * square(s->status.rejected_share / tuning->lost_share);
+        return unknown * s->status.q_scale + doubted;
+    }
     return s->settings.qa * max_real(s->status.q_scale, speed_squared(s) / square(s->tuning.walking_mps));
 }
 
@@ -3081,6 +3156,9 @@ INTERNAL void update_stationary(State *s, real dt) {
     }
     status->stationary_s += dt;
     bool moved = chi2 > (real)s->dim || status->lag_square > tuning->lag_limit || status->rejected_in_row > 1;
+    if (MOTION_STATES > 0 && s->motion.is_used) {
+        moved = moved || s->motion.rest_s < tuning->level_s;
+    }
     if (moved) {
         status->stationary_s = REAL(0.0);
     }
@@ -4057,6 +4135,548 @@ INTERNAL void zero_velocity(State *s) {
     }
 }
 
+/* A motion sensor as an input of the time update: gyroscope and accelerometer carried by the tag.
+ *
+ * The gyroscope turns the accelerometer's specific force into a level frame, whose heading against the site is unknown and
+ * drifts. The integrals of the force since the newest packet, V for velocity and S for position, move the state:
+ *
+ *     v ← v + c·V + d·t        p ← p + c·S + d·t²/2
+ *
+ * with c = cos ψ + i·sin ψ, x + i·y for vectors, and d for bias and tilt. Both are states, in which all of it is linear:
+ * c begins as 0 ± 0.7, where the sensor has no effect, and finds the heading from the first metres of motion without a
+ * search. What is known of c and d then moves into the attitude, and what returns of them into the gyroscope's bias. */
+
+/* Samples */
+
+/* Process a speed along x at a tag time, and a rate if no gyroscope gives one. Returns False if it is late. */
+SKYLESS_EXPORT bool skyless_hear_wheels(State *s, int64_t ticks, real *rate_rps, real speed_mps) {
+    Motion *m = &s->motion;
+    if (m->speeds > 0 && (-s->tuning.longest_gap_s < (real)(ticks - m->speed_ticks) * TICK_S && (real)(ticks -
+            m->speed_ticks) * TICK_S <= REAL(0.0))) {
+        m->late += 1;
+        return false;
+    }
+    m->speeds += 1;
+    m->speed_ticks = ticks;
+    m->speed_mps = speed_mps;
+    if (m->has_force && (real)abs_64(ticks - m->ticks) * TICK_S <= s->tuning.longest_gap_s) {
+        return true;
+    }
+    m->up_mps2[0] = REAL(0.0);
+    m->up_mps2[1] = REAL(0.0);
+    m->up_mps2[2] = GRAVITY_MPS2;
+    bool is_used = skyless_hear_motion(s, ticks, rate_rps, m->up_mps2);
+    m->has_force = false;
+    return is_used;
+}
+
+/* Process a sample of rate and specific force at a tag time. Returns False if it is late.
+ *
+ * After a gap level and heading are looked for again. */
+SKYLESS_EXPORT bool skyless_hear_motion(State *s, int64_t ticks, real *rate_rps, real *force_mps2) {
+    Motion *m = &s->motion;
+    Tuning *tuning = &s->tuning;
+    real dt = (real)(ticks - m->ticks) * TICK_S;
+    m->has_force = true;
+    if (m->samples > 0 && (-tuning->longest_gap_s < dt && dt <= REAL(0.0))) {
+        m->late += 1;
+        return false;
+    }
+    if (m->samples == 0 || !(REAL(0.0) < dt && dt <= tuning->longest_gap_s)) {
+        if (m->samples > 0) {
+            m->gaps += 1;
+        }
+        m->is_level = false;
+        m->level_s = REAL(0.0);
+        dt = REAL(0.0);
+        for (int32_t one = 0; one < 4; one++) {
+            m->attitude[one] = one == 0 ? REAL(1.0) : REAL(0.0);
+        }
+        for (int32_t axis = 0; axis < AXES; axis++) {
+            m->mean_mps2[axis] = REAL(0.0);
+        }
+    }
+    m->samples += 1;
+    m->ticks = ticks;
+    step(m, rate_rps, force_mps2, dt);
+    if (m->is_level) {
+        rest(s, rate_rps, dt);
+    } else {
+        find_level(s, dt);
+    }
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        m->rate_rps[axis] = rate_rps[axis];
+    }
+    return true;
+}
+
+/* Average the specific force, which on average points upwards, and turn it to z at the end.
+ *
+ * Until then the attitude is against the first sample's. */
+INTERNAL void find_level(State *s, real dt) {
+    Motion *m = &s->motion;
+    real *f = s->motion.mean_mps2;
+    real *q = s->motion.attitude;
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        f[axis] += m->force_mps2[axis] * dt;
+    }
+    m->level_s += dt;
+    real length = SQRT(square(f[0]) + square(f[1]) + square(f[2]));
+    if (m->level_s < s->tuning.level_s || length == REAL(0.0)) {
+        return;
+    }
+    /* a half turn about the sum of the two directions swaps them; upside down any horizontal axis is right */
+    real w = length + f[2];
+    real x = f[1];
+    real y = -f[0];
+    if (w < REAL(1e-06) * length) {
+        w = REAL(0.0);
+        x = REAL(1.0);
+        y = REAL(0.0);
+    }
+    real norm = SQRT(square(w) + square(x) + square(y));
+    w = w / norm;
+    x = x / norm;
+    y = y / norm;
+    m->level[0] = w;
+    m->level[1] = x;
+    m->level[2] = y;
+    m->level[3] = REAL(0.0);
+    multiply(q, w, x, y, REAL(0.0), q[0], q[1], q[2], q[3]);
+    turned(m->force_mps2, m->level, m->force_mps2);
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        m->mean_mps2[axis] = axis == 2 ? GRAVITY_MPS2 : REAL(0.0);
+        m->velocity_mps[axis] = REAL(0.0);
+        m->position_m[axis] = REAL(0.0);
+    }
+    m->is_level = true;
+    m->rest_s = REAL(0.0);
+    m->used_ticks = NEVER;
+}
+
+/* Integrate a sample over the time since the one before, by the mean rate and the mean force of both. */
+INTERNAL void step(Motion *m, real *rate_rps, real *force_mps2, real dt) {
+    real *q = m->attitude;
+    real *b = m->bias_rps;
+    real half = REAL(0.5) * dt;
+    real x = REAL(0.5) * (rate_rps[0] + m->rate_rps[0]) - b[0];
+    real y = REAL(0.5) * (rate_rps[1] + m->rate_rps[1]) - b[1];
+    real z = REAL(0.5) * (rate_rps[2] + m->rate_rps[2]) - b[2];
+    x = x * half;
+    y = y * half;
+    z = z * half;
+    real angle2 = square(x) + square(y) + square(z);
+    real w = REAL(1.0) - REAL(0.5) * angle2;
+    real scale = REAL(1.0) - angle2 / REAL(6.0);
+    multiply(q, q[0], q[1], q[2], q[3], w, scale * x, scale * y, scale * z);
+    x = m->force_mps2[0];
+    y = m->force_mps2[1];
+    z = m->force_mps2[2];
+    turned(m->force_mps2, q, force_mps2);
+    push(m, 0, REAL(0.5) * (x + m->force_mps2[0]), dt);
+    push(m, 1, REAL(0.5) * (y + m->force_mps2[1]), dt);
+    push(m, 2, REAL(0.5) * (z + m->force_mps2[2]) - GRAVITY_MPS2, dt);
+}
+
+/* Advance the path along an axis with constant acceleration. */
+INTERNAL void push(Motion *m, int32_t axis, real acceleration_mps2, real dt) {
+    m->position_m[axis] += dt * (m->velocity_mps[axis] + REAL(0.5) * dt * acceleration_mps2);
+    m->velocity_mps[axis] += dt * acceleration_mps2;
+}
+
+/* Write the product of the quaternions (a, b, c, d) and (w, x, y, z), of unit length. */
+INTERNAL void multiply(real *to, real a, real b, real c, real d, real w, real x, real y, real z) {
+    to[0] = a * w - b * x - c * y - d * z;
+    to[1] = a * x + b * w + c * z - d * y;
+    to[2] = a * y - b * z + c * w + d * x;
+    to[3] = a * z + b * y - c * x + d * w;
+    real norm = SQRT(square(to[0]) + square(to[1]) + square(to[2]) + square(to[3]));
+    if (norm > REAL(0.0)) {
+        for (int32_t one = 0; one < 4; one++) {
+            to[one] /= norm;
+        }
+    }
+}
+
+/* Update the time since the sensor last showed motion, and at rest level and gyroscope's bias. */
+INTERNAL void rest(State *s, real *rate_rps, real dt) {
+    Motion *m = &s->motion;
+    Tuning *tuning = &s->tuning;
+    real turning = REAL(0.0);
+    real pushed = REAL(0.0);
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        real change = m->force_mps2[axis] - m->mean_mps2[axis];
+        turning += square(rate_rps[axis]);
+        pushed += square(change);
+        m->mean_mps2[axis] += min_real(dt / tuning->level_s, REAL(1.0)) * change;
+    }
+    m->rest_s += dt;
+    if (turning > square(tuning->rest_rps) || pushed > square(tuning->rest_mps2)) {
+        m->rest_s = REAL(0.0);
+    }
+    if (m->rest_s > tuning->level_s && speed_squared(s) < square(tuning->rest_mps)) {
+        for (int32_t axis = 0; axis < AXES; axis++) {
+            m->bias_rps[axis] += dt / tuning->tilt_s * (rate_rps[axis] - m->bias_rps[axis]);
+        }
+        real share = dt / (tuning->tilt_s * GRAVITY_MPS2);
+        tilt(s, share * m->mean_mps2[1], -share * m->mean_mps2[0]);
+    }
+}
+
+/* Turn the level frame by small angles about x and y; the acceleration's error becomes what is left of it. */
+INTERNAL void tilt(State *s, real x, real y) {
+    Motion *m = &s->motion;
+    real *q = s->motion.attitude;
+    Layout *where = &s->layout;
+    multiply(q, REAL(1.0), REAL(0.5) * x, REAL(0.5) * y, REAL(0.0), q[0], q[1], q[2], q[3]);
+    tilt_vector(m->force_mps2, x, y);
+    tilt_vector(m->mean_mps2, x, y);
+    if (m->has_states) {
+        real cos = s->x[where->heading];
+        real sin = s->x[where->heading + 1];
+        real across = y * GRAVITY_MPS2;
+        real along = -x * GRAVITY_MPS2;
+        s->x[where->acceleration] -= cos * across - sin * along;
+        s->x[where->acceleration + 1] -= cos * along + sin * across;
+    }
+}
+
+/* Turn a vector by small angles about x and y. */
+INTERNAL void tilt_vector(real *vector, real x, real y) {
+    real a = vector[0];
+    real b = vector[1];
+    real c = vector[2];
+    vector[0] = a + y * c;
+    vector[1] = b - x * c;
+    vector[2] = c + x * b - y * a;
+}
+
+/* Write a vector of the level frame in the sensor's. */
+INTERNAL void turned_back(real *to, real *attitude, real *vector) {
+    attitude[0] = -attitude[0];
+    turned(to, attitude, vector);
+    attitude[0] = -attitude[0];
+}
+
+/* Write a vector of the sensor's frame in the level frame: v + 2·w·(u×v) + 2·u×(u×v) of the quaternion (w, u). */
+INTERNAL void turned(real *to, real *attitude, real *vector) {
+    real w = attitude[0];
+    real x = attitude[1];
+    real y = attitude[2];
+    real z = attitude[3];
+    real a = REAL(2.0) * (y * vector[2] - z * vector[1]);
+    real b = REAL(2.0) * (z * vector[0] - x * vector[2]);
+    real c = REAL(2.0) * (x * vector[1] - y * vector[0]);
+    real d = vector[0] + w * a + y * c - z * b;
+    real e = vector[1] + w * b + z * a - x * c;
+    real f = vector[2] + w * c + x * b - y * a;
+    to[0] = d;
+    to[1] = e;
+    to[2] = f;
+}
+
+/* Time update */
+
+/* Add to ``predict`` what the sensor shows of the time since the newest packet before. */
+INTERNAL void move(State *s, int64_t rx_ticks) {
+    Motion *m = &s->motion;
+    Tuning *tuning = &s->tuning;
+    m->is_used = false;
+    m->has_effect = false;
+    bool is_present = m->is_level && (real)abs_64(rx_ticks - m->ticks) * TICK_S <= tuning->longest_gap_s;
+    if (!is_present || (0 < m->ignored_ticks - rx_ticks && (real)(m->ignored_ticks - rx_ticks) < tuning->ignored_s *
+            TICK_RATE_HZ)) {
+        m->used_ticks = NEVER;
+        return;
+    }
+    use_motion(s);
+    find_antenna(m);
+    real ahead = (real)(rx_ticks - m->ticks) * TICK_S;
+    bool begins = m->used_ticks == NEVER;
+    real dt = begins ? REAL(0.0) : (real)(rx_ticks - m->used_ticks) * TICK_S;
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        real a = m->force_mps2[axis] - (axis == 2 ? GRAVITY_MPS2 : REAL(0.0));
+        m->shown_m[axis] = m->position_m[axis] + m->arm_m[axis] + ahead * (m->velocity_mps[axis] + REAL(0.5) * ahead *
+                a);
+        m->shown_mps[axis] = m->velocity_mps[axis] + m->arm_mps[axis] + ahead * a;
+    }
+    for (int32_t axis = 0; axis < AXES; axis++) {  /* the path begins again with the antenna's position and velocity at this packet */
+        m->velocity_mps[axis] -= m->shown_mps[axis];
+        m->position_m[axis] -= m->shown_m[axis] - ahead * m->shown_mps[axis];
+    }
+    m->used_ticks = rx_ticks;
+    m->has_effect = !begins;
+    m->is_used = m->has_force && m->has_effect && ahead < tuning->short_gap_s;
+    if (dt > REAL(0.0)) {
+        doubt(s, dt);
+        if (m->has_force) {
+            add_path(s, dt);
+        }
+        let_drift(s, dt);
+        settle_heading(s, dt);
+        if (m->speeds > 0 && (real)abs_64(rx_ticks - m->speed_ticks) * TICK_S <= tuning->longest_gap_s) {
+            measure_speed(s, dt);
+        }
+    }
+}
+
+/* Begin again with an unknown heading if innovations call for much process noise; the second time, ignore it. */
+INTERNAL void doubt(State *s, real dt) {
+    Motion *m = &s->motion;
+    Tuning *tuning = &s->tuning;
+    bool is_wrong = s->status.q_scale > tuning->wrong_scale || m->speed_nis > tuning->wrong_speed_nis;
+    m->wrong_s = is_wrong ? m->wrong_s + dt : max_real(m->wrong_s - dt, REAL(0.0));
+    m->right_s = is_wrong ? REAL(0.0) : m->right_s + dt;
+    if (m->right_s > tuning->ignored_s) {
+        m->contradictions = 0;
+    }
+    if (m->wrong_s > tuning->wrong_s) {
+        m->speed_nis = REAL(0.0);
+        m->wrong_s = REAL(0.0);
+        m->contradictions += 1;
+        if (m->contradictions > 1) {
+            m->ignored_ticks = m->used_ticks + floor_real(tuning->ignored_s * TICK_RATE_HZ);
+        }
+        expect_motion(s);
+    }
+}
+
+/* Write position and velocity of the antenna against the sensor, in the level frame. */
+INTERNAL void find_antenna(Motion *m) {
+    real *rate = m->rate_rps;
+    real *lever = m->lever_m;
+    m->shown_m[0] = rate[1] * lever[2] - rate[2] * lever[1];
+    m->shown_m[1] = rate[2] * lever[0] - rate[0] * lever[2];
+    m->shown_m[2] = rate[0] * lever[1] - rate[1] * lever[0];
+    turned(m->arm_mps, m->attitude, m->shown_m);
+    turned(m->arm_m, m->attitude, lever);
+}
+
+/* Move position and velocity by the path in ``shown_m`` and ``shown_mps``, by way of heading and acceleration. */
+INTERNAL void add_path(State *s, real dt) {
+    add_to(s, 0, s->motion.shown_m, REAL(0.5) * dt * dt);
+    add_to(s, s->layout.velocity, s->motion.shown_mps, dt);
+}
+
+/* Add the process noise of heading and acceleration. */
+INTERNAL void let_drift(State *s, real dt) {
+    Layout *where = &s->layout;
+    Tuning *tuning = &s->tuning;
+    for (int32_t state = where->heading, state_end = where->acceleration; state < state_end; state++) {
+        s->P[at(state, state)] += square(tuning->heading_walk) * s->status.q_scale * dt;
+    }
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        real walk = square(tuning->acceleration_walk) * s->status.q_scale * dt * (axis == 2 ? tuning->vertical_share :
+                REAL(1.0));
+        s->P[at(where->acceleration + axis, where->acceleration + axis)] += walk;
+    }
+}
+
+/* Add c·path to the horizontal states from ``first`` on, its third element to the vertical one, and the error d. */
+INTERNAL void add_to(State *s, int32_t first, real *path, real of_acceleration) {
+    int32_t cos = s->layout.heading;
+    int32_t sin = s->layout.heading + 1;
+    add_state(s, first, cos, path[0]);
+    add_state(s, first, sin, -path[1]);
+    add_state(s, first + 1, cos, path[1]);
+    add_state(s, first + 1, sin, path[0]);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        add_state(s, first + axis, s->layout.acceleration + axis, of_acceleration);
+    }
+    if (s->dim == AXES) {
+        s->x[first + 2] += path[2];
+    }
+}
+
+/* x[target] += factor·x[source], with covariances and sensitivities. */
+INTERNAL void add_state(State *s, int32_t target, int32_t source, real factor) {
+    s->x[target] += factor * s->x[source];
+    real variance = factor * (REAL(2.0) * s->P[at(target, source)] + factor * s->P[at(source, source)]);
+    for (int32_t other = 0, other_end = s->used; other < other_end; other++) {
+        if (other != target) {
+            set_covariance(s, target, other, s->P[at(target, other)] + factor * s->P[at(source, other)]);
+        }
+    }
+    s->P[at(target, target)] += variance;
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        s->V[target][fault] += factor * s->V[source][fault];
+    }
+}
+
+/* Heading */
+
+/* Whether the direction of the heading's vector is roughly known. */
+INTERNAL bool is_heading_known(State *s) {
+    int32_t cos = s->layout.heading;
+    int32_t sin = s->layout.heading + 1;
+    real length2 = square(s->x[cos]) + square(s->x[sin]);
+    real variance = s->P[at(cos, cos)] + s->P[at(sin, sin)];
+    return length2 > square(s->tuning.heading_std) && variance < s->tuning.known_heading_variance;
+}
+
+/* Standard deviation of the heading; negative until it is known to five degrees. */
+INTERNAL real heading_std_rad(State *s) {
+    Motion *m = &s->motion;
+    int32_t cos = s->layout.heading;
+    int32_t sin = s->layout.heading + 1;
+    if (!m->has_effect || !is_heading_known(s)) {
+        return -REAL(1.0);
+    }
+    real variance = s->P[at(cos, cos)] + s->P[at(sin, sin)];
+    return variance < s->tuning.sure_heading_variance ? SQRT(variance) : -REAL(1.0);
+}
+
+/* Fill the rows of a fix with the rotation from the sensor's frame to the site's, if its heading is known. */
+INTERNAL void fill_orientation(State *s) {
+    Motion *m = &s->motion;
+    real *q = s->motion.attitude;
+    real std_rad = heading_std_rad(s);
+    for (int32_t row = ORIENTATION; row < PROTECTED_ROWS; row++) {
+        for (int32_t axis = 0; axis < AXES; axis++) {
+            s->fix[row][axis] = REAL(0.0);
+        }
+    }
+    if (std_rad >= REAL(0.0)) {
+        real cos = s->x[s->layout.heading];
+        real sin = s->x[s->layout.heading + 1];
+        real half = SQRT(max_real(REAL(0.5) + REAL(0.5) * cos / SQRT(square(cos) + square(sin)), REAL(1e-12)));
+        multiply(m->level, half, REAL(0.0), REAL(0.0), REAL(0.5) * sin / half, q[0], q[1], q[2], q[3]);
+        for (int32_t one = 0; one < 4; one++) {
+            int32_t row = ORIENTATION + floor_div_32(one, AXES);
+            int32_t axis = floor_mod_32(one, AXES);
+            s->fix[row][axis] = m->level[one];
+        }
+        s->fix[ORIENTATION + 1][1] = std_rad;
+    }
+}
+
+/* Measure the length of the heading's vector as 1, and turn the level frame into the site's. */
+INTERNAL void settle_heading(State *s, real dt) {
+    if (!is_heading_known(s)) {
+        return;
+    }
+    Motion *m = &s->motion;
+    Tuning *tuning = &s->tuning;
+    Layout *where = &s->layout;
+    real *q = s->motion.attitude;
+    int32_t cos = where->heading;
+    int32_t sin = where->heading + 1;
+    real share = min_real(dt / tuning->tilt_s, REAL(1.0));
+    real length = SQRT(square(s->x[cos]) + square(s->x[sin]));
+    s->terms = 0;
+    add_term(s, cos, s->x[cos] / length);
+    add_term(s, sin, s->x[sin] / length);
+    real variance = compute_ph(s) + square(tuning->length_std) * REAL(0.1) / dt;
+    compute_fault_input(s, -1);
+    update(s, REAL(1.0) - length, variance, REAL(1.0));
+    /* what has been learnt of tilt and heading moves into the attitude, and what had to move into the bias */
+    real c = s->x[cos];
+    real d = s->x[sin];
+    real x = -share * (c * s->x[where->acceleration + 1] - d * s->x[where->acceleration]) / GRAVITY_MPS2;
+    real y = share * (c * s->x[where->acceleration] + d * s->x[where->acceleration + 1]) / GRAVITY_MPS2;
+    if (m->has_force) {
+        tilt(s, x, y);
+    }
+    if (c < REAL(0.5) * length) {  /* at once */
+        share = REAL(1.0);
+    }
+    c = REAL(1.0) - share + share * c / length;
+    d = share * d / length;
+    length = SQRT(square(c) + square(d));
+    c = c / length;
+    d = d / length;
+    turn_states(s, cos, sin, c, d);
+    real half = SQRT(max_real(REAL(0.5) + REAL(0.5) * c, REAL(1e-12)));
+    multiply(q, half, REAL(0.0), REAL(0.0), REAL(0.5) * d / half, q[0], q[1], q[2], q[3]);
+    turn_vector(m->force_mps2, c, d);
+    turn_vector(m->mean_mps2, c, d);
+    if (share < REAL(1.0) && s->P[at(cos, cos)] + s->P[at(sin, sin)] < tuning->sure_heading_variance) {
+        m->shown_m[0] = x;
+        m->shown_m[1] = y;
+        m->shown_m[2] = d;
+        turned_back(m->shown_mps, q, m->shown_m);
+        for (int32_t axis = 0; axis < AXES; axis++) {
+            m->bias_rps[axis] -= m->shown_mps[axis] / tuning->bias_s;
+        }
+    }
+}
+
+/* Turn a vector about z. */
+INTERNAL void turn_vector(real *vector, real cos, real sin) {
+    real a = vector[0];
+    real b = vector[1];
+    vector[0] = cos * a - sin * b;
+    vector[1] = sin * a + cos * b;
+}
+
+/* Turn two states back by an angle, with covariances and sensitivities. */
+INTERNAL void turn_states(State *s, int32_t one, int32_t other, real cos, real sin) {
+    real a = s->x[one];
+    real b = s->x[other];
+    s->x[one] = cos * a + sin * b;
+    s->x[other] = cos * b - sin * a;
+    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
+        a = s->V[one][fault];
+        b = s->V[other][fault];
+        s->V[one][fault] = cos * a + sin * b;
+        s->V[other][fault] = cos * b - sin * a;
+    }
+    real first = s->P[at(one, one)];
+    real both = s->P[at(one, other)];
+    real second = s->P[at(other, other)];
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        a = s->P[at(one, state)];
+        b = s->P[at(other, state)];
+        set_covariance(s, one, state, cos * a + sin * b);
+        set_covariance(s, other, state, cos * b - sin * a);
+    }
+    s->P[at(one, one)] = cos * cos * first + REAL(2.0) * cos * sin * both + sin * sin * second;
+    s->P[at(other, other)] = cos * cos * second - REAL(2.0) * cos * sin * both + sin * sin * first;
+    set_covariance(s, one, other, (cos * cos - sin * sin) * both + cos * sin * (second - first));
+}
+
+/* Wheels */
+
+/* Measure v − c·u as 0, with the velocity u of the antenna in the level frame that wheels and turning show.
+ *
+ * Their errors last, so that a second of speeds counts as one. */
+INTERNAL void measure_speed(State *s, real dt) {
+    Motion *m = &s->motion;
+    Tuning *tuning = &s->tuning;
+    int32_t cos = s->layout.heading;
+    int32_t sin = s->layout.heading + 1;
+    int32_t velocity = s->layout.velocity;
+    m->shown_m[0] = m->speed_mps;
+    m->shown_m[1] = REAL(0.0);
+    m->shown_m[2] = REAL(0.0);
+    turned(m->shown_mps, m->attitude, m->shown_m);
+    real x = m->shown_mps[0] + m->arm_mps[0];
+    real y = m->shown_mps[1] + m->arm_mps[1];
+    real noise = (square(tuning->speed_std_mps) + square(tuning->speed_share * m->speed_mps)) * max_real(REAL(1.0) / dt,
+            REAL(1.0));
+    for (int32_t axis = 0; axis < 2; axis++) {
+        real of_cos = x;
+        real of_sin = -y;
+        if (axis == 1) {
+            of_cos = y;
+            of_sin = x;
+        }
+        s->terms = 0;
+        add_term(s, velocity + axis, REAL(1.0));
+        add_term(s, cos, -of_cos);
+        add_term(s, sin, -of_sin);
+        real innovation = s->x[cos] * of_cos + s->x[sin] * of_sin - s->x[velocity + axis];
+        real predicted = compute_ph(s);
+        real nis = min_real(square(innovation) / (predicted + noise), MOST_NIS);
+        m->speed_nis += min_real(dt, REAL(1.0)) * (nis - m->speed_nis);
+        real variance = predicted + noise * s->status.q_scale;
+        if (innovation * innovation < square(tuning->suspect) * variance) {
+            compute_fault_input(s, -1);
+            update(s, innovation, variance, REAL(1.0));
+        }
+    }
+}
+
 /* Carrier phase: 20 times as precise as a stamp, but known only modulo a wavelength.
  *
  *     R − X  =  |p − a| + b + ambiguity + noise                 (mod λ)      (the tag receives an anchor)
@@ -4532,6 +5152,9 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
     }
     status->stale_in_row = 0;
     predict(s, rx_ticks);
+    if (MOTION_STATES > 0) {
+        move(s, rx_ticks);
+    }
     fade_faults(s);
     if (outcome == JOINED) {
         first_reception(s, anchor, rx_ticks, tx_ticks, packet->variance_factor);
@@ -4671,6 +5294,9 @@ INTERNAL void fill_fix(State *s) {
     if (s->dim == 2) {
         s->fix[POSITION][2] = s->settings.height_m;
     }
+    if (MOTION_STATES > 0) {
+        fill_orientation(s);
+    }
     protect(s);
     s->fix[QUALITY][0] = s->status.mean_nis;
     s->fix[QUALITY][1] = s->status.mean_square_m2;
@@ -4699,6 +5325,9 @@ SKYLESS_EXPORT int32_t skyless_process_difference(State *s, Place *a, Place *b, 
     status->stale_in_row = 0;
     real elapsed_s = (real)(rx_ticks - status->epoch_ticks) * TICK_S;
     predict(s, rx_ticks);
+    if (MOTION_STATES > 0) {
+        move(s, rx_ticks);
+    }
     fade_faults(s);
     int32_t outcome = difference(s, near, far, rx_ticks, difference_m) == USED ? ACCEPTED : REJECTED;
     status->packets += 1;
@@ -6807,32 +7436,40 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             = REAL(1.2), .max_walk_scale = REAL(10000.0), .noise_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row
             = REAL(8.0), .steady_walk_scale = REAL(4.0), .max_scale = REAL(100.0), .lag_limit = REAL(3.5), .sudden_lag =
             REAL(9.0), .walking_mps = REAL(4.0), .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07),
-            .stationary_std_mps = REAL(0.01), .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share =
-            REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02), .wrong_nis = REAL(2.0), .slow_forgetting =
-            REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5), .difference_huber = REAL(1.0),
-            .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share = REAL(0.5), .suspect = REAL(3.0),
-            .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0), .first_change_scale =
-            REAL(10.0), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk = REAL(0.004),
-            .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5),
-            .obstructed_std_m = REAL(0.05), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1), .place_first =
-            REAL(20.0), .place_samples = REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 = REAL(0.0012),
-            .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3), .recent_std_m =
-            REAL(0.08), .creeping_std_m = REAL(0.2), .recent_packets = REAL(16.0), .creeping_s = REAL(3.0), .late_std_m
-            = REAL(1.0), .sure_chi2 = REAL(50.0), .early_weight = REAL(0.8), .open_pair_std_m = REAL(0.1), .pair_relays
-            = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s = REAL(0.5), .curved_std = REAL(0.1),
-            .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s = REAL(1.0), .start_margin =
-            REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0), .slow_superframe_s = REAL(0.2),
-            .slow_curved_std = REAL(0.7), .slow_start_std = REAL(2.0), .longest_superframe_s = REAL(1.3),
-            .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late =
-            REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s =
-            REAL(1.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),
-            .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
-            .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
-            .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =
-            REAL(0.1), .phase_step_m = REAL(0.02), .phase_former_s = REAL(0.5), .phases_in_row = REAL(4.0),
-            .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m
-            = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting
-            = true, .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
+            .stationary_std_mps = REAL(0.01), .longest_gap_s = REAL(0.3), .short_gap_s = REAL(0.05), .wrong_scale =
+            REAL(60.0), .wrong_speed_nis = REAL(5.0), .wrong_s = REAL(1.5), .ignored_s = REAL(20.0), .level_s =
+            REAL(0.5), .rest_rps = REAL(0.1), .rest_mps2 = REAL(0.5), .rest_mps = REAL(0.2), .tilt_s = REAL(2.0),
+            .bias_s = REAL(20.0), .heading_std = REAL(0.7), .heading_walk = REAL(0.02), .acceleration_std_mps2 =
+            REAL(1.0), .acceleration_walk = REAL(0.08), .vertical_share = REAL(0.02), .sensor_noise = REAL(0.01),
+            .headless_noise = REAL(0.1), .known_heading_variance = REAL(0.1), .sure_heading_variance = REAL(0.007),
+            .length_std = REAL(0.2), .speed_std_mps = REAL(0.02), .speed_share = REAL(0.02), .held_step_m = REAL(0.15),
+            .held_max_m = REAL(0.4), .curvature_share = REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02),
+            .wrong_nis = REAL(2.0), .slow_forgetting = REAL(0.005), .late_often_share = REAL(0.02), .reception_huber =
+            REAL(1.5), .difference_huber = REAL(1.0), .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0),
+            .lost_share = REAL(0.5), .suspect = REAL(3.0), .in_row = REAL(2.0), .in_row_where_late = REAL(5.0),
+            .together = REAL(7.0), .first_change_scale = REAL(10.0), .ended_std_m = REAL(0.05), .ended = REAL(2.0),
+            .obstructed_walk = REAL(0.004), .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2),
+            .jump_rise = REAL(0.5), .obstructed_std_m = REAL(0.05), .obstructed_s = REAL(5.0), .place_step_m =
+            REAL(0.1), .place_first = REAL(20.0), .place_samples = REAL(100.0), .place_memory = REAL(1000.0),
+            .place_min_m2 = REAL(0.0012), .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m =
+            REAL(0.3), .recent_std_m = REAL(0.08), .creeping_std_m = REAL(0.2), .recent_packets = REAL(16.0),
+            .creeping_s = REAL(3.0), .late_std_m = REAL(1.0), .sure_chi2 = REAL(50.0), .early_weight = REAL(0.8),
+            .open_pair_std_m = REAL(0.1), .pair_relays = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s =
+            REAL(0.5), .curved_std = REAL(0.1), .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s
+            = REAL(1.0), .start_margin = REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0),
+            .slow_superframe_s = REAL(0.2), .slow_curved_std = REAL(0.7), .slow_start_std = REAL(2.0),
+            .longest_superframe_s = REAL(1.3), .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15),
+            .fitting_chi2 = REAL(2.0), .most_late = REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2),
+            .window = REAL(60.0), .window_s = REAL(1.0), .moving_window = REAL(20.0), .moving_std_m = REAL(1.5),
+            .moving_nis = REAL(1.5), .moving_apart = REAL(6.0), .median_difference_std_m = REAL(0.08), .late_start_std_m
+            = REAL(0.14), .rival_m = REAL(0.5), .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5),
+            .most_horizontal_std_m = REAL(3.0), .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002),
+            .phase_max_std_m = REAL(0.006), .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate =
+            REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02), .phase_former_s = REAL(0.5),
+            .phases_in_row = REAL(4.0), .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02),
+            .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0),
+            .sensor_valid_s = REAL(1.0)}, .is_starting = true, .misfit = -1, .relays_may_contradict = true,
+            .may_begin_again = true};
     t->owner.qa = qa;
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;

@@ -11,6 +11,7 @@
  * skyless.core.estimator.levels
  * skyless.core.estimator.measurements
  * skyless.core.estimator.monitor
+ * skyless.core.estimator.motion
  * skyless.core.estimator.phases
  * skyless.core.estimator.process
  * skyless.core.estimator.state
@@ -138,6 +139,7 @@ typedef double real;
 #define FREE 0
 #define GAIN_TOLERANCE REAL(1e-13)
 #define GEOREFERENCE_PAGE 4
+#define GRAVITY_MPS2 REAL(9.80665)
 #define HAS_AUTHENTICATION 4
 #define HAS_CERTIFICATE 8
 /* Whether positions are relative to whole metres near the first anchor, so that single precision suffices. */
@@ -151,6 +153,7 @@ typedef double real;
 #define HAS_TOO_FEW 27
 /* Length of the frame up to the magic number. */
 #define HEADER_BYTES 11
+#define HEADINGS 2
 #define HEARD_BYTES 8
 #define HEIGHT 1
 /* Offset of the flags in a site page; the height follows. */
@@ -269,9 +272,15 @@ typedef double real;
 #define MM_PER_M 1000
 /* Upper limit of the share of late packets in ``is_lost``. */
 #define MOST_LATE REAL(0.45)
+/* One speed counts for no more than this in the mean. */
+#define MOST_NIS REAL(100.0)
 /* Most queued updates of the filter. */
 #ifndef MOST_WAITING
 #define MOST_WAITING 8
+#endif
+/* States for a motion sensor; 0 if none can be used. */
+#ifndef MOTION_STATES
+#define MOTION_STATES 5
 #endif
 #define MOVED_ANCHOR 31
 #define MOVED_HOLD_TICKS INT64_C(19169280000)
@@ -304,6 +313,9 @@ typedef double real;
 #define NO_SITE (-1)
 #define OBSTRUCTED 1
 #define ONES INT64_C(4294967295)
+/* Quaternion w, x, y, z that turns the frame of a motion sensor into the site's, then the heading's standard deviation
+ * [rad], in two rows; zeros if unknown. Only of methods that use one. */
+#define ORIENTATION 10
 /* Columns are orthogonal if the cosine of their angle does not exceed this. */
 #define ORTHOGONAL REAL(1e-14)
 #define OTHER_PAGES 1
@@ -345,7 +357,7 @@ typedef double real;
 #define POWER_GAIN REAL(0.1)
 /* Anchors received within this time are present. */
 #define PRESENT_TICKS INT64_C(63897600000)
-#define PROTECTED_ROWS 10
+#define PROTECTED_ROWS 12
 /* The first three levels (``estimator/levels.py``); only of methods that compute them. */
 #define PROTECTION 9
 /* Row of chi-square and mean squared residual in m². */
@@ -406,7 +418,7 @@ typedef double real;
 #define START_FIX 25
 #define STATE 2
 /* Capacity for states; a multiple of ``LANES``. */
-#define STATES (2 * (AXES + MAX_ANCHORS) + (3 + PHASE_STATES + AXES) * MAX_ANCHORS + 2)
+#define STATES ((2 * (AXES + MAX_ANCHORS) + (3 + PHASE_STATES + AXES) * MAX_ANCHORS + 2 + MOTION_STATES + LANES - 1) / LANES * LANES)
 #define STD_STEPS_PER_M 10000
 #define STEPS 16
 #define STEPS_PER_M 100
@@ -682,6 +694,34 @@ typedef struct Tuning {
     real better_known;  /* The position of a tag at rest is updated once its variance has shrunk to this fraction. */
     real stationary_noise_share;  /* Fraction of the process noise of motion kept at rest: 5 cm within half a minute. */
     real stationary_std_mps;  /* Standard deviation of the velocity of a tag at rest [m/s]. */
+    real longest_gap_s;  /* Without samples for longer, the tag moves by its motion model again [s]. */
+    /* Beyond this the newest sample does not stand for the present: process noise is that without a sensor [s]. */
+    real short_gap_s;
+    /* A factor on process noise beyond this shows that sensor and positions contradict each other, … */
+    real wrong_scale;
+    real wrong_speed_nis;  /* … or a mean NIS of wheels' speeds beyond this, … */
+    real wrong_s;  /* … after this time [s]: the heading is looked for again, and from the second time on … */
+    real ignored_s;  /* … the sensor is ignored for this time [s]; after as long without it counts as the first time. */
+    real level_s;  /* Time over which specific force is averaged to find the level [s]. */
+    real rest_rps;  /* A sensor's rate above this shows motion [rad/s] … */
+    real rest_mps2;  /* … and a specific force that differs from its running mean by more [m/s²]. */
+    real rest_mps;  /* A tag that is faster is not at rest, whatever the sensor shows [m/s]. */
+    real tilt_s;  /* Time in which known errors of tilt and heading move into the attitude [s] … */
+    real bias_s;  /* … and in which those that come back move into the gyroscope's bias [s]. */
+    real heading_std;  /* Standard deviation of cosine and sine of an unknown heading. */
+    real heading_walk;  /* Random walk of both [1/√s]: the gyroscope's drift. */
+    real acceleration_std_mps2;  /* Standard deviation of an acceleration's error: six degrees of tilt [m/s²] … */
+    real acceleration_walk;  /* … and its random walk [m/s²/√s]. */
+    real vertical_share;  /* Share of both variances for the vertical, which does not depend on tilt. */
+    real sensor_noise;  /* Process noise of motion with a sensor whose heading is known [m²/s³] … */
+    real headless_noise;  /* … and while it is not known. */
+    /* Variance of the heading's cosine and sine, together, below which it is roughly known … */
+    real known_heading_variance;
+    /* … below which it is well known, to five degrees: the gyroscope's bias is then learnt from its changes … */
+    real sure_heading_variance;
+    real length_std;  /* … and its length counts as 1, to this in each tenth of a second. */
+    real speed_std_mps;  /* Standard deviation of the speed that wheels show, over a second [m/s] … */
+    real speed_share;  /* … and the part that is a fraction of it. */
     /* Distance of the estimate from the point of linearisation, of ranges or phases, that moves the point [m]. */
     real held_step_m;
     /* The point stays within ``suspect`` standard deviations of the estimate, and within this distance [m]. */
@@ -777,6 +817,11 @@ typedef struct Tuning {
     real staying_share;
     real window;  /* Ready-made time differences used to find a start … */
     real window_s;  /* … or those of this time [s]. */
+    /* Differences that take longer than that find the start of a tag that may be moving; in them it is searched … */
+    real moving_window;
+    real moving_std_m;  /* … from places with this standard deviation [m] … */
+    real moving_nis;  /* … and found where the mean NIS is below this … */
+    real moving_apart;  /* … and that of no other place, summed, is within this. */
     real median_difference_std_m;  /* Standard deviation of the median of a pair's differences [m]. */
     real late_start_std_m;  /* Standard deviation of each anchor's error at the start, before any are estimated [m]. */
     /* Distance from which two positions are rivals; after it a moving tag is late to other anchors [m]. */
@@ -835,7 +880,7 @@ typedef struct Course {
     bool is_starting;
     real late_share;  /* Share of late packets that the last filter estimated. */
     int32_t misfit;  /* The anchor that was inconsistent with the others at the start. */
-    real alone[10][3];  /* Rows of a fix that comes from a start alone, without a filter. */
+    real alone[12][3];  /* Rows of a fix that comes from a start alone, without a filter. */
     bool open_range_errors;  /* Whether the next start expects larger range errors than the settings state. */
     bool is_open;  /* Whether the last start did so. */
     bool start_was_contradicted;
@@ -922,6 +967,9 @@ typedef struct Layout {
     int32_t velocity;
     int32_t rate;
     int32_t tx_noise;
+    int32_t heading;
+    /* These two exist only with a motion sensor; without, they equal ``ambiguity`` and are not used. */
+    int32_t acceleration;
     int32_t ambiguity;
     int32_t mesh;
     int32_t former;  /* The last three exist only with phases; without, they equal ``change`` and are not used. */
@@ -994,6 +1042,46 @@ typedef struct Status {
     int32_t range_errors;  /* ``NO_RANGE_ERRORS``, ``CHANGING_RANGE_ERRORS`` or ``ALL_RANGE_ERRORS``. */
     real fault_std_m[3];  /* Prior standard deviation of each kind of faults. */
 } Status;
+
+/* A motion sensor's attitude and path since the newest packet, in a level frame with a heading of its own. */
+typedef struct Motion {
+    real lever_m[3];  /* Position of the antenna seen from the sensor, in the sensor's frame. */
+    bool has_states;  /* Whether heading and acceleration are states. */
+    bool is_level;  /* Whether the attitude is known but for the heading. */
+    bool has_force;  /* Whether samples have a specific force; wheels have none. */
+    bool is_used;  /* Whether the newest time update was one by a specific force. */
+    bool has_effect;  /* Whether the newest time update was one by the sensor or its wheels. */
+    real speed_nis;  /* Running mean of the NIS of speeds, over a second. */
+    real wrong_s;  /* Time for which innovations have called for much process noise … */
+    real right_s;  /* … or for little. */
+    int32_t contradictions;  /* How often the former has lasted long, since the latter did. */
+    int64_t ignored_ticks;  /* Tag time until which the sensor is ignored for that. */
+    int64_t ticks;  /* Tag time of the newest sample that turned the attitude. */
+    int64_t speed_ticks;  /* Tag time of the newest speed of wheels, … */
+    real speed_mps;  /* … along x of the sensor's frame. */
+    int64_t used_ticks;  /* Tag time at which the path begins: that of the newest packet. */
+    real attitude[4];  /* Quaternion w, x, y, z that turns the sensor's frame into the level one. */
+    /* Quaternion that turned the first sample's frame into the level one; then that of the newest fix. */
+    real level[4];
+    real bias_rps[3];  /* Bias of the gyroscope. */
+    /* Path at the newest sample, against a uniform motion with the antenna's velocity where it begins. */
+    real position_m[3];
+    real velocity_mps[3];
+    real rate_rps[3];  /* The newest sample's rate, in the sensor's frame. */
+    real force_mps2[3];  /* Its specific force, in the level frame. */
+    real arm_m[3];  /* Position of the antenna against the sensor in the level frame … */
+    real arm_mps[3];  /* … and its velocity. */
+    real shown_m[3];  /* Path of the antenna since the newest packet … */
+    real shown_mps[3];  /* … and the change of its velocity. */
+    real up_mps2[3];  /* What a sensor at rest would show, for wheels. */
+    real mean_mps2[3];  /* Running mean of the specific force. */
+    real rest_s;  /* Time since the newest sample that showed motion. */
+    real level_s;  /* Time over which the specific force has been averaged to find the level. */
+    int64_t samples;  /* Samples that turned the attitude … */
+    int64_t speeds;  /* … speeds of wheels … */
+    int64_t late;  /* … those not in order, or too old when they came … */
+    int64_t gaps;  /* … and gaps after which level and heading were looked for again. */
+} Motion;
 
 /* Record of an ambiguity beside its state. */
 typedef struct Ambiguity {
@@ -1073,6 +1161,7 @@ typedef struct State {
     int32_t rows;  /* Columns of V in use. */
     Layout layout;
     Status status;
+    Motion motion;
     real information[FAULTS][FAULTS];  /* Information of the innovations on all faults, M; lower triangle. */
     real evidence[FAULTS];  /* Evidence of the innovations for all faults, y. */
     /* Covariance of the lasting faults, (M + I/σ_f²)⁻¹, as M grows without limit and 1/σ_f² would be lost in it. */
@@ -1090,7 +1179,7 @@ typedef struct State {
     real G[MOST_WAITING][SENSITIVITIES];
     real work[WORK_ROWS][MAX_ANCHORS];  /* Scratch for systems of equations of all faults of one kind. */
     real levels[5];
-    real fix[10][3];  /* Rows of a fix (``POSITION`` and the following). */
+    real fix[12][3];  /* Rows of a fix (``POSITION`` and the following). */
 } State;
 
 /* A TX time on a scale common to packets of several anchors. */
@@ -1326,6 +1415,8 @@ SKYLESS_EXPORT void skyless_restart(State *s, int64_t rx_ticks, real late_share,
 SKYLESS_EXPORT int32_t skyless_find_anchor(State *s, int32_t identifier);
 SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *position_m, real std_m, bool is_open);
 SKYLESS_EXPORT void skyless_fit_plane(State *s);
+SKYLESS_EXPORT bool skyless_hear_wheels(State *s, int64_t ticks, real *rate_rps, real speed_mps);
+SKYLESS_EXPORT bool skyless_hear_motion(State *s, int64_t ticks, real *rate_rps, real *force_mps2);
 SKYLESS_EXPORT void skyless_leave(State *s, int32_t identifier);
 SKYLESS_EXPORT int32_t skyless_process_frame(State *s, Packet *packet, Relays *relays, uint8_t *packed, int32_t
         packed_bytes);

@@ -20,6 +20,7 @@ from skyless.core.estimator.estimator import NO_REPORT, Report
 from skyless.core.estimator.settings import TUNING
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
+from skyless.core.motion_sample import MotionSample, SampleClock
 from skyless.core.native.library import compiled
 from skyless.core.tag.admission import COUNTER_JUMPED, DROP_COUNTERS, SITE_CHANGED, Admission, Tag
 from skyless.core.tag.following import FIX
@@ -80,12 +81,19 @@ class SiteListener(Protocol):
     def phase_anchors(self) -> tuple[int, ...]:
         """Anchors whose carrier phases are in use."""
 
+    @property
+    def motion_note(self) -> str | None:
+        """What keeps a motion sensor from being used fully, in a sentence."""
+
 
 class TagReceiver(SiteListener, Protocol):
     """A tag as programs, replays and simulations see it. Bytes and ticks in, fixes out; no I/O, no clock."""
 
     def hear(self, reception: Reception) -> Fix | None:
         """Process a frame from the air. Returns a fix if it made one, otherwise sets ``reason``."""
+
+    def hear_motion(self, sample: MotionSample) -> bool:
+        """Process what a motion sensor or wheels of the tag show. Returns True if it was used."""
 
 
 class BeaconReceiver(ABC):
@@ -95,6 +103,7 @@ class BeaconReceiver(ABC):
         """Create a tag that has heard nothing."""
         self.counters: Counter[str] = Counter()
         self.reason: NoFixReason = NoFixReason.NO_BEACONS
+        self._sample_clock = SampleClock()
 
     @property
     @abstractmethod
@@ -142,6 +151,25 @@ class BeaconReceiver(ABC):
             )
         method = self._estimation
         return method is not None and method.update_height(height_m, std_m)
+
+    def hear_motion(self, sample: MotionSample) -> bool:
+        """Process what a motion sensor or wheels of the tag show. Returns True if it was used.
+
+        Samples are in order of time; receptions must have the host's time. Only ``joint`` uses them, and only while
+        they are no older than 0.3 s: without them the tag moves by its motion model.
+
+        Raises:
+            ValueError: a number is not finite.
+        """
+        sample.check()
+        method = self._estimation
+        ticks = None if method is None else self._sample_clock.ticks(self.admission.own, sample.time_s)
+        return method is not None and ticks is not None and method.estimator.hear_motion(ticks, sample)
+
+    @property
+    def motion_note(self) -> str | None:
+        """What keeps a motion sensor from being used fully, in a sentence; None if nothing does, or there is none."""
+        return None if self._estimation is None else self._estimation.estimator.motion_note
 
     def continue_time_of(self, other: "BeaconReceiver", fix_time: FixTime) -> None:
         """Continue another receiver's counter, and count the time of fixes with ``fix_time``."""

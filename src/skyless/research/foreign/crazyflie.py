@@ -24,6 +24,7 @@ import yaml
 
 from skyless.core.air.masterless_packets import Packet, PairTdoa
 from skyless.core.arrays import Array
+from skyless.core.estimator.motion import GRAVITY_MPS2
 from skyless.core.ticks import TICK_BITS
 from skyless.files import Drops, chunks, open_source
 from skyless.radio.foreign.bitcraze import decode_payload
@@ -46,6 +47,9 @@ _TRUTHS: Final = ("estPose", "estPosition", "lhPosition")
 """Events with a position from motion capture or lighthouse, the better first."""
 
 _SENSOR, _BAROMETER = "estTOF", "estBarometer"
+_GYROSCOPE, _ACCELEROMETER = "estGyroscope", "estAcceleration"
+"""In degrees per second, and in units of gravity."""
+
 _MILLIMETRES_FROM: Final = 20.0
 """A ranger's reading above this is in millimetres: its range is four metres."""
 
@@ -121,6 +125,20 @@ def read_heights(path: str | PathLike[str], *, is_barometer: bool) -> Array | No
         events = [event for event in _Log(stream, Counter()).events() if event.name == wanted and event.values]
     rows = [(event.time_s, next(iter(event.values.values()))) for event in events]
     return heights_of(np.array(rows).reshape(-1, 2), is_barometer=is_barometer)
+
+
+def read_motion(path: str | PathLike[str]) -> Array | None:
+    """Rows of time, rates [rad/s] and specific forces [m/s²], x, y and z each; None if the log lacks either."""
+    found: dict[str, list[tuple[float, ...]]] = {_GYROSCOPE: [], _ACCELEROMETER: []}
+    with open_source(path) as stream:
+        for event in _Log(stream, Counter()).events():
+            if event.name in found and event.values.keys() >= {"x", "y", "z"}:
+                found[event.name].append((event.time_s, *(event.values[axis] for axis in "xyz")))
+    rates, forces = (in_order(np.array(rows, dtype=np.float64).reshape(-1, 4)) for rows in found.values())
+    if len(rates) == 0 or len(forces) == 0:
+        return None
+    together = [np.interp(rates[:, 0], forces[:, 0], GRAVITY_MPS2 * forces[:, axis]) for axis in (1, 2, 3)]
+    return np.column_stack([rates[:, 0], np.radians(rates[:, 1:]), *together])
 
 
 def heights_of(rows: Array, *, is_barometer: bool) -> Array | None:

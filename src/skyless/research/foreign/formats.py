@@ -50,6 +50,8 @@ class Format:
     """Whether that truth is of the body that carries the antenna."""
     read_heights: Callable[..., Array | None] | None = None
     """Rows of time, height and standard deviation of a recorded sensor, from the path and ``is_barometer``."""
+    read_motion: Callable[[str | PathLike[str]], Array | None] | None = None
+    """Rows of time, rates and specific forces of a recorded motion sensor, from the path."""
     read_anchors: Callable[[str | PathLike[str]], dict[int, Point]] | None = None
     """Positions of all anchors, from the path, if the recording itself has them."""
     channels: tuple[int, ...] = ()
@@ -126,13 +128,14 @@ FORMATS: Final = (
     ),
     Format(
         "crazyflie-log",
-        "Log of a Crazyflie's SD card (events estTDOA or estTdoaCand, poses, lighthouse, ranger, barometer)",
+        "Log of a Crazyflie's SD card (events estTDOA or estTdoaCand, poses, lighthouse, ranger, barometer, IMU)",
         crazyflie.recognise,
         crazyflie.read,
         None,
         read_truth=crazyflie.read_truth,
         truth_is_of_body=True,
         read_heights=crazyflie.read_heights,
+        read_motion=crazyflie.read_motion,
     ),
     _dl_tdoa(
         "uci-pcapng",

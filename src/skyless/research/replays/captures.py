@@ -18,6 +18,7 @@ from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.geometry import GUESSED_STD_M, plane_height_m
+from skyless.core.motion_sample import MotionSample
 from skyless.core.site import Site
 from skyless.core.ticks import CARRIER_CYCLES
 from skyless.research.foreign.datasets import anchor_distances_m
@@ -317,9 +318,16 @@ def _measured(pairs: Iterable[PairTdoa], used: Iterable[bool]) -> Iterator[Measu
 class ByPairs(Pipeline):
     """Time differences, and the filter of pairs."""
 
-    def __init__(self, tracking: DifferenceTracking, engine: PairEngine | None, noise: NoiseByPair) -> None:
+    def __init__(
+        self,
+        tracking: DifferenceTracking,
+        engine: PairEngine | None,
+        noise: NoiseByPair,
+        motion: Sequence[MotionSample] = (),
+    ) -> None:
+        """``motion``: all samples of the tag's motion sensor, in order of time."""
         super().__init__(engine, noise)
-        self._tracking = tracking
+        self._tracking, self._motion = tracking, deque(motion)
 
     def process(self, record: Record) -> tuple[float | None, Fix | None]:
         """See ``Pipeline``."""
@@ -327,6 +335,8 @@ class ByPairs(Pipeline):
         if not pairs:
             self.measured = ()
             return None, None
+        while self._motion and self._motion[0].time_s <= pairs[0].time_s:
+            self._tracking.hear_motion(self._motion.popleft())
         fix = self._tracking.fix() if self._tracking.update(pairs) else None
         self.measured, self.reason = _measured(pairs, self._tracking.used), self._tracking.reason
         return pairs[0].time_s, fix
@@ -570,7 +580,18 @@ class CaptureReplay:
         known = {key: value for key, value in asked.items() if value is not None}
         settings = PROFILES.get(self.recording.format.name, DIFFERENCES).changed(**known)
         tracking = DifferenceTracking(settings, self.known_m, self._asked.z_bounds_m, self._calibration)
-        return (Smoothed if self._asked.smooth else ByPairs)(tracking, engine, self._noise)
+        if self._asked.smooth:
+            return Smoothed(tracking, engine, self._noise)
+        return ByPairs(tracking, engine, self._noise, self._motion())
+
+    def _motion(self) -> Sequence[MotionSample]:
+        """What the tag's motion sensor showed, if it was recorded and is wanted."""
+        read, arm_m = self.recording.format.read_motion, self._asked.lever_arm_m or (0.0, 0.0, 0.0)
+        rows = None if read is None or self._asked.imu != RECORDED else read(self._asked.file)
+        return [
+            MotionSample(t_s, (p, q, r), (x, y, z), arm_m=arm_m)
+            for t_s, p, q, r, x, y, z in ([] if rows is None else rows.tolist())
+        ]
 
     def _by_packets(self) -> ByPackets:
         bits = self.recording.format.tx_bits

@@ -47,7 +47,7 @@ MEASUREMENTS: Final = (PACKETS, DIFFERENCES_MADE)
 
 AUTO: Final = "auto"
 
-HEIGHT_SENSOR, BAROMETER, RECORDED = "sensor", "barometer", "recording"
+HEIGHT_SENSOR, BAROMETER, RECORDED, NO_MOTION = "sensor", "barometer", "recording", "none"
 
 HEIGHT_WORDS: Final = ("truth", "free", "auto")
 """Alternatives to a tag's height in metres: the truth's median, estimated, or automatic."""
@@ -152,6 +152,8 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     holds."""
     height_kind: Annotated[str, choice(HEIGHT_SENSOR, BAROMETER)] = HEIGHT_SENSOR
     """What gave the heights: a sensor of the height itself, or a barometer, whose zero is unknown and moves slowly."""
+    imu: Annotated[str, choice(RECORDED, NO_MOTION)] = RECORDED
+    """Whether the filter uses gyroscope and accelerometer where the recording holds them: recording, or none."""
     smooth: bool = False
     """Let every fix use all of the recording, what came later as well (of time differences); fixes have no protection
     level then."""

@@ -2,7 +2,7 @@
 
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
-from itertools import combinations
+from itertools import combinations, product
 from math import dist
 from typing import Final
 
@@ -18,6 +18,7 @@ from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.estimator.state import at
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import CONTRADICTED, SOUND, IntegrityRequirement
+from skyless.core.motion_sample import MotionSample
 from skyless.core.native.records import MAX_ANCHORS
 from skyless.core.tag.position import NoSolution, locate
 from skyless.core.ticks import TICK_RATE_HZ
@@ -93,6 +94,10 @@ class DifferenceTracking:
         """Process a reading of the tag's height sensor at the time of the newest difference."""
         if self.has_started and self.estimator.process_height(height_m, std_m, is_barometer) != ACCEPTED:
             self.counters["outlier-height"] += 1
+
+    def hear_motion(self, sample: MotionSample) -> None:
+        """Process what a motion sensor shows; its times are those of the differences."""
+        self.estimator.hear_motion(self.ticks(sample.time_s), sample)
 
     def update(self, pairs: Sequence[PairTdoa]) -> bool:
         """Process the differences of one reception; receptions must be in the order of time.
@@ -208,9 +213,11 @@ class DifferenceTracking:
         """Search for a start, or for one that confirms or contradicts the current one. Returns True if it is used."""
         window, dim = self._window, self.estimator.dim
         self._tried_s = self._newest_s
-        start = find_start(
-            window, self._positions_m, self._calibration, self._settings.known_height_m, self._z_bounds_m
-        )
+        if TUNING.moving_window <= len(window) < TUNING.window:
+            start = self._find_moving_start()
+        else:
+            height_m = self._settings.known_height_m
+            start = find_start(window, self._positions_m, self._calibration, height_m, self._z_bounds_m)
         if isinstance(start, NoSolution):
             self.reason = start.reason
             return False
@@ -225,10 +232,11 @@ class DifferenceTracking:
                 window.clear()
                 return False
             self.counters["restart"] += 1
-        self._begin_s, newest = self._newest_s, window[-1]
-        self.estimator.start(
-            0, start.position_m[:dim], start.covariance_m2[:dim, :dim], self._settings.start_speed_std_mps**2
-        )
+        newest = window[-1]
+        self.estimator.shift_motion(-self.ticks(self._newest_s))
+        self._begin_s = self._newest_s
+        x, P = start.motion or (start.position_m[:dim], start.covariance_m2[:dim, :dim])
+        self.estimator.start(0, x, P, self._settings.start_speed_std_mps**2)
         self.estimator.withhold_levels(CONTRADICTED)
         self._start = start
         for anchor, (late_m, variance_m2) in start.late.items():
@@ -240,9 +248,48 @@ class DifferenceTracking:
         window.clear()
         return self._process(newest)
 
+    def _find_moving_start(self) -> "Start | NoSolution":
+        """Find a start from differences during which the tag may have moved.
+
+        The filter itself runs over the newest of them from several places. The run with the smallest innovations is
+        right, unless one that ends elsewhere is nearly as good.
+        """
+        window, dim = list(self._window)[-int(TUNING.moving_window) :], self.estimator.dim
+        anchors_m = np.array(
+            [self._positions_m[anchor] for pair in window for anchor in (pair.anchor_a, pair.anchor_b)]
+        )
+        corners_m, low, high = neighbourhood_m(anchors_m), anchors_m.min(axis=0), anchors_m.max(axis=0)
+        runs: list[tuple[float, Array, Array]] = []
+        filtered = DifferenceTracking(self._settings, {}, None, self._calibration)
+        filtered._positions_m, filtered._begin_s = self._positions_m, window[0].time_s
+        for share in product(*PLACES[:dim]):
+            estimator = filtered.estimator
+            place_m = low[:dim] + np.array(share) * (high - low)[:dim]
+            estimator.start(0, place_m, TUNING.moving_std_m**2 * np.eye(dim), self._settings.start_speed_std_mps**2)
+            status, misfit = estimator.state.status, 0.0
+            for pair in window:
+                before = status.mean_nis
+                is_used = filtered._process(pair)
+                nis = (status.mean_nis - before) / TUNING.forgetting + before
+                misfit += nis if is_used else self._settings.gate**2
+            runs.append((misfit, *estimator.motion()))
+        misfit, x, P = min(runs, key=lambda run: run[0])
+        if misfit > TUNING.moving_nis * len(window):
+            return NoSolution(NoFixReason.RESIDUALS, "no position fits these differences")
+        rivals = [run[0] for run in runs if dist(run[1][:dim], x[:dim]) > TUNING.rival_m]
+        position_m, covariance_m2 = np.zeros(3), np.zeros((3, 3))
+        position_m[:dim], covariance_m2[:dim, :dim] = x[:dim], P[:dim, :dim]
+        if not is_within(corners_m, position_m[:dim].tolist()) or np.trace(covariance_m2) > TUNING.late_std_m**2:
+            return NoSolution(NoFixReason.NOT_CONVERGED, "the position is not determined")
+        is_ambiguous = min(rivals, default=np.inf) < misfit + TUNING.moving_apart
+        return Start(position_m, covariance_m2, {}, is_ambiguous, corners_m, (x, P))
+
 
 # Start
 
+
+PLACES: Final = ((0.2, 0.5, 0.8), (0.2, 0.5, 0.8), (0.25, 0.75))
+"""Shares of the anchors' extent from which the filter searches for a moving tag."""
 
 JOINING_STEPS: Final = 4  # iterations of reweighted least squares
 
@@ -263,6 +310,8 @@ class Start(Struct, frozen=True):
     """Whether another position fits nearly as well, or some anchor is late."""
     corners_m: Corners
     """Of the neighbourhood of the anchors."""
+    motion: tuple[Array, Array] | None = None
+    """Position and velocity, shape (2·dim,), and their covariance, of a tag that may be moving."""
 
 
 def neighbourhood_m(anchors_m: Array) -> Corners:

@@ -14,6 +14,7 @@ from msgspec import Struct, structs
 from skyless.core.air.masterless_packets import Packet, Point
 from skyless.core.errors import ConfigurationError
 from skyless.core.geometry import GUESSED_STD_M, plane_height_m
+from skyless.core.motion_sample import MotionSample
 from skyless.core.site import AnchorSite, GeoreferenceSite, Site, TagsSite
 from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign.bitcraze import STAMP_BITS
@@ -96,6 +97,8 @@ class PacketTagNode:
         self.fix_log = FixLog(radio.name, publish, settings.publish_hz, clock)
         self.monitor = RadioMonitor(f"tag {radio.name}", "listening", log, radio.advice)
         self._drops: Counter[str] = Counter()
+        self.motion_counters: Counter[str] = Counter()
+        """Unusable messages of the motion sensor, by reason."""
         self._notes: tuple[str, ...] = ()
         self._known = 0  # packets of anchors with known positions
 
@@ -114,7 +117,8 @@ class PacketTagNode:
     @property
     def drops(self) -> Counter[str]:
         """Unusable data, by reason."""
-        return self._drops + self.tracking.drops + self.radio.counters + self.fix_log.lateness.drops
+        unused = self._drops + self.tracking.drops + self.radio.counters
+        return unused + self.fix_log.lateness.drops + self.motion_counters
 
     def check_reception(self, now_s: float) -> None:
         """Log advice if the radio receives nothing usable. ``now_s``: the host's monotonic clock."""
@@ -127,6 +131,10 @@ class PacketTagNode:
             if note not in before:
                 log(f"tag {self.radio.name}: {note}")
         return notes
+
+    def hear_motion(self, sample: MotionSample) -> None:
+        """Process what the tag's motion sensor shows, at a time of the host's monotonic clock."""
+        self.tracking.hear_motion(sample)
 
     async def run(self) -> None:
         """Listen until cancelled."""

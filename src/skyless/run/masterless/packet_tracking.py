@@ -16,6 +16,7 @@ from skyless.core.air.masterless_packets import Packet, Point, Relay
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import CONTRADICTED, SOUND, UNAVAILABLE
+from skyless.core.motion_sample import MotionSample, SampleClock
 from skyless.core.tag.joint import Estimation, Observation
 from skyless.core.ticks import (
     LAST_TICKS,
@@ -145,7 +146,7 @@ class PacketTracking:
         self._anchors: dict[int, _Anchor] = {}
         self._delays = RelayDelays(self._positions_m, estimate=calibration is None)
         self._calibration = calibration
-        self._tag_clock = Unwrapper()
+        self._tag_clock, self._sample_clock = Unwrapper(), SampleClock()
         self._newest_rx_ticks: int | None = None
         self._back_in_row = 0
         self._time = FixTime()
@@ -205,7 +206,15 @@ class PacketTracking:
         late = () if flips or not self._is_often_late else ("Receptions are often late: no protection level",)
         without = sorted(self._uncalibrated)
         which = "" if self._calibration is None else f" ({', '.join(map(names, without))})"
-        return (*own, *flips, *late, *((NOT_CALIBRATED.format(which),) if without else ()))
+        motion = self.tracking.estimator.motion_note
+        others = ((NOT_CALIBRATED.format(which),) if without else ()) + ((motion,) if motion else ())
+        return (*own, *flips, *late, *others)
+
+    def hear_motion(self, sample: MotionSample) -> bool:
+        """Process what a motion sensor shows, as ``Receiver.hear_motion`` does; packets must have the host's time."""
+        sample.check()
+        ticks = self._sample_clock.ticks(self._tag_clock, sample.time_s)
+        return ticks is not None and self.tracking.estimator.hear_motion(ticks, sample)
 
     def on_packet(self, packet: Packet) -> Fix | None:
         """Process one packet. Returns a fix, or None with the ``reason``.

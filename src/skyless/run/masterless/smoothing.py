@@ -29,6 +29,7 @@ from skyless.core.estimator.kalman import is_stationary, motion_noise, range_err
 from skyless.core.estimator.settings import TUNING
 from skyless.core.estimator.state import covariances
 from skyless.core.fix import POSITION, VELOCITY, Fix, NoFixReason
+from skyless.core.motion_sample import MotionSample
 from skyless.core.native.views import view
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_BITS, TICK_S
@@ -302,6 +303,10 @@ class OwnReceiver:
             self.counters[beacon] += 1
             return None
         return self.hear_beacon(beacon, reception)
+
+    def hear_motion(self, _sample: MotionSample) -> bool:
+        """Drop what a motion sensor shows: an estimator gets time differences only."""
+        return False
 
     def hear_beacon(self, beacon: SiteBeacon, reception: Reception) -> Fix | None:
         """Process a decoded beacon like ``hear``."""

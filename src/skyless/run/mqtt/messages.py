@@ -111,6 +111,10 @@ class FixMessage(Struct, frozen=True):
     """Up to this time, on the scale of ``time_s``, all beacons that count are verified; None if none is verified."""
     unverified: float = 1.0
     """Share of the beacons of the last second that are not verified, or not yet."""
+    orientation: tuple[float, float, float, float] | None = None
+    """Quaternion w, x, y, z that turns the frame of the tag's motion sensor into the site's; None if unknown."""
+    heading_std_rad: float | None = None
+    """Standard deviation of its heading."""
 
 
 class Counters(Struct, frozen=True):
@@ -653,6 +657,8 @@ def fix_message(tag: str, serial: int, fix: "Fix", unix_s: float, latency_s: flo
         alert=None if fix.alert is None else fix.alert.value,
         verified_until_s=fix.verified_until_s,
         unverified=fix.unverified,
+        orientation=fix.orientation,
+        heading_std_rad=fix.heading_std_rad,
     )
 
 

@@ -14,12 +14,14 @@ from skyless.core.arrays import Array
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.motion_sample import MotionSample
 from skyless.core.site import Site
 from skyless.core.tag.receiver import NOT_DROPS
 from skyless.sim.evaluation.figures import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
 from skyless.sim.impairments import Impairments, Outage
 from skyless.sim.listening import Outcome, TagSpec
 from skyless.sim.medium import Tally
+from skyless.sim.motion_sensor import MotionErrors, MotionSensor
 from skyless.sim.tape import Tape
 from skyless.sim.trajectory import Trajectory
 from skyless.sim.world import World
@@ -58,6 +60,9 @@ class TagReceiver(Protocol):
     def hear(self, reception: Reception) -> Fix | None:
         """Process a frame from the air. Returns a fix if it made one."""
 
+    def hear_motion(self, sample: MotionSample) -> bool:
+        """Process what a motion sensor shows."""
+
     def hear_beacon(self, beacon: SiteBeacon, reception: Reception) -> Fix | None:
         """Process a decoded beacon as ``hear`` does."""
 
@@ -73,6 +78,8 @@ class FleetSettings(Struct, frozen=True):
     integrity: IntegrityRequirement = IntegrityRequirement()
     silences: tuple[Outage, ...] = ()
     """True times in which no tag's radio receives."""
+    motion: MotionErrors | None = None
+    """The tags' motion sensors; None for tags without."""
     new_receiver: Callable[[], TagReceiver] | None = None
     """Creates each tag's receiver, instead of one of the method."""
 
@@ -201,6 +208,10 @@ class Fleet(TagFleet):
         super().__init__(site, len(trajectories), settings)
         self.anchors: dict[int, AnchorMachine] = {}
         specs = [TagSpec(trajectory) for trajectory in trajectories]
+        errors = settings.motion
+        self.sensors = [
+            [] if errors is None else [MotionSensor(path, errors, seed, tag)] for tag, path in enumerate(trajectories)
+        ]
         self.world = World(site, self._new_anchor, specs, impairments, seed)
 
     def _new_anchor(self, anchor: int) -> AnchorMachine:
@@ -221,6 +232,9 @@ class Fleet(TagFleet):
         """See ``TagFleet``."""
         for broadcast in self.world.run(until_s):
             for tag, reception, truth_m in broadcast.receptions():
+                for sensor in self.sensors[tag]:
+                    for sample in sensor.until(broadcast.end_s):
+                        self.receivers[tag].hear_motion(sample)
                 judged = self.add(tag, self.receivers[tag].hear(reception), truth_m, broadcast.end_s)
                 if judged is not None:
                     yield judged

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from msgspec import Struct
 
@@ -238,6 +238,10 @@ class Conditions(ProtectionOptions, frozen=True, kw_only=True):
     """Let the crystals warm up and swing."""
     carrier: bool = False
     """Let radios measure the phase of the carrier, as a DW1000 can; joint uses it, which needs a tag that moves."""
+
+    carries: Literal["imu", "wheels"] | None = None
+    """Motion sensors of the tags, which joint uses: imu, accelerometer and gyroscope in a hand; wheels, odometer and
+    gyroscope of a robot; both with errors of low-cost parts. None by default."""
 
     def check(self) -> None:
         """See that the options fit one another. Raises SkylessError."""

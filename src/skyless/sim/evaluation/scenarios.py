@@ -18,6 +18,7 @@ from skyless.core.site import FloorSite, Site
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings, JudgedFix, TagFleet, TagReceiver, TapeFleet
 from skyless.sim.evaluation.request import Conditions
 from skyless.sim.impairments import AnchorDisplacement, Body, CarrierModel, Impairments, RangeErrorModel, WarmUp
+from skyless.sim.motion_sensor import MotionErrors
 from skyless.sim.oscillator import OscillatorModel, Temperature
 from skyless.sim.streams import stream
 from skyless.sim.trajectory import Roaming, Static, Trajectory, Waypoints
@@ -180,6 +181,7 @@ def fleet_of_any_size(request: Request) -> TagFleet:
             ("--nlos", request.nlos),
             ("--temperature", request.temperature),
             ("--carrier", request.carrier),
+            ("--carries", request.carries),
             ("walls of the site file", site.walls),
             ("floors of the site file", site.storeys[1:]),
         )
@@ -204,6 +206,7 @@ def _settings(request: Request) -> FleetSettings:
         request.fixes,
         request.requirement(request.method),
         tuple(request.silences),
+        None if request.carries is None else MotionErrors(has_wheels=request.carries == "wheels"),
         request.new_receiver,
     )
 

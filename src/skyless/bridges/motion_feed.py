@@ -1,0 +1,167 @@
+"""What a robot or a vehicle tells a tag of its motion: lines of JSON by TCP, or MAVLink by UDP.
+
+A line is ``{"imu": {"t_s": …, "rate_rps": [x, y, z], "force_mps2": [x, y, z]}}`` or ``{"wheels": {"t_s": …,
+"speed_mps": …, "rate_rps": …}}``, in a frame with x forward, y to the left and z up. ``t_s`` is Unix time; without it
+a line counts as of its arrival. Of MAVLink, HIGHRES_IMU and SCALED_IMU are used; their time since the vehicle's start
+is put on this computer's clock by the shortest latency.
+"""
+
+import asyncio
+import time
+from asyncio import StreamReader, StreamWriter
+from collections import Counter
+from collections.abc import Callable
+from math import inf
+from struct import Struct as Format
+from typing import Final
+
+import msgspec
+from msgspec import Struct
+
+from skyless.bridges.mavlink import Frame, FrameReader
+from skyless.bridges.target import TargetUrl
+from skyless.core.errors import SkylessError
+from skyless.core.estimator.motion import GRAVITY_MPS2
+from skyless.core.motion_sample import MotionSample
+
+PORT: Final = 7480
+MAVLINK_PORT: Final = 14_551
+
+_MAX_LINE_BYTES: Final = 1 << 12
+_DRIFT: Final = 1e-4
+"""By how much the two clocks may drift apart, so that the shortest latency does not stay for ever."""
+_SET_S: Final = 1.0
+
+_HIGHRES_IMU, _SCALED_IMU = 105, 26
+_CRC_EXTRAS: Final = {_HIGHRES_IMU: 93, _SCALED_IMU: 170}
+_HIGHRES: Final = Format("<Q6f")
+"""Time in µs, accelerations in m/s² and rates in rad/s, forward, right and down each; more follows."""
+_SCALED: Final = Format("<I6h")
+"""Time in ms, accelerations in thousandths of gravity and rates in mrad/s."""
+
+OnSample = Callable[[MotionSample], None]
+
+
+class _Imu(Struct):
+    rate_rps: tuple[float, float, float]
+    force_mps2: tuple[float, float, float]
+    t_s: float | None = None
+
+
+class _Wheels(Struct):
+    speed_mps: float
+    rate_rps: float
+    t_s: float | None = None
+
+
+class _Line(Struct):
+    imu: _Imu | None = None
+    wheels: _Wheels | None = None
+
+
+class MotionFeed:
+    """Receives the samples of one vehicle."""
+
+    def __init__(self, address: str, on_sample: OnSample, clock: Callable[[], float] = time.monotonic) -> None:
+        """``address``: jsonl+tcp://HOST:PORT or mavlink+udp://HOST:PORT, with ?arm=x,y,z for the antenna's position.
+
+        ``clock``: the host's monotonic clock, as in ``host_s`` of receptions.
+
+        Raises:
+            SkylessError: the address is none of these.
+        """
+        url = TargetUrl(address)
+        if url.scheme not in {"jsonl+tcp", "mavlink+udp"}:
+            raise url.wrong("jsonl+tcp://HOST:PORT or mavlink+udp://HOST:PORT, where this computer waits for samples")
+        self._is_mavlink = url.scheme == "mavlink+udp"
+        self._host, self.port = url.host("127.0.0.1"), url.port(MAVLINK_PORT if self._is_mavlink else PORT)
+        try:
+            x, y, z = map(float, url.text_option("arm", "0,0,0").split(","))
+        except ValueError:
+            raise url.wrong("with arm=x,y,z in metres: the antenna seen from the sensor") from None
+        url.check_all_read()
+        self._arm_m, self._on_sample, self._clock = (x, y, z), on_sample, clock
+        self._frames = FrameReader(_CRC_EXTRAS)
+        self._ahead_s, self._ahead_at_s = inf, -inf
+        self.server: asyncio.Server | None = None
+        """What accepts connections, once it does."""
+        self.counters: Counter[str] = Counter()
+        """What could not be used, by reason."""
+
+    async def run(self) -> None:
+        """Receive until cancelled. Raises SkylessError if it cannot listen there."""
+        try:
+            if self._is_mavlink:
+                loop = asyncio.get_running_loop()
+                await loop.create_datagram_endpoint(lambda: _Datagrams(self.feed_mavlink), (self._host, self.port))
+                await asyncio.Event().wait()
+            self.server = await asyncio.start_server(self._serve, self._host, self.port, limit=_MAX_LINE_BYTES)
+        except (OSError, UnicodeError) as error:
+            raise SkylessError(f"--motion cannot listen on {self._host}:{self.port}: {error}") from None
+        async with self.server:
+            await self.server.serve_forever()
+
+    async def _serve(self, reader: StreamReader, writer: StreamWriter) -> None:
+        try:
+            while line := await reader.readline():
+                self.feed_line(line)
+        except (OSError, ValueError):  # it broke, or a line was too long
+            self.counters["motion-connection-ended"] += 1
+        finally:
+            writer.close()
+
+    def feed_line(self, line: bytes) -> None:
+        """Process a line of JSON."""
+        try:
+            found = msgspec.json.decode(line, type=_Line)
+        except (msgspec.MsgspecError, ValueError, RecursionError):
+            self.counters["motion-malformed"] += 1
+            return
+        if (imu := found.imu) is not None:
+            self._pass(MotionSample(self._host_s(imu.t_s), imu.rate_rps, imu.force_mps2, arm_m=self._arm_m))
+        if (wheels := found.wheels) is not None:
+            turning = 0.0, 0.0, wheels.rate_rps
+            self._pass(MotionSample(self._host_s(wheels.t_s), turning, None, wheels.speed_mps, self._arm_m))
+
+    def feed_mavlink(self, data: bytes) -> None:
+        """Process a datagram of frames."""
+        for frame in self._frames.frames(data):
+            self._take(frame)
+
+    def _take(self, frame: Frame) -> None:
+        layout = _HIGHRES if frame.number == _HIGHRES_IMU else _SCALED
+        when, *values = layout.unpack(frame.payload.ljust(layout.size, b"\0")[: layout.size])
+        time_s, force, rate = when * 1e-6, 1.0, 1.0
+        if layout is _SCALED:
+            time_s, force, rate = when * 1e-3, 1e-3 * GRAVITY_MPS2, 1e-3
+        x, y, z, p, q, r = values
+        now_s = self._clock()
+        if abs(now_s - time_s - self._ahead_s) < _SET_S:
+            self._ahead_s = min(now_s - time_s, self._ahead_s + _DRIFT * (now_s - self._ahead_at_s))
+        else:
+            self._ahead_s = now_s - time_s
+        self._ahead_at_s = now_s
+        turning, pushed = (rate * p, -rate * q, -rate * r), (force * x, -force * y, -force * z)
+        self._pass(MotionSample(time_s + self._ahead_s, turning, pushed, arm_m=self._arm_m))
+
+    def _host_s(self, unix_s: float | None) -> float:
+        """A time on the host's clock; without one the present."""
+        return self._clock() if unix_s is None else unix_s - time.time() + self._clock()
+
+    def _pass(self, sample: MotionSample) -> None:
+        """Pass on a sample if all its numbers are finite."""
+        try:
+            sample.check()
+        except ValueError:
+            self.counters["motion-not-finite"] += 1
+            return
+        self._on_sample(sample)
+
+
+class _Datagrams(asyncio.DatagramProtocol):
+    def __init__(self, on_data: Callable[[bytes], None]) -> None:
+        self._on_data = on_data
+
+    def datagram_received(self, data: bytes, _address: object) -> None:
+        """Pass on a datagram."""
+        self._on_data(data)

@@ -1,0 +1,54 @@
+"""What a tag's motion sensor or wheels show, and when by the tag's own counter."""
+
+from math import inf, isfinite
+from typing import Final
+
+from msgspec import Struct
+
+from skyless.core.ticks import MAX_DRIFT, TICK_RATE_HZ, Unwrapper
+
+_SET_S: Final = 1.0
+"""A larger change between the two clocks means that one of them was set [s]."""
+
+
+class MotionSample(Struct, frozen=True, gc=False):
+    """What a motion sensor shows at an instant, in its own frame: x forward, y to the left, z up."""
+
+    time_s: float
+    """Time of the sample, by the clock of the receptions' ``host_s``."""
+    rate_rps: tuple[float, float, float]
+    """Angular rate; of wheels (0, 0, rate)."""
+    force_mps2: tuple[float, float, float] | None = None
+    """Specific force: 9.8 m/s² along z at rest. None without an accelerometer."""
+    speed_mps: float | None = None
+    """Speed along x that wheels show; None without."""
+
+    arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Position of the antenna seen from the sensor."""
+
+    def check(self) -> None:
+        """See that all numbers are finite. Raises ValueError."""
+        if not all(
+            map(isfinite, (self.time_s, *self.rate_rps, *(self.force_mps2 or ()), self.speed_mps or 0.0, *self.arm_m))
+        ):
+            raise ValueError(f"{self} should have finite numbers only")
+
+
+class SampleClock:
+    """Converts times of the host to ticks of the tag's counter.
+
+    Hosts take stamps of receptions late, by varying times. Of recent latencies the shortest is right, but for drift.
+    """
+
+    def __init__(self) -> None:
+        self._host_s, self._ahead = -inf, -inf
+
+    def ticks(self, own: Unwrapper, time_s: float) -> int | None:
+        """The tag time of a host time, by the newest reception in ``own``; None if that has no host time."""
+        if not isfinite(own.last_host_s):
+            return None
+        ahead, elapsed_s = own.last_ticks - own.last_host_s * TICK_RATE_HZ, own.last_host_s - self._host_s
+        if 0.0 <= elapsed_s < inf and abs(ahead - self._ahead) < _SET_S * TICK_RATE_HZ:
+            ahead = max(ahead, self._ahead - 2.0 * MAX_DRIFT * elapsed_s * TICK_RATE_HZ)
+        self._host_s, self._ahead = own.last_host_s, ahead
+        return round(time_s * TICK_RATE_HZ + ahead)
