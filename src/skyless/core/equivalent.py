@@ -1,0 +1,47 @@
+"""The equivalent measurement: what a filter has learned since an earlier estimate, with errors of its own.
+
+A filter's positions share their past, so that no other filter must take each of them as new. If the earlier one is
+predicted to now, x₀ with P₀, and x₁ with P₁ is the position now, then what was measured in between is worth one
+measurement of covariance R = (P₁⁻¹ − P₀⁻¹)⁻¹ at R (P₁⁻¹ x₁ − P₀⁻¹ x₀) (Drummond, Proc. SPIE 3163, 1997: tracklets).
+"""
+
+from math import sqrt
+from typing import Final
+
+import numpy as np
+
+from skyless.core.arrays import Array
+
+CORRELATION: Final = sqrt(0.5)
+"""Of the errors of position and velocity in the steady state of a filter for constant velocity, whose variances are
+√2 q^¼ r^¾ and √2 q^¾ r^¼, and whose covariance is √(q r), with noise q of the acceleration and r of the position."""
+
+LEAST_NEW: Final = 0.05
+"""Smallest part of a variance whose loss counts as information: less may come from changed process noise."""
+
+
+def predicted(position_m: Array, spread_m2: Array, velocity_mps: Array, spread: Array, s: float) -> tuple[Array, Array]:
+    """The position ``s`` seconds later, shape (n,), and its covariance, (n, n), less the process noise.
+
+    The covariance with the velocity is that of the steady state along each principal axis of the position's.
+    """
+    variances_m2, axes = np.linalg.eigh(spread_m2)
+    both = CORRELATION * np.sqrt(np.maximum(variances_m2 * np.diag(axes.T @ spread @ axes), 0.0))
+    return position_m + s * velocity_mps, spread_m2 + 2.0 * s * (axes * both) @ axes.T + s**2 * spread
+
+
+def equivalent_measurement(x0_m: Array, P0_m2: Array, x1_m: Array, P1_m2: Array) -> tuple[Array, Array]:
+    """The measurement, shape (n,), that turns one estimate into the other, and its covariance, (n, n).
+
+    Where the variance has not shrunk by ``LEAST_NEW`` it is x₁ with a variance that makes it count for little.
+
+    Raises:
+        numpy.linalg.LinAlgError: P₀ is not positive definite.
+    """
+    root = np.linalg.cholesky(P0_m2)
+    kept, axes = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, P1_m2).T))
+    is_new = kept < 1.0 - LEAST_NEW
+    new = np.where(is_new, 1.0 - kept, LEAST_NEW)
+    change, directions = axes.T @ np.linalg.solve(root, x1_m - x0_m), root @ axes
+    spread_m2 = (directions * np.where(is_new, kept, 1.0) / new) @ directions.T
+    return x0_m + directions @ np.where(is_new, change / new, change), spread_m2
