@@ -10,11 +10,11 @@ import msgspec
 from msgspec import Struct
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl, floored, require_georeference
-from skyless.bridges.vehicle import PARAMETERS, Following, NewInformation, north_east_down
+from skyless.bridges.vehicle import PARAMETERS, Following, NewInformation, known_velocity, north_east_down
 from skyless.core.earth import geodetic, horizontal_ellipse, rotated
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
-from skyless.run.mqtt.messages import FixMessage, Matrix, Vector
+from skyless.run.mqtt.messages import FixMessage, Matrix
 
 # MAVLink: frames in bytes, and the few messages of its common set that are sent or read here.
 #
@@ -198,13 +198,6 @@ class Timesync(Struct, frozen=True):
     asked_ns: int
 
 
-class VehicleState(Struct, frozen=True):
-    """A message of ``_STATES``."""
-
-    number: int
-    values: tuple[float, ...]
-
-
 class VisionPositionEstimate(Struct, frozen=True):
     """VISION_POSITION_ESTIMATE: m and rad; covariance of x, y, z, roll, pitch, yaw as the upper triangle by rows."""
 
@@ -309,12 +302,12 @@ def encoded(message: Message, *, sequence: int, system: int, component: int) -> 
     return frame(layout.number, layout.crc_extra, payload, sequence=sequence, system=system, component=component)
 
 
-def decoded(received: Frame) -> Heartbeat | Timesync | GpsGlobalOrigin | VehicleState:
+def decoded(received: Frame) -> Heartbeat | Timesync | GpsGlobalOrigin | tuple[float, ...]:
     """Decode a frame whose number is in ``CRC_EXTRAS``; missing fields at its end are 0."""
     kind = _READ_BY_NUMBER.get(received.number)
     fields = _STATES[received.number][1] if kind is None else _LAYOUTS[kind].fields
     values = fields.unpack(received.payload.ljust(fields.size, b"\0")[: fields.size])
-    return VehicleState(received.number, values) if kind is None else kind(*values)
+    return values if kind is None else kind(*values)
 
 
 # What an autopilot gets of a fix, by profile: ``ardupilot``, ``px4`` or ``gps``.
@@ -401,7 +394,7 @@ def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None 
     covariance_m2 = _covariance_ned(fix.covariance_m2, origin.heading_deg)
     hdop, vdop = _dilution(fix.hdop), _dilution(fix.vdop)
     ignore = (IGNORE_HDOP if hdop == 0.0 else 0) | (IGNORE_VDOP if vdop == 0.0 else 0)
-    moving = _velocity(fix)
+    moving = known_velocity(fix)
     velocity, speed_std = (0.0, 0.0, 0.0), 0.0
     if moving is None:
         ignore |= _IGNORE_VELOCITY
@@ -464,14 +457,6 @@ def gps_time(unix_s: float) -> tuple[int, int]:
 def _dilution(value: float | None) -> float:
     """Dilution of precision as a GPS receiver states it; 0 if unknown."""
     return value if value is not None and isfinite(value) else 0.0
-
-
-def _velocity(fix: FixMessage) -> tuple[Vector, Matrix] | None:
-    """Velocity and its covariance, if both are known."""
-    velocity, covariance = fix.velocity_mps, fix.velocity_covariance
-    if velocity is None or covariance is None or not all(map(isfinite, (*velocity, *covariance))):
-        return None
-    return velocity, covariance
 
 
 def _covariance_ned(covariance_m2: Matrix, heading_deg: float) -> Matrix:
@@ -551,15 +536,8 @@ class MavlinkEncoder(Encoder):
         """Seconds since the vehicle's last message."""
         self._vehicle_origin: GpsGlobalOrigin | None = None
         """As stated by the vehicle."""
-        self._begin_again()
+        self._new, self._following = NewInformation(), Following(PARAMETERS[profile])
         self.dropped = Counter()
-
-    def _begin_again(self) -> None:
-        """Forget what was handed over: it was in another frame."""
-        self._new = NewInformation()
-        self._following = Following(PARAMETERS[self._profile])
-        self._subjects = "", ""
-        """Of the newest verdict about the vehicle, and of the one logged last."""
 
     def on_site(self, site: BridgedSite) -> list[bytes]:
         """Raises SkylessError if profile ``gps`` lacks a georeference, or ``heading`` is given beside one."""
@@ -573,7 +551,7 @@ class MavlinkEncoder(Encoder):
         if self._site is not None and _has_moved(self._site, site):
             self._reset_counter += 1
             self._vehicle_origin = None
-            self._begin_again()
+            self._new, self._following = NewInformation(), Following(PARAMETERS[self._profile])
         self._site = site
         given = self._given_heading_deg or 0.0
         self._heading_deg = given if site.georeference is None else site.georeference.heading_deg
@@ -609,12 +587,8 @@ class MavlinkEncoder(Encoder):
         self._silent_s += 1
         if self._silent_s >= _GONE_S:
             self._vehicle_origin = None
-        elif verdict := self._following.verdict(unix_s, self._heading_deg):
-            (subject, words), (newest, logged) = verdict, self._subjects
-            if subject == newest != logged:  # twice in a row
-                self._log(f"{self._text}: {words}")
-                logged = subject
-            self._subjects = subject, logged
+        elif words := self._following.verdict(unix_s, self._heading_deg):
+            self._log(f"{self._text}: {words}")
         messages: list[Message] = [Heartbeat()]
         origin = self._origin(unix_s)
         if origin is not None and self._vehicle_origin is None and not self._armed:
@@ -635,24 +609,24 @@ class MavlinkEncoder(Encoder):
             elif isinstance(message, GpsGlobalOrigin):
                 self._vehicle_origin = message
                 self._compare_origin(message, unix_ns)
-            elif isinstance(message, VehicleState):
-                self._on_state(message, unix_ns * 1e-9)
+            elif isinstance(message, tuple):
+                self._on_state(frame.number, message, unix_ns * 1e-9)
             elif message.answered_ns == 0:
                 answers.append(Timesync(answered_ns=unix_ns, asked_ns=message.asked_ns))
         if self._reader.damaged > damaged:
             self.dropped["mavlink-check"] += self._reader.damaged - damaged
         return self._frames(answers)
 
-    def _on_state(self, state: VehicleState, unix_s: float) -> None:
-        """Process what the vehicle says of itself."""
-        following, values = self._following, state.values
+    def _on_state(self, number: int, values: tuple[float, ...], unix_s: float) -> None:
+        """Process what the vehicle says of itself, a message of ``_STATES``."""
+        following = self._following
         if not all(abs(value) < _NONSENSE for value in values if isinstance(value, float)):
             self.dropped["mavlink-nonsense"] += 1
-        elif state.number == _ATTITUDE:
+        elif number == _ATTITUDE:
             following.attitude_rad = values
-        elif state.number == _ESTIMATOR_STATUS:
+        elif number == _ESTIMATOR_STATUS:
             following.is_used = bool(int(values[0]) & _KNOWS_PLACE)
-        elif state.number == _HIGHRES_IMU:
+        elif number == _HIGHRES_IMU:
             following.on_motion(unix_s, values[0] * 1e-6, values[1:])
         elif values[3:] in ((), (LOCAL_NED,)):
             following.on_position(unix_s, values[:3])

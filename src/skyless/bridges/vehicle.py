@@ -2,7 +2,8 @@
 
 from cmath import phase
 from collections import deque
-from math import degrees, exp, inf, isnan, nan, sqrt
+from contextlib import suppress
+from math import degrees, exp, inf, isfinite, isnan, nan, sqrt
 from typing import Final
 
 import numpy as np
@@ -11,7 +12,7 @@ from msgspec.structs import replace
 from skyless.core.arrays import Array
 from skyless.core.earth import east_north_up
 from skyless.core.equivalent import equivalent_measurement, predicted
-from skyless.run.mqtt.messages import FixMessage, Vector
+from skyless.run.mqtt.messages import FixMessage, Matrix, Vector
 
 
 def north_east_down(vector: Vector, heading_deg: float) -> Vector:
@@ -20,14 +21,19 @@ def north_east_down(vector: Vector, heading_deg: float) -> Vector:
     return north, east, -up
 
 
+def known_velocity(fix: FixMessage) -> tuple[Vector, Matrix] | None:
+    """Velocity and its covariance, if both are known."""
+    velocity, covariance = fix.velocity_mps, fix.velocity_covariance
+    if velocity is None or covariance is None or not all(map(isfinite, (*velocity, *covariance))):
+        return None
+    return velocity, covariance
+
+
 # What it is given
 
-OUTAGE_S: Final = 1.5
-"""After a longer silence there is no prior, and the vehicle has dead-reckoned …"""
-DRIFT_MPS2: Final = 0.2
-"""… by up to this · t², 13 m after 8 s; generous, as that only slows its return …"""
-RETURN_S: Final = 0.33
-"""… in which that variance fades with this time constant: each of 30 messages a second moves it by a tenth."""
+OUTAGE_S, DRIFT_MPS2, RETURN_S = 1.5, 0.2, 0.33
+"""After a longer silence t a vehicle has drifted by up to DRIFT · t², 13 m after 8 s: generous, as that variance only
+slows its return. It fades with RETURN_S as time constant, so that each of 30 messages a second moves it by a tenth."""
 
 
 class NewInformation:
@@ -45,34 +51,21 @@ class NewInformation:
         After an outage it is wide for a second, so that the vehicle returns without a jump.
         """
         before, self._before = self._before, fix
+        position_m, covariance_m2 = np.array(fix.position_m), np.array(fix.covariance_m2).reshape(3, 3)
         if before is not None and before.serial < fix.serial:
             elapsed_s = fix.unix_s - before.unix_s
             if elapsed_s > OUTAGE_S:
                 self._drift_m, self._back_s = DRIFT_MPS2 * min(elapsed_s, 60.0) ** 2, fix.unix_s
-            elif elapsed_s > 0.0:
-                fix = _new(before, fix, elapsed_s)
-        wide_m2 = self._drift_m**2 * exp(-max(fix.unix_s - self._back_s, 0.0) / RETURN_S)
-        xx, xy, xz, yx, yy, yz, zx, zy, zz = fix.covariance_m2
-        return replace(fix, covariance_m2=(xx + wide_m2, xy, xz, yx, yy + wide_m2, yz, zx, zy, zz + wide_m2))
-
-
-def _new(before: FixMessage, fix: FixMessage, elapsed_s: float) -> FixMessage:
-    """What a fix has that the one before it had not; methods without a velocity filter nothing, and all is new."""
-    dim = 2 if fix.height_known else 3
-    moving = before.velocity_mps, before.velocity_covariance
-    if moving[0] is None or moving[1] is None:
-        return fix
-    vectors_m = [np.array(one)[:dim] for one in (before.position_m, fix.position_m, moving[0])]
-    spreads = [np.array(one).reshape(3, 3)[:dim, :dim] for one in (before.covariance_m2, fix.covariance_m2, moving[1])]
-    try:
-        prior = predicted(vectors_m[0], spreads[0], vectors_m[2], spreads[2], elapsed_s)
-        measured_m, new_m2 = equivalent_measurement(*prior, vectors_m[1], spreads[1])
-    except np.linalg.LinAlgError:
-        return fix  # it states no covariance
-    covariance_m2 = np.array(fix.covariance_m2).reshape(3, 3)
-    covariance_m2[:dim, :dim] += new_m2
-    position_m = np.append(measured_m, fix.position_m[dim:])
-    return replace(fix, position_m=tuple(position_m.tolist()), covariance_m2=tuple(covariance_m2.ravel().tolist()))
+            elif elapsed_s > 0.0 and (moving := known_velocity(before)) is not None:
+                at = slice(2 if fix.height_known else 3)
+                states = np.array([before.position_m, moving[0]])
+                spreads = np.reshape([before.covariance_m2, moving[1]], (2, 3, 3))
+                with suppress(np.linalg.LinAlgError):  # it states no covariance
+                    x_m, P_m2 = predicted(states[:, at], spreads[:, at, at], elapsed_s)
+                    position_m[at], new_m2 = equivalent_measurement(x_m, P_m2, position_m[at], covariance_m2[at, at])
+                    covariance_m2[at, at] += new_m2
+        covariance_m2 += np.eye(3) * self._drift_m**2 * exp(-max(fix.unix_s - self._back_s, 0.0) / RETURN_S)
+        return replace(fix, position_m=tuple(position_m.tolist()), covariance_m2=tuple(covariance_m2.ravel().tolist()))
 
 
 # Whether it follows
@@ -87,20 +80,15 @@ PARAMETERS: Final = {
 }
 """Of each profile's vehicles: so that they state their position, use ours, have its height, know its delay."""
 
-WINDOW_S: Final = 20.0
-"""What the vehicle says is compared over this time."""
-GAP_S: Final = 0.2
-"""Longest time between two samples of an inertial sensor, and between a fix and a position compared with it."""
+WINDOW_S, GAP_S, ROWS = 20.0, 0.2, 20_000
+"""How long, and how many of the vehicle's messages are compared; longest step between two of them, or to a fix."""
 APART_M, HEIGHT_M, LATE_S, MOVING_MPS = 1.0, 0.5, 0.15, 0.3
 """A vehicle that is farther from the fixes, horizontally or vertically, has its position from elsewhere; one that is
 farther behind takes them for newer than they are, which is seen from this speed on."""
-NORTH_DEG: Final = 5.0
-"""Norths agree within this: the anchors' lasting errors turned recorded flights by up to 4°."""
-LEAST_TRAVEL_M, DEGREE = 0.2, 5
-"""Standard deviation of the motion that tells directions from those errors, beside a polynomial of this degree: what an
-unknown start, a wrong level and biases of the vehicle's sensors do to its path."""
-KEPT: Final = 0.95
-"""Weight of a window that is a second older."""
+NORTH_DEG, LEAST_TRAVEL_M, DEGREE, KEPT = 5.0, 0.2, 5, 0.95
+"""Norths agree within this: the anchors' lasting errors turned recorded flights by up to 4°. Least deviation of the
+motion from a polynomial of this degree, which is what an unknown start, a wrong level and biases of the vehicle's
+sensors do to its path. Weight of a window that is a second older."""
 
 
 def rotations(vectors_rad: Array) -> Array:
@@ -111,11 +99,13 @@ def rotations(vectors_rad: Array) -> Array:
     return turns
 
 
-def inertial_path(motion: Array) -> tuple[Array, Array]:
-    """Times in s, shape (n − 1,), and the vehicle's path, north + i·east in m, but for start and speed.
+def north_sums(given: Array, motion: Array) -> tuple[complex, float]:
+    """Two sums: the first over the second turns a vehicle's inertial path into given positions; zeros without motion.
 
-    ``motion``, shape (n, 11): time of arrival and of sending, specific force in m/s² and rate in rad/s along forward,
-    right, down; roll, pitch, yaw. Only the first attitude is used, as later ones depend on the positions given.
+    ``given``, shape (n, 4): time in s, north and east in m, standard deviation. ``motion``, shape (m, 11): time of
+    arrival and of sending, specific force in m/s² and rate in rad/s along forward, right, down; roll, pitch, yaw.
+    The angle of the turn is by how much the site's azimuths are larger than the vehicle's. Only the first attitude is
+    used, as later ones depend on the positions given. Both paths are taken beside a polynomial.
     """
     time_s = motion[:, 1] + (motion[:, 0] - motion[:, 1]).min()  # the quickest message has the least delay
     step_s = np.diff(time_s)
@@ -124,20 +114,11 @@ def inertial_path(motion: Array) -> tuple[Array, Array]:
     for turn in rotations(motion[:-1, 5:8] * step_s[:, None]):
         attitudes.append(attitudes[-1] @ turn)
     force_mps2 = np.einsum("nij,nj->in", attitudes[:-1], motion[:-1, 2:5])
-    speed_mps = np.cumsum((force_mps2[0] + 1j * force_mps2[1]) * step_s)
-    return time_s[1:], np.cumsum(speed_mps * step_s)
-
-
-def north_sums(given: Array, time_s: Array, path_m: Array) -> tuple[complex, float]:
-    """Two sums: the first over the second turns an inertial path into given positions. Zeros if there is no motion.
-
-    ``given``, shape (n, 4): time in s, north and east in m, standard deviation. The angle of the turn is by how much
-    the site's azimuths are larger than the vehicle's. Both paths are taken beside a polynomial.
-    """
-    at_s, north_m, east_m, std_m = given[(given[:, 0] >= time_s[0]) & (given[:, 0] <= time_s[-1])].T
+    path_m = np.cumsum(np.cumsum((force_mps2[0] + 1j * force_mps2[1]) * step_s) * step_s)
+    at_s, north_m, east_m, std_m = given[(given[:, 0] >= time_s[1]) & (given[:, 0] <= time_s[-1])].T
     if len(at_s) > 2 * DEGREE:
         basis, _ = np.linalg.qr(np.vander((at_s - at_s[0]) / WINDOW_S, DEGREE + 1) / std_m[:, None])
-        both = np.array([north_m + 1j * east_m, np.interp(at_s, time_s, path_m)]) / std_m
+        both = np.array([north_m + 1j * east_m, np.interp(at_s, time_s[1:], path_m)]) / std_m
         measured, travelled = both - (both @ basis) @ basis.T
         if (power := float(np.vdot(travelled, travelled).real)) > LEAST_TRAVEL_M**2 * np.sum(std_m**-2.0):
             return complex(np.vdot(travelled, measured)), power
@@ -153,17 +134,18 @@ class Following:
         """The vehicle's newest roll, pitch and yaw."""
         self.is_used = True
         """Whether the vehicle says that it knows its horizontal position."""
+        self._subjects = "", ""
+        """Of the newest verdict, and of the one that was said last."""
         self._begin_s, self._turn, self._power = inf, 0j, 0.0
-        """When it was given the first position; of ``north_sums``, with earlier windows."""
         self._fix: tuple[float, Vector, Vector] = (-inf, _NONE, _NONE)
         """The newest fix: time, position and velocity."""
-        self._given, self._motion, self._apart = deque[_Row](), deque[_Row](), deque[_Row]()
-        """What ``north_sums`` and ``inertial_path`` take; time, the vehicle's position less the fix, north and east
-        velocity of the fix."""
+        self._given, self._motion, self._apart = (deque[_Row](maxlen=ROWS) for _ in range(3))
+        """Rows of ``north_sums``, and of time, the vehicle's position less the fix, and its north and east velocity."""
 
     def on_given(self, given: FixMessage, fix: FixMessage, heading_deg: float) -> None:
         """The vehicle was given what is new in a fix."""
         at, velocity = (north_east_down(one, heading_deg) for one in (fix.position_m, fix.velocity_mps or _NONE))
+        at = (*at[:2], nan) if fix.height_known else at
         self._begin_s, self._fix = min(self._begin_s, fix.unix_s), (fix.unix_s, at, velocity)
         std_m = sqrt(max(0.5 * (given.covariance_m2[0] + given.covariance_m2[4]), 1e-4))
         self._given.append((fix.unix_s, *north_east_down(given.position_m, heading_deg)[:2], std_m))
@@ -182,22 +164,30 @@ class Following:
         if self.attitude_rad:
             self._motion.append((time_s, sent_s, *sample, *self.attitude_rad))
 
-    def verdict(self, now_s: float, heading_deg: float) -> tuple[str, str] | None:
-        """Once a second: its subject and its words; None while there is nothing to compare."""
+    def verdict(self, now_s: float, heading_deg: float) -> str | None:
+        """What there is to say, once a second; None if it is what was said last, or not yet sure."""
         for rows in (self._given, self._motion, self._apart):
             while rows and now_s - rows[0][0] > WINDOW_S:
                 rows.popleft()
-        states, use, height, delay = self._parameters
         if now_s - self._fix[0] > 1.0 or now_s - self._begin_s < 0.5 * WINDOW_S:
             return None
+        subject, words = self._found(heading_deg)
+        newest, said = self._subjects
+        is_sure = subject == newest != said  # twice in a row
+        self._subjects = subject, subject if is_sure else said
+        return words if is_sure else None
+
+    def _found(self, heading_deg: float) -> tuple[str, str]:
+        """What is wrong, or that nothing is: its subject and its words."""
+        states, use, height, delay = self._parameters
         if not self._apart:
             return "silent", f"the vehicle does not send LOCAL_POSITION_NED: set {states}"
         _, north, east, down, north_mps, east_mps = np.array(self._apart).T
         apart_m, height_m = sqrt(np.mean(north**2 + east**2)), abs(float(np.mean(down)))
-        square = float(np.mean(north_mps**2 + east_mps**2))
-        late_s = -float(np.mean(north * north_mps + east * east_mps)) / max(square, MOVING_MPS**2)
-        off_deg = self._north_deg()
+        square = max(float(np.mean(north_mps**2 + east_mps**2)), MOVING_MPS**2)
+        late_s, off_deg = -float(np.mean(north * north_mps + east * east_mps)) / square, self._north_deg()
         follows = f"the vehicle follows, {100.0 * apart_m:.0f} cm; north"
+        right_deg = (heading_deg - off_deg) % 360.0
         for subject, applies, words in (
             ("use", not self.is_used or apart_m > APART_M, f"the vehicle is {apart_m:.1f} m off: set {use}"),
             ("height", height_m > HEIGHT_M, f"the vehicle's height is {height_m:.1f} m off: set {height}"),
@@ -207,14 +197,12 @@ class Following:
         ):
             if applies:
                 return subject, words
-        return "north", (
-            f"north is {abs(off_deg):.0f}° off; if the vehicle's compass is right, set the site's heading_deg "
-            f"(or heading= of this target) to {(heading_deg - off_deg) % 360.0:.0f}"
-        )
+        what = "if the vehicle's compass is right, set the site's heading_deg (or heading= of this target)"
+        return "north", f"north is {abs(off_deg):.0f}° off; {what} to {right_deg:.0f}"
 
     def _north_deg(self) -> float:
         """By how much the site's azimuths are larger than the vehicle's; NaN until it is seen."""
-        if len(self._given) > 1 and self._motion and self._motion[-1][0] - self._motion[0][0] > WINDOW_S - 1.0:
-            turn, power = north_sums(np.array(self._given), *inertial_path(np.array(self._motion)))
+        if len(self._given) > 1 and self._motion and self._motion[-1][0] - self._motion[0][0] > WINDOW_S - 2.0:
+            turn, power = north_sums(np.array(self._given), np.array(self._motion))
             self._turn, self._power = KEPT * self._turn + turn, KEPT * self._power + power
         return degrees(phase(self._turn)) if self._power else nan

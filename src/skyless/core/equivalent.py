@@ -20,14 +20,16 @@ LEAST_NEW: Final = 0.05
 """Smallest part of a variance whose loss counts as information: less may come from changed process noise."""
 
 
-def predicted(position_m: Array, spread_m2: Array, velocity_mps: Array, spread: Array, s: float) -> tuple[Array, Array]:
-    """The position ``s`` seconds later, shape (n,), and its covariance, (n, n), less the process noise.
+def predicted(states: Array, spreads: Array, elapsed_s: float) -> tuple[Array, Array]:
+    """The position later, shape (n,), and its covariance, (n, n), less the process noise; SI units.
 
-    The covariance with the velocity is that of the steady state along each principal axis of the position's.
+    ``states``: position and velocity, shape (2, n); ``spreads``: the covariance of each, (2, n, n). That of both is
+    the steady state's along each principal axis of the position.
     """
-    variances_m2, axes = np.linalg.eigh(spread_m2)
-    both = CORRELATION * np.sqrt(np.maximum(variances_m2 * np.diag(axes.T @ spread @ axes), 0.0))
-    return position_m + s * velocity_mps, spread_m2 + 2.0 * s * (axes * both) @ axes.T + s**2 * spread
+    variances, axes = np.linalg.eigh(spreads[0])
+    both = CORRELATION * np.sqrt(np.maximum(variances * np.diag(axes.T @ spreads[1] @ axes), 0.0))
+    spread_m2: Array = spreads[0] + 2.0 * elapsed_s * (axes * both) @ axes.T + elapsed_s**2 * spreads[1]
+    return states[0] + elapsed_s * states[1], spread_m2
 
 
 def equivalent_measurement(x0_m: Array, P0_m2: Array, x1_m: Array, P1_m2: Array) -> tuple[Array, Array]:
