@@ -31,9 +31,9 @@ def known_velocity(fix: FixMessage) -> tuple[Vector, Matrix] | None:
 
 # What it is given
 
-OUTAGE_S, DRIFT_MPS2, RETURN_S = 1.5, 0.2, 0.33
-"""After a longer silence t a vehicle has drifted by up to DRIFT · t², 13 m after 8 s: generous, as that variance only
-slows its return. It fades with RETURN_S as time constant, so that each of 30 messages a second moves it by a tenth."""
+OUTAGE_S, DRIFT_MPS2, RETURN_S = 1.5, 0.3, 0.33
+"""After a longer silence t, messages are stated as worse by DRIFT · t², some times what a vehicle drifts by, and that
+fades with RETURN: none moves the vehicle by more than a tenth of its drift."""
 
 
 class NewInformation:
