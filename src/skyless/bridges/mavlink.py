@@ -364,10 +364,7 @@ def vision_position_estimate(fix: FixMessage, heading_deg: float, reset_counter:
 
 
 def odometry(fix: FixMessage, heading_deg: float, reset_counter: int) -> Odometry:
-    """For PX4: attitude, rates and velocity are NaN; a given height has a wide variance.
-
-    The velocity of a filter is made of the positions before, and would count them again.
-    """
+    """For PX4: a given height has a wide variance; all else is NaN, as a filter's velocity counts positions again."""
     covariance_m2 = _covariance_ned(fix.covariance_m2, heading_deg)
     if fix.height_known:
         nn, ne, _, en, ee, _, _, _, _ = covariance_m2
@@ -489,11 +486,8 @@ _NEAR_1E7: Final = 10
 
 _NEAR_MM: Final = 100
 
-_KNOWS_PLACE: Final = 8 | 16
-"""ESTIMATOR_STATUS_FLAGS: horizontal position, relative or absolute."""
-
-_NONSENSE: Final = 1e6
-"""No value that a vehicle states is larger, in SI units."""
+_KNOWS_PLACE, _NONSENSE = 8 | 16, 1e6
+"""ESTIMATOR_STATUS_FLAGS: horizontal position, relative or absolute. No value of a vehicle is larger, in SI units."""
 
 
 class MavlinkEncoder(Encoder):

@@ -1,9 +1,8 @@
 """What a vehicle's estimator is given of fixes, and whether it follows them; without I/O and without MAVLink."""
 
-from cmath import phase
 from collections import deque
 from contextlib import suppress
-from math import degrees, exp, inf, isfinite, isnan, nan, sqrt
+from math import exp, inf, isfinite, isnan, nan, sqrt
 from typing import Final
 
 import numpy as np
@@ -41,8 +40,7 @@ class NewInformation:
 
     def __init__(self) -> None:
         self._before: FixMessage | None = None
-        self._drift_m, self._back_s = 0.0, -inf
-        """After the last outage, which ended at ``_back_s``, as ``unix_s``."""
+        self._drift_m, self._back_s = 0.0, -inf  # of the last outage, and when it ended
 
     def of(self, fix: FixMessage) -> FixMessage:
         """The fix with what is new since the previous one as its position, and that position's covariance.
@@ -95,17 +93,15 @@ def rotations(vectors_rad: Array) -> Array:
     """Rotations about vectors by their length (Rodrigues): shape (n, 3) to (n, 3, 3)."""
     half = np.linalg.norm(vectors_rad, axis=1)[:, None, None] / (2.0 * np.pi)
     cross: Array = np.cross(vectors_rad[:, None], -np.eye(3))
-    turns: Array = np.eye(3) + np.sinc(2.0 * half) * cross + 0.5 * np.sinc(half) ** 2 * cross @ cross
-    return turns
+    return np.asarray(np.eye(3) + np.sinc(2.0 * half) * cross + 0.5 * np.sinc(half) ** 2 * cross @ cross)
 
 
 def north_sums(given: Array, motion: Array) -> tuple[complex, float]:
     """Two sums: the first over the second turns a vehicle's inertial path into given positions; zeros without motion.
 
-    ``given``, shape (n, 4): time in s, north and east in m, standard deviation. ``motion``, shape (m, 11): time of
-    arrival and of sending, specific force in m/s² and rate in rad/s along forward, right, down; roll, pitch, yaw.
-    The angle of the turn is by how much the site's azimuths are larger than the vehicle's. Only the first attitude is
-    used, as later ones depend on the positions given. Both paths are taken beside a polynomial.
+    The angle is by how much the site's azimuths are larger. ``given``, shape (n, 4): time in s, north and east in m,
+    standard deviation. ``motion``, shape (m, 11): time of arrival and of sending, specific force in m/s² and rate in
+    rad/s along forward, right, down; roll, pitch, yaw, of which only the first count: later ones hold the positions.
     """
     time_s = motion[:, 1] + (motion[:, 0] - motion[:, 1]).min()  # the quickest message has the least delay
     step_s = np.diff(time_s)
@@ -130,15 +126,11 @@ class Following:
 
     def __init__(self, parameters: tuple[str, str, str, str]) -> None:
         self._parameters = parameters
-        self.attitude_rad: _Row = ()
-        """The vehicle's newest roll, pitch and yaw."""
-        self.is_used = True
-        """Whether the vehicle says that it knows its horizontal position."""
-        self._subjects = "", ""
-        """Of the newest verdict, and of the one that was said last."""
+        self.attitude_rad: _Row = ()  # the vehicle's newest roll, pitch and yaw
+        self.is_used = True  # whether the vehicle says that it knows its horizontal position
+        self._subjects = "", ""  # of the newest verdict, and of the one that was said last
         self._begin_s, self._turn, self._power = inf, 0j, 0.0
-        self._fix: tuple[float, Vector, Vector] = (-inf, _NONE, _NONE)
-        """The newest fix: time, position and velocity."""
+        self._fix: tuple[float, Vector, Vector] = (-inf, _NONE, _NONE)  # newest: time, position and velocity
         self._given, self._motion, self._apart = (deque[_Row](maxlen=ROWS) for _ in range(3))
         """Rows of ``north_sums``, and of time, the vehicle's position less the fix, and its north and east velocity."""
 
@@ -165,14 +157,13 @@ class Following:
             self._motion.append((time_s, sent_s, *sample, *self.attitude_rad))
 
     def verdict(self, now_s: float, heading_deg: float) -> str | None:
-        """What there is to say, once a second; None if it is what was said last, or not yet sure."""
+        """What there is to say, called once a second; None if it was said last, or is not yet sure."""
         for rows in (self._given, self._motion, self._apart):
             while rows and now_s - rows[0][0] > WINDOW_S:
                 rows.popleft()
         if now_s - self._fix[0] > 1.0 or now_s - self._begin_s < 0.5 * WINDOW_S:
             return None
-        subject, words = self._found(heading_deg)
-        newest, said = self._subjects
+        (subject, words), (newest, said) = self._found(heading_deg), self._subjects
         is_sure = subject == newest != said  # twice in a row
         self._subjects = subject, subject if is_sure else said
         return words if is_sure else None
@@ -187,7 +178,6 @@ class Following:
         square = max(float(np.mean(north_mps**2 + east_mps**2)), MOVING_MPS**2)
         late_s, off_deg = -float(np.mean(north * north_mps + east * east_mps)) / square, self._north_deg()
         follows = f"the vehicle follows, {100.0 * apart_m:.0f} cm; north"
-        right_deg = (heading_deg - off_deg) % 360.0
         for subject, applies, words in (
             ("use", not self.is_used or apart_m > APART_M, f"the vehicle is {apart_m:.1f} m off: set {use}"),
             ("height", height_m > HEIGHT_M, f"the vehicle's height is {height_m:.1f} m off: set {height}"),
@@ -197,12 +187,12 @@ class Following:
         ):
             if applies:
                 return subject, words
-        what = "if the vehicle's compass is right, set the site's heading_deg (or heading= of this target)"
-        return "north", f"north is {abs(off_deg):.0f}° off; {what} to {right_deg:.0f}"
+        what = f"north is {abs(off_deg):.0f}° off; if the vehicle's compass is right, set the site's heading_deg"
+        return "north", f"{what} (or heading= of this target) to {(heading_deg - off_deg) % 360.0:.0f}"
 
     def _north_deg(self) -> float:
         """By how much the site's azimuths are larger than the vehicle's; NaN until it is seen."""
         if len(self._given) > 1 and self._motion and self._motion[-1][0] - self._motion[0][0] > WINDOW_S - 2.0:
             turn, power = north_sums(np.array(self._given), np.array(self._motion))
             self._turn, self._power = KEPT * self._turn + turn, KEPT * self._power + power
-        return degrees(phase(self._turn)) if self._power else nan
+        return float(np.angle(self._turn, deg=True)) if self._power else nan

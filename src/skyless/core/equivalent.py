@@ -1,8 +1,7 @@
-"""The equivalent measurement: what a filter has learned since an earlier estimate, with errors of its own.
+"""What a filter has learned since an earlier estimate, as a measurement that another filter may take as new.
 
-A filter's positions share their past, so that no other filter must take each of them as new. If the earlier one is
-predicted to now, x₀ with P₀, and x₁ with P₁ is the position now, then what was measured in between is worth one
-measurement of covariance R = (P₁⁻¹ − P₀⁻¹)⁻¹ at R (P₁⁻¹ x₁ − P₀⁻¹ x₀) (Drummond, Proc. SPIE 3163, 1997: tracklets).
+With the earlier position predicted to now, x₀ with P₀, and the one now, x₁ with P₁, what was measured in between is
+R (P₁⁻¹ x₁ − P₀⁻¹ x₀) with R = (P₁⁻¹ − P₀⁻¹)⁻¹ (equivalent measurement; Drummond, Proc. SPIE 3163, 1997).
 """
 
 from math import sqrt
@@ -27,9 +26,9 @@ def predicted(states: Array, spreads: Array, elapsed_s: float) -> tuple[Array, A
     the steady state's along each principal axis of the position.
     """
     variances, axes = np.linalg.eigh(spreads[0])
-    both = CORRELATION * np.sqrt(np.maximum(variances * np.diag(axes.T @ spreads[1] @ axes), 0.0))
-    spread_m2: Array = spreads[0] + 2.0 * elapsed_s * (axes * both) @ axes.T + elapsed_s**2 * spreads[1]
-    return states[0] + elapsed_s * states[1], spread_m2
+    both = np.sqrt(np.maximum(variances * np.diag(axes.T @ spreads[1] @ axes), 0.0))
+    both = np.asarray((axes * CORRELATION * both) @ axes.T)
+    return states[0] + elapsed_s * states[1], spreads[0] + 2.0 * elapsed_s * both + elapsed_s**2 * spreads[1]
 
 
 def equivalent_measurement(x0_m: Array, P0_m2: Array, x1_m: Array, P1_m2: Array) -> tuple[Array, Array]:
