@@ -10,7 +10,7 @@ import msgspec
 from msgspec import Struct
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl, floored, require_georeference
-from skyless.bridges.vehicle import PARAMETERS, Following, NewInformation, known_velocity, north_east_down
+from skyless.bridges.vehicle import Following, NewInformation, known_velocity, north_east_down
 from skyless.core.earth import geodetic, horizontal_ellipse, rotated
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
@@ -530,7 +530,7 @@ class MavlinkEncoder(Encoder):
         """Seconds since the vehicle's last message."""
         self._vehicle_origin: GpsGlobalOrigin | None = None
         """As stated by the vehicle."""
-        self._new, self._following = NewInformation(), Following(PARAMETERS[profile])
+        self._new, self._following = NewInformation(), Following(profile)
         self.dropped = Counter()
 
     def on_site(self, site: BridgedSite) -> list[bytes]:
@@ -545,7 +545,7 @@ class MavlinkEncoder(Encoder):
         if self._site is not None and _has_moved(self._site, site):
             self._reset_counter += 1
             self._vehicle_origin = None
-            self._new, self._following = NewInformation(), Following(PARAMETERS[self._profile])
+            self._new, self._following = NewInformation(), Following(self._profile)
         self._site = site
         given = self._given_heading_deg or 0.0
         self._heading_deg = given if site.georeference is None else site.georeference.heading_deg

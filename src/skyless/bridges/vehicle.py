@@ -28,8 +28,6 @@ def known_velocity(fix: FixMessage) -> tuple[Vector, Matrix] | None:
     return velocity, covariance
 
 
-# What it is given
-
 OUTAGE_S, DRIFT_MPS2, RETURN_S = 1.5, 0.3, 0.33
 """After a longer silence t, messages are stated as worse by DRIFT · t², some times what a vehicle drifts by, and that
 fades with RETURN: none moves the vehicle by more than a tenth of its drift."""
@@ -66,17 +64,14 @@ class NewInformation:
         return replace(fix, position_m=tuple(position_m.tolist()), covariance_m2=tuple(covariance_m2.ravel().tolist()))
 
 
-# Whether it follows
-
 _Row = tuple[float, ...]
 _NONE: Final = (0.0, 0.0, 0.0)
 
 PARAMETERS: Final = {
     "px4": ("MAV_1_MODE 2", "EKF2_EV_CTRL 3", "EKF2_HGT_REF 3", "EKF2_EV_DELAY"),
     "ardupilot": ("SR2_POSITION 10", "VISO_TYPE 1 and EK3_SRC1_POSXY 6", "EK3_SRC1_POSZ 6", "VISO_DELAY_MS"),
-    "gps": ("", "", "", ""),
 }
-"""Of each profile's vehicles: so that they state their position, use ours, have its height, know its delay."""
+"""By profile, of a vehicle that is to state its position, use ours, have its height, know its delay."""
 
 WINDOW_S, GAP_S, ROWS = 20.0, 0.2, 20_000
 """How long, and how many of the vehicle's messages are compared; longest step between two of them, or to a fix."""
@@ -124,8 +119,8 @@ def north_sums(given: Array, motion: Array) -> tuple[complex, float]:
 class Following:
     """Compares what a vehicle says of itself with what it is given; north, east, down in m; times in s since 1970."""
 
-    def __init__(self, parameters: tuple[str, str, str, str]) -> None:
-        self._parameters = parameters
+    def __init__(self, profile: str) -> None:
+        self._parameters = PARAMETERS.get(profile, ("",) * 4)
         self.attitude_rad: _Row = ()  # the vehicle's newest roll, pitch and yaw
         self.is_used = True  # whether the vehicle says that it knows its horizontal position
         self._subjects = "", ""  # of the newest verdict, and of the one that was said last

@@ -22,22 +22,20 @@ LEAST_NEW: Final = 0.05
 def predicted(states: Array, spreads: Array, elapsed_s: float) -> tuple[Array, Array]:
     """The position later, shape (n,), and its covariance, (n, n), less the process noise; SI units.
 
-    ``states``: position and velocity, shape (2, n); ``spreads``: the covariance of each, (2, n, n). That of both is
-    the steady state's along each principal axis of the position.
+    ``states``: position and velocity, shape (2, n); ``spreads``: the covariance of each, (2, n, n). The one between
+    them is the steady state's along each principal axis of the position.
     """
     variances, axes = np.linalg.eigh(spreads[0])
-    both = np.sqrt(np.maximum(variances * np.diag(axes.T @ spreads[1] @ axes), 0.0))
-    both = np.asarray((axes * CORRELATION * both) @ axes.T)
-    return states[0] + elapsed_s * states[1], spreads[0] + 2.0 * elapsed_s * both + elapsed_s**2 * spreads[1]
+    both = CORRELATION * np.sqrt(np.maximum(variances * np.diag(axes.T @ spreads[1] @ axes), 0.0))
+    grown = 2.0 * elapsed_s * np.asarray((axes * both) @ axes.T) + elapsed_s**2 * spreads[1]
+    return states[0] + elapsed_s * states[1], spreads[0] + grown
 
 
 def equivalent_measurement(x0_m: Array, P0_m2: Array, x1_m: Array, P1_m2: Array) -> tuple[Array, Array]:
     """The measurement, shape (n,), that turns one estimate into the other, and its covariance, (n, n).
 
-    Where the variance has not shrunk by ``LEAST_NEW`` it is x₁ with a variance that makes it count for little.
-
-    Raises:
-        numpy.linalg.LinAlgError: P₀ is not positive definite.
+    Where the variance has not shrunk by ``LEAST_NEW`` it is x₁ with a variance that makes it count for little. Raises
+    LinAlgError if P₀ is not positive definite.
     """
     root = np.linalg.cholesky(P0_m2)
     kept, axes = np.linalg.eigh(np.linalg.solve(root, np.linalg.solve(root, P1_m2).T))
