@@ -526,7 +526,7 @@ def states(place, flags=831):
         ((4.0, 1.0, -1.5), 831, False, "the vehicle is 2.0 m off: set EKF2_EV_CTRL 3"),
         ((2.0, 1.0, -0.8), 831, False, "height is 0.7 m off: set EKF2_HGT_REF 3"),
         ((2.0, 1.0, -0.8), 831, True, "the vehicle follows"),
-        (None, 831, False, "does not send LOCAL_POSITION_NED: set MAV_1_MODE 2"),
+        (None, 831, False, "no LOCAL_POSITION_NED, or the clocks of tag and bridge differ: set MAV_1_MODE 2"),
     ],
 )
 def test_what_a_vehicle_says_of_itself_is_judged_once(place, flags, height_known, words):

@@ -167,7 +167,7 @@ class Following:
         """What is wrong, or that nothing is: its subject and its words."""
         states, use, height, delay = self._parameters
         if not self._apart:
-            return "silent", f"the vehicle does not send LOCAL_POSITION_NED: set {states}"
+            return "silent", f"no LOCAL_POSITION_NED, or the clocks of tag and bridge differ: set {states}"
         _, north, east, down, north_mps, east_mps = np.array(self._apart).T
         apart_m, height_m = sqrt(np.mean(north**2 + east**2)), abs(float(np.mean(down)))
         square = max(float(np.mean(north_mps**2 + east_mps**2)), MOVING_MPS**2)
