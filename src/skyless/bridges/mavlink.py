@@ -487,7 +487,7 @@ _NEAR_1E7: Final = 10
 _NEAR_MM: Final = 100
 
 _KNOWS_PLACE, _NONSENSE = 8 | 16, 1e6
-"""Flags of ESTIMATOR_STATUS: horizontal position, relative or absolute. No value of a vehicle is larger, in SI units."""
+"""Flags of ESTIMATOR_STATUS: horizontal position, relative or absolute. No value that a vehicle states is larger."""
 
 
 class MavlinkEncoder(Encoder):
