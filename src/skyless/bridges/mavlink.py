@@ -10,10 +10,11 @@ import msgspec
 from msgspec import Struct
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl, floored, require_georeference
-from skyless.core.earth import east_north_up, geodetic, horizontal_ellipse, rotated
+from skyless.bridges.vehicle import Following, NewInformation, known_velocity, north_east_down
+from skyless.core.earth import geodetic, horizontal_ellipse, rotated
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
-from skyless.run.mqtt.messages import FixMessage, Matrix, Vector
+from skyless.run.mqtt.messages import FixMessage, Matrix
 
 # MAVLink: frames in bytes, and the few messages of its common set that are sent or read here.
 #
@@ -272,7 +273,18 @@ _LAYOUTS: Final[dict[type[Message], _Layout]] = {
 
 _READ: Final[tuple[type[Heartbeat | Timesync | GpsGlobalOrigin], ...]] = (Heartbeat, Timesync, GpsGlobalOrigin)
 _READ_BY_NUMBER: Final = {_LAYOUTS[kind].number: kind for kind in _READ}
-CRC_EXTRAS: Final = {_LAYOUTS[kind].number: _LAYOUTS[kind].crc_extra for kind in _READ}
+_ATTITUDE, _LOCAL_POSITION_NED, _HIGHRES_IMU, _ESTIMATOR_STATUS, _ODOMETRY = 30, 32, 105, 230, 331
+_STATES: Final = {
+    _ATTITUDE: (39, struct.Struct("<4x3f")),  # roll, pitch, yaw
+    _LOCAL_POSITION_NED: (185, struct.Struct("<4x3f")),
+    _HIGHRES_IMU: (93, struct.Struct("<Q6f")),  # time in µs, specific force, rate
+    _ESTIMATOR_STATUS: (163, struct.Struct("<40xH")),  # flags
+    _ODOMETRY: (91, struct.Struct("<8x3f208xB")),  # position, frame
+}
+"""What a vehicle says of itself: for each message CRC_EXTRA and its first fields."""
+CRC_EXTRAS: Final = {_LAYOUTS[kind].number: _LAYOUTS[kind].crc_extra for kind in _READ} | {
+    number: crc_extra for number, (crc_extra, _) in _STATES.items()
+}
 """CRC_EXTRA of the messages read here, by number."""
 
 
@@ -290,11 +302,12 @@ def encoded(message: Message, *, sequence: int, system: int, component: int) -> 
     return frame(layout.number, layout.crc_extra, payload, sequence=sequence, system=system, component=component)
 
 
-def decoded(received: Frame) -> Heartbeat | Timesync | GpsGlobalOrigin:
+def decoded(received: Frame) -> Heartbeat | Timesync | GpsGlobalOrigin | tuple[float, ...]:
     """Decode a frame whose number is in ``CRC_EXTRAS``; missing fields at its end are 0."""
-    kind = _READ_BY_NUMBER[received.number]
-    fields = _LAYOUTS[kind].fields
-    return kind(*fields.unpack(received.payload.ljust(fields.size, b"\0")[: fields.size]))
+    kind = _READ_BY_NUMBER.get(received.number)
+    fields = _STATES[received.number][1] if kind is None else _LAYOUTS[kind].fields
+    values = fields.unpack(received.payload.ljust(fields.size, b"\0")[: fields.size])
+    return values if kind is None else kind(*values)
 
 
 # What an autopilot gets of a fix, by profile: ``ardupilot``, ``px4`` or ``gps``.
@@ -314,8 +327,7 @@ WEEK_MS: Final = 604_800_000
 UNKNOWN_ANGLE_RAD2: Final = pi**2
 """Variance of an unknown angle, for ArduPilot, which does not check for NaN."""
 UNKNOWN_HEIGHT_STD_M: Final = 100.0
-UNKNOWN_CLIMB_STD_MPS: Final = 100.0
-"""Standard deviations of a height that is given (``height_known``) rather than measured, and of its change."""
+"""Standard deviation of a height that is given (``height_known``) rather than measured."""
 
 IGNORE_HDOP: Final = 2
 IGNORE_VDOP: Final = 4
@@ -342,7 +354,7 @@ def vision_position_estimate(fix: FixMessage, heading_deg: float, reset_counter:
     """
     return VisionPositionEstimate(
         time_us=micros(fix.unix_s),
-        position=_ned(fix.position_m, heading_deg),
+        position=north_east_down(fix.position_m, heading_deg),
         roll=0.0,
         pitch=0.0,
         yaw=0.0,
@@ -352,28 +364,19 @@ def vision_position_estimate(fix: FixMessage, heading_deg: float, reset_counter:
 
 
 def odometry(fix: FixMessage, heading_deg: float, reset_counter: int) -> Odometry:
-    """For PX4: attitude, rates and an unknown velocity are NaN; a given height has a wide variance."""
+    """For PX4: a given height has a wide variance; all else is NaN, as a filter's velocity counts positions again."""
     covariance_m2 = _covariance_ned(fix.covariance_m2, heading_deg)
     if fix.height_known:
-        covariance_m2 = _flat(covariance_m2, UNKNOWN_HEIGHT_STD_M)
-    moving = _velocity(fix)
-    if moving is None:
-        velocity: Vector = (NAN, NAN, NAN)
-        velocity_covariance: tuple[float, ...] = UNKNOWN_21
-    else:
-        velocity = _ned(moving[0], heading_deg)
-        covariance = _swapped(rotated(moving[1], heading_deg))
-        if fix.height_known:
-            covariance = _flat(covariance, UNKNOWN_CLIMB_STD_MPS)
-        velocity_covariance = _pose_covariance(covariance, NAN, NAN)
+        nn, ne, _, en, ee, _, _, _, _ = covariance_m2
+        covariance_m2 = nn, ne, 0.0, en, ee, 0.0, 0.0, 0.0, UNKNOWN_HEIGHT_STD_M**2
     return Odometry(
         time_us=micros(fix.unix_s),
-        position=_ned(fix.position_m, heading_deg),
+        position=north_east_down(fix.position_m, heading_deg),
         q=(NAN, NAN, NAN, NAN),
-        velocity=velocity,
+        velocity=(NAN, NAN, NAN),
         rates=(NAN, NAN, NAN),
         pose_covariance=_pose_covariance(covariance_m2, NAN, NAN),
-        velocity_covariance=velocity_covariance,
+        velocity_covariance=UNKNOWN_21,
         frame_id=LOCAL_NED,
         child_frame_id=LOCAL_NED,
         reset_counter=reset_counter & 0xFF,
@@ -388,12 +391,12 @@ def gps_input(fix: FixMessage, origin: GeoreferenceSite, satellites: int | None 
     covariance_m2 = _covariance_ned(fix.covariance_m2, origin.heading_deg)
     hdop, vdop = _dilution(fix.hdop), _dilution(fix.vdop)
     ignore = (IGNORE_HDOP if hdop == 0.0 else 0) | (IGNORE_VDOP if vdop == 0.0 else 0)
-    moving = _velocity(fix)
+    moving = known_velocity(fix)
     velocity, speed_std = (0.0, 0.0, 0.0), 0.0
     if moving is None:
         ignore |= _IGNORE_VELOCITY
     else:
-        velocity = _ned(moving[0], origin.heading_deg)
+        velocity = north_east_down(moving[0], origin.heading_deg)
         covariance = _swapped(rotated(moving[1], origin.heading_deg))
         speed_std = max(horizontal_ellipse(covariance)[0], sqrt(max(covariance[8], 0.0)))
         if fix.height_known:
@@ -453,19 +456,6 @@ def _dilution(value: float | None) -> float:
     return value if value is not None and isfinite(value) else 0.0
 
 
-def _velocity(fix: FixMessage) -> tuple[Vector, Matrix] | None:
-    """Velocity and its covariance, if both are known."""
-    velocity, covariance = fix.velocity_mps, fix.velocity_covariance
-    if velocity is None or covariance is None or not all(map(isfinite, (*velocity, *covariance))):
-        return None
-    return velocity, covariance
-
-
-def _ned(vector: Vector, heading_deg: float) -> Vector:
-    east, north, up = east_north_up(vector, heading_deg)
-    return north, east, -up
-
-
 def _covariance_ned(covariance_m2: Matrix, heading_deg: float) -> Matrix:
     return floored(_swapped(rotated(covariance_m2, heading_deg)))
 
@@ -474,12 +464,6 @@ def _swapped(covariance: Matrix) -> Matrix:
     """Convert from east, north, up to north, east, down."""
     ee, en, eu, ne, nn, nu, ue, un, uu = covariance
     return nn, ne, -nu, en, ee, -eu, -un, -ue, uu
-
-
-def _flat(covariance: Matrix, down_std: float) -> Matrix:
-    """The covariance with the vertical axis unknown."""
-    nn, ne, _, en, ee, _, _, _, _ = covariance
-    return nn, ne, 0.0, en, ee, 0.0, 0.0, 0.0, down_std**2
 
 
 def _pose_covariance(covariance: Matrix, between: float, angle: float) -> tuple[float, ...]:
@@ -501,6 +485,9 @@ _NEAR_1E7: Final = 10
 """Origins within this difference, in 10⁻⁷ degrees, count as equal: 11 cm."""
 
 _NEAR_MM: Final = 100
+
+_KNOWS_PLACE, _NONSENSE = 8 | 16, 1e6
+"""Flags of ESTIMATOR_STATUS: horizontal position, relative or absolute. No value that a vehicle states is larger."""
 
 
 class MavlinkEncoder(Encoder):
@@ -543,6 +530,7 @@ class MavlinkEncoder(Encoder):
         """Seconds since the vehicle's last message."""
         self._vehicle_origin: GpsGlobalOrigin | None = None
         """As stated by the vehicle."""
+        self._new, self._following = NewInformation(), Following(profile)
         self.dropped = Counter()
 
     def on_site(self, site: BridgedSite) -> list[bytes]:
@@ -557,6 +545,7 @@ class MavlinkEncoder(Encoder):
         if self._site is not None and _has_moved(self._site, site):
             self._reset_counter += 1
             self._vehicle_origin = None
+            self._new, self._following = NewInformation(), Following(self._profile)
         self._site = site
         given = self._given_heading_deg or 0.0
         self._heading_deg = given if site.georeference is None else site.georeference.heading_deg
@@ -571,12 +560,14 @@ class MavlinkEncoder(Encoder):
         self._last_serial = fix.serial
         self._log_assumptions(fix)
         try:
+            if self._profile == "gps":
+                origin = require_georeference(self._site, self._text)
+                return self._frames([gps_input(fix, origin, self._satellites)])
+            new = self._new.of(fix)
+            self._following.on_given(new, fix, self._heading_deg)
             if self._profile == "ardupilot":
-                return self._frames([vision_position_estimate(fix, self._heading_deg, self._reset_counter)])
-            if self._profile == "px4":
-                return self._frames([odometry(fix, self._heading_deg, self._reset_counter)])
-            origin = require_georeference(self._site, self._text)
-            return self._frames([gps_input(fix, origin, self._satellites)])
+                return self._frames([vision_position_estimate(new, self._heading_deg, self._reset_counter)])
+            return self._frames([odometry(new, self._heading_deg, self._reset_counter)])
         except (struct.error, OverflowError, ValueError):
             self.dropped["mavlink-value"] += 1  # finite, and still beyond what a field can hold
             return []
@@ -586,10 +577,12 @@ class MavlinkEncoder(Encoder):
         return self._frames([no_gps_fix(unix_s)]) if self._profile == "gps" else []
 
     def on_second(self, unix_s: float) -> list[bytes]:
-        """The heartbeat, and the site's origin until the vehicle has one or is armed."""
+        """The heartbeat, and the site's origin until the vehicle has one or is armed; logs how the vehicle does."""
         self._silent_s += 1
         if self._silent_s >= _GONE_S:
             self._vehicle_origin = None
+        elif words := self._following.verdict(unix_s, self._heading_deg):
+            self._log(f"{self._text}: {words}")
         messages: list[Message] = [Heartbeat()]
         origin = self._origin(unix_s)
         if origin is not None and self._vehicle_origin is None and not self._armed:
@@ -610,11 +603,27 @@ class MavlinkEncoder(Encoder):
             elif isinstance(message, GpsGlobalOrigin):
                 self._vehicle_origin = message
                 self._compare_origin(message, unix_ns)
+            elif isinstance(message, tuple):
+                self._on_state(frame.number, message, unix_ns * 1e-9)
             elif message.answered_ns == 0:
                 answers.append(Timesync(answered_ns=unix_ns, asked_ns=message.asked_ns))
         if self._reader.damaged > damaged:
             self.dropped["mavlink-check"] += self._reader.damaged - damaged
         return self._frames(answers)
+
+    def _on_state(self, number: int, values: tuple[float, ...], unix_s: float) -> None:
+        """Process what the vehicle says of itself, a message of ``_STATES``."""
+        following = self._following
+        if not all(abs(value) < _NONSENSE for value in values if isinstance(value, float)):
+            self.dropped["mavlink-nonsense"] += 1
+        elif number == _ATTITUDE:
+            following.attitude_rad = values
+        elif number == _ESTIMATOR_STATUS:
+            following.is_used = bool(int(values[0]) & _KNOWS_PLACE)
+        elif number == _HIGHRES_IMU:
+            following.on_motion(unix_s, values[0] * 1e-6, values[1:])
+        elif values[3:] in ((), (LOCAL_NED,)):
+            following.on_position(unix_s, values[:3])
 
     def _origin(self, unix_s: float) -> SetGpsGlobalOrigin | None:
         """None if the site has none, or the vehicle derives it from GPS_INPUT."""
