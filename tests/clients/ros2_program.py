@@ -231,19 +231,22 @@ def robot(feed_port, motion_port):
         found["states"].append([node._state_machine.current_state[1], len(found["transforms"]), time.monotonic()])
         drive(seconds)
 
+    def wait(seconds):
+        end_s = time.monotonic() + seconds
+        while time.monotonic() < end_s:
+            executor.spin_once(0.1)
+
     drive.t_s = 10.0
     reach(0.0)
     reach(1.0, "configure")
     reach(20.0, "activate")
-    at = Odometry()
-    at.header.stamp.sec, at.pose.pose.position.x = int(drive.t_s) + 1, math.nan
-    odometry.publish(at)
+    broken = Odometry()
+    broken.header.stamp.sec, broken.pose.pose.position.x = int(drive.t_s) + 1, math.nan
+    odometry.publish(broken)
     reach(2.0, "deactivate")
+    wait(1.2)
     reach(20.0, "activate")
-    node.get_logger().info("the odometry stops")
-    end_s = time.monotonic() + 2.5
-    while time.monotonic() < end_s:
-        executor.spin_once(0.1)
+    wait(2.5)
     reach(0.5, "deactivate", "cleanup")
     reach(0.5, "configure", "activate")
     reach(0.0, "shutdown")
