@@ -14,7 +14,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import sysconfig
 import threading
 import time
 from pathlib import Path
@@ -36,38 +35,7 @@ pytestmark = pytest.mark.live
 
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("ros2_program.py")
-FOLDER = ROOT / ".venv-clients" / "ros2"
-PYTHON = FOLDER / "bin" / "python"
-WORKSPACE = FOLDER / "workspace"
-"""Where ``colcon build`` puts both packages."""
-
-NODE = WORKSPACE / "install" / "skyless_ros2" / "lib" / "skyless_ros2" / "node"
-"""What ``ros2 run skyless_ros2 node`` starts; the wheels have no command ros2."""
-
-MESSAGES = ("diagnostic-msgs", "geometry-msgs", "nav-msgs", "sensor-msgs", "std-msgs", "visualization-msgs")
-GENERATORS = (
-    *("ament-cmake==2.7.3", "ament-cmake-include-directories==2.7.3", "ament-package==0.17.2"),
-    *("ament-cmake-ros-core==0.14.5", "rosidl-core-generators==0.3.1"),
-    *("rosidl-default-generators==1.7.1", "rosidl-default-runtime==1.7.1"),
-)
-PACKAGES = [
-    "ros-kilted-rclpy==9.1.2",
-    "ros-kilted-rmw-fastrtps-cpp==9.3.3",
-    *(f"ros-kilted-{name}==5.5.1" for name in MESSAGES),
-    *(f"ros-kilted-{name}" for name in GENERATORS),
-    *("cmake>=4,<5", "colcon-core==0.21.3", "colcon-ros==0.5.0", "mcap==1.3.0"),
-]
-WHEELS = "/opt/python/cp311-cp311"
-"""Where the wheels' makers had Python: their CMake files name its headers and NumPy's."""
-
-TF2_CMAKE = """cmake_minimum_required(VERSION 3.20)
-project(tf2_msgs)
-find_package(ament_cmake REQUIRED)
-find_package(geometry_msgs REQUIRED)
-find_package(rosidl_default_generators REQUIRED)
-rosidl_generate_interfaces(tf2_msgs msg/TFMessage.msg DEPENDENCIES geometry_msgs)
-ament_package()
-"""
+SCRIPT = ROOT / "scripts" / "ros2"
 RATE_HZ = 50.0
 PATIENCE_S = 60.0
 """As long as discovery and a busy machine may take."""
@@ -80,45 +48,25 @@ POSE_HASH = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea
 
 
 class Ros:
-    """An environment with ROS 2 in a domain of its own."""
+    """An environment with ROS 2 and the packages of ``ros2/``, in a domain of its own."""
 
     def __init__(self):
         self.domain = random.Random().randint(100, 200)
-        path = os.pathsep.join([str(FOLDER / "bin"), os.environ.get("PATH", "")])
         without = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
-        prefixes = {"AMENT_PREFIX_PATH": str(FOLDER), "CMAKE_PREFIX_PATH": str(FOLDER)}
-        self.environment = without | prefixes | {"ROS_DOMAIN_ID": str(self.domain), "PATH": path}
+        self.environment = without | {"ROS_DOMAIN_ID": str(self.domain)}
 
     def start(self, *arguments):
-        """Its Python with arguments."""
-        command, pipe = [str(one) for one in (PYTHON, *arguments)], subprocess.PIPE
+        """A command in it."""
+        command, pipe = [str(one) for one in (SCRIPT, *arguments)], subprocess.PIPE
         return subprocess.Popen(command, env=self.environment, stdout=pipe, stderr=pipe, text=True)
 
-    def build(self):
-        """Both packages by colcon, and tf2_msgs, which has no wheel, from its definition."""
-        paths = sysconfig.get_paths()
-        for file in FOLDER.glob("share/*/cmake/*.cmake"):  # two folders of the machine that made the wheels
-            if WHEELS in (text := file.read_text()):
-                text = text.replace(f"{WHEELS}/include/python3.11", paths["include"])
-                numpy = FOLDER / "lib" / "python3.11" / "site-packages" / "numpy"
-                file.write_text(text.replace(f"{WHEELS}/lib/python3.11/site-packages/numpy", str(numpy)))
-        tf2 = WORKSPACE / "src" / "tf2_msgs"
-        (tf2 / "msg").mkdir(parents=True, exist_ok=True)
-        (tf2 / "msg" / "TFMessage.msg").write_text("geometry_msgs/TransformStamped[] transforms\n")
-        (tf2 / "CMakeLists.txt").write_text(TF2_CMAKE)
-        described = (ROOT / "ros2" / "uwb_msgs" / "package.xml").read_text()
-        (tf2 / "package.xml").write_text(described.replace("uwb_msgs", "tf2_msgs"))
-        command = [FOLDER / "bin" / "colcon", "build", "--base-paths", ROOT / "ros2", WORKSPACE / "src"]
-        command += ["--cmake-args", f"-DPython3_EXECUTABLE={PYTHON}"]
-        done = subprocess.run(command, cwd=WORKSPACE, env=self.environment, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, done.stdout + done.stderr
-        sourced = ["sh", "-c", f". {WORKSPACE}/install/local_setup.sh && env -0"]
-        said = subprocess.run(sourced, env=self.environment, capture_output=True, text=True, check=True).stdout
-        self.environment = dict(line.split("=", 1) for line in said.split("\0") if line)
+    def program(self, *arguments):
+        """The program beside this file."""
+        return self.start("python", PROGRAM, *arguments)
 
     def listener(self, count, topics=TOPICS):
         """One that listens already."""
-        process = self.start(PROGRAM, "listen", count, PATIENCE_S, *topics)
+        process = self.program("listen", count, PATIENCE_S, *topics)
         assert "listening" in process.stderr.readline()
         return process
 
@@ -132,18 +80,14 @@ def found_by(process, patience_s=2 * PATIENCE_S):
 
 @pytest.fixture(scope="module")
 def ros():
-    """ROS 2 from PyPI, installed once."""
-    found, probe = Ros(), "import rclpy, mcap, colcon_ros, ament_package, nav_msgs.msg, sensor_msgs.msg"
-    if not PYTHON.exists():
-        subprocess.run([sys.executable, "-m", "venv", FOLDER], check=True)
-    for install in ([], ["-m", "pip", "install", "--quiet", *PACKAGES]):
-        for arguments in filter(None, (install, ["-c", f"{probe}, visualization_msgs.msg"])):
-            done = found.start(*arguments)
-            _, said = done.communicate()
-        if done.returncode == 0:
-            found.build()
-            return found
-    pytest.skip(f"ROS 2's wheels (x86-64 Linux only) are not installed or do not run here: {said.strip()[-200:]}")
+    """ROS 2 from PyPI and our packages, installed and built once."""
+    found = Ros()
+    environment = found.environment | {"PYTHON": sys.executable}
+    done = subprocess.run([SCRIPT], env=environment, capture_output=True, text=True, check=False)
+    if done.returncode == 3:
+        pytest.skip(f"ROS 2's wheels (x86-64 Linux, Python 3.11) cannot be installed: {done.stderr.strip()[-200:]}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    return found
 
 
 class Feed:
@@ -193,7 +137,7 @@ def door(request, ros, capfd):
         return
     port = free_port()
     given = (f"port:={port}", "autostart:=true", "map_frame:=site")
-    node = ros.start(NODE, "--ros-args", *(word for one in given for word in ("-p", one)))
+    node = ros.start("node", "--ros-args", *(word for one in given for word in ("-p", one)))
     try:
         with Feed(f"jsonl+tcp://:{port}?hz=1000", print) as feed:
             while "connected" not in (line := node.stderr.readline()):
@@ -274,7 +218,7 @@ def test_a_subscriber_that_was_there_before(ros):
 
 
 def test_the_command_ros2_shows_type_rate_and_position(ros, door):
-    command = shutil.which("ros2", path=ros.environment["PATH"])
+    command = shutil.which("ros2")
     if command is None:
         pytest.skip("the command ros2 is not installed: the wheels have none (apt-get install ros-kilted-ros2topic)")
     pose = "/skyless/tag1/pose"
@@ -302,7 +246,7 @@ def test_ros_reads_the_bag(ros, tmp_path):
     recording = tmp_path / "walk.mcap"
     live_site.record(recording, live_site.messages(1.0, tags=("a", "b")))
     assert main(["export", str(recording), "--to", str(tmp_path / "bag")]) == 0
-    read = found_by(ros.start(PROGRAM, "bag", tmp_path / "bag" / "bag.mcap"))
+    read = found_by(ros.program("bag", tmp_path / "bag" / "bag.mcap"))
     assert read["profile"] == "ros2"
     assert {coding for _, coding, _ in read["messages"]} == {"cdr/ros2msg"}
     with McapRecording(recording) as source:
@@ -317,12 +261,12 @@ def test_ros_reads_the_bag(ros, tmp_path):
 
 
 def test_lines_that_nobody_should_send_do_not_end_the_node(ros):
-    found = found_by(ros.start(PROGRAM, "garbage", 5000, random.randrange(10**6)), 4 * PATIENCE_S)
+    found = found_by(ros.program("garbage", 5000, random.randrange(10**6)), 4 * PATIENCE_S)
     assert found["last"] == {"tag1": [2, ""]}, "a fix whose velocity is not finite is a fix"
 
 
 def test_a_robot_gets_map_to_odom_in_simulated_time_while_the_node_is_active(ros):
-    process = ros.start(PROGRAM, "robot", free_port(), free_port())
+    process = ros.program("robot", free_port(), free_port())
     found = found_by(process, 4 * PATIENCE_S)
     states, transforms, _ = zip(*found["states"], strict=True)
     assert states == ("unconfigured", "inactive", "active", "inactive", "active", "unconfigured", "active", "finalized")
