@@ -2,7 +2,7 @@
 
 import cmath
 import math
-from dataclasses import dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,20 +11,6 @@ from skyless_ros2.map_odom import MapOdom
 STEP_S = 0.02
 LATE_S = 0.05
 """Fixes come later than odometry."""
-
-
-@dataclass
-class Robot:
-    """Truth and measurements; points are complex, rows of ``odometry`` and ``fixes`` begin with their time."""
-
-    times_s: np.ndarray
-    base_m: np.ndarray
-    yaw_rad: np.ndarray
-    way_m: np.ndarray
-    odometry: list
-    fixes: list
-    fix_error_m: float
-    variance_m2: float
 
 
 def drive(seed, seconds=60.0, slip=(0.0, 0.0)):
@@ -63,10 +49,10 @@ def drive(seed, seconds=60.0, slip=(0.0, 0.0)):
     )
     true_m = np.interp(at, times_s, base_m) + antenna_m * np.exp(1j * np.interp(at, times_s, yaw_rad))
     picked = np.unique(np.searchsorted(times_s, np.arange(0.0, seconds - 0.5, 1.0 / random.uniform(20.0, 50.0))))
-    return Robot(
-        times_s[picked], base_m[picked], yaw_rad[picked], ways_m[picked],
-        list(zip(times_s[picked], odom_m[picked], odom_rad[picked], strict=True)),
-        list(zip(at, true_m + errors + outlier, strict=True)), float(np.sqrt(np.mean(np.abs(errors) ** 2))), std_m**2,
+    return SimpleNamespace(
+        base_m=base_m[picked], yaw_rad=yaw_rad[picked], way_m=ways_m[picked], variance_m2=std_m**2,
+        odometry=list(zip(times_s[picked], odom_m[picked], odom_rad[picked], strict=True)),
+        fixes=list(zip(at, true_m + errors + outlier, strict=True)), fix_error_m=rms(np.abs(errors)),
     )  # fmt: skip
 
 

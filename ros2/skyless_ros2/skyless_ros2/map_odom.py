@@ -130,14 +130,12 @@ class MapOdom:
 
     def _take(self, unix_s: float, place_m: complex, covariance_m2: Array) -> None:
         """Use a fix from whose time on there is odometry."""
-        times_s = [one[0] for one in self._odometry]
+        times_s, places_m, yaws_rad = (np.array(column) for column in zip(*self._odometry, strict=True))
         after = int(np.searchsorted(times_s, unix_s))
         if after == 0 or times_s[after] - times_s[after - 1] > _MOST_GAP_S:
             self.counts["fixes of another time"] += 1
             return
-        (begin_s, begin_m, begin_rad), (end_s, end_m, end_rad) = self._odometry[after - 1], self._odometry[after]
-        share = (unix_s - begin_s) / (end_s - begin_s)
-        at_m, at_rad = begin_m + share * (end_m - begin_m), begin_rad + share * (end_rad - begin_rad)
+        at_m, at_rad = complex(np.interp(unix_s, times_s, places_m)), float(np.interp(unix_s, times_s, yaws_rad))
         kept = self._predict(unix_s, at_m, at_rad)
         self._last = unix_s, at_m, at_rad
         self._P[:, 6:, 6:] += (1.0 - kept**2) * covariance_m2
@@ -258,17 +256,20 @@ class MapOdom:
             return ""
         (_, covariance), limit_deg = self._moments(), math.degrees(self._limit_rad)
         heading_deg, base_m = math.degrees(math.sqrt(covariance[4, 4])), math.sqrt(np.trace(covariance[:2, :2]))
-        if not self._odometry:
-            text = "no odometry yet"
-        elif self._last is None:
-            text = f"no fix within {_MOST_LATE_S:.0f} s of odometry, by their stamps: none came, or two clocks differ"
-        elif self._way_m < _LEAST_WAY_M:
-            text = f"the robot has moved {self._way_m:.1f} of {_LEAST_WAY_M:.0f} m"
-        elif heading_deg > limit_deg:
-            text = f"heading to {heading_deg:.1f} deg, should be {limit_deg:.1f}: drive on"
-        else:
-            text = f"base to {base_m:.2f} m, should be {self._limit_m:.2f}: drive a turn, or state the antenna's place"
-        return text + self._why
+        checks = (
+            (not self._odometry, "no odometry yet"),
+            (self._last is None, "no fix that is within 2 s of odometry by its stamp: none came, or two clocks differ"),
+            (self._way_m < _LEAST_WAY_M, f"the robot has moved {self._way_m:.1f} of {_LEAST_WAY_M:.0f} m"),
+            (
+                heading_deg > limit_deg,
+                f"heading to {heading_deg:.1f} deg, should be {limit_deg:.1f}: drive straight on",
+            ),
+            (
+                True,
+                f"base to {base_m:.2f} m, should be {self._limit_m:.2f}: drive a turn, or state the antenna's place",
+            ),
+        )
+        return next(text for wrong, text in checks if wrong) + self._why
 
 
 def _usable(unix_s: float, *values: float) -> bool:

@@ -16,7 +16,7 @@ from typing import Any
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.clock import Clock, ClockType
@@ -37,7 +37,7 @@ STOPPED_S = 0.5  # odometry that has not come for so long has stopped
 LONGEST_LINE = 1 << 16
 LASTING = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
-PARAMETERS: dict[str, tuple[Any, tuple[float, float] | None, str]] = {
+PARAMETERS: dict[str, tuple[Any, tuple[Any, Any] | None, str]] = {  # default, range, description
     "host": ("127.0.0.1", None, "host of the JSON lines"),
     "port": (7010, (1, 65535), "port of the JSON lines"),
     "map_frame": ("map", None, "frame of the site's axes: frame_id of poses, velocities and anchors"),
@@ -61,27 +61,23 @@ PARAMETERS: dict[str, tuple[Any, tuple[float, float] | None, str]] = {
 }
 
 
-def descriptor(value: Any, limits: tuple[float, float] | None, text: str) -> ParameterDescriptor:
-    """A parameter's description and range."""
-    made = ParameterDescriptor(description=f"{text}; read at configure")
-    if limits is not None and isinstance(value, int):
-        made.integer_range = [IntegerRange(from_value=int(limits[0]), to_value=int(limits[1]), step=1)]
-    elif limits is not None:
-        made.floating_point_range = [FloatingPointRange(from_value=limits[0], to_value=limits[1])]
-    return made
-
-
 class SkylessNode(Node):
     """Reads lines in a thread while it is active, and publishes each when it comes."""
 
     def __init__(self) -> None:
         super().__init__("skyless")
-        for name, declared in PARAMETERS.items():
-            self.declare_parameter(name, declared[0], descriptor(*declared))
+        for name, (value, limits, text) in PARAMETERS.items():
+            described = ParameterDescriptor(description=f"{text}; read at configure")
+            if limits is not None and isinstance(value, int):
+                described.integer_range = [IntegerRange(from_value=limits[0], to_value=limits[1], step=1)]
+            elif limits is not None:
+                described.floating_point_range = [FloatingPointRange(from_value=limits[0], to_value=limits[1])]
+            self.declare_parameter(name, value, described)
         self.lock = threading.Lock()  # of the estimator, which callbacks and the reading thread use
         self.stop = threading.Event()
         self.links: dict[str, socket.socket] = {}
         self.threads: list[threading.Thread] = []
+        self.topics: dict[str, Any] = {}
         self.made: list[Callable[[], Any]] = []
 
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -89,7 +85,6 @@ class SkylessNode(Node):
         self.of = of = {name: self.get_parameter(name).value for name in PARAMETERS}
         antenna_m = complex(of["antenna_x_m"], of["antenna_y_m"])
         self.estimator = MapOdom(antenna_m, of["antenna_std_m"], of["heading_limit_deg"], of["base_limit_m"])
-        self.topics: dict[tuple[str, str], Any] = {}
         self.names: dict[str, str] = {}
         self.tags: dict[str, tuple[int, str]] = {}  # fixes since the last report, and why there is none
         self.motion: queue.Queue[bytes] = queue.Queue(500)
@@ -100,12 +95,12 @@ class SkylessNode(Node):
         if of["publish_map_to_odom"] or of["publish_tag_tf"]:
             from tf2_msgs.msg import TFMessage
 
-            transforms = self.publisher(TFMessage, "/tf", QoSProfile(depth=100))
-            self.give_transform = lambda one: transforms.publish(TFMessage(transforms=[one]))
-        self.markers = self.publisher(MarkerArray, "~/anchors", LASTING)
-        self.anchors = self.publisher(Anchors, "~/anchor_positions", LASTING)
-        self.base = self.publisher(PoseWithCovarianceStamped, "~/base", self.usual)
-        self.diagnostics = self.publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
+            self.transforms = TFMessage
+            self.publisher("/tf", TFMessage, QoSProfile(depth=100))
+        self.publisher("~/anchors", MarkerArray, LASTING)
+        self.publisher("~/anchor_positions", Anchors, LASTING)
+        self.publisher("~/base", PoseWithCovarianceStamped, self.usual)
+        self.publisher("/diagnostics", DiagnosticArray, QoSProfile(depth=10))
         for kind, topic, callback in ((Odometry, "odom", self.on_odometry), (Imu, "imu", self.pass_on)):
             made = self.create_subscription(kind, topic, callback, qos_profile_sensor_data)
             self.made.append(lambda made=made: self.destroy_subscription(made))
@@ -136,6 +131,8 @@ class SkylessNode(Node):
         self.end_threads()
         while self.made:
             self.made.pop()()
+        while self.topics:
+            self.destroy_publisher(self.topics.popitem()[1])
         return super().on_cleanup(state)
 
     on_shutdown = on_error = on_cleanup
@@ -150,27 +147,24 @@ class SkylessNode(Node):
             thread.join()
         self.threads = []
 
-    def publisher(self, kind: type, topic: str, quality: QoSProfile) -> Any:
-        """A publisher that is destroyed at clean-up."""
-        made = self.create_publisher(kind, topic, quality)
-        self.made.append(lambda: self.destroy_publisher(made))
-        return made
+    def publisher(self, topic: str, kind: type, quality: QoSProfile) -> Any:
+        """The publisher of a topic, which is destroyed at clean-up."""
+        if topic not in self.topics:
+            self.topics[topic] = self.create_publisher(kind, topic, quality)
+        return self.topics[topic]
 
     def keep_connected(self, name: str, host: str, port: int, use: Callable[[Any], None]) -> None:
         """Connect again and again, until the node is not active any more."""
-        trouble = ""
         while not self.stop.is_set():
             try:
                 with socket.create_connection((host, port), RECONNECT_S) as link:
                     link.settimeout(SILENT_S)
                     self.links[name] = link
                     self.get_logger().info(f"{name}: connected to {host}:{port}")
-                    trouble = ""
                     use(link)
             except OSError as error:
-                if str(error) != trouble and not (isinstance(error, TimeoutError) or self.stop.is_set()):
-                    trouble = str(error)
-                    self.get_logger().warning(f"{name}: nothing at {host}:{port}: {error}")
+                if not self.stop.is_set():
+                    self.get_logger().warning(f"{name}: {host}:{port}: {error}", throttle_duration_sec=60.0)
             self.links.pop(name, None)
             self.stop.wait(RECONNECT_S)
 
@@ -192,9 +186,9 @@ class SkylessNode(Node):
     def publish(self, line: dict[str, Any]) -> None:
         """Publish one line. Raises many things where it is not as it should be."""
         if line["type"] == "site":
-            found = messages.anchors(line["anchors_m"], self.of["map_frame"])
-            self.markers.publish(messages.anchor_markers(line["anchors_m"], self.of["map_frame"]))
-            self.anchors.publish(found)
+            found, markers = messages.anchors(line["anchors_m"], self.of["map_frame"])
+            self.topics["~/anchor_positions"].publish(found)
+            self.topics["~/anchors"].publish(markers)
         elif line["type"] == "fix":
             self.publish_fix(line)
         elif line["type"] == "no_fix":
@@ -205,17 +199,24 @@ class SkylessNode(Node):
         name, frame, unix_s = self.name(fix["tag"]), self.of["map_frame"], float(fix["unix_s"])
         if self.get_parameter("use_sim_time").value:  # then no other node knows Unix time
             unix_s = self.get_clock().now().nanoseconds * 1e-9 - float(fix["latency_s"])
-        for what, make in (("pose", messages.pose), ("velocity", messages.velocity)):
-            message = make(fix, unix_s, frame)
-            if message is not None:
-                self.topic(name, what, type(message)).publish(message)
+        covariance_m2 = messages.floored(fix["covariance_m2"])
+        pose = messages.pose(unix_s, frame, fix["position_m"], covariance_m2, [0, 1, 2])
+        velocity = messages.velocity(fix, unix_s, frame)
+        self.publisher(f"~/{name}/pose", PoseWithCovarianceStamped, self.usual).publish(pose)
+        if velocity is not None:
+            self.publisher(f"~/{name}/velocity", TwistWithCovarianceStamped, self.usual).publish(velocity)
         if self.of["publish_tag_tf"]:
-            self.give_transform(messages.transform(unix_s, frame, name, fix["position_m"]))
+            self.give_transform(unix_s, frame, name, fix["position_m"], 0.0)
         self.tags[name] = self.tags.get(name, (0, ""))[0] + 1, ""
         if fix["tag"] == self.of["tag"] or not (self.of["tag"] or len(self.tags) > 1):
-            xx, xy, _, _, yy, *_ = messages.floored(fix["covariance_m2"])
             with self.lock:
-                self.estimator.add_fix(unix_s, complex(*map(float, fix["position_m"][:2])), (xx, xy, yy))
+                xx, xy, _, _, yy, *_ = covariance_m2
+                self.estimator.add_fix(unix_s, complex(*fix["position_m"][:2]), (xx, xy, yy))
+
+    def give_transform(self, unix_s: float, frame: str, child: str, place_m: Any, yaw_rad: float) -> None:
+        """Publish a transform."""
+        made = messages.transform(unix_s, frame, child, place_m, yaw_rad)
+        self.topics["/tf"].publish(self.transforms(transforms=[made]))
 
     def on_odometry(self, message: Odometry) -> None:
         """Take odometry, and publish map → odom at its time."""
@@ -223,15 +224,17 @@ class SkylessNode(Node):
             return
         self.odometry_s = time.monotonic()
         self.pass_on(message)
-        unix_s, at, frame = messages.seconds_of(message), message.pose.pose, self.of["map_frame"]
+        at, frame = message.pose.pose, self.of["map_frame"]
+        place_m, yaw_rad = complex(at.position.x, at.position.y), messages.yaw_of(at.orientation)
         with self.lock:
-            self.estimator.add_odometry(unix_s, complex(at.position.x, at.position.y), messages.yaw_of(at.orientation))
+            self.estimator.add_odometry(messages.seconds_of(message), place_m, yaw_rad)
             found = self.estimator.pose
         if found is not None:
-            self.base.publish(messages.base_pose(found, frame))
+            base_m, odom_m = ((one.real, one.imag, 0.0) for one in (found.base_m, found.odom_m))
+            pose = messages.pose(found.unix_s, frame, base_m, found.covariance, [0, 1, 5], found.base_yaw_rad)
+            self.topics["~/base"].publish(pose)
             if self.of["publish_map_to_odom"]:
-                place_m, child = (found.odom_m.real, found.odom_m.imag, 0.0), self.of["odom_frame"]
-                self.give_transform(messages.transform(found.unix_s, frame, child, place_m, found.odom_yaw_rad))
+                self.give_transform(found.unix_s, frame, self.of["odom_frame"], odom_m, found.odom_yaw_rad)
 
     def pass_on(self, message: Imu | Odometry) -> None:
         """Queue motion for the tag; what is not finite, and the oldest where too much waits, is dropped and counted."""
@@ -263,7 +266,7 @@ class SkylessNode(Node):
             pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
             state = DiagnosticStatus(level=level, name=f"skyless: {name}", message=text, hardware_id=name, values=pairs)
             message.status.append(state)
-        self.diagnostics.publish(message)
+        self.topics["/diagnostics"].publish(message)
 
     def map_odom_state(self) -> tuple[str, bytes, str, dict[str, Any]]:
         """Whether map → odom is given, and if not why."""
@@ -276,12 +279,6 @@ class SkylessNode(Node):
         elif self.odometry_s and silent_s > STOPPED_S:
             reason = f"no odometry for {silent_s:.1f} s"
         return "map_odom", WARN if reason else OK, reason or "map -> odom is given", values
-
-    def topic(self, name: str, what: str, kind: type) -> Any:
-        """The publisher of a tag's topic."""
-        if (name, what) not in self.topics:
-            self.topics[name, what] = self.publisher(kind, f"~/{name}/{what}", self.usual)
-        return self.topics[name, what]
 
     def name(self, tag: str) -> str:
         """A tag's name as ROS allows it; tags whose names become equal are numbered as they come."""
