@@ -6,6 +6,7 @@ nothing of Skyless where it runs. Topics and parameters: docs/tools/ros2.md of h
 
 import contextlib
 import json
+import math
 import queue
 import re
 import socket
@@ -199,6 +200,9 @@ class SkylessNode(Node):
         name, frame, unix_s = self.name(fix["tag"]), self.of["map_frame"], float(fix["unix_s"])
         if self.get_parameter("use_sim_time").value:  # then no other node knows Unix time
             unix_s = self.get_clock().now().nanoseconds * 1e-9 - float(fix["latency_s"])
+            if unix_s <= 0.0:
+                self.tags[name] = 0, "no time yet: use_sim_time is set, and nothing came on /clock"
+                return
         covariance_m2 = messages.floored(fix["covariance_m2"])
         pose = messages.pose(unix_s, frame, fix["position_m"], covariance_m2, [0, 1, 2])
         velocity = messages.velocity(fix, unix_s, frame)
@@ -227,9 +231,10 @@ class SkylessNode(Node):
         at, frame = message.pose.pose, self.of["map_frame"]
         place_m, yaw_rad = complex(at.position.x, at.position.y), messages.yaw_of(at.orientation)
         with self.lock:
+            before = self.estimator.pose
             self.estimator.add_odometry(messages.seconds_of(message), place_m, yaw_rad)
             found = self.estimator.pose
-        if found is not None:
+        if found is not None and found is not before:
             base_m, odom_m = ((one.real, one.imag, 0.0) for one in (found.base_m, found.odom_m))
             pose = messages.pose(found.unix_s, frame, base_m, found.covariance, [0, 1, 5], found.base_yaw_rad)
             self.topics["~/base"].publish(pose)
@@ -271,8 +276,8 @@ class SkylessNode(Node):
     def map_odom_state(self) -> tuple[str, bytes, str, dict[str, Any]]:
         """Whether map → odom is given, and if not why."""
         with self.lock:
-            reason, values = self.estimator.reason(), dict(self.estimator.counts)
-            values["heading_std_mrad"] = round(1e3 * self.estimator.heading()[1])
+            reason, values = self.estimator.reason(), dict[str, Any](self.estimator.counts)
+            values |= {"heading_std_deg": f"{math.degrees(self.estimator.heading()[1]):.2f}"}
         silent_s = time.monotonic() - self.odometry_s
         if not self.of["tag"] and len(self.tags) > 1:
             reason = f"several tags ({', '.join(self.tags)}): the parameter tag should say which is the robot's"
