@@ -165,39 +165,40 @@ def serve(port, lines, got):
 
 
 def robot(feed_port, motion_port):
-    from builtin_interfaces.msg import Time
-    from diagnostic_msgs.msg import DiagnosticArray
-    from geometry_msgs.msg import PoseWithCovarianceStamped
-    from nav_msgs.msg import Odometry
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import DurabilityPolicy, QoSProfile
-    from rosgraph_msgs.msg import Clock
-    from sensor_msgs.msg import Imu
     from skyless_ros2.node import SkylessNode
-    from tf2_msgs.msg import TFMessage
-    from uwb_msgs.msg import Anchors
 
     lines, motion = [SITE], []
     for served in ((feed_port, lines, []), (motion_port, [], motion)):
         threading.Thread(target=serve, args=served, daemon=True).start()
-    given = {"use_sim_time": True, "port": feed_port, "motion_host": "127.0.0.1", "motion_port": motion_port}
-    rclpy.init(args=["--ros-args", *(word for key, value in given.items() for word in ("-p", f"{key}:={value}"))])
+    given = ("use_sim_time:=true", f"port:={feed_port}", "motion_host:=127.0.0.1", f"motion_port:={motion_port}")
+    rclpy.init(args=["--ros-args", *(word for one in given for word in ("-p", one))])
     node, other, executor = SkylessNode(), rclpy.create_node("robot"), SingleThreadedExecutor()
     executor.add_node(node)
     executor.add_node(other)
-    found = {"states": [], "transforms": [], "bases": [], "poses": [], "anchors": [], "said": []}
-    lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    for kind, topic, key, quality in (
-        (TFMessage, "/tf", "transforms", 100), (PoseWithCovarianceStamped, "/skyless/base", "bases", 100),
-        (PoseWithCovarianceStamped, POSE, "poses", 100), (Anchors, "/skyless/anchor_positions", "anchors", lasting),
-    ):  # fmt: skip
-        other.create_subscription(kind, topic, lambda one, key=key: found[key].append(plain(one)), quality)
-    take = lambda array: found["said"].extend([one.name, one.message] for one in array.status)  # noqa: E731
-    other.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
-    odometry, imu, clock = (
-        other.create_publisher(kind, topic, 10)
-        for kind, topic in ((Odometry, "/odom"), (Imu, "/imu"), (Clock, "/clock"))
+    found = {
+        "states": [],
+        "/tf": [],
+        "/skyless/base": [],
+        POSE: [],
+        "/skyless/anchor_positions": [],
+        "/diagnostics": [],
+    }
+    kinds = (
+        "tf2_msgs/msg/TFMessage",
+        TOPICS[POSE],
+        TOPICS[POSE],
+        "uwb_msgs/msg/Anchors",
+        "diagnostic_msgs/msg/DiagnosticArray",
     )
+    for (topic, got), kind in zip(list(found.items())[1:], kinds, strict=True):
+        lasting = DurabilityPolicy.TRANSIENT_LOCAL if "anchor" in topic else DurabilityPolicy.VOLATILE
+        quality = QoSProfile(depth=100, durability=lasting)
+        other.create_subscription(type_of(kind), topic, lambda one, got=got: got.append(plain(one)), quality)
+    Odometry, Imu, Clock = map(type_of, ("nav_msgs/msg/Odometry", "sensor_msgs/msg/Imu", "rosgraph_msgs/msg/Clock"))
+    sent = {kind: other.create_publisher(kind, f"/{kind.__name__.lower()[:4]}", 10) for kind in (Odometry, Imu)}
+    sent[Clock] = other.create_publisher(Clock, "/clock", 10)
 
     def drive(seconds):
         """An eight on the map, by odometry that begins at (6, 2) and 1 rad; the antenna is .2 m in front."""
@@ -205,15 +206,14 @@ def robot(feed_port, motion_port):
             drive.t_s += 0.05
             a = 0.4 * drive.t_s
             base, yaw = complex(5 + 2 * math.sin(a), 5 + math.sin(2 * a)), math.atan2(math.cos(2 * a), math.cos(a))
-            stamp = Time(sec=int(drive.t_s), nanosec=round(drive.t_s % 1 * 1e9))
             moved, sample = Odometry(), Imu()
-            moved.header.stamp = sample.header.stamp = stamp
+            stamp = sample.header.stamp = moved.header.stamp
+            stamp.sec, stamp.nanosec = int(drive.t_s), round(drive.t_s % 1 * 1e9)
             at, place = moved.pose.pose, (base - (6 + 2j)) * cmath.rect(1, -1)
             at.position.x, at.position.y = place.real, place.imag
             at.orientation.z, at.orientation.w = math.sin((yaw - 1) / 2), math.cos((yaw - 1) / 2)
-            clock.publish(Clock(clock=stamp))
-            odometry.publish(moved)
-            imu.publish(sample)
+            for one in (Clock(clock=stamp), moved, sample):
+                sent[type(one)].publish(one)
             for _ in range(8):
                 executor.spin_once(0.002)
             tag, before, end_s = base + cmath.rect(0.2, yaw), node.tags.get("tag1"), time.monotonic() + 1.0
@@ -228,7 +228,7 @@ def robot(feed_port, motion_port):
         end_s = time.monotonic() + 5.0
         while node.threads and len(node.links) < 2 and time.monotonic() < end_s:
             time.sleep(1e-3)
-        found["states"].append([node._state_machine.current_state[1], len(found["transforms"]), time.monotonic()])
+        found["states"].append([node._state_machine.current_state[1], len(found["/tf"])])
         drive(seconds)
 
     def wait(seconds):
@@ -242,7 +242,7 @@ def robot(feed_port, motion_port):
     reach(20.0, "activate")
     broken = Odometry()
     broken.header.stamp.sec, broken.pose.pose.position.x = int(drive.t_s) + 1, math.nan
-    odometry.publish(broken)
+    sent[Odometry].publish(broken)
     reach(2.0, "deactivate")
     wait(1.2)
     reach(20.0, "activate")

@@ -268,28 +268,30 @@ def test_lines_that_nobody_should_send_do_not_end_the_node(ros):
 def test_a_robot_gets_map_to_odom_in_simulated_time_while_the_node_is_active(ros):
     process = ros.program("robot", free_port(), free_port())
     found = found_by(process, 4 * PATIENCE_S)
-    states, transforms, _ = zip(*found["states"], strict=True)
+    states, transforms = zip(*found["states"], strict=True)
     assert states == ("unconfigured", "inactive", "active", "inactive", "active", "unconfigured", "active", "finalized")
     assert transforms[2] == 0 < transforms[3] == transforms[4] < transforms[5] == transforms[6], (
         "inactive, it is silent"
     )
-    for (one,) in (message["transforms"] for message in found["transforms"]):
+    for (one,) in (message["transforms"] for message in found["/tf"]):
         assert (one["header"]["frame_id"], one["child_frame_id"]) == ("map", "odom")
         x, y, yaw = found["place"]
         place, turn = one["transform"]["translation"], one["transform"]["rotation"]
         assert (place["x"], place["y"], 2.0 * math.asin(turn["z"])) == pytest.approx((x, y, yaw), abs=0.1)
-    assert len(found["bases"]) == len(found["transforms"])
-    assert all(0.0 < one["pose"]["covariance"][35] < math.radians(2.5) ** 2 for one in found["bases"])
-    stamps_s = [one["header"]["stamp"]["sec"] for one in found["poses"]]
+    assert len(found["/skyless/base"]) == len(found["/tf"])
+    assert all(0.0 < one["pose"]["covariance"][35] < math.radians(2.5) ** 2 for one in found["/skyless/base"])
+    stamps_s = [one["header"]["stamp"]["sec"] for one in found["/skyless/tag1/pose"]]
     assert stamps_s == sorted(stamps_s)
     assert (stamps_s[0], len(stamps_s)) == (pytest.approx(12, abs=1), pytest.approx(800, abs=60))
-    said = dict.fromkeys(map(tuple, found["said"]))
+    said = {(one["name"], one["message"]) for message in found["/diagnostics"] for one in message["status"]}
     for name, text in {
         "connection": "the node is not active", "map_odom": "the robot has moved", "tag1": "fixes in a second",
         "motion": "given to skyless tag",
     }.items() | {("map_odom", "map -> odom is given"), ("map_odom", "no odometry for")}:  # fmt: skip
         assert any(one == f"skyless: {name}" and text in words for one, words in said), (name, text, said)
-    assert [one["position"] for one in found["anchors"][0]["anchors"]] == [{"x": 0.0, "y": 1.0, "z": 2.0}]
+    assert [one["position"] for one in found["/skyless/anchor_positions"][0]["anchors"]] == [
+        {"x": 0.0, "y": 1.0, "z": 2.0}
+    ]
     imu, wheels = ([line[kind] for line in found["motion"] if kind in line] for kind in ("imu", "wheels"))
     assert len(imu) == pytest.approx(len(wheels), abs=20)
     assert {"t_s", "rate_rps", "force_mps2"} == set(imu[0]) and {"t_s", "speed_mps", "rate_rps"} == set(wheels[0])
