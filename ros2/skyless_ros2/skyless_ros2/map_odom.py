@@ -27,7 +27,7 @@ _ALONG_M, _ACROSS_M = (
     0.05,
     0.01,
 )  # odometry's error along its path, and across, after 1 m; grows with the root of the way
-_SLIP_GAIN: Final = 5.0  # how much the first of them grows where fixes disagree with odometry
+_SLIP_GAIN: Final = 20.0  # how much the first of them grows where fixes disagree with odometry
 _HEADING_RAD, _TURN_RAD = math.radians(0.1), 0.003  # error of its heading after 1 m, and after a turn of 1 rad
 _DRIFT_RADPS: Final = math.radians(0.5)  # bias of its gyroscope, which changes by a hundredth of that in a second
 _STILL_M: Final = 0.001  # error after 1 s of standing
@@ -36,7 +36,7 @@ _LOST_S: Final = {False: 1.0, True: 5.0}  # outliers for so long are none: it st
 _MOST_GAP_S, _MOST_LATE_S = 0.5, 2.0  # between two messages of odometry; between a fix and odometry
 _JUMP_M, _JUMP_MPS, _JUMP_RAD, _JUMP_RADPS = 0.3, 4.0, 0.4, 6.0  # more than that, and that per second, is no motion
 _LEAST_WAY_M: Final = 3.0
-_BLEND_S, _STEP_M, _STEP_MPS, _STEP_RAD = 0.3, 0.03, 0.5, 0.017  # how fast what is published follows the estimate
+_BLEND_S, _STEP_M, _STEP_MPS, _STEP_RAD = 0.15, 0.03, 0.5, 0.017  # how fast what is published follows the estimate
 _LOST: Final = 5.0  # times the limits at which it was given
 _LARGEST: Final = 1e6  # metres, radians, square metres
 
