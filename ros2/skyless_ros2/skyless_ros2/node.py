@@ -25,6 +25,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.lifecycle import LifecycleState, Node, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import Imu
+from tf2_msgs.msg import TFMessage
 from uwb_msgs.msg import Anchors
 from visualization_msgs.msg import MarkerArray
 
@@ -94,9 +95,6 @@ class SkylessNode(Node):
         reliability = ReliabilityPolicy.BEST_EFFORT if of["best_effort"] else ReliabilityPolicy.RELIABLE
         self.usual = QoSProfile(depth=10, reliability=reliability)
         if of["publish_map_to_odom"] or of["publish_tag_tf"]:
-            from tf2_msgs.msg import TFMessage
-
-            self.transforms = TFMessage
             self.publisher("/tf", TFMessage, QoSProfile(depth=100))
         self.publisher("~/anchors", MarkerArray, LASTING)
         self.publisher("~/anchor_positions", Anchors, LASTING)
@@ -220,7 +218,7 @@ class SkylessNode(Node):
     def give_transform(self, unix_s: float, frame: str, child: str, place_m: Any, yaw_rad: float) -> None:
         """Publish a transform."""
         made = messages.transform(unix_s, frame, child, place_m, yaw_rad)
-        self.topics["/tf"].publish(self.transforms(transforms=[made]))
+        self.topics["/tf"].publish(TFMessage(transforms=[made]))
 
     def on_odometry(self, message: Odometry) -> None:
         """Take odometry, and publish map → odom at its time."""
@@ -302,8 +300,7 @@ def main() -> None:
     rclpy.init()
     node = SkylessNode()
     try:
-        if node.get_parameter("autostart").value:
-            node.trigger_configure()
+        if node.get_parameter("autostart").value and node.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             node.trigger_activate()
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
