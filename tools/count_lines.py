@@ -8,7 +8,7 @@ from typing import Final
 
 ROOT: Final = Path(__file__).parents[1]
 PARTS: Final = {
-    "source": ("src/*.py",),
+    "source": ("src/*.py", "ros2/*.py"),
     "page": ("src/*.js", "src/*.css", "src/*.html", ":(exclude)*/vendor/*"),
     "tests": ("tests/*.py", "tests/*.mjs", "tests/*.cjs", "tests/*.c"),
     "documents": ("*.md",),

@@ -1,4 +1,4 @@
-"""ROS 2 itself (Kilted, from its wheels) reads what Skyless gives: by DDS, through the one-file node, and in a bag.
+"""ROS 2 itself (Kilted, from its wheels) reads what Skyless gives: by DDS, by its package ``ros2/``, and in a bag.
 
 The wheels have no command ``ros2``; where one is found, in this environment or in PATH, it is asked, too.
 """
@@ -6,6 +6,7 @@ The wheels have no command ``ros2``; where one is found, in this environment or 
 import asyncio
 import contextlib
 import json
+import math
 import os
 import random
 import re
@@ -30,44 +31,42 @@ from support import live_site
 from support.bridged_values import SITE, a_fix
 from support.processes import free_port
 
+pytestmark = pytest.mark.live
+
 ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("ros2_program.py")
-FOLDER = ROOT / ".venv-clients" / "ros2"
-PYTHON = FOLDER / "bin" / "python"
-MESSAGES = ("diagnostic-msgs", "geometry-msgs", "sensor-msgs", "std-msgs", "visualization-msgs")
-PACKAGES = [
-    "ros-kilted-rclpy==9.1.2",
-    "ros-kilted-rmw-fastrtps-cpp==9.3.3",
-    *(f"ros-kilted-{name}==5.5.1" for name in MESSAGES),
-    "mcap==1.3.0",
-]
+SCRIPT = ROOT / "scripts" / "ros2"
 RATE_HZ = 50.0
 PATIENCE_S = 60.0
 """As long as discovery and a busy machine may take."""
 
 FEW = 100
 
+TOPICS = [f"/skyless/{name}" for name in ("tag1/pose", "tag1/velocity", "anchors", "tag1/fix")]
 POSE_HASH = "RIHS01_26432f9803e43727d3c8f668d1fdb3c630f548af631e2f4e31382371bfea3b6e"
 """Of POSE, as ROS states it."""
 
 
 class Ros:
-    """An environment with ROS 2 in a domain of its own."""
+    """An environment with ROS 2 and the packages of ``ros2/``, in a domain of its own."""
 
     def __init__(self):
         self.domain = random.Random().randint(100, 200)
-        path = os.pathsep.join([str(FOLDER / "bin"), os.environ.get("PATH", "")])
         without = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "VIRTUAL_ENV"))}
-        self.environment = without | {"ROS_DOMAIN_ID": str(self.domain), "PATH": path}
+        self.environment = without | {"ROS_DOMAIN_ID": str(self.domain)}
 
     def start(self, *arguments):
-        """Its Python with arguments."""
-        command, pipe = [str(one) for one in (PYTHON, *arguments)], subprocess.PIPE
+        """A command in it."""
+        command, pipe = [str(one) for one in (SCRIPT, *arguments)], subprocess.PIPE
         return subprocess.Popen(command, env=self.environment, stdout=pipe, stderr=pipe, text=True)
 
-    def listener(self, count):
+    def program(self, *arguments):
+        """The program beside this file."""
+        return self.start("python", PROGRAM, *arguments)
+
+    def listener(self, count, topics=TOPICS):
         """One that listens already."""
-        process = self.start(PROGRAM, "listen", count, PATIENCE_S)
+        process = self.program("listen", count, PATIENCE_S, *topics)
         assert "listening" in process.stderr.readline()
         return process
 
@@ -81,17 +80,14 @@ def found_by(process, patience_s=2 * PATIENCE_S):
 
 @pytest.fixture(scope="module")
 def ros():
-    """ROS 2 from PyPI, installed once."""
-    found, probe = Ros(), "import rclpy, mcap, diagnostic_msgs.msg, geometry_msgs.msg, sensor_msgs.msg"
-    if not PYTHON.exists():
-        subprocess.run([sys.executable, "-m", "venv", FOLDER], check=True)
-    for install in ([], ["-m", "pip", "install", "--quiet", *PACKAGES]):
-        for arguments in filter(None, (install, ["-c", f"{probe}, visualization_msgs.msg"])):
-            done = found.start(*arguments)
-            _, said = done.communicate()
-        if done.returncode == 0:
-            return found
-    pytest.skip(f"ROS 2's wheels (x86-64 Linux only) are not installed or do not run here: {said.strip()[-200:]}")
+    """ROS 2 from PyPI and our packages, installed and built once."""
+    found = Ros()
+    environment = found.environment | {"PYTHON": sys.executable}
+    done = subprocess.run([SCRIPT], env=environment, capture_output=True, text=True, check=False)
+    if done.returncode == 3:
+        pytest.skip(f"ROS 2's wheels (x86-64 Linux, Python 3.11) cannot be installed: {done.stderr.strip()[-200:]}")
+    assert done.returncode == 0, done.stdout + done.stderr
+    return found
 
 
 class Feed:
@@ -132,18 +128,21 @@ class Feed:
 
 @pytest.fixture(params=["dds", "node"])
 def door(request, ros, capfd):
-    """A feed that comes out in ROS: by ros2://, or by jsonl+tcp:// and the node."""
+    """A feed that comes out in ROS: by ros2://, or by jsonl+tcp:// and the package's node, which has no NavSatFix."""
     if request.param == "dds":
         pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheel here")
         with Feed(f"ros2://?domain={ros.domain}&hz=1000", print) as feed:
+            feed.topics = TOPICS
             yield feed
         return
     port = free_port()
-    node = ros.start(ROOT / "examples/ros2/skyless_node.py", "--ros-args", "-p", f"port:={port}")
+    given = (f"port:={port}", "autostart:=true", "map_frame:=site")
+    node = ros.start("node", "--ros-args", *(word for one in given for word in ("-p", one)))
     try:
         with Feed(f"jsonl+tcp://:{port}?hz=1000", print) as feed:
-            while "reading" not in (line := node.stderr.readline()):
+            while "connected" not in (line := node.stderr.readline()):
                 assert line, "the node has ended"
+            feed.topics = TOPICS[:3]
             yield feed
     finally:
         node.send_signal(signal.SIGINT)
@@ -167,7 +166,7 @@ def xyz(vector):
 
 def expect(topics, feed, count):
     """What came is what was given, in order, without holes."""
-    poses, velocities, fixes, (anchors, *_) = topics.values()
+    poses, velocities, (anchors, *_), *fixes = topics.values()
     assert len(poses) >= count
     serials = [round(1e3 * one["pose"]["pose"]["position"]["x"]) for one in poses]
     assert serials == list(range(serials[0], serials[0] + len(serials))), "one is missing, or the order is wrong"
@@ -185,7 +184,7 @@ def expect(topics, feed, count):
         fix = by_stamp[tuple(stamp_of(one))]
         assert xyz(one["twist"]["twist"]["linear"]) == fix.velocity_mps
         assert one["twist"]["covariance"][:3] == list(fix.velocity_covariance[:3])
-    for one in fixes:
+    for one in fixes[0] if fixes else ():
         fix = by_stamp[tuple(stamp_of(one))]
         assert one["status"]["status"] == 0
         latitude_deg, longitude_deg, height_m = geodetic(fix.position_m, SITE.georeference)
@@ -199,7 +198,7 @@ def expect(topics, feed, count):
 
 
 def test_a_subscriber_reads_the_fixes_and_the_hash_of_their_type_and_one_that_is_killed_costs_it_nothing(ros, door):
-    victim, other = ros.listener(10_000), ros.listener(6 * FEW)
+    victim, other = (ros.listener(count, door.topics) for count in (10_000, 6 * FEW))
     assert "a pose" in victim.stderr.readline()
     victim.kill()
     victim.communicate()
@@ -219,7 +218,7 @@ def test_a_subscriber_that_was_there_before(ros):
 
 
 def test_the_command_ros2_shows_type_rate_and_position(ros, door):
-    command = shutil.which("ros2", path=ros.environment["PATH"])
+    command = shutil.which("ros2")
     if command is None:
         pytest.skip("the command ros2 is not installed: the wheels have none (apt-get install ros-kilted-ros2topic)")
     pose = "/skyless/tag1/pose"
@@ -247,7 +246,7 @@ def test_ros_reads_the_bag(ros, tmp_path):
     recording = tmp_path / "walk.mcap"
     live_site.record(recording, live_site.messages(1.0, tags=("a", "b")))
     assert main(["export", str(recording), "--to", str(tmp_path / "bag")]) == 0
-    read = found_by(ros.start(PROGRAM, "bag", tmp_path / "bag" / "bag.mcap"))
+    read = found_by(ros.program("bag", tmp_path / "bag" / "bag.mcap"))
     assert read["profile"] == "ros2"
     assert {coding for _, coding, _ in read["messages"]} == {"cdr/ros2msg"}
     with McapRecording(recording) as source:
@@ -262,5 +261,38 @@ def test_ros_reads_the_bag(ros, tmp_path):
 
 
 def test_lines_that_nobody_should_send_do_not_end_the_node(ros):
-    found = found_by(ros.start(PROGRAM, "garbage", 5000, random.randrange(10**6)), 4 * PATIENCE_S)
-    assert found["last"] == {"tag1": 2}, "a fix whose velocity is not finite is a fix"
+    found = found_by(ros.program("garbage", 5000, random.randrange(10**6)), 4 * PATIENCE_S)
+    assert found["last"] == {"tag1": [2, ""]}, "a fix whose velocity is not finite is a fix"
+
+
+def test_a_robot_gets_map_to_odom_in_simulated_time_while_the_node_is_active(ros):
+    process = ros.program("robot", free_port(), free_port())
+    found = found_by(process, 4 * PATIENCE_S)
+    states, transforms = zip(*found["states"], strict=True)
+    assert states == ("unconfigured", "inactive", "active", "inactive", "active", "unconfigured", "active", "finalized")
+    assert transforms[2] == 0 < transforms[3] == transforms[4] < transforms[5] == transforms[6], (
+        "inactive, it is silent"
+    )
+    for (one,) in (message["transforms"] for message in found["/tf"]):
+        assert (one["header"]["frame_id"], one["child_frame_id"]) == ("map", "odom")
+        x, y, yaw = found["place"]
+        place, turn = one["transform"]["translation"], one["transform"]["rotation"]
+        assert (place["x"], place["y"], 2.0 * math.asin(turn["z"])) == pytest.approx((x, y, yaw), abs=0.1)
+    assert len(found["/skyless/base"]) == len(found["/tf"])
+    assert all(0.0 < one["pose"]["covariance"][35] < math.radians(2.5) ** 2 for one in found["/skyless/base"])
+    stamps_s = [one["header"]["stamp"]["sec"] for one in found["/skyless/tag1/pose"]]
+    assert stamps_s == sorted(stamps_s)
+    assert (stamps_s[0], len(stamps_s)) == (pytest.approx(12, abs=1), pytest.approx(800, abs=60))
+    said = {(one["name"], one["message"]) for message in found["/diagnostics"] for one in message["status"]}
+    for name, text in {
+        "connection": "the node is not active", "map_odom": "the robot has moved", "tag1": "fixes in a second",
+        "motion": "given to skyless tag",
+    }.items() | {("map_odom", "map -> odom is given"), ("map_odom", "no odometry for")}:  # fmt: skip
+        assert any(one == f"skyless: {name}" and text in words for one, words in said), (name, text, said)
+    assert [one["position"] for one in found["/skyless/anchor_positions"][0]["anchors"]] == [
+        {"x": 0.0, "y": 1.0, "z": 2.0}
+    ]
+    imu, wheels = ([line[kind] for line in found["motion"] if kind in line] for kind in ("imu", "wheels"))
+    assert len(imu) == pytest.approx(len(wheels), abs=20)
+    assert {"t_s", "rate_rps", "force_mps2"} == set(imu[0]) and {"t_s", "speed_mps", "rate_rps"} == set(wheels[0])
+    assert [one["t_s"] for one in wheels] == sorted(one["t_s"] for one in wheels)

@@ -56,7 +56,10 @@ def test_the_workflow_runs_the_scripts_of_the_repository():
     workflow = loaded(GITHUB / "workflows" / "ci.yml")
     assert workflow.keys() >= {"name", True, "permissions", "jobs"}  # YAML 1.1 reads the key ``on`` as true
     assert workflow["jobs"]["test"]["strategy"]["matrix"]["python"] == ["3.11", "3.13"]
-    tests = {"scripts/test", *(f"scripts/test {tier}" for tier in ("unit", "statistical", "tests/firmware"))}
+    tests = {
+        "scripts/test",
+        *(f"scripts/test {tier}" for tier in ("unit", "statistical", "tests/firmware", "clients ros2")),
+    }
     assert scripts_of(workflow) == {"scripts/check", *tests, "scripts/docs", "scripts/audit"}
     nightly = {name: job.get("if", "always").endswith("== 'schedule'") for name, job in workflow["jobs"].items()}
     assert [name for name, is_nightly in nightly.items() if is_nightly] == ["statistical"]

@@ -32,7 +32,7 @@ PAGES = [
 ]
 CURRENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
 """Those that describe the code as it is."""
-SOURCES = ("tools", "src", "tests", "benchmarks", "scripts", "firmware", "docs", "examples", "packaging")
+SOURCES = ("tools", "src", "ros2", "tests", "benchmarks", "scripts", "firmware", "docs", "examples", "packaging")
 OTHER_PROGRAMS = {
     "--dry-run",
     "--experimental-websocket",

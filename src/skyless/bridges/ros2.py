@@ -363,7 +363,7 @@ class DdsPublisher:
         except ImportError as error:
             raise SkylessError(
                 f"{what_to_install(error, f'the target {text!r}')}; it is made for x86-64 up to Python 3.13: elsewhere "
-                "use jsonl+tcp: and the node examples/ros2/skyless_node.py"
+                "use jsonl+tcp: and the ROS 2 package ros2/skyless_ros2"
             ) from None
         given = os.environ.get("CYCLONEDDS_URI", "")
         try:
