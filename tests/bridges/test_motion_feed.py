@@ -32,7 +32,7 @@ def test_lines_become_samples_on_the_hosts_clock():
     assert (second.rate_rps, second.speed_mps, second.force_mps2) == ((0.0, 0.0, -0.2), 1.5, None)
 
 
-@given(st.one_of(st.binary(max_size=80), st.from_regex(rb'\{"imu": \{"rate_rps": \[[-0-9,eE.na]{0,9}\]', fullmatch=True)))
+@given(st.one_of(st.binary(max_size=80), st.from_regex(rb'\{"imu": \{"rate_rps": [-0-9,eE.na]{0,9}', fullmatch=True)))
 def test_lines_that_nobody_should_send_are_counted(line):
     motion, samples = feed()
     motion.feed_line(line)
@@ -59,17 +59,13 @@ def test_mavlink_turns_into_forward_left_up():
         )
         motion.feed_mavlink(message.pack(writer))
         assert abs(samples[-1].time_s - 1000.0 - time_s) < 1e-3
-    scaled = mavlink.MAVLink_scaled_imu_message(6000, 0, 0, -1000, 100, 0, -300, 0, 0, 0)
-    motion.feed_mavlink(scaled.pack(writer))
     assert samples[0].force_mps2 == pytest.approx((1.0, -2.0, 9.8), rel=1e-6)
     assert samples[0].rate_rps == pytest.approx((0.1, -0.2, -0.3), rel=1e-6)
-    assert samples[-1].force_mps2 == pytest.approx((0.0, 0.0, 9.80665))
-    assert samples[-1].rate_rps == pytest.approx((0.1, 0.0, 0.3))
 
 
 @pytest.mark.parametrize("address", ["tcp://:1", "jsonl+tcp://:7480?arm=1,2", "mavlink+udp://:7480/path"])
 def test_an_address_that_is_none_is_refused(address):
-    with pytest.raises(SkylessError, match="it should be|should"):
+    with pytest.raises(SkylessError, match="should be"):
         feed(address)
 
 

@@ -1,4 +1,4 @@
-"""A motion sensor as an input of the time update: its arithmetic, and what a tag does with good, late and no samples."""
+"""A motion sensor as an input of the time update: its arithmetic, and what a tag does with good and late samples."""
 
 import numpy as np
 import pytest

@@ -3,7 +3,7 @@
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from math import floor, inf, isfinite, pi, sqrt
+from math import asin, atan2, cos, floor, inf, isfinite, pi, radians, sin, sqrt
 from typing import Final, Literal, cast
 
 import msgspec
@@ -14,7 +14,7 @@ from skyless.bridges.vehicle import Following, NewInformation, known_velocity, n
 from skyless.core.earth import geodetic, horizontal_ellipse, rotated
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
-from skyless.run.mqtt.messages import FixMessage, Matrix
+from skyless.run.mqtt.messages import LEVEL_VARIANCE, FixMessage, Matrix
 
 # MAVLink: frames in bytes, and the few messages of its common set that are sent or read here.
 #
@@ -273,11 +273,11 @@ _LAYOUTS: Final[dict[type[Message], _Layout]] = {
 
 _READ: Final[tuple[type[Heartbeat | Timesync | GpsGlobalOrigin], ...]] = (Heartbeat, Timesync, GpsGlobalOrigin)
 _READ_BY_NUMBER: Final = {_LAYOUTS[kind].number: kind for kind in _READ}
-_ATTITUDE, _LOCAL_POSITION_NED, _HIGHRES_IMU, _ESTIMATOR_STATUS, _ODOMETRY = 30, 32, 105, 230, 331
+_ATTITUDE, _LOCAL_POSITION_NED, HIGHRES_IMU, _ESTIMATOR_STATUS, _ODOMETRY = 30, 32, 105, 230, 331
 _STATES: Final = {
     _ATTITUDE: (39, struct.Struct("<4x3f")),  # roll, pitch, yaw
     _LOCAL_POSITION_NED: (185, struct.Struct("<4x3f")),
-    _HIGHRES_IMU: (93, struct.Struct("<Q6f")),  # time in µs, specific force, rate
+    HIGHRES_IMU: (93, struct.Struct("<Q6f")),  # time in µs, specific force, rate
     _ESTIMATOR_STATUS: (163, struct.Struct("<40xH")),  # flags
     _ODOMETRY: (91, struct.Struct("<8x3f208xB")),  # position, frame
 }
@@ -312,7 +312,7 @@ def decoded(received: Frame) -> Heartbeat | Timesync | GpsGlobalOrigin | tuple[f
 
 # What an autopilot gets of a fix, by profile: ``ardupilot``, ``px4`` or ``gps``.
 #
-# A tag has no attitude, so that none is given: the vehicle's own compass keeps its heading. Positions are north, east
+# A tag without a motion sensor has no attitude: the vehicle's own compass keeps its heading. Positions are north, east
 # and down of the site's origin.
 
 Profile = Literal["ardupilot", "px4", "gps"]
@@ -352,13 +352,16 @@ def vision_position_estimate(fix: FixMessage, heading_deg: float, reset_counter:
     A given height is sent unchanged: ArduPilot combines the three variances into one number, so a wide one for the
     height would cost the vehicle its horizontal position as well.
     """
+    w, x, y, z = _orientation_ned(fix, heading_deg) or (1.0, 0.0, 0.0, 0.0)
     return VisionPositionEstimate(
         time_us=micros(fix.unix_s),
         position=north_east_down(fix.position_m, heading_deg),
-        roll=0.0,
-        pitch=0.0,
-        yaw=0.0,
-        covariance=_pose_covariance(_covariance_ned(fix.covariance_m2, heading_deg), 0.0, UNKNOWN_ANGLE_RAD2),
+        roll=atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        pitch=asin(max(min(2.0 * (w * y - z * x), 1.0), -1.0)),
+        yaw=atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+        covariance=_with_angles(
+            fix, _pose_covariance(_covariance_ned(fix.covariance_m2, heading_deg), 0.0, UNKNOWN_ANGLE_RAD2)
+        ),
         reset_counter=reset_counter & 0xFF,
     )
 
@@ -372,10 +375,10 @@ def odometry(fix: FixMessage, heading_deg: float, reset_counter: int) -> Odometr
     return Odometry(
         time_us=micros(fix.unix_s),
         position=north_east_down(fix.position_m, heading_deg),
-        q=(NAN, NAN, NAN, NAN),
+        q=_orientation_ned(fix, heading_deg) or (NAN, NAN, NAN, NAN),
         velocity=(NAN, NAN, NAN),
         rates=(NAN, NAN, NAN),
-        pose_covariance=_pose_covariance(covariance_m2, NAN, NAN),
+        pose_covariance=_with_angles(fix, _pose_covariance(covariance_m2, NAN, NAN)),
         velocity_covariance=UNKNOWN_21,
         frame_id=LOCAL_NED,
         child_frame_id=LOCAL_NED,
@@ -464,6 +467,24 @@ def _swapped(covariance: Matrix) -> Matrix:
     """Convert from east, north, up to north, east, down."""
     ee, en, eu, ne, nn, nu, ue, un, uu = covariance
     return nn, ne, -nu, en, ee, -eu, -un, -ue, uu
+
+
+def _orientation_ned(fix: FixMessage, heading_deg: float) -> tuple[float, float, float, float] | None:
+    """Quaternion from forward, right, down to north, east, down of the fix's from forward, left, up to the site."""
+    if fix.orientation is None:
+        return None
+    w, x, y, z = fix.orientation
+    c, s = cos(0.5 * radians(heading_deg)), -sin(0.5 * radians(heading_deg))  # the site's y axis is turned clockwise
+    w, x, y, z = c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w
+    return sqrt(0.5) * (w + z), sqrt(0.5) * (x + y), sqrt(0.5) * (x - y), sqrt(0.5) * (w - z)
+
+
+def _with_angles(fix: FixMessage, covariance: tuple[float, ...]) -> tuple[float, ...]:
+    """The covariance of a pose with the variances of roll, pitch and heading, where the orientation is known."""
+    if fix.heading_std_rad is None:
+        return covariance
+    level, heading = LEVEL_VARIANCE, fix.heading_std_rad**2
+    return *covariance[:15], level, 0.0, 0.0, level, 0.0, heading
 
 
 def _pose_covariance(covariance: Matrix, between: float, angle: float) -> tuple[float, ...]:
@@ -620,7 +641,7 @@ class MavlinkEncoder(Encoder):
             following.attitude_rad = values
         elif number == _ESTIMATOR_STATUS:
             following.is_used = bool(int(values[0]) & _KNOWS_PLACE)
-        elif number == _HIGHRES_IMU:
+        elif number == HIGHRES_IMU:
             following.on_motion(unix_s, values[0] * 1e-6, values[1:])
         elif values[3:] in ((), (LOCAL_NED,)):
             following.on_position(unix_s, values[:3])

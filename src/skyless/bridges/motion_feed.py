@@ -2,8 +2,9 @@
 
 A line is ``{"imu": {"t_s": …, "rate_rps": [x, y, z], "force_mps2": [x, y, z]}}`` or ``{"wheels": {"t_s": …,
 "speed_mps": …, "rate_rps": …}}``, in a frame with x forward, y to the left and z up. ``t_s`` is Unix time; without it
-a line counts as of its arrival. Of MAVLink, HIGHRES_IMU and SCALED_IMU are used; their time since the vehicle's start
-is put on this computer's clock by the shortest latency.
+a line counts as of its arrival. Of MAVLink, HIGHRES_IMU is used, which has all that ATTITUDE has but for the angles,
+which the filter finds itself; its time since the vehicle's start is put on this computer's clock by the shortest
+latency.
 """
 
 import asyncio
@@ -12,16 +13,14 @@ from asyncio import StreamReader, StreamWriter
 from collections import Counter
 from collections.abc import Callable
 from math import inf
-from struct import Struct as Format
-from typing import Final
+from typing import Final, cast
 
 import msgspec
 from msgspec import Struct
 
-from skyless.bridges.mavlink import Frame, FrameReader
+from skyless.bridges.mavlink import CRC_EXTRAS, HIGHRES_IMU, Frame, FrameReader, decoded
 from skyless.bridges.target import TargetUrl
 from skyless.core.errors import SkylessError
-from skyless.core.estimator.motion import GRAVITY_MPS2
 from skyless.core.motion_sample import MotionSample
 
 PORT: Final = 7480
@@ -31,13 +30,6 @@ _MAX_LINE_BYTES: Final = 1 << 12
 _DRIFT: Final = 1e-4
 """By how much the two clocks may drift apart, so that the shortest latency does not stay for ever."""
 _SET_S: Final = 1.0
-
-_HIGHRES_IMU, _SCALED_IMU = 105, 26
-_CRC_EXTRAS: Final = {_HIGHRES_IMU: 93, _SCALED_IMU: 170}
-_HIGHRES: Final = Format("<Q6f")
-"""Time in µs, accelerations in m/s² and rates in rad/s, forward, right and down each; more follows."""
-_SCALED: Final = Format("<I6h")
-"""Time in ms, accelerations in thousandths of gravity and rates in mrad/s."""
 
 OnSample = Callable[[MotionSample], None]
 
@@ -81,7 +73,7 @@ class MotionFeed:
             raise url.wrong("with arm=x,y,z in metres: the antenna seen from the sensor") from None
         url.check_all_read()
         self._arm_m, self._on_sample, self._clock = (x, y, z), on_sample, clock
-        self._frames = FrameReader(_CRC_EXTRAS)
+        self._frames = FrameReader({HIGHRES_IMU: CRC_EXTRAS[HIGHRES_IMU]})
         self._ahead_s, self._ahead_at_s = inf, -inf
         self.server: asyncio.Server | None = None
         """What accepts connections, once it does."""
@@ -129,20 +121,14 @@ class MotionFeed:
             self._take(frame)
 
     def _take(self, frame: Frame) -> None:
-        layout = _HIGHRES if frame.number == _HIGHRES_IMU else _SCALED
-        when, *values = layout.unpack(frame.payload.ljust(layout.size, b"\0")[: layout.size])
-        time_s, force, rate = when * 1e-6, 1.0, 1.0
-        if layout is _SCALED:
-            time_s, force, rate = when * 1e-3, 1e-3 * GRAVITY_MPS2, 1e-3
-        x, y, z, p, q, r = values
-        now_s = self._clock()
+        when_us, x, y, z, p, q, r = cast(tuple[float, ...], decoded(frame))  # forward, right, down
+        time_s, now_s = when_us * 1e-6, self._clock()
         if abs(now_s - time_s - self._ahead_s) < _SET_S:
             self._ahead_s = min(now_s - time_s, self._ahead_s + _DRIFT * (now_s - self._ahead_at_s))
         else:
             self._ahead_s = now_s - time_s
         self._ahead_at_s = now_s
-        turning, pushed = (rate * p, -rate * q, -rate * r), (force * x, -force * y, -force * z)
-        self._pass(MotionSample(time_s + self._ahead_s, turning, pushed, arm_m=self._arm_m))
+        self._pass(MotionSample(time_s + self._ahead_s, (p, -q, -r), (x, -y, -z), arm_m=self._arm_m))
 
     def _host_s(self, unix_s: float | None) -> float:
         """A time on the host's clock; without one the present."""

@@ -25,7 +25,7 @@ from skyless.core.arrays import Array
 from skyless.core.earth import geodetic, rotated
 from skyless.core.errors import SkylessError
 from skyless.machine import what_to_install
-from skyless.run.mqtt.messages import AnchorHealth, FixMessage, Matrix, TagHealth, Vector
+from skyless.run.mqtt.messages import LEVEL_VARIANCE, AnchorHealth, FixMessage, Matrix, TagHealth, Vector
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
@@ -47,8 +47,6 @@ FRAME_RULE: Final = "a frame's name: letters, digits, _, - and /, not a / first"
 
 UNKNOWN_VARIANCE: Final = 1e6
 """Variance of each angle [rad²] and of its rate, where a tag does not know its orientation."""
-LEVEL_VARIANCE: Final = 0.002
-"""Variance of roll and pitch of a motion sensor whose heading is known: 2.5 degrees."""
 
 _STATUS_NO_FIX, _STATUS_FIX = -1, 0
 _SERVICE_UNKNOWN: Final = 0

@@ -233,8 +233,8 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     """How far this computer's clock may be from those of the anchors, in ms; 100 by default (with --site-key)."""
     motion: str | None = None
     """Where the tag's motion sensor or wheels are heard, which its filter uses (one NAME; joint): jsonl+tcp://HOST:PORT
-    for lines of JSON, as of the ROS 2 node, or mavlink+udp://HOST:PORT for HIGHRES_IMU and SCALED_IMU of a vehicle, on
-    which this computer waits; ?arm=x,y,z is the antenna seen from the sensor, forward, left and up in metres."""
+    for lines of JSON, as of the ROS 2 node, or mavlink+udp://HOST:PORT for HIGHRES_IMU of a vehicle, on which
+    this computer waits; ?arm=x,y,z is the antenna seen from the sensor, forward, left and up in metres."""
     tag_height: str | None = None
     """The tags' height (sniffers, FiRa boards, phones): metres, free (estimated) or auto, the default: estimated unless
     the anchors lie too flat, then theirs."""

@@ -72,6 +72,10 @@ class StatusMessage(Struct, frozen=True):
     """When it came online; 0 in a last will."""
 
 
+LEVEL_VARIANCE: Final = 0.002
+"""Variance of roll and pitch of a known orientation [rad²]: 2.5 degrees."""
+
+
 class FixMessage(Struct, frozen=True):
     """One fix of one tag. A tag publishes at its configured rate; ``serial`` counts all its fixes."""
 
