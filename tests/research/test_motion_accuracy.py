@@ -64,7 +64,9 @@ def flight(request, recordings):
 
 def means(flight, every, *, has_motion):
     """Roots of the mean squares over flights that begin with other differences, and the share beyond the level."""
-    runs = [flight.flown(every, begin, has_motion=has_motion) for begin in sorted({every * part // 3 for part in range(3)})]
+    runs = [
+        flight.flown(every, begin, has_motion=has_motion) for begin in sorted({every * part // 3 for part in range(3)})
+    ]
     across2, space2, beyond = np.mean(runs, axis=0)
     return np.sqrt(across2), np.sqrt(space2), beyond
 

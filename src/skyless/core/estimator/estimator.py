@@ -203,7 +203,8 @@ class Estimator:
 
     def shift_motion(self, ticks: int) -> None:
         """Let the time of motion samples continue on a scale on which the same time is ``ticks`` later."""
-        self._state.motion.ticks += ticks
+        m = self._state.motion
+        m.ticks, m.speed_ticks, m.ignored_ticks = m.ticks + ticks, m.speed_ticks + ticks, m.ignored_ticks + ticks
 
     def process(
         self,

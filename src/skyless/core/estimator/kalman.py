@@ -174,12 +174,12 @@ def relax_range_error(s: State, anchor: int, dt: float, walked_m: float) -> None
     kept, variance, kept_constant = range_error_decay(s, anchor, dt, walked_m)
     if variance > 0.0:  # also if the site states exact ranges: multipath is learnt there too
         make_uncertain(s, CHANGING_RANGE_ERRORS)
-        _decay(s, s.layout.change + anchor, kept, variance)
+        decay(s, s.layout.change + anchor, kept, variance)
     if kept_constant < 1.0:
-        _decay(s, s.layout.constant + anchor, kept_constant, square(s.settings.range_std_m))
+        decay(s, s.layout.constant + anchor, kept_constant, square(s.settings.range_std_m))
 
 
-def _decay(s: State, state: int, kept: float, variance: float) -> None:
+def decay(s: State, state: int, kept: float, variance: float) -> None:
     """Decay a state towards zero with the given long-term variance (Gauss–Markov)."""
     s.x[state] *= kept
     for other in range(s.used):

@@ -12,7 +12,7 @@ search. What is known of c and d then moves into the attitude, and what returns 
 
 from typing import Final
 
-from skyless.core.estimator.kalman import compute_fault_input, compute_ph, speed_squared, update
+from skyless.core.estimator.kalman import compute_fault_input, compute_ph, decay, speed_squared, update
 from skyless.core.estimator.measurements import add_term
 from skyless.core.estimator.state import (
     AXES,
@@ -24,7 +24,7 @@ from skyless.core.estimator.state import (
     use_motion,
 )
 from skyless.core.fix import ORIENTATION, PROTECTED_ROWS
-from skyless.core.native.arithmetic import floor, sqrt, square
+from skyless.core.native.arithmetic import exp, floor, sqrt, square
 from skyless.core.native.records import Reals, Ticks
 from skyless.core.ticks import NEVER, TICK_RATE_HZ, TICK_S
 
@@ -157,6 +157,21 @@ def _rest(s: State, rate_rps: Reals, dt: float) -> None:
             m.bias_rps[axis] += dt / tuning.tilt_s * (rate_rps[axis] - m.bias_rps[axis])
         share = dt / (tuning.tilt_s * GRAVITY_MPS2)
         _tilt(s, share * m.mean_mps2[1], -share * m.mean_mps2[0])
+    elif m.has_force and not (m.has_states and is_heading_known(s)):
+        # over a while even a tag in motion is on average not accelerated; later the positions show its level
+        share = dt / (tuning.slow_tilt_s * GRAVITY_MPS2)
+        x, y = share * m.mean_mps2[1], -share * m.mean_mps2[0]
+        _tilt(s, x, y)
+        _learn_bias(s, x, y, 0.0)
+
+
+def _learn_bias(s: State, x: float, y: float, z: float) -> None:
+    """Let a turn of the level frame, which the gyroscope's bias has made necessary, reduce that bias."""
+    m = s.motion
+    m.shown_m[0], m.shown_m[1], m.shown_m[2] = x, y, z
+    turned_back(m.shown_mps, m.attitude, m.shown_m)
+    for axis in range(AXES):
+        m.bias_rps[axis] -= m.shown_mps[axis] / s.tuning.bias_s
 
 
 def _tilt(s: State, x: float, y: float) -> None:
@@ -230,18 +245,14 @@ def move(s: State, rx_ticks: Ticks) -> None:
 
 
 def _doubt(s: State, dt: float) -> None:
-    """Begin again with an unknown heading if innovations call for much process noise; the second time, ignore it."""
+    """Ignore a sensor for a while if innovations call for much process noise; its heading is then unknown again."""
     m, tuning = s.motion, s.tuning
     is_wrong = s.status.q_scale > tuning.wrong_scale or m.speed_nis > tuning.wrong_speed_nis
     m.wrong_s = m.wrong_s + dt if is_wrong else max(m.wrong_s - dt, 0.0)
-    m.right_s = 0.0 if is_wrong else m.right_s + dt
-    if m.right_s > tuning.ignored_s:
-        m.contradictions = 0
     if m.wrong_s > tuning.wrong_s:
         m.wrong_s = m.speed_nis = 0.0
         m.contradictions += 1
-        if m.contradictions > 1:
-            m.ignored_ticks = m.used_ticks + floor(tuning.ignored_s * TICK_RATE_HZ)
+        m.ignored_ticks = m.used_ticks + floor(tuning.ignored_s * TICK_RATE_HZ)
         expect_motion(s)
 
 
@@ -264,8 +275,11 @@ def _add_path(s: State, dt: float) -> None:
 def _let_drift(s: State, dt: float) -> None:
     """Add the process noise of heading and acceleration."""
     where, tuning = s.layout, s.tuning
+    is_slow, kept = speed_squared(s) < square(tuning.rest_mps), exp(-dt / tuning.heading_memory_s)
     for state in range(where.heading, where.acceleration):
         s.P[at(state, state)] += square(tuning.heading_walk) * s.status.q_scale * dt
+        if is_slow and not is_heading_known(s):  # a sensor's errors at rest look like a heading without effect
+            decay(s, state, kept, square(tuning.heading_std))
     for axis in range(s.dim):
         walk = square(tuning.acceleration_walk) * s.status.q_scale * dt * (tuning.vertical_share if axis == 2 else 1.0)
         s.P[at(where.acceleration + axis, where.acceleration + axis)] += walk
@@ -300,18 +314,24 @@ def add_state(s: State, target: int, source: int, factor: float) -> None:
 
 
 def is_heading_known(s: State) -> bool:
-    """Whether the direction of the heading's vector is roughly known."""
-    cos, sin = s.layout.heading, s.layout.heading + 1
-    length2, variance = square(s.x[cos]) + square(s.x[sin]), s.P[at(cos, cos)] + s.P[at(sin, sin)]
-    return length2 > square(s.tuning.heading_std) and variance < s.tuning.known_heading_variance
+    """Whether the heading is roughly known, so that its vector is about as long as it should be."""
+    length2 = square(s.x[s.layout.heading]) + square(s.x[s.layout.heading + 1])
+    return length2 > square(s.tuning.heading_std) and _heading_variance(s) < s.tuning.known_heading_variance
+
+
+def _heading_variance(s: State) -> float:
+    """Variance of the heading [rad²]: of its vector across its direction, over its length."""
+    first = s.layout.heading
+    cos, sin = s.x[first], s.x[first + 1]
+    across = cos * cos * s.P[at(first + 1, first + 1)] + sin * sin * s.P[at(first, first)]
+    return (across - 2.0 * cos * sin * s.P[at(first, first + 1)]) / square(cos * cos + sin * sin)
 
 
 def heading_std_rad(s: State) -> float:
     """Standard deviation of the heading; negative until it is known to five degrees."""
-    m, cos, sin = s.motion, s.layout.heading, s.layout.heading + 1
-    if not m.has_effect or not is_heading_known(s):
+    if not s.motion.has_effect or not is_heading_known(s):
         return -1.0
-    variance = s.P[at(cos, cos)] + s.P[at(sin, sin)]
+    variance = _heading_variance(s)
     return sqrt(variance) if variance < s.tuning.sure_heading_variance else -1.0
 
 
@@ -332,18 +352,12 @@ def fill_orientation(s: State) -> None:
 
 
 def settle_heading(s: State, dt: float) -> None:
-    """Measure the length of the heading's vector as 1, and turn the level frame into the site's."""
+    """Turn the level frame into the site's, once the heading is roughly known."""
     if not is_heading_known(s):
         return
     m, tuning, where, q = s.motion, s.tuning, s.layout, s.motion.attitude
     cos, sin, share = where.heading, where.heading + 1, min(dt / tuning.tilt_s, 1.0)
     length = sqrt(square(s.x[cos]) + square(s.x[sin]))
-    s.terms = 0
-    add_term(s, cos, s.x[cos] / length)
-    add_term(s, sin, s.x[sin] / length)
-    variance = compute_ph(s) + square(tuning.length_std) * 0.1 / dt
-    compute_fault_input(s, -1)
-    update(s, 1.0 - length, variance)
     # what has been learnt of tilt and heading moves into the attitude, and what had to move into the bias
     c, d = s.x[cos], s.x[sin]
     x = -share * (c * s.x[where.acceleration + 1] - d * s.x[where.acceleration]) / GRAVITY_MPS2
@@ -360,11 +374,8 @@ def settle_heading(s: State, dt: float) -> None:
     _multiply(q, half, 0.0, 0.0, 0.5 * d / half, q[0], q[1], q[2], q[3])
     _turn_vector(m.force_mps2, c, d)
     _turn_vector(m.mean_mps2, c, d)
-    if share < 1.0 and s.P[at(cos, cos)] + s.P[at(sin, sin)] < tuning.sure_heading_variance:
-        m.shown_m[0], m.shown_m[1], m.shown_m[2] = x, y, d
-        turned_back(m.shown_mps, q, m.shown_m)
-        for axis in range(AXES):
-            m.bias_rps[axis] -= m.shown_mps[axis] / tuning.bias_s
+    if share < 1.0 and _heading_variance(s) < tuning.sure_heading_variance:
+        _learn_bias(s, x, y, d)
 
 
 def _turn_vector(vector: Reals, cos: float, sin: float) -> None:

@@ -61,9 +61,9 @@ class Tuning(Record):
     wrong_speed_nis: float = 5.0
     """… or a mean NIS of wheels' speeds beyond this, …"""
     wrong_s: float = 1.5
-    """… after this time [s]: the heading is looked for again, and from the second time on …"""
+    """… after this time [s]. It is then ignored …"""
     ignored_s: float = 20.0
-    """… the sensor is ignored for this time [s]; after as long without it counts as the first time."""
+    """… for this time [s], and its heading is looked for again."""
     level_s: float = 0.5
     """Time over which specific force is averaged to find the level [s]."""
     rest_rps: float = 0.1
@@ -73,11 +73,15 @@ class Tuning(Record):
     rest_mps: float = 0.2
     """A tag that is faster is not at rest, whatever the sensor shows [m/s]."""
     tilt_s: float = 2.0
-    """Time in which known errors of tilt and heading move into the attitude [s] …"""
+    """Time in which known errors of tilt and heading move into the attitude [s], …"""
+    slow_tilt_s: float = 10.0
+    """… in which the mean specific force corrects the level of a tag in motion whose heading is unknown [s] …"""
     bias_s: float = 20.0
     """… and in which those that come back move into the gyroscope's bias [s]."""
     heading_std: float = 0.7
     """Standard deviation of cosine and sine of an unknown heading."""
+    heading_memory_s: float = 20.0
+    """Time in which a tag at rest forgets what little it knows of its heading [s]."""
     heading_walk: float = 0.02
     """Random walk of both [1/√s]: the gyroscope's drift."""
     acceleration_std_mps2: float = 1.0
@@ -90,13 +94,10 @@ class Tuning(Record):
     """Process noise of motion with a sensor whose heading is known [m²/s³] …"""
     headless_noise: float = 0.1
     """… and while it is not known."""
-    known_heading_variance: float = 0.1
-    """Variance of the heading's cosine and sine, together, below which it is roughly known …"""
-    sure_heading_variance: float = 0.007
-    """… below which it is well known, to five degrees: the gyroscope's bias is then learnt from its changes …"""
-    length_std: float = 0.2
-    """… and its length counts as 1, to this in each tenth of a second."""
-
+    known_heading_variance: float = 0.05
+    """Variance of the heading below which it is roughly known [rad²] …"""
+    sure_heading_variance: float = 0.0076
+    """… and below which it is well known, to five degrees: the gyroscope's bias is then learnt from its changes."""
     speed_std_mps: float = 0.02
     """Standard deviation of the speed that wheels show, over a second [m/s] …"""
     speed_share: float = 0.02

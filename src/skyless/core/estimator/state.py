@@ -211,13 +211,11 @@ class Motion(Record):
     speed_nis: float
     """Running mean of the NIS of speeds, over a second."""
     wrong_s: float
-    """Time for which innovations have called for much process noise …"""
-    right_s: float
-    """… or for little."""
-    contradictions: int
-    """How often the former has lasted long, since the latter did."""
+    """Time for which innovations have called for much process noise."""
+    contradictions: Count
+    """How often that has lasted long."""
     ignored_ticks: Ticks
-    """Tag time until which the sensor is ignored for that."""
+    """Tag time until which the sensor is ignored for it."""
     ticks: Ticks
     """Tag time of the newest sample that turned the attitude."""
     speed_ticks: Ticks

@@ -282,6 +282,7 @@ INTERNAL void step(Motion *m, real *rate_rps, real *force_mps2, real dt);
 INTERNAL void push(Motion *m, int32_t axis, real acceleration_mps2, real dt);
 INTERNAL void multiply(real *to, real a, real b, real c, real d, real w, real x, real y, real z);
 INTERNAL void rest(State *s, real *rate_rps, real dt);
+INTERNAL void learn_bias(State *s, real x, real y, real z);
 INTERNAL void tilt(State *s, real x, real y);
 INTERNAL void tilt_vector(real *vector, real x, real y);
 INTERNAL void turned_back(real *to, real *attitude, real *vector);
@@ -294,6 +295,7 @@ INTERNAL void let_drift(State *s, real dt);
 INTERNAL void add_to(State *s, int32_t first, real *path, real of_acceleration);
 INTERNAL void add_state(State *s, int32_t target, int32_t source, real factor);
 INTERNAL bool is_heading_known(State *s);
+INTERNAL real heading_variance(State *s);
 INTERNAL real heading_std_rad(State *s);
 INTERNAL void fill_orientation(State *s);
 INTERNAL void settle_heading(State *s, real dt);
@@ -4320,6 +4322,25 @@ INTERNAL void rest(State *s, real *rate_rps, real dt) {
         }
         real share = dt / (tuning->tilt_s * GRAVITY_MPS2);
         tilt(s, share * m->mean_mps2[1], -share * m->mean_mps2[0]);
+    } else if (m->has_force && !(m->has_states && is_heading_known(s))) {
+        /* over a while even a tag in motion is on average not accelerated; later the positions show its level */
+        real share = dt / (tuning->slow_tilt_s * GRAVITY_MPS2);
+        real x = share * m->mean_mps2[1];
+        real y = -share * m->mean_mps2[0];
+        tilt(s, x, y);
+        learn_bias(s, x, y, REAL(0.0));
+    }
+}
+
+/* Let a turn of the level frame, which the gyroscope's bias has made necessary, reduce that bias. */
+INTERNAL void learn_bias(State *s, real x, real y, real z) {
+    Motion *m = &s->motion;
+    m->shown_m[0] = x;
+    m->shown_m[1] = y;
+    m->shown_m[2] = z;
+    turned_back(m->shown_mps, m->attitude, m->shown_m);
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        m->bias_rps[axis] -= m->shown_mps[axis] / s->tuning.bias_s;
     }
 }
 
@@ -4420,23 +4441,17 @@ INTERNAL void move(State *s, int64_t rx_ticks) {
     }
 }
 
-/* Begin again with an unknown heading if innovations call for much process noise; the second time, ignore it. */
+/* Ignore a sensor for a while if innovations call for much process noise; its heading is then unknown again. */
 INTERNAL void doubt(State *s, real dt) {
     Motion *m = &s->motion;
     Tuning *tuning = &s->tuning;
     bool is_wrong = s->status.q_scale > tuning->wrong_scale || m->speed_nis > tuning->wrong_speed_nis;
     m->wrong_s = is_wrong ? m->wrong_s + dt : max_real(m->wrong_s - dt, REAL(0.0));
-    m->right_s = is_wrong ? REAL(0.0) : m->right_s + dt;
-    if (m->right_s > tuning->ignored_s) {
-        m->contradictions = 0;
-    }
     if (m->wrong_s > tuning->wrong_s) {
         m->speed_nis = REAL(0.0);
         m->wrong_s = REAL(0.0);
         m->contradictions += 1;
-        if (m->contradictions > 1) {
-            m->ignored_ticks = m->used_ticks + floor_real(tuning->ignored_s * TICK_RATE_HZ);
-        }
+        m->ignored_ticks = m->used_ticks + floor_real(tuning->ignored_s * TICK_RATE_HZ);
         expect_motion(s);
     }
 }
@@ -4462,8 +4477,13 @@ INTERNAL void add_path(State *s, real dt) {
 INTERNAL void let_drift(State *s, real dt) {
     Layout *where = &s->layout;
     Tuning *tuning = &s->tuning;
+    bool is_slow = speed_squared(s) < square(tuning->rest_mps);
+    real kept = exp_(-dt / tuning->heading_memory_s);
     for (int32_t state = where->heading, state_end = where->acceleration; state < state_end; state++) {
         s->P[at(state, state)] += square(tuning->heading_walk) * s->status.q_scale * dt;
+        if (is_slow && !is_heading_known(s)) {  /* a sensor's errors at rest look like a heading without effect */
+            decay(s, state, kept, square(tuning->heading_std));
+        }
     }
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         real walk = square(tuning->acceleration_walk) * s->status.q_scale * dt * (axis == 2 ? tuning->vertical_share :
@@ -4505,24 +4525,27 @@ INTERNAL void add_state(State *s, int32_t target, int32_t source, real factor) {
 
 /* Heading */
 
-/* Whether the direction of the heading's vector is roughly known. */
+/* Whether the heading is roughly known, so that its vector is about as long as it should be. */
 INTERNAL bool is_heading_known(State *s) {
-    int32_t cos = s->layout.heading;
-    int32_t sin = s->layout.heading + 1;
-    real length2 = square(s->x[cos]) + square(s->x[sin]);
-    real variance = s->P[at(cos, cos)] + s->P[at(sin, sin)];
-    return length2 > square(s->tuning.heading_std) && variance < s->tuning.known_heading_variance;
+    real length2 = square(s->x[s->layout.heading]) + square(s->x[s->layout.heading + 1]);
+    return length2 > square(s->tuning.heading_std) && heading_variance(s) < s->tuning.known_heading_variance;
+}
+
+/* Variance of the heading [rad²]: of its vector across its direction, over its length. */
+INTERNAL real heading_variance(State *s) {
+    int32_t first = s->layout.heading;
+    real cos = s->x[first];
+    real sin = s->x[first + 1];
+    real across = cos * cos * s->P[at(first + 1, first + 1)] + sin * sin * s->P[at(first, first)];
+    return (across - REAL(2.0) * cos * sin * s->P[at(first, first + 1)]) / square(cos * cos + sin * sin);
 }
 
 /* Standard deviation of the heading; negative until it is known to five degrees. */
 INTERNAL real heading_std_rad(State *s) {
-    Motion *m = &s->motion;
-    int32_t cos = s->layout.heading;
-    int32_t sin = s->layout.heading + 1;
-    if (!m->has_effect || !is_heading_known(s)) {
+    if (!s->motion.has_effect || !is_heading_known(s)) {
         return -REAL(1.0);
     }
-    real variance = s->P[at(cos, cos)] + s->P[at(sin, sin)];
+    real variance = heading_variance(s);
     return variance < s->tuning.sure_heading_variance ? SQRT(variance) : -REAL(1.0);
 }
 
@@ -4550,7 +4573,7 @@ INTERNAL void fill_orientation(State *s) {
     }
 }
 
-/* Measure the length of the heading's vector as 1, and turn the level frame into the site's. */
+/* Turn the level frame into the site's, once the heading is roughly known. */
 INTERNAL void settle_heading(State *s, real dt) {
     if (!is_heading_known(s)) {
         return;
@@ -4563,12 +4586,6 @@ INTERNAL void settle_heading(State *s, real dt) {
     int32_t sin = where->heading + 1;
     real share = min_real(dt / tuning->tilt_s, REAL(1.0));
     real length = SQRT(square(s->x[cos]) + square(s->x[sin]));
-    s->terms = 0;
-    add_term(s, cos, s->x[cos] / length);
-    add_term(s, sin, s->x[sin] / length);
-    real variance = compute_ph(s) + square(tuning->length_std) * REAL(0.1) / dt;
-    compute_fault_input(s, -1);
-    update(s, REAL(1.0) - length, variance, REAL(1.0));
     /* what has been learnt of tilt and heading moves into the attitude, and what had to move into the bias */
     real c = s->x[cos];
     real d = s->x[sin];
@@ -4590,14 +4607,8 @@ INTERNAL void settle_heading(State *s, real dt) {
     multiply(q, half, REAL(0.0), REAL(0.0), REAL(0.5) * d / half, q[0], q[1], q[2], q[3]);
     turn_vector(m->force_mps2, c, d);
     turn_vector(m->mean_mps2, c, d);
-    if (share < REAL(1.0) && s->P[at(cos, cos)] + s->P[at(sin, sin)] < tuning->sure_heading_variance) {
-        m->shown_m[0] = x;
-        m->shown_m[1] = y;
-        m->shown_m[2] = d;
-        turned_back(m->shown_mps, q, m->shown_m);
-        for (int32_t axis = 0; axis < AXES; axis++) {
-            m->bias_rps[axis] -= m->shown_mps[axis] / tuning->bias_s;
-        }
+    if (share < REAL(1.0) && heading_variance(s) < tuning->sure_heading_variance) {
+        learn_bias(s, x, y, d);
     }
 }
 
@@ -7439,37 +7450,37 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .stationary_std_mps = REAL(0.01), .longest_gap_s = REAL(0.3), .short_gap_s = REAL(0.05), .wrong_scale =
             REAL(60.0), .wrong_speed_nis = REAL(5.0), .wrong_s = REAL(1.5), .ignored_s = REAL(20.0), .level_s =
             REAL(0.5), .rest_rps = REAL(0.1), .rest_mps2 = REAL(0.5), .rest_mps = REAL(0.2), .tilt_s = REAL(2.0),
-            .bias_s = REAL(20.0), .heading_std = REAL(0.7), .heading_walk = REAL(0.02), .acceleration_std_mps2 =
-            REAL(1.0), .acceleration_walk = REAL(0.08), .vertical_share = REAL(0.02), .sensor_noise = REAL(0.01),
-            .headless_noise = REAL(0.1), .known_heading_variance = REAL(0.1), .sure_heading_variance = REAL(0.007),
-            .length_std = REAL(0.2), .speed_std_mps = REAL(0.02), .speed_share = REAL(0.02), .held_step_m = REAL(0.15),
-            .held_max_m = REAL(0.4), .curvature_share = REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02),
-            .wrong_nis = REAL(2.0), .slow_forgetting = REAL(0.005), .late_often_share = REAL(0.02), .reception_huber =
-            REAL(1.5), .difference_huber = REAL(1.0), .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0),
-            .lost_share = REAL(0.5), .suspect = REAL(3.0), .in_row = REAL(2.0), .in_row_where_late = REAL(5.0),
-            .together = REAL(7.0), .first_change_scale = REAL(10.0), .ended_std_m = REAL(0.05), .ended = REAL(2.0),
-            .obstructed_walk = REAL(0.004), .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2),
-            .jump_rise = REAL(0.5), .obstructed_std_m = REAL(0.05), .obstructed_s = REAL(5.0), .place_step_m =
-            REAL(0.1), .place_first = REAL(20.0), .place_samples = REAL(100.0), .place_memory = REAL(1000.0),
-            .place_min_m2 = REAL(0.0012), .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m =
-            REAL(0.3), .recent_std_m = REAL(0.08), .creeping_std_m = REAL(0.2), .recent_packets = REAL(16.0),
-            .creeping_s = REAL(3.0), .late_std_m = REAL(1.0), .sure_chi2 = REAL(50.0), .early_weight = REAL(0.8),
-            .open_pair_std_m = REAL(0.1), .pair_relays = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s =
-            REAL(0.5), .curved_std = REAL(0.1), .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s
-            = REAL(1.0), .start_margin = REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0),
-            .slow_superframe_s = REAL(0.2), .slow_curved_std = REAL(0.7), .slow_start_std = REAL(2.0),
-            .longest_superframe_s = REAL(1.3), .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15),
-            .fitting_chi2 = REAL(2.0), .most_late = REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2),
-            .window = REAL(60.0), .window_s = REAL(1.0), .moving_window = REAL(20.0), .moving_std_m = REAL(1.5),
-            .moving_nis = REAL(1.5), .moving_apart = REAL(6.0), .median_difference_std_m = REAL(0.08), .late_start_std_m
-            = REAL(0.14), .rival_m = REAL(0.5), .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5),
-            .most_horizontal_std_m = REAL(3.0), .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002),
-            .phase_max_std_m = REAL(0.006), .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate =
-            REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02), .phase_former_s = REAL(0.5),
-            .phases_in_row = REAL(4.0), .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02),
-            .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0),
-            .sensor_valid_s = REAL(1.0)}, .is_starting = true, .misfit = -1, .relays_may_contradict = true,
-            .may_begin_again = true};
+            .slow_tilt_s = REAL(10.0), .bias_s = REAL(20.0), .heading_std = REAL(0.7), .heading_memory_s = REAL(20.0),
+            .heading_walk = REAL(0.02), .acceleration_std_mps2 = REAL(1.0), .acceleration_walk = REAL(0.08),
+            .vertical_share = REAL(0.02), .sensor_noise = REAL(0.01), .headless_noise = REAL(0.1),
+            .known_heading_variance = REAL(0.05), .sure_heading_variance = REAL(0.0076), .speed_std_mps = REAL(0.02),
+            .speed_share = REAL(0.02), .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share =
+            REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02), .wrong_nis = REAL(2.0), .slow_forgetting =
+            REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5), .difference_huber = REAL(1.0),
+            .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share = REAL(0.5), .suspect = REAL(3.0),
+            .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0), .first_change_scale =
+            REAL(10.0), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk = REAL(0.004),
+            .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5),
+            .obstructed_std_m = REAL(0.05), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1), .place_first =
+            REAL(20.0), .place_samples = REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 = REAL(0.0012),
+            .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3), .recent_std_m =
+            REAL(0.08), .creeping_std_m = REAL(0.2), .recent_packets = REAL(16.0), .creeping_s = REAL(3.0), .late_std_m
+            = REAL(1.0), .sure_chi2 = REAL(50.0), .early_weight = REAL(0.8), .open_pair_std_m = REAL(0.1), .pair_relays
+            = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s = REAL(0.5), .curved_std = REAL(0.1),
+            .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s = REAL(1.0), .start_margin =
+            REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0), .slow_superframe_s = REAL(0.2),
+            .slow_curved_std = REAL(0.7), .slow_start_std = REAL(2.0), .longest_superframe_s = REAL(1.3),
+            .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late =
+            REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s =
+            REAL(1.0), .moving_window = REAL(20.0), .moving_std_m = REAL(1.5), .moving_nis = REAL(1.5), .moving_apart =
+            REAL(6.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),
+            .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
+            .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
+            .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =
+            REAL(0.1), .phase_step_m = REAL(0.02), .phase_former_s = REAL(0.5), .phases_in_row = REAL(4.0),
+            .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m
+            = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting
+            = true, .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
     t->owner.qa = qa;
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;

@@ -700,26 +700,27 @@ typedef struct Tuning {
     /* A factor on process noise beyond this shows that sensor and positions contradict each other, … */
     real wrong_scale;
     real wrong_speed_nis;  /* … or a mean NIS of wheels' speeds beyond this, … */
-    real wrong_s;  /* … after this time [s]: the heading is looked for again, and from the second time on … */
-    real ignored_s;  /* … the sensor is ignored for this time [s]; after as long without it counts as the first time. */
+    real wrong_s;  /* … after this time [s]. It is then ignored … */
+    real ignored_s;  /* … for this time [s], and its heading is looked for again. */
     real level_s;  /* Time over which specific force is averaged to find the level [s]. */
     real rest_rps;  /* A sensor's rate above this shows motion [rad/s] … */
     real rest_mps2;  /* … and a specific force that differs from its running mean by more [m/s²]. */
     real rest_mps;  /* A tag that is faster is not at rest, whatever the sensor shows [m/s]. */
-    real tilt_s;  /* Time in which known errors of tilt and heading move into the attitude [s] … */
+    real tilt_s;  /* Time in which known errors of tilt and heading move into the attitude [s], … */
+    /* … in which the mean specific force corrects the level of a tag in motion whose heading is unknown [s] … */
+    real slow_tilt_s;
     real bias_s;  /* … and in which those that come back move into the gyroscope's bias [s]. */
     real heading_std;  /* Standard deviation of cosine and sine of an unknown heading. */
+    real heading_memory_s;  /* Time in which a tag at rest forgets what little it knows of its heading [s]. */
     real heading_walk;  /* Random walk of both [1/√s]: the gyroscope's drift. */
     real acceleration_std_mps2;  /* Standard deviation of an acceleration's error: six degrees of tilt [m/s²] … */
     real acceleration_walk;  /* … and its random walk [m/s²/√s]. */
     real vertical_share;  /* Share of both variances for the vertical, which does not depend on tilt. */
     real sensor_noise;  /* Process noise of motion with a sensor whose heading is known [m²/s³] … */
     real headless_noise;  /* … and while it is not known. */
-    /* Variance of the heading's cosine and sine, together, below which it is roughly known … */
-    real known_heading_variance;
-    /* … below which it is well known, to five degrees: the gyroscope's bias is then learnt from its changes … */
+    real known_heading_variance;  /* Variance of the heading below which it is roughly known [rad²] … */
+    /* … and below which it is well known, to five degrees: the gyroscope's bias is then learnt from its changes. */
     real sure_heading_variance;
-    real length_std;  /* … and its length counts as 1, to this in each tenth of a second. */
     real speed_std_mps;  /* Standard deviation of the speed that wheels show, over a second [m/s] … */
     real speed_share;  /* … and the part that is a fraction of it. */
     /* Distance of the estimate from the point of linearisation, of ranges or phases, that moves the point [m]. */
@@ -1052,10 +1053,9 @@ typedef struct Motion {
     bool is_used;  /* Whether the newest time update was one by a specific force. */
     bool has_effect;  /* Whether the newest time update was one by the sensor or its wheels. */
     real speed_nis;  /* Running mean of the NIS of speeds, over a second. */
-    real wrong_s;  /* Time for which innovations have called for much process noise … */
-    real right_s;  /* … or for little. */
-    int32_t contradictions;  /* How often the former has lasted long, since the latter did. */
-    int64_t ignored_ticks;  /* Tag time until which the sensor is ignored for that. */
+    real wrong_s;  /* Time for which innovations have called for much process noise. */
+    int64_t contradictions;  /* How often that has lasted long. */
+    int64_t ignored_ticks;  /* Tag time until which the sensor is ignored for it. */
     int64_t ticks;  /* Tag time of the newest sample that turned the attitude. */
     int64_t speed_ticks;  /* Tag time of the newest speed of wheels, … */
     real speed_mps;  /* … along x of the sensor's frame. */
