@@ -23,7 +23,7 @@ from skyless.bridges.target import TargetUrl
 from skyless.core.errors import SkylessError
 from skyless.core.motion_sample import MotionSample
 
-PORT: Final = 7480
+PORT: Final = 7011
 MAVLINK_PORT: Final = 14_551
 
 _MAX_LINE_BYTES: Final = 1 << 12

@@ -211,7 +211,7 @@ def update_stationary(s: State, dt: float) -> None:
         chi2 += square(s.x[axis] - status.stationary_m[axis]) / s.P[at(axis, axis)]
     status.stationary_s += dt
     moved = chi2 > s.dim or status.lag_square > tuning.lag_limit or status.rejected_in_row > 1
-    if MOTION_STATES > 0 and s.motion.is_used:
+    if MOTION_STATES > 0 and s.motion.has_effect:
         moved = moved or s.motion.rest_s < tuning.level_s
     if moved:
         status.stationary_s = 0.0

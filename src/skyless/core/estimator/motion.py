@@ -36,11 +36,13 @@ GRAVITY_MPS2: Final = 9.80665
 def hear_wheels(s: State, ticks: Ticks, rate_rps: Reals, speed_mps: float) -> bool:
     """Process a speed along x at a tag time, and a rate if no gyroscope gives one. Returns False if it is late."""
     m = s.motion
-    if m.speeds > 0 and -s.tuning.longest_gap_s < (ticks - m.speed_ticks) * TICK_S <= 0.0:
+    if m.speeds > 0 and -s.tuning.longest_silence_s < (ticks - m.speed_ticks) * TICK_S <= 0.0:
         m.late += 1
         return False
     m.speeds += 1
     m.speed_ticks, m.speed_mps = ticks, speed_mps
+    if abs(speed_mps) > s.tuning.speed_std_mps:
+        m.rest_s = 0.0
     if m.has_force and abs(ticks - m.ticks) * TICK_S <= s.tuning.longest_gap_s:
         return True
     m.up_mps2[0], m.up_mps2[1], m.up_mps2[2] = 0.0, 0.0, GRAVITY_MPS2
@@ -52,11 +54,11 @@ def hear_wheels(s: State, ticks: Ticks, rate_rps: Reals, speed_mps: float) -> bo
 def hear_motion(s: State, ticks: Ticks, rate_rps: Reals, force_mps2: Reals) -> bool:
     """Process a sample of rate and specific force at a tag time. Returns False if it is late.
 
-    After a gap level and heading are looked for again.
+    After a gap, or on another scale of time, level and heading are looked for again.
     """
     m, tuning = s.motion, s.tuning
     dt, m.has_force = (ticks - m.ticks) * TICK_S, True
-    if m.samples > 0 and -tuning.longest_gap_s < dt <= 0.0:
+    if m.samples > 0 and -tuning.longest_silence_s < dt <= 0.0:
         m.late += 1
         return False
     if m.samples == 0 or not 0.0 < dt <= tuning.longest_gap_s:

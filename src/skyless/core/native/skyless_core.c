@@ -3158,7 +3158,7 @@ INTERNAL void update_stationary(State *s, real dt) {
     }
     status->stationary_s += dt;
     bool moved = chi2 > (real)s->dim || status->lag_square > tuning->lag_limit || status->rejected_in_row > 1;
-    if (MOTION_STATES > 0 && s->motion.is_used) {
+    if (MOTION_STATES > 0 && s->motion.has_effect) {
         moved = moved || s->motion.rest_s < tuning->level_s;
     }
     if (moved) {
@@ -4153,7 +4153,7 @@ INTERNAL void zero_velocity(State *s) {
 /* Process a speed along x at a tag time, and a rate if no gyroscope gives one. Returns False if it is late. */
 SKYLESS_EXPORT bool skyless_hear_wheels(State *s, int64_t ticks, real *rate_rps, real speed_mps) {
     Motion *m = &s->motion;
-    if (m->speeds > 0 && (-s->tuning.longest_gap_s < (real)(ticks - m->speed_ticks) * TICK_S && (real)(ticks -
+    if (m->speeds > 0 && (-s->tuning.longest_silence_s < (real)(ticks - m->speed_ticks) * TICK_S && (real)(ticks -
             m->speed_ticks) * TICK_S <= REAL(0.0))) {
         m->late += 1;
         return false;
@@ -4161,6 +4161,9 @@ SKYLESS_EXPORT bool skyless_hear_wheels(State *s, int64_t ticks, real *rate_rps,
     m->speeds += 1;
     m->speed_ticks = ticks;
     m->speed_mps = speed_mps;
+    if (abs_real(speed_mps) > s->tuning.speed_std_mps) {
+        m->rest_s = REAL(0.0);
+    }
     if (m->has_force && (real)abs_64(ticks - m->ticks) * TICK_S <= s->tuning.longest_gap_s) {
         return true;
     }
@@ -4174,13 +4177,13 @@ SKYLESS_EXPORT bool skyless_hear_wheels(State *s, int64_t ticks, real *rate_rps,
 
 /* Process a sample of rate and specific force at a tag time. Returns False if it is late.
  *
- * After a gap level and heading are looked for again. */
+ * After a gap, or on another scale of time, level and heading are looked for again. */
 SKYLESS_EXPORT bool skyless_hear_motion(State *s, int64_t ticks, real *rate_rps, real *force_mps2) {
     Motion *m = &s->motion;
     Tuning *tuning = &s->tuning;
     real dt = (real)(ticks - m->ticks) * TICK_S;
     m->has_force = true;
-    if (m->samples > 0 && (-tuning->longest_gap_s < dt && dt <= REAL(0.0))) {
+    if (m->samples > 0 && (-tuning->longest_silence_s < dt && dt <= REAL(0.0))) {
         m->late += 1;
         return false;
     }

@@ -199,7 +199,7 @@ class TagHealth(Struct, frozen=True):
     sleeps_s: float | None = None
     """For how long from now it sends no fixes, as it is going to sleep; None while it is awake."""
     notes: tuple[str, ...] = ()
-    """What is wrong with another system's anchors, in sentences."""
+    """What is wrong with another system's anchors or with the tag's motion sensor, in sentences."""
 
 
 NOT_DROPS: Final = frozenset({"heard", "sent", "takeover"})
