@@ -132,7 +132,7 @@ class Feed:
 
 @pytest.fixture(params=["dds", "node"])
 def door(request, ros, capfd):
-    """A feed that comes out in ROS, in a domain where nothing of another test is on its way: by ros2://, or by jsonl+tcp:// and the package's node, which has no NavSatFix."""
+    """A feed in a new domain of ROS: by ros2://, or by jsonl+tcp:// and the package's node, which has no NavSatFix."""
     ros.choose_domain()
     if request.param == "dds":
         pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheel here")

@@ -14,15 +14,7 @@ from typing import Final
 
 from skyless.core.estimator.kalman import compute_fault_input, compute_ph, decay, speed_squared, update
 from skyless.core.estimator.measurements import add_term
-from skyless.core.estimator.state import (
-    AXES,
-    Motion,
-    State,
-    at,
-    expect_motion,
-    set_covariance,
-    use_motion,
-)
+from skyless.core.estimator.state import AXES, Motion, State, at, expect_motion, set_covariance, use_motion
 from skyless.core.fix import ORIENTATION, PROTECTED_ROWS
 from skyless.core.native.arithmetic import exp, floor, sqrt, square
 from skyless.core.native.records import Reals, Ticks
