@@ -22,7 +22,7 @@ from skyless.sim.trajectory import Roaming
 
 pytestmark = pytest.mark.site
 
-UP = (0.0, 0.0, GRAVITY_MPS2)
+UP, HIT, THROWN = (0.0, 0.0, GRAVITY_MPS2), (150.0, 0.0, 9.8), (35.0, 0.0, 0.0)
 numbers = st.floats(-2.0, 2.0)
 vectors = st.tuples(numbers, numbers, numbers)
 
@@ -51,9 +51,11 @@ def test_the_level_is_found_from_gravity(force):
 
 @given(vectors.filter(lambda v: np.linalg.norm(v) > 0.2), st.integers(20, 100))
 def test_rates_turn_the_attitude_as_rotations_do(rate, samples):
-    """Smaller rates may be at rest, where the level is corrected."""
-    estimator = fed([((0.0, 0.0, 0.0), UP)] * 60 + [(rate, UP)] * samples)
-    turn = Rotation.from_rotvec(np.array(rate) * (samples - 0.5) / 100.0)  # between samples rates change linearly
+    """Smaller rates may be at rest, where the level is corrected; the sensor turns where it is."""
+    turns = Rotation.from_rotvec(np.outer(np.arange(0.5, samples) / 100.0, rate))  # rates change linearly in between
+    forces = turns.inv().apply(UP)
+    estimator = fed([((0.0, 0.0, 0.0), UP)] * 60 + [(rate, force) for force in forces])
+    turn = turns[-1]
     assert (attitude(estimator).inv() * turn).magnitude() < 1e-5
 
 
@@ -143,11 +145,30 @@ def test_the_orientation_is_that_of_the_sensor_once_it_is_stated():
     [
         (lambda sample: [] if sample.time_s > 10.0 else [sample], "have ended"),
         (lambda sample: [replace(sample, time_s=sample.time_s - 1.0)], "1.0 s late"),
+        (lambda sample: [replace(sample, time_s=sample.time_s + 2.0)], "2.0 s ahead"),
+        (lambda sample: [] if 8.0 < sample.time_s < 10.0 else [sample], None),
+        (lambda sample: [replace(sample, force_mps2=HIT)] if 10.0 < sample.time_s < 10.05 else [sample], None),
+        (lambda sample: [replace(sample, rate_rps=THROWN)] if 10.0 < sample.time_s < 10.03 else [sample], None),
     ],
-    ids=["it dies", "it is a second late"],
+    ids=["it dies", "it is late", "it is ahead", "it pauses", "it is hit", "it is thrown"],
 )
 def test_a_tag_whose_sensor_fails_says_so_and_is_as_good_as_without(change, said):
-    errors, _, fleet = walked(MotionErrors(), change=change)
+    errors, judged, fleet = walked(MotionErrors(), change=change)
     alone, _, _ = walked(None)
-    assert said in fleet.receivers[0].motion_note
+    note = fleet.receivers[0].motion_note
+    assert said in note if said else note is None
     assert rms(errors) <= 1.1 * rms(alone)
+    assert all(error <= one.fix.hpl_m for error, one in zip(errors, judged, strict=True) if one.fix.hpl_m)
+
+
+def test_a_silence_of_radio_and_sensor_is_not_taken_for_one_that_the_sensor_saw():
+    site = lab_site(330.0)
+    path = Roaming((3.0, 4.0, 0.0), (1.0, 1.3, 0.0), qa_m2ps3=2.0, damping_s=2.0, seed=3)
+    fleet = Fleet(site, [path], impairments_of(Request(site), site), 3, FleetSettings(motion=MotionErrors()))
+    receiver = fleet.receivers[0]
+    for name in ("hear", "hear_motion"):
+        call = getattr(receiver, name)
+        setattr(receiver, name, lambda one, call=call: None if 8.0 < fleet.now_s < 10.0 else call(one))
+    seen = [one for one in fleet.run(12.0) if one.time_s > 9.0]
+    assert seen
+    assert all(np.linalg.norm(one.error_m[:2]) <= 6.0 * one.fix.std_m for one in seen)

@@ -67,6 +67,15 @@ def pose(
     return message
 
 
+def set_orientation(message: PoseWithCovarianceStamped, fix: dict[str, Any]) -> None:
+    """Turn a tag's pose, where a motion sensor of it shows how."""
+    if fix.get("orientation") is not None:
+        at = message.pose.pose.orientation
+        at.w, at.x, at.y, at.z = fix["orientation"]
+        for axis, std_rad in ((3, 0.045), (4, 0.045), (5, fix["heading_std_rad"])):
+            message.pose.covariance[7 * axis] = std_rad**2
+
+
 def velocity(fix: dict[str, Any], unix_s: float, frame: str) -> TwistWithCovarianceStamped | None:
     """How a tag moves, in the site's frame; None where that is not known."""
     if fix["velocity_mps"] is None or None in fix["velocity_mps"] + fix["velocity_covariance"]:
@@ -107,12 +116,18 @@ def anchors(anchors_m: dict[str, list[float]], frame: str) -> tuple[Anchors, Mar
     return found, markers
 
 
-def motion_line(message: Imu | Odometry) -> bytes:
-    """What ``skyless tag --motion`` reads; axes x forward, y left, z up. Raises ValueError where it is not finite."""
+def motion_line(message: Imu | Odometry, *, has_unix_time: bool) -> bytes:
+    """What ``skyless tag --motion`` reads; axes x forward, y left, z up.
+
+    Raises ValueError where it is not finite, or not provided (REP 145).
+    """
     if isinstance(message, Imu):
+        if -1.0 in (message.angular_velocity_covariance[0], message.linear_acceleration_covariance[0]):
+            raise ValueError
         rate, force = message.angular_velocity, message.linear_acceleration
         found = {"rate_rps": [rate.x, rate.y, rate.z], "force_mps2": [force.x, force.y, force.z]}
     else:
         found = {"speed_mps": message.twist.twist.linear.x, "rate_rps": message.twist.twist.angular.z}
-    line = {"imu" if isinstance(message, Imu) else "wheels": {"t_s": seconds_of(message), **found}}
-    return json.dumps(line, allow_nan=False).encode() + b"\n"
+    if has_unix_time:
+        found["t_s"] = seconds_of(message)
+    return json.dumps({"imu" if isinstance(message, Imu) else "wheels": found}, allow_nan=False).encode() + b"\n"

@@ -203,6 +203,7 @@ class SkylessNode(Node):
                 return
         covariance_m2 = messages.floored(fix["covariance_m2"])
         pose = messages.pose(unix_s, frame, fix["position_m"], covariance_m2, [0, 1, 2])
+        messages.set_orientation(pose, fix)
         velocity = messages.velocity(fix, unix_s, frame)
         self.publisher(f"~/{name}/pose", PoseWithCovarianceStamped, self.usual).publish(pose)
         if velocity is not None:
@@ -246,7 +247,8 @@ class SkylessNode(Node):
                 if self.motion.full():
                     self.motion_dropped += 1
                     self.motion.get_nowait()
-                self.motion.put_nowait(messages.motion_line(message))
+                has_unix_time = not self.get_parameter("use_sim_time").value
+                self.motion.put_nowait(messages.motion_line(message, has_unix_time=has_unix_time))
             except (ValueError, queue.Empty):
                 self.motion_dropped += 1
 

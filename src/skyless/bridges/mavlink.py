@@ -273,11 +273,12 @@ _LAYOUTS: Final[dict[type[Message], _Layout]] = {
 
 _READ: Final[tuple[type[Heartbeat | Timesync | GpsGlobalOrigin], ...]] = (Heartbeat, Timesync, GpsGlobalOrigin)
 _READ_BY_NUMBER: Final = {_LAYOUTS[kind].number: kind for kind in _READ}
-_ATTITUDE, _LOCAL_POSITION_NED, HIGHRES_IMU, _ESTIMATOR_STATUS, _ODOMETRY = 30, 32, 105, 230, 331
+_ATTITUDE, _LOCAL_POSITION_NED, HIGHRES_IMU, _EKF_STATUS, _ESTIMATOR_STATUS, _ODOMETRY = 30, 32, 105, 193, 230, 331
 _STATES: Final = {
     _ATTITUDE: (39, struct.Struct("<4x3f")),  # roll, pitch, yaw
     _LOCAL_POSITION_NED: (185, struct.Struct("<4x3f")),
     HIGHRES_IMU: (93, struct.Struct("<Q6f")),  # time in µs, specific force, rate
+    _EKF_STATUS: (71, struct.Struct("<20xH")),  # flags: EKF_STATUS_REPORT of ArduPilot
     _ESTIMATOR_STATUS: (163, struct.Struct("<40xH")),  # flags
     _ODOMETRY: (91, struct.Struct("<8x3f208xB")),  # position, frame
 }
@@ -639,7 +640,7 @@ class MavlinkEncoder(Encoder):
             self.dropped["mavlink-nonsense"] += 1
         elif number == _ATTITUDE:
             following.attitude_rad = values
-        elif number == _ESTIMATOR_STATUS:
+        elif number in {_EKF_STATUS, _ESTIMATOR_STATUS}:
             following.is_used = bool(int(values[0]) & _KNOWS_PLACE)
         elif number == HIGHRES_IMU:
             following.on_motion(unix_s, values[0] * 1e-6, values[1:])

@@ -30,6 +30,8 @@ _MAX_LINE_BYTES: Final = 1 << 12
 _DRIFT: Final = 1e-4
 """By how much the two clocks may drift apart, so that the shortest latency does not stay for ever."""
 _SET_S: Final = 1.0
+_OTHER_TIME_S: Final = 5.0
+"""Samples farther from the present are of a clock that is not set, or simulated."""
 
 OnSample = Callable[[MotionSample], None]
 
@@ -67,6 +69,7 @@ class MotionFeed:
             raise url.wrong("jsonl+tcp://HOST:PORT or mavlink+udp://HOST:PORT, where this computer waits for samples")
         self._is_mavlink = url.scheme == "mavlink+udp"
         self._host, self.port = url.host("127.0.0.1"), url.port(MAVLINK_PORT if self._is_mavlink else PORT)
+        self.address = f"{self._host}:{self.port}"
         try:
             x, y, z = map(float, url.text_option("arm", "0,0,0").split(","))
         except ValueError:
@@ -75,6 +78,7 @@ class MotionFeed:
         self._arm_m, self._on_sample, self._clock = (x, y, z), on_sample, clock
         self._frames = FrameReader({HIGHRES_IMU: CRC_EXTRAS[HIGHRES_IMU]})
         self._ahead_s, self._ahead_at_s = inf, -inf
+        self._writer: StreamWriter | None = None
         self.server: asyncio.Server | None = None
         """What accepts connections, once it does."""
         self.counters: Counter[str] = Counter()
@@ -82,18 +86,34 @@ class MotionFeed:
 
     async def run(self) -> None:
         """Receive until cancelled. Raises SkylessError if it cannot listen there."""
+        transport: asyncio.BaseTransport | None = None
         try:
             if self._is_mavlink:
                 loop = asyncio.get_running_loop()
-                await loop.create_datagram_endpoint(lambda: _Datagrams(self.feed_mavlink), (self._host, self.port))
-                await asyncio.Event().wait()
-            self.server = await asyncio.start_server(self._serve, self._host, self.port, limit=_MAX_LINE_BYTES)
+                transport, _ = await loop.create_datagram_endpoint(
+                    lambda: _Datagrams(self.feed_mavlink), (self._host, self.port)
+                )
+            else:
+                self.server = await asyncio.start_server(self._serve, self._host, self.port, limit=_MAX_LINE_BYTES)
         except (OSError, UnicodeError) as error:
             raise SkylessError(f"--motion cannot listen on {self._host}:{self.port}: {error}") from None
-        async with self.server:
-            await self.server.serve_forever()
+        try:
+            await asyncio.Event().wait()
+        finally:
+            if transport is not None:
+                transport.close()
+            if self.server is not None:
+                self.server.close()
+            self._end_connection()
+
+    def _end_connection(self) -> None:
+        if self._writer is not None:
+            self._writer.transport.abort()
 
     async def _serve(self, reader: StreamReader, writer: StreamWriter) -> None:
+        """Read one connection, which ends the one before it."""
+        self._end_connection()
+        self._writer = writer
         try:
             while line := await reader.readline():
                 self.feed_line(line)
@@ -135,11 +155,14 @@ class MotionFeed:
         return self._clock() if unix_s is None else unix_s - time.time() + self._clock()
 
     def _pass(self, sample: MotionSample) -> None:
-        """Pass on a sample if all its numbers are finite."""
+        """Pass on a sample if it is possible and of now."""
         try:
             sample.check()
         except ValueError:
-            self.counters["motion-not-finite"] += 1
+            self.counters["motion-impossible"] += 1
+            return
+        if abs(sample.time_s - self._clock()) > _OTHER_TIME_S:
+            self.counters["motion-of-another-time"] += 1
             return
         self._on_sample(sample)
 

@@ -29,7 +29,7 @@ def known_velocity(fix: FixMessage) -> tuple[Vector, Matrix] | None:
 
 
 OUTAGE_S, DRIFT_MPS2, RETURN_S = 1.5, 0.3, 0.33
-"""After a longer silence t, messages are stated as worse by DRIFT · t², some times what a vehicle drifts by, and that
+"""After a longer silence t, messages are stated as worse by DRIFT · t², several times a vehicle's usual drift, which
 fades with RETURN: none moves the vehicle by more than a tenth of its drift."""
 
 
@@ -50,6 +50,8 @@ class NewInformation:
         position_m, covariance_m2 = np.array(fix.position_m), np.array(fix.covariance_m2).reshape(3, 3)
         if before is not None and before.serial < fix.serial:
             elapsed_s = fix.unix_s - before.unix_s
+            if fix.unix_s < self._back_s:  # the clock was set
+                self._drift_m, self._back_s = 0.0, -inf
             if elapsed_s > OUTAGE_S:
                 self._drift_m, self._back_s = DRIFT_MPS2 * min(elapsed_s, 60.0) ** 2, fix.unix_s
             elif elapsed_s > 0.0 and (moving := known_velocity(before)) is not None:
@@ -174,9 +176,10 @@ class Following:
         late_s, off_deg = -float(np.mean(north * north_mps + east * east_mps)) / square, self._north_deg()
         follows = f"the vehicle follows, {100.0 * apart_m:.0f} cm; north"
         for subject, applies, words in (
-            ("use", not self.is_used or apart_m > APART_M, f"the vehicle is {apart_m:.1f} m off: set {use}"),
+            ("unused", not self.is_used, f"the vehicle says that it does not use the positions: set {use}"),
+            ("use", apart_m > APART_M, f"the vehicle is {apart_m:.1f} m off: set {use}"),
             ("height", height_m > HEIGHT_M, f"the vehicle's height is {height_m:.1f} m off: set {height}"),
-            ("delay", late_s > LATE_S, f"the vehicle is {1e3 * late_s:.0f} ms late: set {delay}"),
+            ("delay", late_s > LATE_S, f"the vehicle is {1e3 * late_s:.0f} ms late: raise {delay} by that"),
             ("unseen", isnan(off_deg), f"{follows} is seen after 20 s of motion with ATTITUDE and HIGHRES_IMU"),
             ("follows", abs(off_deg) <= NORTH_DEG, f"{follows} agrees within {NORTH_DEG:.0f}°"),
         ):

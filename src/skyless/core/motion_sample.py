@@ -7,8 +7,11 @@ from msgspec import Struct
 
 from skyless.core.ticks import MAX_DRIFT, TICK_RATE_HZ, Unwrapper
 
-_SET_S: Final = 1.0
-"""A larger change between the two clocks means that one of them was set [s]."""
+_SET_S: Final = 0.1
+"""A larger change between the two clocks means that one of them was set or began again [s]."""
+
+_MOST_RPS, _MOST_MPS2, _MOST_MPS = 40.0, 250.0, 100.0
+"""Larger values no sensor of these kinds shows."""
 
 
 class MotionSample(Struct, frozen=True, gc=False):
@@ -22,16 +25,15 @@ class MotionSample(Struct, frozen=True, gc=False):
     """Specific force: 9.8 m/s² along z at rest. None without an accelerometer."""
     speed_mps: float | None = None
     """Speed along x that wheels show; None without."""
-
     arm_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Position of the antenna seen from the sensor."""
 
     def check(self) -> None:
-        """See that all numbers are finite. Raises ValueError."""
-        if not all(
-            map(isfinite, (self.time_s, *self.rate_rps, *(self.force_mps2 or ()), self.speed_mps or 0.0, *self.arm_m))
-        ):
-            raise ValueError(f"{self} should have finite numbers only")
+        """See that all numbers are finite, and as sensors show them. Raises ValueError."""
+        limits = (self.rate_rps, _MOST_RPS), (self.force_mps2 or (), _MOST_MPS2), ((self.speed_mps or 0.0,), _MOST_MPS)
+        is_possible = all(abs(value) <= most for values, most in limits for value in values)
+        if not (is_possible and all(map(isfinite, (self.time_s, *self.arm_m)))):
+            raise ValueError(f"{self} should have numbers that sensors show, in rad/s, m/s² and m/s")
 
 
 class SampleClock:

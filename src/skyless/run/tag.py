@@ -1,6 +1,7 @@
 """``skyless tag``: one process with one or several tags, each with its own radio and its own MQTT connection."""
 
 import asyncio
+import re
 import secrets
 import time
 from collections import Counter
@@ -170,9 +171,11 @@ class TagNode:
         ``now_s`` is the host's monotonic clock.
         """
         self.monitor.check(now_s, self.receptions, self.receiver.counters["heard"], self.drops)
-        if (note := self.receiver.motion_note) != self._motion_note:
-            self._motion_note = note
-            self._log(f"tag {self.name}: {note or 'the motion sensor is in use, and its heading is known'}")
+        note = self.receiver.motion_note
+        kind = None if note is None else re.sub(r"[0-9.]+", "", note)
+        if kind != self._motion_note:
+            self._motion_note = kind
+            self._log(f"tag {self.name}: {note or 'nothing is wrong with the motion sensor any more'}")
         if not self._has_logged_multipath and (found := self.receiver.multipath_m) is not None:
             self._has_logged_multipath = True
             std_m, distance_m = found

@@ -23,7 +23,7 @@ from skyless.cli.nodes.bridge import hub_of
 from skyless.cli.nodes.options import MqttOptions, SiteId, log, run_until_stopped
 from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
-from skyless.core.method_names import DEFAULT_METHOD
+from skyless.core.method_names import DEFAULT_METHOD, FILTERS
 from skyless.core.site import GeoreferenceSite
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.run.fix_log import FixListener
@@ -45,7 +45,7 @@ from skyless.site.anchor_names import anchor_name
 
 if TYPE_CHECKING:
     from skyless.core.air.masterless_packets import Point
-    from skyless.run.masterless.packet_tags import PacketTagNode, PacketTagSettings
+    from skyless.run.masterless.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
     from skyless.run.tag import TagNode
 
 # Fixes as lines on standard output: for people, as CSV, or as JSON.
@@ -232,9 +232,9 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     clock_bound_ms: Annotated[float | None, number(above=0.0, most=10_000.0)] = None
     """How far this computer's clock may be from those of the anchors, in ms; 100 by default (with --site-key)."""
     motion: str | None = None
-    """Where the tag's motion sensor or wheels are heard, which its filter uses (one NAME; joint): jsonl+tcp://HOST:PORT
-    for lines of JSON, as of the ROS 2 node, or mavlink+udp://HOST:PORT for HIGHRES_IMU of a vehicle, on which
-    this computer waits; ?arm=x,y,z is the antenna seen from the sensor, forward, left and up in metres."""
+    """Where this computer receives what the tag's motion sensor or wheels show (one NAME, method joint):
+    jsonl+tcp://HOST:PORT for lines of JSON, also from the ROS 2 node, or mavlink+udp://HOST:PORT for HIGHRES_IMU of a
+    vehicle; 0.0.0.0 for another computer's. ?arm=x,y,z: the antenna seen from the sensor, forward, left, up, in m."""
     tag_height: str | None = None
     """The tags' height (sniffers, FiRa boards, phones): metres, free (estimated) or auto, the default: estimated unless
     the anchors lie too flat, then theirs."""
@@ -278,8 +278,10 @@ def tag(
                 f"--radio is {asked.radio!r}; with --from-board it should be a board, serial:PATH[@BAUD]"
             )
         asked.leave_out(*_OF_BOARDS, why="the board computes, with the settings of skyless flash-config")
-    if asked.motion is not None and (len(names) > 1 or asked.from_board):
-        raise SkylessError("--motion is of one tag that computes on this computer; give one name, without --from-board")
+    is_here = asked.method in FILTERS and asked.trust != "verified" and not asked.from_board
+    if asked.motion is not None and (len(names) > 1 or not is_here):
+        why = "of one tag whose fixes are computed here and at once: one name, --method joint, and neither --from-board"
+        raise SkylessError(f"--motion is {why} nor --trust verified")
     bridge = TagBridge(hub_of(asked.to, address), lambda: is_simulated(asked.radio), log) if asked.to else None
     serve = tags(names, asked, address, _listener(lines, bridge), bridge)
     others = [part.run() for part in (lines, bridge) if part is not None]
@@ -317,18 +319,19 @@ def _on_radios(
     )
     radios = open_radios(asked.radio, "tag", names, computes=asked.from_board)
     tags = Tags(settings, radios, address, log, on_fix, None if bridge is None else bridge.on_health)
-    return _with_motion(asked, tags.run(), tags.tags[0].node)
+    return _with_motion(asked, tags, tags.tags[0].node)
 
 
 def _with_motion(
-    asked: TagOptions, run: Coroutine[Any, Any, None], node: "TagNode | PacketTagNode"
+    asked: TagOptions, tags: "Tags | PacketTags", node: "TagNode | PacketTagNode"
 ) -> Coroutine[Any, Any, None]:
-    """Run tags, and what receives the motion of the first."""
+    """Run tags, and what receives the motion of the only one. Raises SkylessError."""
     if asked.motion is None:
-        return run
+        return tags.run()
     feed = MotionFeed(asked.motion, node.hear_motion)
     node.motion_counters = feed.counters
-    return together(run, feed.run())
+    log(f"tag {node.radio.name}: waits for its motion at {feed.address}")
+    return together(tags.run(), feed.run())
 
 
 def _site_trust(asked: TagOptions) -> SiteTrust | None:
@@ -375,7 +378,7 @@ def _on_sniffers(
         on_health=None if bridge is None else bridge.on_system_health,
         on_anchors=on_anchors,
     )
-    return _with_motion(asked, tags.run(), tags.nodes[0])
+    return _with_motion(asked, tags, tags.nodes[0])
 
 
 def _system(asked: TagOptions) -> "PacketTagSettings":

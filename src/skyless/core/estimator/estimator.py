@@ -335,9 +335,12 @@ class Estimator:
         silent_s = (s.status.epoch_ticks - max(m.ticks, m.speed_ticks)) * TICK_S
         if m.samples == 0:
             return None
-        if silent_s > TUNING.longest_gap_s:
-            is_late = self._motion_late_s > TUNING.longest_gap_s
-            why = f"come {self._motion_late_s:.1f} s late" if is_late else "have ended"
+        if abs(silent_s) > TUNING.longest_gap_s:
+            why = "have ended"
+            if self._motion_late_s > TUNING.longest_gap_s:
+                why = f"come {self._motion_late_s:.1f} s late"
+            elif silent_s < 0.0:
+                why = f"are {-silent_s:.1f} s ahead of the receptions"
             return f"The motion sensor's samples {why}: they are not used"
         if not m.is_level:
             return "The motion sensor's level is being found"

@@ -40,6 +40,8 @@ def predict(s: State, rx_ticks: Ticks) -> None:
         status.line_m[axis] += s.x[where.velocity + axis] * dt
     _advance(s, dt)
     motion, white_m2 = motion_noise(s), settings.white * dt
+    if MOTION_STATES > 0 and s.motion.is_used:
+        motion = _unseen_noise(s)
     if is_stationary(s):
         motion *= s.tuning.stationary_noise_share
     square_s, cube_s = dt * dt / 2.0, dt * dt * dt / 3.0
@@ -65,17 +67,16 @@ def speed_squared(s: State) -> float:
 
 
 def motion_noise(s: State) -> float:
-    """Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need.
-
-    With a motion sensor it is that of what the sensor does not show.
-    """
-    if MOTION_STATES > 0 and s.motion.is_used:
-        tuning = s.tuning
-        known = min(square(s.x[s.layout.heading]) + square(s.x[s.layout.heading + 1]), 1.0)
-        unknown = tuning.headless_noise + known * (tuning.sensor_noise - tuning.headless_noise)
-        doubted = s.settings.qa * square(s.status.rejected_share / tuning.lost_share)
-        return unknown * s.status.q_scale + doubted
+    """Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need."""
     return s.settings.qa * max(s.status.q_scale, speed_squared(s) / square(s.tuning.walking_mps))
+
+
+def _unseen_noise(s: State) -> float:
+    """The same of what a motion sensor does not show."""
+    tuning = s.tuning
+    known = min(square(s.x[s.layout.heading]) + square(s.x[s.layout.heading + 1]), 1.0)
+    unknown = tuning.headless_noise + known * (tuning.sensor_noise - tuning.headless_noise)
+    return unknown * s.status.q_scale + s.settings.qa * square(s.status.rejected_share / tuning.lost_share)
 
 
 def is_stationary(s: State) -> bool:

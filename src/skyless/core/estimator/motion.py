@@ -46,14 +46,19 @@ def hear_wheels(s: State, ticks: Ticks, rate_rps: Reals, speed_mps: float) -> bo
 def hear_motion(s: State, ticks: Ticks, rate_rps: Reals, force_mps2: Reals) -> bool:
     """Process a sample of rate and specific force at a tag time. Returns False if it is late.
 
-    After a gap, or on another scale of time, level and heading are looked for again.
+    After a gap or a shock, or on another scale of time, level and heading are looked for again.
     """
     m, tuning = s.motion, s.tuning
     dt, m.has_force = (ticks - m.ticks) * TICK_S, True
     if m.samples > 0 and -tuning.longest_silence_s < dt <= 0.0:
         m.late += 1
         return False
-    if m.samples == 0 or not 0.0 < dt <= tuning.longest_gap_s:
+    pushed, turning = 0.0, 0.0
+    for axis in range(AXES):
+        pushed += square(force_mps2[axis])
+        turning += square(rate_rps[axis])
+    is_shocked = pushed > square(tuning.shock_mps2) or turning > square(tuning.shock_rps)
+    if m.samples == 0 or not 0.0 < dt <= tuning.longest_gap_s or is_shocked:
         if m.samples > 0:
             m.gaps += 1
         m.is_level, m.level_s, dt = False, 0.0, 0.0
@@ -99,6 +104,8 @@ def _find_level(s: State, dt: float) -> None:
         m.position_m[axis] = m.velocity_mps[axis] = 0.0
     m.is_level, m.rest_s = True, 0.0
     m.used_ticks = NEVER
+    if m.has_states:
+        expect_motion(s)
 
 
 def _step(m: Motion, rate_rps: Reals, force_mps2: Reals, dt: float) -> None:
@@ -206,18 +213,25 @@ def turned(to: Reals, attitude: Reals, vector: Reals) -> None:
 # Time update
 
 
+def foresee_motion(s: State, rx_ticks: Ticks) -> None:
+    """Before ``predict``: see whether the sensor shows the time up to then."""
+    m, tuning = s.motion, s.tuning
+    ahead_s = (rx_ticks - m.ticks) * TICK_S
+    is_ignored = 0 < m.ignored_ticks - rx_ticks < tuning.ignored_s * TICK_RATE_HZ
+    m.has_effect = m.is_level and not is_ignored and abs(ahead_s) <= tuning.longest_gap_s
+    m.is_used = m.has_effect and m.has_force and m.used_ticks == s.status.epoch_ticks and ahead_s < tuning.short_gap_s
+
+
 def move(s: State, rx_ticks: Ticks) -> None:
     """Add to ``predict`` what the sensor shows of the time since the newest packet before."""
     m, tuning = s.motion, s.tuning
-    m.is_used, m.has_effect = False, False
-    is_present = m.is_level and abs(rx_ticks - m.ticks) * TICK_S <= tuning.longest_gap_s
-    if not is_present or 0 < m.ignored_ticks - rx_ticks < tuning.ignored_s * TICK_RATE_HZ:
+    if not m.has_effect:
         m.used_ticks = NEVER
         return
     use_motion(s)
     _find_antenna(m)
-    ahead, begins = (rx_ticks - m.ticks) * TICK_S, m.used_ticks == NEVER
-    dt = 0.0 if begins else (rx_ticks - m.used_ticks) * TICK_S
+    ahead = (rx_ticks - m.ticks) * TICK_S
+    dt = 0.0 if m.used_ticks == NEVER else (rx_ticks - m.used_ticks) * TICK_S
     for axis in range(AXES):
         a = m.force_mps2[axis] - (GRAVITY_MPS2 if axis == 2 else 0.0)
         m.shown_m[axis] = m.position_m[axis] + m.arm_m[axis] + ahead * (m.velocity_mps[axis] + 0.5 * ahead * a)
@@ -226,8 +240,6 @@ def move(s: State, rx_ticks: Ticks) -> None:
         m.velocity_mps[axis] -= m.shown_mps[axis]
         m.position_m[axis] -= m.shown_m[axis] - ahead * m.shown_mps[axis]
     m.used_ticks = rx_ticks
-    m.has_effect = not begins
-    m.is_used = m.has_force and m.has_effect and ahead < tuning.short_gap_s
     if dt > 0.0:
         _doubt(s, dt)
         if m.has_force:
@@ -318,7 +330,7 @@ def _heading_variance(s: State) -> float:
     first = s.layout.heading
     cos, sin = s.x[first], s.x[first + 1]
     across = cos * cos * s.P[at(first + 1, first + 1)] + sin * sin * s.P[at(first, first)]
-    return (across - 2.0 * cos * sin * s.P[at(first, first + 1)]) / square(cos * cos + sin * sin)
+    return (across - 2.0 * cos * sin * s.P[at(first, first + 1)]) / max(square(cos * cos + sin * sin), 1e-12)
 
 
 def heading_std_rad(s: State) -> float:
@@ -337,8 +349,9 @@ def fill_orientation(s: State) -> None:
             s.fix[row][axis] = 0.0
     if std_rad >= 0.0:
         cos, sin = s.x[s.layout.heading], s.x[s.layout.heading + 1]
-        half = sqrt(max(0.5 + 0.5 * cos / sqrt(square(cos) + square(sin)), 1e-12))
-        _multiply(m.level, half, 0.0, 0.0, 0.5 * sin / half, q[0], q[1], q[2], q[3])
+        length = sqrt(square(cos) + square(sin))
+        half = sqrt(max(0.5 + 0.5 * cos / length, 1e-12))
+        _multiply(m.level, half, 0.0, 0.0, 0.5 * sin / (half * length), q[0], q[1], q[2], q[3])
         for one in range(4):
             row, axis = ORIENTATION + one // AXES, one % AXES
             s.fix[row][axis] = m.level[one]

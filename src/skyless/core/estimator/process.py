@@ -19,7 +19,7 @@ from skyless.core.estimator.measurements import (
     zero_velocity,
 )
 from skyless.core.estimator.monitor import covariance_scale, update_stationary
-from skyless.core.estimator.motion import fill_orientation, move
+from skyless.core.estimator.motion import fill_orientation, foresee_motion, move
 from skyless.core.estimator.phases import close_phases, own_phase, relay_phase
 from skyless.core.estimator.state import (
     AXES,
@@ -226,10 +226,7 @@ def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
     if outcome in (REJECTED, RESTARTED_CLOCK):
         return outcome
     status.stale_in_row = 0
-    predict(s, rx_ticks)
-    if MOTION_STATES > 0:
-        move(s, rx_ticks)
-    fade_faults(s)
+    _advance_to(s, rx_ticks)
     if outcome == JOINED:
         first_reception(s, anchor, rx_ticks, tx_ticks, packet.variance_factor)
     else:
@@ -257,6 +254,16 @@ def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
                 report(s, anchor, master, packet.subticks, packet.report_variance_m2)
     _check_motion_and_faults(s, elapsed_s)
     return outcome
+
+
+def _advance_to(s: State, rx_ticks: Ticks) -> None:
+    """Time update to a tag time."""
+    if MOTION_STATES > 0:
+        foresee_motion(s, rx_ticks)
+    predict(s, rx_ticks)
+    if MOTION_STATES > 0:
+        move(s, rx_ticks)
+    fade_faults(s)
 
 
 def _admit(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks) -> int:
@@ -370,10 +377,7 @@ def process_difference(s: State, a: Place, b: Place, rx_ticks: Ticks, difference
     near, far = find_anchor(s, a.anchor), find_anchor(s, b.anchor)
     status.stale_in_row = 0
     elapsed_s = (rx_ticks - status.epoch_ticks) * TICK_S
-    predict(s, rx_ticks)
-    if MOTION_STATES > 0:
-        move(s, rx_ticks)
-    fade_faults(s)
+    _advance_to(s, rx_ticks)
     outcome = ACCEPTED if difference(s, near, far, rx_ticks, difference_m) == USED else REJECTED
     status.packets += 1
     _note_difference(s, near, rx_ticks)

@@ -54,6 +54,10 @@ class Tuning(Record):
     # Motion sensors
     longest_gap_s: float = 0.3
     """Without samples for longer, the tag moves by its motion model again [s]."""
+    shock_mps2: float = 100.0
+    """A specific force beyond this [m/s²] …"""
+    shock_rps: float = 20.0
+    """… or a rate beyond this [rad/s] exceeds many sensors' range: what it did to the tag is unknown."""
     short_gap_s: float = 0.05
     """Beyond this the newest sample does not stand for the present: process noise is that without a sensor [s]."""
     wrong_scale: float = 60.0

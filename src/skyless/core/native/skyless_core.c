@@ -175,6 +175,7 @@ INTERNAL void weigh_zero(State *s, int32_t anchor, real weight);
 INTERNAL void predict(State *s, int64_t rx_ticks);
 INTERNAL real speed_squared(State *s);
 INTERNAL real motion_noise(State *s);
+INTERNAL real unseen_noise(State *s);
 INTERNAL bool is_stationary(State *s);
 INTERNAL void advance(State *s, real dt);
 INTERNAL void advance_packed(State *s, int32_t values, real dt);
@@ -287,6 +288,7 @@ INTERNAL void tilt(State *s, real x, real y);
 INTERNAL void tilt_vector(real *vector, real x, real y);
 INTERNAL void turned_back(real *to, real *attitude, real *vector);
 INTERNAL void turned(real *to, real *attitude, real *vector);
+INTERNAL void foresee_motion(State *s, int64_t rx_ticks);
 INTERNAL void move(State *s, int64_t rx_ticks);
 INTERNAL void doubt(State *s, real dt);
 INTERNAL void find_antenna(Motion *m);
@@ -332,6 +334,7 @@ INTERNAL int32_t process_packet(State *s, Packet *packet, Relays *relays);
 INTERNAL int32_t present(State *s, Place *place);
 INTERNAL void remove_silent(State *s, int64_t rx_ticks);
 INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *relays);
+INTERNAL void advance_to(State *s, int64_t rx_ticks);
 INTERNAL int32_t admit(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
 INTERNAL bool is_impossible(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
 INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet);
@@ -2113,6 +2116,9 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     advance(s, dt);
     real motion = motion_noise(s);
     real white_m2 = settings->white * dt;
+    if (MOTION_STATES > 0 && s->motion.is_used) {
+        motion = unseen_noise(s);
+    }
     if (is_stationary(s)) {
         motion *= s->tuning.stationary_noise_share;
     }
@@ -2144,18 +2150,17 @@ INTERNAL real speed_squared(State *s) {
     return total;
 }
 
-/* Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need.
- *
- * With a motion sensor it is that of what the sensor does not show. */
+/* Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need. */
 INTERNAL real motion_noise(State *s) {
-    if (MOTION_STATES > 0 && s->motion.is_used) {
-        Tuning *tuning = &s->tuning;
-        real known = min_real(square(s->x[s->layout.heading]) + square(s->x[s->layout.heading + 1]), REAL(1.0));
-        real unknown = tuning->headless_noise + known * (tuning->sensor_noise - tuning->headless_noise);
-        real doubted = s->settings.qa * square(s->status.rejected_share / tuning->lost_share);
-        return unknown * s->status.q_scale + doubted;
-    }
     return s->settings.qa * max_real(s->status.q_scale, speed_squared(s) / square(s->tuning.walking_mps));
+}
+
+/* The same of what a motion sensor does not show. */
+INTERNAL real unseen_noise(State *s) {
+    Tuning *tuning = &s->tuning;
+    real known = min_real(square(s->x[s->layout.heading]) + square(s->x[s->layout.heading + 1]), REAL(1.0));
+    real unknown = tuning->headless_noise + known * (tuning->sensor_noise - tuning->headless_noise);
+    return unknown * s->status.q_scale + s->settings.qa * square(s->status.rejected_share / tuning->lost_share);
 }
 
 /* Whether the tag has shown no motion for long enough to count as stationary.
@@ -4177,7 +4182,7 @@ SKYLESS_EXPORT bool skyless_hear_wheels(State *s, int64_t ticks, real *rate_rps,
 
 /* Process a sample of rate and specific force at a tag time. Returns False if it is late.
  *
- * After a gap, or on another scale of time, level and heading are looked for again. */
+ * After a gap or a shock, or on another scale of time, level and heading are looked for again. */
 SKYLESS_EXPORT bool skyless_hear_motion(State *s, int64_t ticks, real *rate_rps, real *force_mps2) {
     Motion *m = &s->motion;
     Tuning *tuning = &s->tuning;
@@ -4187,7 +4192,14 @@ SKYLESS_EXPORT bool skyless_hear_motion(State *s, int64_t ticks, real *rate_rps,
         m->late += 1;
         return false;
     }
-    if (m->samples == 0 || !(REAL(0.0) < dt && dt <= tuning->longest_gap_s)) {
+    real pushed = REAL(0.0);
+    real turning = REAL(0.0);
+    for (int32_t axis = 0; axis < AXES; axis++) {
+        pushed += square(force_mps2[axis]);
+        turning += square(rate_rps[axis]);
+    }
+    bool is_shocked = pushed > square(tuning->shock_mps2) || turning > square(tuning->shock_rps);
+    if (m->samples == 0 || !(REAL(0.0) < dt && dt <= tuning->longest_gap_s) || is_shocked) {
         if (m->samples > 0) {
             m->gaps += 1;
         }
@@ -4257,6 +4269,9 @@ INTERNAL void find_level(State *s, real dt) {
     m->is_level = true;
     m->rest_s = REAL(0.0);
     m->used_ticks = NEVER;
+    if (m->has_states) {
+        expect_motion(s);
+    }
 }
 
 /* Integrate a sample over the time since the one before, by the mean rate and the mean force of both. */
@@ -4401,23 +4416,30 @@ INTERNAL void turned(real *to, real *attitude, real *vector) {
 
 /* Time update */
 
+/* Before ``predict``: see whether the sensor shows the time up to then. */
+INTERNAL void foresee_motion(State *s, int64_t rx_ticks) {
+    Motion *m = &s->motion;
+    Tuning *tuning = &s->tuning;
+    real ahead_s = (real)(rx_ticks - m->ticks) * TICK_S;
+    bool is_ignored = 0 < m->ignored_ticks - rx_ticks && (real)(m->ignored_ticks - rx_ticks) < tuning->ignored_s *
+            TICK_RATE_HZ;
+    m->has_effect = m->is_level && !is_ignored && abs_real(ahead_s) <= tuning->longest_gap_s;
+    m->is_used = m->has_effect && m->has_force && m->used_ticks == s->status.epoch_ticks && ahead_s <
+            tuning->short_gap_s;
+}
+
 /* Add to ``predict`` what the sensor shows of the time since the newest packet before. */
 INTERNAL void move(State *s, int64_t rx_ticks) {
     Motion *m = &s->motion;
     Tuning *tuning = &s->tuning;
-    m->is_used = false;
-    m->has_effect = false;
-    bool is_present = m->is_level && (real)abs_64(rx_ticks - m->ticks) * TICK_S <= tuning->longest_gap_s;
-    if (!is_present || (0 < m->ignored_ticks - rx_ticks && (real)(m->ignored_ticks - rx_ticks) < tuning->ignored_s *
-            TICK_RATE_HZ)) {
+    if (!m->has_effect) {
         m->used_ticks = NEVER;
         return;
     }
     use_motion(s);
     find_antenna(m);
     real ahead = (real)(rx_ticks - m->ticks) * TICK_S;
-    bool begins = m->used_ticks == NEVER;
-    real dt = begins ? REAL(0.0) : (real)(rx_ticks - m->used_ticks) * TICK_S;
+    real dt = m->used_ticks == NEVER ? REAL(0.0) : (real)(rx_ticks - m->used_ticks) * TICK_S;
     for (int32_t axis = 0; axis < AXES; axis++) {
         real a = m->force_mps2[axis] - (axis == 2 ? GRAVITY_MPS2 : REAL(0.0));
         m->shown_m[axis] = m->position_m[axis] + m->arm_m[axis] + ahead * (m->velocity_mps[axis] + REAL(0.5) * ahead *
@@ -4429,8 +4451,6 @@ INTERNAL void move(State *s, int64_t rx_ticks) {
         m->position_m[axis] -= m->shown_m[axis] - ahead * m->shown_mps[axis];
     }
     m->used_ticks = rx_ticks;
-    m->has_effect = !begins;
-    m->is_used = m->has_force && m->has_effect && ahead < tuning->short_gap_s;
     if (dt > REAL(0.0)) {
         doubt(s, dt);
         if (m->has_force) {
@@ -4540,7 +4560,8 @@ INTERNAL real heading_variance(State *s) {
     real cos = s->x[first];
     real sin = s->x[first + 1];
     real across = cos * cos * s->P[at(first + 1, first + 1)] + sin * sin * s->P[at(first, first)];
-    return (across - REAL(2.0) * cos * sin * s->P[at(first, first + 1)]) / square(cos * cos + sin * sin);
+    return (across - REAL(2.0) * cos * sin * s->P[at(first, first + 1)]) / max_real(square(cos * cos + sin * sin),
+            REAL(1e-12));
 }
 
 /* Standard deviation of the heading; negative until it is known to five degrees. */
@@ -4565,8 +4586,9 @@ INTERNAL void fill_orientation(State *s) {
     if (std_rad >= REAL(0.0)) {
         real cos = s->x[s->layout.heading];
         real sin = s->x[s->layout.heading + 1];
-        real half = SQRT(max_real(REAL(0.5) + REAL(0.5) * cos / SQRT(square(cos) + square(sin)), REAL(1e-12)));
-        multiply(m->level, half, REAL(0.0), REAL(0.0), REAL(0.5) * sin / half, q[0], q[1], q[2], q[3]);
+        real length = SQRT(square(cos) + square(sin));
+        real half = SQRT(max_real(REAL(0.5) + REAL(0.5) * cos / length, REAL(1e-12)));
+        multiply(m->level, half, REAL(0.0), REAL(0.0), REAL(0.5) * sin / (half * length), q[0], q[1], q[2], q[3]);
         for (int32_t one = 0; one < 4; one++) {
             int32_t row = ORIENTATION + floor_div_32(one, AXES);
             int32_t axis = floor_mod_32(one, AXES);
@@ -5165,11 +5187,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
         return outcome;
     }
     status->stale_in_row = 0;
-    predict(s, rx_ticks);
-    if (MOTION_STATES > 0) {
-        move(s, rx_ticks);
-    }
-    fade_faults(s);
+    advance_to(s, rx_ticks);
     if (outcome == JOINED) {
         first_reception(s, anchor, rx_ticks, tx_ticks, packet->variance_factor);
     } else {
@@ -5205,6 +5223,18 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
     }
     check_motion_and_faults(s, elapsed_s);
     return outcome;
+}
+
+/* Time update to a tag time. */
+INTERNAL void advance_to(State *s, int64_t rx_ticks) {
+    if (MOTION_STATES > 0) {
+        foresee_motion(s, rx_ticks);
+    }
+    predict(s, rx_ticks);
+    if (MOTION_STATES > 0) {
+        move(s, rx_ticks);
+    }
+    fade_faults(s);
 }
 
 /* Return ``JOINED`` or ``ACCEPTED`` for a packet that can be processed; otherwise count and return its outcome. */
@@ -5338,11 +5368,7 @@ SKYLESS_EXPORT int32_t skyless_process_difference(State *s, Place *a, Place *b, 
     int32_t far = skyless_find_anchor(s, b->anchor);
     status->stale_in_row = 0;
     real elapsed_s = (real)(rx_ticks - status->epoch_ticks) * TICK_S;
-    predict(s, rx_ticks);
-    if (MOTION_STATES > 0) {
-        move(s, rx_ticks);
-    }
-    fade_faults(s);
+    advance_to(s, rx_ticks);
     int32_t outcome = difference(s, near, far, rx_ticks, difference_m) == USED ? ACCEPTED : REJECTED;
     status->packets += 1;
     note_difference(s, near, rx_ticks);
@@ -7450,16 +7476,16 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             = REAL(1.2), .max_walk_scale = REAL(10000.0), .noise_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row
             = REAL(8.0), .steady_walk_scale = REAL(4.0), .max_scale = REAL(100.0), .lag_limit = REAL(3.5), .sudden_lag =
             REAL(9.0), .walking_mps = REAL(4.0), .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07),
-            .stationary_std_mps = REAL(0.01), .longest_gap_s = REAL(0.3), .short_gap_s = REAL(0.05), .wrong_scale =
-            REAL(60.0), .wrong_speed_nis = REAL(5.0), .wrong_s = REAL(1.5), .ignored_s = REAL(20.0), .level_s =
-            REAL(0.5), .rest_rps = REAL(0.1), .rest_mps2 = REAL(0.5), .rest_mps = REAL(0.2), .tilt_s = REAL(2.0),
-            .slow_tilt_s = REAL(10.0), .bias_s = REAL(20.0), .heading_std = REAL(0.7), .heading_memory_s = REAL(20.0),
-            .heading_walk = REAL(0.02), .acceleration_std_mps2 = REAL(1.0), .acceleration_walk = REAL(0.08),
-            .vertical_share = REAL(0.02), .sensor_noise = REAL(0.01), .headless_noise = REAL(0.1),
-            .known_heading_variance = REAL(0.05), .sure_heading_variance = REAL(0.0076), .speed_std_mps = REAL(0.02),
-            .speed_share = REAL(0.02), .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share =
-            REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02), .wrong_nis = REAL(2.0), .slow_forgetting =
-            REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5), .difference_huber = REAL(1.0),
+            .stationary_std_mps = REAL(0.01), .longest_gap_s = REAL(0.3), .shock_mps2 = REAL(100.0), .shock_rps =
+            REAL(20.0), .short_gap_s = REAL(0.05), .wrong_scale = REAL(60.0), .wrong_speed_nis = REAL(5.0), .wrong_s =
+            REAL(1.5), .ignored_s = REAL(20.0), .level_s = REAL(0.5), .rest_rps = REAL(0.1), .rest_mps2 = REAL(0.5),
+            .rest_mps = REAL(0.2), .tilt_s = REAL(2.0), .slow_tilt_s = REAL(10.0), .bias_s = REAL(20.0), .heading_std =
+            REAL(0.7), .heading_memory_s = REAL(20.0), .heading_walk = REAL(0.02), .acceleration_std_mps2 = REAL(1.0),
+            .acceleration_walk = REAL(0.08), .vertical_share = REAL(0.02), .sensor_noise = REAL(0.01), .headless_noise =
+            REAL(0.1), .known_heading_variance = REAL(0.05), .sure_heading_variance = REAL(0.0076), .speed_std_mps =
+            REAL(0.02), .speed_share = REAL(0.02), .held_step_m = REAL(0.15), .held_max_m = REAL(0.4), .curvature_share
+            = REAL(0.01), .slope_from_m = REAL(4.0), .forgetting = REAL(0.02), .wrong_nis = REAL(2.0), .slow_forgetting
+            = REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5), .difference_huber = REAL(1.0),
             .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share = REAL(0.5), .suspect = REAL(3.0),
             .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0), .first_change_scale =
             REAL(10.0), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk = REAL(0.004),

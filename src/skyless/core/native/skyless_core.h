@@ -695,6 +695,9 @@ typedef struct Tuning {
     real stationary_noise_share;  /* Fraction of the process noise of motion kept at rest: 5 cm within half a minute. */
     real stationary_std_mps;  /* Standard deviation of the velocity of a tag at rest [m/s]. */
     real longest_gap_s;  /* Without samples for longer, the tag moves by its motion model again [s]. */
+    real shock_mps2;  /* A specific force beyond this [m/s²] … */
+    /* … or a rate beyond this [rad/s] exceeds many sensors' range: what it did to the tag is unknown. */
+    real shock_rps;
     /* Beyond this the newest sample does not stand for the present: process noise is that without a sensor [s]. */
     real short_gap_s;
     /* A factor on process noise beyond this shows that sensor and positions contradict each other, … */

@@ -49,6 +49,8 @@ _TRUTHS: Final = ("estPose", "estPosition", "lhPosition")
 _SENSOR, _BAROMETER = "estTOF", "estBarometer"
 _GYROSCOPE, _ACCELEROMETER = "estGyroscope", "estAcceleration"
 """In degrees per second, and in units of gravity."""
+MOST_OF_SENSOR: Final = 40.0
+"""Rows with a larger rate [rad/s] or specific force [m/s²] along an axis are left out, as after a crash."""
 
 _MILLIMETRES_FROM: Final = 20.0
 """A ranger's reading above this is in millimetres: its range is four metres."""
@@ -138,7 +140,8 @@ def read_motion(path: str | PathLike[str]) -> Array | None:
     if len(rates) == 0 or len(forces) == 0:
         return None
     together = [np.interp(rates[:, 0], forces[:, 0], GRAVITY_MPS2 * forces[:, axis]) for axis in (1, 2, 3)]
-    return np.column_stack([rates[:, 0], np.radians(rates[:, 1:]), *together])
+    rows = np.column_stack([rates[:, 0], np.radians(rates[:, 1:]), *together])
+    return rows[np.all(np.abs(rows[:, 1:]) < MOST_OF_SENSOR, axis=1)]
 
 
 def heights_of(rows: Array, *, is_barometer: bool) -> Array | None:

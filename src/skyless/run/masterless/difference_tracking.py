@@ -96,7 +96,8 @@ class DifferenceTracking:
             self.counters["outlier-height"] += 1
 
     def hear_motion(self, sample: MotionSample) -> None:
-        """Process what a motion sensor shows; its times are those of the differences."""
+        """Process what a motion sensor shows; its times are those of the differences. Raises ValueError."""
+        sample.check()
         self.estimator.hear_motion(self.ticks(sample.time_s), sample)
 
     def update(self, pairs: Sequence[PairTdoa]) -> bool:
