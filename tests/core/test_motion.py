@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from scipy.spatial.transform import Rotation
 
 from skyless.core.estimator.estimator import Estimator
-from skyless.core.estimator.motion import GRAVITY_MPS2, add_state, turn_states, turned
+from skyless.core.estimator.motion import GRAVITY_MPS2, add_motion, turn_states, turned
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import covariances, new_state, use_motion
 from skyless.core.motion_sample import MotionSample, SampleClock
@@ -74,8 +74,9 @@ def test_states_are_added_and_turned_as_matrices_say(seed, factor, turns):
         F[[one, other], [one, other]], F[one, other], F[other, one] = cos, sin, -sin
         turn_states(s, one, other, cos, sin)
     else:
-        F[one, other] = factor
-        add_state(s, one, other, factor)
+        one, heading, error = int(draw.integers(s.layout.heading)), s.layout.heading, s.layout.acceleration
+        F[one, [heading, heading + 1, error]] = factor, 0.5, -factor
+        add_motion(s, one, factor, 0.5, error, -factor)
     np.testing.assert_allclose(view(s.x)[:n], F @ x, atol=1e-12)
     np.testing.assert_allclose(covariances(s)[:n, :n], F @ P @ F.T, atol=1e-10)
 

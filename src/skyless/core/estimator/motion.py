@@ -293,27 +293,28 @@ def _let_drift(s: State, dt: float) -> None:
 
 def _add_to(s: State, first: int, path: Reals, of_acceleration: float) -> None:
     """Add c·path to the horizontal states from ``first`` on, its third element to the vertical one, and the error d."""
-    cos, sin = s.layout.heading, s.layout.heading + 1
-    add_state(s, first, cos, path[0])
-    add_state(s, first, sin, -path[1])
-    add_state(s, first + 1, cos, path[1])
-    add_state(s, first + 1, sin, path[0])
-    for axis in range(s.dim):
-        add_state(s, first + axis, s.layout.acceleration + axis, of_acceleration)
+    error = s.layout.acceleration
+    add_motion(s, first, path[0], -path[1], error, of_acceleration)
+    add_motion(s, first + 1, path[1], path[0], error + 1, of_acceleration)
     if s.dim == AXES:
+        add_motion(s, first + 2, 0.0, 0.0, error + 2, of_acceleration)
         s.x[first + 2] += path[2]
 
 
-def add_state(s: State, target: int, source: int, factor: float) -> None:
-    """x[target] += factor·x[source], with covariances and sensitivities."""
-    s.x[target] += factor * s.x[source]
-    variance = factor * (2.0 * s.P[at(target, source)] + factor * s.P[at(source, source)])
+def add_motion(s: State, target: int, a: float, b: float, error: int, c: float) -> None:
+    """Add a·cos + b·sin + c·error to a state, with covariances and sensitivities."""
+    cos, sin = s.layout.heading, s.layout.heading + 1
+    s.x[target] += a * s.x[cos] + b * s.x[sin] + c * s.x[error]
+    both = a * s.P[at(target, cos)] + b * s.P[at(target, sin)] + c * s.P[at(target, error)]
+    own = a * a * s.P[at(cos, cos)] + b * b * s.P[at(sin, sin)] + c * c * s.P[at(error, error)]
+    own += 2.0 * (a * b * s.P[at(cos, sin)] + a * c * s.P[at(cos, error)] + b * c * s.P[at(sin, error)])
     for other in range(s.used):
         if other != target:
-            set_covariance(s, target, other, s.P[at(target, other)] + factor * s.P[at(source, other)])
-    s.P[at(target, target)] += variance
+            added = a * s.P[at(cos, other)] + b * s.P[at(sin, other)] + c * s.P[at(error, other)]
+            set_covariance(s, target, other, s.P[at(target, other)] + added)
+    s.P[at(target, target)] += 2.0 * both + own
     for fault in range(s.rows):
-        s.V[target][fault] += factor * s.V[source][fault]
+        s.V[target][fault] += a * s.V[cos][fault] + b * s.V[sin][fault] + c * s.V[error][fault]
 
 
 # Heading

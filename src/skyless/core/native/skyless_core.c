@@ -295,7 +295,7 @@ INTERNAL void find_antenna(Motion *m);
 INTERNAL void add_path(State *s, real dt);
 INTERNAL void let_drift(State *s, real dt);
 INTERNAL void add_to(State *s, int32_t first, real *path, real of_acceleration);
-INTERNAL void add_state(State *s, int32_t target, int32_t source, real factor);
+INTERNAL void add_motion(State *s, int32_t target, real a, real b, int32_t error, real c);
 INTERNAL bool is_heading_known(State *s);
 INTERNAL real heading_variance(State *s);
 INTERNAL real heading_std_rad(State *s);
@@ -4517,32 +4517,32 @@ INTERNAL void let_drift(State *s, real dt) {
 
 /* Add c·path to the horizontal states from ``first`` on, its third element to the vertical one, and the error d. */
 INTERNAL void add_to(State *s, int32_t first, real *path, real of_acceleration) {
-    int32_t cos = s->layout.heading;
-    int32_t sin = s->layout.heading + 1;
-    add_state(s, first, cos, path[0]);
-    add_state(s, first, sin, -path[1]);
-    add_state(s, first + 1, cos, path[1]);
-    add_state(s, first + 1, sin, path[0]);
-    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        add_state(s, first + axis, s->layout.acceleration + axis, of_acceleration);
-    }
+    int32_t error = s->layout.acceleration;
+    add_motion(s, first, path[0], -path[1], error, of_acceleration);
+    add_motion(s, first + 1, path[1], path[0], error + 1, of_acceleration);
     if (s->dim == AXES) {
+        add_motion(s, first + 2, REAL(0.0), REAL(0.0), error + 2, of_acceleration);
         s->x[first + 2] += path[2];
     }
 }
 
-/* x[target] += factor·x[source], with covariances and sensitivities. */
-INTERNAL void add_state(State *s, int32_t target, int32_t source, real factor) {
-    s->x[target] += factor * s->x[source];
-    real variance = factor * (REAL(2.0) * s->P[at(target, source)] + factor * s->P[at(source, source)]);
+/* Add a·cos + b·sin + c·error to a state, with covariances and sensitivities. */
+INTERNAL void add_motion(State *s, int32_t target, real a, real b, int32_t error, real c) {
+    int32_t cos = s->layout.heading;
+    int32_t sin = s->layout.heading + 1;
+    s->x[target] += a * s->x[cos] + b * s->x[sin] + c * s->x[error];
+    real both = a * s->P[at(target, cos)] + b * s->P[at(target, sin)] + c * s->P[at(target, error)];
+    real own = a * a * s->P[at(cos, cos)] + b * b * s->P[at(sin, sin)] + c * c * s->P[at(error, error)];
+    own += REAL(2.0) * (a * b * s->P[at(cos, sin)] + a * c * s->P[at(cos, error)] + b * c * s->P[at(sin, error)]);
     for (int32_t other = 0, other_end = s->used; other < other_end; other++) {
         if (other != target) {
-            set_covariance(s, target, other, s->P[at(target, other)] + factor * s->P[at(source, other)]);
+            real added = a * s->P[at(cos, other)] + b * s->P[at(sin, other)] + c * s->P[at(error, other)];
+            set_covariance(s, target, other, s->P[at(target, other)] + added);
         }
     }
-    s->P[at(target, target)] += variance;
+    s->P[at(target, target)] += REAL(2.0) * both + own;
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->V[target][fault] += factor * s->V[source][fault];
+        s->V[target][fault] += a * s->V[cos][fault] + b * s->V[sin][fault] + c * s->V[error][fault];
     }
 }
 
