@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from copy import deepcopy
-from math import atan2, cos, exp, sin, sqrt
+from math import atan2, cos, exp, remainder, sin, sqrt
 from typing import Final
 
 import numpy as np
@@ -16,6 +16,10 @@ from skyless.sim.trajectory import Trajectory
 
 _MOTION_KEY: Final = 6
 _UP_MPS2: Final = np.array([0.0, 0.0, GRAVITY_MPS2])
+_FASTEST_RPS: Final = 8.0
+"""Rate at which a robot turns into its course."""
+_MOST_MPS2, _MOST_RPS, _MOST_MPS = 157.0, 35.0, 100.0
+"""Where sensors saturate: 16 g, 2000 degrees per second."""
 _SWAY_RAD: Final = 0.25
 _SWAY_RPS: Final = (1.7, 2.3, 0.9)
 """Amplitude and rates of a hand's roll, pitch and heading."""
@@ -71,15 +75,16 @@ class MotionSensor:
         before, self._turned = self._turned, self._attitude(time_s)
         turn = before.T @ self._turned
         rate = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]) / (2.0 * dt)
-        rate += self._drift_rps + errors.noise_rps * draw.standard_normal(3)
+        rate = np.clip(rate + self._drift_rps + errors.noise_rps * draw.standard_normal(3), -_MOST_RPS, _MOST_RPS)
         if errors.has_wheels:
             velocity_mps = self._path.velocity(time_s) @ self._turned[:, 0]
             speed_mps = self._scale * float(velocity_mps) + errors.noise_mps * float(draw.standard_normal())
-            return MotionSample(time_s, (0.0, 0.0, float(rate[2])), None, speed_mps)
+            return MotionSample(time_s, (0.0, 0.0, float(rate[2])), None, max(min(speed_mps, _MOST_MPS), -_MOST_MPS))
         kept = exp(-dt / errors.bias_s)
         self._bias_mps2 = kept * self._bias_mps2 + errors.bias_mps2 * sqrt(1.0 - kept**2) * draw.standard_normal(3)
         force = self._turned.T @ (self._path.piece(time_s).acceleration_mps2 + _UP_MPS2)
         force = force + self._bias_mps2 + errors.noise_mps2 * draw.standard_normal(3)
+        force = np.clip(force, -_MOST_MPS2, _MOST_MPS2)
         return MotionSample(time_s, (float(rate[0]), float(rate[1]), float(rate[2])), tuple(force.tolist()))
 
     def _attitude(self, time_s: float) -> Array:
@@ -87,7 +92,9 @@ class MotionSensor:
         if self._errors.has_wheels:
             x, y, _ = self._path.velocity(time_s).tolist()
             if x or y:
-                self._heading = atan2(y, x)
+                step = remainder(atan2(y, x) - self._heading, 2.0 * np.pi)
+                most = _FASTEST_RPS / self._errors.rate_hz
+                self._heading += max(min(step, most), -most)
             return _turned(self._heading, 0.0, 0.0)
         roll, pitch, yaw = (
             _SWAY_RAD * sin(rate * time_s + phase) for rate, phase in zip(_SWAY_RPS, self._phases, strict=True)
