@@ -12,7 +12,6 @@ import time
 from asyncio import StreamReader, StreamWriter
 from collections import Counter
 from collections.abc import Callable
-from math import inf
 from typing import Final, cast
 
 import msgspec
@@ -21,15 +20,12 @@ from msgspec import Struct
 from skyless.bridges.mavlink import CRC_EXTRAS, HIGHRES_IMU, Frame, FrameReader, decoded
 from skyless.bridges.target import TargetUrl
 from skyless.core.errors import SkylessError
-from skyless.core.motion_sample import MotionSample
+from skyless.core.motion_sample import MotionSample, ShortestLatency
 
 PORT: Final = 7011
 MAVLINK_PORT: Final = 14_551
 
 _MAX_LINE_BYTES: Final = 1 << 12
-_DRIFT: Final = 1e-4
-"""By how much the two clocks may drift apart, so that the shortest latency does not stay for ever."""
-_SET_S: Final = 1.0
 _OTHER_TIME_S: Final = 5.0
 """Samples farther from the present are of a clock that is not set, or simulated."""
 
@@ -77,7 +73,7 @@ class MotionFeed:
         url.check_all_read()
         self._arm_m, self._on_sample, self._clock = (x, y, z), on_sample, clock
         self._frames = FrameReader({HIGHRES_IMU: CRC_EXTRAS[HIGHRES_IMU]})
-        self._ahead_s, self._ahead_at_s = inf, -inf
+        self._vehicle = ShortestLatency()
         self._writer: StreamWriter | None = None
         self.server: asyncio.Server | None = None
         """What accepts connections, once it does."""
@@ -142,13 +138,8 @@ class MotionFeed:
 
     def _take(self, frame: Frame) -> None:
         when_us, x, y, z, p, q, r = cast(tuple[float, ...], decoded(frame))  # forward, right, down
-        time_s, now_s = when_us * 1e-6, self._clock()
-        if abs(now_s - time_s - self._ahead_s) < _SET_S:
-            self._ahead_s = min(now_s - time_s, self._ahead_s + _DRIFT * (now_s - self._ahead_at_s))
-        else:
-            self._ahead_s = now_s - time_s
-        self._ahead_at_s = now_s
-        self._pass(MotionSample(time_s + self._ahead_s, (p, -q, -r), (x, -y, -z), arm_m=self._arm_m))
+        time_s = when_us * 1e-6 - self._vehicle.ahead_s(self._clock(), when_us * 1e-6)
+        self._pass(MotionSample(time_s, (p, -q, -r), (x, -y, -z), arm_m=self._arm_m))
 
     def _host_s(self, unix_s: float | None) -> float:
         """A time on the host's clock; without one the present."""

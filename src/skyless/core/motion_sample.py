@@ -5,7 +5,7 @@ from typing import Final
 
 from msgspec import Struct
 
-from skyless.core.ticks import MAX_DRIFT, TICK_RATE_HZ, Unwrapper
+from skyless.core.ticks import MAX_DRIFT, TICK_RATE_HZ, TICK_S, Unwrapper
 
 _SET_S: Final = 0.1
 """A larger change between the two clocks means that one of them was set or began again [s]."""
@@ -36,21 +36,29 @@ class MotionSample(Struct, frozen=True, gc=False):
             raise ValueError(f"{self} should have numbers that sensors show, in rad/s, m/s² and m/s")
 
 
-class SampleClock:
-    """Converts times of the host to ticks of the tag's counter.
+class ShortestLatency:
+    """How far another clock is ahead of the host's, seen from messages whose latencies vary.
 
-    Hosts take stamps of receptions late, by varying times. Of recent latencies the shortest is right, but for drift.
+    Of recent latencies the shortest is right, but for the drift of the clocks.
     """
 
     def __init__(self) -> None:
-        self._host_s, self._ahead = -inf, -inf
+        self._host_s, self._ahead_s = -inf, -inf
+
+    def ahead_s(self, host_s: float, other_s: float) -> float:
+        """The other clock less the host's, after a message of ``other_s`` that arrived at ``host_s``."""
+        ahead_s, elapsed_s = other_s - host_s, host_s - self._host_s
+        if 0.0 <= elapsed_s < inf and abs(ahead_s - self._ahead_s) < _SET_S:
+            ahead_s = max(ahead_s, self._ahead_s - 2.0 * MAX_DRIFT * elapsed_s)
+        self._host_s, self._ahead_s = host_s, ahead_s
+        return ahead_s
+
+
+class SampleClock(ShortestLatency):
+    """Converts times of the host to ticks of the tag's counter."""
 
     def ticks(self, own: Unwrapper, time_s: float) -> int | None:
         """The tag time of a host time, by the newest reception in ``own``; None if that has no host time."""
         if not isfinite(own.last_host_s):
             return None
-        ahead, elapsed_s = own.last_ticks - own.last_host_s * TICK_RATE_HZ, own.last_host_s - self._host_s
-        if 0.0 <= elapsed_s < inf and abs(ahead - self._ahead) < _SET_S * TICK_RATE_HZ:
-            ahead = max(ahead, self._ahead - 2.0 * MAX_DRIFT * elapsed_s * TICK_RATE_HZ)
-        self._host_s, self._ahead = own.last_host_s, ahead
-        return round(time_s * TICK_RATE_HZ + ahead)
+        return round((time_s + self.ahead_s(own.last_host_s, own.last_ticks * TICK_S)) * TICK_RATE_HZ)

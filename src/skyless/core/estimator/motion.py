@@ -213,7 +213,7 @@ def turned(to: Reals, attitude: Reals, vector: Reals) -> None:
 # Time update
 
 
-def foresee_motion(s: State, rx_ticks: Ticks) -> None:
+def look_at_sensor(s: State, rx_ticks: Ticks) -> None:
     """Before ``predict``: see whether the sensor shows the time up to then."""
     m, tuning = s.motion, s.tuning
     ahead_s = (rx_ticks - m.ticks) * TICK_S
@@ -241,16 +241,16 @@ def move(s: State, rx_ticks: Ticks) -> None:
         m.position_m[axis] -= m.shown_m[axis] - ahead * m.shown_mps[axis]
     m.used_ticks = rx_ticks
     if dt > 0.0:
-        _doubt(s, dt)
+        _check_agreement(s, dt)
         if m.has_force:
             _add_path(s, dt)
-        _let_drift(s, dt)
+        _add_drift(s, dt)
         settle_heading(s, dt)
         if m.speeds > 0 and abs(rx_ticks - m.speed_ticks) * TICK_S <= tuning.longest_gap_s:
             _measure_speed(s, dt)
 
 
-def _doubt(s: State, dt: float) -> None:
+def _check_agreement(s: State, dt: float) -> None:
     """Ignore a sensor for a while if innovations call for much process noise; its heading is then unknown again."""
     m, tuning = s.motion, s.tuning
     is_wrong = s.status.q_scale > tuning.wrong_scale or m.speed_nis > tuning.wrong_speed_nis
@@ -278,7 +278,7 @@ def _add_path(s: State, dt: float) -> None:
     _add_to(s, s.layout.velocity, s.motion.shown_mps, dt)
 
 
-def _let_drift(s: State, dt: float) -> None:
+def _add_drift(s: State, dt: float) -> None:
     """Add the process noise of heading and acceleration."""
     where, tuning = s.layout, s.tuning
     is_slow, kept = speed_squared(s) < square(tuning.rest_mps), exp(-dt / tuning.heading_memory_s)

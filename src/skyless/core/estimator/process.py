@@ -19,7 +19,7 @@ from skyless.core.estimator.measurements import (
     zero_velocity,
 )
 from skyless.core.estimator.monitor import covariance_scale, update_stationary
-from skyless.core.estimator.motion import fill_orientation, foresee_motion, move
+from skyless.core.estimator.motion import fill_orientation, look_at_sensor, move
 from skyless.core.estimator.phases import close_phases, own_phase, relay_phase
 from skyless.core.estimator.state import (
     AXES,
@@ -259,7 +259,7 @@ def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
 def _advance_to(s: State, rx_ticks: Ticks) -> None:
     """Time update to a tag time."""
     if MOTION_STATES > 0:
-        foresee_motion(s, rx_ticks)
+        look_at_sensor(s, rx_ticks)
     predict(s, rx_ticks)
     if MOTION_STATES > 0:
         move(s, rx_ticks)

@@ -288,12 +288,12 @@ INTERNAL void tilt(State *s, real x, real y);
 INTERNAL void tilt_vector(real *vector, real x, real y);
 INTERNAL void turned_back(real *to, real *attitude, real *vector);
 INTERNAL void turned(real *to, real *attitude, real *vector);
-INTERNAL void foresee_motion(State *s, int64_t rx_ticks);
+INTERNAL void look_at_sensor(State *s, int64_t rx_ticks);
 INTERNAL void move(State *s, int64_t rx_ticks);
-INTERNAL void doubt(State *s, real dt);
+INTERNAL void check_agreement(State *s, real dt);
 INTERNAL void find_antenna(Motion *m);
 INTERNAL void add_path(State *s, real dt);
-INTERNAL void let_drift(State *s, real dt);
+INTERNAL void add_drift(State *s, real dt);
 INTERNAL void add_to(State *s, int32_t first, real *path, real of_acceleration);
 INTERNAL void add_motion(State *s, int32_t target, real a, real b, int32_t error, real c);
 INTERNAL bool is_heading_known(State *s);
@@ -4417,7 +4417,7 @@ INTERNAL void turned(real *to, real *attitude, real *vector) {
 /* Time update */
 
 /* Before ``predict``: see whether the sensor shows the time up to then. */
-INTERNAL void foresee_motion(State *s, int64_t rx_ticks) {
+INTERNAL void look_at_sensor(State *s, int64_t rx_ticks) {
     Motion *m = &s->motion;
     Tuning *tuning = &s->tuning;
     real ahead_s = (real)(rx_ticks - m->ticks) * TICK_S;
@@ -4452,11 +4452,11 @@ INTERNAL void move(State *s, int64_t rx_ticks) {
     }
     m->used_ticks = rx_ticks;
     if (dt > REAL(0.0)) {
-        doubt(s, dt);
+        check_agreement(s, dt);
         if (m->has_force) {
             add_path(s, dt);
         }
-        let_drift(s, dt);
+        add_drift(s, dt);
         settle_heading(s, dt);
         if (m->speeds > 0 && (real)abs_64(rx_ticks - m->speed_ticks) * TICK_S <= tuning->longest_gap_s) {
             measure_speed(s, dt);
@@ -4465,7 +4465,7 @@ INTERNAL void move(State *s, int64_t rx_ticks) {
 }
 
 /* Ignore a sensor for a while if innovations call for much process noise; its heading is then unknown again. */
-INTERNAL void doubt(State *s, real dt) {
+INTERNAL void check_agreement(State *s, real dt) {
     Motion *m = &s->motion;
     Tuning *tuning = &s->tuning;
     bool is_wrong = s->status.q_scale > tuning->wrong_scale || m->speed_nis > tuning->wrong_speed_nis;
@@ -4497,7 +4497,7 @@ INTERNAL void add_path(State *s, real dt) {
 }
 
 /* Add the process noise of heading and acceleration. */
-INTERNAL void let_drift(State *s, real dt) {
+INTERNAL void add_drift(State *s, real dt) {
     Layout *where = &s->layout;
     Tuning *tuning = &s->tuning;
     bool is_slow = speed_squared(s) < square(tuning->rest_mps);
@@ -5228,7 +5228,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
 /* Time update to a tag time. */
 INTERNAL void advance_to(State *s, int64_t rx_ticks) {
     if (MOTION_STATES > 0) {
-        foresee_motion(s, rx_ticks);
+        look_at_sensor(s, rx_ticks);
     }
     predict(s, rx_ticks);
     if (MOTION_STATES > 0) {

@@ -164,7 +164,11 @@ class BeaconReceiver(ABC):
         sample.check()
         method = self._estimation
         ticks = None if method is None else self._sample_clock.ticks(self.admission.own, sample.time_s)
-        return method is not None and ticks is not None and method.estimator.hear_motion(ticks, sample)
+        if method is None or ticks is None:
+            return False
+        is_used = method.estimator.hear_motion(ticks, sample)
+        self.counters["late-motion"] += not is_used
+        return is_used
 
     @property
     def motion_note(self) -> str | None:

@@ -153,7 +153,7 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     height_kind: Annotated[str, choice(HEIGHT_SENSOR, BAROMETER)] = HEIGHT_SENSOR
     """What gave the heights: a sensor of the height itself, or a barometer, whose zero is unknown and moves slowly."""
     imu: Annotated[str, choice(RECORDED, NO_MOTION)] = RECORDED
-    """Whether the filter uses gyroscope and accelerometer where the recording holds them: recording, or none."""
+    """Whether the filter uses gyroscope and accelerometer where the recording holds them (not with --smooth)."""
     smooth: bool = False
     """Let every fix use all of the recording, what came later as well (of time differences); fixes have no protection
     level then."""

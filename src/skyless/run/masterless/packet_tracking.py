@@ -214,7 +214,9 @@ class PacketTracking:
         """Process what a motion sensor shows, as ``Receiver.hear_motion`` does; packets must have the host's time."""
         sample.check()
         ticks = self._sample_clock.ticks(self._tag_clock, sample.time_s)
-        return ticks is not None and self.tracking.estimator.hear_motion(ticks, sample)
+        is_used = ticks is not None and self.tracking.estimator.hear_motion(ticks, sample)
+        self._drops["late-motion"] += ticks is not None and not is_used
+        return is_used
 
     def on_packet(self, packet: Packet) -> Fix | None:
         """Process one packet. Returns a fix, or None with the ``reason``.
