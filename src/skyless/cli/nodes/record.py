@@ -159,13 +159,12 @@ def export(
     bag_version
         Of the bag's metadata: 9 for ROS 2 from Jazzy on, 8 for Humble and Iron.
     """
-    from skyless.bridges.ros2 import FRAME_NAME, FRAME_RULE, RosSettings
-    from skyless.bridges.rosbag import write_bag
+    from skyless.bridges.rosbag import FRAME_NAME, FRAME_RULE, RosEncoder, write_bag
 
     check_output("to", to, file)
     if not FRAME_NAME.fullmatch(frame):
         raise SkylessError(f"--frame is {frame!r}; it should be {FRAME_RULE}")
-    bag = write_bag(file, to, RosSettings(frame=frame, transforms=transforms), tag, 8 if bag_version == "8" else 9)
+    bag = write_bag(file, to, RosEncoder(frame, transforms=transforms), tag, 8 if bag_version == "8" else 9)
     if output.json:
         print_json(bag)
     else:
