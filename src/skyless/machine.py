@@ -12,7 +12,6 @@ from skyless.core.errors import SkylessError
 EXTRA_OF: Final = {
     "cryptography": "keys",
     "dateparser": "history",
-    "distributed": "dask",
     "duckdb": "history",
     "gpiod": "pi",
     "matplotlib": "site",

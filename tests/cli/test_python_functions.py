@@ -501,8 +501,6 @@ STUDY = [
     ({"integrity_risk": 0.01}, "integrity_risk is 0.01; it should be left out: it is for the study integrity"),
     ({"worlds": 1}, "worlds is 1; it should be a whole number, at least 2"),
     ({"noise_ps": float("nan")}, "noise_ps is nan"),
-    ({"processes": 1, "scheduler": "tcp://127.0.0.1:9"}, "give either"),
-    ({"scheduler": "nowhere"}, "scheduler is 'nowhere'; it should be an address"),
 ]
 
 

@@ -125,8 +125,6 @@ def test_all_conditions_can_be_drawn(conditions):
         (["room", "--out", __file__], "--out is '" + __file__ + "', which is a file"),
         (["room", "--resume", __file__], "--resume is '" + __file__ + "', which is a file"),
         (["room", "--resume", "/proc/parts"], "--resume is '/proc/parts', w"),
-        (["room", "--scheduler", "here"], "it should be an address"),
-        (["room", "--scheduler", "tcp://127.0.0.1:9", "--processes", "2"], "give either"),
     ],
 )
 def test_wrong_input_is_one_line(run, complaint, arguments, said):

@@ -1,6 +1,5 @@
-"""Cells over processes and over a Dask cluster: the same results, and what happens when something dies."""
+"""Cells over processes: the same results, and what happens when something dies."""
 
-import json
 import os
 import signal
 import subprocess
@@ -10,22 +9,15 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from distributed import Client, LocalCluster
 
 from skyless.core.errors import SkylessError
-from skyless.research.studies import lab, runner
+from skyless.research.studies import lab
 from skyless.research.studies.picture import world_cells, world_rows
-from skyless.research.studies.runner import MEASURED, Cell, Plan, run_cells, run_cells_on_dask
+from skyless.research.studies.runner import MEASURED, Cell, Plan, run_cells
 
 pytestmark = pytest.mark.statistical
 
 PLAN = Plan(method="joint", seed=3, quick=True, worlds=2, seconds=1.0, tags=1)
-
-
-@pytest.fixture(scope="module")
-def cluster():
-    with LocalCluster(n_workers=8, threads_per_worker=1, dashboard_address=None) as made:
-        yield made
 
 
 CASES = lab.loss_cases(PLAN)[:2]
@@ -59,40 +51,11 @@ def cells(function, arguments):
 
 
 @pytest.mark.statistical
-def test_the_same_rows_from_one_process_from_two_and_from_a_cluster_that_loses_a_worker(cluster):
-    work = world_cells(CASES)
-    reached = []
+def test_one_process_and_two_give_the_same_rows():
+    work, reached = world_cells(CASES), []
     one, two = (run_cells(work, reached.append, processes) for processes in (1, 2))
     assert reached[-1] == pytest.approx(1.0)
-    killed = []
-
-    def kill_once(share):
-        if not killed:
-            assert share < 1.0
-            killed.append(kill_a_busy_worker(cluster.scheduler_address))
-
-    third = run_cells_on_dask(work, kill_once, cluster.scheduler_address)
-    assert killed
-    assert rows_of(one) == rows_of(two) == rows_of(third)
-
-
-def kill_a_busy_worker(address):
-    with Client(address, set_as_default=False) as client:
-        pids = client.run(os.getpid)
-        worker = next(worker for worker, tasks in client.processing().items() if tasks)
-    os.kill(pids[worker], signal.SIGKILL)
-    return worker
-
-
-@pytest.mark.parametrize(
-    ("digest", "message"),
-    [(lambda: str(os.getpid()), "the worker tcp://"), (lambda: "another", "the worker on ")],
-    ids=["before", "in a cell of a worker that came later"],
-)
-def test_a_worker_with_another_program_is_named(cluster, monkeypatch, digest, message):
-    monkeypatch.setattr(runner, "program_digest", digest)
-    with pytest.raises(SkylessError, match=message + r"\S+ runs another Skyless"):
-        run_cells_on_dask(cells(double, [1]), lambda share: None, cluster.scheduler_address)
+    assert rows_of(one) == rows_of(two)
 
 
 def test_another_seed_gives_other_rows():
@@ -138,56 +101,9 @@ def test_a_process_that_dies_is_named():
         run_cells(cells(die, range(4)), lambda share: None, 2)
 
 
-@pytest.mark.statistical
-def test_a_cell_that_kills_its_workers_is_named(cluster):
-    with pytest.raises(SkylessError, match="the cluster failed: several workers died computing 'cell'"):
-        run_cells_on_dask(cells(die, [1]), lambda share: None, cluster.scheduler_address)
-
-
-def test_what_a_cell_raises_comes_through(cluster):
+def test_what_a_cell_raises_comes_through():
     with pytest.raises(ValueError, match="cell 0 has gone wrong"):
         run_cells(cells(fail, [0]), lambda share: None, 1)
-    with pytest.raises(SkylessError, match="cell 0 has gone wrong"):
-        run_cells_on_dask(cells(fail, [0]), lambda share: None, cluster.scheduler_address)
-
-
-@pytest.mark.parametrize("address", ["nowhere", "tcp://", "127.0.0.1", "tcp://127.0.0.1:x"])
-def test_what_is_no_address_is_named(address):
-    with pytest.raises(SkylessError, match=r"--scheduler is .* it should be an address"):
-        run_cells_on_dask(cells(double, [1]), lambda share: None, address)
-
-
-def test_a_scheduler_without_workers_is_named():
-    with (
-        LocalCluster(n_workers=0, dashboard_address=None, protocol="tcp") as empty,
-        pytest.raises(SkylessError, match="has no workers; start some: dask worker tcp:"),
-    ):
-        run_cells_on_dask(cells(double, [1]), lambda share: None, empty.scheduler_address)
-
-
-@pytest.mark.parametrize("dies", ["the scheduler has gone", "no worker is left; start some"])
-def test_a_scheduler_or_a_last_worker_that_dies_is_named(dies, tmp_path, monkeypatch):
-    monkeypatch.setattr(runner, "_WORKERLESS_S", 0.1)
-    dask, stated = [sys.executable, "-m", "distributed.cli.dask_scheduler"], tmp_path / "scheduler.json"
-    scheduler = subprocess.Popen([*dask, "--port", "0", "--no-dashboard", "--scheduler-file", str(stated)])
-    work = [sys.executable, "-m", "distributed.cli.dask_worker", "--scheduler-file", str(stated), "--no-nanny"]
-    wait_for(stated.exists)
-    worker = subprocess.Popen([*work, "--no-dashboard"])
-    address = wait_for(lambda: json.loads(stated.read_text())["address"])
-    try:
-        wait_for(lambda: has_workers(address))
-        victim = scheduler if "scheduler" in dies else worker
-        with pytest.raises(SkylessError, match=dies):
-            run_cells_on_dask(cells(time.sleep, [600.0]), lambda share: victim.kill(), address)
-    finally:
-        for process in (scheduler, worker):
-            process.kill()
-            process.wait()
-
-
-def has_workers(address):
-    with Client(address, set_as_default=False) as client:
-        return client.scheduler_info()["workers"]
 
 
 def test_an_interrupt_ends_cells_that_would_last_for_minutes():

@@ -203,7 +203,7 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
     method: Method = DEFAULT_METHOD
     """How positions are computed; by default the best method."""
     seed: Seed = 1
-    """Same seed, same rows on every scheduler, except CPU times."""
+    """Same seed, same rows, except CPU times."""
     episodes: Annotated[int | None, whole(1, 10**6)] = None
     """Episodes of two seconds for each case (efficiency, integrity)."""
     conditions: Annotated[str, Rule(_check_conditions)] = "usual"
@@ -223,8 +223,6 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
     """Compute a fraction, with more scatter."""
     processes: Annotated[int | None, whole(1, 1024)] = None
     """Processes on this machine; by default one for each core. 1 is this process."""
-    scheduler: str | None = None
-    """Address of a Dask scheduler whose workers do the work, for example tcp://127.0.0.1:8786."""
     resume: Annotated[str | Path | None, Path, Rule(folder_to_write)] = None
     """Keep each finished part in this folder, and compute only parts that are not there."""
 
@@ -232,8 +230,6 @@ class StudyOptions(_Studied, frozen=True, kw_only=True):
         """Check that the options are compatible. Raises SkylessError."""
         from skyless.research.studies.run import OF_EPISODES
 
-        if self.scheduler is not None and self.processes is not None:
-            raise SkylessError("--processes are on this machine, --scheduler is for others; give either")
         if self.name != "integrity":
             self.leave_out("integrity_risk", "alert_limit_m", why="it is for the study integrity")
         if self.name != "room":

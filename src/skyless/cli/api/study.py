@@ -114,7 +114,7 @@ def run_study(asked: StudyOptions) -> StudyResult:
         alert_limit_m=asked.alert_limit_m,
     )
     chosen, resume = STUDIES[asked.name], asked.resume
-    rows, parts = rows_of_study(chosen, plan, asked.progress, asked.processes, asked.scheduler, resume)
+    rows, parts = rows_of_study(chosen, plan, asked.progress, asked.processes, resume)
     asked.progress(1.0)
     return StudyResult(asked.name, plan, tuple(rows), time.perf_counter() - started_s, parts)
 

@@ -18,7 +18,6 @@ from skyless.research.studies.runner import (
     UnfinishedError,
     run_cells,
     run_cells_here,
-    run_cells_on_dask,
 )
 
 OF_EPISODES: Final = ("efficiency", "integrity")
@@ -40,7 +39,6 @@ def run_study(
     plan: Plan,
     on_progress: Callable[[float], None],
     processes: int | None = None,
-    scheduler: str | None = None,
     resume: str | Path | None = None,
 ) -> tuple[Sequence[Row], Parts]:
     """The rows of a study; ``on_progress`` gets the share done. One process is this one.
@@ -48,7 +46,7 @@ def run_study(
     Finished cells are kept in the folder ``resume``, and those that are there are not computed.
 
     Raises:
-        SkylessError: a process died, or the Dask scheduler or the folder cannot be used.
+        SkylessError: a process died, or the folder cannot be used.
     """
     cells = chosen.cells(plan)
     kept = None if resume is None else KeptResults(resume, chosen.name, plan)
@@ -65,10 +63,8 @@ def run_study(
     try:
         if processes == 1 or not missing:
             run_cells_here(missing, on_progress, finished)
-        elif scheduler is None:
-            run_cells(missing, on_progress, processes, finished)
         else:
-            run_cells_on_dask(missing, on_progress, scheduler, finished)
+            run_cells(missing, on_progress, processes, finished)
     except UnfinishedError as error:
         raise SkylessError(f"{error}; {way_on(resume)}") from None
     return chosen.rows(plan, [results[number] for number in range(len(cells))]), parts

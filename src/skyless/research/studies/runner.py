@@ -1,25 +1,21 @@
-"""How studies run: plans, cells over all cores or a Dask cluster, and finished parts that are kept.
+"""How studies run: plans, cells over all cores, and finished parts that are kept.
 
 ``reached`` is called with the share of the work that is done, ``keep`` with number and result of each finished cell.
 """
 
-import logging
 import multiprocessing
 import os
 import pickle
-import re
 import signal
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from hashlib import sha256
 from multiprocessing.connection import Connection
 from pathlib import Path
-from socket import gethostname
 from typing import Any, Final, TypeVar
-from uuid import uuid4
 
 import msgspec
 import numpy as np
@@ -31,7 +27,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.integrity import RISK
 from skyless.core.version import installed_version, program_digest
 from skyless.files import write_whole
-from skyless.machine import cores, extra_module
+from skyless.machine import cores
 
 # What a study is: independent cells of work, and rows of a table that come of their results.
 
@@ -197,11 +193,6 @@ def seed_of(seed: int, *numbers: int) -> int:
 
 
 _POLL_S: Final = 0.2
-_CONNECT_S: Final = 10.0
-_WORKERLESS_S: Final = 30.0
-"""For how long a study waits when no worker is left; ``dask worker`` starts a lost one again within seconds."""
-
-_ADDRESS: Final = re.compile(r"((tcp|tls|ws|wss)://)?[^\s/]+:\d{1,5}")
 
 _ENDING_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGALRM)
 """SIGALRM among them: the command line delays by it an interrupt that came during an import."""
@@ -242,55 +233,8 @@ def run_cells_here(cells: Sequence[Cell], reached: Reached, keep: Keep) -> list[
     return results
 
 
-def run_cells_on_dask(
-    cells: Sequence[Cell], reached: Reached, scheduler: str, keep: Keep = lambda *_: None
-) -> list[Any]:
-    """As ``run_cells``, on the workers of a Dask scheduler, which need the same program.
-
-    What a lost worker was computing is computed by another one.
-
-    Raises:
-        UnfinishedError: the scheduler or all workers have gone, or a cell failed or killed several workers.
-        SkylessError: the scheduler cannot be reached or has no workers, or a worker runs another program.
-    """
-    killed = extra_module("distributed", "--scheduler").KilledWorker
-    with _cluster(scheduler) as (client, pool):
-
-        def submit(cell: Cell) -> Future[Any]:
-            key = (cell.name, uuid4().hex)
-            return pool.submit(_compute_on_worker, program_digest(), cell.function, key=key)  # type: ignore[call-arg]
-
-        def reached_by_workers(share: float) -> None:
-            reached(share)
-            try:
-                if not client.nthreads():
-                    client.wait_for_workers(1, _WORKERLESS_S)
-            except TimeoutError:
-                raise UnfinishedError(f"--scheduler {scheduler}: no worker is left; start some") from None
-            except OSError:
-                raise CancelledError from None
-
-        try:
-            return _map(submit, cells, reached_by_workers, keep)
-        except SkylessError:
-            raise
-        except CancelledError:
-            reason = "the scheduler has gone"
-        except killed as error:
-            reason = f"several workers died computing {error.task[0]!r}, killed from outside or for want of memory"
-        except Exception as error:  # noqa: BLE001 - whatever a worker raised, or the network
-            reason = " ".join(str(error).split()) or type(error).__name__
-        raise UnfinishedError(f"--scheduler {scheduler}: the cluster failed: {reason}")
-
-
-def _compute_on_worker(program: str, function: Callable[[], Any]) -> Any:  # noqa: ANN401 - any result
-    if program_digest() != program:
-        raise SkylessError(f"the worker on {gethostname()} runs another Skyless; it should be of the same source")
-    return function()
-
-
 def _map(submit: Callable[[Cell], Future[Any]], cells: Sequence[Cell], reached: Reached, keep: Keep) -> list[Any]:
-    """The longest cells begin first. Futures of finished ones are dropped: a cluster would compute lost ones again."""
+    """The longest cells begin first."""
     order = sorted(range(len(cells)), key=lambda number: -cells[number].weight_s)
     with _uninterrupted():
         waiting = {submit(cells[number]): number for number in order}
@@ -356,31 +300,6 @@ def _start_worker(parent: Connection) -> None:
             os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def _cluster(scheduler: str) -> Iterator[tuple[Any, Executor]]:
-    """A Dask client and its executor, once all workers have confirmed that they run this program."""
-    if not _ADDRESS.fullmatch(scheduler):
-        raise SkylessError(f"--scheduler is {scheduler!r}; it should be an address such as tcp://127.0.0.1:8786")
-    connect = extra_module("distributed", "--scheduler").Client
-    with ExitStack() as stack:
-        logging.disable(logging.ERROR)  # what goes wrong is reported once, by an exception
-        stack.callback(logging.disable, logging.NOTSET)
-        try:
-            client = stack.enter_context(connect(scheduler, timeout=_CONNECT_S, set_as_default=False))
-            # Not by a task: a worker that cannot unpickle one ends, and the next one gets it.
-            programs = client.run(program_digest, on_error="return", callback_timeout=_CONNECT_S)
-        except (OSError, ValueError, TypeError) as error:
-            raise SkylessError(f"--scheduler {scheduler}: scheduler or workers do not answer: {error}") from None
-        if not programs:
-            raise SkylessError(f"--scheduler {scheduler} has no workers; start some: dask worker {scheduler}")
-        for worker, program in programs.items():
-            if program != program_digest() and not isinstance(program, OSError):
-                raise SkylessError(f"the worker {worker} runs another Skyless; it should be of the same source")
-        executor = client.get_executor(pure=False)
-        stack.callback(executor.shutdown, wait=False)
-        yield client, executor
 
 
 # Results of a study's finished cells in a folder, from which a later call goes on.
