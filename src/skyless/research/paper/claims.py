@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -22,6 +22,7 @@ from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.snapshots import literal_covariance
 from skyless.core.site import AnchorSite, ScheduleSite, Site
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.research.paper import _scale
 from skyless.research.paper.plan import (
     CLAIM_M,
     DW1000_PS,
@@ -31,12 +32,15 @@ from skyless.research.paper.plan import (
     PAPER_PS,
     RADIO_PS,
     ChainMoments,
+    Figures,
+    Found,
     Panel,
     Plan,
     Point,
     Quantity,
     Results,
     Section,
+    Table,
     TimedReception,
     Track,
     Verdict,
@@ -68,21 +72,6 @@ from skyless.site.report import (
     draw_floor_plan,
     panel,
 )
-
-Figures = dict[str, Any]
-"""Figures that the rules and texts of a claim refer to."""
-Table = list[tuple[str, ...]]
-"""Rows of cells, the first one the heads."""
-
-
-class Found(NamedTuple):
-    """Evaluation of the results of a claim's cells."""
-
-    figures: Figures
-    table: Table
-    panels: list[Panel]
-    numbers: dict[str, object]
-    """For programs, SI units in the names."""
 
 
 class Rule(Struct, frozen=True, forbid_unknown_fields=True):
@@ -123,8 +112,8 @@ class Claim(Struct, frozen=True, forbid_unknown_fields=True):
         figures, table, panels, numbers = _WORK[self.key][1](plan, results)
         amounts = {name: grouped(getattr(plan, name)) for name in ("fixes", "fewer_fixes", "draws")}
         words: Figures = {"plan": plan, **amounts, **figures}
-        simulated, command = self.simulated.format(**words), self.command.format(**words)
-        about = self.key, self.title, self.label, self.claim, simulated, *self.judge(figures)
+        title, simulated, command = (one.format(**words) for one in (self.title, self.simulated, self.command))
+        about = self.key, title, self.label, self.claim, simulated, *self.judge(figures)
         return Section(*about, tuple(panels), tuple(table), numbers, command)
 
 
@@ -1128,6 +1117,7 @@ _WORK: Final[dict[str, tuple[Callable[[Plan], list[Cell]], Callable[[Plan, Resul
     "three-receivers": (_timeline_cells, _timeline),
     "update-rate": (_rate_cells, _rate),
     "largest-error": (_claim_cells, _claim),
+    "scaling": (_scale.cells, _scale.evaluated),
 }
 """Cells of each claim, and their evaluation."""
 

@@ -9,7 +9,7 @@ from enum import IntEnum, StrEnum
 from functools import reduce
 from html import escape
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -137,6 +137,22 @@ class Section(Struct, frozen=True):
     """The same and more for programs, SI units in the names."""
     command: str
     """A command that reproduces the central number."""
+
+
+Figures = dict[str, Any]
+"""Figures that the rules and texts of a claim refer to."""
+Table = list[tuple[str, ...]]
+"""Rows of cells, the first one the heads."""
+
+
+class Found(NamedTuple):
+    """Evaluation of the results of a claim's cells."""
+
+    figures: Figures
+    table: Table
+    panels: list[Panel]
+    numbers: dict[str, object]
+    """For programs, SI units in the names."""
 
 
 def gaussian(values: Array, std: float, mean: float = 0.0) -> Array:
