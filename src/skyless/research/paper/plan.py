@@ -31,7 +31,7 @@ from skyless.core.protocol1.snapshots import (
 from skyless.core.site import Site
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.machine import cores
-from skyless.research.uncertainty import Chain, Reference
+from skyless.research.uncertainty import Chain
 from skyless.sim.evaluation.figures import FirstFixes
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import Impairments, lab_impairments
@@ -265,14 +265,13 @@ _UNITS: Final = np.array([1.0, *[TICK_S] * 5, 1.0, TICK_S, TICK_M])[:, None]
 """From ticks to what ``ChainMoments`` gives, by ``Quantity``."""
 
 
-def run_chain(chain: Chain, reference: Reference, noise: Array) -> Array:
+def run_chain(chain: Chain, noise: Array) -> Array:
     """Every quantity of the chain in ticks, shape (quantities, draws, n), for stamps with ``noise`` of unit variance.
 
     ``noise``: shape (draws, numbers of a draw).
     """
     c, n = chain, len(chain.anchor_rate)
     shared, own = noise[:, :_SHARED_NOISES, None], noise[:, _SHARED_NOISES:].reshape(-1, n, _ANCHOR_NOISES)
-    of_reference = {Reference.FIRST_SYNC: 0, Reference.SECOND_SYNC: 1, Reference.APART: 2}[reference]
 
     def master(true_s: float, noise: Array) -> Any:  # noqa: ANN401 - arrays, for functions of numbers
         return (c.master_offset_s + c.master_rate * true_s + c.sigma_master_s * noise) / TICK_S
@@ -285,7 +284,7 @@ def run_chain(chain: Chain, reference: Reference, noise: Array) -> Array:
 
     second_s, sent_s = c.sync_s + c.sync_spacing_s, c.reference_s + c.delay_s
     m1, m2 = master(c.sync_s, shared[:, 0]), master(second_s, shared[:, 1])
-    tm = master(c.reference_s, shared[:, of_reference])
+    tm = master(c.reference_s, shared[:, {c.sync_s: 0, second_s: 1}.get(c.reference_s, 2)])
     rm = tag(c.reference_s + c.tag_master_tof_s, shared[:, 3])
     s1, s2 = anchor(c.sync_s + c.anchor_tof_s, own[..., 0]), anchor(second_s + c.anchor_tof_s, own[..., 1])
     a1, a2 = anchor(sent_s, own[..., 2]), anchor(sent_s + c.spacing_s, own[..., 3])
@@ -300,9 +299,9 @@ def run_chain(chain: Chain, reference: Reference, noise: Array) -> Array:
     return np.array([rate, first, delayed, offset, sent1, sent2, tags_rate, interval, (r1 - rm) - interval])
 
 
-def ideal_values(chain: Chain, reference: Reference) -> Array:
+def ideal_values(chain: Chain) -> Array:
     """Every quantity of the chain without noise, shape (quantities, n)."""
-    return run_chain(chain, reference, np.zeros((1, noise_size(chain))))[:, 0]
+    return run_chain(chain, np.zeros((1, noise_size(chain))))[:, 0]
 
 
 def noise_size(chain: Chain) -> int:
@@ -356,13 +355,7 @@ class ChainMoments(Struct, frozen=True):
 
 
 def draw_moments(
-    chain: Chain,
-    seed: int,
-    draws: int,
-    *,
-    reference: Reference = Reference.APART,
-    uniform: bool = False,
-    threads: int | None = None,
+    chain: Chain, seed: int, draws: int, *, uniform: bool = False, threads: int | None = None
 ) -> ChainMoments:
     """Moments of every quantity of the chain over ``draws`` (at least 2) draws.
 
@@ -370,7 +363,7 @@ def draw_moments(
     """
 
     def sums_of(chunk: tuple[int, int]) -> tuple[Array, ...]:
-        return _total(_sums(errors) for errors in _errors(chain, seed, chunk, reference, uniform=uniform))
+        return _total(_sums(errors) for errors in _errors(chain, seed, chunk, uniform=uniform))
 
     with ThreadPoolExecutor(threads or cores()) as pool:
         sums = _total(pool.map(sums_of, _chunks(draws)))
@@ -385,12 +378,10 @@ def draw_moments(
     )
 
 
-def draw_lambdas(
-    chain: Chain, seed: int, draws: int, *, reference: Reference = Reference.APART, uniform: bool = False
-) -> Iterator[Array]:
+def draw_lambdas(chain: Chain, seed: int, draws: int, *, uniform: bool = False) -> Iterator[Array]:
     """Errors of the DTDoAs of the draws that ``draw_moments`` makes, in metres, shape (up to a batch, n) each."""
     for chunk in _chunks(draws):
-        for errors in _errors(chain, seed, chunk, reference, uniform=uniform):
+        for errors in _errors(chain, seed, chunk, uniform=uniform):
             yield errors[Quantity.LAMBDA] * TICK_M
 
 
@@ -400,11 +391,11 @@ def _chunks(draws: int) -> Iterator[tuple[int, int]]:
         yield chunk, min(CHUNK_DRAWS, draws - chunk * CHUNK_DRAWS)
 
 
-def _errors(chain: Chain, seed: int, chunk: tuple[int, int], reference: Reference, *, uniform: bool) -> Iterator[Array]:
+def _errors(chain: Chain, seed: int, chunk: tuple[int, int], *, uniform: bool) -> Iterator[Array]:
     """Errors of every quantity of a chunk's draws, shape (quantities, up to a batch, n) each."""
-    ideal = ideal_values(chain, reference)[:, None]
+    ideal = ideal_values(chain)[:, None]
     for noise in noise_batches(seed, *chunk, noise_size(chain), uniform=uniform):
-        yield run_chain(chain, reference, noise) - ideal
+        yield run_chain(chain, noise) - ideal
 
 
 def _sums(errors: Array) -> tuple[Array, ...]:
