@@ -22,8 +22,8 @@ def few(monkeypatch):
 def test_rows_hold_what_was_found_and_are_judged(few):
     study, plan = STUDIES["watch"], Plan(worlds=2, seed=3)
     cells = study.cells(plan)
-    found = WatchResult(10, 9, 9, 8, 0, 10, (10.0,) * 8 + (40.0,), 0, 0, 80)
-    quiet = WatchResult(0, 0, 0, 0, 0, 0, (), 1, 0, 8640)
+    found = WatchResult(10, 9, 9, 8, 0, (10.0,) * 8 + (40.0,), 0, 0, 80)
+    quiet = WatchResult(0, 0, 0, 0, 0, (), 1, 0, 8640)
     results = [0 if "noise" in cell.name else quiet if "nothing" in cell.name else found for cell in cells]
     rows = {row.case: row for row in study.rows(plan, results)}
     assert set(rows) == {cell.name for cell in cells}

@@ -312,7 +312,7 @@ def _checks(chain: Chain, moments: ChainMoments, noise: str, anchor: int) -> Ite
             printed_error_pct=_error_pct(printed_variance, std) if printed_variance >= 0.0 else None,
             corrected_error_pct=_error_pct(_first_number(as_corrected(chain)), std),
             standard_error_pct=100.0 * float(moments.std_relative_error[row, 0]),
-            mean_error_sigmas=float(moments.mean[row, 0] / moments.mean_error[row, 0]),
+            mean_error_sigmas=float(moments.mean[row, 0] / np.sqrt(moments.variance[row, 0] / moments.draws)),
             draws=moments.draws,
         )
 
@@ -426,12 +426,8 @@ class LambdaDistribution(Struct, frozen=True):
         return float(0.5 * np.abs(self.counts / self.draws - np.diff(below)).sum())
 
 
-def lambda_distributions(seed: int, draws: int) -> tuple[LambdaDistribution, ...]:
-    """Distributions of λ of anchor 1, one for each of ``NOISES``."""
-    return tuple(_distribution(seed, noise, draws) for noise in NOISES)
-
-
-def _distribution(seed: int, noise: str, draws: int) -> LambdaDistribution:
+def lambda_distribution(seed: int, noise: str, draws: int) -> LambdaDistribution:
+    """Distribution of λ of anchor 1 with stamps of one of ``NOISES``."""
     chain = paper_chain(seed, 1, noise)
     theory_m = math.sqrt(_first_number(CORRECTED.lambda_m2(chain)))
     printed_variance = _first_number(PRINTED.lambda_m2(chain))
@@ -448,7 +444,8 @@ def _distribution(seed: int, noise: str, draws: int) -> LambdaDistribution:
 
 def _distribution_cells(plan: Plan) -> list[Cell]:
     """One anchor, two kinds of noise."""
-    return [Cell("distributions", partial(lambda_distributions, seed=plan.seed, draws=plan.draws), plan.draws * 3e-6)]
+    draws = plan.draws
+    return [Cell(f"lambda/{one}", partial(lambda_distribution, plan.seed, one, draws), draws * 2e-6) for one in NOISES]
 
 
 def distribution_figures(normal: LambdaDistribution, uniform: LambdaDistribution) -> Figures:
@@ -464,7 +461,7 @@ def distribution_figures(normal: LambdaDistribution, uniform: LambdaDistribution
 
 
 def _distributions(plan: Plan, results: Results) -> Found:  # noqa: ARG001
-    both: tuple[LambdaDistribution, ...] = results["distributions"]
+    both: list[LambdaDistribution] = [results[f"lambda/{noise}"] for noise in NOISES]
     table: Table = [("stamps", "σ of the draws in mm", "corrected", "as printed", "shape off by")]
     numbers = []
     for one in both:
@@ -772,18 +769,13 @@ def _dop_map(plan: Plan, results: Results) -> Found:  # noqa: ARG001
             )
         )
         numbers[key] = dict(zip(("min", "median", "max", "p1", "p2"), (*three, *own), strict=True))
-    figures = map_figures(float(np.corrcoef(pdop, sigma_m)[0, 1]), asymmetry)
+    figures = {"correlation": float(np.corrcoef(pdop, sigma_m)[0, 1]), "asymmetry_pct": 100.0 * asymmetry}
     panels = [
         _map("06-pdop-map", "PDoP", (x, y, pdop), "PDoP for a known height; darker is better."),
         _map("06-sigma-map", "σ of literal in cm", (x, y, 100 * sigma_m), "Predicted σ of one fix of literal."),
     ]
     numbers |= {"correlation": figures["correlation"], "sigma_asymmetry": asymmetry}
     return Found(figures, table, panels, numbers)
-
-
-def map_figures(correlation: float, asymmetry: float) -> Figures:
-    """Correlation of PDoP and predicted deviation over the floor, and how mirrored positions differ."""
-    return {"correlation": correlation, "asymmetry_pct": 100.0 * asymmetry}
 
 
 def _map(name: str, title: str, field: tuple[Array, ...], caption: str) -> Panel:

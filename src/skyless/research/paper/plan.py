@@ -18,6 +18,7 @@ from msgspec import Struct
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
+from skyless.core.geometry import anchor_positions
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.snapshots import (
@@ -342,11 +343,6 @@ class ChainMoments(Struct, frozen=True):
         return np.sqrt(self.variance)
 
     @property
-    def mean_error(self) -> Array:
-        """Standard error of the means."""
-        return np.sqrt(self.variance / self.draws)
-
-    @property
     def std_relative_error(self) -> Array:
         """Standard error of the standard deviations over themselves: 1/√(2·draws) for Gaussian errors."""
         excess: Array = np.maximum(self.fourth / self.variance**2 - 1.0, 0.0)
@@ -508,7 +504,7 @@ def receptions(
     """All receptions of tags until a true time, and by which methods they gave a fix."""
     world = World(site, lambda anchor: Anchor(site, anchor), tags, lab_impairments(RADIO_PS), seed)
     receivers = [{method: AnyReceiver(method) for method in methods} for _ in tags]
-    anchors_m = {anchor.id: np.array((anchor.x_m, anchor.y_m, anchor.z_m)) for anchor in site.anchors}
+    anchors_m = dict(zip((anchor.id for anchor in site.anchors), anchor_positions(site), strict=True))
     heard = []
     for broadcast in world.run(until_s):
         for tag, reception, truth_m in broadcast.receptions():

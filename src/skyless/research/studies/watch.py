@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
-from skyless.research.studies.runner import Cell, Limit, Plan, Row, missed_limits, seed_of
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of
 from skyless.research.studies.surveyed_rooms import SurveyLayout, survey_layouts
 from skyless.site.survey.explain import Finding, Kind, is_significant, pairs_of
 from skyless.site.survey.facts import PairBlock
@@ -76,8 +76,6 @@ class WatchResult(Struct, frozen=True):
     """Events with also the right kind."""
     wrong: int
     """Events with an anchor wrongly said to have moved, or its delay to have changed."""
-    ended: int
-    """Events whose findings ended afterwards."""
     found_s: tuple[float, ...]
     """Times from an event to its finding."""
     alarms: int
@@ -220,7 +218,7 @@ def _judged(plan: Plan, case: str, series: str, runs: int, limits: tuple[Limit, 
     row = WatchRow(
         study="watch", method=plan.method, case=case, series=series, noise_ps=plan.noise_ps, runs=runs, **figures
     )
-    missed = missed_limits(row, limits)
+    missed = tuple(limit.figure for limit in limits if not limit.holds(row))
     return replace(row, limits=limits, missed=missed, passed=not missed if limits else None)
 
 
@@ -285,7 +283,7 @@ def run_watch(run: WatchRun) -> WatchResult:
     if run.event == "none":
         return _undisturbed(site, run.events)
     found_s: list[float] = []
-    counts = dict.fromkeys(("found", "named", "kind", "wrong", "ended"), 0)
+    counts = dict.fromkeys(("found", "named", "kind", "wrong"), 0)
     alarms = alarms_moved = windows = 0
     for _ in range(run.events):
         standing = site.watch.findings
@@ -307,7 +305,6 @@ def run_watch(run: WatchRun) -> WatchResult:
         for _ in range(_RETURN_WINDOWS):
             site.run_step()
             windows += 1
-        counts["ended"] += not site.watch.findings
     return WatchResult(
         tries=run.events, found_s=tuple(found_s), alarms=alarms, alarms_moved=alarms_moved, windows=windows, **counts
     )
@@ -323,7 +320,7 @@ def _undisturbed(site: _Site, windows: int) -> WatchResult:
         alarms += len(now - known)
         alarms_moved += sum(kind in {"moved", "delay"} for kind, _ in now - known)
         known = now
-    return WatchResult(0, 0, 0, 0, 0, 0, (), alarms, alarms_moved, windows)
+    return WatchResult(0, 0, 0, 0, 0, (), alarms, alarms_moved, windows)
 
 
 def _happen(site: _Site, run: WatchRun, draw: np.random.Generator) -> tuple[_Truth, tuple[Finding, ...], float, int]:
