@@ -422,16 +422,11 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     Sources: PNG (W3C, third edition) 11.2.2, JPEG (ITU-T T.81) B.1 and B.2.2.
     """
     if data.startswith(_PNG):
-        return _png_size(data)
+        is_whole = len(data) >= 24 and data[12:16] == b"IHDR"
+        return _positive(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) if is_whole else None
     if data.startswith(_JPEG):
         return _jpeg_size(data)
     return None
-
-
-def _png_size(data: bytes) -> tuple[int, int] | None:
-    if len(data) < 24 or data[12:16] != b"IHDR":
-        return None
-    return _positive(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"))
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
