@@ -5,8 +5,7 @@ import pytest
 from skyless.research.studies import watch
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import Plan
-from skyless.research.studies.surveyed_rooms import survey_layouts
-from skyless.research.studies.watch import WatchResult, WatchRun, run_watch
+from skyless.research.studies.watch import WatchCase, WatchResult, WatchRun, run_watch
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site
@@ -45,5 +44,5 @@ def test_cells_compute_and_runs_of_one_seed_are_the_same(few):
 
 
 def test_a_late_link_is_no_displacement():
-    result = run_watch(WatchRun(survey_layouts()["lab"], "link", 0.35, (0.02, 0.02), 60.0, 0.0, 0.0, 5, seed=5))
+    result = run_watch(WatchRun(WatchCase("", "", "lab", "link", 0.35), 5, seed=5))
     assert (result.tries, result.found, result.wrong, result.alarms_moved) == (5, 5, 0, 0)
