@@ -73,8 +73,3 @@ def test_larger_biases_never_make_the_bound_smaller(name):
     for smaller, larger in pairwise(bounds):
         assert np.linalg.eigvalsh(larger - smaller).min() > -1e-12
         assert np.trace(larger) > np.trace(smaller)
-
-
-def test_shapes_that_do_not_fit_are_refused():
-    with pytest.raises(ValueError, match="7 positions, no multiple of 6 anchors"):
-        tracking_bound(LAB, np.zeros((7, 3)), settings_of(), Biases())
