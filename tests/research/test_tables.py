@@ -79,27 +79,6 @@ def test_anchors_with_other_columns_and_hexadecimal_identifiers(tmp_path):
     assert read_anchors(file) == {1: (3.0, 2.0, 0.5), 0x90000A05B: (1.0, 1.0, 1.0)}
 
 
-@pytest.mark.parametrize(
-    ("text", "named"),
-    [
-        ("", "line 1"),
-        ("id,x_m,y_m\n1,2,3\n", "line 1"),
-        ("id,x_m,y_m,z_m\n", "the table"),
-        ("id,x_m,y_m,z_m\n1,2,3\n", "line 2"),
-        ("id,x_m,y_m,z_m\n1,2,3,4\n2,2,three,4\n", "line 3, column y_m"),
-        ("id,x_m,y_m,z_m\n1,2,3,nan\n", "line 2, column z_m"),
-        ("id,x_m,y_m,z_m\nA,2,3,4\n", "line 2, column id"),
-        ("id,x_m,y_m,z_m\n1,2,3,4\n1,2,3,4\n", "line 3, column id"),
-    ],
-)
-def test_bad_anchors_are_named(tmp_path, text, named):
-    file = write(tmp_path, text)
-    with pytest.raises(ConfigurationError) as caught:
-        read_anchors(file)
-    assert caught.value.key == named
-    assert str(file) in str(caught.value)
-
-
 def test_truth_with_and_without_attitude(tmp_path):
     truth = read_truth(write(tmp_path, "t_s,x_m,y_m,z_m,qx,qy,qz,qw\n0,1,2,3,0,0,0,1\n1,2,3,4,0,0,1,0\n"))
     np.testing.assert_array_equal(truth.position_m, [[1, 2, 3], [2, 3, 4]])
@@ -108,19 +87,29 @@ def test_truth_with_and_without_attitude(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "named"),
+    ("read", "text", "named"),
     [
-        ("a,b\n1,2\n", "line 1"),
-        ("t_s,x_m,y_m,z_m\n", "the table"),
-        ("t_s,x_m,y_m,z_m\n0,1,2\n", "line 2"),
-        ("t_s,x_m,y_m,z_m\n0,1,2,inf\n", "line 2, column z_m"),
-        ("t_s,x_m,y_m,z_m\n1,1,2,3\n0.5,1,2,3\n", "column t_s"),
+        (read_anchors, "", "line 1"),
+        (read_anchors, "id,x_m,y_m\n1,2,3\n", "line 1"),
+        (read_anchors, "id,x_m,y_m,z_m\n", "the table"),
+        (read_anchors, "id,x_m,y_m,z_m\n1,2,3\n", "line 2"),
+        (read_anchors, "id,x_m,y_m,z_m\n1,2,3,4\n2,2,three,4\n", "line 3, column y_m"),
+        (read_anchors, "id,x_m,y_m,z_m\n1,2,3,nan\n", "line 2, column z_m"),
+        (read_anchors, "id,x_m,y_m,z_m\nA,2,3,4\n", "line 2, column id"),
+        (read_anchors, "id,x_m,y_m,z_m\n1,2,3,4\n1,2,3,4\n", "line 3, column id"),
+        (read_truth, "a,b\n1,2\n", "line 1"),
+        (read_truth, "t_s,x_m,y_m,z_m\n", "the table"),
+        (read_truth, "t_s,x_m,y_m,z_m\n0,1,2\n", "line 2"),
+        (read_truth, "t_s,x_m,y_m,z_m\n0,1,2,inf\n", "line 2, column z_m"),
+        (read_truth, "t_s,x_m,y_m,z_m\n1,1,2,3\n0.5,1,2,3\n", "column t_s"),
     ],
 )
-def test_bad_truth_is_named(tmp_path, text, named):
+def test_bad_tables_are_named(tmp_path, read, text, named):
+    file = write(tmp_path, text)
     with pytest.raises(ConfigurationError) as caught:
-        read_truth(write(tmp_path, text))
+        read(file)
     assert caught.value.key == named
+    assert str(file) in str(caught.value)
 
 
 def test_truth_in_a_broken_archive_is_an_error(tmp_path):
