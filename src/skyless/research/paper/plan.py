@@ -2,7 +2,6 @@
 
 import math
 import time
-from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from enum import IntEnum, StrEnum
@@ -17,7 +16,6 @@ from msgspec import Struct
 
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.arrays import Array
-from skyless.core.fix import Fix
 from skyless.core.geometry import anchor_positions
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import schedule_of
@@ -409,7 +407,6 @@ def _total(parts: Iterable[tuple[Array, ...]]) -> tuple[Array, ...]:
 
 # Tags in the lab's world that compute with several methods from the same receptions.
 
-_COLUMNS: Final = 5
 _WARMUP_S: Final = 2.0
 """Fixes before this true time are not judged: the filters settle."""
 
@@ -430,25 +427,6 @@ class Track(Struct, frozen=True):
         return self.position_m - self.truth_m
 
 
-class _Log:
-    """Keeps the first fix of every superframe."""
-
-    def __init__(self, site: Site) -> None:
-        self._first_fixes = FirstFixes(site, 1)
-        self._numbers = array("d")
-
-    def __len__(self) -> int:
-        return len(self._numbers) // _COLUMNS
-
-    def add(self, time_s: float, fix: Fix, truth_m: Array) -> None:
-        if self._first_fixes.is_first(0, time_s):
-            self._numbers.extend((time_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist()))
-
-    def track(self) -> Track:
-        rows = np.array(self._numbers).reshape(-1, _COLUMNS)
-        return Track(rows[:, 0], rows[:, 1:3], rows[:, 3:5])
-
-
 def listen(
     site: Site,
     tags: Sequence[tuple[Trajectory, Mapping[str, int]]],
@@ -465,22 +443,33 @@ def listen(
     """
     world = world_of(site, [trajectory for trajectory, _ in tags], impairments, seed)
     superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
-    listeners = [[(AnyReceiver(method), _Log(site), most) for method, most in methods.items()] for _, methods in tags]
+    listeners = [
+        [
+            (AnyReceiver(method), FirstFixes(site, 1), list[tuple[float, ...]](), most)
+            for method, most in methods.items()
+        ]
+        for _, methods in tags
+    ]
     most_fixes = max(most for _, methods in tags for most in methods.values())
     end_s = until_s if until_s is not None else _WARMUP_S + 1.02 * most_fixes * superframe_s + 1.0
     now_s = 0.0
-    while now_s < end_s and any(len(log) < most for own in listeners for _, log, most in own):
+    while now_s < end_s and any(len(rows) < most for own in listeners for *_, rows, most in own):
         now_s = min(now_s + 0.5, end_s)
         for broadcast in world.run(now_s):
             for tag, reception, truth_m in broadcast.receptions():
-                for receiver, log, most in listeners[tag]:
-                    fix = receiver.hear(reception) if len(log) < most else None
-                    if fix is not None and broadcast.end_s >= _WARMUP_S:
-                        log.add(broadcast.end_s, fix, truth_m)
+                for receiver, first_fixes, rows, most in listeners[tag]:
+                    at_s, fix = broadcast.end_s, receiver.hear(reception) if len(rows) < most else None
+                    if fix is not None and at_s >= _WARMUP_S and first_fixes.is_first(0, at_s):
+                        rows.append((at_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist()))
     return [
-        {method: log.track() for method, (_, log, _) in zip(methods, own, strict=True)}
+        {method: _track(rows) for method, (_, _, rows, _) in zip(methods, own, strict=True)}
         for (_, methods), own in zip(tags, listeners, strict=True)
     ]
+
+
+def _track(rows: list[tuple[float, ...]]) -> Track:
+    columns = np.array(rows).reshape(-1, 5)
+    return Track(columns[:, 0], columns[:, 1:3], columns[:, 3:])
 
 
 class TimedReception(Struct, frozen=True):

@@ -18,7 +18,7 @@ from skyless.core.fix import Fix
 from skyless.core.site import EXACT, AccuracySite, Site
 from skyless.core.tag.joint import Estimation
 from skyless.core.tag.receiver import Receiver
-from skyless.research.studies.picture import interval, jackknife
+from skyless.research.studies.picture import jackknife, with_errors
 from skyless.research.studies.room import biases_of
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
 from skyless.research.studies.worlds import bounds_m2
@@ -347,17 +347,10 @@ def row_of(plan: Plan, case: LargeCase, each: list[LargeResult]) -> Row:
     if case.starts or whole.fixes == 0:
         return row
     sums = np.array([(one.fixes, one.squared_m2, one.nees, one.bound_m2) for one in each])
-    rmse_m, rmse_error_m = jackknife(sums, lambda part: math.sqrt(part[:, 1].sum() / part[:, 0].sum()))
-    nees, nees_error = jackknife(sums, lambda part: float(part[:, 2].sum() / part[:, 0].sum()))
     row = replace(
-        row,
-        rmse_m=rmse_m,
-        rmse_error_m=rmse_error_m,
-        p95_m=float(np.percentile(whole.errors_m, 95)),
+        with_errors(row, sums, whole.errors_m),
         max_m=float(whole.errors_m.max()),
         said_m=math.sqrt(whole.variance_m2 / whole.fixes),
-        nees=nees,
-        nees_interval=interval(nees_error, len(each)),
         beacons_per_s=whole.beacons / whole.tag_s,
         gap_s=whole.gap_s,
         joins=whole.joins,
