@@ -4,13 +4,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from textbook_bound import LAB, RAISED, SLOT_S, STAMP_S, positions, settings_of, textbook, walk
+from textbook_bound import ALL_BIASES, LAB, PHASES, RAISED, SLOT_S, STAMP_S, positions, settings_of, textbook, walk
 
+from skyless.core.geometry import anchor_positions
 from skyless.core.protocol1.snapshots import bracketed_covariance, literal_covariance
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.machine import cores
 from skyless.research.studies.efficiency import EPISODE_SPEED_STD_MPS, EPISODE_SUPERFRAMES, WHITE_FM, random_path
-from skyless.research.uncertainty import BoundSettings, Chain, tracking_bound
+from skyless.research.uncertainty import Biases, BoundSettings, Chain, tracking_bound
 from skyless.sim.lab import paper_lab_site
 from support.dense_covariance import position_covariance
 
@@ -30,7 +31,7 @@ def lab_tracking_bound_m(stamp_s, *, random_walk_fm=1e-9, qa=0.5, mesh=False, pa
     at random (``qa``). ``mesh``: anchors also relay when they heard each other.
     """
     site = paper_lab_site()
-    anchors = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    anchors = anchor_positions(site)
     slot_s = site.schedule.slot_s
     settings = BoundSettings(
         stamp_s,
@@ -70,13 +71,23 @@ def test_the_published_bounds_of_the_lab(stamp_s, walk, qa, without, with_mesh, 
         assert found == pytest.approx(expected, rel=0.02)
 
 
-@pytest.mark.parametrize("mesh", [False, True])
+@pytest.mark.parametrize(
+    ("changes", "biases", "superframes", "rtol"),
+    [
+        ({"mesh": False}, Biases(), 30, 1e-4),
+        ({"mesh": True}, Biases(), 30, 1e-4),
+        ({}, ALL_BIASES, 40, 1e-3),
+        (PHASES, Biases(), 8, 2e-3),
+    ],
+    ids=["plain", "mesh", "biases", "phases"],
+)
 @pytest.mark.parametrize("dims", [2, 3])
-def test_the_recursion_is_the_textbooks(mesh, dims):
-    anchors, path = (LAB, walk(30)) if dims == 2 else (RAISED, walk(30, 1.2))
-    settings = settings_of(mesh=mesh, height_known=dims == 2)
-    expected = positions(textbook(anchors, path, settings), dims)
-    np.testing.assert_allclose(tracking_bound(anchors, path, settings)[2:], expected, rtol=1e-4, atol=1e-9)
+def test_the_recursion_is_the_textbooks(changes, biases, superframes, rtol, dims):
+    anchors, path = (LAB, walk(superframes)) if dims == 2 else (RAISED, walk(superframes, 1.2))
+    settings = settings_of(**changes, height_known=dims == 2)
+    expected = positions(textbook(anchors, path, settings, biases), dims)
+    found = tracking_bound(anchors, path, settings, biases)
+    np.testing.assert_allclose(found[2:], expected, rtol=rtol, atol=1e-9)
 
 
 @pytest.mark.parametrize("mesh", [False, True])

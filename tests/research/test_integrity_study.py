@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from skyless.core.errors import SkylessError
 from skyless.core.ticks import TICK_M
 from skyless.research.studies import integrity
 from skyless.research.studies.efficiency import Case, draw_episode
@@ -44,13 +43,8 @@ def test_ramps_grow_for_a_second_and_bursts_come_and_go():
     since_s = (np.arange(len(own)) - onset)[own] * SLOT_S
 
     def late_m(kind):
-        return (
-            (
-                integrity.faulty(episode, integrity.Fault("lab", 2.0, kind), anchor, onset, SLOT_S).rx_ticks
-                - episode.packets.rx_ticks
-            )
-            * TICK_M
-        )[own]
+        packets = integrity.faulty(episode, integrity.Fault("lab", 2.0, kind), anchor, onset, SLOT_S)
+        return (packets.rx_ticks - episode.packets.rx_ticks)[own] * TICK_M
 
     assert late_m("ramp") == pytest.approx(2.0 * np.clip(since_s, 0.0, 1.0), abs=TICK_M)
     on = (since_s >= 0.0) & (since_s % (2.0 * integrity.FAULT_BURST_S) < integrity.FAULT_BURST_S)
@@ -146,8 +140,3 @@ def test_levels_hold_in_clean_episodes(place):
     assert not across.any()
     assert not above.any()
     assert 0.0 < found.top.max() < 1.0
-
-
-def test_other_methods_have_no_levels():
-    with pytest.raises(SkylessError, match="--method is 'literal'"):
-        integrity.cells(plan_of("literal", 1))

@@ -1,25 +1,37 @@
 """Monte Carlo of the paper's chain: covariances against the theory, sums against other ways to make them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from skyless.core.ticks import TICK_M, TICK_S
+from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.research.paper.plan import CHUNK_DRAWS, Quantity, draw_lambdas, draw_moments, noise_batches
-from skyless.research.uncertainty import CORRECTED, Chain, Reference, chain_covariance
+from skyless.research.uncertainty import CORRECTED
 from support.random_chain import draw_loop, random_chain
 
 pytestmark = pytest.mark.statistical
 
-SHARING = list(Reference)
+SHARING = ["apart", "first sync", "second sync"]
+"""Packet of the master that the TDoAs refer to: none of the synchronisation packets, as in the paper, or one."""
 
 
-def chain_for(reference, **changes):
+def chain_for(reference="apart"):
     """Ten random anchors, stamps of master, anchors and tag of different noise."""
     chain = random_chain(10, seed=4)
-    t_m = {Reference.APART: 0.041, Reference.FIRST_SYNC: 0.0, Reference.SECOND_SYNC: chain.sync_spacing_s}[reference]
-    sigmas = {"sigma_master_s": 9e-12, "sigma_anchor_s": 4e-12, "sigma_tag_s": 6e-12}
-    fields = {name: getattr(chain, name) for name in Chain.__slots__}
-    return Chain(**(fields | sigmas | {"reference_s": t_m} | changes))
+    t_m = dict(zip(SHARING, (0.041, 0.0, chain.sync_spacing_s), strict=True))[reference]
+    return replace(chain, sigma_master_s=9e-12, sigma_anchor_s=4e-12, sigma_tag_s=6e-12, reference_s=t_m)
+
+
+def theorys_covariance_m2(chain):
+    """Covariance of the TDoAs of n anchors, shape (n, n), to first order in the noise (``docs/maths.md`` section 2)."""
+    u = (chain.master_offset_s + chain.master_rate * chain.reference_s - chain.T_c) / chain.L
+    w1, w2, Q = 0.5 - u, 0.5 + u, (1.0 + chain.kappa) ** 2 + chain.kappa**2
+    is_apart = chain.reference_s not in (chain.sync_s, chain.sync_s + chain.sync_spacing_s)
+    masters = (1.0 + w1**2 + w2**2) * is_apart
+    common = chain.sigma_tag_s**2 + chain.V**2 * chain.sigma_master_s**2 * masters
+    anchors = (chain.V / chain.N) ** 2 * chain.sigma_anchor_s**2 * (Q + w1**2 + w2**2)
+    return SPEED_OF_LIGHT_MPS**2 * (np.diag(Q * chain.sigma_tag_s**2 + anchors) + common)
 
 
 @pytest.mark.parametrize("uniform", [False, True])
@@ -27,41 +39,21 @@ def chain_for(reference, **changes):
 def test_the_covariance_of_all_tdoas_is_the_theorys(reference, uniform):
     """All 100 elements within 5 standard errors of half a million draws; the variances then to 0.5 %."""
     chain = chain_for(reference)
-    moments = draw_moments(chain, 3, 500_000, reference=reference, uniform=uniform)
-    excess = moments.lambda_covariance_m2 - chain_covariance(chain, reference)
+    moments = draw_moments(chain, 3, 500_000, uniform=uniform)
+    excess = moments.lambda_covariance_m2 - theorys_covariance_m2(chain)
     own = np.diag(moments.lambda_covariance_m2)
     error = np.sqrt((np.outer(own, own) + moments.lambda_covariance_m2**2) / moments.draws)  # of Gaussian errors
     assert (np.abs(excess) < 5.0 * error).all()
     np.testing.assert_allclose(np.diag(excess), 0.0, atol=5e-3 * np.diag(moments.lambda_covariance_m2).max())
 
 
-def test_the_theorys_covariance_of_a_shared_packet_does_not_know_the_sync_spacing():
-    """As long as the reference is not apart from it: then the rate error grows with every second between."""
-    for reference, same in ((Reference.FIRST_SYNC, True), (Reference.APART, False)):
-        near, far = (chain_for(reference, sync_spacing_s=spacing_s) for spacing_s in (0.015, 0.3))
-        variances = [np.diag(chain_covariance(chain, reference)) for chain in (near, far)]
-        np.testing.assert_equal(np.isclose(*variances, rtol=1e-12), same)
-
-
-def test_a_reference_that_is_no_sync_packet_is_refused():
-    with pytest.raises(ValueError, match=r"reference_s is 0\.041, the first-sync packet is at 0\.0"):
-        chain_covariance(chain_for(Reference.APART), Reference.FIRST_SYNC)
-
-
-@pytest.mark.parametrize("reference", SHARING)
-def test_the_theorys_covariance_is_a_diagonal_and_a_common_number(reference):
-    """To the 40 ppm by which rates differ; the diagonal is FinalTDoAUnc's where the paper has it."""
-    chain = chain_for(reference)
-    covariance = chain_covariance(chain, reference)
-    common = covariance[0, 1]
-    own = covariance.diagonal() - common
-    np.testing.assert_allclose(np.diag(own) + common, covariance, rtol=1e-4)
-    if reference is Reference.APART:
-        np.testing.assert_allclose(np.diag(covariance), CORRECTED.lambda_m2(chain), rtol=1e-12)
+def test_the_theorys_variances_are_those_of_the_paper():
+    chain = chain_for()
+    np.testing.assert_allclose(np.diag(theorys_covariance_m2(chain)), CORRECTED.lambda_m2(chain), rtol=1e-12)
 
 
 def test_the_autocovariance_of_epsilon_is_the_theorys():
-    chain = chain_for(Reference.APART)
+    chain = chain_for()
     moments = draw_moments(chain, 5, 500_000)
     excess = moments.epsilon_covariance_s2 - CORRECTED.epsilon_covariance(chain)
     both = moments.variance[Quantity.EPSILON_FIRST] * moments.variance[Quantity.EPSILON_DELAYED]
@@ -71,7 +63,7 @@ def test_the_autocovariance_of_epsilon_is_the_theorys():
 
 def test_sums_have_the_same_bits_for_any_number_of_threads():
     draws = 5 * CHUNK_DRAWS + 77
-    one, three = (draw_moments(chain_for(Reference.APART), 8, draws, threads=threads) for threads in (1, 3))
+    one, three = (draw_moments(chain_for(), 8, draws, threads=threads) for threads in (1, 3))
     assert one.draws == three.draws == draws
     for name in ("mean", "variance", "fourth", "epsilon_covariance_s2", "lambda_covariance_m2"):
         np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
@@ -79,7 +71,7 @@ def test_sums_have_the_same_bits_for_any_number_of_threads():
 
 def test_moments_are_those_of_the_draws_one_by_one():
     """Chunks merged against all draws at once, and standard errors against their own scatter over batches."""
-    chain, draws = chain_for(Reference.APART), 2 * CHUNK_DRAWS + 5
+    chain, draws = chain_for(), 2 * CHUNK_DRAWS + 5
     lambdas = np.concatenate(list(draw_lambdas(chain, 8, draws)))
     moments = draw_moments(chain, 8, draws)
     np.testing.assert_allclose(moments.mean[Quantity.LAMBDA], lambdas.mean(axis=0), rtol=1e-6, atol=1e-12)
@@ -91,7 +83,7 @@ def test_moments_are_those_of_the_draws_one_by_one():
 
 
 def test_a_loop_over_draws_gives_the_same_deviations():
-    chain = chain_for(Reference.APART)
+    chain = chain_for()
     units = np.array([1.0, *[TICK_S] * 5, 1.0, TICK_S, TICK_M])[:, None]
     deviations = np.sqrt(draw_loop(chain, 4000)) * units
     np.testing.assert_allclose(deviations, draw_moments(chain, 2, 100_000).std, rtol=5.0 / np.sqrt(2 * 4000))

@@ -69,7 +69,7 @@ def test_far_from_the_origin_the_printed_form_is_off_by_hundreds_of_per_cent():
 def test_distributions_have_the_shape_of_their_noise():
     """E10: uniform noise changes the shape a little and the variance not at all, once σ is that of the noise."""
     draws = 300_000
-    gaussian, uniform = claims.lambda_distributions(2, draws)
+    gaussian, uniform = (claims.lambda_distribution(2, noise, draws) for noise in claims.NOISES)
     middles = (gaussian.edges_m[1:] + gaussian.edges_m[:-1]) / 2.0
     assert gaussian.counts.sum() == pytest.approx(draws, abs=10)
     assert uniform.std_m / gaussian.std_m == pytest.approx(math.sqrt(3.0), rel=5.0 / math.sqrt(draws))

@@ -30,6 +30,9 @@ REAL = ["master_offset_s", "tag_offset_s", "anchor_offset_s", "sync_s", "referen
 CHAIN = Chain(
     **{name: sp.Symbol(name, positive=True) for name in POSITIVE}, **{name: sp.Symbol(name, real=True) for name in REAL}
 )
+Q = (1 + CHAIN.kappa) ** 2 + CHAIN.kappa**2
+U = CHAIN.master_offset_s + CHAIN.master_rate * CHAIN.reference_s - CHAIN.T_c
+"""What ``docs/maths.md`` section 2 calls Q and u."""
 MASTER, ANCHOR, TAG = CHAIN.sigma_master_s, CHAIN.sigma_anchor_s, CHAIN.sigma_tag_s
 M1, M2, REF, S1, S2, A1, A2, R1, R2, RM = STAMPS = sp.symbols("m1 m2 tm s1 s2 a1 a2 r1 r2 rm", real=True)
 """Noise of each stamp: the master's, the anchor's receptions and transmissions, the tag's receptions."""
@@ -54,11 +57,6 @@ def light_is_a_symbol(monkeypatch):
     monkeypatch.setattr(uncertainty, "SPEED_OF_LIGHT_MPS", LIGHT)
 
 
-def plain(function):
-    """The Python function within a compiled one."""
-    return getattr(function, "py_func", function)
-
-
 def algorithm(same_as=None):
     """Every quantity of the chain from noisy stamps; ``same_as``: the sync stamp that is also the reference's."""
     c = CHAIN
@@ -79,13 +77,13 @@ def algorithm(same_as=None):
     s1, s2 = anchor(t1 + c.anchor_tof_s, S1), anchor(t2 + c.anchor_tof_s, S2)
     a1, a2 = anchor(t_i, A1), anchor(t_i + c.spacing_s, A2)
     r1, r2 = tag(t_i + c.tag_tof_s, R1), tag(t_i + c.spacing_s + c.tag_tof_s, R2)
-    rate = plain(snapshots.relative_rate)(s2 - s1, m2 - m1)
-    first = plain(snapshots.relative_offset)(s1, m1, rate, c.anchor_tof_s)
-    delayed = plain(snapshots.relative_offset)(s2, m2, rate, c.anchor_tof_s)
-    offset = plain(snapshots.averaged_offset)(first, delayed)
-    x1, x2 = plain(snapshots.to_master)(a1, rate, offset), plain(snapshots.to_master)(a2, rate, offset)
-    tags_rate = plain(snapshots.tag_rate)(r2 - r1, x2 - x1)
-    interval = plain(snapshots.protocol_interval)(tags_rate, x1, master(t_m, reference))
+    rate = snapshots.relative_rate(s2 - s1, m2 - m1)
+    first = snapshots.relative_offset(s1, m1, rate, c.anchor_tof_s)
+    delayed = snapshots.relative_offset(s2, m2, rate, c.anchor_tof_s)
+    offset = snapshots.averaged_offset(first, delayed)
+    x1, x2 = snapshots.to_master(a1, rate, offset), snapshots.to_master(a2, rate, offset)
+    tags_rate = snapshots.tag_rate(r2 - r1, x2 - x1)
+    interval = snapshots.protocol_interval(tags_rate, x1, master(t_m, reference))
     tdoa = (r1 - tag(t_m + c.tag_master_tof_s, RM)) - interval
     return {
         "beta": rate,
@@ -135,9 +133,9 @@ def test_the_corrected_autocovariance_of_epsilon_is_that_of_the_algorithm(gradie
 def test_the_compact_form_is_the_same_variance():
     """σ_λ² free of the origin of time: what of which stamp remains (``docs/maths.md`` section 2)."""
     c = CHAIN
-    tag = (c.Q + 1) * TAG**2 + c.V**2 * MASTER**2
-    anchor = (c.Q + sp.Rational(1, 2)) * ANCHOR**2 + c.N**2 * MASTER**2 / 2
-    compact = LIGHT**2 * (tag + (c.V / c.N) ** 2 * (anchor + c.u**2 * CORRECTED.beta(c)))
+    tag = (Q + 1) * TAG**2 + c.V**2 * MASTER**2
+    anchor = (Q + sp.Rational(1, 2)) * ANCHOR**2 + c.N**2 * MASTER**2 / 2
+    compact = LIGHT**2 * (tag + (c.V / c.N) ** 2 * (anchor + U**2 * CORRECTED.beta(c)))
     assert equal(compact, CORRECTED.lambda_m2(c))
 
 
@@ -189,7 +187,7 @@ def test_a_reference_among_the_sync_packets_takes_the_master_out(packet):
     tdoa = gradient(algorithm(same_as=packet)["lambda_m2"])
     assert all(tdoa[stamp] == 0 for stamp in (M1, M2, REF))
     at = {c.reference_s: c.sync_s if packet is M1 else c.sync_s + c.sync_spacing_s}
-    q = c.Q.subs(at)
+    q = Q.subs(at)
     expected = LIGHT**2 * ((q + 1) * TAG**2 + (c.V / c.N) ** 2 * (q + 1) * ANCHOR**2)
     assert equal(covariance(tdoa, tdoa), expected)
 
@@ -205,6 +203,6 @@ def test_what_two_anchors_have_in_common(packet, masters):
     rename = {old: sp.Symbol(new, positive=True) for old, new in own_names.items()}
     common = sum(tdoa[stamp] * tdoa[stamp].subs(rename) * SIGMAS[stamp] ** 2 for stamp in shared)
     at = {None: c.reference_s, M1: c.sync_s, M2: c.sync_s + c.sync_spacing_s}[packet]
-    u = c.u.subs(c.reference_s, at)
+    u = U.subs(c.reference_s, at)
     mu = sp.sympify(masters, locals={"w1": sp.Rational(1, 2) - u / c.L, "w2": sp.Rational(1, 2) + u / c.L})
     assert equal(common, LIGHT**2 * (TAG**2 + c.V**2 * MASTER**2 * mu))

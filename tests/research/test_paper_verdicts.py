@@ -101,9 +101,9 @@ def frames(sent, heard):
         ("walking-test", {"pdop_correlation": 0.9, "predicted_correlation": 0.95}, HOLDS),
         ("walking-test", {"pdop_correlation": 0.4, "predicted_correlation": 0.95}, CORRECTED),
         ("walking-test", {"pdop_correlation": 0.4, "predicted_correlation": 0.5}, FAILS),
-        ("pdop-map", claims.map_figures(0.95, 0.02), HOLDS),
-        ("pdop-map", claims.map_figures(0.95, 0.3), CORRECTED),
-        ("pdop-map", claims.map_figures(-0.2, 0.3), FAILS),
+        ("pdop-map", {"correlation": 0.95, "asymmetry_pct": 2.0}, HOLDS),
+        ("pdop-map", {"correlation": 0.95, "asymmetry_pct": 30.0}, CORRECTED),
+        ("pdop-map", {"correlation": -0.2, "asymmetry_pct": 30.0}, FAILS),
         ("three-receivers", claims.timeline_figures(3, 3, 100, 100), HOLDS),
         ("three-receivers", claims.timeline_figures(3, 3, 90, 100), FAILS),
         ("three-receivers", claims.timeline_figures(2, 3, 100, 100), FAILS),
@@ -124,11 +124,14 @@ def test_other_verdicts_follow_their_numbers(key, figures, verdict):
 def test_scaling_holds_only_if_nothing_changes():
     one = scale.summarise(np.array([0.04]), np.array([240]), 240, "same", 0.1)
     many = scale.summarise(np.array([0.04] * 5), np.array([240] * 5), 240, "same", 0.5)
-    assert scale.judge([one, many])[0] is HOLDS
-    assert scale.judge([one, replace(many, fewest_fixes_per_s=200.0)])[0] is CORRECTED
-    assert scale.judge([one, replace(many, first_tag="other")])[0] is FAILS
-    assert scale.judge([one, replace(many, frames_per_s=500.0)])[0] is FAILS
-    assert scale.judge([one, replace(many, fewest_heard_per_s=300.0)])[0] is FAILS
+    for changes, verdict in (
+        ({}, HOLDS),
+        ({"fewest_fixes_per_s": 200.0}, CORRECTED),
+        ({"first_tag": "other"}, FAILS),
+        ({"frames_per_s": 500.0}, FAILS),
+        ({"fewest_heard_per_s": 300.0}, FAILS),
+    ):
+        assert verdict_of("scaling", scale.figures_of([one, replace(many, **changes)])) is verdict
 
 
 def test_the_largest_of_many_round_errors_is_that_of_the_rayleigh_law():

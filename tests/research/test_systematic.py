@@ -14,7 +14,6 @@ from systematic import (
 from skyless.core.protocol1.snapshots import bracketed_tdoa, literal_tdoa
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ, TICK_S
 from skyless.research.paper.plan import Quantity, ideal_values
-from skyless.research.uncertainty import Reference
 from support.random_chain import random_chain
 
 MASTER, ANCHORS = np.array([0.0, 0.0, 0.5]), np.array([(6, 0, 2.5), (6, 8, 0.5), (0, 8, 2.5)], float)
@@ -82,7 +81,7 @@ def test_a_smoothed_rate_keeps_the_velocity():
 def test_what_the_ideal_chain_leaves_is_e_and_the_tags_scale():
     """``eq:GPSTDoA`` without noise, through the program's functions, to a ten-thousandth of a tick."""
     chain = random_chain(10, seed=6)
-    left_m = ideal_values(chain, Reference.APART)[Quantity.LAMBDA] * TICK_M
+    left_m = ideal_values(chain)[Quantity.LAMBDA] * TICK_M
     left_m -= (chain.tag_tof_s - chain.tag_master_tof_s) / TICK_S * TICK_M  # the true difference
     np.testing.assert_allclose(left_m, synchronisation_error_m(chain) + scale_error_m(chain), atol=1e-4 * TICK_M)
 

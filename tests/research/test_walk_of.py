@@ -63,7 +63,7 @@ def rms_m(survey):
 @pytest.mark.statistical
 def test_a_walk_separates_delays_from_positions_where_the_anchors_are_on_two_lines(walk):
     """The lab's ranges alone cannot (SURVEY.md 2): its left side is as well wider, with other delays."""
-    ranges = ranges_of(walk).ranges
+    ranges = ranges_of(walk).ranger.ranges()
     with McapRecording(walk) as recording:
         epochs = walk_of(recording, LAB.id, "a", height_m=HEIGHT_M)
     facts = Facts(delay_std_m=0.15, pair_std_m=0.01)

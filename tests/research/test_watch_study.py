@@ -5,8 +5,7 @@ import pytest
 from skyless.research.studies import watch
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import Plan
-from skyless.research.studies.surveyed_rooms import survey_layouts
-from skyless.research.studies.watch import WatchResult, WatchRun, run_watch
+from skyless.research.studies.watch import WatchCase, WatchResult, WatchRun, run_watch
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site
@@ -22,8 +21,8 @@ def few(monkeypatch):
 def test_rows_hold_what_was_found_and_are_judged(few):
     study, plan = STUDIES["watch"], Plan(worlds=2, seed=3)
     cells = study.cells(plan)
-    found = WatchResult(10, 9, 9, 8, 0, 10, (10.0,) * 8 + (40.0,), 0, 0, 80)
-    quiet = WatchResult(0, 0, 0, 0, 0, 0, (), 1, 0, 8640)
+    found = WatchResult(10, 9, 9, 8, 0, (10.0,) * 8 + (40.0,), 0, 0, 80)
+    quiet = WatchResult(0, 0, 0, 0, 0, (), 1, 0, 8640)
     results = [0 if "noise" in cell.name else quiet if "nothing" in cell.name else found for cell in cells]
     rows = {row.case: row for row in study.rows(plan, results)}
     assert set(rows) == {cell.name for cell in cells}
@@ -45,5 +44,5 @@ def test_cells_compute_and_runs_of_one_seed_are_the_same(few):
 
 
 def test_a_late_link_is_no_displacement():
-    result = run_watch(WatchRun(survey_layouts()["lab"], "link", 0.35, (0.02, 0.02), 60.0, 0.0, 0.0, 5, seed=5))
+    result = run_watch(WatchRun(WatchCase("", "", "lab", "link", 0.35), 5, seed=5))
     assert (result.tries, result.found, result.wrong, result.alarms_moved) == (5, 5, 0, 0)

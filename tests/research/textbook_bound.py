@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+from msgspec.structs import replace
 
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
 from skyless.research.studies.efficiency import random_path
@@ -13,6 +14,9 @@ RAISED = LAB + np.column_stack([np.zeros((6, 2)), [0.5, 2.5] * 3])
 SLOT_S = 2.5e-3
 STAMP_S = 100e-12
 USUAL = {"white_fm": 2e-11, "random_walk_fm": 1e-9, "qa": 0.5, "slot_s": SLOT_S, "speed_std_mps": 0.4, "mesh": True}
+PHASES = {"phase_std_m": 0.002, "phase_wander": 1e-4}
+ROOM = Biases(survey_std_m=0.02, constant_std_m=0.029, slope_std_m=0.05)
+ALL_BIASES = replace(ROOM, changing_std_m=0.03, correlation_s=0.5, correlation_m=0.3)
 
 
 def settings_of(stamp_s=STAMP_S, **changes):

@@ -4,16 +4,23 @@ import struct
 from dataclasses import dataclass, field
 
 import msgspec
+import numpy as np
 
 from skyless.core.air.frame import Reception, Transmission
 from skyless.core.site import AnchorSite, Site
-from skyless.core.ticks import TICK_MASK, from_seconds
+from skyless.core.ticks import TICK_M, TICK_MASK, difference, from_seconds
 from skyless.sim.impairments import Impairments
+from skyless.sim.lab import paper_lab_site
+from skyless.sim.listening import TagSpec
 from skyless.sim.oscillator import OscillatorModel
+from skyless.sim.trajectory import Static
+from skyless.sim.world import World
 
 DELAY_TICKS = 16_436
 QUIET_CRYSTALS = OscillatorModel(offset_ppm=0.0, white_fm=0.0, random_walk_fm=0.0)
 IDEAL = Impairments(tx_stamp_ps=0.0, rx_stamp_ps=0.0, oscillator=QUIET_CRYSTALS)
+LAB = paper_lab_site()
+AT_REST = TagSpec(Static(3.0, 4.0))
 
 
 def faulty(**changes) -> Impairments:
@@ -67,3 +74,19 @@ def site_of(*places_m: tuple[float, float], walls=()) -> Site:
 def staggered(**options):
     """A factory of metronomes that start 2 ms after one another and never collide."""
     return lambda anchor: Metronome(anchor, first_s=5e-3 + 2e-3 * anchor, **options)
+
+
+def lateness(changed, until_s, *, tag=AT_REST, sites=(LAB, LAB)):
+    """Per anchor rows of (emission in s, how much later the tag stamps the frame than in the plain world).
+
+    Both worlds have the same seed, and so the same noise; what differs is the change alone, and the rounding.
+    """
+    worlds = [
+        World(site, staggered(), [tag], impairments, 7)
+        for site, impairments in zip(sites, (IDEAL, changed), strict=True)
+    ]
+    rows = {}
+    for plain, late in zip(*(world.run(until_s) for world in worlds), strict=True):
+        ticks = difference(int(late.rx_ticks[0]), int(plain.rx_ticks[0]))
+        rows.setdefault(plain.anchor, []).append((plain.emission_s, ticks * TICK_M))
+    return {anchor: np.array(own) for anchor, own in rows.items()}

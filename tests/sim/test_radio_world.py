@@ -9,14 +9,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from metronome import DELAY_TICKS, IDEAL, Metronome, faulty, sent, site_of, staggered
+from metronome import AT_REST, DELAY_TICKS, IDEAL, LAB, Metronome, faulty, lateness, sent, site_of, staggered
 from scipy.stats import binom, chi2, expon, kstest
 
 from skyless.core.protocol1.anchor import Anchor
-from skyless.core.site import AccuracySite, WallSite
+from skyless.core.site import WallSite
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S, Unwrapper, difference
-from skyless.sim.impairments import AnchorBias, AnchorOutage, DelayError, Impairments, Outage, lab_impairments
-from skyless.sim.lab import paper_lab_site
+from skyless.sim.impairments import (
+    AnchorBias,
+    AnchorDisplacement,
+    AnchorOutage,
+    Body,
+    DelayError,
+    Impairments,
+    Outage,
+    RangeErrorModel,
+    WarmUp,
+    lab_impairments,
+)
 from skyless.sim.listening import TagSpec
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.trajectory import Roaming, Static, Waypoints
@@ -24,9 +34,6 @@ from skyless.sim.world import World
 from skyless.site.channel import ChannelModel, power_bias_m, received_power_dbm
 
 pytestmark = pytest.mark.site
-
-LAB = paper_lab_site(accuracy=AccuracySite())
-AT_P1 = TagSpec(Static(3.0, 4.0))
 
 
 def unwrapped(counters):
@@ -68,7 +75,7 @@ def _flights_m(world, until_s, tag=0):
 
 def test_stamps_reproduce_the_distances_to_the_rounding():
     """Ideal clocks and radios: differences of flight times are differences of distances, within a tick."""
-    flights = _flights_m(World(LAB, staggered(), [AT_P1], IDEAL, 1), 0.5)
+    flights = _flights_m(World(LAB, staggered(), [AT_REST], IDEAL, 1), 0.5)
     assert sorted(flights) == [1, 2, 3, 4, 5, 6]
     distance_m = {a.id: math.hypot(a.x_m - 3.0, a.y_m - 4.0) for a in LAB.anchors}
     for anchor, metres in flights.items():
@@ -79,7 +86,7 @@ def test_stamps_reproduce_the_distances_to_the_rounding():
 
 def test_claimed_and_received_stamps_differ_by_flight_and_both_noises():
     """With noise σ on each stamp, RX - claimed TX has variance 2σ² + tick²/12 (RX alone is rounded)."""
-    world = World(LAB, staggered(), [AT_P1], faulty(tx_stamp_ps=150.0, rx_stamp_ps=150.0), 2)
+    world = World(LAB, staggered(), [AT_REST], faulty(tx_stamp_ps=150.0, rx_stamp_ps=150.0), 2)
     for rows in _receptions(world, 12.0).values():
         ticks = np.array([difference(rx, tx) for tx, rx, _, _ in rows], dtype=np.float64)
         theory = 2.0 * (150e-12 / TICK_S) ** 2 + 1.0 / 12.0
@@ -88,7 +95,7 @@ def test_claimed_and_received_stamps_differ_by_flight_and_both_noises():
 
 
 def test_the_truth_knows_of_the_emission_noise():
-    world = World(LAB, staggered(), [AT_P1], faulty(tx_stamp_ps=5000.0), 2)
+    world = World(LAB, staggered(), [AT_REST], faulty(tx_stamp_ps=5000.0), 2)
     for metres in _flights_m(world, 2.0).values():
         assert np.ptp(metres) <= 2 * TICK_M
 
@@ -96,7 +103,7 @@ def test_the_truth_knows_of_the_emission_noise():
 def test_crystals_run_at_their_own_rates():
     """RX against TX is a straight line; its slope differs from 1 by both offsets, and only noise is left over."""
     crystals = OscillatorModel(offset_ppm=10.0, white_fm=0.0, random_walk_fm=0.0)
-    world = World(LAB, staggered(), [AT_P1], faulty(oscillator=crystals, rx_stamp_ps=100.0), 3)
+    world = World(LAB, staggered(), [AT_REST], faulty(oscillator=crystals, rx_stamp_ps=100.0), 3)
     slopes = []
     for rows in _receptions(world, 20.0).values():
         tx, rx = (unwrapped([row[k] for row in rows]) for k in (0, 1))
@@ -113,8 +120,8 @@ def test_crystals_run_at_their_own_rates():
 
 def test_the_radio_drops_the_low_nine_bits():
     """A machine that asks for a time between the 8 ns steps sends earlier than it says."""
-    honest = _receptions(World(LAB, staggered(), [AT_P1], IDEAL, 1), 0.1)
-    hasty = _receptions(World(LAB, staggered(off_grid_ticks=300), [AT_P1], IDEAL, 1), 0.1)
+    honest = _receptions(World(LAB, staggered(), [AT_REST], IDEAL, 1), 0.1)
+    hasty = _receptions(World(LAB, staggered(off_grid_ticks=300), [AT_REST], IDEAL, 1), 0.1)
     for anchor, rows in hasty.items():
         assert all((tx - DELAY_TICKS) % 512 == 300 for tx, _, _, _ in rows)
         told = [difference(rx, tx) for tx, rx, _, _ in rows]
@@ -126,7 +133,7 @@ def test_counters_wrap_for_hours_without_a_jump():
     """One frame in 8 s over 10 h: 2000 wraps; the line of RX over true time is straight to a tick."""
     crystals = OscillatorModel(offset_ppm=10.0, white_fm=0.0, random_walk_fm=0.0)
     site = site_of((0, 0))
-    world = World(site, lambda a: Metronome(a, period_s=8.0), [AT_P1], faulty(oscillator=crystals), 4)
+    world = World(site, lambda a: Metronome(a, period_s=8.0), [AT_REST], faulty(oscillator=crystals), 4)
     rows = _receptions(world, 36_000.0)[1]
     rx = unwrapped([row[1] for row in rows])
     tx = unwrapped([row[0] for row in rows])
@@ -150,7 +157,12 @@ def _fingerprint(world, until_s):
 def _busy_world(seed, tags=2):
     faults = Impairments(
         channel=ChannelModel(loss_probability=0.1, nlos_probability=0.1, power_bias=True),
+        anchor_displacements=(AnchorDisplacement(2, 0.1, 0.1),),
+        anchor_biases=(AnchorBias(5, 0.3, from_s=0.1, to_s=0.2),),
         anchor_outages=(AnchorOutage(3, Outage(0.1, 0.3)),),
+        range_errors=RangeErrorModel(0.05, 0.05, 0.029, correlation_m=1.0),
+        body=Body(),
+        warm_ups=(WarmUp(1.0, 20.0), WarmUp(1.0, 20.0, anchor=2)),
         diagnostics=True,
     )
     specs = [TagSpec(Roaming((3, 4, 0), (1, 1.3, 0), seed=k)) for k in range(tags)]
@@ -183,7 +195,7 @@ def test_anchors_hear_each_other_and_the_host_knows_the_time():
         machines[anchor] = Metronome(anchor, first_s=5e-3 + 2e-3 * anchor)
         return machines[anchor]
 
-    world = World(LAB, factory, [AT_P1], IDEAL, 1)
+    world = World(LAB, factory, [AT_REST], IDEAL, 1)
     ends = [broadcast.end_s for broadcast in world.run(0.1)]
     heard = [sent(reception.frame)[0] for reception in machines[2].heard]
     assert set(heard) == {1, 3, 4, 5, 6}
@@ -192,7 +204,7 @@ def test_anchors_hear_each_other_and_the_host_knows_the_time():
 
 
 def test_a_silent_machine_is_asked_again():
-    world = World(site_of((0, 0)), lambda a: Metronome(a, silent_asks=7), [AT_P1], IDEAL, 1)
+    world = World(site_of((0, 0)), lambda a: Metronome(a, silent_asks=7), [AT_REST], IDEAL, 1)
     first = next(iter(world.run(1.0)))
     assert 0.035 <= first.emission_s < 0.045  # seven asks, 5 ms apart, then 5 ms to the first beat
 
@@ -200,14 +212,14 @@ def test_a_silent_machine_is_asked_again():
 def test_a_late_frame_is_skipped_and_counted():
     """The preamble flies 138.4 µs before the RMARKER, and the host needs 200 µs before that."""
     for first_s, late in ((0.335e-3, 1), (0.342e-3, 0)):
-        world = World(site_of((0, 0)), lambda a, first_s=first_s: Metronome(a, first_s=first_s), [AT_P1], IDEAL, 1)
+        world = World(site_of((0, 0)), lambda a, first_s=first_s: Metronome(a, first_s=first_s), [AT_REST], IDEAL, 1)
         sent_times = [broadcast.emission_s for broadcast in world.run(0.1)]
         assert world.tally.late_transmissions == late
         assert sent_times[0] == pytest.approx(late * 15e-3 + first_s, abs=1e-8)
 
 
 def test_message_loss_is_as_frequent_as_asked():
-    world = World(LAB, staggered(), [AT_P1], _channel(loss_probability=0.2), 5)
+    world = World(LAB, staggered(), [AT_REST], _channel(loss_probability=0.2), 5)
     for _ in world.run(8.0):
         pass
     tally = world.tally
@@ -235,18 +247,8 @@ def test_reception_fades_out_around_the_sensitivity():
         assert binom.ppf(1e-4, frames, share) <= count <= binom.ppf(1 - 1e-4, frames, share)
 
 
-def _excess_m(changed, until_s, seed=7, site=LAB):
-    """Extra flight of each message at the tag against an ideal world of the same seed; and its emission time."""
-    clear, obstructed = (World(site, staggered(), [AT_P1], i, seed) for i in (IDEAL, changed))
-    extra = {}
-    for plain, late in zip(clear.run(until_s), obstructed.run(until_s), strict=True):
-        ticks = difference(int(late.rx_ticks[0]), int(plain.rx_ticks[0]))
-        extra.setdefault(plain.anchor, []).append((plain.emission_s, ticks * TICK_M))
-    return {anchor: np.array(rows) for anchor, rows in extra.items()}
-
-
 def test_late_messages_are_as_frequent_and_as_late_as_asked():
-    extra = _excess_m(_channel(nlos_probability=0.3, nlos_mean_m=2.0), 6.0)
+    extra = lateness(_channel(nlos_probability=0.3, nlos_mean_m=2.0), 6.0)
     metres = np.concatenate([rows[:, 1] for rows in extra.values()])
     late = metres[metres > 0.5 * TICK_M]
     share = 0.3 * math.exp(-0.5 * TICK_M / 2.0)
@@ -255,22 +257,13 @@ def test_late_messages_are_as_frequent_and_as_late_as_asked():
     assert metres.min() == 0.0
 
 
-def test_persistent_and_bursty_biases_fall_on_their_anchors():
-    always, bursts = AnchorBias(2, 0.3), AnchorBias(4, 1.5, burst_s=0.5, pause_s=1.0)
-    extra = _excess_m(faulty(anchor_biases=(always, bursts)), 4.0)
-    assert np.abs(extra[1][:, 1]).max() == 0.0
-    assert extra[2][:, 1] == pytest.approx(np.full(len(extra[2]), 0.3), abs=TICK_M)
-    in_burst = extra[4][:, 0] % 1.5 >= 1.0
-    assert extra[4][in_burst, 1] == pytest.approx(np.full(in_burst.sum(), 1.5), abs=TICK_M)
-    assert np.abs(extra[4][~in_burst, 1]).max() == 0.0
-
-
 def test_walls_delay_and_weaken():
     wall = WallSite(1.5, 1.0, 1.5, 3.0, loss_db=7.0, delay_m=0.25)
     plain, walled = site_of((0, 0), (6, 0)), site_of((0, 0), (6, 0), walls=[wall])
     seen = []
+    model = faulty(diagnostics=True, channel=ChannelModel(power_noise_db=0.0))
     for site in (plain, walled):
-        world = World(site, staggered(), [AT_P1], faulty(diagnostics=True, channel=ChannelModel(power_noise_db=0.0)), 1)
+        world = World(site, staggered(), [AT_REST], model, 1)
         seen.append({b.anchor: (int(b.rx_ticks[0]), b.diagnostics[0]) for b in world.run(0.03)})
     for anchor, metres, loss_db in ((1, 0.25, 7.0), (2, 0.0, 0.0)):
         (clear_ticks, clear), (late_ticks, late) = seen[0][anchor], seen[1][anchor]
@@ -280,7 +273,7 @@ def test_walls_delay_and_weaken():
 
 
 def test_power_bias_follows_the_table():
-    extra = _excess_m(_channel(power_bias=True), 0.2)
+    extra = lateness(_channel(power_bias=True), 0.2)
     for anchor in LAB.anchors:
         distance_m = math.hypot(anchor.x_m - 3.0, anchor.y_m - 4.0)
         bias_m = power_bias_m(received_power_dbm(-14.3, distance_m, 0.0))
@@ -290,7 +283,7 @@ def test_power_bias_follows_the_table():
 
 def test_antenna_delay_errors_shift_their_stamps():
     errors = (DelayError(2, tx_ticks=70.0), DelayError(3, rx_ticks=900.0))
-    extra = _excess_m(faulty(delay_errors=errors), 0.2)
+    extra = lateness(faulty(delay_errors=errors), 0.2)
     assert extra[2][:, 1] == pytest.approx(np.full(len(extra[2]), 70.0 * TICK_M), abs=TICK_M)
     assert np.abs(extra[3][:, 1]).max() == 0.0
 
@@ -318,14 +311,14 @@ def test_diagnostics_tell_power_offset_and_doppler():
 
 
 def test_without_diagnostics_none_are_told():
-    broadcast = next(iter(World(LAB, staggered(), [AT_P1], IDEAL, 1).run(1.0)))
+    broadcast = next(iter(World(LAB, staggered(), [AT_REST], IDEAL, 1).run(1.0)))
     assert broadcast.diagnostics is None
     assert next(broadcast.receptions())[1].diagnostics is None
 
 
 def test_moving_tags_are_where_their_path_says():
     path = Waypoints([(0, 1), (6, 1), (6, 7)], 2.0, corner_s=0.5)
-    world = World(LAB, staggered(), [AT_P1, TagSpec(path)], IDEAL, 1)
+    world = World(LAB, staggered(), [AT_REST, TagSpec(path)], IDEAL, 1)
     for broadcast in world.run(8.0):
         at = broadcast.tags.tolist().index(1)
         assert broadcast.positions_m[at] == pytest.approx(path.position(broadcast.emission_s), abs=1e-9)
@@ -339,7 +332,7 @@ def test_a_restarted_anchor_is_a_new_machine_with_a_new_counter():
         return Metronome(anchor, first_s=5e-3 + 2e-3 * anchor)
 
     outage = AnchorOutage(2, Outage(0.2, 0.5))
-    world = World(LAB, factory, [AT_P1], faulty(anchor_outages=(outage,)), 9)
+    world = World(LAB, factory, [AT_REST], faulty(anchor_outages=(outage,)), 9)
     rows = _receptions(world, 1.0)
     assert made.count(2) == 2
     assert made.count(1) == 1
@@ -352,13 +345,13 @@ def test_a_restarted_anchor_is_a_new_machine_with_a_new_counter():
     assert np.ptp(before) <= 1
     assert np.ptp(after) <= 1
     assert abs(difference(int(before[0]), int(after[0]))) > 10**6
-    undisturbed = World(LAB, staggered(), [AT_P1], IDEAL, 9)
+    undisturbed = World(LAB, staggered(), [AT_REST], IDEAL, 9)
     assert rows[1] == _receptions(undisturbed, 1.0)[1]
 
 
 def test_a_restarted_tag_has_a_new_counter():
     tag = TagSpec(Static(3, 4), outages=(Outage(0.2, 0.4), Outage(0.6)))
-    world = World(LAB, staggered(), [AT_P1, tag], IDEAL, 9)
+    world = World(LAB, staggered(), [AT_REST, tag], IDEAL, 9)
     rows = _receptions(world, 1.0, tag=1)[1]
     times = np.array([true for _, _, true, _ in rows]) * TICK_S
     assert not ((times > 0.2) & (times < 0.4)).any()
@@ -375,7 +368,7 @@ def test_overlapping_outages_end_with_the_last():
         return Metronome(anchor)
 
     outages = (AnchorOutage(1, Outage(0.0, 0.3)), AnchorOutage(1, Outage(0.1, 0.5)))
-    world = World(site_of((0, 0)), factory, [AT_P1], faulty(anchor_outages=outages), 1)
+    world = World(site_of((0, 0)), factory, [AT_REST], faulty(anchor_outages=outages), 1)
     times = [broadcast.emission_s for broadcast in world.run(1.0)]
     assert made == [1]
     assert times[0] == pytest.approx(0.505, abs=1e-7)
@@ -390,7 +383,7 @@ def test_impairments_of_unknown_anchors_are_refused():
 def test_the_lab_is_as_the_mathematics_says():
     lab = lab_impairments(150.0)
     assert (lab.tx_stamp_ps, lab.rx_stamp_ps) == (150.0, 150.0)
-    world = World(LAB, staggered(), [AT_P1], lab, 1)
+    world = World(LAB, staggered(), [AT_REST], lab, 1)
     for _ in world.run(1.0):
         pass
     assert set(world.tally.at_tags.values()) == {0, world.tally.transmissions}
@@ -422,7 +415,7 @@ def test_without_the_compiler_the_world_is_the_same():
 
 def test_the_real_anchors_keep_their_slots_in_the_world():
     """In true time the six anchors of the lab speak one slot of 2.5 ms after the other, and nothing is lost."""
-    world = World(LAB, lambda anchor: Anchor(LAB, anchor), [AT_P1], lab_impairments(100.0), 11)
+    world = World(LAB, lambda anchor: Anchor(LAB, anchor), [AT_REST], lab_impairments(100.0), 11)
     told = [(b.emission_s, b.anchor) for b in world.run(1.5) if b.emission_s > 0.5]
     times, anchors = np.array(told).T
     assert np.diff(times) == pytest.approx(np.full(len(times) - 1, 2.5e-3), rel=1e-5, abs=20e-9)

@@ -6,45 +6,24 @@ import math
 import msgspec
 import numpy as np
 import pytest
-from metronome import IDEAL, Metronome, faulty, site_of, staggered
+from metronome import AT_REST, IDEAL, LAB, Metronome, faulty, lateness, site_of, staggered
 from scipy.integrate import quad
 from scipy.stats import chi2, kstest, uniform
 
 from skyless.core.native.views import view
-from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import WallSite
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S, difference
 from skyless.sim import impairments as faults
-from skyless.sim.lab import paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.oscillator import OscillatorModel, clock_rate, drift_phase_s, make_clocks, warm_up
 from skyless.sim.streams import stream
-from skyless.sim.trajectory import Roaming, Static, Waypoints
+from skyless.sim.trajectory import Static, Waypoints
 from skyless.sim.world import World
 from skyless.site.channel import ChannelModel
 
 pytestmark = pytest.mark.site
 
-LAB = paper_lab_site()
 PLACES_M = {anchor.id: np.array([anchor.x_m, anchor.y_m]) for anchor in LAB.anchors}
-MIDDLE = Static(3.0, 4.0)
-AT_REST = TagSpec(MIDDLE)
-
-
-def _late_m(changed, until_s, *, tag=AT_REST, sites=(LAB, LAB)):
-    """Per anchor rows of (emission in s, how much later the tag stamps the frame than in the plain world).
-
-    Both worlds have the same seed, and so the same noise; what differs is the change alone, and the rounding.
-    """
-    worlds = [
-        World(site, staggered(), [tag], impairments, 7)
-        for site, impairments in zip(sites, (IDEAL, changed), strict=True)
-    ]
-    rows = {}
-    for plain, late in zip(*(world.run(until_s) for world in worlds), strict=True):
-        ticks = difference(int(late.rx_ticks[0]), int(plain.rx_ticks[0]))
-        rows.setdefault(plain.anchor, []).append((plain.emission_s, ticks * TICK_M))
-    return {anchor: np.array(own) for anchor, own in rows.items()}
 
 
 def _late_at_anchors_m(changed, sites=(LAB, LAB)):
@@ -73,7 +52,7 @@ def test_displaced_anchors_are_heard_from_where_they_truly_are():
     """By tags and by other anchors; and they themselves hear there."""
     shift = np.array([0.3, -0.2])
     changed = faulty(anchor_displacements=(faults.AnchorDisplacement(3, *shift),))
-    for anchor, rows in _late_m(changed, 0.2).items():
+    for anchor, rows in lateness(changed, 0.2).items():
         moved = PLACES_M[anchor] + (shift if anchor == 3 else 0.0)
         longer_m = math.dist(moved, (3.0, 4.0)) - math.dist(PLACES_M[anchor], (3.0, 4.0))
         assert rows[:, 1] == pytest.approx(longer_m, abs=1.01 * TICK_M)
@@ -111,7 +90,7 @@ def test_the_slope_grows_with_the_distance_at_tags_alone():
         assert faults.slope_error_m(0.05, distance_m) == pytest.approx(0.05 * share)
     model = faulty(range_errors=faults.RangeErrorModel(slope_m=0.08))
     place = Static(0.5, 1.5)
-    for anchor, rows in _late_m(model, 0.2, tag=TagSpec(place)).items():
+    for anchor, rows in lateness(model, 0.2, tag=TagSpec(place)).items():
         expected_m = 0.08 * np.clip((math.dist(PLACES_M[anchor], (0.5, 1.5)) - 4.0) / 4.0, -1.0, 1.0)
         assert rows[:, 1] == pytest.approx(expected_m, abs=1.01 * TICK_M)
     assert {value for values in _late_at_anchors_m(model).values() for value in values} == {0.0}
@@ -149,8 +128,8 @@ def test_changing_errors_forget_with_their_correlation_length(along):
 
 def test_changing_errors_reach_the_stamps():
     model = faulty(range_errors=faults.RangeErrorModel(changing_m=0.1, correlation_s=0.2))
-    world = World(LAB, staggered(), [TagSpec(MIDDLE)], model, 7)
-    plain = World(LAB, staggered(), [TagSpec(MIDDLE)], IDEAL, 7)
+    world = World(LAB, staggered(), [AT_REST], model, 7)
+    plain = World(LAB, staggered(), [AT_REST], IDEAL, 7)
     seen = set()
     for clear in plain.run(2.0):
         changed = next(world.run(clear.end_s + 1e-4))  # its errors are those of its own emission until the next one
@@ -174,7 +153,7 @@ def test_a_wall_delays_while_it_stands_between(between_anchors):
     walled = msgspec.structs.replace(LAB, walls=(wall,))
     path = Waypoints([(3.0, 1.0), (3.0, 7.0)], 1.0)
     changed = faulty(channel=ChannelModel(walls_between_anchors=between_anchors))
-    late = _late_m(changed, 6.0, tag=TagSpec(path), sites=(LAB, walled))
+    late = lateness(changed, 6.0, tag=TagSpec(path), sites=(LAB, walled))
     behind_s = {}
     for anchor, rows in late.items():
         blocked = np.array([_crosses(path.position(t)[:2], PLACES_M[anchor], wall) for t in rows[:, 0]])
@@ -190,7 +169,7 @@ def test_a_wall_delays_while_it_stands_between(between_anchors):
 def test_a_body_shadows_its_sector_behind_the_tag_and_turns_with_it():
     body = faults.Body(delay_m=0.2, sector_rad=math.radians(100.0))
     path = Waypoints([(2.0, 3.0), (4.0, 3.0), (4.0, 5.0)], 1.0)
-    late = _late_m(faulty(body=body), 4.0, tag=TagSpec(path))
+    late = lateness(faulty(body=body), 4.0, tag=TagSpec(path))
     shadowed = 0
     for anchor, rows in late.items():
         for t_s, late_m in rows:
@@ -204,14 +183,20 @@ def test_a_body_shadows_its_sector_behind_the_tag_and_turns_with_it():
 
 
 def test_a_body_in_front_of_a_tag_at_rest_looks_along_x():
-    late = _late_m(faulty(body=faults.Body(0.2, math.radians(20.0), 0.0)), 0.2)
+    late = lateness(faulty(body=faults.Body(0.2, math.radians(20.0), 0.0)), 0.2)
     assert {anchor for anchor, rows in late.items() if rows[:, 1].mean() > 0.1} == {3}  # at (6, 4), seen from (3, 4)
 
 
 def test_a_bias_lasts_from_one_time_to_another():
-    """Within it bursts come and go as always."""
-    biases = (faults.AnchorBias(2, 0.3, from_s=0.5, to_s=1.25), faults.AnchorBias(4, 1.0, 0.2, 0.3, from_s=1.0))
-    late = _late_m(faulty(anchor_biases=biases), 2.0)
+    """Within it bursts come and go as always; without times it lasts from beginning to end."""
+    biases = (
+        faults.AnchorBias(2, 0.3, from_s=0.5, to_s=1.25),
+        faults.AnchorBias(4, 1.0, 0.2, 0.3, from_s=1.0),
+        faults.AnchorBias(6, 0.5),
+    )
+    late = lateness(faulty(anchor_biases=biases), 2.0)
+    assert late[6][:, 1] == pytest.approx(0.5, abs=1.01 * TICK_M)
+    assert not np.vstack([late[anchor] for anchor in (1, 3, 5)])[:, 1].any()
     t_s, late_m = late[2].T
     assert late_m == pytest.approx(np.where((t_s >= 0.5) & (t_s < 1.25), 0.3, 0.0), abs=1.01 * TICK_M)
     t_s, late_m = late[4].T
@@ -219,7 +204,7 @@ def test_a_bias_lasts_from_one_time_to_another():
 
 
 def test_a_bias_that_creeps_grows_from_its_beginning_and_ends_at_once():
-    late = _late_m(faulty(anchor_biases=(faults.AnchorBias(2, 0.1, from_s=0.5, to_s=1.5, creep_mps=0.4),)), 2.0)
+    late = lateness(faulty(anchor_biases=(faults.AnchorBias(2, 0.1, from_s=0.5, to_s=1.5, creep_mps=0.4),)), 2.0)
     t_s, late_m = late[2].T
     grown_m = np.where((t_s >= 0.5) & (t_s < 1.5), 0.1 + 0.4 * (t_s - 0.5), 0.0)
     assert late_m == pytest.approx(grown_m, abs=1.01 * TICK_M)
@@ -229,7 +214,7 @@ def test_a_bias_that_creeps_grows_from_its_beginning_and_ends_at_once():
 @pytest.mark.statistical
 def test_a_warming_crystal_gains_what_its_curve_says(ppm):
     """The tag's stamps run ahead by ppm·(t − τ(1 − e^(−t/τ))), t from the start of the warm-up."""
-    rows = np.vstack(list(_late_m(faulty(warm_ups=(faults.WarmUp(ppm, 20.0, 1.0),)), 10.0).values()))
+    rows = np.vstack(list(lateness(faulty(warm_ups=(faults.WarmUp(ppm, 20.0, 1.0),)), 10.0).values()))
     since_s = np.maximum(rows[:, 0] - 1.0, 0.0)
     ahead_s = ppm * 1e-6 * (since_s - 20.0 * (1.0 - np.exp(-since_s / 20.0)))
     assert rows[:, 1] == pytest.approx(ahead_s * SPEED_OF_LIGHT_MPS, abs=1.01 * TICK_M + 1e-5)
@@ -254,38 +239,16 @@ def test_the_phase_of_a_warm_up_is_the_integral_of_its_rate():
 def test_an_anchors_crystal_warms_alone():
     """It speaks too early, as its counter runs ahead; the others speak as before."""
     changed = faulty(warm_ups=(faults.WarmUp(2.0, 20.0, anchor=3),))
-    worlds = [World(LAB, staggered(), [TagSpec(MIDDLE)], impairments, 7) for impairments in (IDEAL, changed)]
+    worlds = [World(LAB, staggered(), [AT_REST], impairments, 7) for impairments in (IDEAL, changed)]
     for plain, warm in zip(*(world.run(2.0) for world in worlds), strict=True):
         t_s = plain.emission_s
         ahead_s = 2e-6 * (t_s - 20.0 * (1.0 - math.exp(-t_s / 20.0))) if plain.anchor == 3 else 0.0
         assert plain.emission_s - warm.emission_s == pytest.approx(ahead_s, abs=1.01 * TICK_S)
 
 
-def _room(seed, tags=2, **changes):
-    impairments = faults.Impairments(
-        anchor_displacements=(faults.AnchorDisplacement(2, 0.1, 0.1),),
-        range_errors=faults.RangeErrorModel(0.05, 0.05, 0.029, correlation_m=1.0),
-        body=faults.Body(),
-        warm_ups=(faults.WarmUp(1.0, 20.0), faults.WarmUp(1.0, 20.0, anchor=2)),
-        anchor_biases=(faults.AnchorBias(5, 0.3, from_s=0.1, to_s=0.2),),
-    )
-    specs = [TagSpec(Roaming((3, 4, 0), (1, 1.3, 0), seed=k)) for k in range(tags)]
-    return World(LAB, lambda a: Anchor(LAB, a), specs, msgspec.structs.replace(impairments, **changes), seed)
-
-
-def _stamps(world, tags=None, until_s=0.3):
-    return [(b.anchor, b.emission_ticks, *b.rx_ticks[:tags].tolist()) for b in world.run(until_s)]
-
-
-def test_a_seed_gives_the_same_room_again_and_another_tag_changes_nothing():
-    assert _stamps(_room(1)) == _stamps(_room(1))
-    assert _stamps(_room(1), 2) == _stamps(_room(1, tags=4), 2)
-    assert _stamps(_room(1)) != _stamps(_room(2))
-
-
 def test_the_lab_is_what_it_was():
     """Its ticks, whatever anchors send, as at commit 12610a1, before worlds knew of the errors of rooms."""
-    tags = [TagSpec(MIDDLE), TagSpec(Waypoints([(1, 1), (5, 1), (5, 7)], 1.0))]
+    tags = [AT_REST, TagSpec(Waypoints([(1, 1), (5, 1), (5, 7)], 1.0))]
     digest = hashlib.sha256()
     for broadcast in World(LAB, staggered(), tags, faults.lab_impairments(100.0), 1).run(0.5):
         digest.update(broadcast.frame + broadcast.rx_ticks.tobytes())

@@ -1,6 +1,7 @@
 """The watch of the anchors: what it finds, names, keeps and gives up, on drawn ranges and on real ones."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -9,9 +10,10 @@ from hypothesis import strategies as st
 
 from skyless.research.calibration.biases import ranges_of
 from skyless.research.studies.surveyed_rooms import survey_layouts
-from skyless.research.studies.watch import WatchRun, run_watch, striking_windows
+from skyless.research.studies.watch import WatchCase, WatchRun, run_watch, striking_windows
 from skyless.site.survey.explain import sentence_of
 from skyless.site.survey.facts import PairBlock
+from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.watch import AnchorWatch
 
 pytestmark = pytest.mark.site
@@ -50,7 +52,7 @@ class Ranges:
 
 
 def drawn(layout, event, size_m, events, seed, drift_m=(0.02, 0.02), *, missing=0.0):
-    return run_watch(WatchRun(survey_layouts()[layout], event, size_m, drift_m, 60.0, 0.0, missing, events, seed))
+    return run_watch(WatchRun(WatchCase("", "", layout, event, size_m, drift_m, missing=missing), events, seed))
 
 
 def test_noise_strikes_no_more_often_than_stated():
@@ -80,7 +82,7 @@ def test_an_anchor_that_creeps_is_found():
 
 
 def test_drift_of_a_real_room_is_no_finding():
-    run = WatchRun(survey_layouts()["lab"], "none", 0.0, (0.008, 0.025), 60.0, 0.09, 0.0, 500, seed=87)
+    run = WatchRun(WatchCase("", "", "lab", "none", 0.0, (0.008, 0.025), 60.0, 0.09), 500, seed=87)
     assert run_watch(run).alarms == 0
 
 
@@ -261,6 +263,6 @@ def test_nobody_has_moved_in_real_recordings(recordings, name, position_m, windo
         watch.add(block)
         kinds.update(one.kind for one in watch.findings)
 
-    ranges_of(recordings / name, block_s=min(window_s, 1.0), on_block=add)
+    ranges_of(recordings / name, new_ranger=partial(PairRanger, block_s=min(window_s, 1.0), on_block=add))
     assert watch.state == "watching"
     assert kinds <= {"link"}

@@ -4,7 +4,7 @@ import numpy as np
 
 from skyless.core.ticks import TICK_S
 from skyless.research.paper.plan import ideal_values, noise_size, run_chain
-from skyless.research.uncertainty import Chain, Reference
+from skyless.research.uncertainty import Chain
 
 
 def random_chain(anchors=10, seed=1):
@@ -33,9 +33,9 @@ def random_chain(anchors=10, seed=1):
 
 def draw_loop(chain, draws):
     """Variances of all quantities, shape (quantities, n), by a loop over draws, as anyone would write it first."""
-    generator, ideal = np.random.default_rng(1), ideal_values(chain, Reference.APART)
+    generator, ideal = np.random.default_rng(1), ideal_values(chain)
     squares = np.zeros_like(ideal)
     for _ in range(draws):
         noise = generator.standard_normal((1, noise_size(chain)))
-        squares += (run_chain(chain, Reference.APART, noise)[:, 0] - ideal) ** 2
+        squares += (run_chain(chain, noise)[:, 0] - ideal) ** 2
     return squares / draws

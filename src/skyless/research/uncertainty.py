@@ -1,4 +1,4 @@
-"""Uncertainty of positions: the covariance of the paper's DTDoA, and Cramér–Rao bounds.
+"""Uncertainty of positions: the variances of the paper's DTDoA, and Cramér–Rao bounds.
 
 Names follow ``docs/maths.md`` section 1. Everything is in true seconds unless stated otherwise; the tag stands still.
 All formulas are arithmetic on the chain's fields alone and hold element by element for many anchors; the derivation in
@@ -8,14 +8,13 @@ All formulas are arithmetic on the chain's fields alone and hold element by elem
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from enum import StrEnum
 from typing import Final
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
-from skyless.core.arrays import Array, Integers, Mask, Matrix
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.estimator.compiled import add_anchor
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.estimator.state import State, covariances, new_state
@@ -53,7 +52,7 @@ class Chain:
     sync_spacing_s: float
     """D, from there to the second one (the paper: Δ_{i,m})."""
     reference_s: float
-    """t_m, the master's message that the TDoAs refer to."""
+    """t_m, the master's message that the TDoAs refer to; at the time of a synchronisation message it is that one."""
     delay_s: Array
     """Δ_im = t_i − t_m, the protocol interval, shape (n,) (the paper: also Δ_{i,m}; erratum E8)."""
     spacing_s: Array
@@ -116,11 +115,6 @@ class Chain:
         return self.G / self.P
 
     @property
-    def Q(self) -> Array:
-        """(1 + κ)² + κ²."""
-        return (1 + self.kappa) ** 2 + self.kappa**2
-
-    @property
     def X1(self) -> Array:
         """τ^m(t_i) + e, the anchor's first stamp on the master's scale."""
         return self.master_offset_s + self.master_rate * (self.reference_s + self.delay_s) + self.e
@@ -130,41 +124,6 @@ class Chain:
         """τ^m(t_i + Δ_i) + e, its second one."""
         return self.X1 + self.P
 
-    @property
-    def u(self) -> float:
-        """τ^m(t_m) − T_c, the reference packet from the middle of the synchronisation."""
-        return self.master_offset_s + self.master_rate * self.reference_s - self.T_c
-
-
-class Reference(StrEnum):
-    """Which packet of the master the TDoAs refer to (t_m), as far as it matters."""
-
-    APART = "apart"
-    """None of the synchronisation packets: the paper's assumption."""
-    FIRST_SYNC = "first-sync"
-    SECOND_SYNC = "second-sync"
-
-
-def chain_covariance(chain: Chain, reference: Reference) -> Matrix:
-    """Covariance of the paper's TDoAs (``eq:GPSTDoA``) of n anchors, shape (n, n), first order in the noise.
-
-    The tag's stamp of the reference packet is common to all, and so are the master's stamps: with weights w1 and w2
-    those of the synchronisation, and with one that of the reference packet. If that is one of the two, its weights
-    cancel and the master's noise is gone, with the rate error β. ``chain.reference_s`` must be the time of that packet.
-
-    Raises:
-        ValueError: it is not.
-    """
-    expected_s = {Reference.FIRST_SYNC: chain.sync_s, Reference.SECOND_SYNC: chain.sync_s + chain.sync_spacing_s}
-    if reference in expected_s and chain.reference_s != expected_s[reference]:
-        raise ValueError(f"reference_s is {chain.reference_s}, the {reference} packet is at {expected_s[reference]}")
-    w1, w2 = 0.5 - chain.u / chain.L, 0.5 + chain.u / chain.L
-    masters = 1.0 + w1**2 + w2**2 if reference is Reference.APART else 0.0
-    common = chain.sigma_tag_s**2 + chain.V**2 * chain.sigma_master_s**2 * masters
-    anchors = (chain.V / chain.N) ** 2 * chain.sigma_anchor_s**2 * (chain.Q + w1**2 + w2**2)
-    covariance: Matrix = np.diag(chain.Q * chain.sigma_tag_s**2 + anchors) + common
-    return SPEED_OF_LIGHT_MPS**2 * covariance
-
 
 class Variances:
     """The paper's section on uncertainties: variances in s², and of λ in m².
@@ -172,7 +131,7 @@ class Variances:
     What is printed right stands here. ``CORRECTED`` follows from the paper's own algorithm
     (``core/protocol1/snapshots.py``) by linearising it; ``tests/research/test_paper_derivation.py`` does that
     with symbols, and Monte Carlo draws of the algorithm as it is agree (``tests/research/test_paper_checks.py``). The
-    reference packet is taken to be no synchronisation packet, as in the paper; the other cases: ``chain_covariance``.
+    reference packet is taken to be no synchronisation packet, as in the paper.
     ``PRINTED`` is kept to be compared with it; ``docs/errata.md`` explains each difference.
     """
 

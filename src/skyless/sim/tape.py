@@ -21,7 +21,7 @@ from skyless.core.air.frame import Malformed, PackedHeard, Reception, after_rmar
 from skyless.core.air.site_pages import decode_page, encode_page, site_issue
 from skyless.core.anchor import site_page_for, site_pages_of, stated_position
 from skyless.core.arrays import Array, Integers
-from skyless.core.geometry import anchors_in_reach
+from skyless.core.geometry import anchor_positions, anchors_in_reach
 from skyless.core.site import Site
 from skyless.core.ticks import (
     DELAYED_TX_GRANULARITY_TICKS,
@@ -205,7 +205,7 @@ class Tape:
         _check(impairments)
         ids = np.array([anchor.id for anchor in site.anchors])
         self._ids, self._tags, self._seed, self._impairments = ids, tuple(tags), seed, impairments
-        stated_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+        stated_m = anchor_positions(site)
         errors_m = survey_std_m * np.random.default_rng([seed, _RANGES]).standard_normal(stated_m.shape)
         self.true_positions_m: Array = stated_m + errors_m
         """Shape (anchors, 3)."""

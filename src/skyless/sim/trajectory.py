@@ -48,8 +48,8 @@ class Trajectory(ABC):
         return piece.velocity_mps + (t_s - piece.origin_s) * piece.acceleration_mps2
 
 
-def _rest(position_m: Array, start_s: float = -math.inf, end_s: float = math.inf) -> Piece:
-    return Piece(start_s, end_s, 0.0, position_m, np.zeros(3), np.zeros(3))
+def _rest(position_m: Array, end_s: float = math.inf) -> Piece:
+    return Piece(-math.inf, end_s, 0.0, position_m, np.zeros(3), np.zeros(3))
 
 
 class Static(Trajectory):
@@ -68,12 +68,10 @@ class Waypoints(Trajectory):
 
     With ``corner_s`` the velocity turns over that time around every corner (and at start and end) at constant
     acceleration, cutting the corner slightly; without it, at once. ``loop`` joins the last point to the first and
-    repeats for ever. Before ``start_s`` the tag rests at the first point.
+    repeats for ever. Before the time 0 the tag rests at the first point.
     """
 
-    def __init__(
-        self, points_m: ArrayLike, speed_mps: float, *, loop: bool = False, corner_s: float = 0.0, start_s: float = 0.0
-    ) -> None:
+    def __init__(self, points_m: ArrayLike, speed_mps: float, *, loop: bool = False, corner_s: float = 0.0) -> None:
         """``points_m`` has shape (n, 2) or (n, 3), n ≥ 2. Raises ValueError for paths that cannot be walked."""
         points = np.asarray(points_m, dtype=np.float64)
         if points.ndim != 2 or points.shape[0] < 2 or points.shape[1] not in {2, 3}:
@@ -92,12 +90,11 @@ class Waypoints(Trajectory):
         self._passed_s: list[float] = [0.0, *np.cumsum(durations)[:-1].tolist()]
         self._lap_s = float(durations.sum())
         self._half_s = 0.5 * corner_s
-        self._first_s = start_s + self._half_s
 
     def piece(self, t_s: float) -> Piece:
         """See ``Trajectory``."""
-        if t_s < self._first_s - self._half_s:
-            return _rest(self._points_m[0], end_s=self._first_s - self._half_s)
+        if t_s < 0.0:
+            return _rest(self._points_m[0], end_s=0.0)
         corner = self._last_corner(t_s)
         if corner < 0 or t_s >= self._time_s(corner + 1) - self._half_s:
             return self._bend(corner + 1)
@@ -110,7 +107,7 @@ class Waypoints(Trajectory):
 
     def _last_corner(self, t_s: float) -> int:
         """Number of the last corner passed, counted across laps; -1 before the first."""
-        within_s = t_s - self._first_s
+        within_s = t_s - self._half_s
         lap = int(within_s // self._lap_s) if self._loop else 0
         within_s -= lap * self._lap_s
         corner = lap * len(self._legs_mps) + bisect.bisect_right(self._passed_s, within_s) - 1
@@ -122,9 +119,9 @@ class Waypoints(Trajectory):
 
     def _time_s(self, corner: int) -> float:
         if not self._loop and corner >= len(self._legs_mps):
-            return self._first_s + self._lap_s if corner == len(self._legs_mps) else math.inf
+            return self._half_s + self._lap_s if corner == len(self._legs_mps) else math.inf
         lap, within = divmod(corner, len(self._legs_mps))
-        return self._first_s + lap * self._lap_s + self._passed_s[within]
+        return self._half_s + lap * self._lap_s + self._passed_s[within]
 
     def _corner(self, corner: int) -> Array:
         index = corner % len(self._points_m) if self._loop else min(corner, len(self._points_m) - 1)

@@ -9,11 +9,11 @@ All functions raise ConfigurationError, which names file, line, column and value
 
 import csv
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from io import StringIO
 from math import inf
 from os import PathLike
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -169,17 +169,29 @@ def read_height_readings(path: str | PathLike[str]) -> Array:
 # Anchors and their calibration
 
 
+Value = TypeVar("Value")
+
+
+def _by_anchor(
+    path: str | PathLike[str], columns: tuple[str, ...], what: str, value: Callable[[_Row], Value]
+) -> dict[int, Value]:
+    """What a table states of each anchor, by identifier."""
+    found: dict[int, Value] = {}
+    for row in _rows(path, columns):
+        identifier = row.identifier()
+        if identifier in found:
+            raise row.wrong("id", "an id that occurs only once")
+        found[identifier] = value(row)
+    if not found:
+        raise _empty(path, what)
+    return found
+
+
 def read_anchors(path: str | PathLike[str]) -> dict[int, Point]:
     """Read anchor positions by identifier, in metres."""
-    anchors: dict[int, Point] = {}
-    for row in _rows(path, ANCHOR_COLUMNS):
-        identifier = row.identifier()
-        if identifier in anchors:
-            raise row.wrong("id", "an id that occurs only once")
-        anchors[identifier] = (row.number("x_m"), row.number("y_m"), row.number("z_m"))
-    if not anchors:
-        raise _empty(path, "anchor")
-    return anchors
+    return _by_anchor(
+        path, ANCHOR_COLUMNS, "anchor", lambda row: (row.number("x_m"), row.number("y_m"), row.number("z_m"))
+    )
 
 
 def read_calibration(path: str | PathLike[str]) -> DifferenceCalibration | None:
@@ -247,12 +259,4 @@ def read_ranges(path: str | PathLike[str]) -> PairRanges:
 
 def read_heights(path: str | PathLike[str]) -> dict[int, float]:
     """Read anchor heights by identifier, in metres."""
-    heights_m: dict[int, float] = {}
-    for row in _rows(path, HEIGHT_COLUMNS):
-        anchor = row.identifier()
-        if anchor in heights_m:
-            raise row.wrong("id", "an id that occurs only once")
-        heights_m[anchor] = row.number("z_m", MAX_COORDINATE_M)
-    if not heights_m:
-        raise _empty(path, "height")
-    return heights_m
+    return _by_anchor(path, HEIGHT_COLUMNS, "height", lambda row: row.number("z_m", MAX_COORDINATE_M))

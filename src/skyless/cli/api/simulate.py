@@ -15,7 +15,6 @@ from skyless.core.errors import SkylessError
 from skyless.core.method_names import FILTERS
 from skyless.core.site import Site
 from skyless.run.masterless.smoothing import OwnReceiver
-from skyless.sim.evaluation.figures import dimensions
 from skyless.sim.evaluation.fleet import FleetReport, JudgedFix, TagFleet, report
 from skyless.sim.evaluation.request import Conditions
 from skyless.sim.evaluation.scenarios import (
@@ -100,7 +99,7 @@ class SimulationResult(Result, frozen=True, eq=False):
         if found.tags_without_fix:
             yield "tags without a fix", f"{found.tags_without_fix} of {found.tags}"
         yield "first fix", "none" if found.first_fix_s is None else f"{found.first_fix_s:.3f} s after power-on"
-        of_all = dimensions(planar=self.site.tags.height_m is not None)
+        of_all = "3-D" if self.site.tags.height_m is None else "2-D"
         yield f"RMSE {of_all}", cm(found.rmse_m)
         yield f"predicted σ {of_all}", cm(found.sigma_m)
         yield f"95 % {of_all}", cm(found.p95_m)

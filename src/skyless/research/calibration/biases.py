@@ -1,6 +1,5 @@
 """Tags and ranges from recordings for a survey, and biases of another system's anchors, in bounded memory."""
 
-import math
 import os
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -31,7 +30,6 @@ from skyless.run.recordings.recording import HostClock, McapRecording, Recorded,
 from skyless.sim.evaluation.figures import EvenSample, TruthTrack
 from skyless.site.anchor_names import anchor_name
 from skyless.site.survey.estimate import CalibrationEstimate, Differences, estimate
-from skyless.site.survey.facts import PairBlock, PairRanges
 from skyless.site.survey.legs import AnchorLeg, LegCollector, RelayedDifferences, RelayMatcher
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.walk import EPOCH_S, EpochCollector, TagEpochs
@@ -332,16 +330,13 @@ _MAX_SEEN: Final = 1 << 16
 class RecordedRanges(Struct, frozen=True):
     """Ranges from a recording, and its unusable parts."""
 
-    ranges: PairRanges
     ranger: PairRanger
-    """Source of the ranges, which can drop those from before an anchor was moved."""
+    """Gives the ranges, and can drop those from before an anchor was moved."""
     format: str
     site: Site | None
     """The recorded site. None for recordings of other systems."""
     drops: dict[str, int]
     """Unusable data, by reason."""
-    damage: dict[str, int] = {}
-    """The part of the drops that is damage of the file, which other readers also find."""
 
 
 def ranges_of(
@@ -349,24 +344,19 @@ def ranges_of(
     format_name: str | None = None,
     *,
     identifier: int | None = None,
-    block_s: float = 1.0,
-    on_block: Callable[[PairBlock], None] | None = None,
-    from_s: float = 0.0,
-    to_s: float = math.inf,
     on_progress: Callable[[float], None] | None = None,
+    new_ranger: Callable[[int], PairRanger] = PairRanger,
 ) -> RecordedRanges:
     """Ranges from a recording of ``skyless record``, or of another system; ``format_name`` chooses the format.
 
-    ``identifier``: of the site, if it should be checked. ``block_s``, ``on_block``: see ``PairRanger``. ``from_s``,
-    ``to_s``: the part in use, in seconds since the first leg. ``on_progress`` is called now and then with the share of
-    the recording that has been read.
+    ``identifier``: of the site, if it should be checked. ``on_progress`` is called now and then with the share of the
+    recording that has been read, ``new_ranger`` with the width of the counters.
 
     Raises:
         ConfigurationError: the file cannot be read, or its format has no stamps of anchors.
     """
     if format_name == SITE_FORMAT or (format_name is None and is_mcap(path)):
-        part = _Part(PairRanger(TICK_BITS, block_s, on_block=on_block), from_s, to_s, on_progress)
-        return _of_site(path, identifier, part)
+        return _of_site(path, identifier, _Legs(new_ranger(TICK_BITS), on_progress))
     known = format_of(path, format_name)
     if known.tx_bits is None:
         stamped = ", ".join(one.name for one in FORMATS if one.tx_bits is not None and not one.is_dl_tdoa)
@@ -374,35 +364,28 @@ def ranges_of(
     if known.is_dl_tdoa:
         right = "of a system whose anchors all range each other; here positions are those that messages state"
         raise ConfigurationError(path, "format", known.name, f"{right}, or those of --anchors")
-    part = _Part(PairRanger(known.tx_bits, block_s, on_block=on_block), from_s, to_s, on_progress)
-    drops = _add_receptions(path, part) if known.name == "avalue" else _add_packets(path, known.name, part)
-    return RecordedRanges(part.finish(), part.ranger, known.name, None, dict(drops + part.drops()))
+    legs = _Legs(new_ranger(known.tx_bits), on_progress)
+    drops = _add_receptions(path, legs) if known.name == "avalue" else _add_packets(path, known.name, legs)
+    return RecordedRanges(legs.ranger, known.name, None, dict(drops + legs.finish()))
 
 
-class _Part:
-    """Collects the legs in a part of a recording, each once."""
+class _Legs:
+    """Collects the legs of a recording, each once."""
 
-    def __init__(
-        self, ranger: PairRanger, from_s: float, to_s: float, on_progress: Callable[[float], None] | None
-    ) -> None:
+    def __init__(self, ranger: PairRanger, on_progress: Callable[[float], None] | None) -> None:
         self.ranger = ranger
-        self._from_s, self._to_s = from_s, to_s
         self._on_progress, self._records = on_progress, 0
-        self._begin_s: float | None = None
         self._seen: OrderedDict[tuple[int, int, int], None] = OrderedDict()
 
     def add(self, leg: AnchorLeg) -> None:
-        """Add a leg if it is new and within the part."""
+        """Add a leg if it is new."""
         key = (leg.sender, leg.receiver, leg.rx_ticks)
         if key in self._seen:
             return
         self._seen[key] = None
         if len(self._seen) > _MAX_SEEN:
             self._seen.popitem(last=False)
-        if self._begin_s is None:
-            self._begin_s = leg.t_s
-        if self._from_s <= leg.t_s - self._begin_s < self._to_s:
-            self.ranger.add(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s)
+        self.ranger.add(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s)
 
     def report(self, share: Callable[[], float]) -> None:
         """Count a record, and report progress now and then."""
@@ -410,13 +393,9 @@ class _Part:
         if self._on_progress is not None and self._records % _REPORT_EVERY == 0:
             self._on_progress(min(max(share(), 0.0), 1.0))
 
-    def finish(self) -> PairRanges:
-        """Finish, and return the ranges from all legs."""
+    def finish(self) -> Counter[str]:
+        """Finish, and return what the ranger could not use, by reason."""
         self.ranger.finish()
-        return self.ranger.ranges()
-
-    def drops(self) -> Counter[str]:
-        """Data that the ranger could not use, by reason."""
         return _drops(self.ranger.counters)
 
 
@@ -424,7 +403,7 @@ def _drops(counters: Counter[str]) -> Counter[str]:
     return Counter({name: count for name, count in counters.items() if name != "legs" and count})
 
 
-def _of_site(path: str | PathLike[str], identifier: int | None, part: _Part) -> RecordedRanges:
+def _of_site(path: str | PathLike[str], identifier: int | None, legs: _Legs) -> RecordedRanges:
     """Ranges from tags' receptions, and from anchors' own stamps if recorded."""
     drops: Counter[str] = Counter()
     collectors: dict[str, LegCollector] = {}
@@ -436,18 +415,18 @@ def _of_site(path: str | PathLike[str], identifier: int | None, part: _Part) -> 
         begin_s, end_s = summary.start_s or 0.0, summary.end_s or 1.0
         for found in recording.messages({"receptions", "stamps"}):
             time_s = found.time_s
-            part.report(lambda: (time_s - begin_s) / max(end_s - begin_s, 1.0))  # noqa: B023 - called at once
+            legs.report(lambda: (time_s - begin_s) / max(end_s - begin_s, 1.0))  # noqa: B023 - called at once
             if found.channel.site != str(site.id):
                 drops["foreign-site"] += 1
                 continue
             if isinstance(found.message, StampsMessage):
-                legs = _of_anchor(found.message, part.ranger, runs)
+                found_legs = _of_anchor(found.message, legs.ranger, runs)
             else:
                 collector = collectors.setdefault(found.channel.name, LegCollector(site.id))
-                legs = _of_tag(found, collector)
-            for leg in legs:
+                found_legs = _of_tag(found, collector)
+            for leg in found_legs:
                 if {leg.sender, leg.receiver} <= known:
-                    part.add(leg)
+                    legs.add(leg)
                 else:
                     drops["unknown-anchor"] += 1
         summary = recording.summary()
@@ -456,9 +435,7 @@ def _of_site(path: str | PathLike[str], identifier: int | None, part: _Part) -> 
         damage["unfinished-record"] += 1
     for collector in collectors.values():
         drops += _drops(collector.counters)
-    return RecordedRanges(
-        part.finish(), part.ranger, SITE_FORMAT, site, dict(damage + drops + part.drops()), dict(damage)
-    )
+    return RecordedRanges(legs.ranger, SITE_FORMAT, site, dict(damage + drops + legs.finish()))
 
 
 def _of_anchor(message: StampsMessage, ranger: PairRanger, runs: dict[int, str]) -> list[AnchorLeg]:
@@ -482,7 +459,7 @@ def _of_tag(found: Recorded, collector: LegCollector) -> list[AnchorLeg]:
     return legs
 
 
-def _add_packets(path: str | PathLike[str], format_name: str, part: _Part) -> Counter[str]:
+def _add_packets(path: str | PathLike[str], format_name: str, legs: _Legs) -> Counter[str]:
     """Add legs learned by a listener to another system's packets, with times by its own counter.
 
     Antenna delays included in the stamps are subtracted, so that ranges are near the distances.
@@ -491,22 +468,22 @@ def _add_packets(path: str | PathLike[str], format_name: str, part: _Part) -> Co
         matcher, ticks = RelayMatcher(recording.format.tx_bits or TICK_BITS), Unwrapper()
         size = Path(path).stat().st_size
         for packet in recording:
-            part.report(lambda: recording.bytes_read / max(size, 1))
+            legs.report(lambda: recording.bytes_read / max(size, 1))
             if not isinstance(packet, Packet):
                 continue
             now_ticks = ticks.unwrap(packet.rx_ticks, packet.host_s)
             t_s = to_seconds(now_ticks)
             for leg in matcher.add(packet.anchor, packet.sequence, packet.tx_ticks, packet.relays, now_ticks, t_s):
-                part.add(replace(leg, rx_ticks=leg.rx_ticks - recording.format.delays_ticks))
+                legs.add(replace(leg, rx_ticks=leg.rx_ticks - recording.format.delays_ticks))
         return recording.drops + _drops(matcher.counters)
 
 
-def _add_receptions(path: str | PathLike[str], part: _Part) -> Counter[str]:
+def _add_receptions(path: str | PathLike[str], legs: _Legs) -> Counter[str]:
     """Add legs between Avalue's anchors."""
     drops: Drops = Counter()
     with open_source(path) as stream:
         size = Path(path).stat().st_size
         for heard in datasets.cross_receptions(stream, drops):
-            part.report(lambda: os.lseek(stream.fileno(), 0, os.SEEK_CUR) / max(size, 1))
-            part.add(AnchorLeg(heard.sender, heard.receiver, heard.tx_ticks, heard.rx_ticks, heard.host_s))
+            legs.report(lambda: os.lseek(stream.fileno(), 0, os.SEEK_CUR) / max(size, 1))
+            legs.add(AnchorLeg(heard.sender, heard.receiver, heard.tx_ticks, heard.rx_ticks, heard.host_s))
     return drops

@@ -26,6 +26,7 @@ from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import ConfigurationError, SkylessError
 from skyless.core.site import Site
 from skyless.research.replays.options import RecordingOptions
+from skyless.sim.evaluation.scenarios import position_stds_m
 from skyless.site.anchor_names import read_anchor
 from skyless.site.survey.facts import Facts, Gauge, Point, TagReceived, Tape
 from skyless.site.tables import read_heights
@@ -377,8 +378,7 @@ def _sketch_m(site: Site | None) -> dict[int, Point]:
 
 
 def _stated_std_m(site: Site) -> float:
-    stated = [site.accuracy.survey_std_m if one.std_m is None else one.std_m for one in site.anchors]
-    return float((sum(std_m**2 for std_m in stated) / len(stated)) ** 0.5)
+    return float((sum(std_m**2 for std_m in position_stds_m(site)) / len(site.anchors)) ** 0.5)
 
 
 def _heights(asked: SurveyOptions, known: set[int]) -> dict[int, float]:

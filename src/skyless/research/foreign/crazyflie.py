@@ -12,7 +12,7 @@ import re
 from binascii import Error as Base64Error
 from binascii import a2b_base64
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from io import BufferedIOBase
 from os import PathLike
 from struct import Struct as Binary
@@ -102,16 +102,18 @@ def read_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None
     """Positions from motion capture or lighthouse in the log; None if it has none."""
     found: dict[str, list[tuple[float, ...]]] = {name: [] for name in _TRUTHS}
     names = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    with open_source(path) as stream:
-        for event in _Log(stream, Counter()).events():
-            if event.name in found and event.values.keys() >= {"x", "y", "z"}:
-                found[event.name].append(
-                    (event.time_s, *(event.values[name] for name in names if name in event.values))
-                )
+    for event in _events(path, found):
+        if event.values.keys() >= {"x", "y", "z"}:
+            found[event.name].append((event.time_s, *(event.values[name] for name in names if name in event.values)))
     for rows in found.values():
         if rows and len(table := in_order(np.array(rows, dtype=np.float64))):
             return Truth(table[:, 0], table[:, 1:4], table[:, 4:8] if table.shape[1] == 8 else None)
     return None
+
+
+def _events(path: str | PathLike[str], names: Container[str]) -> Iterator[_Event]:
+    with open_source(path) as stream:
+        yield from (event for event in _Log(stream, Counter()).events() if event.name in names)
 
 
 def in_order(table: Array) -> Array:
@@ -123,19 +125,16 @@ def in_order(table: Array) -> Array:
 def read_heights(path: str | PathLike[str], *, is_barometer: bool) -> Array | None:
     """Rows of time, height and standard deviation of the ranger or the barometer; None if the log has none."""
     wanted = _BAROMETER if is_barometer else _SENSOR
-    with open_source(path) as stream:
-        events = [event for event in _Log(stream, Counter()).events() if event.name == wanted and event.values]
-    rows = [(event.time_s, next(iter(event.values.values()))) for event in events]
+    rows = [(event.time_s, next(iter(event.values.values()))) for event in _events(path, {wanted}) if event.values]
     return heights_of(np.array(rows).reshape(-1, 2), is_barometer=is_barometer)
 
 
 def read_motion(path: str | PathLike[str]) -> Array | None:
     """Rows of time, rates [rad/s] and specific forces [m/s²], x, y and z each; None if the log lacks either."""
     found: dict[str, list[tuple[float, ...]]] = {_GYROSCOPE: [], _ACCELEROMETER: []}
-    with open_source(path) as stream:
-        for event in _Log(stream, Counter()).events():
-            if event.name in found and event.values.keys() >= {"x", "y", "z"}:
-                found[event.name].append((event.time_s, *(event.values[axis] for axis in "xyz")))
+    for event in _events(path, found):
+        if event.values.keys() >= {"x", "y", "z"}:
+            found[event.name].append((event.time_s, *(event.values[axis] for axis in "xyz")))
     rates, forces = (in_order(np.array(rows, dtype=np.float64).reshape(-1, 4)) for rows in found.values())
     if len(rates) == 0 or len(forces) == 0:
         return None

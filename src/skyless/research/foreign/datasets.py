@@ -209,11 +209,6 @@ def _identifier(text: bytes) -> int:
     return int(text.removesuffix(b".0"))
 
 
-def read_util(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:
-    """Yield the TDoAs of one of UTIL's tables."""
-    yield from read_tdoas(stream, drops, UTIL_COLUMNS)
-
-
 def read_util_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None:
     """Poses of motion capture in one of UTIL's tables; None if it has none."""
     table = numbers(path, _POSE_COLUMNS)
@@ -311,22 +306,20 @@ def overheard_tdoa_m(stamps: list[int]) -> float | None:
 
     ``stamps`` are the nine of ``_STAMP_COLUMNS``, in that order.
     """
-    l_rx1, l_rx2, l_rx3, i_tx1, r_rx1, r_tx2, i_rx2, r_tx3, i_rx3 = stamps
-    reply = _elapsed(r_tx2, r_rx1)
-    span = _elapsed(r_tx3, r_tx2)
-    if span == 0:
-        return None
-    gain_l = difference(_elapsed(l_rx3, l_rx2), span, _STAMP_BITS) / span
-    gain_i = difference(_elapsed(i_rx3, i_rx2), span, _STAMP_BITS) / span
-    if abs(gain_l) > _MAX_RATE or abs(gain_i) > _MAX_RATE:
-        return None
-    flight = (difference(_elapsed(i_rx2, i_tx1), reply, _STAMP_BITS) - gain_i * reply) / 2
-    return (difference(_elapsed(l_rx2, l_rx1), reply, _STAMP_BITS) - gain_l * reply - flight) * TICK_M
+    *listeners, i_tx1, r_rx1, r_tx2, i_rx2, r_tx3, i_rx3 = stamps
+    reply, span = wrap(r_tx2 - r_rx1, _STAMP_BITS), wrap(r_tx3 - r_tx2, _STAMP_BITS)
+    heard, answered = (_beyond_reply(three, reply, span) for three in (listeners, [i_tx1, i_rx2, i_rx3]))
+    return None if heard is None or answered is None else (heard - answered / 2) * TICK_M
 
 
-def _elapsed(later: int, earlier: int) -> int:
-    """Ticks between two stamps of the same clock, less than one wrap of 67.2 ms."""
-    return (later - earlier) & ((1 << _STAMP_BITS) - 1)
+def _beyond_reply(stamps: list[int], reply: int, span: int) -> float | None:
+    """Ticks from the first to the second of a clock's three stamps, less the reply by that clock's rate.
+
+    ``reply``, ``span``: before and after the second message, on the clock that replied. None for impossible rates.
+    """
+    first, second, third = stamps
+    gain = difference(third - second, span, _STAMP_BITS) / span if span else _MAX_RATE
+    return difference(second - first, reply, _STAMP_BITS) - gain * reply if abs(gain) < _MAX_RATE else None
 
 
 # STARLOC's tables of two-way exchanges (Dümbgen et al., arXiv 2309.05518), as differences of one tag's ranges.
@@ -384,11 +377,10 @@ def _range_of(row: list[bytes]) -> _Range | str:
         return "not-finite"
     tx1, rx1, tx2, rx2, tx3, rx3 = stamps
     span, reply = (wrap(later - earlier, _STAMP_BITS) for later, earlier in ((tx3, tx2), (tx2, rx1)))
-    gain = difference(rx3 - rx2, span, _STAMP_BITS) / span if span else _MAX_RATE
-    range_m = (difference(rx2 - tx1, reply, _STAMP_BITS) - gain * reply) / 2 * TICK_M
-    if abs(gain) >= _MAX_RATE or abs(range_m) > _FARTHEST_M:
+    answered = _beyond_reply([tx1, rx2, rx3], reply, span)
+    if answered is None or abs(answered / 2 * TICK_M) > _FARTHEST_M:
         return "stamps-of-no-exchange"
-    return _Range(time_s, anchor, range_m)
+    return _Range(time_s, anchor, answered / 2 * TICK_M)
 
 
 def starloc_anchors(path: str | PathLike[str]) -> dict[int, Point]:

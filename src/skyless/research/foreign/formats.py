@@ -17,10 +17,6 @@ from skyless.core.ticks import TICK_BITS
 from skyless.files import Drops, has_columns, header_of, open_source, read_head
 from skyless.radio.foreign import bitcraze, fira, phones
 from skyless.research.foreign import crazyflie, datasets
-from skyless.research.foreign import crazyflie as bitcraze_captures
-from skyless.research.foreign import datasets as muloc
-from skyless.research.foreign import datasets as starloc
-from skyless.research.foreign import datasets as tdoa_tables
 from skyless.site.anchor_names import anchor_name
 from skyless.site.tables import Truth, read_truth
 
@@ -71,8 +67,8 @@ FORMATS: Final = (
     _bitcraze(
         "bitcraze-yaml",
         "Bitcraze sniffer, YAML documents with base64 payloads (TDoA2, TDoA3)",
-        bitcraze_captures.recognise_yaml,
-        bitcraze_captures.read_yaml,
+        crazyflie.recognise_yaml,
+        crazyflie.read_yaml,
     ),
     _bitcraze(
         "bitcraze-text",
@@ -83,8 +79,8 @@ FORMATS: Final = (
     Format(
         "miluv",
         "MILUV passive ticks: three-message exchanges overheard by a listener",
-        partial(has_columns, tdoa_tables.MILUV_COLUMNS),
-        tdoa_tables.read_miluv,
+        partial(has_columns, datasets.MILUV_COLUMNS),
+        datasets.read_miluv,
         None,
         any_listener=True,
         read_truth=read_truth,
@@ -112,19 +108,19 @@ FORMATS: Final = (
     Format(
         "tdoa-table",
         "Table t_s,anchor_a,anchor_b,tdoa_m, or with idA and idB",
-        tdoa_tables.recognise_tdoas,
-        tdoa_tables.read_tdoas,
+        datasets.recognise_tdoas,
+        datasets.read_tdoas,
         None,
     ),
     Format(
         "util-table",
         "UTIL's published tables t_tdoa,idA,idB,tdoa_meas, with poses, ranger and barometer",
-        partial(has_columns, tdoa_tables.UTIL_COLUMNS),
-        tdoa_tables.read_util,
+        partial(has_columns, datasets.UTIL_COLUMNS),
+        partial(datasets.read_tdoas, columns=datasets.UTIL_COLUMNS),
         None,
-        read_truth=tdoa_tables.read_util_truth,
+        read_truth=datasets.read_util_truth,
         truth_is_of_body=True,
-        read_heights=tdoa_tables.read_util_heights,
+        read_heights=datasets.read_util_heights,
     ),
     Format(
         "crazyflie-log",
@@ -146,22 +142,22 @@ FORMATS: Final = (
     Format(
         "starloc",
         "STARLOC's two-way exchanges of a tag with anchors (uwb.csv), as differences of successive ranges",
-        partial(has_columns, starloc.COLUMNS),
-        starloc.read_starloc,
+        partial(has_columns, datasets.COLUMNS),
+        datasets.read_starloc,
         None,
         any_listener=True,
-        read_truth=starloc.starloc_truth,
-        read_anchors=starloc.starloc_anchors,
+        read_truth=datasets.starloc_truth,
+        read_anchors=datasets.starloc_anchors,
     ),
     Format(
         "muloc",
         "MULoc's arrays (npz): four anchors that hear each other and a tag, with anchors and truth",
-        muloc.recognise,
-        muloc.read_muloc,
+        datasets.recognise,
+        datasets.read_muloc,
         TICK_BITS,
-        read_truth=muloc.muloc_truth,
-        read_anchors=muloc.muloc_anchors,
-        channels=muloc.CHANNELS,
+        read_truth=datasets.muloc_truth,
+        read_anchors=datasets.muloc_anchors,
+        channels=datasets.CHANNELS,
     ),
     _bitcraze(
         "bitcraze-binary",
@@ -239,7 +235,7 @@ def open_recording(
     return Recording(chosen, fspath(path), read(stream, drops), stream, drops)
 
 
-_TABLES: Final = (tdoa_tables.TDOA_COLUMNS, tdoa_tables.UTIL_COLUMNS, datasets.RECEPTION_COLUMNS, starloc.COLUMNS)
+_TABLES: Final = (datasets.TDOA_COLUMNS, datasets.UTIL_COLUMNS, datasets.RECEPTION_COLUMNS, datasets.COLUMNS)
 """Columns that a user may have meant if a table has others; of equal matches the first."""
 _HEADER: Final = re.compile(r"[A-Za-z_][\w. ]*(,[ \w.]+)+")
 

@@ -1,4 +1,4 @@
-"""Figure 10: what none of the paper's figures shows: one tag to ten thousand (sec:Intro, sec:conclusion)."""
+"""Claim 10, which none of the paper's figures shows: one tag to ten thousand (sec:Intro, sec:conclusion)."""
 
 import hashlib
 import time
@@ -6,6 +6,7 @@ from functools import partial
 from typing import Final
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 from msgspec import Struct
@@ -14,7 +15,7 @@ from msgspec.structs import replace
 from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.arrays import Array, Integers
-from skyless.research.paper.plan import P1, RADIO_PS, Panel, Plan, Results, Section, Verdict, grouped
+from skyless.research.paper.plan import P1, RADIO_PS, Figures, Found, Panel, Plan, Results, Table, grouped
 from skyless.research.studies.runner import Cell
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import lab_impairments
@@ -133,39 +134,24 @@ def summarise(squares_m2: Array, fixes: Integers, frames: int, digest: str, cpu_
     )
 
 
-def judge(fleets: list[FleetResult]) -> tuple[Verdict, str]:
+def figures_of(fleets: list[FleetResult]) -> Figures:
     """Whether the first tag's fixes, the rate per tag and the load of the air are the same for all sizes."""
-    first, most = fleets[0], fleets[-1]
-    same_fixes = len({fleet.first_tag for fleet in fleets}) == 1
-    same_rate = all(fleet.fewest_fixes_per_s > 0.99 * first.fixes_per_s for fleet in fleets)
-    same_air = len({one for fleet in fleets for one in (fleet.frames_per_s, fleet.fewest_heard_per_s)}) == 1
-    if same_fixes and same_rate and same_air:
-        return Verdict.HOLDS, (
-            f"With {grouped(most.tags)} tags the first one computes bit for bit what it computes alone, every tag "
-            f"receives all of the same {first.frames_per_s:.0f} frames a second, and each one that computes has its "
-            f"{first.fixes_per_s:.0f} fixes. That the simulated radios of listeners do not touch each other is built "
-            "in, as it is in the physics: they never send."
-        )
-    if same_air and same_fixes:
-        return Verdict.CORRECTED, "The accuracy stays, but some tags have fewer fixes."
-    return Verdict.FAILS, "More tags change what a tag computes, or what the air carries."
+    first = fleets[0]
+    return {
+        "same_fixes": len({fleet.first_tag for fleet in fleets}) == 1,
+        "same_rate": all(fleet.fewest_fixes_per_s > 0.99 * first.fixes_per_s for fleet in fleets),
+        "same_air": len({one for fleet in fleets for one in (fleet.frames_per_s, fleet.fewest_heard_per_s)}) == 1,
+        "first": first,
+        "sizes": ", ".join(grouped(fleet.tags) for fleet in fleets),
+        "most": grouped(fleets[-1].tags),
+    }
 
 
-def section(plan: Plan, results: Results) -> Section:
-    """The figure with its verdict."""
+def evaluated(plan: Plan, results: Results) -> Found:
+    """The figures of the claim, its table and its pictures."""
     fleets: list[FleetResult] = [results[f"scale/{tags}"] for tags in plan.fleet_sizes]
-    verdict, reason = judge(fleets)
-    rows = [
-        (
-            "tags",
-            "that compute",
-            "RMSE in cm",
-            "single tags, 5–95 %",
-            "fixes per s and tag",
-            "frames per s on air",
-            "CPU per tag, measured here",
-        )
-    ]
+    heads = ("tags", "that compute", "RMSE in cm", "single tags, 5–95 %", "fixes per s and tag", "frames per s on air")
+    rows: Table = [(*heads, "CPU per tag, measured here")]
     for fleet in fleets:
         error = "" if fleet.rmse_standard_error_m is None else f" ± {100 * fleet.rmse_standard_error_m:.2f}"
         low, high = fleet.tag_rmse_m
@@ -180,41 +166,23 @@ def section(plan: Plan, results: Results) -> Section:
                 f"{1e3 * fleet.cpu_s_per_tag_s:.1f} ms per s",
             )
         )
-    return Section(
-        key="scaling",
-        title="From one tag to ten thousand" if plan.fleet_sizes[-1] >= 10_000 else "More and more tags",
-        label="abstract, sec:conclusion",
-        claim="Any number of tags can be tracked without a lower update rate; the paper shows it with three.",
-        simulated=(
-            f"Fleets of {', '.join(grouped(tags) for tags in plan.fleet_sizes)} tags, all at P1 with radios and "
-            f"clocks of their own, {RADIO_PS:g} ps, joint, from a cold start; judged from {_JUDGED_FROM_S:g} to "
-            f"{_JUDGED_UNTIL_S:g} s, so that the anchors' noise is the same for all sizes (a single short stretch: the "
-            f"RMSE belongs to it, figure 4 has the long run). All tags receive; of more than {_MOST_COMPUTING} as many "
-            "compute, evenly spread, each with the real receiver. The lines for uplink are arithmetic, not simulated."
-        ),
-        verdict=verdict,
-        reason=reason,
-        panels=(_accuracy(fleets), _rates(fleets), _cpu(fleets)),
-        table=tuple(rows),
-        numbers={"fleets": fleets},
-        command=f"skyless simulate --tags 1000 --duration 3 --seed {plan.seed}",
-    )
+    return Found(figures_of(fleets), rows, [_accuracy(fleets), _rates(fleets), _cpu(fleets)], {"fleets": fleets})
 
 
-def _logarithmic(title: str, fleets: list[FleetResult]) -> Figure:
+def _logarithmic(title: str, fleets: list[FleetResult]) -> tuple[Figure, Axes, Array]:
+    """A figure, its axes over the numbers of tags, and these."""
     figure, axes = panel(title, 3.2)
+    tags = np.array([fleet.tags for fleet in fleets], dtype=float)
     axes.set_xscale("log")
-    axes.set_xticks([fleet.tags for fleet in fleets])
+    axes.set_xticks(tags)
     axes.xaxis.set_major_formatter(FuncFormatter(lambda tags, _: grouped(round(tags))))
     axes.minorticks_off()
     axes.set_xlabel("tags")
-    return figure
+    return figure, axes, tags
 
 
 def _accuracy(fleets: list[FleetResult]) -> Panel:
-    figure = _logarithmic("Accuracy of a tag", fleets)
-    (axes,) = figure.axes
-    tags = [fleet.tags for fleet in fleets]
+    figure, axes, tags = _logarithmic("Accuracy of a tag", fleets)
     low, high = (100 * np.array([fleet.tag_rmse_m[k] for fleet in fleets]) for k in (0, 1))
     axes.fill_between(tags, low, high, color=BLUE, alpha=0.2, linewidth=0, label="single tags, 5 to 95 %")
     axes.plot(tags, [100 * fleet.rmse_m for fleet in fleets], "o-", color=BLUE, label="all tags together")
@@ -224,9 +192,7 @@ def _accuracy(fleets: list[FleetResult]) -> Panel:
 
 
 def _rates(fleets: list[FleetResult]) -> Panel:
-    figure = _logarithmic("Updates of each tag", fleets)
-    (axes,) = figure.axes
-    tags = np.array([fleet.tags for fleet in fleets], dtype=float)
+    figure, axes, tags = _logarithmic("Updates of each tag", fleets)
     slots_hz = 1.0 / (paper_lab_site().schedule.slot_s)
     axes.set_yscale("log")
     axes.plot(tags, [fleet.fixes_per_s for fleet in fleets], "o-", color=BLUE, label="downlink: simulated")
@@ -240,9 +206,7 @@ def _rates(fleets: list[FleetResult]) -> Panel:
 
 
 def _cpu(fleets: list[FleetResult]) -> Panel:
-    figure = _logarithmic("What a tag computes, what the air carries", fleets)
-    (axes,) = figure.axes
-    tags = [fleet.tags for fleet in fleets]
+    figure, axes, tags = _logarithmic("What a tag computes, what the air carries", fleets)
     cpu_ms = [1e3 * fleet.cpu_s_per_tag_s for fleet in fleets]
     axes.plot(tags, cpu_ms, "s-", color=GREEN, label="CPU time of a tag (left), measured here")
     axes.set(ylabel="CPU time in ms per s", ylim=(0, 1.7 * max(cpu_ms)))

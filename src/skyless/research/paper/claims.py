@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -22,6 +22,7 @@ from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.snapshots import literal_covariance
 from skyless.core.site import AnchorSite, ScheduleSite, Site
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
+from skyless.research.paper import _scale
 from skyless.research.paper.plan import (
     CLAIM_M,
     DW1000_PS,
@@ -31,12 +32,15 @@ from skyless.research.paper.plan import (
     PAPER_PS,
     RADIO_PS,
     ChainMoments,
+    Figures,
+    Found,
     Panel,
     Plan,
     Point,
     Quantity,
     Results,
     Section,
+    Table,
     TimedReception,
     Track,
     Verdict,
@@ -68,21 +72,6 @@ from skyless.site.report import (
     draw_floor_plan,
     panel,
 )
-
-Figures = dict[str, Any]
-"""Figures that the rules and texts of a claim refer to."""
-Table = list[tuple[str, ...]]
-"""Rows of cells, the first one the heads."""
-
-
-class Found(NamedTuple):
-    """Evaluation of the results of a claim's cells."""
-
-    figures: Figures
-    table: Table
-    panels: list[Panel]
-    numbers: dict[str, object]
-    """For programs, SI units in the names."""
 
 
 class Rule(Struct, frozen=True, forbid_unknown_fields=True):
@@ -123,8 +112,8 @@ class Claim(Struct, frozen=True, forbid_unknown_fields=True):
         figures, table, panels, numbers = _WORK[self.key][1](plan, results)
         amounts = {name: grouped(getattr(plan, name)) for name in ("fixes", "fewer_fixes", "draws")}
         words: Figures = {"plan": plan, **amounts, **figures}
-        simulated, command = self.simulated.format(**words), self.command.format(**words)
-        about = self.key, self.title, self.label, self.claim, simulated, *self.judge(figures)
+        title, simulated, command = (one.format(**words) for one in (self.title, self.simulated, self.command))
+        about = self.key, title, self.label, self.claim, simulated, *self.judge(figures)
         return Section(*about, tuple(panels), tuple(table), numbers, command)
 
 
@@ -323,7 +312,7 @@ def _checks(chain: Chain, moments: ChainMoments, noise: str, anchor: int) -> Ite
             printed_error_pct=_error_pct(printed_variance, std) if printed_variance >= 0.0 else None,
             corrected_error_pct=_error_pct(_first_number(as_corrected(chain)), std),
             standard_error_pct=100.0 * float(moments.std_relative_error[row, 0]),
-            mean_error_sigmas=float(moments.mean[row, 0] / moments.mean_error[row, 0]),
+            mean_error_sigmas=float(moments.mean[row, 0] / np.sqrt(moments.variance[row, 0] / moments.draws)),
             draws=moments.draws,
         )
 
@@ -437,12 +426,8 @@ class LambdaDistribution(Struct, frozen=True):
         return float(0.5 * np.abs(self.counts / self.draws - np.diff(below)).sum())
 
 
-def lambda_distributions(seed: int, draws: int) -> tuple[LambdaDistribution, ...]:
-    """Distributions of λ of anchor 1, one for each of ``NOISES``."""
-    return tuple(_distribution(seed, noise, draws) for noise in NOISES)
-
-
-def _distribution(seed: int, noise: str, draws: int) -> LambdaDistribution:
+def lambda_distribution(seed: int, noise: str, draws: int) -> LambdaDistribution:
+    """Distribution of λ of anchor 1 with stamps of one of ``NOISES``."""
     chain = paper_chain(seed, 1, noise)
     theory_m = math.sqrt(_first_number(CORRECTED.lambda_m2(chain)))
     printed_variance = _first_number(PRINTED.lambda_m2(chain))
@@ -459,7 +444,8 @@ def _distribution(seed: int, noise: str, draws: int) -> LambdaDistribution:
 
 def _distribution_cells(plan: Plan) -> list[Cell]:
     """One anchor, two kinds of noise."""
-    return [Cell("distributions", partial(lambda_distributions, seed=plan.seed, draws=plan.draws), plan.draws * 3e-6)]
+    draws = plan.draws
+    return [Cell(f"lambda/{one}", partial(lambda_distribution, plan.seed, one, draws), draws * 2e-6) for one in NOISES]
 
 
 def distribution_figures(normal: LambdaDistribution, uniform: LambdaDistribution) -> Figures:
@@ -475,7 +461,7 @@ def distribution_figures(normal: LambdaDistribution, uniform: LambdaDistribution
 
 
 def _distributions(plan: Plan, results: Results) -> Found:  # noqa: ARG001
-    both: tuple[LambdaDistribution, ...] = results["distributions"]
+    both: list[LambdaDistribution] = [results[f"lambda/{noise}"] for noise in NOISES]
     table: Table = [("stamps", "σ of the draws in mm", "corrected", "as printed", "shape off by")]
     numbers = []
     for one in both:
@@ -783,18 +769,13 @@ def _dop_map(plan: Plan, results: Results) -> Found:  # noqa: ARG001
             )
         )
         numbers[key] = dict(zip(("min", "median", "max", "p1", "p2"), (*three, *own), strict=True))
-    figures = map_figures(float(np.corrcoef(pdop, sigma_m)[0, 1]), asymmetry)
+    figures = {"correlation": float(np.corrcoef(pdop, sigma_m)[0, 1]), "asymmetry_pct": 100.0 * asymmetry}
     panels = [
         _map("06-pdop-map", "PDoP", (x, y, pdop), "PDoP for a known height; darker is better."),
         _map("06-sigma-map", "σ of literal in cm", (x, y, 100 * sigma_m), "Predicted σ of one fix of literal."),
     ]
     numbers |= {"correlation": figures["correlation"], "sigma_asymmetry": asymmetry}
     return Found(figures, table, panels, numbers)
-
-
-def map_figures(correlation: float, asymmetry: float) -> Figures:
-    """Correlation of PDoP and predicted deviation over the floor, and how mirrored positions differ."""
-    return {"correlation": correlation, "asymmetry_pct": 100.0 * asymmetry}
 
 
 def _map(name: str, title: str, field: tuple[Array, ...], caption: str) -> Panel:
@@ -1128,6 +1109,7 @@ _WORK: Final[dict[str, tuple[Callable[[Plan], list[Cell]], Callable[[Plan, Resul
     "three-receivers": (_timeline_cells, _timeline),
     "update-rate": (_rate_cells, _rate),
     "largest-error": (_claim_cells, _claim),
+    "scaling": (_scale.cells, _scale.evaluated),
 }
 """Cells of each claim, and their evaluation."""
 

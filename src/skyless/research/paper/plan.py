@@ -2,14 +2,13 @@
 
 import math
 import time
-from array import array
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from enum import IntEnum, StrEnum
 from functools import reduce
 from html import escape
 from importlib.metadata import version
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,7 +16,7 @@ from msgspec import Struct
 
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.arrays import Array
-from skyless.core.fix import Fix
+from skyless.core.geometry import anchor_positions
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.protocol1.beacon import schedule_of
 from skyless.core.protocol1.snapshots import (
@@ -31,7 +30,7 @@ from skyless.core.protocol1.snapshots import (
 from skyless.core.site import Site
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_S
 from skyless.machine import cores
-from skyless.research.uncertainty import Chain, Reference
+from skyless.research.uncertainty import Chain
 from skyless.sim.evaluation.figures import FirstFixes
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.impairments import Impairments, lab_impairments
@@ -137,6 +136,22 @@ class Section(Struct, frozen=True):
     """The same and more for programs, SI units in the names."""
     command: str
     """A command that reproduces the central number."""
+
+
+Figures = dict[str, Any]
+"""Figures that the rules and texts of a claim refer to."""
+Table = list[tuple[str, ...]]
+"""Rows of cells, the first one the heads."""
+
+
+class Found(NamedTuple):
+    """Evaluation of the results of a claim's cells."""
+
+    figures: Figures
+    table: Table
+    panels: list[Panel]
+    numbers: dict[str, object]
+    """For programs, SI units in the names."""
 
 
 def gaussian(values: Array, std: float, mean: float = 0.0) -> Array:
@@ -249,14 +264,13 @@ _UNITS: Final = np.array([1.0, *[TICK_S] * 5, 1.0, TICK_S, TICK_M])[:, None]
 """From ticks to what ``ChainMoments`` gives, by ``Quantity``."""
 
 
-def run_chain(chain: Chain, reference: Reference, noise: Array) -> Array:
+def run_chain(chain: Chain, noise: Array) -> Array:
     """Every quantity of the chain in ticks, shape (quantities, draws, n), for stamps with ``noise`` of unit variance.
 
     ``noise``: shape (draws, numbers of a draw).
     """
     c, n = chain, len(chain.anchor_rate)
     shared, own = noise[:, :_SHARED_NOISES, None], noise[:, _SHARED_NOISES:].reshape(-1, n, _ANCHOR_NOISES)
-    of_reference = {Reference.FIRST_SYNC: 0, Reference.SECOND_SYNC: 1, Reference.APART: 2}[reference]
 
     def master(true_s: float, noise: Array) -> Any:  # noqa: ANN401 - arrays, for functions of numbers
         return (c.master_offset_s + c.master_rate * true_s + c.sigma_master_s * noise) / TICK_S
@@ -269,7 +283,7 @@ def run_chain(chain: Chain, reference: Reference, noise: Array) -> Array:
 
     second_s, sent_s = c.sync_s + c.sync_spacing_s, c.reference_s + c.delay_s
     m1, m2 = master(c.sync_s, shared[:, 0]), master(second_s, shared[:, 1])
-    tm = master(c.reference_s, shared[:, of_reference])
+    tm = master(c.reference_s, shared[:, {c.sync_s: 0, second_s: 1}.get(c.reference_s, 2)])
     rm = tag(c.reference_s + c.tag_master_tof_s, shared[:, 3])
     s1, s2 = anchor(c.sync_s + c.anchor_tof_s, own[..., 0]), anchor(second_s + c.anchor_tof_s, own[..., 1])
     a1, a2 = anchor(sent_s, own[..., 2]), anchor(sent_s + c.spacing_s, own[..., 3])
@@ -284,9 +298,9 @@ def run_chain(chain: Chain, reference: Reference, noise: Array) -> Array:
     return np.array([rate, first, delayed, offset, sent1, sent2, tags_rate, interval, (r1 - rm) - interval])
 
 
-def ideal_values(chain: Chain, reference: Reference) -> Array:
+def ideal_values(chain: Chain) -> Array:
     """Every quantity of the chain without noise, shape (quantities, n)."""
-    return run_chain(chain, reference, np.zeros((1, noise_size(chain))))[:, 0]
+    return run_chain(chain, np.zeros((1, noise_size(chain))))[:, 0]
 
 
 def noise_size(chain: Chain) -> int:
@@ -327,11 +341,6 @@ class ChainMoments(Struct, frozen=True):
         return np.sqrt(self.variance)
 
     @property
-    def mean_error(self) -> Array:
-        """Standard error of the means."""
-        return np.sqrt(self.variance / self.draws)
-
-    @property
     def std_relative_error(self) -> Array:
         """Standard error of the standard deviations over themselves: 1/√(2·draws) for Gaussian errors."""
         excess: Array = np.maximum(self.fourth / self.variance**2 - 1.0, 0.0)
@@ -340,13 +349,7 @@ class ChainMoments(Struct, frozen=True):
 
 
 def draw_moments(
-    chain: Chain,
-    seed: int,
-    draws: int,
-    *,
-    reference: Reference = Reference.APART,
-    uniform: bool = False,
-    threads: int | None = None,
+    chain: Chain, seed: int, draws: int, *, uniform: bool = False, threads: int | None = None
 ) -> ChainMoments:
     """Moments of every quantity of the chain over ``draws`` (at least 2) draws.
 
@@ -354,7 +357,7 @@ def draw_moments(
     """
 
     def sums_of(chunk: tuple[int, int]) -> tuple[Array, ...]:
-        return _total(_sums(errors) for errors in _errors(chain, seed, chunk, reference, uniform=uniform))
+        return _total(_sums(errors) for errors in _errors(chain, seed, chunk, uniform=uniform))
 
     with ThreadPoolExecutor(threads or cores()) as pool:
         sums = _total(pool.map(sums_of, _chunks(draws)))
@@ -369,12 +372,10 @@ def draw_moments(
     )
 
 
-def draw_lambdas(
-    chain: Chain, seed: int, draws: int, *, reference: Reference = Reference.APART, uniform: bool = False
-) -> Iterator[Array]:
+def draw_lambdas(chain: Chain, seed: int, draws: int, *, uniform: bool = False) -> Iterator[Array]:
     """Errors of the DTDoAs of the draws that ``draw_moments`` makes, in metres, shape (up to a batch, n) each."""
     for chunk in _chunks(draws):
-        for errors in _errors(chain, seed, chunk, reference, uniform=uniform):
+        for errors in _errors(chain, seed, chunk, uniform=uniform):
             yield errors[Quantity.LAMBDA] * TICK_M
 
 
@@ -384,11 +385,11 @@ def _chunks(draws: int) -> Iterator[tuple[int, int]]:
         yield chunk, min(CHUNK_DRAWS, draws - chunk * CHUNK_DRAWS)
 
 
-def _errors(chain: Chain, seed: int, chunk: tuple[int, int], reference: Reference, *, uniform: bool) -> Iterator[Array]:
+def _errors(chain: Chain, seed: int, chunk: tuple[int, int], *, uniform: bool) -> Iterator[Array]:
     """Errors of every quantity of a chunk's draws, shape (quantities, up to a batch, n) each."""
-    ideal = ideal_values(chain, reference)[:, None]
+    ideal = ideal_values(chain)[:, None]
     for noise in noise_batches(seed, *chunk, noise_size(chain), uniform=uniform):
-        yield run_chain(chain, reference, noise) - ideal
+        yield run_chain(chain, noise) - ideal
 
 
 def _sums(errors: Array) -> tuple[Array, ...]:
@@ -406,7 +407,6 @@ def _total(parts: Iterable[tuple[Array, ...]]) -> tuple[Array, ...]:
 
 # Tags in the lab's world that compute with several methods from the same receptions.
 
-_COLUMNS: Final = 5
 _WARMUP_S: Final = 2.0
 """Fixes before this true time are not judged: the filters settle."""
 
@@ -427,25 +427,6 @@ class Track(Struct, frozen=True):
         return self.position_m - self.truth_m
 
 
-class _Log:
-    """Keeps the first fix of every superframe."""
-
-    def __init__(self, site: Site) -> None:
-        self._first_fixes = FirstFixes(site, 1)
-        self._numbers = array("d")
-
-    def __len__(self) -> int:
-        return len(self._numbers) // _COLUMNS
-
-    def add(self, time_s: float, fix: Fix, truth_m: Array) -> None:
-        if self._first_fixes.is_first(0, time_s):
-            self._numbers.extend((time_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist()))
-
-    def track(self) -> Track:
-        rows = np.array(self._numbers).reshape(-1, _COLUMNS)
-        return Track(rows[:, 0], rows[:, 1:3], rows[:, 3:5])
-
-
 def listen(
     site: Site,
     tags: Sequence[tuple[Trajectory, Mapping[str, int]]],
@@ -462,22 +443,33 @@ def listen(
     """
     world = world_of(site, [trajectory for trajectory, _ in tags], impairments, seed)
     superframe_s = 1.0 / schedule_of(site).superframe_rate_hz
-    listeners = [[(AnyReceiver(method), _Log(site), most) for method, most in methods.items()] for _, methods in tags]
+    listeners = [
+        [
+            (AnyReceiver(method), FirstFixes(site, 1), list[tuple[float, ...]](), most)
+            for method, most in methods.items()
+        ]
+        for _, methods in tags
+    ]
     most_fixes = max(most for _, methods in tags for most in methods.values())
     end_s = until_s if until_s is not None else _WARMUP_S + 1.02 * most_fixes * superframe_s + 1.0
     now_s = 0.0
-    while now_s < end_s and any(len(log) < most for own in listeners for _, log, most in own):
+    while now_s < end_s and any(len(rows) < most for own in listeners for *_, rows, most in own):
         now_s = min(now_s + 0.5, end_s)
         for broadcast in world.run(now_s):
             for tag, reception, truth_m in broadcast.receptions():
-                for receiver, log, most in listeners[tag]:
-                    fix = receiver.hear(reception) if len(log) < most else None
-                    if fix is not None and broadcast.end_s >= _WARMUP_S:
-                        log.add(broadcast.end_s, fix, truth_m)
+                for receiver, first_fixes, rows, most in listeners[tag]:
+                    at_s, fix = broadcast.end_s, receiver.hear(reception) if len(rows) < most else None
+                    if fix is not None and at_s >= _WARMUP_S and first_fixes.is_first(0, at_s):
+                        rows.append((at_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist()))
     return [
-        {method: log.track() for method, (_, log, _) in zip(methods, own, strict=True)}
+        {method: _track(rows) for method, (_, _, rows, _) in zip(methods, own, strict=True)}
         for (_, methods), own in zip(tags, listeners, strict=True)
     ]
+
+
+def _track(rows: list[tuple[float, ...]]) -> Track:
+    columns = np.array(rows).reshape(-1, 5)
+    return Track(columns[:, 0], columns[:, 1:3], columns[:, 3:])
 
 
 class TimedReception(Struct, frozen=True):
@@ -501,7 +493,7 @@ def receptions(
     """All receptions of tags until a true time, and by which methods they gave a fix."""
     world = World(site, lambda anchor: Anchor(site, anchor), tags, lab_impairments(RADIO_PS), seed)
     receivers = [{method: AnyReceiver(method) for method in methods} for _ in tags]
-    anchors_m = {anchor.id: np.array((anchor.x_m, anchor.y_m, anchor.z_m)) for anchor in site.anchors}
+    anchors_m = dict(zip((anchor.id for anchor in site.anchors), anchor_positions(site), strict=True))
     heard = []
     for broadcast in world.run(until_s):
         for tag, reception, truth_m in broadcast.receptions():

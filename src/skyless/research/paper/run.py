@@ -10,7 +10,6 @@ from msgspec import Struct
 
 from skyless.core.errors import SkylessError
 from skyless.files import replace_files
-from skyless.research.paper import _scale as scale
 from skyless.research.paper.claims import CLAIMS
 from skyless.research.paper.plan import Plan, Section, report_page
 from skyless.research.studies.runner import run_cells
@@ -47,11 +46,10 @@ def write_report(plan: Plan, out: Path, reached: Callable[[float], None], proces
     except OSError as error:
         raise SkylessError(f"--out is {str(out)!r}, where no folder can be written: {error.strerror}") from None
     try:
-        cells = [*(cell for claim in CLAIMS for cell in claim.cells(plan)), *scale.cells(plan)]
+        cells = [cell for claim in CLAIMS for cell in claim.cells(plan)]
         results = dict(zip((cell.name for cell in cells), run_cells(cells, reached, processes), strict=True))
         with report_style():
-            sections = [*(claim.section(plan, results) for claim in CLAIMS), scale.section(plan, results)]
-            return _written(plan, sections, results, out)
+            return _written(plan, [claim.section(plan, results) for claim in CLAIMS], results, out)
     except BaseException:
         if is_new:
             out.rmdir()

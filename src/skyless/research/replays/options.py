@@ -207,6 +207,6 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     def requirement(self) -> "IntegrityRequirement | None":
         """Requirements for the levels that replace the tag's own; None without any."""
         asked = ProtectionOptions(integrity_risk=self.integrity_risk, alert_limit_m=self.alert_limit_m)
-        if not asked.protection_given and self.tag_height_std_m is None:
+        if not asked.given("integrity_risk", "alert_limit_m") and self.tag_height_std_m is None:
             return None
         return asked.requirement(self.method, self.tag_height_std_m)

@@ -17,6 +17,7 @@ from skyless.core.arrays import Array, Integers
 from skyless.core.errors import SkylessError
 from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.settings import EstimatorSettings
+from skyless.core.geometry import anchor_positions
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, with_limits
 from skyless.research.uncertainty import BoundSettings, tracking_bound
@@ -182,7 +183,7 @@ def run_chunk(case: Case, seeds: list[np.random.SeedSequence]) -> Array:
 
 def _run(case: Case, draw: np.random.Generator) -> list[float]:
     site = paper_lab_site()
-    anchors = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    anchors = anchor_positions(site)
     episode = draw_episode(draw, anchors, site.schedule.slot_s, case)
     start_m = episode.path_m[0, :2] + draw.normal(0.0, START_STD_M, 2)
     rows = tracked(settings_of(case, height_m=0.0), anchors, episode.packets, start_m)

@@ -19,6 +19,7 @@ from skyless.core.arrays import Array
 from skyless.core.errors import SkylessError
 from skyless.core.estimator.estimator import Packets
 from skyless.core.estimator.process import ACCEPTED, JOINED
+from skyless.core.geometry import anchor_positions
 from skyless.core.integrity import CONTRADICTED, HPL, VPL
 from skyless.core.ticks import TICK_M
 from skyless.research.studies.efficiency import (
@@ -170,7 +171,7 @@ class Chunk(Struct, frozen=True):
 def anchors_of(scene: str) -> Array:
     """Positions, shape (n, 3), in a frame in which tags walk at height 0."""
     if scene == "lab":
-        return np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in paper_lab_site().anchors])
+        return anchor_positions(paper_lab_site())
     return np.array([(x, y, 1.3 if k % 2 else -0.7) for k, (x, y) in enumerate(_CORNERS_M)], float)
 
 

@@ -18,10 +18,10 @@ from skyless.core.fix import Fix
 from skyless.core.site import EXACT, AccuracySite, Site
 from skyless.core.tag.joint import Estimation
 from skyless.core.tag.receiver import Receiver
-from skyless.research.studies.picture import interval, jackknife
+from skyless.research.studies.picture import jackknife, with_errors
 from skyless.research.studies.room import biases_of
 from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
-from skyless.research.uncertainty import BoundSettings, Sendings, received_bound, relayed_receptions
+from skyless.research.studies.worlds import bounds_m2
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, Room
 from skyless.sim.impairments import Impairments, RangeErrorModel
 from skyless.sim.tape import Heard, Tape
@@ -294,32 +294,13 @@ def _sum(tags: Sequence[LargeResult]) -> LargeResult:
 
 
 def _bound_m2(tape: Tape, site: Site, heard: Sequence[Heard], case: LargeCase, plan: Plan) -> Array:
-    """Trace of the Cramér–Rao bound after each beacon of a tag, shape (beacons,): of all that these beacons state."""
-    sequence = np.array([one.beacon.sequence for one in heard])
-    times_s = np.array([one.reception.host_s for one in heard])
-    ids, senders = np.unique([one.beacon.anchor for one in heard], return_inverse=True)
-    index_of = {identifier: index for index, identifier in enumerate(ids.tolist())}
-    relays = [
-        [(index_of[relay.anchor], relay.sequence) for relay in one.beacon.heard if relay.anchor in index_of]
-        for one in heard
-    ]
-    known = relayed_receptions(senders, sequence, relays, len(ids))
-    row_of = {one.id: row for row, one in enumerate(site.anchors)}
-    anchors_m = tape.true_positions_m[[row_of[identifier] for identifier in ids.tolist()]]
-    noise = site.noise
-    settings = BoundSettings(
-        plan.noise_ps * 1e-12,
-        white_fm=noise.white_fm,
-        random_walk_fm=noise.random_walk_fm,
-        qa=ROOM_QA_M2PS3,
-        slot_s=1.0,
-        speed_std_mps=1.0,
-        mesh=True,
-    )
+    """Trace of the Cramér–Rao bound after each beacon of a tag, shape (beacons,)."""
+    row_of, beacons = {one.id: row for row, one in enumerate(site.anchors)}, [one.beacon for one in heard]
+    ids = sorted({beacon.anchor for beacon in beacons})
+    anchors_m = {identifier: tape.true_positions_m[row_of[identifier]] for identifier in ids}
+    times_s, path_m = np.array([one.reception.host_s for one in heard]), np.array([one.truth_m for one in heard])
     biases = biases_of(_ROOM if case.in_room else None)
-    path_m = np.array([one.truth_m for one in heard])
-    bound = received_bound(anchors_m, path_m, settings, known, Sendings(senders, times_s), biases)
-    return np.asarray(np.trace(bound, axis1=1, axis2=2))
+    return bounds_m2(anchors_m, beacons, times_s, path_m, plan.noise_ps * 1e-12, site.noise, biases)
 
 
 # Cells and rows
@@ -366,17 +347,10 @@ def row_of(plan: Plan, case: LargeCase, each: list[LargeResult]) -> Row:
     if case.starts or whole.fixes == 0:
         return row
     sums = np.array([(one.fixes, one.squared_m2, one.nees, one.bound_m2) for one in each])
-    rmse_m, rmse_error_m = jackknife(sums, lambda part: math.sqrt(part[:, 1].sum() / part[:, 0].sum()))
-    nees, nees_error = jackknife(sums, lambda part: float(part[:, 2].sum() / part[:, 0].sum()))
     row = replace(
-        row,
-        rmse_m=rmse_m,
-        rmse_error_m=rmse_error_m,
-        p95_m=float(np.percentile(whole.errors_m, 95)),
+        with_errors(row, sums, whole.errors_m),
         max_m=float(whole.errors_m.max()),
         said_m=math.sqrt(whole.variance_m2 / whole.fixes),
-        nees=nees,
-        nees_interval=interval(nees_error, len(each)),
         beacons_per_s=whole.beacons / whole.tag_s,
         gap_s=whole.gap_s,
         joins=whole.joins,

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 
 from skyless.core.arrays import Array
-from skyless.research.studies.runner import Cell, Limit, Plan, Row, with_limits
+from skyless.research.studies.runner import AnyRow, Cell, Limit, Plan, Row, with_limits
 from skyless.research.studies.worlds import Run, RunResult, bound_m2, run_world
 from skyless.research.uncertainty import Biases
 from skyless.site.report import BLUE, GREEN, GRID, INK, MUTED, ORANGE, RED, report_style
@@ -383,18 +383,25 @@ def case_row(
 
 def _with_errors(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
     sums = np.array([(world.fixes, world.squared_m2, world.nees) for world in worlds])
+    return replace(
+        with_errors(row, sums, np.concatenate([world.sample_m for world in worlds])),
+        max_m=max(world.max_m for world in worlds),
+        said_m=(sum(world.variance_m2 for world in worlds) / row.fixes) ** 0.5,
+        outside=sum(world.outside for world in worlds) / row.fixes,
+    )
+
+
+def with_errors(row: AnyRow, sums: Array, errors_m: Array) -> AnyRow:
+    """Add RMSE, NEES and percentile; ``sums``: of each independent run fixes, squared errors and their NEES."""
     rmse_m, rmse_error_m = jackknife(sums, _rmse)
     nees, nees_error = jackknife(sums, lambda rows: _per_fix(rows, 2))
     return replace(
         row,
         rmse_m=rmse_m,
         rmse_error_m=rmse_error_m,
-        p95_m=float(np.percentile(np.concatenate([world.sample_m for world in worlds]), 95)),
-        max_m=max(world.max_m for world in worlds),
-        said_m=(sum(world.variance_m2 for world in worlds) / row.fixes) ** 0.5,
+        p95_m=float(np.percentile(errors_m, 95)),
         nees=nees,
-        nees_interval=interval(nees_error, len(worlds)),
-        outside=sum(world.outside for world in worlds) / row.fixes,
+        nees_interval=interval(nees_error, len(sums)),
     )
 
 

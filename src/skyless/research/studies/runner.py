@@ -102,6 +102,13 @@ class Limit(Struct, frozen=True):
         low, high = ("" if one is None else f"{one:g}" for one in (self.least, self.most))
         return f"{self.figure}:{low}..{high}"
 
+    def holds(self, row: "Row") -> bool:
+        """Whether a row's figure is within. A missing one exceeds nothing (levels that no fix gives)."""
+        value = getattr(row, self.figure)
+        if value is None:
+            return self.least is None
+        return bool((self.least is None or value >= self.least) and (self.most is None or value <= self.most))
+
 
 class Row(Struct, frozen=True, kw_only=True):
     """Results of a case; lengths in metres, None where it does not apply. All is simulated.
@@ -154,21 +161,9 @@ def with_limits(row: AnyRow, limits: Sequence[Limit]) -> AnyRow:
     """Add limits and the figures that miss them to a row. Without a fix, only limits on levels can hold."""
     if not limits:
         return row
-    without = () if row.fixes else tuple(one.figure for one in limits if one.figure not in {"level", "exceeded"})
-    missed = missed_limits(row, limits)
-    missed = tuple(one.figure for one in limits if one.figure in missed or one.figure in without)
+    possible = {one.figure for one in limits} if row.fixes else {"level", "exceeded"}
+    missed = tuple(one.figure for one in limits if one.figure not in possible or not one.holds(row))
     return replace(row, limits=tuple(limits), missed=missed, passed=not missed)
-
-
-def missed_limits(row: Row, limits: Sequence[Limit]) -> tuple[str, ...]:
-    """Figures outside of their limits. A missing value exceeds nothing (levels that no fix gives)."""
-    return tuple(limit.figure for limit in limits if not _holds(getattr(row, limit.figure), limit))
-
-
-def _holds(value: float | None, limit: Limit) -> bool:
-    if value is None:
-        return limit.least is None
-    return (limit.least is None or value >= limit.least) and (limit.most is None or value <= limit.most)
 
 
 class Study(Struct, frozen=True):

@@ -239,7 +239,8 @@ def _row(plan: Plan, layout: str, variant: str, outcomes: Sequence[Outcome]) -> 
     whole = [one for one in outcomes if one.is_determined]
     errors_m = np.array([one.error_m for one in whole], float)
     bounds_m2 = np.array([one.bound_m**2 for one in whole])
-    wrong = [one for one in whole if _is_wrong(one)]
+    said_m = np.array([one.said_m or 0.0 for one in whole])
+    wrong = [whole[row] for row in np.flatnonzero(errors_m > np.maximum(NEAR_M, _WRONG_SIGMAS * said_m)).tolist()]
     squares_m2 = errors_m**2
     rmse_m = _root_mean(errors_m.tolist())
     ratio = error = None
@@ -278,11 +279,6 @@ def _row(plan: Plan, layout: str, variant: str, outcomes: Sequence[Outcome]) -> 
     )
     limits = [] if plan.quick else [one for one in limits_of(layout, variant) if one.figure != "wrong_flagged" or wrong]
     return with_limits(row, limits)
-
-
-def _is_wrong(one: Outcome) -> bool:
-    """Whether a result is far off, and farther than it says."""
-    return one.error_m is not None and one.error_m > max(NEAR_M, _WRONG_SIGMAS * (one.said_m or 0.0))
 
 
 def _root_mean(values: Sequence[float | None]) -> float | None:

@@ -558,15 +558,16 @@ def groups() -> tuple[Group, ...]:
     """The lab and the room in 3-D, with errors of pairs from none on; then tags at rest in the lab."""
     of_layout = {"lab": (TRUTH, SURVEYED, TAPED, KEPT, HAND), "room": (TRUTH, SURVEYED, KEPT, HAND)}
     walking = [
-        Group(f"{layout}, pairs {100.0 * pair_std_m:g} cm", layout, _errors(pair_std_m), files)
+        Group(
+            f"{layout}, pairs {100.0 * pair_std_m:g} cm",
+            layout,
+            RoomErrors(_DELAY_STD_M, pair_std_m, ROOM_RANGES),
+            files,
+        )
         for layout, files in of_layout.items()
         for pair_std_m in _PAIR_STDS_M
     ]
     return (*walking, Group("lab, at rest", "lab", at_rest=True))
-
-
-def _errors(pair_std_m: float) -> RoomErrors:
-    return RoomErrors(_DELAY_STD_M, pair_std_m, ROOM_RANGES)
 
 
 def limits_of(group: Group, file: str) -> tuple[Limit, ...]:

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
-from skyless.research.studies.runner import Cell, Limit, Plan, Row, missed_limits, seed_of
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of
 from skyless.research.studies.surveyed_rooms import SurveyLayout, survey_layouts
 from skyless.site.survey.explain import Finding, Kind, is_significant, pairs_of
 from skyless.site.survey.facts import PairBlock
@@ -44,21 +44,30 @@ _Truth = set[tuple[Kind, tuple[int, ...]]]
 """Kinds and anchors of true findings."""
 
 
-class WatchRun(Struct, frozen=True):
-    """A run of one watched site with a series of events."""
+class WatchCase(Struct, frozen=True):
+    """A kind of event at a watched site."""
 
-    layout: SurveyLayout
+    name: str
+    series: str
+    layout: str
     event: Event
     size_m: float
     """Size of displacements, delays and lateness. Directions and anchors are drawn."""
-    drift_m: tuple[float, float]
+    drift_m: tuple[float, float] = (0.02, 0.02)
     """Standard deviations of the pairs' drift are drawn between these; 0 for none."""
-    drift_s: float
+    drift_s: float = 60.0
     """Correlation time of the drift, a Gauss–Markov process."""
-    lively_m: float
+    lively_m: float = 0.0
     """Larger drift of a single pair; 0 for none."""
-    missing: float
+    missing: float = 0.0
     """Share of pairs without ranges."""
+    limits: tuple[Limit, ...] = ()
+
+
+class WatchRun(Struct, frozen=True):
+    """Events of one kind, one after another."""
+
+    case: WatchCase
     events: int
     """Number of events; of windows for the event ``none``."""
     seed: int
@@ -76,8 +85,6 @@ class WatchResult(Struct, frozen=True):
     """Events with also the right kind."""
     wrong: int
     """Events with an anchor wrongly said to have moved, or its delay to have changed."""
-    ended: int
-    """Events whose findings ended afterwards."""
     found_s: tuple[float, ...]
     """Times from an event to its finding."""
     alarms: int
@@ -107,24 +114,6 @@ _EVENT_COST_S: Final = 0.05
 _QUIET_COST_S: Final = 1.5e-3
 
 
-class _Case(Struct, frozen=True):
-    name: str
-    series: str
-    layout: str
-    event: Event
-    size_m: float
-    drift_m: tuple[float, float] = (0.02, 0.02)
-    drift_s: float = 60.0
-    lively_m: float = 0.0
-    missing: float = 0.0
-    limits: tuple[Limit, ...] = ()
-
-    def run(self, events: int, seed: int) -> WatchRun:
-        """Run some of its events, or windows without any."""
-        drift = (self.drift_m, self.drift_s, self.lively_m)
-        return WatchRun(survey_layouts()[self.layout], self.event, self.size_m, *drift, self.missing, events, seed)
-
-
 class WatchRow(Row, frozen=True, kw_only=True):
     """Findings of the watch of the anchors in the events of a case."""
 
@@ -144,28 +133,28 @@ class WatchRow(Row, frozen=True, kw_only=True):
     """Number of these findings, or of windows with an alarm."""
 
 
-def _cases() -> list[_Case]:
+def _cases() -> list[WatchCase]:
     found = []
     for layout in _LAYOUTS:
         certain = (Limit("found", least=0.99),) if layout == "hall" else ()
         never = (Limit("wrong", most=0.005),)
         series = f"{layout}, drift 2 cm"
         found += [
-            _Case(f"{layout}, moved 10 cm", series, layout, "moved", 0.1, limits=(*certain, *never)),
-            _Case(f"{layout}, moved 20 cm", series, layout, "moved", 0.2, limits=never),
-            _Case(f"{layout}, moved 2 m", series, layout, "moved", 2.0, limits=never),
-            _Case(f"{layout}, moved 30 cm, 30 % of pairs missing", series, layout, "moved", 0.3, missing=0.3),
-            _Case(f"{layout}, two moved 30 cm", series, layout, "two moved", 0.3),
-            _Case(f"{layout}, moved 30 cm at 1 mm/s", series, layout, "slow", 0.3),
-            _Case(f"{layout}, delay 10 cm", series, layout, "delay", 0.1),
-            _Case(f"{layout}, one link 35 cm late", series, layout, "link", 0.35, limits=never),
-            _Case(f"{layout}, a person on some links", series, layout, "door", 0.0),
+            WatchCase(f"{layout}, moved 10 cm", series, layout, "moved", 0.1, limits=(*certain, *never)),
+            WatchCase(f"{layout}, moved 20 cm", series, layout, "moved", 0.2, limits=never),
+            WatchCase(f"{layout}, moved 2 m", series, layout, "moved", 2.0, limits=never),
+            WatchCase(f"{layout}, moved 30 cm, 30 % of pairs missing", series, layout, "moved", 0.3, missing=0.3),
+            WatchCase(f"{layout}, two moved 30 cm", series, layout, "two moved", 0.3),
+            WatchCase(f"{layout}, moved 30 cm at 1 mm/s", series, layout, "slow", 0.3),
+            WatchCase(f"{layout}, delay 10 cm", series, layout, "delay", 0.1),
+            WatchCase(f"{layout}, one link 35 cm late", series, layout, "link", 0.35, limits=never),
+            WatchCase(f"{layout}, a person on some links", series, layout, "door", 0.0),
         ]
     for layout in _LAYOUTS:
         for drift_s in _QUIET_DRIFTS_S:
             name = f"{layout}, nothing, drift of {drift_s:g} s"
             series = "nothing happens, drift 0.8 to 2.5 cm, one pair 9 cm"
-            found.append(_Case(name, series, layout, "none", 0.0, _REAL_DRIFT_M, drift_s, _LIVELY_M))
+            found.append(WatchCase(name, series, layout, "none", 0.0, _REAL_DRIFT_M, drift_s, _LIVELY_M))
     return found
 
 
@@ -175,7 +164,7 @@ def cells(plan: Plan) -> list[Cell]:
     for number, case in enumerate(_cases()):
         events = _QUIET_WINDOWS if case.event == "none" else _EVENTS
         for world in range(plan.worlds):
-            run = case.run(events, seed_of(plan.seed, number, world))
+            run = WatchRun(case, events, seed_of(plan.seed, number, world))
             weight_s = events * (_QUIET_COST_S if case.event == "none" else _EVENT_COST_S)
             worlds.append(Cell(case.name, partial(run_watch, run), weight_s))
     windows = _NOISE_WINDOWS // plan.worlds
@@ -196,7 +185,7 @@ def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
     return [noise, *found]
 
 
-def _row(plan: Plan, case: _Case, results: Sequence[WatchResult]) -> WatchRow:
+def _row(plan: Plan, case: WatchCase, results: Sequence[WatchResult]) -> WatchRow:
     tries = sum(one.tries for one in results)
     alarms = sum(one.alarms for one in results)
     windows = sum(one.windows for one in results)
@@ -220,7 +209,7 @@ def _judged(plan: Plan, case: str, series: str, runs: int, limits: tuple[Limit, 
     row = WatchRow(
         study="watch", method=plan.method, case=case, series=series, noise_ps=plan.noise_ps, runs=runs, **figures
     )
-    missed = missed_limits(row, limits)
+    missed = tuple(limit.figure for limit in limits if not limit.holds(row))
     return replace(row, limits=limits, missed=missed, passed=not missed if limits else None)
 
 
@@ -230,26 +219,26 @@ def _judged(plan: Plan, case: str, series: str, runs: int, limits: tuple[Limit, 
 class _Site:
     """A simulated site with its current ranges, and its watch."""
 
-    def __init__(self, run: WatchRun, draw: np.random.Generator) -> None:
-        self.layout = run.layout
-        self.position_m = run.layout.position_m.copy()
+    def __init__(self, case: WatchCase, draw: np.random.Generator) -> None:
+        self.layout = survey_layouts()[case.layout]
+        self.position_m = self.layout.position_m.copy()
         self.draw = draw
         n = len(self.position_m)
         self.first, self.second = np.triu_indices(n, 1)
         m = len(self.first)
         self.late_m = np.zeros(m)
         self.is_missing: Mask = np.zeros(m, np.bool_)
-        self.is_missing[draw.choice(m, round(run.missing * m), replace=False)] = True
-        self._drift_std_m = draw.uniform(*run.drift_m, m)
-        if run.lively_m > 0.0:
-            self._drift_std_m[draw.integers(m)] = run.lively_m
+        self.is_missing[draw.choice(m, round(case.missing * m), replace=False)] = True
+        self._drift_std_m = draw.uniform(*case.drift_m, m)
+        if case.lively_m > 0.0:
+            self._drift_std_m[draw.integers(m)] = case.lively_m
         self._drift_m = self._drift_std_m * draw.standard_normal(m)
-        self._kept = math.exp(-_WINDOW_S / run.drift_s)
+        self._kept = math.exp(-_WINDOW_S / case.drift_s)
         self._superframe_s = n * _SLOT_S
         self._stamp_m = _STAMP_S * SPEED_OF_LIGHT_MPS
         self.step = 0
         at_m = {
-            anchor: (x, y, z) for anchor, (x, y, z) in zip(run.layout.anchors, self.position_m.tolist(), strict=True)
+            anchor: (x, y, z) for anchor, (x, y, z) in zip(self.layout.anchors, self.position_m.tolist(), strict=True)
         }
         self.watch = AnchorWatch(at_m, self.layout.dimensions)
 
@@ -279,13 +268,13 @@ class _Site:
 def run_watch(run: WatchRun) -> WatchResult:
     """Run the events one after another, and count the watch's findings."""
     draw = np.random.default_rng(run.seed)
-    site = _Site(run, draw)
+    site = _Site(run.case, draw)
     for _ in range(LEARNING_WINDOWS):
         site.run_step()
-    if run.event == "none":
+    if run.case.event == "none":
         return _undisturbed(site, run.events)
     found_s: list[float] = []
-    counts = dict.fromkeys(("found", "named", "kind", "wrong", "ended"), 0)
+    counts = dict.fromkeys(("found", "named", "kind", "wrong"), 0)
     alarms = alarms_moved = windows = 0
     for _ in range(run.events):
         standing = site.watch.findings
@@ -293,7 +282,7 @@ def run_watch(run: WatchRun) -> WatchResult:
         alarms_moved += sum(one.kind in {"moved", "delay"} for one in standing)
         if standing:  # so that earlier findings do not count for the next event
             site.watch.accept()
-        truth, findings, passed_s, took = _happen(site, run, draw)
+        truth, findings, passed_s, took = _happen(site, run.case, draw)
         windows += took
         if findings:
             found_s.append(passed_s)
@@ -307,7 +296,6 @@ def run_watch(run: WatchRun) -> WatchResult:
         for _ in range(_RETURN_WINDOWS):
             site.run_step()
             windows += 1
-        counts["ended"] += not site.watch.findings
     return WatchResult(
         tries=run.events, found_s=tuple(found_s), alarms=alarms, alarms_moved=alarms_moved, windows=windows, **counts
     )
@@ -323,25 +311,25 @@ def _undisturbed(site: _Site, windows: int) -> WatchResult:
         alarms += len(now - known)
         alarms_moved += sum(kind in {"moved", "delay"} for kind, _ in now - known)
         known = now
-    return WatchResult(0, 0, 0, 0, 0, 0, (), alarms, alarms_moved, windows)
+    return WatchResult(0, 0, 0, 0, 0, (), alarms, alarms_moved, windows)
 
 
-def _happen(site: _Site, run: WatchRun, draw: np.random.Generator) -> tuple[_Truth, tuple[Finding, ...], float, int]:
+def _happen(site: _Site, case: WatchCase, draw: np.random.Generator) -> tuple[_Truth, tuple[Finding, ...], float, int]:
     """Simulate one event until one window after it is found, then restore the site.
 
     Returns the truth, the findings, the time until found, and the number of steps.
     """
     position_m = site.position_m.copy()
-    truth: _Truth = _begin(site, run, draw)
+    truth: _Truth = _begin(site, case, draw)
     findings: tuple[Finding, ...] = ()
     passed_s, took = 0.0, 0
     most = _LASTS_WINDOWS
-    if run.event == "slow":
-        most = round(2.0 * run.size_m / _SLOW_MPS / _WINDOW_S)
+    if case.event == "slow":
+        most = round(2.0 * case.size_m / _SLOW_MPS / _WINDOW_S)
     apart_m = site.position_m - position_m
     while took < most and not findings:
-        if run.event == "slow":
-            part = min((took + 1) * _WINDOW_S * _SLOW_MPS / run.size_m, 1.0)
+        if case.event == "slow":
+            part = min((took + 1) * _WINDOW_S * _SLOW_MPS / case.size_m, 1.0)
             site.position_m = position_m + part * apart_m
         site.run_step()
         took += 1
@@ -355,27 +343,27 @@ def _happen(site: _Site, run: WatchRun, draw: np.random.Generator) -> tuple[_Tru
     return truth, findings, passed_s, took
 
 
-def _begin(site: _Site, run: WatchRun, draw: np.random.Generator) -> _Truth:
+def _begin(site: _Site, case: WatchCase, draw: np.random.Generator) -> _Truth:
     """Begin the event. Returns the findings of a perfect watch."""
     n = len(site.position_m)
-    if run.event in {"moved", "two moved", "slow"}:
-        movers = draw.choice(n, 2 if run.event == "two moved" else 1, replace=False).tolist()
+    if case.event in {"moved", "two moved", "slow"}:
+        movers = draw.choice(n, 2 if case.event == "two moved" else 1, replace=False).tolist()
         for anchor in movers:
             direction = draw.standard_normal(site.layout.dimensions)
-            site.position_m[anchor, : len(direction)] += run.size_m * direction / np.linalg.norm(direction)
+            site.position_m[anchor, : len(direction)] += case.size_m * direction / np.linalg.norm(direction)
         return {("moved", (anchor + 1,)) for anchor in movers}
-    if run.event == "delay":
+    if case.event == "delay":
         anchor = int(draw.integers(n))
-        site.late_m[(site.first == anchor) | (site.second == anchor)] = run.size_m
+        site.late_m[(site.first == anchor) | (site.second == anchor)] = case.size_m
         return {("delay", (anchor + 1,))}
-    if run.event == "link":
+    if case.event == "link":
         pairs: Integers = np.array([draw.choice(np.flatnonzero(~site.is_missing))])
     else:
         low, high = site.position_m[:, :2].min(axis=0), site.position_m[:, :2].max(axis=0)
         pairs = _crossing(site, draw.uniform(low, high))
         while not len(pairs):
             pairs = _crossing(site, draw.uniform(low, high))
-    site.late_m[pairs] = run.size_m if run.event == "link" else draw.uniform(*_DOOR_LATE_M, len(pairs))
+    site.late_m[pairs] = case.size_m if case.event == "link" else draw.uniform(*_DOOR_LATE_M, len(pairs))
     return {("link", (int(site.first[pair]) + 1, int(site.second[pair]) + 1)) for pair in pairs.tolist()}
 
 

@@ -5,7 +5,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import compress
 from typing import Any, Final
 
@@ -17,10 +17,11 @@ from scipy.stats import chi2
 from skyless.core.air.beacon import Beacon, decode_cached
 from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver
-from skyless.core.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array
 from skyless.core.fix import Fix
+from skyless.core.geometry import anchor_positions
 from skyless.core.integrity import IntegrityRequirement
-from skyless.core.site import AnchorSite, Site
+from skyless.core.site import AnchorSite, NoiseSite, Site
 from skyless.research.studies.runner import Plan, seed_of
 from skyless.research.uncertainty import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
 from skyless.sim.evaluation.figures import EvenSample, FirstFixes, LevelCounts, LevelTally
@@ -28,6 +29,7 @@ from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, WALL_MARGIN_M, Request, impairments_of, trajectories_of
 from skyless.sim.impairments import Impairments
 from skyless.sim.lab import paper_lab_site
+from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.streams import stream
 from skyless.sim.trajectory import Trajectory
 from skyless.sim.world import Broadcast
@@ -180,28 +182,55 @@ def judged(run: Run, beacons: Iterable[Heard]) -> RunResult:
 def bound_m2(run: Run, biases: Biases) -> float:
     """Mean trace of the bound over all tags of a world and the time in which fixes are judged."""
     site, noise = run.site, run.impairments
-    off_m = {one.anchor: (one.x_m, one.y_m, one.z_m) for one in noise.anchor_displacements}
-    anchors_m = np.array(
-        [np.add((one.x_m, one.y_m, one.z_m), off_m.get(one.id, (0.0, 0.0, 0.0))) for one in site.anchors]
-    )
+    anchors_m = {one.id: position_m for one, position_m in zip(site.anchors, anchor_positions(site), strict=True)}
+    for one in noise.anchor_displacements:
+        anchors_m[one.anchor] = anchors_m[one.anchor] + (one.x_m, one.y_m, one.z_m)
+    means = []
+    for received in _received(run):
+        beacons = [beacon for one, _ in received if isinstance(beacon := decode_cached(one.frame), Beacon)]
+        times_s = np.array([broadcast.emission_s for broadcast, _ in received])
+        path_m = np.array([position_m for _, position_m in received])
+        stamps_s, is_flat = noise.rx_stamp_ps * 1e-12, site.tags.height_m is not None
+        bounds = bounds_m2(anchors_m, beacons, times_s, path_m, stamps_s, noise.oscillator, biases, is_flat=is_flat)
+        means.append(bounds[times_s >= run.warmup_s].mean())
+    return float(np.mean(means))
+
+
+def bounds_m2(
+    anchors_m: Mapping[int, Array],
+    beacons: Sequence[Beacon],
+    times_s: Array,
+    path_m: Array,
+    stamp_s: float,
+    crystals: OscillatorModel | NoiseSite,
+    biases: Biases,
+    *,
+    is_flat: bool = True,
+) -> Array:
+    """Trace of the bound after each beacon that a tag received, shape (beacons,): of all that these beacons state.
+
+    ``anchors_m``: true positions by identifier; relays of other anchors do not count. ``path_m``: where the tag was.
+    """
+    index_of = {anchor: index for index, anchor in enumerate(anchors_m)}
+    senders = np.array([index_of[one.anchor] for one in beacons])
+    sequences = np.array([one.sequence for one in beacons])
+    relays = [
+        [(index_of[relay.anchor], relay.sequence) for relay in one.heard if relay.anchor in index_of] for one in beacons
+    ]
+    known = relayed_receptions(senders, sequences, relays, len(index_of))
     settings = BoundSettings(
-        noise.rx_stamp_ps * 1e-12,
-        white_fm=noise.oscillator.white_fm,
-        random_walk_fm=noise.oscillator.random_walk_fm,
+        stamp_s,
+        white_fm=crystals.white_fm,
+        random_walk_fm=crystals.random_walk_fm,
         qa=ROOM_QA_M2PS3,
         slot_s=1.0,  # of no use here: the frames state when they were sent
         speed_std_mps=_BOUND_SPEED_STD_MPS,
         mesh=True,
-        height_known=site.tags.height_m is not None,
+        height_known=is_flat,
     )
-    means = []
-    for received in _received(run):
-        times_s = np.array([broadcast.emission_s for broadcast, _ in received])
-        path_m = np.array([position_m for _, position_m in received])
-        known, senders = _known(site, [broadcast.frame for broadcast, _ in received])
-        bound = received_bound(anchors_m, path_m, settings, known, Sendings(senders, times_s), biases)
-        means.append(np.trace(bound, axis1=1, axis2=2)[times_s >= run.warmup_s].mean())
-    return float(np.mean(means))
+    positions_m = np.array(list(anchors_m.values()))
+    bound = received_bound(positions_m, path_m, settings, known, Sendings(senders, times_s), biases)
+    return np.asarray(np.trace(bound, axis1=1, axis2=2))
 
 
 def _received(run: Run) -> list[list[tuple[Broadcast, Array]]]:
@@ -211,16 +240,6 @@ def _received(run: Run) -> list[list[tuple[Broadcast, Array]]]:
         for tag, position_m in zip(broadcast.tags.tolist(), broadcast.positions_m, strict=True):
             received[tag].append((broadcast, position_m))
     return received
-
-
-def _known(site: Site, frames: Sequence[bytes]) -> tuple[Mask, Integers]:
-    """Receptions that a tag learns from its frames, as by ``relayed_receptions``, and the frames' senders."""
-    index_of = {one.id: row for row, one in enumerate(site.anchors)}
-    beacons = [beacon for frame in frames if isinstance(beacon := decode_cached(frame), Beacon)]
-    senders = np.array([index_of[one.anchor] for one in beacons])
-    sequences = np.array([one.sequence for one in beacons])
-    relays = [[(index_of[entry.anchor], entry.sequence) for entry in one.heard] for one in beacons]
-    return relayed_receptions(senders, sequences, relays, len(index_of)), senders
 
 
 def large_lab_site(noise_ps: float) -> Site:
@@ -283,7 +302,7 @@ def worlds(
 
 def box(site: Site) -> tuple[Array, Array]:
     """Lowest and highest corner of the space in which tags move, shape (3,): half a metre within the anchors."""
-    anchors_m = np.array([(anchor.x_m, anchor.y_m, anchor.z_m) for anchor in site.anchors])
+    anchors_m = anchor_positions(site)
     low_m, high_m = anchors_m.min(axis=0) + WALL_MARGIN_M, anchors_m.max(axis=0) - WALL_MARGIN_M
     low_m[2] = high_m[2] = site.tags.height_m or 0.0
     return low_m, high_m

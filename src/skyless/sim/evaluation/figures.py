@@ -74,11 +74,6 @@ class EvenSample:
         return np.array(self._store).reshape(-1, self._columns)
 
 
-def dimensions(*, planar: bool) -> str:
-    """Which errors percentiles refer to, for display: horizontal ones if the height was given."""
-    return "2-D" if planar else "3-D"
-
-
 class ErrorSummary(Struct, frozen=True):
     """Errors of a run in metres; None if there were none to judge."""
 

@@ -17,7 +17,7 @@ from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.motion_sample import MotionSample
 from skyless.core.site import Site
 from skyless.core.tag.receiver import NOT_DROPS
-from skyless.sim.evaluation.figures import ErrorStatistics, ErrorSummary, FirstFixes, LevelReport, LevelTally
+from skyless.sim.evaluation.figures import ErrorStatistics, FirstFixes, LevelReport, LevelTally
 from skyless.sim.impairments import Impairments, Outage
 from skyless.sim.listening import Outcome, TagSpec
 from skyless.sim.medium import Tally
@@ -327,6 +327,9 @@ def report(fleet: TagFleet, method: str, started_s: float) -> FleetReport:
     fixes = sum(record.fixes for record in fleet.records)
     listening_s = sum(simulated_s - first for first in firsts)
     rmse_m = summary.rmse_2d_m if fleet.site.tags.height_m is not None else summary.rmse_3d_m
+    std_m = None
+    if rmse_m is not None and summary.bias_m is not None:
+        std_m = float(np.sqrt(max(rmse_m**2 - sum(value * value for value in summary.bias_m), 0.0)))
     claims = np.isfinite(fleet.sigma_squared_sum)  # one's own estimator may claim nothing
     return FleetReport(
         method=method,
@@ -338,7 +341,7 @@ def report(fleet: TagFleet, method: str, started_s: float) -> FleetReport:
         max_m=summary.max_m,
         updates_per_s=fixes / listening_s if listening_s > 0.0 else 0.0,
         dropped=sum(fleet.drops.values()),
-        std_m=_std_m(rmse_m, summary),
+        std_m=std_m,
         sigma_m=(fleet.sigma_squared_sum / summary.count) ** 0.5 if summary.count and claims else None,
         bias_m=summary.bias_m,
         first_fix_s=float(np.median(firsts)) if firsts else None,
@@ -350,9 +353,3 @@ def report(fleet: TagFleet, method: str, started_s: float) -> FleetReport:
         wall_s=wall_s,
         speed=simulated_s / wall_s if wall_s > 0.0 else 0.0,
     )
-
-
-def _std_m(rmse_m: float | None, summary: ErrorSummary) -> float | None:
-    if rmse_m is None or summary.bias_m is None:
-        return None
-    return float(np.sqrt(max(rmse_m**2 - sum(value * value for value in summary.bias_m), 0.0)))

@@ -56,11 +56,6 @@ class ProtectionOptions(ComputedOptions, frozen=True, kw_only=True):
     alert_limit_m: Positive | None = None
     """Fixes whose protection level exceeds this, in metres, carry an alert (joint)."""
 
-    @property
-    def protection_given(self) -> bool:
-        """Whether any of them is given."""
-        return bool(self.given("integrity_risk", "alert_limit_m"))
-
     def requirement(self, method: str | None = None, height_std_m: float | None = None) -> "IntegrityRequirement":
         """Them and --tag-height-std as the filter takes them.
 

@@ -1,5 +1,7 @@
 """Soft problems of a valid site: geometry and distances that reduce accuracy or prevent a fix."""
 
+from collections.abc import Iterator
+from itertools import chain
 from typing import Final
 
 import numpy as np
@@ -33,11 +35,10 @@ _FLATTEST: Final = 0.05
 
 def warnings_of(site: Site) -> list[str]:
     """Sentences on the soft problems of a valid site."""
-    general = [*_count(site), *_geometry(site), *_height(site), *_outline(site), *_guard(site), *_accuracy(site)]
-    general += _without_effect(site)
-    if site.schedule.needs_master:
-        return general
-    return [*general, *_neighbours(site), *_load(site)]
+    checks = [_count, _geometry, _height, _outline, _guard, _accuracy, _without_effect]
+    if not site.schedule.needs_master:
+        checks += [_neighbours, _load]
+    return list(chain.from_iterable(check(site) for check in checks))
 
 
 def too_few_anchors(site: Site) -> str | None:
@@ -57,33 +58,30 @@ def anchors_needed(site: Site) -> tuple[int, str]:
     return (4, "with its height") if site.tags.height_m is None else (3, "at a known height")
 
 
-def _count(site: Site) -> list[str]:
+def _count(site: Site) -> Iterator[str]:
     needed, what = anchors_needed(site)
-    count = len(site.anchors)
     if too_few := too_few_anchors(site):
-        return [too_few]
-    if count == needed:
-        return [f"{count} anchors are the fewest for a position {what}: none may fail, and no outlier can be detected"]
-    return []
+        yield too_few
+    elif len(site.anchors) == needed:
+        yield f"{needed} anchors are the fewest for a position {what}: none may fail, and no outlier can be detected"
 
 
-def _geometry(site: Site) -> list[str]:
+def _geometry(site: Site) -> Iterator[str]:
     """Anchors in one line (2-D) or one plane (3-D) leave two mirror positions (``docs/maths.md`` section 5)."""
     flat = site.tags.height_m is not None
     dimensions = 2 if flat else 3
     points = anchor_positions(site)[:, :dimensions]
     if len(points) < dimensions + 1:
-        return []
+        return
     which = _flat_everywhere(points) if site.schedule.needs_master else _flat_in_reach(site, points)
-    if which is None:
-        return []
     mirror = "the mirror image of a tag's position fits its beacons as well"
-    if flat:
-        return [f"{which} lie nearly in one line: {mirror}; hang one anchor away from it"]
-    return [
-        f"{which} lie nearly in one plane: {mirror}, "
-        "and the direction across is poor; alternate the anchors' heights, or set tags.height_m if it is known"
-    ]
+    if which and flat:
+        yield f"{which} lie nearly in one line: {mirror}; hang one anchor away from it"
+    elif which:
+        yield (
+            f"{which} lie nearly in one plane: {mirror}, "
+            "and the direction across is poor; alternate the anchors' heights, or set tags.height_m if it is known"
+        )
 
 
 def _flat_everywhere(points: Array) -> str | None:
@@ -112,54 +110,49 @@ def _flat_in_reach(site: Site, points: Array) -> str | None:
     return f"{_named([site.anchors[row].id for row in np.flatnonzero(flat)])}: all anchors in reach"
 
 
-def _height(site: Site) -> list[str]:
-    height_m = site.tags.height_m
-    heights_m = [anchor.z_m for anchor in site.anchors]
-    if height_m is None or any(abs(z_m - height_m) <= RADIO_REACH_M for z_m in heights_m) or not heights_m:
-        return []
-    reach = f"{RADIO_REACH_M:.0f} m, the range in the open"
-    return [f"tags.height_m is {height_m:g}: no anchor is within {reach}, of that height"]
+def _height(site: Site) -> Iterator[str]:
+    height_m, anchors = site.tags.height_m, site.anchors
+    if height_m is not None and anchors and all(abs(one.z_m - height_m) > RADIO_REACH_M for one in anchors):
+        reach = f"{RADIO_REACH_M:.0f} m, the range in the open"
+        yield f"tags.height_m is {height_m:g}: no anchor is within {reach}, of that height"
 
 
-def _outline(site: Site) -> list[str]:
+def _outline(site: Site) -> Iterator[str]:
     outline_m = outline_of(site)
     if outline_m is None:
-        return []
+        return
     points = anchor_positions(site)[:, :2]
     far = {
         site.anchors[row].id: distance_m
         for row in np.flatnonzero(~inside(points, outline_m)).tolist()
         if (distance_m := distance_outside(points[row], outline_m)) > OUTSIDE_M
     }
-    if not far:
-        return []
-    distance = f"{'up to ' if len(far) > 1 else ''}{max(far.values()):.2f} m"
-    return [f"{_named(list(far))}: {distance} outside the room that outline_m gives; see which of the two is wrong"]
+    if far:
+        distance = f"{'up to ' if len(far) > 1 else ''}{max(far.values()):.2f} m"
+        yield f"{_named(list(far))}: {distance} outside the room that outline_m gives; see which of the two is wrong"
 
 
-def _without_effect(site: Site) -> list[str]:
+def _without_effect(site: Site) -> Iterator[str]:
     """Warn of keys that have no effect in the site's mode."""
     schedule, usual = site.schedule, ScheduleSite()
-    found = [
-        f"schedule.{key} is {str(getattr(schedule, key)).lower()}, which has no effect in mode {schedule.mode}"
-        for key, mode in _ONLY_IN.items()
-        if schedule.mode != mode and getattr(schedule, key) != getattr(usual, key)
-    ]
+    for key, mode in _ONLY_IN.items():
+        value = getattr(schedule, key)
+        if schedule.mode != mode and value != getattr(usual, key):
+            yield f"schedule.{key} is {str(value).lower()}, which has no effect in mode {schedule.mode}"
     if not schedule.needs_master:
-        slotted = [anchor.id for anchor in site.all_anchors if anchor.slot is not None]
-        return [*found, *([f"{_named(slotted)}: slot has no effect in mode free"] if slotted else [])]
+        if slotted := [anchor.id for anchor in site.all_anchors if anchor.slot is not None]:
+            yield f"{_named(slotted)}: slot has no effect in mode free"
+        return
     for key in ("std_m", "floor", "zone"):
-        stated = [anchor.id for anchor in site.anchors if getattr(anchor, key)]
-        if stated:
-            found.append(f"{_named(stated)}: {key} has no effect in mode master, whose beacons do not carry it")
-    return found
+        if stated := [anchor.id for anchor in site.anchors if getattr(anchor, key)]:
+            yield f"{_named(stated)}: {key} has no effect in mode master, whose beacons do not carry it"
 
 
-def _neighbours(site: Site) -> list[str]:
+def _neighbours(site: Site) -> Iterator[str]:
     """Warn of anchors without a neighbour in reach, and of groups of anchors without a link between them."""
     points = anchor_positions(site)
     if len(points) < 2:
-        return []
+        return
     ones, others = links_in_reach(site)
     lowest, before = np.arange(len(points)), None
     while before is None or (lowest != before).any():  # each anchor takes the lowest row among its neighbours'
@@ -170,34 +163,31 @@ def _neighbours(site: Site) -> list[str]:
     count = len(rows)
     sizes = np.bincount(group)
     alone = [site.anchors[row].id for row in np.flatnonzero(sizes[group] == 1)]
-    found = []
     if alone:
-        found.append(
+        yield (
             f"{_named(alone)}: no other anchor within {RADIO_REACH_M:.0f} m, the range in the open; "
             "nothing ties its clock to others', so tags hardly gain from it"
         )
     if count - len(alone) > 1 or (alone and count > len(alone)):
-        found.append(
+        yield (
             f"the anchors form {count} groups with no link of {RADIO_REACH_M:.0f} m or less between them: "
             "a tag between two groups positions itself by one at a time"
         )
-    return found
 
 
-def _load(site: Site) -> list[str]:
+def _load(site: Site) -> Iterator[str]:
     """Warn of too high a rate: frames at random instants collide if too many are in reach."""
     rate_hz = site.schedule.rate_hz
     if rate_hz is None or not site.anchors:
-        return []
+        return
     in_reach = float(np.median(anchors_in_reach(site)))
     offered_hz = in_reach * rate_hz
-    if offered_hz <= _MAX_OVERLOAD * OFFERED_HZ:
-        return []
-    return [
-        f"schedule.rate_hz is {rate_hz:g}: the {in_reach:.0f} anchors in reach of one another send "
-        f"{offered_hz:.0f} beacons/s, and most collide; without it each would choose the rate that "
-        f"gives tags most, {1.0 / suitable_period_s(round(in_reach), None):.3g}"
-    ]
+    if offered_hz > _MAX_OVERLOAD * OFFERED_HZ:
+        yield (
+            f"schedule.rate_hz is {rate_hz:g}: the {in_reach:.0f} anchors in reach of one another send "
+            f"{offered_hz:.0f} beacons/s, and most collide; without it each would choose the rate that "
+            f"gives tags most, {1.0 / suitable_period_s(round(in_reach), None):.3g}"
+        )
 
 
 def _named(identifiers: list[int]) -> str:
@@ -207,20 +197,18 @@ def _named(identifiers: list[int]) -> str:
     return f"anchor{'s' if len(identifiers) > 1 else ''} {shown}{more}"
 
 
-def _guard(site: Site) -> list[str]:
+def _guard(site: Site) -> Iterator[str]:
     guard_s = site.schedule.guard_s
-    if guard_s >= _SHORTEST_GUARD_S or not site.schedule.needs_master:
-        return []
-    return [
-        f"a guard of {guard_s * 1e6:.0f} µs is shorter than a radio's host needs between two frames "
-        f"({_SHORTEST_GUARD_S * 1e6:.0f} µs)"
-    ]
+    if guard_s < _SHORTEST_GUARD_S and site.schedule.needs_master:
+        yield (
+            f"a guard of {guard_s * 1e6:.0f} µs is shorter than a radio's host needs between two frames "
+            f"({_SHORTEST_GUARD_S * 1e6:.0f} µs)"
+        )
 
 
-def _accuracy(site: Site) -> list[str]:
-    if site.accuracy.survey_std_m > 0.0 or site.accuracy.range_std_m > 0.0:
-        return []
-    return [
-        "[accuracy] states that survey and ranges are exact; no real site is: the standard deviations that tags report "
-        "will be too small; set survey_std_m and range_std_m"
-    ]
+def _accuracy(site: Site) -> Iterator[str]:
+    if site.accuracy.survey_std_m == site.accuracy.range_std_m == 0.0:
+        yield (
+            "[accuracy] states that survey and ranges are exact; no real site is: the standard deviations that tags "
+            "report will be too small; set survey_std_m and range_std_m"
+        )

@@ -17,7 +17,7 @@ from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
 from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import ConfigurationError
 from skyless.core.protocol1.beacon import Schedule, first_slots, schedule_of
-from skyless.core.site import AnchorSite, Site, UnplacedAnchor
+from skyless.core.site import Site
 from skyless.core.ticks import TICK_BITS, TICK_S
 from skyless.site.alarm_rules import KINDS, BadAlarmRulesError, check_rules
 
@@ -311,7 +311,8 @@ def _check_anchors(site: Site, file: Path) -> None:
     if not site.all_anchors:
         raise ConfigurationError(file, "anchors", [], "at least one [[anchors]] table")
     rows: dict[int, str] = {}
-    for row, anchor in _rows(site):
+    places = [f"{name}[{row}]" for name in ("anchors", "unplaced") for row in range(len(getattr(site, name)))]
+    for row, anchor in zip(places, site.all_anchors, strict=True):
         if anchor.id in rows:
             right = f"an identifier of its own; {rows[anchor.id]} has this one already"
             raise ConfigurationError(file, f"{row}.id", anchor.id, right)
@@ -326,13 +327,6 @@ def _check_anchors(site: Site, file: Path) -> None:
         key = _with_anchor(f"anchors[{same_point[1]}]", site)
         point = other.x_m, other.y_m, other.z_m
         raise ConfigurationError(file, key, f"at {point}", f"elsewhere; anchor {one.id} is at the same point")
-
-
-def _rows(site: Site) -> Iterator[tuple[str, AnchorSite | UnplacedAnchor]]:
-    """Every anchor, preceded by its place, such as ``anchors[3]``."""
-    for index, anchor in enumerate(site.all_anchors):
-        placed = index < len(site.anchors)
-        yield f"anchors[{index}]" if placed else f"unplaced[{index - len(site.anchors)}]", anchor
 
 
 def _at_one_point(site: Site) -> Iterator[tuple[int, int]]:
@@ -422,16 +416,11 @@ def image_size(data: bytes) -> tuple[int, int] | None:
     Sources: PNG (W3C, third edition) 11.2.2, JPEG (ITU-T T.81) B.1 and B.2.2.
     """
     if data.startswith(_PNG):
-        return _png_size(data)
+        is_whole = len(data) >= 24 and data[12:16] == b"IHDR"
+        return _positive(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) if is_whole else None
     if data.startswith(_JPEG):
         return _jpeg_size(data)
     return None
-
-
-def _png_size(data: bytes) -> tuple[int, int] | None:
-    if len(data) < 24 or data[12:16] != b"IHDR":
-        return None
-    return _positive(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big"))
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:

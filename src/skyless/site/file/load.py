@@ -89,37 +89,29 @@ def _refuse_mode_slots(path: Path, document: dict[str, Any]) -> None:
         raise ConfigurationError(path, "schedule.mode", "slots", right)
 
 
-class _Rows(Struct):
-    """Rows in the file's list of the anchors with and without a position."""
-
-    anchors: list[int]
-    unplaced: list[int]
-
-
-def _separate_unplaced(path: Path, document: dict[str, Any]) -> _Rows | None:
+def _separate_unplaced(path: Path, document: dict[str, Any]) -> dict[str, list[int]]:
     """Move a protocol 2 document's anchors without a position to a separate list, and name a master if there is none.
 
-    Returns None for protocol 1, and for a document that the conversion will refuse.
+    Returns the rows in the file of both lists; none for protocol 1, and for a document that the conversion will refuse.
     """
     schedule, entries = document.get("schedule"), document.get("anchors")
     mode = schedule.get("mode") if isinstance(schedule, dict) else None
     if mode != "free":
-        return None
+        return {}
     if "anchors" not in document:
         raise ConfigurationError(path, "anchors", None, expected("anchors"))
     if not isinstance(entries, list):
         document.setdefault("master", 0)
-        return None
+        return {}
     if entries and isinstance(entries[0], dict) and "id" in entries[0]:
         document.setdefault("master", entries[0]["id"])
-    rows = _Rows([], [])
+    rows: dict[str, list[int]] = {"anchors": [], "unplaced": []}
     for row, entry in enumerate(entries):
         unplaced = isinstance(entry, dict) and "x_m" not in entry and "y_m" not in entry
-        (rows.unplaced if unplaced else rows.anchors).append(row)
+        rows["unplaced" if unplaced else "anchors"].append(row)
         if unplaced:
             _refuse_without_position(path, f"anchors[{row}]", entry)
-    document["anchors"] = [entries[row] for row in rows.anchors]
-    document["unplaced"] = [entries[row] for row in rows.unplaced]
+    document |= {name: [entries[row] for row in own] for name, own in rows.items()}
     return rows
 
 
@@ -131,16 +123,11 @@ def _refuse_without_position(path: Path, row: str, entry: dict[str, Any]) -> Non
             raise ConfigurationError(path, f"{row}.{key} (anchor {entry.get('id')})", value, right)
 
 
-def _in_file(text: str, rows: _Rows | None) -> str:
+def _in_file(text: str, rows: dict[str, list[int]]) -> str:
     """Replace rows of the separate lists of anchors in a text by those of the file's single list."""
-    if rows is None:
+    if not rows:
         return text
-
-    def row_in_file(match: re.Match[str]) -> str:
-        in_file: list[int] = getattr(rows, match[1])
-        return f"anchors[{in_file[int(match[2])]}]"
-
-    return re.sub(r"\b(anchors|unplaced)\[(\d+)\]", row_in_file, text)
+    return re.sub(r"\b(anchors|unplaced)\[(\d+)\]", lambda match: f"anchors[{rows[match[1]][int(match[2])]}]", text)
 
 
 def _parse(path: Path) -> dict[str, Any]:

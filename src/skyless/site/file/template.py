@@ -243,19 +243,15 @@ def _anchor(anchor: AnchorSite | UnplacedAnchor) -> str:
 def _tail(site: Site) -> str:
     walls = "".join(_WALL.format(**structs.asdict(wall)) for wall in site.walls)
     plan, earth = site.floor_plan or _EXAMPLE_PLAN, site.georeference or _EXAMPLE_GEOREFERENCE
-    image = json.dumps(plan.image, ensure_ascii=False)
+    floors, image = site.storeys or (_EXAMPLE_FLOOR,), json.dumps(plan.image, ensure_ascii=False)
     return (
         (_WALLS + walls if walls else _NO_WALLS)
         + _ALARMS.format(rules="\n".join(map(_rule, site.alarms)) if site.alarms else _rule(_EXAMPLE_RULE, "# "))
         + _FLOOR_PLAN.format(**{**structs.asdict(plan), "image": image}, off=_off(site.floor_plan is not None))
-        + _floors(site)
+        + _FLOORS
+        + "".join(_floor(floor, _off(bool(site.storeys))) for floor in floors)
         + _GEOREFERENCE.format(**structs.asdict(earth), off=_off(site.georeference is not None))
     )
-
-
-def _floors(site: Site) -> str:
-    floors, off = ((_EXAMPLE_FLOOR,), _off(False)) if site.floors is UNSET else (site.floors, "")
-    return _FLOORS + "".join(_floor(floor, off) for floor in floors)
 
 
 def _floor(floor: FloorSite, off: str) -> str:

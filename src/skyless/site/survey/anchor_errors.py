@@ -8,9 +8,9 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import PairTdoa, Point
-from skyless.core.arrays import Array
 from skyless.core.ticks import TICK_BITS, TICK_M
 from skyless.site.survey.legs import RunningMedian, TwoWayRanging
+from skyless.site.survey.problem import incidence
 
 MIN_NOISE_M: Final = 0.05
 """Least noise assumed, as positions outside the calibration differ somewhat."""
@@ -133,7 +133,9 @@ def antenna_delays_m(excess_m: Mapping[Pair, float]) -> dict[int, float]:
     middle = float(np.median(list(excess_m.values())))
     kept = {pair: excess - middle for pair, excess in excess_m.items() if abs(excess - middle) <= BLOCKED_M}
     anchors = sorted({anchor for pair in kept for anchor in pair})
-    H, excess = _design(kept, anchors), np.array(list(kept.values()))
+    first, second = np.searchsorted(anchors, list(kept)).T
+    H = np.column_stack([incidence(len(anchors), first, second), np.ones(len(kept))])  # last what is common to all
+    excess = np.array(list(kept.values()))
     information = H.T @ H / EXCESS_STD_M**2
     information[range(len(anchors)), range(len(anchors))] += 1.0 / ANTENNA_DELAY_STD_M**2
     return dict(zip(anchors, np.linalg.solve(information, H.T @ excess / EXCESS_STD_M**2)[:-1].tolist(), strict=True))
@@ -152,16 +154,6 @@ def contradictions_m(excess_m: Mapping[Pair, float], delays_m: Mapping[int, floa
     }
     wrong = {pair: round(off, 3) for pair, off in off_m.items() if abs(off) > BLOCKED_M}
     return wrong if min(wrong.values(), default=0.0) < 0.0 else {}
-
-
-def _design(pairs: Mapping[Pair, float], anchors: list[int]) -> Array:
-    """Design matrix: one row per pair with its two anchors; the last column is the part common to all."""
-    column = {anchor: k for k, anchor in enumerate(anchors)}
-    H = np.zeros((len(pairs), len(anchors) + 1))
-    H[:, -1] = 1.0
-    for row, (a, b) in enumerate(pairs):
-        H[row, column[a]] = H[row, column[b]] = 1.0
-    return H
 
 
 # Delays of relayed receptions

@@ -45,14 +45,6 @@ class Finding(Struct, frozen=True):
     sentence: str
 
 
-_SILENT: Final = "anchors {} and {} no longer receive each other"
-
-
-def silent_link(a: int, b: int, since_s: float) -> Finding:
-    """Finding for a pair without ranges although both anchors have ranges with others."""
-    return Finding("link", (a, b), 0.0, None, since_s, _SILENT.format(a, b))
-
-
 def sentence_of(kind: Kind, anchors: tuple[int, ...], size_m: float, *, or_else: Kind | None = None) -> str:
     """One sentence without a full stop. ``or_else``: another change of the same anchor that would explain it too."""
     if kind == "moved":
@@ -104,11 +96,6 @@ class Pairs(Struct, frozen=True, eq=False):
     def anchors(self) -> int:
         """Number of anchors."""
         return len(self.position_m)
-
-    @property
-    def causes(self) -> int:
-        """Number of causes."""
-        return 2 * len(self.position_m) + len(self.first)
 
 
 class Fit(Struct, frozen=True, eq=False):

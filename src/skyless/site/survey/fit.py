@@ -495,31 +495,22 @@ def regular(information: Array) -> Array:
 
 
 def mirrored(problem: Problem, position_m: Array) -> Array:
-    """Starts with parts reflected in the line (plane) through the two (three) anchors that hold them, shape (b, n, 3).
+    """Starts with two anchors reflected in the line (plane) of the others that hold them, shape (b, n, 3).
 
-    ``relocated`` covers single anchors.
+    These are no more than there are dimensions. ``relocated`` covers single anchors.
     """
     axes = np.flatnonzero(problem.is_free.all(axis=0))
     n = len(position_m)
     joined = adjacency(n, problem.first, problem.second) | adjacency(n, problem.tape_first, problem.tape_second)
     starts = []
-    for part in _hanging_parts(joined, len(axes)):
-        hinge = joined[part].any(axis=0) & ~part
-        start_m = position_m.copy()
-        start_m[np.ix_(part, axes)] = _reflection(position_m[part][:, axes], position_m[hinge][:, axes])
-        starts.append(start_m)
-    return np.array(starts).reshape(-1, n, 3)
-
-
-def _hanging_parts(joined: Mask, dimensions: int) -> list[Mask]:
-    """Masks of the pairs of anchors held by no more others than there are dimensions, each of shape (n,)."""
-    n = len(joined)
-    parts = []
     for pair in combinations(range(n), 2):
         part = np.isin(np.arange(n), pair)
-        if np.count_nonzero(joined[part].any(axis=0) & ~part) <= dimensions < n - 2:
-            parts.append(part)
-    return parts
+        hinge = joined[part].any(axis=0) & ~part
+        if np.count_nonzero(hinge) <= len(axes) < n - 2:
+            start_m = position_m.copy()
+            start_m[np.ix_(part, axes)] = _reflection(position_m[part][:, axes], position_m[hinge][:, axes])
+            starts.append(start_m)
+    return np.array(starts).reshape(-1, n, 3)
 
 
 def _reflection(position_m: Array, hinge_m: Array) -> Array:

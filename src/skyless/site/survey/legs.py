@@ -328,18 +328,13 @@ def _noise(ranges_m: Mapping[tuple[int, int], Sequence[float]]) -> float:
     own, weight = [], []
     for values in ranges_m.values():
         if len(values) >= _MIN_COUNT:
-            own.append(_robust_std(np.asarray(values)) ** 2)
+            deviation = float(np.median(np.abs(np.asarray(values) - np.median(values))))
+            own.append((STD_OVER_MAD * deviation * math.sqrt(len(values) / (len(values) - 1.0))) ** 2)
             weight.append(len(values) - 1)
     if not own:
         return _UNKNOWN_NOISE_M
     quiet = np.argsort(own)[: math.ceil(0.75 * len(own))]
     return max(math.sqrt(float(np.average(np.array(own)[quiet], weights=np.array(weight)[quiet]))), _MIN_NOISE_M)
-
-
-def _robust_std(values: Array) -> float:
-    """Standard deviation from the median absolute deviation, corrected for few values."""
-    deviation = float(np.median(np.abs(values - np.median(values))))
-    return STD_OVER_MAD * deviation * math.sqrt(len(values) / (len(values) - 1.0))
 
 
 def _mean(a: int, b: int, values_m: Array, noise_m: float) -> PairRange:

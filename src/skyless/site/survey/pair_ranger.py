@@ -92,7 +92,8 @@ class _OneWay(Struct, frozen=True, eq=False):
 def _bracketed(legs: Legs, x_ticks: Integers, y_ticks: Integers, is_reply: Mask, longest_ticks: int) -> _OneWay:
     """Flights of replies y → x that lie between two legs x → y on x's counter."""
     order = np.lexsort((x_ticks, legs.pair))
-    order = order[_first_of_equals(legs.pair[order], x_ticks[order], is_reply[order])]
+    rows = np.stack([legs.pair, x_ticks, is_reply])[:, order]
+    order = order[np.append(True, (np.diff(rows) != 0).any(axis=0))[: len(order)]]  # without repeated legs
     pair, reply = legs.pair[order], is_reply[order]
     row, n = np.arange(len(order)), len(order)
     before = np.maximum.accumulate(np.where(reply, -1, row)) if n else row
@@ -121,13 +122,6 @@ def _bracketed(legs: Legs, x_ticks: Integers, y_ticks: Integers, is_reply: Mask,
         needed[:] = False
         needed[order[row >= cut[pair]]] = True
     return _OneWay(Flights(middle[good], ticks[good], part[good]), middle, needed, int(np.sum(in_time & ~good)))
-
-
-def _first_of_equals(pair: Integers, ticks: Integers, reply: Mask) -> Mask:
-    """Mask of the rows that do not repeat the one before."""
-    first = np.ones(len(pair), dtype=bool)
-    first[1:] = (pair[1:] != pair[:-1]) | (ticks[1:] != ticks[:-1]) | (reply[1:] != reply[:-1])
-    return first
 
 
 # Steps: ranges in the order of time, to see whether they stayed the same

@@ -191,15 +191,12 @@ def _ambiguities(fitted: Fitted, framed: Framed, others: tuple[OtherFit, ...]) -
             continue
         elsewhere = np.flatnonzero(distance_m > max(_MOVED_M, _ELSEWHERE * distance_m.max()))
         positions = {fitted.anchors[index]: tuple(position_m[index].tolist()) for index in elsewhere.tolist()}
-        if any(_is_same(positions, known.positions_m) for known in found):
+        same = [one.positions_m for one in found if one.positions_m.keys() == positions.keys()]
+        if any(all(math.dist(one[anchor], at_m) < _SAME_M for anchor, at_m in positions.items()) for one in same):
             continue
         sentence = _sentence(fitted, framed, other, position_m, distance_m, elsewhere)
         found.append(Ambiguity(sentence, tuple(positions), positions))
     return tuple(found)
-
-
-def _is_same(one: dict[int, tuple[float, float, float]], other: dict[int, tuple[float, float, float]]) -> bool:
-    return one.keys() == other.keys() and all(math.dist(one[anchor], other[anchor]) < _SAME_M for anchor in one)
 
 
 def _sentence(

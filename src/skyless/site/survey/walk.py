@@ -417,6 +417,7 @@ _RANGES_PER_INDEPENDENT: Final = 4.0
 
 _CLEARLY: Final = 16.0  # a result whose cost is higher by more than this is ruled out
 _EXCLUSION_ROUNDS: Final = 6
+_SAME_M: Final = 0.02  # two results whose distances all differ by less are one
 
 
 class JointFit(Struct, frozen=True, eq=False):
@@ -455,7 +456,9 @@ def fit_with_tag(
     ``pair_ranges_m``: see ``tag_ranges``. ``used``: ranges in use in each result; by default all.
     """
     everything, name = tuple(range(len(alone))), epochs.name
-    range_m = _of_anchors(tag_ranges(epochs, pair_ranges_m), epochs.anchors, anchors)
+    by_anchor = dict(zip(epochs.anchors, tag_ranges(epochs, pair_ranges_m).T, strict=True))
+    nothing = np.full(len(epochs.t_s), np.nan)
+    range_m = np.column_stack([by_anchor.get(anchor, nothing) for anchor in anchors])
     in_use = used or [np.ones(len(problem.range_m), dtype=bool)] * len(alone)
     trials = [
         _trial(problem, start.position_m, epochs, range_m, mask) for start, mask in zip(alone, in_use, strict=True)
@@ -467,22 +470,13 @@ def fit_with_tag(
     reason = _unfit(problem, alone[chosen], best)
     if reason is not None:
         return JointFit(None, 0, everything, f"what {name} received was not used: {reason}", None)
-    apart = [number for number in possible if number == chosen or not _same(best.solution, trials[number].solution)]
+    apart_m = [distances_m(trial.solution.position_m) - distances_m(best.solution.position_m) for trial in trials]
+    apart = [number for number in possible if number == chosen or np.abs(apart_m[number]).max() >= _SAME_M]
     seconds, excluded = best.rows.epochs * EPOCH_S, best.rows.excluded_share
     sentence = f"{seconds:g} s of {name} were used" + (
         f"; {excluded:.0%} of its ranges were left out" if excluded else ""
     )
     return JointFit(best.solution, chosen, tuple(apart), sentence, best.rows)
-
-
-def _of_anchors(range_m: Array, have: Sequence[int], wanted: Sequence[int]) -> Array:
-    """Columns of the wanted anchors; NaN for missing ones."""
-    column = {anchor: number for number, anchor in enumerate(have)}
-    found = np.full((len(range_m), len(wanted)), np.nan)
-    for number, anchor in enumerate(wanted):
-        if anchor in column:
-            found[:, number] = range_m[:, column[anchor]]
-    return found
 
 
 def _trial(problem: Problem, start_m: Array, epochs: TagEpochs, range_m: Array, used: Mask) -> _Trial:
@@ -525,8 +519,3 @@ def _unfit(problem: Problem, alone: Solution, trial: _Trial) -> str | None:
     if rise > usual * chdtri(max(taken, 1.0), _FALSE_ALARM):
         return "it contradicts the ranges between the anchors"
     return None
-
-
-def _same(one: Solution, other: Solution) -> bool:
-    """Whether two results have the same distances within 2 cm."""
-    return bool(np.abs(distances_m(one.position_m) - distances_m(other.position_m)).max() < 0.02)

@@ -23,7 +23,6 @@ from skyless.site.survey.explain import (
     nothing,
     pairs_of,
     sentence_of,
-    silent_link,
 )
 from skyless.site.survey.facts import Facts, PairBlock, PairRange, PairRanges, Survey
 from skyless.site.survey.legs import MEDIAN_VARIANCE, STD_OVER_MAD
@@ -232,10 +231,11 @@ class AnchorWatch:
     def findings(self) -> tuple[Finding, ...]:
         """Current findings: the largest first, unclear ones (``check``) after them, silent links last."""
         held = sorted((one.finding for one in self._held), key=lambda one: (one.kind == "check", -abs(one.size_m)))
-        silent = [
-            silent_link(self._ids[self._first[row]], self._ids[self._second[row]], since_s)
-            for row, since_s in sorted(self._blocked.items())
-        ]
+        silent = []
+        for row, since_s in sorted(self._blocked.items()):
+            a, b = self._ids[self._first[row]], self._ids[self._second[row]]
+            sentence = f"anchors {a} and {b} no longer receive each other"
+            silent.append(Finding("link", (a, b), 0.0, None, since_s, sentence))
         return (*held, *silent)
 
     def add(self, block: PairBlock) -> None:
