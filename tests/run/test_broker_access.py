@@ -1,7 +1,6 @@
 """Roles at the embedded broker: each may do exactly what the table says."""
 
 import asyncio
-import inspect
 import re
 
 import pytest
@@ -26,11 +25,9 @@ NODES = {topics.status_topic: (*KINDS, "doctor"), topics.health_topic: ("tag", "
 def every_topic():
     """All topics of Skyless, of two sites and one node of each kind, and some that are none of them."""
     found = []
-    for name, function in inspect.getmembers(topics, inspect.isfunction):
-        count = len(inspect.signature(function).parameters)
-        assert name.endswith("_topic")
-        nodes = [(kind, "n1") for kind in NODES.get(function, ())] or [("n1", "n2")[: count - 1]]
-        found += [function(site, *words) for site in (7, 8) for words in nodes]
+    for topic in (one for one in vars(topics).values() if isinstance(one, topics.Topic)):
+        nodes = [(kind, "n1") for kind in NODES.get(topic, ())] or [("n1", "n2")[: topic.levels.count("+")]]
+        found += [topic(site, *words) for site in (7, 8) for words in nodes]
     assert len(set(found)) == len(found) > 25
     others = ["homeassistant/status", "homeassistant/device/skyless-7-t/config", "homeassistant/switch/x/set"]
     return found + others + ["skyless/v2/7/site", "skyless/v1/7/tag/n1/fix/more", "skyless", "other"]
