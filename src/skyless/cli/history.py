@@ -71,7 +71,8 @@ class _Asked(Options, frozen=True, kw_only=True):
     def opened(self) -> "tuple[History, Span]":
         """Open the history, and parse the time range. Raises SkylessError."""
         from skyless.run.history.answers import span_of
-        from skyless.run.history.queries import History, sites_in
+        from skyless.run.history.layout import sites_in
+        from skyless.run.history.queries import History
         from skyless.run.process import data_folder
 
         folder = self.history or data_folder() / "history"

@@ -459,11 +459,8 @@ def _stop(server: "_Server", services: Services) -> None:
         server.should_exit = True
         for live in services.sites.all:
             live.close()
-        services.playback.stop()
-        services.overlays.stop()
-        services.what_ifs.stop()
-        services.sheets.stop()
-        services.past.stop()
+        for part in (services.playback, services.overlays, services.what_ifs, services.sheets, services.past):
+            part.stop()
         asyncio.get_running_loop().call_later(_GRACE_S, server.drop_connections)
 
 

@@ -15,7 +15,7 @@ from skyless.radio import emulated as wire
 from skyless.radio.interface import ignore
 from skyless.run.fix_log import MAX_RECEPTION_AGE_S
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.messages import EtherHealth, TrueMotion, TruthMessage, Vector
+from skyless.run.mqtt.messages import EtherHealth, TrueMotion, TruthMessage, vector
 from skyless.run.mqtt.topics import health_topic, truth_topic
 from skyless.run.process import HEALTH_S, Log, every, keep, link_of, most_files, together
 from skyless.sim.impairments import Impairments
@@ -304,7 +304,7 @@ class Ether:
         for name, trajectory in self._tags.items():
             if self._nodes["tag", name] in self._owners:
                 position, velocity = trajectory.position(now_s), trajectory.velocity(now_s)
-                motions[name] = TrueMotion(_vector(position), _vector(velocity))
+                motions[name] = TrueMotion(vector(position.tolist()), vector(velocity.tolist()))
         return TruthMessage(unix_s, motions)
 
     def health(self, unix_s: float) -> EtherHealth:
@@ -328,11 +328,6 @@ class Ether:
         )
 
 
-def _vector(values: object) -> Vector:
-    x, y, z = values.tolist()  # type: ignore[attr-defined]
-    return x, y, z
-
-
 class EtherNode:
     """An ether listening at an address, with an MQTT connection for truth and health."""
 
@@ -353,17 +348,11 @@ class EtherNode:
         async with server:
             parts = [self._ether.send_clocks()]
             if self._link is not None:
+                publish, truth = self._link.publish, truth_topic(self._site)
+                health = health_topic(self._site, "ether", "air")
                 parts += [
                     keep(self._link, self._log),
-                    every(_TRUTH_S, self._publish_truth),
-                    every(HEALTH_S, self._publish_health),
+                    every(_TRUTH_S, lambda: publish(truth, self._ether.truth(time.time() - time.monotonic()))),
+                    every(HEALTH_S, lambda: publish(health, self._ether.health(time.time()))),
                 ]
             await together(*parts)
-
-    def _publish_truth(self) -> None:
-        if self._link is not None:
-            self._link.publish(truth_topic(self._site), self._ether.truth(time.time() - time.monotonic()))
-
-    def _publish_health(self) -> None:
-        if self._link is not None:
-            self._link.publish(health_topic(self._site, "ether", "air"), self._ether.health(time.time()))

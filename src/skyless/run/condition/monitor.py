@@ -692,8 +692,6 @@ def verb(items: Sized, one: str, many: str) -> str:
     return one if len(items) == 1 else many
 
 
-__all__ = ["Condition", "ConditionMonitor", "offline_anchors"]
-
 EVALUATION_S: Final = 0.5
 """Interval of the evaluations."""
 

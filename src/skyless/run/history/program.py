@@ -29,7 +29,7 @@ from skyless.run.gather import subjects
 from skyless.run.gather.node import Gather
 from skyless.run.gather.streams import Names, follow, make_streams
 from skyless.run.gather.subjects import NatsAddress, connect, rarely
-from skyless.run.history.layout import FIX_COLUMNS, Place, current_events, current_files, day_of
+from skyless.run.history.layout import FIX_COLUMNS, Place, current_events, current_files, day_of, sites_in
 from skyless.run.history.tables import REMEMBERED_KINDS, Event, EventLog, read_events, read_table, unix_ms
 from skyless.run.history.writer import FILE_ROWS, Intake, Keep, Writer, tidy
 from skyless.run.hub import LIST_S, sites_at
@@ -489,9 +489,8 @@ class HubHistory:
         client = self._client = await connect(self._address, "skyless history", self._say, self._drops)
         try:
             async with asyncio.TaskGroup() as self._tasks:
-                for folder in self._folder.glob("site=*"):
-                    if (number := folder.name.removeprefix("site=")).isdecimal():
-                        self._keep_site(int(number), client)
+                for number in sites_in(self._folder):
+                    self._keep_site(number, client)
                 self._tasks.create_task(self._find_sites(client))
         except* SkylessError as errors:
             raise errors.exceptions[0] from None
