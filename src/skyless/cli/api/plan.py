@@ -123,20 +123,13 @@ class RatePlanResult(FloorResult[RateMap], frozen=True, eq=False):
             yield "warning", warning
 
 
-def plan_rates(
-    site: Site,
-    file: Path,
-    floor: Floor,
-    heights_m: tuple[float, ...],
-    step_m: float | None,
-    range_m: float | None,
-    exponent: float,
-) -> RatePlanResult:
+def _plan_rates(asked: PlanOptions, site: Site, file: Path) -> RatePlanResult:
     """Plan a site of protocol 2. Raises SkylessError."""
-    started_s = time.perf_counter()
-    channel = ChannelModel() if range_m is None else with_range(ChannelModel(), range_m, exponent)
+    started_s, exponent = time.perf_counter(), asked.exponent or 2.0
+    heights_m, floor = _heights_m(asked, site), _floor(asked, site, file)
+    channel = ChannelModel() if asked.range_m is None else with_range(ChannelModel(), asked.range_m, exponent)
     try:
-        mapped = rate_map(site, floor, heights_m, step_m, channel, exponent)
+        mapped = rate_map(site, floor, heights_m, asked.step_m, channel, exponent)
     except ValueError as error:
         raise SkylessError(f"no map: {error}") from None
     found = rate_report(site, floor, mapped, channel, exponent)
@@ -294,9 +287,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
             *("search_s", "verify_points", "verify_rounds", "seed"),
             why=f"errors are predicted for sites of at most {MAX_PREDICTED} anchors; this one has {len(site.anchors)}",
         )
-        heights_m, exponent = _heights_m(asked, site), asked.exponent or 2.0
-        floor = _floor(asked, site, file)
-        rates = plan_rates(site, file, floor, heights_m, asked.step_m, asked.range_m, exponent)
+        rates = _plan_rates(asked, site, file)
         asked.progress(1.0)
         return rates
     asked.leave_out("exponent", why=f"it is for sites of more than {MAX_PREDICTED} anchors")
