@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -28,6 +27,7 @@ from skyless.cli.common import (
 from skyless.cli.nodes.options import SiteId, SiteOptions, log, run_until_stopped
 from skyless.core.errors import SkylessError
 from skyless.machine import extra_module
+from skyless.run.history.answers import span_of, time_text
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable
@@ -52,6 +52,8 @@ _LONGEST_LIST = 10
 _HEADINGS = {"seconds": "duration"}
 _OF_TAGS = ("tag", "other")
 _Row = dict[str, Any]
+_Tag = Annotated[str, Parameter(help="Name of the tag, or of its asset.")]
+_Tags = Annotated[str, Parameter(help="Names of tags, or of their assets.")]
 
 questions = App(name="history")
 
@@ -68,7 +70,6 @@ class _Asked(JsonOptions, frozen=True, kw_only=True):
 
     def opened(self) -> "tuple[History, Span]":
         """Open the history, and parse the time range. Raises SkylessError."""
-        from skyless.run.history.answers import span_of
         from skyless.run.history.layout import sites_in
         from skyless.run.history.queries import History
         from skyless.run.process import data_folder
@@ -125,7 +126,7 @@ def _named(answer: Struct, assets: Mapping[str, str]) -> _Row:
 def _track_rows(way: _Row) -> list[_Row]:
     row = {name: way[name] for name in ("tag_name", "fixes", "length_m")}
     for end, point in zip(("first", "last"), (*way["points"][:1], *way["points"][-1:]), strict=False):
-        row[end] = f"({point.x_m:.2f}, {point.y_m:.2f}) m at {_time(point.unix_s)}"
+        row[end] = f"({point.x_m:.2f}, {point.y_m:.2f}) m at {time_text(point.unix_s)}"
     return [row] if way["fixes"] else []
 
 
@@ -146,13 +147,11 @@ _ROWS: Mapping[str, Callable[[Any], list[_Row]]] = {"track": _track_rows, "heatm
 
 @questions.command(help_epilogue="Example: skyless history track tag7 --from 8:00 --to 16:00 --plot way.png")
 @command
-def track(tag: str, /, *, asked: _Drawn, points: Annotated[int, whole(2, 20_000)] = 2000) -> int:
+def track(tag: _Tag, /, *, asked: _Drawn, points: Annotated[int, whole(2, 20_000)] = 2000) -> int:
     """Where a tag was: its way, thinned to a number of points, with its length.
 
     Parameters
     ----------
-    tag
-        Name of the tag, or of its asset.
     points
         How many points of the way are given at most.
     """
@@ -161,13 +160,11 @@ def track(tag: str, /, *, asked: _Drawn, points: Annotated[int, whole(2, 20_000)
 
 @questions.command(help_epilogue="Example: skyless history heatmap --from yesterday --to today --plot heat.png")
 @command
-def heatmap(*tags: str, asked: _Drawn, cell: Positive = 0.25) -> int:
+def heatmap(*tags: _Tags, asked: _Drawn, cell: Positive = 0.25) -> int:
     """How long tags, by default all, were where.
 
     Parameters
     ----------
-    tags
-        Names of tags, or of their assets.
     cell
         Side of a cell in metres.
     """
@@ -176,13 +173,11 @@ def heatmap(*tags: str, asked: _Drawn, cell: Positive = 0.25) -> int:
 
 @questions.command(help_epilogue="Example: skyless history dwell --from monday --zone dock")
 @command
-def dwell(*tags: str, asked: _Drawn, zone: str | None = None) -> int:
+def dwell(*tags: _Tags, asked: _Drawn, zone: str | None = None) -> int:
     """How long tags, by default all, were in zones.
 
     Parameters
     ----------
-    tags
-        Names of tags, or of their assets.
     zone
         Identifier of the only zone; by default all.
     """
@@ -191,13 +186,11 @@ def dwell(*tags: str, asked: _Drawn, zone: str | None = None) -> int:
 
 @questions.command(help_epilogue="Example: skyless history contacts tag7 --from yesterday --within 1.5")
 @command
-def contacts(tag: str, /, *, asked: _Drawn, within: Positive = 2.0) -> int:
+def contacts(tag: _Tag, /, *, asked: _Drawn, within: Positive = 2.0) -> int:
     """Which tags were near a tag, and when.
 
     Parameters
     ----------
-    tag
-        Name of the tag, or of its asset.
     within
         Metres in the plane at which tags are near each other.
     """
@@ -266,7 +259,7 @@ def _shown(name: str, value: object) -> str:
     if not isinstance(value, float):
         return str(value)
     if name.endswith("unix_s"):
-        return _time(value)
+        return time_text(value)
     if name != "seconds":
         return f"{value:.2f}"
     minutes, seconds = divmod(round(value), 60)
@@ -274,12 +267,8 @@ def _shown(name: str, value: object) -> str:
     return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {seconds:02} s" if minutes else f"{seconds} s"
 
 
-def _time(unix_s: float) -> str:
-    return datetime.fromtimestamp(unix_s).isoformat(" ", "seconds")
-
-
 def _range(span: "Span") -> str:
-    return f"{_time(span.from_unix_s)} to {_time(span.to_unix_s)}"
+    return f"{time_text(span.from_unix_s)} to {time_text(span.to_unix_s)}"
 
 
 HistoryFolder = Annotated[Path, Parameter(name="--to")]

@@ -67,7 +67,6 @@ from skyless.run.process import (
     Program,
     data_folder,
     hold_any,
-    new_recording,
     outlasting,
     recordings_folder,
     reserve_next,
@@ -527,7 +526,7 @@ def _recording(asked: str | None, folder: Path) -> Path | None:
     """File of the recording; None for none. Raises SkylessError."""
     if asked == "none":
         return None
-    file = new_recording(folder, "demo") if asked is None else Path(asked)
+    file = folder / time.strftime("demo-%Y%m%d-%H%M%S.mcap") if asked is None else Path(asked)
     if file.exists() or not file.parent.is_dir():
         raise SkylessError(f"--record is {asked!r}; it should be a new file in a folder that exists, or none")
     return file

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 from cyclopts import App
 
-from skyless.arguments import Positive
+from skyless.arguments import Options, Positive, wrong
 from skyless.cli.common import (
     NO_FIX,
     JsonOptions,
@@ -126,19 +126,22 @@ def _report(path: Path, state: "RecorderState | None", *, json: bool) -> None:
 export_app = App(name="export", help_epilogue="Example: skyless export walk.mcap --to walk_bag")
 
 
+class ExportOptions(Options, frozen=True, kw_only=True):
+    """Options of ``skyless export``."""
+
+    tag: str | None = None
+    """Name of the only tag to write; by default all."""
+    frame: str = "site"
+    """Name of the site's frame in the messages."""
+    transforms: bool = False
+    """Write a transform from that frame to each tag's, too (/tf)."""
+    bag_version: Literal["9", "8"] = "9"
+    """Of the bag's metadata: 9 for ROS 2 from Jazzy on, 8 for Humble and Iron."""
+
+
 @export_app.default
 @command
-def export(
-    file: Path,
-    /,
-    *,
-    to: Path,
-    tag: str | None = None,
-    frame: str = "site",
-    transforms: bool = False,
-    bag_version: Literal["9", "8"] = "9",
-    output: JsonOptions,
-) -> int:
+def export(file: Path, /, *, to: Path, asked: ExportOptions, output: JsonOptions) -> int:
     """Write a recording of skyless record as a bag of ROS 2: MCAP, for ros2 bag play, Foxglove, Rerun, PlotJuggler.
 
     Each tag gets the topics pose, velocity, fix (where the site file has a georeference) and truth (where it is
@@ -150,22 +153,15 @@ def export(
         The recording, an MCAP of skyless record.
     to
         Where fixes go: the bag, a new folder.
-    tag
-        Name of the only tag to write; by default all.
-    frame
-        Name of the site's frame in the messages.
-    transforms
-        Write a transform from that frame to each tag's, too (/tf).
-    bag_version
-        Of the bag's metadata: 9 for ROS 2 from Jazzy on, 8 for Humble and Iron.
     """
     from skyless.bridges.ros2 import FRAME_NAME, FRAME_RULE, RosSettings
     from skyless.bridges.rosbag import write_bag
 
     check_output("to", to, file)
-    if not FRAME_NAME.fullmatch(frame):
-        raise SkylessError(f"--frame is {frame!r}; it should be {FRAME_RULE}")
-    bag = write_bag(file, to, RosSettings(frame=frame, transforms=transforms), tag, 8 if bag_version == "8" else 9)
+    if not FRAME_NAME.fullmatch(asked.frame):
+        raise wrong("--frame", asked.frame, FRAME_RULE)
+    settings = RosSettings(frame=asked.frame, transforms=asked.transforms)
+    bag = write_bag(file, to, settings, asked.tag, 8 if asked.bag_version == "8" else 9)
     if output.json:
         print_json(bag)
     else:

@@ -32,11 +32,12 @@ from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.open_radio import (
     DEFAULT_RADIO,
-    hears_positions,
+    PACKET_DRIVERS,
+    STATED_POSITIONS,
+    driver_of,
     is_simulated,
     open_radios,
     open_sniffers,
-    receives_packets,
 )
 from skyless.run.process import Log, together
 from skyless.run.tag import Tags, TagSettings
@@ -256,13 +257,13 @@ def tag(
     names
         Names of one or more tags: letters, digits, - and _.
     """
-    address, lines = broker.address(), shown.lines(log, addresses=hears_positions(asked.radio))
+    address, lines = broker.address(), shown.lines(log, addresses=driver_of(asked.radio) in STATED_POSITIONS)
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
         given = repr(" ".join(names)) if names else "missing"
         raise SkylessError(
             f"NAMES is {given}; it should be one or more names, each once, of 1 to 32 letters, digits, - or _"
         )
-    if receives_packets(asked.radio):
+    if driver_of(asked.radio) in PACKET_DRIVERS:
         asked.leave_out(
             *("site_key", "trust", "clock_bound_ms", "integrity_risk", "alert_limit_m"),
             why="it is not for sniffers, FiRa boards and phones",
@@ -283,27 +284,21 @@ def tag(
         why = "of one tag whose fixes are computed here and at once: one name, --method joint, and neither --from-board"
         raise SkylessError(f"--motion is {why} nor --trust verified")
     bridge = TagBridge(hub_of(asked.to, address), lambda: is_simulated(asked.radio), log) if asked.to else None
-    serve = tags(names, asked, address, _listener(lines, bridge), bridge)
-    others = [part.run() for part in (lines, bridge) if part is not None]
-    run_until_stopped(together(serve, *others), punctual=True)
-
-
-def _listener(lines: FixLines | None, bridge: TagBridge | None) -> FixListener | None:
-    """A function that passes a fix to all consumers; None without any."""
-    listeners = [part.on_fix for part in (lines, bridge) if part is not None]
+    consumers = [part for part in (lines, bridge) if part is not None]
 
     def on_fix(fix: FixMessage) -> None:
-        for listener in listeners:
-            listener(fix)
+        for consumer in consumers:
+            consumer.on_fix(fix)
 
-    return on_fix if listeners else None
+    serve = tags(names, asked, address, on_fix, bridge)
+    run_until_stopped(together(serve, *(consumer.run() for consumer in consumers)), punctual=True)
 
 
 def _on_radios(
     names: tuple[str, ...],
     asked: TagOptions,
     address: MqttAddress | None,
-    on_fix: FixListener | None,
+    on_fix: FixListener,
     bridge: TagBridge | None,
 ) -> Coroutine[Any, Any, None]:
     """Run tags that receive beacons."""
@@ -352,7 +347,7 @@ def _on_sniffers(
     names: tuple[str, ...],
     asked: TagOptions,
     address: MqttAddress | None,
-    on_fix: FixListener | None,
+    on_fix: FixListener,
     bridge: TagBridge | None,
 ) -> Coroutine[Any, Any, None]:
     """Run tags that receive the packets of another system."""
@@ -387,7 +382,7 @@ def _system(asked: TagOptions) -> "PacketTagSettings":
     from skyless.run.masterless.packet_tags import TDOA_SITE, PacketTagSettings
     from skyless.site.tables import read_anchors, read_calibration
 
-    if asked.anchors is None and not hears_positions(asked.radio):
+    if asked.anchors is None and driver_of(asked.radio) not in STATED_POSITIONS:
         raise SkylessError("--anchors is missing; a sniffer needs a table of the system's anchors: id,x_m,y_m,z_m")
     anchors_m, std_m = {} if asked.anchors is None else read_anchors(asked.anchors), 0.0
     if asked.tag_height in (None, "auto"):
