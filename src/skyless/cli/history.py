@@ -54,6 +54,10 @@ _OF_TAGS = ("tag", "other")
 _Row = dict[str, Any]
 _Tag = Annotated[str, Parameter(help="Name of the tag, or of its asset.")]
 _Tags = Annotated[str, Parameter(help="Names of tags, or of their assets.")]
+_Points = Annotated[int, whole(2, 20_000), Parameter(help="How many points of the way are given at most.")]
+_Cell = Annotated[Positive, Parameter(help="Side of a cell in metres.")]
+_Zone = Annotated[str | None, Parameter(help="Identifier of the only zone; by default all.")]
+_Within = Annotated[Positive, Parameter(help="Metres in the plane at which tags are near each other.")]
 
 questions = App(name="history")
 
@@ -147,53 +151,29 @@ _ROWS: Mapping[str, Callable[[Any], list[_Row]]] = {"track": _track_rows, "heatm
 
 @questions.command(help_epilogue="Example: skyless history track tag7 --from 8:00 --to 16:00 --plot way.png")
 @command
-def track(tag: _Tag, /, *, asked: _Drawn, points: Annotated[int, whole(2, 20_000)] = 2000) -> int:
-    """Where a tag was: its way, thinned to a number of points, with its length.
-
-    Parameters
-    ----------
-    points
-        How many points of the way are given at most.
-    """
+def track(tag: _Tag, /, *, asked: _Drawn, points: _Points = 2000) -> int:
+    """Where a tag was: its way, thinned to a number of points, with its length."""
     return asked.answer("track", lambda history, span: history.track(tag, span, points))
 
 
 @questions.command(help_epilogue="Example: skyless history heatmap --from yesterday --to today --plot heat.png")
 @command
-def heatmap(*tags: _Tags, asked: _Drawn, cell: Positive = 0.25) -> int:
-    """How long tags, by default all, were where.
-
-    Parameters
-    ----------
-    cell
-        Side of a cell in metres.
-    """
+def heatmap(*tags: _Tags, asked: _Drawn, cell: _Cell = 0.25) -> int:
+    """How long tags, by default all, were where."""
     return asked.answer("heatmap", lambda history, span: history.heatmap(span, cell, tags))
 
 
 @questions.command(help_epilogue="Example: skyless history dwell --from monday --zone dock")
 @command
-def dwell(*tags: _Tags, asked: _Drawn, zone: str | None = None) -> int:
-    """How long tags, by default all, were in zones.
-
-    Parameters
-    ----------
-    zone
-        Identifier of the only zone; by default all.
-    """
+def dwell(*tags: _Tags, asked: _Drawn, zone: _Zone = None) -> int:
+    """How long tags, by default all, were in zones."""
     return asked.answer("dwell", lambda history, span: history.dwell(span, tags, zone))
 
 
 @questions.command(help_epilogue="Example: skyless history contacts tag7 --from yesterday --within 1.5")
 @command
-def contacts(tag: _Tag, /, *, asked: _Drawn, within: Positive = 2.0) -> int:
-    """Which tags were near a tag, and when.
-
-    Parameters
-    ----------
-    within
-        Metres in the plane at which tags are near each other.
-    """
+def contacts(tag: _Tag, /, *, asked: _Drawn, within: _Within = 2.0) -> int:
+    """Which tags were near a tag, and when."""
     return asked.answer("contacts", lambda history, span: history.contacts(tag, span, within))
 
 
@@ -271,7 +251,9 @@ def _range(span: "Span") -> str:
     return f"{time_text(span.from_unix_s)} to {time_text(span.to_unix_s)}"
 
 
-HistoryFolder = Annotated[Path, Parameter(name="--to")]
+HistoryFolder = Annotated[
+    Path, Parameter(name="--to", help="Where fixes are kept: a folder, which several sites may share.")
+]
 
 app = App(name="history", help_epilogue="Example: skyless history run --to history")
 app.update(questions)
@@ -302,11 +284,6 @@ def run(*, to: HistoryFolder, live: SiteOptions, asked: RunOptions, output: Json
 
     A kill -9 loses nothing that has reached the site's stream. Give the same folder at every start. The exit code is 1
     where the disk did not take everything; the next start goes on there.
-
-    Parameters
-    ----------
-    to
-        Where fixes are kept: a folder, which several sites may share.
     """
     from skyless.run.gather.subjects import nats_address
     from skyless.run.history.writer import Keep
@@ -390,8 +367,6 @@ def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None
     ----------
     recording
         The recording, an MCAP file of skyless record.
-    to
-        Where fixes are kept: a folder, which several sites may share.
     site_id
         Number of the site; by default the one that was recorded.
     """

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, cast
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from skyless.cli.api.options import PlanOptions
 from skyless.cli.common import cm
 from skyless.core.arrays import Array, Vector
 from skyless.core.errors import SkylessError
-from skyless.core.geometry import Box
 from skyless.core.site import Site
 from skyless.research.verify import random_points, verify
 from skyless.site.channel import ChannelModel
@@ -48,6 +47,8 @@ from skyless.site.planning.report import Verification, described, plan_report
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+    from skyless.core.geometry import Box
 
 FloorMap = TypeVar("FloorMap", PlanMap, RateMap)
 
@@ -332,11 +333,7 @@ def _heights_m(asked: PlanOptions, site: Site) -> tuple[float, ...]:
 def _floor(asked: PlanOptions, site: Site, file: Path) -> Floor:
     """The floor from the given outline and region of interest. Raises ConfigurationError."""
     outline_m = None if asked.outline_m is None else np.array(asked.outline_m)
-    region_m: Box | None = None
-    if asked.region_m is not None:
-        x1_m, y1_m, x2_m, y2_m = asked.region_m
-        region_m = x1_m, y1_m, x2_m, y2_m
-    return floor_of(site, file, outline_m, region_m)
+    return floor_of(site, file, outline_m, cast("Box | None", asked.region_m))
 
 
 plan = python_function(PlanOptions, run_plan)

@@ -200,35 +200,30 @@ async def _keep_history(address: MqttAddress, folder: Path, nats: NatsAddress | 
 gather_app = App(name="gather", help_epilogue="Example: skyless gather --nats nats://127.0.0.1:4222 --site-id 7")
 
 
+class PackOptions(GatherOptions, frozen=True, kw_only=True):
+    """Options of ``skyless gather``."""
+
+    nats: Annotated[str, Parameter(env_var="SKYLESS_NATS")] = "nats://127.0.0.1:4222"
+    """NATS server with JetStream and MQTT, nats://[USER@]HOST[:PORT] or tls://...; the password is taken from
+    SKYLESS_MQTT_PASSWORD."""
+    mqtt: str | None = None
+    """Broker to copy kept messages from: the same server, mqtt://[USER@]HOST[:PORT]. Zones, plans and the like are then
+    in the stream of the site's state from the start, and not from their next change on."""
+
+
 @gather_app.default
 @command
-def gather(
-    *,
-    nats: Annotated[str, Parameter(env_var="SKYLESS_NATS")] = "nats://127.0.0.1:4222",
-    mqtt: str | None = None,
-    asked: GatherOptions,
-    output: JsonOptions,
-) -> None:
+def gather(*, asked: PackOptions, output: JsonOptions) -> None:
     """Pack the fixes of a site's tags into batches until Ctrl-C, and keep them in a stream of NATS.
 
     skyless broker --gather runs it. Several gathers of one site share its fixes. At the end it says what was gathered
     and dropped.
-
-    Parameters
-    ----------
-    nats
-        NATS server with JetStream and MQTT, nats://[USER@]HOST[:PORT] or tls://...; the password is taken from
-        SKYLESS_MQTT_PASSWORD.
-    mqtt
-        Broker to copy kept messages from: the same server, mqtt://[USER@]HOST[:PORT]. Zones, plans and the like are
-        then in the stream of the site's state from the start, and not from their next change on.
     """
     extra_module("nats", "skyless gather")
     from skyless.run.gather.node import Gather
-    from skyless.run.mqtt.address import mqtt_address
 
-    broker = None if mqtt is None else mqtt_address(mqtt)
-    node = Gather(nats_address(nats), asked.site_id, round(1e9 * asked.keep_gb), log, broker)
+    broker = None if asked.mqtt is None else mqtt_address(asked.mqtt)
+    node = Gather(nats_address(asked.nats), asked.site_id, round(1e9 * asked.keep_gb), log, broker)
     run_until_stopped(node.run())
     summary = node.summary
     if output.json:

@@ -34,17 +34,18 @@ if TYPE_CHECKING:
 app = App(name="record", help_epilogue="Example: skyless record walk.mcap --duration 60")
 
 
+class RecordOptions(SiteOptions, frozen=True, kw_only=True):
+    """Options of ``skyless record``."""
+
+    duration: Positive | None = None
+    """Seconds to record; by default until Ctrl-C."""
+    limit_mb: Positive | None = None
+    """Megabytes after which the recording ends."""
+
+
 @app.default
 @command
-def record(
-    file: Path | None = None,
-    /,
-    *,
-    live: SiteOptions,
-    duration: Positive | None = None,
-    limit_mb: Positive | None = None,
-    output: JsonOptions,
-) -> int:
+def record(file: Path | None = None, /, *, asked: RecordOptions, output: JsonOptions) -> int:
     """Record a running site until Ctrl-C: raw receptions, fixes, truth, health, site and zones.
 
     skyless replay computes every fix of a recording again; the dashboard and Foxglove show it.
@@ -53,20 +54,16 @@ def record(
     ----------
     file
         The recording, a new MCAP file; by default in this folder, named after the time.
-    duration
-        Seconds to record; by default until Ctrl-C.
-    limit_mb
-        Megabytes after which the recording ends.
     """
     from skyless.run.recordings.recorder import McapFile
 
-    address = live.required("the broker of the site to record")
+    address = asked.required("the broker of the site to record")
     path = file or Path(time.strftime("skyless-%Y-%m-%dT%H-%M-%S.mcap"))
-    out = McapFile(path, None if limit_mb is None else round(limit_mb * 1e6))
+    out = McapFile(path, None if asked.limit_mb is None else round(asked.limit_mb * 1e6))
     found: list[RecorderNode] = []
     with contextlib.suppress(KeyboardInterrupt, TimeoutError):
         try:
-            run(_record(out, address, live.site_id, duration, found))
+            run(_record(out, address, asked, found))
         except SkylessError:
             if not found:
                 path.unlink()  # nothing was recorded
@@ -77,15 +74,12 @@ def record(
     return 1 if out.failed or not found else 0
 
 
-async def _record(
-    file: "McapFile", address: MqttAddress, site_id: int | None, duration_s: float | None, found: "list[RecorderNode]"
-) -> None:
+async def _record(file: "McapFile", address: MqttAddress, asked: RecordOptions, found: "list[RecorderNode]") -> None:
     from skyless.run.record import RecorderNode
 
-    end_s = None if duration_s is None else time.monotonic() + duration_s
-    if site_id is None:
-        async with asyncio.timeout(duration_s):
-            site_id = await find_site(address)
+    end_s = None if asked.duration is None else time.monotonic() + asked.duration
+    async with asyncio.timeout(asked.duration):
+        site_id = await find_site(address) if asked.site_id is None else asked.site_id
     node = RecorderNode(file, address, site_id, log)
     found.append(node)
     before = node.state()
