@@ -64,7 +64,7 @@ def broker(*, asked: BrokerOptions, gathered: GatherOptions, output: JsonOptions
     host, port = listen_address(asked.listen, FIRST_PORT)
     if asked.port is not None and port not in (None, asked.port):
         raise SkylessError(f"--port is {asked.port}, and --listen is {asked.listen!r}; give the port once")
-    leaf = None if asked.hub is None else read_json(asked.hub, Leaf, "skyless hub init")
+    leaf = None if asked.hub is None else read_json(asked.hub, Leaf)
     if leaf is not None:
         gathered.leave_out("site_id", why=f"{asked.hub} is of site {leaf.site}")
         gathered = replace(gathered, site_id=leaf.site)
@@ -276,7 +276,7 @@ def init(*, asked: InitOptions, output: JsonOptions) -> None:
         raise wrong("--tenant", asked.tenant, "a letter, then at most 30 small letters, digits and hyphens")
     if not plan.exists() and len(set(asked.node)) not in {1, 3, 5}:
         raise SkylessError(f"--node was given {len(set(asked.node))} times; it should name 1, 3 or 5 servers")
-    hub = read_json(plan, Hub, "skyless hub init") if plan.exists() else Hub(asked.node)
+    hub = read_json(plan, Hub) if plan.exists() else Hub(asked.node)
     if asked.node not in ((), hub.nodes):
         raise SkylessError(f"--node differs from the nodes in {plan}; it should be left out")
     folders = {"data": asked.data, "certificates": asked.certificates}
@@ -308,7 +308,7 @@ def apply(folder: Path, /, *, output: JsonOptions) -> None:
     extra_module("nats", "skyless hub apply")
     from skyless.run.hub import make_streams_of
 
-    hub = read_json(folder / PLAN, Hub, "skyless hub init")
+    hub = read_json(folder / PLAN, Hub)
     found = {tenant: asyncio.run(make_streams_of(hub, tenant, log)) for tenant in hub.sites}
     if output.json:
         print_json({"tenants": found})
