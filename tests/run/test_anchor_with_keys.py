@@ -21,6 +21,7 @@ from skyless.run import keys as key_files
 from skyless.run.anchor import AnchorNode, Anchors, health_of
 from skyless.run.mqtt.messages import Counters, PlacementMessage
 from support.keyed_air import START_UNIX_S
+from support.mqtt_brokers import stopped
 
 BEGIN_S = 1000.0
 """The first instant of the loop, at which ``START_UNIX_S`` is the time."""
@@ -56,8 +57,7 @@ class Stage:
         return self
 
     async def __aexit__(self, *_):
-        self._task.cancel()
-        await asyncio.wait([self._task])
+        await stopped(self._task)
 
     def frames(self):
         return [decode(transmission.frame) for _, transmission in self.radios[0].transmissions]

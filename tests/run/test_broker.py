@@ -22,6 +22,7 @@ from skyless.run.broker import BrokerSettings, StatedAddress, running_broker, st
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
+from support.mqtt_brokers import stopped
 from support.processes import SKYLESS, free_port, started
 
 pytestmark = pytest.mark.site
@@ -90,8 +91,7 @@ async def retained_by(broker, topic, name):
     reader.subscribe(topic, lambda _, payload: got.done() or got.set_result(payload))
     task = asyncio.ensure_future(reader.run())
     found = await asyncio.wait_for(got, 20)
-    task.cancel()
-    await asyncio.wait([task])
+    await stopped(task)
     return found
 
 
@@ -111,8 +111,7 @@ async def test_retained_messages_survive_its_death(port, tmp_path):
     while not is_written():
         await asyncio.sleep(0.01)
     os.kill(broker.pid, signal.SIGKILL)
-    task.cancel()
-    await asyncio.wait([task])
+    await stopped(task)
     await broker.stop()
     async with await start_broker(settings) as broker:
         assert await retained_by(broker, "skyless/v1/7/zones", "t3") == b"kept"
@@ -140,8 +139,7 @@ async def test_a_broker_that_listens_elsewhere_says_so(taken, tmp_path, monkeypa
     while not (said := capsys.readouterr()).err:
         assert not serving.done(), serving
         await asyncio.sleep(0.05)
-    serving.cancel()
-    await asyncio.wait([serving])
+    await stopped(serving)
     assert f"port {taken} is taken" in said.err
     assert f"this one listens at {mqtt_address(said.out.strip()).port};" in said.err
 

@@ -13,7 +13,7 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import ACCESS, USERS, MqttAddress, Role, create_access, read_access
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
-from support.mqtt_brokers import Embedded
+from support.mqtt_brokers import Embedded, stopped
 from support.waiting import until
 
 pytestmark = pytest.mark.site
@@ -242,8 +242,7 @@ def test_a_program_of_the_wrong_role_is_warned(role, make_access, caplog, monkey
         link = Link(access.address(role), "n1", site=7, kind="tag")
         task = asyncio.ensure_future(link.run())
         await until(lambda: "has not returned skyless/v1/7/tag/n1/status" in caplog.text)
-        task.cancel()
-        await asyncio.wait([task])
+        await stopped(task)
 
     asyncio.run(check())
     assert ("a subscription to skyless/v1/7/tag/n1/status" in caplog.text) == (role is Role.ANCHORS)
@@ -261,8 +260,7 @@ def test_a_program_of_the_right_role_is_not_warned(make_access, caplog):
         task = asyncio.ensure_future(link.run())
         await until(lambda: returned and not link.unacknowledged)
         link._check_echo(link._connection)
-        task.cancel()
-        await asyncio.wait([task])
+        await stopped(task)
 
     asyncio.run(check())
     assert caplog.text == ""
