@@ -423,16 +423,11 @@ PLAN = [
     ({"optimise": 2}, "optimise is 2; it should be a whole number, at least 3, at most 60"),
     ({"step_m": 1e-9}, "no map"),
     ({"exponent": 2.0}, "exponent is 2; it should be left out: it is for sites of more than 60 anchors"),
+    *(
+        ({"site": grid_site(100.0, 90.0, 10.0, 4.0, 1.2), name: value}, f"{name} is .*; it should be left out: errors")
+        for name, value in {"noise_ps": 50.0, "search_s": 3.0, "verify_rounds": 200, "seed": 2, "optimise": 4}.items()
+    ),
 ]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("noise_ps", 50.0), ("search_s", 3.0), ("verify_rounds", 200), ("seed", 2), ("optimise", 4)]
-)
-def test_what_has_no_effect_on_a_plan_of_beacons_is_refused(name, value):
-    with pytest.raises(skyless.SkylessError, match=f"{name} is .*; it should be left out: errors are"):
-        skyless.plan(grid_site(100.0, 90.0, 10.0, 4.0, 1.2), **{name: value})
-
 
 CALIBRATE = [
     ({"stays": ((1,),)}, r"stays\[0\] is \(1,\); it should be 2 or 3 finite numbers"),

@@ -28,6 +28,7 @@ from skyless.run.history.layout import current_events, current_files, rows_of, s
 from skyless.run.history.program import HistoryNode, import_recording
 from skyless.run.history.queries import History
 from skyless.run.history.writer import Keep, Writer
+from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress, Role, create_access, mqtt_address, read_access
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -39,15 +40,6 @@ from skyless.run.mqtt.messages import (
     Zone,
     ZoneEvent,
     ZonesMessage,
-)
-from skyless.run.mqtt.topics import (
-    alarm_topic,
-    assets_topic,
-    fix_topic,
-    site_topic,
-    status_topic,
-    zone_event_topic,
-    zones_topic,
 )
 from skyless.run.record import RecorderNode
 from skyless.run.recordings.recorder import McapFile
@@ -95,7 +87,7 @@ class Stage:
     async def publish_fixes(self):
         """Until cancelled: 200 a second, each with the next serial."""
         for serial in count(1):
-            self.link.publish(fix_topic(SITE, TAG), numbered_fix(serial))
+            self.link.publish(topics.fix_topic(SITE, TAG), numbered_fix(serial))
             await asyncio.sleep(0.005)
 
 
@@ -241,28 +233,32 @@ async def test_what_it_takes_of_a_sites_messages(tmp_path, kind):
         publish = stage.link.publish
         await until(lambda: node.state().events == 1)  # the tag's own status: it has subscribed
         lab = msgspec.structs.replace(lab_site(), id=SITE)
-        publish(site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
-        publish(zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
-        publish(assets_topic(SITE), AssetsMessage((Asset(TAG, "Forklift"), Asset("bob"))), qos=1, retain=True)
-        publish(status_topic(SITE, "anchor", 3), StatusMessage(True, "anchor", "3", unix_s=now_s), qos=1, retain=True)
-        publish(status_topic(SITE, "anchor", "a b"), StatusMessage(True, "anchor", "a b", unix_s=now_s), qos=1)
-        publish(alarm_topic(SITE, "cold", "ann"), alarm, qos=1, retain=True)
-        publish(zone_event_topic(SITE, "z1"), ZoneEvent("z1", "door", "ann", "enter", now_s, (0.0, 0.0, 0.0)), qos=1)
-        publish(fix_topic(SITE, "bad"), b"{}")
+        publish(topics.site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
+        publish(topics.zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
+        publish(topics.assets_topic(SITE), AssetsMessage((Asset(TAG, "Forklift"), Asset("bob"))), qos=1, retain=True)
+        publish(
+            topics.status_topic(SITE, "anchor", 3), StatusMessage(True, "anchor", "3", unix_s=now_s), qos=1, retain=True
+        )
+        publish(topics.status_topic(SITE, "anchor", "a b"), StatusMessage(True, "anchor", "a b", unix_s=now_s), qos=1)
+        publish(topics.alarm_topic(SITE, "cold", "ann"), alarm, qos=1, retain=True)
+        publish(
+            topics.zone_event_topic(SITE, "z1"), ZoneEvent("z1", "door", "ann", "enter", now_s, (0.0, 0.0, 0.0)), qos=1
+        )
+        publish(topics.fix_topic(SITE, "bad"), b"{}")
         await until(lambda: (site_folder(folder, SITE) / "stream").is_dir() and node.state().events >= 4)
         await until(lambda: node.state().drops.get("wrong"))
-        publish(zones_topic(SITE), b'{"zones": [{"id": "/", "name": "", "polygon_m": []}]}', qos=1)
+        publish(topics.zones_topic(SITE), b'{"zones": [{"id": "/", "name": "", "polygon_m": []}]}', qos=1)
         await until(lambda: node.state().drops.get("wrong-message"))
-        publish(fix_topic(SITE, TAG), numbered_fix(1))
+        publish(topics.fix_topic(SITE, TAG), numbered_fix(1))
         await until(lambda: node.state().fixes == 1)
 
     async def again(node):
         publish = stage.link.publish
         while not node.state().fixes:  # nats-server may lose what comes while somebody subscribes
-            publish(fix_topic(SITE, TAG), numbered_fix(2))
+            publish(topics.fix_topic(SITE, TAG), numbered_fix(2))
             await asyncio.sleep(0.05)
-        publish(status_topic(SITE, "anchor", 3), StatusMessage(False, "anchor", "3"), qos=1, retain=True)
-        publish(alarm_topic(SITE, "cold", "ann"), ended, qos=1, retain=True)
+        publish(topics.status_topic(SITE, "anchor", 3), StatusMessage(False, "anchor", "3"), qos=1, retain=True)
+        publish(topics.alarm_topic(SITE, "cold", "ann"), ended, qos=1, retain=True)
         await until(lambda: node.state().events >= 2)
 
     stage = Stage(tmp_path / "broker", kind)
@@ -297,22 +293,22 @@ async def test_a_recording_gives_the_rows_of_the_running_history(tmp_path):
     async def scenario(node):
         await until(lambda: node.state().events == 1 and recorder.recorder.kinds["status"])
         publish, now_s = stage.link.publish, time.time()
-        publish(site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
-        publish(zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
-        publish(assets_topic(SITE), AssetsMessage((Asset("t0", "Forklift"),)), qos=1, retain=True)
+        publish(topics.site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
+        publish(topics.zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
+        publish(topics.assets_topic(SITE), AssetsMessage((Asset("t0", "Forklift"),)), qos=1, retain=True)
         await until(lambda: recorder.recorder.kinds["assets"])
         for serial in range(1, 301):
             made = walked(serial)
-            publish(fix_topic(SITE, made.tag), made)
+            publish(topics.fix_topic(SITE, made.tag), made)
             if serial % 50 == 0:
                 event = ZoneEvent("z1", "door", made.tag, "enter", made.unix_s, made.position_m)
-                publish(zone_event_topic(SITE, "z1"), event, qos=1)
+                publish(topics.zone_event_topic(SITE, "z1"), event, qos=1)
                 raised = AlarmMessage(
                     f"cold/{serial}", "cold", "Cold", "inside", "critical", made.tag, now_s, now_s, "in"
                 )
-                publish(alarm_topic(SITE, "cold", made.tag), raised, qos=1, retain=True)
+                publish(topics.alarm_topic(SITE, "cold", made.tag), raised, qos=1, retain=True)
                 publish(
-                    status_topic(SITE, "anchor", 3),
+                    topics.status_topic(SITE, "anchor", 3),
                     StatusMessage(serial % 100 > 0, "anchor", "3", unix_s=made.unix_s),
                     qos=1,
                 )
@@ -379,14 +375,14 @@ async def test_a_broker_keeps_the_history_of_the_sites_on_it(tmp_path):
         await process.stdout.readline()
         address = MqttAddress("127.0.0.1", port, user="operator", password=read_access(access)[Role.OPERATOR])
         link, statuses = Link(address, TAG, site=SITE, kind="tag"), []
-        link.subscribe(status_topic(SITE, "history", "+"), lambda _, payload: statuses.append(payload), qos=1)
+        link.subscribe(topics.status_topic(SITE, "history", "+"), lambda _, payload: statuses.append(payload), qos=1)
         lab = msgspec.structs.replace(lab_site(), id=SITE)
-        link.publish(site_topic(SITE), SiteMessage(lab, False, time.time()), qos=1, retain=True)
+        link.publish(topics.site_topic(SITE), SiteMessage(lab, False, time.time()), qos=1, retain=True)
         task = asyncio.ensure_future(link.run())
         await until(lambda: statuses)
         serials, blocks = count(1), "stream/jetstream/*/streams/FIX_*/msgs/*.blk"
         while not any(file.stat().st_size for file in site_folder(folder, SITE).glob(blocks)) or next(serials) < 200:
-            link.publish(fix_topic(SITE, TAG), numbered_fix(next(serials)))
+            link.publish(topics.fix_topic(SITE, TAG), numbered_fix(next(serials)))
             await asyncio.sleep(0.02)
         process.send_signal(signal.SIGTERM)
         _, err = await process.communicate()

@@ -17,7 +17,7 @@ from skyless.machine import extra_module
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from skyless.page.app import ListenAddress, Services
+    from skyless.page.app import Services
     from skyless.page.connections import AccessRules
     from skyless.page.gathered import Gathered
     from skyless.page.live import LiveSite
@@ -39,8 +39,8 @@ class DashboardOptions(Options, frozen=True, kw_only=True):
     """Site file, or lab; by default the one that the broker has retained, which comes before this."""
     site_id: SiteId | None = None
     """Number of the site; by default one whose programs are online, and the page lets choose among several."""
-    listen: str | None = None
-    """Where programs connect, here browsers, HOST:PORT; by default 127.0.0.1:8080, or the next free port."""
+    listen: str = "127.0.0.1"
+    """Where programs connect, here browsers, HOST:PORT or HOST; without PORT 8080, or the next port that is free."""
     recordings: Path | None = None
     """Folder of recordings to replay."""
     history: Path | None = None
@@ -72,7 +72,7 @@ def dashboard(*, asked: DashboardOptions, broker: MqttOptions, output: JsonOptio
     import socket
 
     from skyless.page.api.questions import Past
-    from skyless.page.app import Services, bind, serve
+    from skyless.page.app import PORT, Services, bind, serve
     from skyless.page.live import LiveSite
     from skyless.page.playback import Playback
     from skyless.run.condition.evidence import ProcessorUse
@@ -84,10 +84,10 @@ def dashboard(*, asked: DashboardOptions, broker: MqttOptions, output: JsonOptio
         if not history.is_dir():
             raise SkylessError(f"--history is {str(history)!r}; it should be a folder that skyless history writes")
         extra_module("duckdb", "--history")
-    listening = _listening(asked.listen)
-    sock = bind(listening)
+    host, port_asked = listen_address(asked.listen, PORT)
+    sock = bind(host, port_asked)
     bound, port = sock.getsockname()[:2]
-    rules = _rules(bound, listening.host, port, asked.token, asked.reader_token, read_only=hub is not None)
+    rules = _rules(bound, host, port, asked.token, asked.reader_token, read_only=hub is not None)
     # The same name on MQTT after a restart, so that old sessions do not accumulate.
     client = f"{re.sub(r'[^A-Za-z0-9_.-]', '-', socket.gethostname())}-{port}"
     make = partial(LiveSite, client, used_share=ProcessorUse().share, has_history=history is not None)
@@ -98,7 +98,7 @@ def dashboard(*, asked: DashboardOptions, broker: MqttOptions, output: JsonOptio
         for name in (*broker.given("mqtt"), *asked.given("nats", "assets", "site", "site_id")):
             raise SkylessError(f"--hub and --{name.replace('_', '-')} exclude each other; give one of them")
         address, services, work = _at_hub(make, serves, hub, broker.mqtt_ca)
-    page = _address(listening.host, port, rules)
+    page = _address(host, port, rules)
     if output.json:
         kind = "mqtt" if hub is None else "hub"
         print_json({"page": page, kind: address, "token": rules.token, "reader_token": rules.reader_token})
@@ -163,15 +163,6 @@ def _load(name: str) -> "tuple[SiteMessage, dict[int | None, bytes]]":
     site = site_named(name)
     images = {floor: file.read_bytes() for floor, file in plan_files(site, Path(name)).items()}
     return site_message(site, simulated=False, unix_s=time.time()), images
-
-
-def _listening(listen: str | None) -> "ListenAddress":
-    """The address to listen at. Raises SkylessError."""
-    from skyless.page.app import PORT, ListenAddress
-
-    if listen is None:
-        return ListenAddress("127.0.0.1", None)
-    return ListenAddress(*listen_address(listen, PORT))
 
 
 def _rules(

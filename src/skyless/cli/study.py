@@ -21,6 +21,7 @@ from skyless.cli.common import (
     command,
     console,
     json_form,
+    make_folder,
     print_json,
     print_table,
     progress_bar,
@@ -353,10 +354,7 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) 
     if not found:
         raise SkylessError(f"FOLDER is {str(folder)!r}; it should hold recordings that skyless replay can read")
     kept = asked.out / "results"
-    try:
-        kept.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SkylessError(f"--out is {str(asked.out)!r}; it should be a folder: {error.strerror}") from None
+    make_folder("--out", kept)
     first_s = _QUICK_S if asked.quick and asked.first_s is None else asked.first_s
     own = asked.estimator
     estimators = {} if own is None else {getattr(own, "__name__", "own"): own}

@@ -7,10 +7,10 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TextIO
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TextIO
 
 from cyclopts import App, Parameter
 from msgspec.structs import replace
@@ -48,6 +48,8 @@ if TYPE_CHECKING:
     from skyless.core.air.masterless_packets import Point
     from skyless.run.masterless.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
     from skyless.run.tag import TagNode
+
+    _Opened = tuple[Tags | PacketTags, TagNode | PacketTagNode]
 
 # Fixes as lines on standard output: for people, as CSV, or as JSON.
 #
@@ -290,8 +292,14 @@ def tag(
         for consumer in consumers:
             consumer.on_fix(fix)
 
-    serve = tags(names, asked, address, on_fix, bridge)
-    run_until_stopped(together(serve, *(consumer.run() for consumer in consumers)), punctual=True)
+    running, node = tags(names, asked, address, on_fix, bridge)
+    parts = [running.run(), *(consumer.run() for consumer in consumers)]
+    if asked.motion is not None:
+        feed = MotionFeed(asked.motion, node.hear_motion)
+        node.motion_counters = feed.counters
+        log(f"tag {node.radio.name}: waits for its motion at {feed.address}")
+        parts.append(feed.run())
+    run_until_stopped(together(*parts), punctual=True)
 
 
 def _on_radios(
@@ -300,8 +308,8 @@ def _on_radios(
     address: MqttAddress | None,
     on_fix: FixListener,
     bridge: TagBridge | None,
-) -> Coroutine[Any, Any, None]:
-    """Run tags that receive beacons."""
+) -> "_Opened":
+    """Open tags that receive beacons; the first tag's node."""
     required = asked.requirement(asked.method, asked.tag_height_std)
     trust = _site_trust(asked)
     settings = TagSettings(
@@ -314,19 +322,7 @@ def _on_radios(
     )
     radios = open_radios(asked.radio, "tag", names, computes=asked.from_board)
     tags = Tags(settings, radios, address, log, on_fix, None if bridge is None else bridge.on_health)
-    return _with_motion(asked, tags, tags.tags[0].node)
-
-
-def _with_motion(
-    asked: TagOptions, tags: "Tags | PacketTags", node: "TagNode | PacketTagNode"
-) -> Coroutine[Any, Any, None]:
-    """Run tags, and what receives the motion of the only one. Raises SkylessError."""
-    if asked.motion is None:
-        return tags.run()
-    feed = MotionFeed(asked.motion, node.hear_motion)
-    node.motion_counters = feed.counters
-    log(f"tag {node.radio.name}: waits for its motion at {feed.address}")
-    return together(tags.run(), feed.run())
+    return tags, tags.tags[0].node
 
 
 def _site_trust(asked: TagOptions) -> SiteTrust | None:
@@ -349,8 +345,8 @@ def _on_sniffers(
     address: MqttAddress | None,
     on_fix: FixListener,
     bridge: TagBridge | None,
-) -> Coroutine[Any, Any, None]:
-    """Run tags that receive the packets of another system."""
+) -> "_Opened":
+    """Open tags that receive the packets of another system; the first tag's node."""
     from skyless.run.masterless.packet_tags import PacketTags
 
     settings = _system(asked)
@@ -373,7 +369,7 @@ def _on_sniffers(
         on_health=None if bridge is None else bridge.on_system_health,
         on_anchors=on_anchors,
     )
-    return _with_motion(asked, tags, tags.nodes[0])
+    return tags, tags.nodes[0]
 
 
 def _system(asked: TagOptions) -> "PacketTagSettings":

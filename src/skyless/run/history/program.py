@@ -193,7 +193,8 @@ class SiteHistory:
         """Keep the history until cancelled, then write what waits; what cannot be written is still in the streams."""
         self._stream = stream
         try:
-            await together(self._take_fixes(), self._take_events(), self._take_state(), self._work())
+            others = self._take_others(subjects.EVENT_STREAM, self._writer.events)
+            await together(self._take_fixes(), others, self._take_others(subjects.STATE_STREAM), self._work())
         finally:
             self._try("files", self._writer.close)
 
@@ -219,17 +220,12 @@ class SiteHistory:
         async for message in self._follow(subjects.FIX_STREAM, self._writer.fixes, own):
             await taker.take(message)
 
-    async def _take_events(self) -> None:
-        events = self._writer.events
-        async for message in self._follow(subjects.EVENT_STREAM, events):
-            await _until_room(events)
-            events.place = replace(events.place, number=message.metadata.sequence.stream)
-            self._receive(message)
-
-    async def _take_state(self) -> None:
-        async for message in self._follow(subjects.STATE_STREAM):
+    async def _take_others(self, pattern: str, intake: Intake | None = None) -> None:
+        async for message in self._follow(pattern, intake):
             await _until_room(self._writer.events)
-            self._receive(message)
+            if intake is not None:
+                intake.place = replace(intake.place, number=message.metadata.sequence.stream)
+            self._feed.receive(subjects.topic_of(message.subject), message.data)
 
     async def _follow(
         self, pattern: str, intake: Intake | None = None, subject: str | None = None
@@ -264,9 +260,6 @@ class SiteHistory:
             self._writer.drops["lost-batches" if intake is self._writer.fixes else "lost-events"] += lost
             self._say(f"the stream {name} has dropped {lost} messages before they could be read")
         return intake.place.number
-
-    def _receive(self, message: "Msg") -> None:
-        self._feed.receive(subjects.topic_of(message.subject), message.data)
 
     # Files
 
