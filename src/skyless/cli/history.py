@@ -14,6 +14,7 @@ from skyless.arguments import Option, Options, Positive, whole
 from skyless.cli.common import (
     NO_FIX,
     JsonOptions,
+    RecordingFile,
     check_folder,
     check_new,
     check_picture,
@@ -358,18 +359,15 @@ def _losses(state: "HistoryState") -> str:
     return f"; not kept: {', '.join(lost)}" if lost else ""
 
 
+_RecordedSite = Annotated[SiteId | None, Parameter(help="Number of the site; by default the one that was recorded.")]
+
+
 @app.command(name="import", help_epilogue="Example: skyless history import walk.mcap --to history")
 @command
-def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None = None, output: JsonOptions) -> None:
-    """Add the fixes, events, zones and names of a recording to a history; what that has already is left out.
-
-    Parameters
-    ----------
-    recording
-        The recording, an MCAP file of skyless record.
-    site_id
-        Number of the site; by default the one that was recorded.
-    """
+def import_file(
+    recording: RecordingFile, /, *, to: HistoryFolder, site_id: _RecordedSite = None, output: JsonOptions
+) -> None:
+    """Add the fixes, events, zones and names of a recording to a history; what that has already is left out."""
     import msgspec
 
     from skyless.cli.common import progress_bar

@@ -297,14 +297,8 @@ def init(*, asked: InitOptions, output: JsonOptions) -> None:
 
 @hub_app.command
 @command
-def apply(folder: Path, /, *, output: JsonOptions) -> None:
-    """Make the streams of all tenants of a hub, or extend them, and say which sites are heard.
-
-    Parameters
-    ----------
-    folder
-        Folder of skyless hub init.
-    """
+def apply(folder: Annotated[Path, Parameter(help="Folder of skyless hub init.")], /, *, output: JsonOptions) -> None:
+    """Make the streams of all tenants of a hub, or extend them, and say which sites are heard."""
     extra_module("nats", "skyless hub apply")
     from skyless.run.hub import make_streams_of
 

@@ -4,15 +4,16 @@ import asyncio
 import contextlib
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
-from cyclopts import App
+from cyclopts import App, Parameter
 
 from skyless.arguments import Options, Positive, wrong
 from skyless.cli.common import (
     NO_FIX,
     JsonOptions,
+    RecordingFile,
     check_output,
     command,
     print_json,
@@ -133,20 +134,16 @@ class ExportOptions(Options, frozen=True, kw_only=True):
     """Of the bag's metadata: 9 for ROS 2 from Jazzy on, 8 for Humble and Iron."""
 
 
+_Bag = Annotated[Path, Parameter(help="Where fixes go: the bag, a new folder.")]
+
+
 @export_app.default
 @command
-def export(file: Path, /, *, to: Path, asked: ExportOptions, output: JsonOptions) -> int:
+def export(file: RecordingFile, /, *, to: _Bag, asked: ExportOptions, output: JsonOptions) -> int:
     """Write a recording of skyless record as a bag of ROS 2: MCAP, for ros2 bag play, Foxglove, Rerun, PlotJuggler.
 
     Each tag gets the topics pose, velocity, fix (where the site file has a georeference) and truth (where it is
     simulated) below /skyless/TAG; anchors and health become /skyless/anchors and /diagnostics. Needs the extra ros2.
-
-    Parameters
-    ----------
-    file
-        The recording, an MCAP of skyless record.
-    to
-        Where fixes go: the bag, a new folder.
     """
     from skyless.bridges.ros2 import FRAME_NAME, FRAME_RULE, RosSettings
     from skyless.bridges.rosbag import write_bag

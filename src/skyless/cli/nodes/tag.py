@@ -243,21 +243,17 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     the anchors lie too flat, then theirs."""
 
 
+_Names = Annotated[str, Parameter(name="NAMES", help="Names of one or more tags: letters, digits, - and _.")]
+
+
 @app.default
 @command
-def tag(
-    *names: Annotated[str, Parameter(name="NAMES")], asked: TagOptions, broker: MqttOptions, shown: LineOptions
-) -> None:
+def tag(*names: _Names, asked: TagOptions, broker: MqttOptions, shown: LineOptions) -> None:
     """Run listening tags until Ctrl-C.
 
     A tag needs no configuration: it learns the site from the beacons that it hears. It computes a fix with every
     message, with or without a broker, and publishes fixes on MQTT under skyless/v1/SITE/tag/NAME/fix. With --print,
     --csv or --json it writes the same fixes on standard output.
-
-    Parameters
-    ----------
-    names
-        Names of one or more tags: letters, digits, - and _.
     """
     address, lines = broker.address(), shown.lines(log, addresses=driver_of(asked.radio) in STATED_POSITIONS)
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
