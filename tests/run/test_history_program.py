@@ -1,6 +1,7 @@
 """``skyless history run`` against real brokers: killed, with a full disk, and what it takes of a site's messages."""
 
 import asyncio
+import contextlib
 import errno
 import multiprocessing
 import os
@@ -166,13 +167,13 @@ async def test_fifty_kills_lose_no_acknowledged_batch_and_double_none(tmp_path):
     assert numbers == [*range(1, len(found) + 1)]
 
 
-async def keeping(stage, folder, log, scenario):
-    """Run a node in this process during a scenario."""
+@contextlib.asynccontextmanager
+async def keeping(stage, folder, log):
+    """A node that runs in this process, once it is connected."""
     node = HistoryNode(folder, SITE, stage.broker.address, Keep(), log)
     async with running(node.run()) as (task,):
         await until(lambda: node.link.connected or task.done())
-        await scenario(node)
-    return node
+        yield node
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
@@ -192,8 +193,7 @@ async def test_a_disk_that_takes_nothing_is_said_and_forgiven(tmp_path, monkeypa
 
     monkeypatch.setattr(Path, "write_bytes", write)
 
-    async def scenario(node):
-        nonlocal is_at_fault
+    async with Stage(tmp_path / "broker") as stage, keeping(stage, folder, lines.append) as node:
         publishing = asyncio.ensure_future(stage.publish_fixes())
         await until(lambda: node.state().disk is not None)
         during = node.state()
@@ -204,10 +204,6 @@ async def test_a_disk_that_takes_nothing_is_said_and_forgiven(tmp_path, monkeypa
         later = node.state().fixes + 100
         await until(lambda: node.state().fixes > later and current_files(folder, SITE))
         publishing.cancel()
-
-    stage = Stage(tmp_path / "broker")
-    async with stage:
-        node = await keeping(stage, folder, lines.append, scenario)
     assert lines[:3] == [
         f"the history's files cannot be written: {os.strerror(number)}",
         "the history's files can be written again",
@@ -229,42 +225,45 @@ async def test_what_it_takes_of_a_sites_messages(tmp_path, kind):
     alarm = AlarmMessage(*("cold/ann/1", "cold", "Cold", "inside", "critical", "ann", now_s, now_s, "ann is in Cold"))
     ended = msgspec.structs.replace(alarm, ended_unix_s=now_s + 1.0)
 
-    async def scenario(node):
+    async with Stage(tmp_path / "broker", kind) as stage:
         publish = stage.link.publish
-        await until(lambda: node.state().events == 1)  # the tag's own status: it has subscribed
-        lab = msgspec.structs.replace(lab_site(), id=SITE)
-        publish(topics.site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
-        publish(topics.zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
-        publish(topics.assets_topic(SITE), AssetsMessage((Asset(TAG, "Forklift"), Asset("bob"))), qos=1, retain=True)
-        publish(
-            topics.status_topic(SITE, "anchor", 3), StatusMessage(True, "anchor", "3", unix_s=now_s), qos=1, retain=True
-        )
-        publish(topics.status_topic(SITE, "anchor", "a b"), StatusMessage(True, "anchor", "a b", unix_s=now_s), qos=1)
-        publish(topics.alarm_topic(SITE, "cold", "ann"), alarm, qos=1, retain=True)
-        publish(
-            topics.zone_event_topic(SITE, "z1"), ZoneEvent("z1", "door", "ann", "enter", now_s, (0.0, 0.0, 0.0)), qos=1
-        )
-        publish(topics.fix_topic(SITE, "bad"), b"{}")
-        await until(lambda: (site_folder(folder, SITE) / "stream").is_dir() and node.state().events >= 4)
-        await until(lambda: node.state().drops.get("wrong"))
-        publish(topics.zones_topic(SITE), b'{"zones": [{"id": "/", "name": "", "polygon_m": []}]}', qos=1)
-        await until(lambda: node.state().drops.get("wrong-message"))
-        publish(topics.fix_topic(SITE, TAG), numbered_fix(1))
-        await until(lambda: node.state().fixes == 1)
-
-    async def again(node):
-        publish = stage.link.publish
-        while not node.state().fixes:  # nats-server may lose what comes while somebody subscribes
-            publish(topics.fix_topic(SITE, TAG), numbered_fix(2))
-            await asyncio.sleep(0.05)
-        publish(topics.status_topic(SITE, "anchor", 3), StatusMessage(False, "anchor", "3"), qos=1, retain=True)
-        publish(topics.alarm_topic(SITE, "cold", "ann"), ended, qos=1, retain=True)
-        await until(lambda: node.state().events >= 2)
-
-    stage = Stage(tmp_path / "broker", kind)
-    async with stage:
-        await keeping(stage, folder, lambda _: None, scenario)
-        await keeping(stage, folder, lambda _: None, again)
+        async with keeping(stage, folder, lambda _: None) as node:
+            await until(lambda: node.state().events == 1)  # the tag's own status: it has subscribed
+            lab = msgspec.structs.replace(lab_site(), id=SITE)
+            publish(topics.site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
+            publish(topics.zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
+            publish(
+                topics.assets_topic(SITE), AssetsMessage((Asset(TAG, "Forklift"), Asset("bob"))), qos=1, retain=True
+            )
+            publish(
+                topics.status_topic(SITE, "anchor", 3),
+                StatusMessage(True, "anchor", "3", unix_s=now_s),
+                qos=1,
+                retain=True,
+            )
+            publish(
+                topics.status_topic(SITE, "anchor", "a b"), StatusMessage(True, "anchor", "a b", unix_s=now_s), qos=1
+            )
+            publish(topics.alarm_topic(SITE, "cold", "ann"), alarm, qos=1, retain=True)
+            publish(
+                topics.zone_event_topic(SITE, "z1"),
+                ZoneEvent("z1", "door", "ann", "enter", now_s, (0.0, 0.0, 0.0)),
+                qos=1,
+            )
+            publish(topics.fix_topic(SITE, "bad"), b"{}")
+            await until(lambda: (site_folder(folder, SITE) / "stream").is_dir() and node.state().events >= 4)
+            await until(lambda: node.state().drops.get("wrong"))
+            publish(topics.zones_topic(SITE), b'{"zones": [{"id": "/", "name": "", "polygon_m": []}]}', qos=1)
+            await until(lambda: node.state().drops.get("wrong-message"))
+            publish(topics.fix_topic(SITE, TAG), numbered_fix(1))
+            await until(lambda: node.state().fixes == 1)
+        async with keeping(stage, folder, lambda _: None) as node:
+            while not node.state().fixes:  # nats-server may lose what comes while somebody subscribes
+                publish(topics.fix_topic(SITE, TAG), numbered_fix(2))
+                await asyncio.sleep(0.05)
+            publish(topics.status_topic(SITE, "anchor", 3), StatusMessage(False, "anchor", "3"), qos=1, retain=True)
+            publish(topics.alarm_topic(SITE, "cold", "ann"), ended, qos=1, retain=True)
+            await until(lambda: node.state().events >= 2)
     assert History(folder, SITE).assets() == {TAG: "Forklift"}
     found = [parquet.read_table(file, partitioning=None).to_pylist() for file in current_events(folder, SITE)]
     kinds = sorted((row["kind"], row["tag"] or row["subject"]) for table in found for row in table)
@@ -290,7 +289,9 @@ async def test_a_recording_gives_the_rows_of_the_running_history(tmp_path):
         at_m, variances = ([chance.uniform(*limits) for _ in range(3)] for limits in ((-50.0, 50.0), (1e-6, 4.0)))
         return fix(f"t{serial % 3}", serial, time.time(), tuple(at_m), variances, hpl_m=chance.uniform(0.1, 9.0))
 
-    async def scenario(node):
+    stage = Stage(tmp_path / "broker")
+    recorder = RecorderNode(McapFile(walk), stage.broker.address, SITE, print)
+    async with stage, running(recorder.run()), keeping(stage, live, print) as node:
         await until(lambda: node.state().events == 1 and recorder.recorder.kinds["status"])
         publish, now_s = stage.link.publish, time.time()
         publish(topics.site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
@@ -315,13 +316,6 @@ async def test_a_recording_gives_the_rows_of_the_running_history(tmp_path):
             await asyncio.sleep(0.002)
         await until(lambda: (node.state().fixes, node.state().events) == (300, 1 + 6 + 6 + 6))
         await until(lambda: recorder.recorder.kinds["fix"] == 300 and recorder.recorder.kinds["event"] == 6)
-
-    stage = Stage(tmp_path / "broker")
-    recorder = RecorderNode(McapFile(walk), stage.broker.address, SITE, print)
-    async with stage:
-        recording = asyncio.ensure_future(recorder.run())
-        await keeping(stage, live, print, scenario)
-        await stopped(recording)
     for folder, fixes, events in ((played, 300, 19), (live, 0, 0)):
         with McapRecording(walk) as recording:
             writer = Writer(folder, SITE)
