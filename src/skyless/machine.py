@@ -11,7 +11,6 @@ from skyless.core.errors import SkylessError
 
 EXTRA_OF: Final = {
     "cryptography": "keys",
-    "cyclonedds": "ros2",
     "dateparser": "history",
     "distributed": "dask",
     "duckdb": "history",

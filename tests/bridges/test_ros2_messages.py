@@ -1,6 +1,5 @@
-"""Messages of ROS 2, read by rosbags and by Cyclone DDS: two decoders that are not ours."""
+"""Messages of ROS 2, read by rosbags."""
 
-import math
 import re
 from fractions import Fraction
 
@@ -10,8 +9,8 @@ from hypothesis import strategies as st
 from msgspec import structs
 from rosbags.typesys import Stores, get_typestore
 
-from skyless.bridges import ros2
-from skyless.bridges.ros2 import DdsTypes, RosEncoder, RosSettings, ros_name, stamp_of
+from skyless.bridges import rosbag
+from skyless.bridges.rosbag import RosEncoder, ros_name, stamp_of
 from skyless.bridges.target import floored
 from skyless.core.earth import geodetic, rotated
 from skyless.run.mqtt.messages import AnchorHealth, Counters, TagHealth
@@ -19,8 +18,7 @@ from support.bridged_values import BARE_SITE, SITE, a_fix, fixes, georeferences
 
 pytestmark = pytest.mark.site
 
-EVERY = RosSettings(frame="map", namespace="hall/uwb", transforms=True)
-TYPES = [value for value in vars(ros2).values() if isinstance(value, str) and "/msg/" in value]
+TYPES = [value for value in vars(rosbag).values() if isinstance(value, str) and "/msg/" in value]
 RELEASES = [Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY, Stores.ROS2_KILTED]
 KILTED = get_typestore(Stores.ROS2_KILTED)
 
@@ -36,8 +34,8 @@ tag_health = st.builds(
 )
 
 
-def encoder(site=SITE, settings=EVERY):
-    made = RosEncoder(settings)
+def encoder(site=SITE, *, transforms=True):
+    made = RosEncoder("map", transforms=transforms)
     (anchors,) = made.on_site(site)
     return made, anchors
 
@@ -72,7 +70,7 @@ def test_every_fix_is_read_as_it_was(fix, origin):
     made, _ = encoder(structs.replace(SITE, georeference=origin))
     name = ros_name(fix.tag)
     read = by_topic(made.on_fix(fix))
-    pose = read.pop(f"/hall/uwb/{name}/pose")
+    pose = read.pop(f"/skyless/{name}/pose")
     assert pose.header.frame_id == "map"
     if fix.unix_s < 2**31 - 1:
         assert abs(seconds(pose.header.stamp) - Fraction(fix.unix_s)) <= Fraction(1, 2 * 10**9)
@@ -85,14 +83,14 @@ def test_every_fix_is_read_as_it_was(fix, origin):
     assert covariance.trace() == pytest.approx(3e6 + sum(floored(fix.covariance_m2)[::4]))
     assert not covariance[:3, 3:].any()
     assert not covariance[3:, :3].any()
-    velocity = read.pop(f"/hall/uwb/{name}/velocity", None)
+    velocity = read.pop(f"/skyless/{name}/velocity", None)
     assert (velocity is None) == (fix.velocity_mps is None)
     if velocity is not None:
         assert velocity.header == pose.header
         assert xyz(velocity.twist.twist.linear) == fix.velocity_mps
         assert xyz(velocity.twist.twist.angular) == (0.0, 0.0, 0.0)
         assert tuple(velocity.twist.covariance.reshape(6, 6)[:3, :3].ravel()) == fix.velocity_covariance
-    earth = read.pop(f"/hall/uwb/{name}/fix")
+    earth = read.pop(f"/skyless/{name}/fix")
     assert (earth.header.stamp, earth.header.frame_id) == (pose.header.stamp, name)
     assert (earth.status.status, earth.status.service, earth.position_covariance_type) == (0, 0, 3)
     assert (earth.latitude, earth.longitude, earth.altitude) == geodetic(fix.position_m, origin)
@@ -105,17 +103,9 @@ def test_every_fix_is_read_as_it_was(fix, origin):
 
 
 def test_without_a_georeference_there_is_no_position_on_the_earth():
-    made, _ = encoder(BARE_SITE, RosSettings())
+    made, _ = encoder(BARE_SITE, transforms=False)
     topics = [one.topic for one in made.on_fix(a_fix())]
     assert topics == ["/skyless/tag1/pose", "/skyless/tag1/velocity"]
-    assert made.on_no_fix("tag1", 5.0) == []
-
-
-def test_no_fix_has_no_position():
-    made, _ = encoder(settings=RosSettings())
-    (earth,) = by_topic(made.on_no_fix("tag1", 5.25)).values()
-    assert (seconds(earth.header.stamp), earth.status.status, earth.position_covariance_type) == (5.25, -1, 0)
-    assert all(map(math.isnan, (earth.latitude, earth.longitude, earth.altitude)))
 
 
 @given(tag_health)
@@ -139,7 +129,7 @@ def test_an_anchor_that_is_not_synchronised_warns(health):
 def test_anchors_are_markers_that_last():
     _, anchors = encoder()
     assert anchors.lasting
-    found = by_topic([anchors])["/hall/uwb/anchors"].markers
+    found = by_topic([anchors])["/skyless/anchors"].markers
     cubes = {one.id: xyz(one.pose.position) for one in found if one.type == 1}
     assert cubes == SITE.anchors_m
     assert {one.text for one in found if one.type == 9} == {"1", "2"}
@@ -153,7 +143,7 @@ def test_a_site_that_is_known_already_gives_nothing():
 
 @given(st.lists(st.from_regex(r"[A-Za-z0-9_-]{1,32}", fullmatch=True), unique=True, max_size=8))
 def test_each_tag_has_topics_of_its_own_that_ros_allows(tags):
-    made, _ = encoder(settings=RosSettings())
+    made, _ = encoder()
     topics = [made.on_fix(a_fix(tag=tag))[0].topic for tag in tags]
     assert len(set(topics)) == len(tags)
     assert all(re.fullmatch(r"(/[A-Za-z][A-Za-z0-9_]*)+", topic) and "__" not in topic for topic in topics)
@@ -165,17 +155,3 @@ def test_a_stamp_is_always_one(unix_s):
     whole, nanoseconds = stamp_of(unix_s)
     assert 0 <= whole < 2**31
     assert 0 <= nanoseconds < 10**9
-
-
-@given(fix=fixes())
-@pytest.mark.statistical
-def test_cyclone_dds_reads_and_writes_the_same_bytes(fix):
-    pytest.importorskip("cyclonedds", reason="Cyclone DDS has no wheel here")
-    types = DdsTypes()
-    made, anchors = encoder()
-    health = TagHealth("t", 5.0, 1.0, "joint", 1, 1, 1.0, "x", None, None, None, {}, Counters(0, 0, 0), 0.0, 1, ())
-    for one in (anchors, *made.on_fix(fix), *made.on_no_fix("a", 3.0), *made.on_health(health)):
-        kind = types.type(one.type)
-        assert kind.deserialize(one.data).serialize(use_version_2=False) == one.data
-        package, between, name = one.type.split("/")
-        assert kind.__idl_typename__ == f"{package}.{between}.dds_.{name}_"

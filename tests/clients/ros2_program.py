@@ -24,7 +24,6 @@ POSE = "/skyless/tag1/pose"
 TOPICS = {
     POSE: "geometry_msgs/msg/PoseWithCovarianceStamped",
     "/skyless/tag1/velocity": "geometry_msgs/msg/TwistWithCovarianceStamped",
-    "/skyless/tag1/fix": "sensor_msgs/msg/NavSatFix",
     "/skyless/anchors": "visualization_msgs/msg/MarkerArray",
 }
 FIX = {

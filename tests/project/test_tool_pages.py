@@ -40,6 +40,10 @@ def test_commands_are_known_to_the_program(page):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_targets_can_be_opened(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    node = tmp_path / "lib" / "skyless_ros2" / "node"
+    node.parent.mkdir(parents=True)
+    node.touch()
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
     for text in sorted(targets(page)):
         if any(letters in text for letters in ("HOST", "PORT", "PATH", "[", "192.168.")) or text.endswith((":", "://")):
             continue  # how such an address is made up

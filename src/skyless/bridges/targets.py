@@ -45,7 +45,8 @@ class TcpServer:
         """``greeting`` returns what a new reader gets first."""
         self.dropped: Counter[str] = Counter()
         self.port = port
-        """The port in use; with 0 configured, known once the server runs."""
+        """The port in use; with 0 configured, known once ``is_listening`` is set."""
+        self.is_listening = asyncio.Event()
         self._text, self._host, self._greeting = text, host, greeting
         self._readers: set[_TcpReader] = set()
 
@@ -65,6 +66,7 @@ class TcpServer:
         except OSError as error:
             raise cannot_listen(self._text, self._host, self.port, error) from None
         self.port = server.sockets[0].getsockname()[1]
+        self.is_listening.set()
         try:
             await asyncio.Event().wait()  # serve_forever, when cancelled, waits until all readers have left
         finally:
@@ -262,7 +264,7 @@ TARGET_KINDS: Final = {
     "nmea+udp": Kind("nmea", 10.0, 50.0, "NMEA 0183 as datagrams", 10110),
     "nmea+pty": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a pseudo-terminal"),
     "nmea+serial": Kind("nmea", 10.0, 50.0, "NMEA 0183 on a serial port, as nmea+serial:/dev/ttyUSB0@115200"),
-    "ros2": Kind("ros2", 50.0, MAX_HZ, "topics of ROS 2, published by DDS without ROS being installed"),
+    "ros2": Kind("ros2", 50.0, MAX_HZ, "topics of ROS 2, published by the node of ros2/skyless_ros2 on this computer"),
     "mavlink+udpout": Kind(
         "mavlink", 30.0, 100.0, "MAVLink 2 for an autopilot; ?profile= ardupilot, px4 or gps", 14550
     ),
@@ -281,7 +283,7 @@ TARGET_KINDS: Final = {
 }
 
 
-class _StreamTarget(Target):
+class StreamTarget(Target):
     """An encoder's bytes, carried by a sender."""
 
     def __init__(self, text: str, encoder: Encoder, sender: Sender) -> None:
@@ -291,21 +293,27 @@ class _StreamTarget(Target):
         self.dropped = encoder.dropped = sender.dropped
 
     def on_site(self, site: BridgedSite) -> None:
+        """See ``Target``."""
         self._send(self._encoder.on_site(site))
 
     def on_fix(self, fix: FixMessage) -> None:
+        """See ``Target``."""
         self._send(self._encoder.on_fix(fix))
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
+        """See ``Target``."""
         self._send(self._encoder.on_no_fix(tag, unix_s, reason))
 
     def on_second(self, unix_s: float) -> None:
+        """See ``Target``."""
         self._send(self._encoder.on_second(unix_s))
 
     def on_bytes(self, data: bytes) -> None:
+        """See ``Target``."""
         self._send(self._encoder.on_bytes(data, time.time_ns()))
 
     async def run(self) -> None:
+        """See ``Target``."""
         await self._sender.run()
 
     def _send(self, messages: list[bytes]) -> None:
@@ -336,7 +344,7 @@ def open_route(text: str, context: BridgeContext) -> Route:
     return Route(target, tag, hz, others=tag is not None)
 
 
-def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext) -> _StreamTarget:
+def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext) -> StreamTarget:
     """Combine an encoder with the sender named after ``+`` in the scheme."""
     sender: Sender
     match url.scheme.partition("+")[2]:
@@ -351,7 +359,7 @@ def _stream(url: TargetUrl, kind: Kind, encoder: Encoder, context: BridgeContext
             sender = SerialSender(url.text, path, int(baud or 115_200), context.log)
         case _:
             sender = UdpSender(url.text, url.host(), url.port(kind.port), context.log)
-    target = _StreamTarget(url.text, encoder, sender)
+    target = StreamTarget(url.text, encoder, sender)
     if isinstance(sender, UdpSender | SerialSender):
         sender.received = target.on_bytes
     return target

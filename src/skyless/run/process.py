@@ -416,7 +416,7 @@ _COMMAND: Final = (sys.executable, "-m", "skyless.cli.main")
 
 
 class Program(Struct, frozen=True):
-    """A command of ``skyless`` to run."""
+    """A command to run."""
 
     name: str
     arguments: tuple[str, ...]
@@ -430,6 +430,8 @@ class Program(Struct, frozen=True):
     """Whether lines on standard error are logged as they come; otherwise only the last one, at its end."""
     environment: Mapping[str, str] = {}
     """Variables in addition to those of this program."""
+    command: tuple[str, ...] = _COMMAND
+    """What takes the arguments; by default ``skyless``."""
 
     def start(self, number: int) -> tuple[str, ...]:
         """Arguments of the start with this number, counted from 1."""
@@ -508,7 +510,7 @@ class Child:
         """Start the program. Standard error goes to a pipe, whose writing end is closed on this side."""
         try:
             return await asyncio.create_subprocess_exec(
-                *(*_COMMAND, *self.program.start(self.starts)),
+                *(*self.program.command, *self.program.start(self.starts)),
                 stdin=asyncio.subprocess.DEVNULL,
                 stdout=asyncio.subprocess.DEVNULL,
                 stderr=stderr,

@@ -145,14 +145,13 @@ def export(file: RecordingFile, /, *, to: _Bag, asked: ExportOptions, output: Js
     Each tag gets the topics pose, velocity, fix (where the site file has a georeference) and truth (where it is
     simulated) below /skyless/TAG; anchors and health become /skyless/anchors and /diagnostics. Needs the extra ros2.
     """
-    from skyless.bridges.ros2 import FRAME_NAME, FRAME_RULE, RosSettings
-    from skyless.bridges.rosbag import write_bag
+    from skyless.bridges.rosbag import FRAME_NAME, FRAME_RULE, RosEncoder, write_bag
 
     check_output("to", to, file)
     if not FRAME_NAME.fullmatch(asked.frame):
         raise wrong("--frame", asked.frame, FRAME_RULE)
-    settings = RosSettings(frame=asked.frame, transforms=asked.transforms)
-    bag = write_bag(file, to, settings, asked.tag, 8 if asked.bag_version == "8" else 9)
+    encoder = RosEncoder(asked.frame, transforms=asked.transforms)
+    bag = write_bag(file, to, encoder, asked.tag, 8 if asked.bag_version == "8" else 9)
     if output.json:
         print_json(bag)
     else:
